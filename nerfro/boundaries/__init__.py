@@ -1,0 +1,1 @@
+"""What lies beyond the volume: exit direction -> colour."""

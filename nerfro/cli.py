@@ -1,0 +1,68 @@
+"""What every entry point shares: composing the configuration, and telling a user's mistake in one line."""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+from collections.abc import Callable
+
+import hydra
+from hydra.core.config_store import ConfigStore
+from hydra.errors import HydraException
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from nerfro.errors import NerfroError
+from nerfro.paths import CONF_DIR
+from nerfro.registry import discover
+
+EXIT_INTERRUPTED = 130
+
+
+def entry_point(config_name: str, schema: type) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
+    """Decorate `main(cfg)` so that it is composed from conf/<config_name>.yaml, checked against a dataclass.
+
+    The YAML's defaults list must begin with `<config_name>_schema`, or misspelt root keys pass unnoticed.
+
+    Args:
+        config_name: file in conf/, without extension.
+        schema: dataclass of the root.
+    """
+
+    def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
+        @functools.wraps(task)
+        def run() -> None:
+            # Without this Hydra prints its own report of errors and exits, before we can.
+            os.environ["HYDRA_FULL_ERROR"] = "1"
+            try:
+                ConfigStore.instance().store(name=f"{config_name}_schema", node=schema, provider="nerfro")
+                discover()
+                hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(task)()
+            except NerfroError as error:
+                _fail(str(error))
+            except (HydraException, OmegaConfBaseException) as error:
+                _fail(" ".join(_messages(error)))
+            except OSError as error:
+                _fail(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}")
+            except KeyboardInterrupt:
+                print("nerfro: interrupted", file=sys.stderr)
+                sys.exit(EXIT_INTERRUPTED)
+
+        return run
+
+    return decorate
+
+
+def _messages(error: BaseException) -> list[str]:
+    """An error's lines and its cause's, joined to one; Hydra keeps the name of the bad key in the cause."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    cause = error.__cause__
+    if cause is not None and isinstance(cause, OmegaConfBaseException):
+        lines += [line.strip() for line in str(cause).splitlines() if line.strip() and line.strip() not in lines]
+    return lines
+
+
+def _fail(message: str) -> None:
+    print(f"nerfro: error: {message}", file=sys.stderr)
+    sys.exit(1)

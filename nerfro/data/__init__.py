@@ -1,0 +1,1 @@
+"""Posed images: folder -> cameras, images, masks."""

@@ -1,0 +1,55 @@
+"""What a data set is."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.data.cameras import Cameras
+
+
+@dataclass(frozen=True)
+class Views:
+    """Posed images of one split.
+
+    Attributes:
+        cameras: one camera for each image, all of one resolution.
+        images: colours, sRGB in [0, 1].
+        masks: share of each pixel that the refractive object covers, or None where the data has no masks.
+        names: of the images, as the data set calls them.
+    """
+
+    cameras: Cameras
+    images: Float[Tensor, "V H W 3"]
+    masks: Float[Tensor, "V H W"] | None
+    names: list[str]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+class DataSource(ABC):
+    """A folder of posed images in some format.
+
+    Attributes:
+        root: the folder.
+    """
+
+    root: Path
+
+    @property
+    @abstractmethod
+    def splits(self) -> list[str]:
+        """Names of the splits that the folder holds."""
+
+    @abstractmethod
+    def load(self, split: str) -> Views:
+        """Read one split, checked.
+
+        Raises:
+            NerfroError: unknown split, or anything missing, truncated, of the wrong size or not finite.
+        """

@@ -1,0 +1,17 @@
+"""What a radiance field is."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+from torch import nn
+
+from nerfro.types import Radiance, Samples
+
+
+class Field(nn.Module, ABC):
+    """Density and colour of a volume."""
+
+    @abstractmethod
+    def forward(self, samples: Samples) -> Radiance:
+        """Density (per world unit) and colour (sRGB) at every sample."""

@@ -1,0 +1,44 @@
+"""What a loss is, and its weight's schedule."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerfro.errors import NerfroError
+from nerfro.types import Batch, Rendering
+
+if TYPE_CHECKING:
+    from nerfro.models.base import NerfModel
+
+
+class Loss(nn.Module, ABC):
+    """A term of the training objective, weighted by `weight` once `start` steps are done, ramped in over `ramp` steps.
+
+    Args:
+        weight: final weight.
+        start: number of optimiser steps during which the weight is zero.
+        ramp: number of steps after that over which it grows linearly.
+
+    Raises:
+        NerfroError: a negative weight or number of steps.
+    """
+
+    def __init__(self, weight: float = 1.0, start: int = 0, ramp: int = 0) -> None:
+        super().__init__()
+        if weight < 0 or start < 0 or ramp < 0:
+            raise NerfroError(f"loss weight={weight} start={start} ramp={ramp}: none may be negative; 0 switches off")
+        self.weight, self.start, self.ramp = weight, start, ramp
+
+    def weight_at(self, step: int) -> float:
+        """Weight at the given optimiser step (0 is the first)."""
+        if step < self.start:
+            return 0.0
+        return self.weight * min(1.0, (step - self.start + 1) / (self.ramp + 1))
+
+    @abstractmethod
+    def forward(self, renderings: list[Rendering], batch: Batch, model: NerfModel) -> Float[Tensor, ""]:
+        """Unweighted value, averaged over the batch."""

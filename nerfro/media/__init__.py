@@ -1,0 +1,1 @@
+"""Refractive index: x -> (n, grad n)."""

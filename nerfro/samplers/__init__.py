@@ -1,0 +1,1 @@
+"""How rays become paths, and where paths are sampled."""

@@ -1,0 +1,32 @@
+"""What path samplers and point samplers are."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+from torch import nn
+
+from nerfro.media.base import Medium
+from nerfro.types import Path, Rays, Rendering, Samples
+
+
+class PathSampler(nn.Module, ABC):
+    """Bends rays into paths."""
+
+    @abstractmethod
+    def forward(self, rays: Rays, medium: Medium) -> Path:
+        """Trace every ray from near to far through the medium."""
+
+
+class PointSampler(nn.Module, ABC):
+    """Chooses samples on a path; random in training, deterministic in evaluation.
+
+    Attributes:
+        num_levels: how often the path is sampled, each level guided by the rendering of the one before.
+    """
+
+    num_levels: int
+
+    @abstractmethod
+    def forward(self, path: Path, previous: Rendering | None) -> Samples:
+        """Sample the path, first without and then with the previous level's rendering."""

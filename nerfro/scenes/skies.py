@@ -1,0 +1,132 @@
+"""Procedural surroundings at infinity: layers painted as functions of direction, and their lat-long textures.
+
+Directions are unit vectors in a z-up world. Layers return sRGB colours, because that is what a person judges by eye; a
+sky returns linear radiance at most 1, so that 8-bit pictures never clip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from nerfro.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
+
+Sky = Callable[[np.ndarray], np.ndarray]
+"""Maps unit directions [..., 3] to linear radiance [..., 3] in [0, 1]."""
+
+
+def azimuth(directions: np.ndarray) -> np.ndarray:
+    """Return the angle around z from +x towards +y, in turns [0, 1)."""
+    return (np.arctan2(directions[..., 1], directions[..., 0]) / (2 * np.pi)) % 1.0
+
+
+def elevation(directions: np.ndarray) -> np.ndarray:
+    """Return the angle above the horizon in degrees, [-90, 90]."""
+    return np.degrees(np.arcsin(np.clip(directions[..., 2], -1.0, 1.0)))
+
+
+def clouds(directions: np.ndarray, horizon: tuple, zenith: tuple, cover: float, seed: int) -> np.ndarray:
+    """Paint an overhead sky: a gradient from `horizon` to `zenith` with clouds on a flat layer.
+
+    Args:
+        directions: [..., 3].
+        horizon: sRGB colour at elevation 0.
+        zenith: sRGB colour straight up.
+        cover: fraction-like amount of cloud in [0, 1].
+        seed: selects the clouds.
+
+    Returns:
+        sRGB [..., 3].
+    """
+    height = np.maximum(directions[..., 2], 0.0)
+    colour = mix(np.asarray(horizon), np.asarray(zenith), height**0.6)
+    layer = directions[..., :2] / (height + 0.25)[..., None]
+    density = fractal_noise(np.concatenate([3 * layer, np.zeros_like(layer[..., :1])], -1), 5, seed)
+    amount = smoothstep(0.62 - 0.3 * cover, 0.72 - 0.3 * cover, density) * smoothstep(0.02, 0.2, height)
+    shade = mix(np.array([0.80, 0.83, 0.88]), np.array([0.98, 0.98, 0.97]), smoothstep(0.45, 0.75, density))
+    return mix(colour, shade, amount)
+
+
+def skyline(directions: np.ndarray, palette: np.ndarray, count: int, heights: tuple[float, float], seed: int):
+    """Paint a row of houses with windows standing on the horizon.
+
+    Args:
+        directions: [..., 3].
+        palette: facade colours, sRGB [K, 3].
+        count: houses around the full circle.
+        heights: lowest and highest roof, degrees above the horizon.
+        seed: selects heights, colours and lit windows.
+
+    Returns:
+        sRGB colours [..., 3] and coverage [...], 1 where there is a house.
+    """
+    turn, height = azimuth(directions) * count, elevation(directions)
+    house = np.floor(turn).astype(np.int64)
+    across = turn - house
+    key = house[..., None]
+    roof = heights[0] + (heights[1] - heights[0]) * hashed(key, seed)
+    # Every third house or so carries a gable, so that roof lines are not all horizontal.
+    gable = np.where(hashed(key, seed + 1) < 0.4, 5.0 * (1 - 2 * np.abs(across - 0.5)), 0.0)
+    facade = chosen(palette, hashed(key, seed + 2))
+    columns = 3 + np.floor(3 * hashed(key, seed + 3))
+    column, row = np.floor(across * columns), np.floor(height / 3.2)
+    u, v = across * columns - column, height / 3.2 - row
+    window = (np.abs(u - 0.5) < 0.27) & (np.abs(v - 0.5) < 0.3) & (height < roof - 1.0) & (height > 0.5)
+    pane = np.stack([house, column.astype(np.int64), row.astype(np.int64)], -1)
+    glow = np.array([[0.12, 0.15, 0.22], [0.20, 0.27, 0.36], [0.98, 0.86, 0.55], [0.62, 0.76, 0.86]])
+    colour = np.where(window[..., None], chosen(glow, hashed(pane, seed + 4)), facade)
+    edge = np.abs(across - 0.5) > 0.47
+    colour = np.where(edge[..., None], colour * 0.55, colour)
+    covered = (height < roof + gable) & (height >= 0)
+    above_roof = height > roof
+    return np.where(above_roof[..., None], np.array([0.55, 0.24, 0.18]), colour), covered.astype(np.float64)
+
+
+def tiles(directions: np.ndarray, palette: np.ndarray, size: float, grout: tuple, fade: tuple, seed: int):
+    """Paint a tiled floor at height -1 below the viewer, fading to one colour towards the horizon.
+
+    Args:
+        directions: [..., 3]; those above the horizon get the `fade` colour.
+        palette: tile colours, sRGB [K, 3].
+        size: side of a tile, in units of the viewer's height.
+        grout: sRGB colour between tiles.
+        fade: sRGB colour at the horizon; hides the tiles before they are finer than a pixel.
+        seed: selects the tiles' colours.
+
+    Returns:
+        sRGB [..., 3].
+    """
+    depth = np.maximum(-directions[..., 2], 1e-3)
+    place = directions[..., :2] / depth[..., None] / size
+    cell = np.floor(place).astype(np.int64)
+    inside = np.abs(place - cell - 0.5).max(-1) < 0.46
+    checker = ((cell.sum(-1) % 2) == 0)[..., None]
+    colour = chosen(palette, hashed(cell, seed))
+    colour = np.where(checker, colour, 0.25 + 0.6 * colour)
+    colour = np.where(inside[..., None], colour, np.asarray(grout))
+    return mix(np.asarray(fade), colour, smoothstep(0.06, 0.35, depth))
+
+
+def lat_long_directions(height: int, width: int) -> np.ndarray:
+    """Return the directions at the pixel centres of a lat-long picture, [H, W, 3].
+
+    Column centre u = 0.5 - atan2(y, x) / (2 pi) and row centre v = acos(z) / pi: z is up, the middle of the picture
+    looks along +x, and a viewer inside sees it unmirrored. Blender's environment textures use the same convention.
+    """
+    rows, columns = (np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width
+    theta, phi = np.pi * rows[:, None], 2 * np.pi * (0.5 - columns[None])
+    return np.stack(
+        [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi], -1
+    )
+
+
+def lat_long_texture(sky: Sky, height: int, supersampling: int = 2) -> np.ndarray:
+    """Return the sky as a float32 lat-long picture [H, 2H, 3] of linear radiance, averaged over each pixel."""
+    k = supersampling
+    texture = np.empty((height, 2 * height, 3), np.float32)
+    fine = lat_long_directions(k * height, 2 * k * height)
+    for row in range(height):  # row by row: the layers' temporaries of a whole 4k sky would not fit in memory
+        band = sky(fine[k * row : k * (row + 1)])
+        texture[row] = band.reshape(k, 2 * height, k, 3).mean((0, 2))
+    return texture

@@ -1,0 +1,133 @@
+"""Triangle surfaces with exact normals, and the shapes that are meshed directly rather than from a distance field."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A triangle surface in world units; normals point out of the enclosed volume.
+
+    Attributes:
+        vertices: float32 [V, 3].
+        faces: int32 [F, 3], counter-clockwise seen from outside.
+        normals: float32 [V, 3], unit length. Normals of the underlying smooth surface, not averages over facets.
+        colours: float32 [V, 3] sRGB albedo in [0, 1], or None for glass.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+    colours: np.ndarray | None = None
+
+    def moved(self, offset: Sequence[float]) -> Surface:
+        """Return the surface translated by `offset` (world units)."""
+        return replace(self, vertices=(self.vertices + np.asarray(offset)).astype(np.float32))
+
+    def as_trimesh(self) -> trimesh.Trimesh:
+        """Return a trimesh with the same vertex order (nothing merged or reordered)."""
+        colours = None if self.colours is None else np.rint(self.colours * 255).astype(np.uint8)
+        return trimesh.Trimesh(
+            self.vertices, self.faces, vertex_normals=self.normals, vertex_colors=colours, process=False
+        )
+
+    def save(self, path: Path) -> None:
+        """Write a binary PLY with normals, and sRGB vertex colours where there are any."""
+        path.write_bytes(self.as_trimesh().export(file_type="ply", vertex_normal=True))
+
+
+def join(surfaces: Sequence[Surface]) -> Surface:
+    """Return one surface holding all `surfaces`, which must all be coloured."""
+    offsets = np.cumsum([0] + [len(surface.vertices) for surface in surfaces[:-1]])
+    return Surface(
+        vertices=np.concatenate([surface.vertices for surface in surfaces]),
+        faces=np.concatenate([surface.faces + offset for surface, offset in zip(surfaces, offsets, strict=True)]),
+        normals=np.concatenate([surface.normals for surface in surfaces]),
+        colours=np.concatenate([surface.colours for surface in surfaces if surface.colours is not None]),
+    )
+
+
+def rounded_box(half_sides: Sequence[float], radius: float, edge_steps: int) -> Surface:
+    """Mesh a box whose edges and corners are rounded with `radius`.
+
+    The surface is the set of points at distance `radius` from the inner box of half sides `half_sides - radius`. Flat
+    faces are two triangles each; all the resolution goes into the edges, in equal steps of angle.
+
+    Args:
+        half_sides: half the outer extent along x, y, z, world units.
+        radius: rounding radius, less than every half side.
+        edge_steps: steps per 45 degrees of an edge.
+
+    Returns:
+        A watertight surface around the origin with exact normals.
+    """
+    outer = np.asarray(half_sides, np.float64)
+    inner = outer - radius
+    rise = radius * np.tan(np.linspace(0, np.pi / 4, edge_steps + 1))
+    points, quads, count = [], [], 0
+    for axis in range(3):
+        u_axis, v_axis = (axis + 1) % 3, (axis + 2) % 3
+        u, v = (np.concatenate([-(inner[a] + rise)[::-1], inner[a] + rise]) for a in (u_axis, v_axis))
+        columns, rows = len(u), len(v)
+        index = np.arange(columns * rows).reshape(columns, rows)
+        corners = np.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]], -1).reshape(-1, 4)
+        for sign in (1, -1):
+            face = np.empty((columns, rows, 3))
+            face[..., axis] = sign * outer[axis]
+            face[..., u_axis], face[..., v_axis] = u[:, None], v[None]
+            points.append(face.reshape(-1, 3))
+            quads.append((corners if sign > 0 else corners[:, ::-1]) + count)
+            count += columns * rows
+    cube = np.concatenate(points)
+    core = np.clip(cube, -inner, inner)
+    normals = cube - core
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    # Neighbouring cube faces repeat the vertices of their common edge: weld them, or the mesh is not watertight.
+    _, first, inverse = np.unique(np.round(cube, 9), axis=0, return_index=True, return_inverse=True)
+    quad = inverse.reshape(-1)[np.concatenate(quads)]
+    faces = np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
+    vertices = (core + radius * normals)[first]
+    return Surface(vertices.astype(np.float32), faces.astype(np.int32), normals[first].astype(np.float32))
+
+
+def sphere(radius: float, subdivisions: int) -> Surface:
+    """Mesh a sphere around the origin as a subdivided icosahedron (20 * 4^subdivisions faces) with exact normals."""
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    normals = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
+    return Surface(
+        (normals * radius).astype(np.float32), np.asarray(mesh.faces, np.int32), normals.astype(np.float32)
+    )
+
+
+def torus_angles(major_radius: float, minor_radius: float, spacing: float) -> tuple[Surface, np.ndarray]:
+    """Mesh a torus around the z axis, and return the two angles that its colours are drawn with.
+
+    Args:
+        major_radius: distance of the tube's centre line from the axis, world units.
+        minor_radius: radius of the tube.
+        spacing: distance between neighbouring vertices, world units.
+
+    Returns:
+        The uncoloured surface with exact normals, and angles [V, 2] in [0, 2 pi): around the axis, around the tube.
+    """
+    around = int(np.ceil(2 * np.pi * (major_radius + minor_radius) / spacing))
+    across = int(np.ceil(2 * np.pi * minor_radius / spacing))
+    i, j = np.meshgrid(np.arange(around), np.arange(across), indexing="ij")
+    phi, theta = 2 * np.pi * i.ravel() / around, 2 * np.pi * j.ravel() / across
+    outward = np.stack([np.cos(phi), np.sin(phi), np.zeros_like(phi)], -1)
+    normals = np.cos(theta)[:, None] * outward + np.sin(theta)[:, None] * np.array([0.0, 0.0, 1.0])
+    vertices = major_radius * outward + minor_radius * normals
+
+    def index(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return ((a % around) * across + b % across).ravel()
+
+    a, b, c, d = index(i, j), index(i + 1, j), index(i + 1, j + 1), index(i, j + 1)
+    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
+    surface = Surface(vertices.astype(np.float32), faces.astype(np.int32), normals.astype(np.float32))
+    return surface, np.stack([phi, theta], -1)

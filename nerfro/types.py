@@ -1,0 +1,181 @@
+"""The values that pass between the parts. Shapes use the axis letters below, lengths are in world units.
+
+R rays, S path vertices, N samples, V views, H and W pixels, L sampling levels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from nerfro.data.cameras import Cameras
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Camera rays in world space.
+
+    Attributes:
+        origins: camera centres.
+        directions: unit viewing directions.
+        radii: radius of the pixel's cone at unit distance (mip-NeRF, section 3.1).
+        near, far: arc length from the origin at which the path begins and ends.
+    """
+
+    origins: Float[Tensor, "R 3"]
+    directions: Float[Tensor, "R 3"]
+    radii: Float[Tensor, "R"]
+    near: Float[Tensor, "R"]
+    far: Float[Tensor, "R"]
+
+    def __len__(self) -> int:
+        return self.origins.shape[0]
+
+    def __getitem__(self, index: slice | Tensor) -> Rays:
+        return Rays(self.origins[index], self.directions[index], self.radii[index], self.near[index], self.far[index])
+
+    def to(self, device: torch.device | str) -> Rays:
+        return Rays(*(getattr(self, name).to(device) for name in ("origins", "directions", "radii", "near", "far")))
+
+
+@dataclass(frozen=True)
+class Path:
+    """Rays as polylines in arc length: vertex i is left along directions[i] until s[i + 1].
+
+    A straight ray is a path of two vertices. Rows with fewer vertices than others repeat their last one (s and all).
+
+    Attributes:
+        positions: vertices.
+        directions: unit direction in which each vertex is left.
+        s: arc length from the camera at each vertex, non-decreasing; s[:, 0] is near, s[:, -1] far.
+        exit_directions: unit direction in which the ray leaves the bounded volume.
+        refracted: whether the ray met the medium (n not 1) at all.
+        radii: pixel cone radius at unit distance, carried along from the rays.
+    """
+
+    positions: Float[Tensor, "R S 3"]
+    directions: Float[Tensor, "R S 3"]
+    s: Float[Tensor, "R S"]
+    exit_directions: Float[Tensor, "R 3"]
+    refracted: Bool[Tensor, "R"]
+    radii: Float[Tensor, "R"]
+
+    @property
+    def near(self) -> Float[Tensor, "R"]:
+        return self.s[:, 0]
+
+    @property
+    def far(self) -> Float[Tensor, "R"]:
+        return self.s[:, -1]
+
+    @property
+    def exit_positions(self) -> Float[Tensor, "R 3"]:
+        return self.positions[:, -1]
+
+    def __getitem__(self, index: slice | Tensor) -> Path:
+        fields = ("positions", "directions", "s", "exit_directions", "refracted", "radii")
+        return Path(*(getattr(self, name)[index] for name in fields))
+
+    def at(self, s: Float[Tensor, "R N"]) -> tuple[Float[Tensor, "R N 3"], Float[Tensor, "R N 3"]]:
+        """Positions and directions at arc lengths `s` (paper, section 2: the nearest former vertex, floor of t).
+
+        The vertex before `s` is the last one strictly before it, as in the authors' code, so a sample that lies on a
+        vertex has the direction of the segment that leads to it.
+        """
+        # searchsorted needs contiguous rows of its own; both calls are free for tensors that already are.
+        vertex = torch.searchsorted(self.s.contiguous(), s.contiguous(), side="left") - 1
+        vertex = vertex.clamp(min=0)
+        index = vertex[..., None].expand(-1, -1, 3)
+        directions = self.directions.gather(1, index)
+        positions = self.positions.gather(1, index) + directions * (s - self.s.gather(1, vertex))[..., None]
+        return positions, directions
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Samples of the radiance field along a path; sample i stands for the interval from edges[i] to edges[i + 1].
+
+    Point samples (NeRF) lie at the start of their interval, cone samples (mip-NeRF) in its middle.
+
+    Attributes:
+        positions: where the field is asked.
+        directions: unit direction of the path there.
+        s: arc length from the camera.
+        edges: interval bounds in arc length.
+        radii: pixel cone radius at unit distance.
+    """
+
+    positions: Float[Tensor, "R N 3"]
+    directions: Float[Tensor, "R N 3"]
+    s: Float[Tensor, "R N"]
+    edges: Float[Tensor, "R N+1"]
+    radii: Float[Tensor, "R"]
+
+    @property
+    def deltas(self) -> Float[Tensor, "R N"]:
+        return self.edges[:, 1:] - self.edges[:, :-1]
+
+
+@dataclass(frozen=True)
+class Radiance:
+    """What a field returns: volume density (per world unit, non-negative) and colour (sRGB)."""
+
+    density: Float[Tensor, "R N"]
+    rgb: Float[Tensor, "R N 3"]
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """One sampling level of rendered rays (paper, Eqn. volrendBd).
+
+    Attributes:
+        rgb: pixel colour, boundary term included.
+        weights: contribution of each sample.
+        transmittance: what is left at the end of the path, T_{N+1}.
+        boundary_rgb: colour of the boundary in the leaving direction, C'(d_N).
+        samples: the samples that were rendered.
+        path: the path they lie on.
+    """
+
+    rgb: Float[Tensor, "R 3"]
+    weights: Float[Tensor, "R N"]
+    transmittance: Float[Tensor, "R"]
+    boundary_rgb: Float[Tensor, "R 3"]
+    samples: Samples
+    path: Path
+
+    @property
+    def opacity(self) -> Float[Tensor, "R"]:
+        return self.weights.sum(-1)
+
+    @property
+    def depth(self) -> Float[Tensor, "R"]:
+        """Expected arc length of the samples that were hit; far where nothing was."""
+        weight = self.weights.sum(-1)
+        centres = 0.5 * (self.samples.edges[:, 1:] + self.samples.edges[:, :-1])
+        depth = (self.weights * centres).sum(-1) / weight.clamp(min=1e-6)
+        return torch.where(weight > 1e-6, depth, self.path.far)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Training pixels.
+
+    Attributes:
+        rays: one ray for each pixel.
+        rgb: the pixels' colours (sRGB in [0, 1]).
+        index: identity of each training ray, `view * H * W + row * W + column`.
+        cameras: all training cameras, for losses that ask for further directions.
+    """
+
+    rays: Rays
+    rgb: Float[Tensor, "R 3"]
+    index: Int[Tensor, "R"]
+    cameras: Cameras
+
+
