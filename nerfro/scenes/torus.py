@@ -27,11 +27,11 @@ PAVING = np.array([[0.62, 0.58, 0.52], [0.72, 0.50, 0.40], [0.45, 0.50, 0.54], [
 def torus_colours(angles: np.ndarray) -> np.ndarray:
     """Return sRGB colours [V, 3] of mosaic ribbons winding around the tube; `angles` [V, 2] as in `torus_angles`."""
     phi, theta = angles[:, 0] / (2 * np.pi), angles[:, 1] / (2 * np.pi)
-    # Whole windings in both angles, so that the pattern closes on itself.
-    across, along = 10 * phi + 1 * theta, 24 * phi - 8 * theta
+    # Whole periods (5 ribbons, 8 steps) in both angles, so that the pattern closes on itself.
+    across, along = 10 * phi + 5 * theta, 24 * phi - 8 * theta
     ribbon, step = np.floor(across).astype(int), np.floor(along).astype(int)
     colours = RIBBONS[ribbon % len(RIBBONS)]
-    piece = hashed(np.stack([ribbon % 10, step % 8], -1), seed=3)
+    piece = hashed(np.stack([ribbon % len(RIBBONS), step % 8], -1), seed=3)
     colours = colours * (0.70 + 0.30 * piece)[:, None]
     seam = (np.abs(across - ribbon - 0.5) > 0.44) | (np.abs(along - step - 0.5) > 0.43)
     dot = np.hypot((across - ribbon - 0.5) * 1.2, along - step - 0.5) < 0.17

@@ -1,0 +1,29 @@
+"""A boundary of one colour."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.boundaries.base import Boundary
+from nerfro.errors import NerfroError
+from nerfro.registry import register
+
+
+@register("boundary", "constant")
+class ConstantBoundary(Boundary):
+    """The same colour in every direction, black by default: what stock NeRF and mip-NeRF assume.
+
+    Args:
+        rgb: the colour, sRGB.
+    """
+
+    def __init__(self, rgb: list[float] = (0.0, 0.0, 0.0)) -> None:  # type: ignore[assignment]
+        super().__init__()
+        if len(rgb) != 3:
+            raise NerfroError(f"boundary=constant: rgb={list(rgb)} needs three numbers")
+        self.register_buffer("rgb", torch.tensor(list(rgb)), persistent=False)
+
+    def forward(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        return self.rgb.expand(directions.shape)

@@ -1,0 +1,30 @@
+"""The paper's skybox: a small MLP of the leaving direction."""
+
+from __future__ import annotations
+
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.boundaries.base import Boundary
+from nerfro.fields.encoding import positional_encoding
+from nerfro.fields.mlp import SkipMLP, glorot_linear, padded_sigmoid
+from nerfro.registry import register
+
+
+@register("boundary", "skybox")
+class Skybox(Boundary):
+    """4x128 MLP of the encoded direction, after NeRFactor's normal field (paper, Eqn. volrendBd, F_psi).
+
+    Args:
+        width, depth, skip: of the MLP.
+        direction_degree: octaves of the direction's encoding; 4 in the paper, which bounds how sharp a sky can be.
+    """
+
+    def __init__(self, width: int = 128, depth: int = 4, skip: int = 3, direction_degree: int = 4) -> None:
+        super().__init__()
+        self.direction_degree = direction_degree
+        self.trunk = SkipMLP(3 * (1 + 2 * direction_degree), width, depth, skip)
+        self.rgb = glorot_linear(self.trunk.num_outputs, 3)
+
+    def forward(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        return padded_sigmoid(self.rgb(self.trunk(positional_encoding(directions, 0, self.direction_degree))))

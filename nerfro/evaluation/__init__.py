@@ -1,0 +1,1 @@
+"""Image quality: metrics, tables, comparison pictures, and the files that hold them."""

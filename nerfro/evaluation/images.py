@@ -1,0 +1,89 @@
+"""8-bit sRGB pictures: the form in which predictions are written, and scored."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
+
+from nerfro.errors import NerfroError
+from nerfro.evaluation.files import write_atomically
+
+
+def to_8bit(rgb: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
+    """Clip to [0, 1] and round to the nearest of 256 levels.
+
+    Truncation instead of rounding would darken every picture by half a level.
+
+    Args:
+        rgb: sRGB values; what lies outside [0, 1] cannot be displayed and is clipped.
+
+    Returns:
+        Levels 0 to 255.
+
+    Raises:
+        NerfroError: if a value is NaN or infinite, or the tensor is not of floating point.
+    """
+    if not rgb.is_floating_point():
+        raise NerfroError(f"expected sRGB values of floating point in [0, 1], got {rgb.dtype}; divide levels by 255")
+    num_bad = int((~torch.isfinite(rgb)).sum())
+    if num_bad:
+        raise NerfroError(
+            f"the picture holds {num_bad} NaN or infinite values of {rgb.numel()}: the model that drew it has diverged; "
+            "train with a lower learning rate or with gradient clipping"
+        )
+    return (rgb.detach().clamp(0, 1) * 255).round().to(torch.uint8)
+
+
+def round_to_8bit(rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+    """The values that a viewer of the saved PNG sees: multiples of 1/255 in [0, 1], of the input's type."""
+    return to_8bit(rgb).to(rgb.dtype) / 255
+
+
+def save_png(path: Path | str, rgb: Float[Tensor, "H W 3"]) -> None:
+    """Write a picture as 8-bit sRGB PNG, rounded, whole or not at all.
+
+    Args:
+        path: the file to write; missing parent folders are made.
+        rgb: sRGB values, clipped to [0, 1].
+
+    Raises:
+        NerfroError: if the shape is not [H, W, 3], a value is not finite, or the file cannot be written.
+    """
+    if rgb.ndim != 3 or rgb.shape[-1] != 3:
+        raise NerfroError(f"cannot write {path}: expected a picture [H, W, 3], got {list(rgb.shape)}")
+    encoded = io.BytesIO()
+    Image.fromarray(to_8bit(rgb).cpu().numpy()).save(encoded, format="PNG")
+    write_atomically(path, encoded.getvalue())
+
+
+def load_png(path: Path | str) -> Float[Tensor, "H W 3"]:
+    """Read an 8-bit picture, as `save_png` wrote it.
+
+    Args:
+        path: an 8-bit grey or RGB picture, without transparency.
+
+    Returns:
+        sRGB values in [0, 1], float32, multiples of 1/255.
+
+    Raises:
+        NerfroError: if the file is missing, truncated, not a picture, not of 8 bits, or transparent.
+    """
+    try:
+        with Image.open(path) as image:
+            if image.mode not in ("RGB", "L"):
+                raise NerfroError(
+                    f"{path} has pixels of mode {image.mode}; "
+                    "allowed are 8-bit RGB and grey: convert it, with transparency composited first"
+                )
+            levels = np.array(image.convert("RGB"))
+    except FileNotFoundError as error:
+        raise NerfroError(f"the picture {path} does not exist; check the folder and the file's name") from error
+    except (UnidentifiedImageError, OSError, SyntaxError) as error:  # Pillow's PNG reader raises SyntaxError
+        raise NerfroError(f"the picture {path} cannot be read ({error}); write or copy it again") from error
+    return torch.from_numpy(levels).float() / 255

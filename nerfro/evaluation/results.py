@@ -1,0 +1,170 @@
+"""What an evaluation found: scores of each view, their means, and the file `metrics.json` that holds them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from nerfro.errors import NerfroError
+from nerfro.evaluation.files import write_atomically
+
+Score = float | None  # None: not available, the reason stands in the notes
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How a metric is called and read.
+
+    Attributes:
+        name: key in files and in code.
+        title: heading in tables.
+        better: whether higher or lower values are better.
+        decimals: digits after the point in tables.
+    """
+
+    name: str
+    title: str
+    better: Literal["higher", "lower"]
+    decimals: int
+
+
+METRICS = (
+    Metric("psnr", "PSNR", "higher", 2),
+    Metric("ssim", "SSIM", "higher", 3),
+    Metric("lpips", "LPIPS", "lower", 3),
+)
+
+
+@dataclass(frozen=True)
+class ViewScores:
+    """The scores of one picture.
+
+    Attributes:
+        name: which view it is; `images/<name>.png` is the picture.
+        scores: value of each metric by name; None where it is not available.
+    """
+
+    name: str
+    scores: Mapping[str, Score]
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """The scores of all views.
+
+    Attributes:
+        views: one row for each view, in order.
+        notes: for each metric that is not available, the reason.
+        protocol: "8bit" if predictions were rounded to what a PNG holds before they were scored, "float" if not.
+    """
+
+    views: tuple[ViewScores, ...]
+    notes: Mapping[str, str] = field(default_factory=dict)
+    protocol: Literal["8bit", "float"] = "8bit"
+
+    def mean(self, metric: str) -> Score:
+        """Mean of the per-view values; None if any view lacks one, for a mean over fewer views is another quantity."""
+        values = [view.scores.get(metric) for view in self.views]
+        present = [value for value in values if value is not None]
+        return math.fsum(present) / len(present) if present and len(present) == len(values) else None
+
+    @property
+    def means(self) -> dict[str, Score]:
+        """The mean of every metric, by name."""
+        return {metric.name: self.mean(metric.name) for metric in METRICS}
+
+
+@dataclass(frozen=True)
+class RunMetrics:
+    """The content of a run's `metrics.json`.
+
+    Attributes:
+        result: scores of the test views.
+        steps: optimisation steps that the weights have seen.
+        train_seconds: wall-clock time spent training, without evaluation; None if nothing was trained.
+        rays_per_second: training throughput; None if nothing was trained.
+    """
+
+    result: EvaluationResult
+    steps: int
+    train_seconds: float | None
+    rays_per_second: float | None
+
+
+def write_metrics_json(
+    path: Path | str,
+    result: EvaluationResult,
+    steps: int,
+    train_seconds: float | None,
+    rays_per_second: float | None,
+) -> None:
+    """Write the file by which other tools read a run, whole or not at all.
+
+    It holds `{"test": {"psnr", "ssim", "lpips"}, "views": [{"name", "psnr", ...}], "steps", "train_seconds",
+    "rays_per_second", "notes", "protocol"}`: means over views, per-view rows, and null for what is not available.
+
+    Args:
+        path: usually `metrics.json` in the run folder.
+        result: scores of the test views.
+        steps: optimisation steps done.
+        train_seconds: wall-clock time spent training.
+        rays_per_second: training throughput.
+
+    Raises:
+        NerfroError: if a number is NaN or infinite (JSON has neither), or the file cannot be written.
+    """
+    content = {
+        "test": result.means,
+        "views": [{"name": view.name, **view.scores} for view in result.views],
+        "steps": steps,
+        "train_seconds": train_seconds,
+        "rays_per_second": rays_per_second,
+        "notes": dict(result.notes),
+        "protocol": result.protocol,
+    }
+    _refuse_non_finite(content, "metrics")
+    write_atomically(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def read_metrics_json(path: Path | str) -> RunMetrics:
+    """Read what `write_metrics_json` wrote; means are computed again from the rows.
+
+    Args:
+        path: a run's `metrics.json`.
+
+    Returns:
+        Scores and the budget they were reached with.
+
+    Raises:
+        NerfroError: if the file is missing, truncated, or lacks a key.
+    """
+    path = Path(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        views = tuple(
+            ViewScores(row["name"], {metric.name: row.get(metric.name) for metric in METRICS})
+            for row in content["views"]
+        )
+        result = EvaluationResult(views, content.get("notes", {}), content.get("protocol", "8bit"))
+        return RunMetrics(result, content["steps"], content["train_seconds"], content["rays_per_second"])
+    except FileNotFoundError as error:
+        raise NerfroError(f"{path} does not exist; has this run been evaluated? run nerfro.evaluate on it") from error
+    except (OSError, ValueError) as error:  # unreadable, not UTF-8, not JSON
+        raise NerfroError(f"{path} cannot be read ({error}); run nerfro.evaluate on the run again") from error
+    except (KeyError, TypeError, AttributeError) as error:
+        raise NerfroError(f"{path} is not a metrics file ({error!r}); run nerfro.evaluate on the run again") from error
+
+
+def _refuse_non_finite(value: object, name: str) -> None:
+    if isinstance(value, float) and not math.isfinite(value):
+        raise NerfroError(f"{name} is {value}, which JSON cannot hold; give a finite number, or None if there is none")
+    if isinstance(value, dict):
+        for key, item in value.items():
+            _refuse_non_finite(item, f"{name}.{key}")
+    if isinstance(value, list):
+        for index, item in enumerate(value):
+            _refuse_non_finite(item, f"{name}[{index}]")

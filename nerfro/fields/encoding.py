@@ -1,0 +1,32 @@
+"""Positional encodings."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def positional_encoding(
+    x: Float[Tensor, "*batch D"], min_degree: int, max_degree: int, identity: bool = True
+) -> Float[Tensor, "*batch F"]:
+    """Sines and cosines of x at octaves 2^min .. 2^(max-1), all sines first, preceded by x itself (NeRF, Eqn. 4).
+
+    The frequencies carry no factor pi and x is not normalised, as in mip-NeRF's code. F is D (2 octaves + identity).
+    """
+    scales = 2.0 ** torch.arange(min_degree, max_degree, device=x.device, dtype=x.dtype)
+    angles = (x[..., None, :] * scales[:, None]).flatten(-2)
+    waves = torch.sin(torch.cat([angles, angles + 0.5 * math.pi], dim=-1))
+    return torch.cat([x, waves], dim=-1) if identity else waves
+
+
+def integrated_positional_encoding(
+    mean: Float[Tensor, "*batch 3"], variance: Float[Tensor, "*batch 3"], min_degree: int, max_degree: int
+) -> Float[Tensor, "*batch F"]:
+    """Expected sines and cosines of a Gaussian with diagonal covariance (mip-NeRF, Eqn. 13)."""
+    scales = 2.0 ** torch.arange(min_degree, max_degree, device=mean.device, dtype=mean.dtype)
+    angles = (mean[..., None, :] * scales[:, None]).flatten(-2)
+    damping = torch.exp(-0.5 * (variance[..., None, :] * scales[:, None] ** 2).flatten(-2))
+    return torch.cat([torch.sin(angles) * damping, torch.sin(angles + 0.5 * math.pi) * damping], dim=-1)

@@ -1,0 +1,47 @@
+"""The boundary regulariser."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.losses.base import Loss
+from nerfro.registry import register
+from nerfro.types import Batch, Rendering
+
+if TYPE_CHECKING:
+    from nerfro.models.base import NerfModel
+
+
+@register("loss", "boundary")
+class BoundaryRegulariser(Loss):
+    """Where most light passes, the boundary alone shall explain the pixel: |T C'(d) - C|, T > 1/2 (Eqn. lossBD).
+
+    The boundary's colour is held fixed, so only the finest level's density learns: it clears fog from the surface.
+    Channels are summed and the sum over rays is divided by their number plus one, as in the authors' code.
+
+    Args:
+        threshold: final transmittance above which a ray counts.
+        refracted_only: count only rays that meet the medium.
+    """
+
+    def __init__(
+        self,
+        weight: float = 0.025,
+        start: int = 2500,
+        ramp: int = 0,
+        threshold: float = 0.5,
+        refracted_only: bool = False,
+    ) -> None:
+        super().__init__(weight, start, ramp)
+        self.threshold, self.refracted_only = threshold, refracted_only
+
+    def forward(self, renderings: list[Rendering], batch: Batch, model: NerfModel) -> Float[Tensor, ""]:
+        fine = renderings[-1]
+        counts = fine.transmittance.detach() > self.threshold
+        if self.refracted_only:
+            counts = counts & fine.path.refracted
+        error = (fine.transmittance[:, None] * fine.boundary_rgb.detach() - batch.rgb).abs().sum(-1)
+        return (error * counts).sum() / (counts.sum() + 1)

@@ -1,0 +1,39 @@
+"""The smoothness of the boundary."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.errors import NerfroError
+from nerfro.losses.base import Loss
+from nerfro.registry import register
+from nerfro.types import Batch, Rendering
+
+if TYPE_CHECKING:
+    from nerfro.models.base import NerfModel
+
+
+@register("loss", "smoothness")
+class Smoothness(Loss):
+    """Squared differences of the boundary's colour between neighbouring directions of a tile (Eqn. lossS).
+
+    Args:
+        tile_size: side in pixels of a random window of a random training view, whose directions are the tile.
+    """
+
+    def __init__(self, weight: float = 1.0, start: int = 2500, ramp: int = 0, tile_size: int = 128) -> None:
+        super().__init__(weight, start, ramp)
+        if tile_size < 2:
+            raise NerfroError(f"loss.smoothness.tile_size={tile_size} has no neighbours; take 2 or more")
+        self.tile_size = tile_size
+
+    def forward(self, renderings: list[Rendering], batch: Batch, model: NerfModel) -> Float[Tensor, ""]:
+        return tile_roughness(model.boundary(batch.cameras.tile(self.tile_size)))
+
+
+def tile_roughness(rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
+    """Half the mean squared difference between horizontal neighbours plus the same for vertical ones."""
+    return 0.5 * (rgb[:, 1:] - rgb[:, :-1]).square().mean() + 0.5 * (rgb[1:] - rgb[:-1]).square().mean()

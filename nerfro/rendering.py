@@ -1,0 +1,39 @@
+"""Volume rendering with a boundary term."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.types import Path, Radiance, Rendering, Samples
+
+
+def volume_weights(
+    density: Float[Tensor, "R N"], deltas: Float[Tensor, "R N"]
+) -> tuple[Float[Tensor, "R N"], Float[Tensor, "R"]]:
+    """Weights w_i = T_i (1 - exp(-sigma_i delta_i)) and the final transmittance T_{N+1} (paper, Eqn. volrend).
+
+    Args:
+        density: per world unit.
+        deltas: interval lengths in world units.
+
+    Returns:
+        Weights and transmittance; together they sum to one on every ray.
+    """
+    optical_depth = density * deltas
+    total = optical_depth.cumsum(-1)
+    transmittance = torch.exp(-torch.cat([torch.zeros_like(total[:, :1]), total], dim=-1))
+    weights = -torch.expm1(-optical_depth) * transmittance[:, :-1]
+    return weights, transmittance[:, -1]
+
+
+def composite(
+    samples: Samples, radiance: Radiance, boundary_rgb: Float[Tensor, "R 3"], path: Path
+) -> Rendering:
+    """Render one level: C = sum_i w_i c_i + T_{N+1} C'(d_N) (paper, Eqn. volrendBd)."""
+    density, rgb = radiance.density.float(), radiance.rgb.float()  # sums over a ray stay in single precision
+    weights, transmittance = volume_weights(density, samples.deltas)
+    boundary_rgb = boundary_rgb.float()
+    colour = (weights[..., None] * rgb).sum(-2) + transmittance[:, None] * boundary_rgb
+    return Rendering(colour, weights, transmittance, boundary_rgb, samples, path)

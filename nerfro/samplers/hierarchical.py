@@ -1,0 +1,77 @@
+"""Hierarchical sampling on arc length (paper, section 2): fine samples where the coarse rendering has weight."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.errors import NerfroError
+from nerfro.registry import register
+from nerfro.samplers.base import PointSampler
+from nerfro.samplers.stepfun import blur_weights, invert_cdf, midpoints, spread_uniform
+from nerfro.samplers.stratified import Stratified, cone_samples, point_samples
+from nerfro.types import Path, Rendering, Samples
+
+
+@register("sampler/points", "hierarchical")
+class Hierarchical(PointSampler):
+    """Coarse stratified samples, then fine ones by inverse transform sampling of the coarse weights.
+
+    Fine arc lengths are mapped to the path by the nearest former vertex, so they lie on the bent ray (Fig. sampling).
+
+    Args:
+        num_coarse: coarse samples, N_c.
+        num_fine: fine samples, N_f.
+        union: render the sorted union of both (NeRF, the paper) or the fine ones alone (mip-NeRF).
+        blur: filter the coarse weights with mip-NeRF's max-blur first.
+        padding: weight added to every bin before drawing; mip-NeRF's is 0.01, the authors' code has 0.
+        draw, cast, offset: of the coarse samples, see `stratified`.
+    """
+
+    num_levels = 2
+
+    def __init__(
+        self,
+        num_coarse: int = 64,
+        num_fine: int = 128,
+        union: bool = True,
+        blur: bool = False,
+        padding: float = 0.0,
+        draw: Literal["arc_length", "vertices"] = "arc_length",
+        cast: Literal["points", "cones"] = "points",
+        offset: float = 0.5,
+    ) -> None:
+        super().__init__()
+        if num_coarse < 4 or num_fine < 1:
+            raise NerfroError(
+                f"sampler/points: num_coarse={num_coarse} num_fine={num_fine}; take at least 4 and 1, "
+                "or sampler/points=stratified for no fine samples"
+            )
+        if padding < 0:
+            raise NerfroError(f"sampler/points: padding={padding} is negative; 0 switches it off")
+        if cast == "cones" and union:
+            raise NerfroError("sampler/points: cones are not merged with coarse ones; set union=false")
+        self.coarse = Stratified(num_coarse, draw, cast, offset)
+        self.num_fine, self.union, self.blur, self.padding, self.cast = num_fine, union, blur, padding, cast
+
+    def forward(self, path: Path, previous: Rendering | None) -> Samples:
+        if previous is None:
+            return self.coarse(path, None)
+        if self.cast == "cones":
+            return cone_samples(path, self._draw(previous.samples.edges, previous.weights, self.num_fine + 1))
+        # Weights belong to samples; the bins that they are drawn from lie between the samples' midpoints.
+        s = self._draw(midpoints(previous.samples.s), previous.weights[:, 1:-1], self.num_fine)
+        if self.union:
+            s = torch.cat([previous.samples.s, s], dim=1)
+        return point_samples(path, s.sort(dim=1).values)
+
+    @torch.no_grad()
+    def _draw(
+        self, edges: Float[Tensor, "R B+1"], weights: Float[Tensor, "R B"], num_samples: int
+    ) -> Float[Tensor, "R N"]:
+        weights = weights.detach().to(edges.dtype)
+        weights = blur_weights(weights, self.padding) if self.blur else weights + self.padding
+        return invert_cdf(edges, weights, spread_uniform(len(edges), num_samples, self.training, edges))

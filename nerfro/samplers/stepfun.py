@@ -1,0 +1,61 @@
+"""Step functions: intervals of arc length with a weight each, and drawing samples from them."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+# Below this total weight a ray is treated as empty and sampled uniformly (mip-NeRF's code).
+_MIN_TOTAL_WEIGHT = 1e-5
+
+
+def spread_uniform(num_rays: int, num_samples: int, random: bool, like: Tensor) -> Float[Tensor, "R N"]:
+    """Numbers in [0, 1), ascending along each ray: one uniform draw per bin, or evenly spaced from 0 to 1 - eps.
+
+    The evenly spaced ones include both ends, which is what inverse transform sampling is given in evaluation
+    (authors' code); `random` is the stratified draw of the paper's Eqn. stratified.
+    """
+    if random:
+        jitter = torch.rand(num_rays, num_samples, device=like.device, dtype=like.dtype)
+        return (torch.arange(num_samples, device=like.device, dtype=like.dtype) + jitter) / num_samples
+    eps = torch.finfo(like.dtype).eps
+    return torch.linspace(0.0, 1.0 - eps, num_samples, device=like.device, dtype=like.dtype).expand(num_rays, -1)
+
+
+def invert_cdf(
+    edges: Float[Tensor, "R B+1"], weights: Float[Tensor, "R B"], u: Float[Tensor, "R N"]
+) -> Float[Tensor, "R N"]:
+    """Inverse transform sampling of a step function (paper, Eqn. hierarchical).
+
+    Args:
+        edges: interval bounds, ascending.
+        weights: non-negative weight of each interval; need not be normalised.
+        u: positions in the cumulative distribution, in [0, 1).
+
+    Returns:
+        Arc lengths, ascending where u is; constant density inside each interval.
+    """
+    num_bins = weights.shape[-1]
+    total = weights.sum(-1, keepdim=True)
+    padding = (_MIN_TOTAL_WEIGHT - total).clamp(min=0)
+    pdf = (weights + padding / num_bins) / (total + padding)
+    cdf = pdf[..., :-1].cumsum(-1).clamp(max=1.0)
+    cdf = torch.cat([torch.zeros_like(total), cdf, torch.ones_like(total)], dim=-1)
+    index = (torch.searchsorted(cdf, u.contiguous(), right=True) - 1).clamp(0, num_bins - 1)
+    low, high = cdf.gather(-1, index), cdf.gather(-1, index + 1)
+    fraction = ((u - low) / (high - low).clamp(min=torch.finfo(u.dtype).tiny)).clamp(0.0, 1.0)
+    left, right = edges.gather(-1, index), edges.gather(-1, index + 1)
+    return left + fraction * (right - left)
+
+
+def blur_weights(weights: Float[Tensor, "R B"], padding: float) -> Float[Tensor, "R B"]:
+    """Max-then-average filter over neighbours plus a constant, against missed surfaces (mip-NeRF, Eqn. 18)."""
+    padded = torch.cat([weights[..., :1], weights, weights[..., -1:]], dim=-1)
+    highest = torch.maximum(padded[..., :-1], padded[..., 1:])
+    return 0.5 * (highest[..., :-1] + highest[..., 1:]) + padding
+
+
+def midpoints(edges: Float[Tensor, "R B+1"]) -> Float[Tensor, "R B"]:
+    """Middle of each interval."""
+    return 0.5 * (edges[..., 1:] + edges[..., :-1])

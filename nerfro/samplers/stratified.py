@@ -1,0 +1,106 @@
+"""Stratified sampling of a path (paper, Eqn. stratified), along straight and bent ones alike."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.errors import NerfroError
+from nerfro.registry import register
+from nerfro.samplers.base import PointSampler
+from nerfro.types import Path, Rendering, Samples
+
+# Width of the last point sample's interval, so that light beyond it reaches the boundary (authors' code).
+LAST_DELTA = 1e-3
+
+
+@register("sampler/points", "stratified")
+class Stratified(PointSampler):
+    """One sample in each of evenly spaced bins: random in training, central in evaluation.
+
+    Args:
+        num_samples: number of bins, N_c.
+        draw: `arc_length` draws anywhere on the path; `vertices` draws one of every S / N_c path vertices, as the
+            paper does with its Eikonal samples, and needs a path of S = N_c * N_e vertices.
+        cast: `points`, or `cones` whose samples fill the bins (mip-NeRF).
+        offset: bin position used in evaluation, 0 the bin's start, 0.5 its centre.
+    """
+
+    num_levels = 1
+
+    def __init__(
+        self,
+        num_samples: int = 64,
+        draw: Literal["arc_length", "vertices"] = "arc_length",
+        cast: Literal["points", "cones"] = "points",
+        offset: float = 0.5,
+    ) -> None:
+        super().__init__()
+        if num_samples < 2:
+            raise NerfroError(f"sampler/points: num_samples={num_samples} is too few; take 2 or more")
+        if not 0 <= offset < 1:
+            raise NerfroError(f"sampler/points: offset={offset} is outside [0, 1)")
+        if cast == "cones" and draw == "vertices":
+            raise NerfroError("sampler/points: cones have no vertices to draw; set draw=arc_length")
+        self.num_samples, self.draw, self.cast, self.offset = num_samples, draw, cast, offset
+
+    def forward(self, path: Path, previous: Rendering | None) -> Samples:
+        if self.draw == "vertices":
+            return self._draw_vertices(path)
+        if self.cast == "cones":
+            return cone_samples(path, self._cone_edges(path))
+        fractions = (self._bins(path.s) + self._offsets(path.s)) / self.num_samples
+        return point_samples(path, path.near[:, None] + fractions * (path.far - path.near)[:, None])
+
+    def _bins(self, like: Tensor) -> Float[Tensor, "N"]:
+        return torch.arange(self.num_samples, device=like.device, dtype=like.dtype)
+
+    def _offsets(self, like: Tensor) -> Float[Tensor, "R N"]:
+        shape = (like.shape[0], self.num_samples)
+        if self.training:
+            return torch.rand(shape, device=like.device, dtype=like.dtype)
+        return torch.full(shape, self.offset, device=like.device, dtype=like.dtype)
+
+    def _cone_edges(self, path: Path) -> Float[Tensor, "R N+1"]:
+        fractions = torch.linspace(0.0, 1.0, self.num_samples + 1, device=path.s.device, dtype=path.s.dtype)
+        if self.training:  # each edge moves within half a bin of its place, as mip-NeRF's do
+            middle = 0.5 * (fractions[1:] + fractions[:-1])
+            low = torch.cat([fractions[:1], middle])
+            high = torch.cat([middle, fractions[-1:]])
+            draw = torch.rand(len(path.s), self.num_samples + 1, device=path.s.device, dtype=path.s.dtype)
+            fractions = low + (high - low) * draw
+        return path.near[:, None] + fractions * (path.far - path.near)[:, None]
+
+    def _draw_vertices(self, path: Path) -> Samples:
+        steps, remainder = divmod(path.s.shape[1], self.num_samples)
+        if steps == 0 or remainder:
+            raise NerfroError(
+                f"sampler/points: draw=vertices needs a multiple of {self.num_samples} path vertices, this path has "
+                f"{path.s.shape[1]}; set sampler.path.num_steps to a multiple, or draw=arc_length"
+            )
+        offsets = (self._offsets(path.s) * steps).long()  # floor: 0 .. steps - 1
+        vertex = torch.arange(self.num_samples, device=path.s.device) * steps + offsets
+        s = path.s.gather(1, vertex)
+        index = vertex[..., None].expand(-1, -1, 3)
+        positions, directions = path.positions.gather(1, index), path.directions.gather(1, index)
+        return Samples(positions, directions, s, _edges_from_starts(s), path.radii)
+
+
+def point_samples(path: Path, s: Float[Tensor, "R N"]) -> Samples:
+    """Samples at ascending arc lengths, each standing for the interval up to the next."""
+    positions, directions = path.at(s)
+    return Samples(positions, directions, s, _edges_from_starts(s), path.radii)
+
+
+def cone_samples(path: Path, edges: Float[Tensor, "R N+1"]) -> Samples:
+    """Samples that fill the intervals between ascending edges, placed at their middles."""
+    s = 0.5 * (edges[:, 1:] + edges[:, :-1])
+    positions, directions = path.at(s)
+    return Samples(positions, directions, s, edges, path.radii)
+
+
+def _edges_from_starts(s: Float[Tensor, "R N"]) -> Float[Tensor, "R N+1"]:
+    return torch.cat([s, s[:, -1:] + LAST_DELTA], dim=1)

@@ -1,0 +1,198 @@
+"""Rendering a scene with Mitsuba 3: pictures by path tracing, silhouettes by one ray per pixel centre."""
+
+from __future__ import annotations
+
+import functools
+from types import ModuleType
+
+import numpy as np
+
+from nerfro.errors import NerfroError
+from nerfro.scenes.glass import PLUGIN, register_transmitting_glass
+from nerfro.scenes.patterns import to_linear
+from nerfro.scenes.scene import Scene
+from nerfro.scenes.skies import Sky
+from nerfro.scenes.surface import Surface
+
+VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "scalar_rgb")
+SAMPLES_PER_PASS = 6_000_000  # a wavefront of paths is held in memory at once: about 1 GB per 10 M paths
+ROULETTE_DEPTH, MAX_DEPTH = 32, 1024  # light bounces long between the walls of a cube: cut late and without bias
+
+
+@functools.lru_cache(maxsize=None)
+def load_mitsuba(variant: str = "auto") -> ModuleType:
+    """Import Mitsuba, choose its variant and register our material.
+
+    Args:
+        variant: one of `VARIANTS`, or `auto` for the first one that works on this machine.
+
+    Returns:
+        The mitsuba module.
+
+    Raises:
+        NerfroError: Mitsuba is not installed, or the variant does not run here.
+    """
+    try:
+        import drjit
+        import mitsuba
+    except ImportError as error:
+        raise NerfroError(
+            f"rendering ground truth needs Mitsuba 3, which cannot be imported ({error}); "
+            "install it with: pip install 'nerfro[synthesize]'"
+        ) from error
+    if variant not in ("auto", *VARIANTS):
+        raise NerfroError(f"unknown Mitsuba variant '{variant}'; choose auto, {', '.join(VARIANTS)}")
+    for name in VARIANTS if variant == "auto" else (variant,):
+        backend = {"llvm": drjit.JitBackend.LLVM, "cuda": drjit.JitBackend.CUDA}.get(name.split("_")[0])
+        if backend is None or drjit.has_backend(backend):
+            mitsuba.set_variant(name)
+            register_transmitting_glass(mitsuba)
+            return mitsuba
+    raise NerfroError(
+        f"Mitsuba variant '{variant}' does not run on this machine; "
+        "llvm_ad_rgb needs the LLVM library (Debian: apt-get install libllvm19), or use variant=scalar_rgb, which is slower"
+    )
+
+
+class PathTracer:
+    """Renders one scene from many cameras.
+
+    Args:
+        scene: what to render.
+        fresnel: False for transmission and total reflection only (the paper's image formation), True for a physical
+            dielectric with partial reflection.
+        camera_angle_x: horizontal field of view, radians.
+        resolution: picture side in pixels; pictures are square.
+        texels_per_pixel: sky texels per pixel of the background.
+        variant: Mitsuba variant, see `load_mitsuba`.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        fresnel: bool,
+        camera_angle_x: float,
+        resolution: int,
+        texels_per_pixel: float = 2.0,
+        variant: str = "auto",
+    ) -> None:
+        self.mitsuba = load_mitsuba(variant)
+        self.camera_angle_x, self.resolution = camera_angle_x, resolution
+        mi = self.mitsuba
+        height = int(np.clip(np.pi / camera_angle_x * resolution * texels_per_pixel, 256, 2048))
+        # The sky stands on its edge in Mitsuba's frame (y up); this turns y to our z.
+        upright = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+        glass = (
+            {"type": "dielectric", "int_ior": scene.ior, "ext_ior": 1.0}
+            if fresnel
+            else {"type": PLUGIN, "ior": scene.ior, "tint": mi.ScalarColor3f(*scene.tint)}
+        )
+        if fresnel:
+            glass["specular_transmittance"] = {"type": "rgb", "value": list(scene.tint)}
+        paint = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
+        texture = mi.Bitmap(envmap_texture(scene.sky, height, np.asarray(upright.matrix)[:3, :3]))
+        self.glass = mi.load_dict({"type": "scene", "glass": _mesh(mi, "glass", scene.glass, glass)})
+        self.scene = mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": {"type": "path", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH},
+                "sky": {"type": "envmap", "bitmap": texture, "to_world": upright},
+                "glass": _mesh(mi, "glass", scene.glass, glass),
+                "interior": _mesh(mi, "interior", scene.interior, paint),
+            }
+        )
+
+    def render(self, pose: np.ndarray, spp: int, seed: int) -> np.ndarray:
+        """Return linear radiance [H, W, 3], averaged over each pixel with a box filter.
+
+        Args:
+            pose: camera-to-world matrix [4, 4], OpenGL axes.
+            spp: samples per pixel; rendered in passes of at most `SAMPLES_PER_PASS` samples.
+            seed: seed of the sampler; equal seeds give equal pictures.
+        """
+        mi = self.mitsuba
+        per_pass = max(1, min(spp, SAMPLES_PER_PASS // self.resolution**2))
+        sensor = self._sensor(pose)
+        total = np.zeros((self.resolution, self.resolution, 3))
+        for number, first in enumerate(range(0, spp, per_pass)):
+            count = min(per_pass, spp - first)
+            # Mitsuba hashes the seed, so neighbouring seeds are independent; 4096 passes is 24 G samples per view.
+            picture = mi.render(self.scene, sensor=sensor, spp=count, seed=(seed * 4096 + number) % 2**32)
+            total += count * np.asarray(picture, np.float64)
+        return total / spp
+
+    def silhouette(self, pose: np.ndarray) -> np.ndarray:
+        """Return bool [H, W]: whether the ray through each pixel's centre meets the glass."""
+        mi = self.mitsuba
+        size = self.resolution
+        focal = 0.5 * size / np.tan(0.5 * self.camera_angle_x)
+        u, v = np.meshgrid(np.arange(size) + 0.5 - 0.5 * size, 0.5 * size - np.arange(size) - 0.5)
+        directions = np.stack([u / focal, v / focal, -np.ones_like(u)], -1).reshape(-1, 3) @ pose[:3, :3].T
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        if mi.variant().startswith("scalar"):
+            hits = [self.glass.ray_test(mi.Ray3f(list(pose[:3, 3]), list(direction))) for direction in directions]
+        else:
+            origins = mi.Point3f(*(mi.Float(np.full(size * size, x, np.float32)) for x in pose[:3, 3]))
+            rays = mi.Ray3f(origins, mi.Vector3f(*(mi.Float(x.astype(np.float32)) for x in directions.T)))
+            hits = self.glass.ray_test(rays)
+        return np.asarray(hits, bool).reshape(size, size)
+
+    def _sensor(self, pose: np.ndarray):
+        mi = self.mitsuba
+        # Mitsuba's camera looks along +z with x to the left; ours looks along -z with x to the right.
+        return mi.load_dict(
+            {
+                "type": "perspective",
+                "fov": float(np.degrees(self.camera_angle_x)),
+                "fov_axis": "x",
+                "near_clip": 0.01,
+                "far_clip": 100.0,
+                "to_world": mi.ScalarTransform4f((pose @ np.diag([-1.0, 1.0, -1.0, 1.0])).tolist()),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": self.resolution,
+                    "height": self.resolution,
+                    "rfilter": {"type": "box"},
+                    "pixel_format": "rgb",
+                    "component_format": "float32",
+                },
+                "sampler": {"type": "independent"},
+            }
+        )
+
+
+def envmap_texture(sky: Sky, height: int, to_world: np.ndarray) -> np.ndarray:
+    """Return the sky sampled where Mitsuba's `envmap` looks it up, float32 [H, 2H, 3].
+
+    Mitsuba reads row j at the polar angle pi j / (H - 1), the first and last rows being the poles, but column i at the
+    azimuth 2 pi (i + 1/2) / W.
+
+    Args:
+        sky: the radiance.
+        height: rows H.
+        to_world: rotation [3, 3] from the emitter's frame (y up) to ours.
+    """
+    width, k = 2 * height, 2  # k x k samples per texel
+    jitter = (np.arange(k) + 0.5) / k - 0.5
+    phi = (2 * np.pi * (np.arange(width)[:, None] + 0.5 + jitter) / width).ravel()
+    texture = np.empty((height, width, 3), np.float32)
+    for row in range(height):
+        theta = (np.pi * (row + jitter) / (height - 1))[:, None]
+        local = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi, -np.sin(theta) * np.cos(phi)], -1)
+        texture[row] = sky(local @ to_world.T).reshape(k, width, k, 3).mean((0, 2))
+    return texture
+
+
+def _mesh(mi: ModuleType, name: str, surface: Surface, material: dict):
+    """Return a Mitsuba mesh; vertex colours become the attribute `vertex_color`, decoded to linear albedo."""
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(material)
+    mesh = mi.Mesh(name, len(surface.vertices), len(surface.faces), has_vertex_normals=True, props=properties)
+    if surface.colours is not None:
+        mesh.add_attribute("vertex_color", 3, to_linear(surface.colours).astype(np.float32).ravel())
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = surface.vertices.ravel()
+    parameters["vertex_normals"] = surface.normals.ravel()
+    parameters["faces"] = surface.faces.astype(np.uint32).ravel()
+    parameters.update()
+    return mesh

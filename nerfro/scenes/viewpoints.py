@@ -1,0 +1,44 @@
+"""Camera poses on a sphere around the object."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+
+
+def directions_on_sphere(count: int, seed: int, split: int) -> np.ndarray:
+    """Return well-spread directions on the full sphere: a Fibonacci lattice, turned at random and jittered.
+
+    Args:
+        count: number of directions.
+        seed: seed of the data set.
+        split: number of the split; each split gets its own rotation, so no test view repeats a training view.
+
+    Returns:
+        Unit directions [count, 3], float64.
+    """
+    generator = np.random.default_rng([seed, split])
+    index = np.arange(count) + 0.5
+    z = 1 - 2 * index / count
+    phi = np.pi * (1 + np.sqrt(5)) * index
+    radius = np.sqrt(1 - z * z)
+    lattice = np.stack([radius * np.cos(phi), radius * np.sin(phi), z], -1)
+    turn = trimesh.transformations.random_rotation_matrix(generator.random(3))[:3, :3]
+    spacing = np.sqrt(4 * np.pi / count)
+    jittered = lattice @ turn.T + 0.2 * spacing * generator.normal(size=lattice.shape)
+    jittered = jittered / np.linalg.norm(jittered, axis=1, keepdims=True)
+    return generator.permutation(jittered)
+
+
+def look_at_origin(position: np.ndarray) -> np.ndarray:
+    """Return the camera-to-world matrix [4, 4] (OpenGL axes: x right, y up, looks along -z) of a camera at `position`.
+
+    World z is up in the picture, except straight above and below the origin, where world y is.
+    """
+    backward = position / np.linalg.norm(position)
+    up = np.array([0.0, 0.0, 1.0]) if abs(backward[2]) < 0.999 else np.array([0.0, 1.0, 0.0])
+    right = np.cross(up, backward)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :4] = np.stack([right, np.cross(backward, right), backward, position], -1)
+    return pose
