@@ -1,0 +1,150 @@
+"""Pinhole cameras and their rays."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nerfro.errors import NerfroError
+from nerfro.types import Rays
+
+
+class Window(NamedTuple):
+    """A rectangle of pixels."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+
+
+def central_window(height: int, width: int, fraction: float) -> Window:
+    """The window of even sides around the centre of an image that spans `fraction` of each side.
+
+    Raises:
+        NerfroError: the fraction is outside (0, 1], or leaves no pixel.
+    """
+    if not 0 < fraction <= 1:
+        raise NerfroError(f"a central crop of {fraction} of the image is impossible; take a fraction in (0, 1]")
+    if fraction == 1:
+        return Window(0, 0, height, width)
+    # Half sides are truncated, as in the authors' code, so that the window is symmetric.
+    half_height, half_width = int(height // 2 * fraction), int(width // 2 * fraction)
+    if half_height == 0 or half_width == 0:
+        raise NerfroError(f"a central crop of {fraction} leaves nothing of {width}x{height} pixels; take a larger one")
+    return Window(height // 2 - half_height, width // 2 - half_width, 2 * half_height, 2 * half_width)
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Pinhole cameras of one resolution.
+
+    A camera looks along its -z axis, x is right and y is up (OpenGL). Pixel (row i, column j) covers the square from
+    (j, i) to (j + 1, i + 1) of the image plane, so its centre is (j + .5, i + .5) and the image's is (W / 2, H / 2).
+
+    Attributes:
+        camera_to_world: rotation and centre [R | o], world units.
+        fx, fy: focal lengths, pixels.
+        cx, cy: principal point, pixels from the image's left and top edge.
+        width, height: resolution, pixels.
+        near, far: arc length from the camera's centre at which rays begin and end, world units.
+    """
+
+    camera_to_world: Float[Tensor, "V 3 4"]
+    fx: Float[Tensor, "V"]
+    fy: Float[Tensor, "V"]
+    cx: Float[Tensor, "V"]
+    cy: Float[Tensor, "V"]
+    width: int
+    height: int
+    near: float
+    far: float
+
+    def __len__(self) -> int:
+        return self.camera_to_world.shape[0]
+
+    @property
+    def device(self) -> torch.device:
+        return self.camera_to_world.device
+
+    def to(self, device: torch.device | str) -> Cameras:
+        tensors = {name: getattr(self, name).to(device) for name in ("camera_to_world", "fx", "fy", "cx", "cy")}
+        return replace(self, **tensors)
+
+    def crop(self, window: Window) -> Cameras:
+        """The cameras of a window of each image: its pixel (0, 0) is pixel (top, left) of these cameras."""
+        return replace(
+            self, cx=self.cx - window.left, cy=self.cy - window.top, width=window.width, height=window.height
+        )
+
+    def rays(
+        self,
+        view: Int[Tensor, "R"],
+        row: Int[Tensor, "R"],
+        column: Int[Tensor, "R"],
+        jitter: Float[Tensor, "R 2"] | None = None,
+    ) -> Rays:
+        """Rays through pixels.
+
+        The radius of a pixel's cone is 2 / sqrt(12) of the pixel's width (mip-NeRF, section 3.1: the disc has the
+        variance of the pixel). That width is 1 / fx at unit depth, which lies at distance |d| along the ray
+        d = ((u - cx) / fx, -(v - cy) / fy, -1); at unit distance it is 1 / (fx |d|).
+
+        Args:
+            view, row, column: of each pixel, on the cameras' device.
+            jitter: place (x, y) in [0, 1) within each pixel that the ray goes through; its centre (.5, .5) by default.
+
+        Returns:
+            Rays in world space with unit directions.
+        """
+        offset_x, offset_y = (0.5, 0.5) if jitter is None else jitter.unbind(-1)
+        fx = self.fx[view]
+        x = (column + offset_x - self.cx[view]) / fx
+        y = (self.cy[view] - row - offset_y) / self.fy[view]
+        directions = torch.stack([x, y, -torch.ones_like(x)], -1)
+        length = torch.linalg.vector_norm(directions, dim=-1)
+        pose = self.camera_to_world[view]
+        directions = (pose[..., :3] @ directions[..., None])[..., 0]
+        # Normalised in world space, because a rotation read from a file is one only to the file's digits.
+        return Rays(
+            origins=pose[..., 3],
+            directions=torch.nn.functional.normalize(directions, dim=-1),
+            radii=2 / math.sqrt(12) / (fx * length),
+            near=torch.full_like(x, self.near),
+            far=torch.full_like(x, self.far),
+        )
+
+    def image_rays(self, view: int) -> Rays:
+        """Rays through all pixel centres of one view, row by row."""
+        return self._window_rays(view, Window(0, 0, self.height, self.width))
+
+    def tile(self, size: int, generator: torch.Generator | None = None) -> Float[Tensor, "T T 3"]:
+        """Viewing directions of a random window of a random view.
+
+        Args:
+            size: side of the window in pixels; the image's shorter side where that is smaller.
+            generator: source of randomness on the CPU.
+
+        Returns:
+            Unit directions in world space.
+        """
+        side = min(size, self.height, self.width)
+        # Drawn on the CPU whatever the cameras' device: no synchronisation, and the same tile on every device.
+        view, top, left = (
+            int(torch.randint(count, (), generator=generator))
+            for count in (len(self), self.height - side + 1, self.width - side + 1)
+        )
+        return self._window_rays(view, Window(top, left, side, side)).directions.reshape(side, side, 3)
+
+    def _window_rays(self, view: int, window: Window) -> Rays:
+        row, column = torch.meshgrid(
+            torch.arange(window.top, window.top + window.height, device=self.device),
+            torch.arange(window.left, window.left + window.width, device=self.device),
+            indexing="ij",
+        )
+        return self.rays(torch.full_like(row, view).flatten(), row.flatten(), column.flatten())

@@ -1,0 +1,115 @@
+"""Random training pixels, resident on the training device."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+
+from nerfro.data.base import Views
+from nerfro.data.cameras import central_window
+from nerfro.errors import NerfroError
+from nerfro.types import Batch
+
+Batching = Literal["single_image", "all_images"]
+
+
+class RayBatches:
+    """An endless sequence of random training pixels, in which batch `i` depends on the seed and `i` alone.
+
+    A run that stops and resumes with `first_step` set therefore sees the batches that it would have seen.
+
+    Args:
+        views: posed images; their tensors' device is where batches are made, see `to`.
+        batch_size: number of pixels in a batch.
+        batching: `single_image` draws different pixels of one random image, `all_images` draws each pixel anew from
+            all images.
+        seed: of the sequence.
+        precrop_steps: number of steps at first during which pixels come from the middle of the images.
+        precrop_fraction: share of each side that this middle spans.
+        jitter: send rays through a random place in each pixel instead of through its centre.
+        first_step: step at which iteration begins.
+
+    Raises:
+        NerfroError: an option is out of range, or an image (or its middle) has fewer pixels than a batch.
+    """
+
+    def __init__(
+        self,
+        views: Views,
+        batch_size: int,
+        batching: Batching = "single_image",
+        seed: int = 0,
+        precrop_steps: int = 0,
+        precrop_fraction: float = 0.5,
+        jitter: bool = False,
+        first_step: int = 0,
+    ) -> None:
+        if batching not in get_args(Batching):
+            raise NerfroError(f"batching={batching!r} is unknown; choose {' or '.join(map(repr, get_args(Batching)))}")
+        for name, value, least in (
+            ("batch_size", batch_size, 1),
+            ("seed", seed, 0),
+            ("precrop_steps", precrop_steps, 0),
+            ("first_step", first_step, 0),
+        ):
+            if value < least:
+                raise NerfroError(f"{name}={value} is too small; take {least} or more")
+        if len(views) == 0:
+            raise NerfroError("there are no training images; give at least one")
+        self.batch_size, self.batching, self.seed = batch_size, batching, seed
+        self.precrop_steps, self.jitter, self.first_step = precrop_steps, jitter, first_step
+        cameras = views.cameras
+        self._cameras = cameras
+        self._pixels = views.images.reshape(-1, 3)
+        self._crop = central_window(cameras.height, cameras.width, precrop_fraction if precrop_steps > 0 else 1.0)
+        if batching == "single_image" and batch_size > self._crop.height * self._crop.width:
+            raise NerfroError(
+                f"batch_size={batch_size} exceeds the {self._crop.width}x{self._crop.height} pixels that one image"
+                f"{' offers while precropped' if precrop_steps > 0 else ' has'}; take a smaller one, or all_images"
+            )
+
+    def to(self, device: torch.device | str) -> RayBatches:
+        """The same sequence with cameras and pixels on another device."""
+        moved = copy.copy(self)
+        moved._cameras, moved._pixels = self._cameras.to(device), self._pixels.to(device)
+        return moved
+
+    def __iter__(self) -> Iterator[Batch]:
+        step = self.first_step
+        while True:
+            yield self.batch(step)
+            step += 1
+
+    def batch(self, step: int) -> Batch:
+        """The batch of a step: a pure function of the seed and the step, on every device the same pixels."""
+        cameras = self._cameras
+        height, width = cameras.height, cameras.width
+        window = central_window(height, width, 1.0) if step >= self.precrop_steps else self._crop
+        generator = np.random.default_rng([self.seed, step])
+        view, pixel = self._draw(generator, window.height * window.width)
+        row, column = window.top + pixel // window.width, window.left + pixel % window.width
+        # One small copy to the device; the rest is computed there.
+        index = torch.from_numpy((view * height + row) * width + column).to(cameras.device, non_blocking=True)
+        jitter = None
+        if self.jitter:
+            offsets = generator.random((self.batch_size, 2), dtype=np.float32)
+            jitter = torch.from_numpy(offsets).to(cameras.device, non_blocking=True)
+        return Batch(
+            rays=cameras.rays(index // (height * width), index // width % height, index % width, jitter),
+            rgb=self._pixels[index],
+            index=index,
+            cameras=cameras.crop(window),
+        )
+
+    def _draw(self, generator: np.random.Generator, num_pixels: int) -> tuple[np.ndarray | np.int64, np.ndarray]:
+        """Views and pixels of the window, numbered row by row."""
+        if self.batching == "single_image":
+            view = generator.integers(len(self._cameras))
+            # Floyd's algorithm or a partial shuffle inside: far cheaper than a permutation of all pixels.
+            return view, generator.choice(num_pixels, self.batch_size, replace=False, shuffle=False)
+        views = generator.integers(len(self._cameras), size=self.batch_size)
+        return views, generator.integers(num_pixels, size=self.batch_size)
