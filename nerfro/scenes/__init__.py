@@ -1,0 +1,1 @@
+"""Synthetic scenes of refractive objects: modelled procedurally, rendered by a path tracer."""

@@ -105,7 +105,7 @@ def tiles(directions: np.ndarray, palette: np.ndarray, size: float, grout: tuple
     colour = chosen(palette, hashed(cell, seed))
     colour = np.where(checker, colour, 0.25 + 0.6 * colour)
     colour = np.where(inside[..., None], colour, np.asarray(grout))
-    return mix(np.asarray(fade), colour, smoothstep(0.06, 0.35, depth))
+    return mix(np.asarray(fade), colour, smoothstep(0.04, 0.24, depth))
 
 
 def lat_long_directions(height: int, width: int) -> np.ndarray:

@@ -42,9 +42,9 @@ def torus_colours(angles: np.ndarray) -> np.ndarray:
 def sky(directions: np.ndarray) -> np.ndarray:
     """Return linear radiance [..., 3] of a square with houses under a cloudy sky."""
     colour = clouds(directions, horizon=(0.86, 0.90, 0.94), zenith=(0.30, 0.52, 0.86), cover=0.55, seed=11)
-    houses, covered = skyline(directions, FACADES, count=22, heights=(7.0, 24.0), seed=5)
+    houses, covered = skyline(directions, FACADES, count=26, heights=(7.0, 24.0), seed=5)
     colour = mix(colour, houses, covered)
-    floor = tiles(directions, PAVING, size=0.42, grout=(0.30, 0.28, 0.27), fade=(0.62, 0.58, 0.54), seed=8)
+    floor = tiles(directions, PAVING, size=0.34, grout=(0.30, 0.28, 0.27), fade=(0.62, 0.58, 0.54), seed=8)
     colour = mix(colour, floor, elevation(directions) < 0)
     return to_linear(np.clip(colour, 0.0, 1.0))
 

@@ -1,0 +1,209 @@
+"""A rendered scene as a folder in Blender format, written so that an interrupted run can be continued."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from nerfro.errors import NerfroError
+from nerfro.scenes.patterns import to_srgb
+from nerfro.scenes.scene import Scene
+from nerfro.scenes.skies import lat_long_directions
+from nerfro.scenes.viewpoints import directions_on_sphere, look_at_origin
+
+CAMERA_ANGLE_X = 0.6911112070083618  # the camera of the NeRF synthetic scenes, which the paper's scenes share
+CAMERA_DISTANCE = 4.03
+NEAR, FAR = 2.0, 6.0
+BOX = ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))
+SPLITS = ("train", "val", "test")
+META = "meta.json"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that decides the contents of the pictures; a folder is continued only with equal settings.
+
+    Attributes:
+        scene: name of the scene.
+        fingerprint: hash of its geometry, colours and sky, so that pictures of an older model are not mixed in.
+        resolution: side of the square pictures, pixels.
+        spp: samples per pixel of training and validation views.
+        test_spp: samples per pixel of test views.
+        views: number of views per split.
+        fresnel: whether the glass reflects partially.
+        seed: seed of viewpoints and of the sampler.
+    """
+
+    scene: str
+    fingerprint: str
+    resolution: int
+    spp: int
+    test_spp: int
+    views: dict[str, int]
+    fresnel: bool
+    seed: int
+
+
+@dataclass(frozen=True)
+class View:
+    """One picture to be rendered.
+
+    Attributes:
+        split: `train`, `val` or `test`.
+        index: number within the split.
+        pose: camera-to-world matrix [4, 4], OpenGL axes.
+        spp: samples per pixel.
+        seed: seed of the sampler, different for every view.
+    """
+
+    split: str
+    index: int
+    pose: np.ndarray
+    spp: int
+    seed: int
+
+    @property
+    def image_path(self) -> str:
+        return f"{self.split}/r_{self.index:03d}.png"
+
+    @property
+    def mask_path(self) -> str:
+        return f"masks/{self.split}/r_{self.index:03d}.png"
+
+
+def fingerprint(scene: Scene) -> str:
+    """Return a short hash of a scene's geometry, colours, index, tint and sky."""
+    digest = hashlib.sha256()
+    for surface in (scene.glass, scene.interior):
+        for array in (surface.vertices, surface.faces, surface.colours):
+            if array is not None:
+                # Rounded: the last bit of a sine may differ between machines, the scene does not.
+                digest.update(np.round(array.astype(np.float64), 4).tobytes())
+    digest.update(np.round(scene.sky(lat_long_directions(64, 128)), 3).tobytes())
+    digest.update(repr((scene.ior, scene.tint)).encode())
+    return digest.hexdigest()[:16]
+
+
+def views(settings: Settings) -> list[View]:
+    """Return every view of a data set, in the order in which they are rendered."""
+    planned = []
+    for number, split in enumerate(SPLITS):
+        directions = directions_on_sphere(settings.views[split], settings.seed, number)
+        spp = settings.test_spp if split == "test" else settings.spp
+        for index, direction in enumerate(directions):
+            pose = look_at_origin(CAMERA_DISTANCE * direction)
+            planned.append(View(split, index, pose, spp, seed=(settings.seed * 3 + number) * 100_000 + index))
+    return planned
+
+
+def prepare(folder: Path, settings: Settings, overwrite: bool) -> None:
+    """Make `folder` ready for pictures of `settings`: new, continued, or cleared.
+
+    Raises:
+        NerfroError: the folder holds another data set, or other files, and `overwrite` is not set.
+    """
+    meta = folder / META
+    if meta.is_file():
+        if _stored_settings(meta) == asdict(settings):
+            return
+        if not overwrite:
+            raise NerfroError(
+                f"'{folder}' holds a data set with other settings; choose another folder with out=DIR, "
+                "or replace it with overwrite=true"
+            )
+        _remove_data_set(folder)
+    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise NerfroError(f"'{folder}' exists and is no data set of ours; choose another folder with out=DIR")
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def missing(folder: Path, planned: list[View]) -> Iterator[View]:
+    """Yield the views whose picture or mask is not on disk yet."""
+    for view in planned:
+        if not ((folder / view.image_path).is_file() and (folder / view.mask_path).is_file()):
+            yield view
+
+
+def write_view(folder: Path, view: View, radiance: np.ndarray, silhouette: np.ndarray) -> None:
+    """Write one view: 8-bit sRGB picture from linear radiance [H, W, 3], binary mask from bool [H, W]."""
+    write_image(folder / view.mask_path, silhouette)
+    write_image(folder / view.image_path, to_srgb(radiance))
+
+
+def write_image(path: Path, image: np.ndarray) -> None:
+    """Write sRGB [H, W, 3] in [0, 1] as an 8-bit PNG, or bool [H, W] as a 1-bit PNG."""
+    picture = Image.fromarray(image if image.dtype == bool else np.rint(image * 255).astype(np.uint8))
+    buffer = io.BytesIO()
+    picture.save(buffer, format="PNG", optimize=True)
+    write_bytes(path, buffer.getvalue())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file so that an interruption leaves either the whole file or none."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    try:
+        partial.write_bytes(content)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_meta(folder: Path, settings: Settings, scene: Scene, versions: dict[str, str]) -> None:
+    """Write meta.json: what the folder holds and how it came about."""
+    meta = {
+        "scene": scene.name,
+        "ior": scene.ior,
+        "tint": list(scene.tint),
+        "box": BOX,
+        "near": NEAR,
+        "far": FAR,
+        "camera_distance": CAMERA_DISTANCE,
+        "sky": "lat-long, z up: column u = 0.5 - atan2(y, x) / (2 pi), row v = acos(z) / pi, pixel centres + 0.5",
+        "masks": "white where the ray through the pixel's centre meets the glass",
+        "settings": asdict(settings),
+        "versions": versions,
+    }
+    write_bytes(folder / META, (json.dumps(meta, indent=1) + "\n").encode())
+
+
+def write_transforms(folder: Path, planned: list[View]) -> None:
+    """Write transforms_{train,val,test}.json; done last, as their presence says that the pictures are complete."""
+    for split in SPLITS:
+        frames = [
+            {
+                "file_path": "./" + view.image_path.removesuffix(".png"),
+                "mask_path": "./" + view.mask_path,
+                "transform_matrix": view.pose.tolist(),
+            }
+            for view in planned
+            if view.split == split
+        ]
+        content = json.dumps({"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}, indent=1)
+        write_bytes(folder / f"transforms_{split}.json", (content + "\n").encode())
+
+
+def _stored_settings(meta: Path) -> dict | None:
+    """Return the settings in a meta.json, or None when it is not one of ours."""
+    try:
+        return json.loads(meta.read_text()).get("settings")
+    except (ValueError, AttributeError):
+        return None
+
+
+def _remove_data_set(folder: Path) -> None:
+    """Delete the files that a data set consists of, and nothing else that somebody may have put beside them."""
+    for split in SPLITS:
+        (folder / f"transforms_{split}.json").unlink(missing_ok=True)
+        for pictures in (folder / split, folder / "masks" / split):
+            for picture in pictures.glob("r_*.png"):
+                picture.unlink()
+    (folder / META).unlink()

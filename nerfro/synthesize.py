@@ -1,0 +1,158 @@
+"""Render ground truth of a synthetic scene: `python -m nerfro.synthesize scene=torus`."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import platform
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from omegaconf import MISSING, DictConfig
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from nerfro.cli import entry_point
+from nerfro.errors import NerfroError
+from nerfro.scenes import dataset
+from nerfro.scenes.path_tracer import PathTracer
+from nerfro.scenes.patterns import to_srgb
+from nerfro.scenes.scene import Scene
+from nerfro.scenes.skies import lat_long_texture
+
+SCENES = ("torus", "ship", "deerglobe", "starlamp")
+
+
+@dataclass
+class ViewCounts:
+    """Number of views per split."""
+
+    train: int = MISSING
+    val: int = MISSING
+    test: int = MISSING
+
+
+@dataclass
+class SynthesizeConfig:
+    """Options of `nerfro.synthesize`; conf/synthesize.yaml gives and explains the defaults."""
+
+    scene: str = MISSING
+    out: str = MISSING
+    resolution: int = MISSING
+    spp: int = MISSING
+    test_spp: int = MISSING
+    views: ViewCounts = field(default_factory=ViewCounts)
+    fresnel: bool = MISSING
+    seed: int = MISSING
+    sky_height: int = MISSING
+    extras: bool = MISSING
+    variant: str = MISSING
+    overwrite: bool = MISSING
+
+
+def build_scene(name: str, resolution: int) -> Scene:
+    """Model a scene, with colours as fine as half a pixel of the picture that it is meant for.
+
+    Args:
+        name: one of `SCENES`.
+        resolution: side of the square picture, pixels.
+
+    Raises:
+        NerfroError: no such scene.
+    """
+    if name not in SCENES:
+        raise NerfroError(f"unknown scene '{name}'; choose one of {', '.join(SCENES)}")
+    pixel = dataset.CAMERA_DISTANCE * dataset.CAMERA_ANGLE_X / resolution
+    return importlib.import_module(f"nerfro.scenes.{name}").build(spacing=max(0.5 * pixel, 0.0025))
+
+
+def synthesize(config: DictConfig) -> Path:
+    """Render what is missing of a data set and return its folder.
+
+    Args:
+        config: resolved `SynthesizeConfig`.
+
+    Raises:
+        NerfroError: an option is out of range, Mitsuba is missing, or `out` holds something else.
+    """
+    _check(config)
+    scene = build_scene(config.scene, config.resolution)
+    settings = dataset.Settings(
+        scene=config.scene,
+        fingerprint=dataset.fingerprint(scene),
+        resolution=config.resolution,
+        spp=config.spp,
+        test_spp=config.test_spp,
+        views={split: config.views[split] for split in dataset.SPLITS},
+        fresnel=config.fresnel,
+        seed=config.seed,
+    )
+    folder = Path(config.out).expanduser()
+    dataset.prepare(folder, settings, config.overwrite)
+    planned = dataset.views(settings)
+    waiting = list(dataset.missing(folder, planned))
+    print(f"{config.scene}: {len(planned)} views, {len(planned) - len(waiting)} of them already in {folder}")
+    if waiting:
+        tracer = PathTracer(scene, config.fresnel, dataset.CAMERA_ANGLE_X, config.resolution, variant=config.variant)
+        dataset.write_meta(folder, settings, scene, _versions(tracer))
+        _render(tracer, folder, waiting)
+    scene.glass.save(folder / "mesh.ply")
+    sky = lat_long_texture(scene.sky, config.sky_height)
+    dataset.write_image(folder / "sky.png", to_srgb(sky))
+    if config.extras:
+        scene.interior.save(folder / "interior.ply")
+        _write_exr(folder / "sky.exr", sky)
+    dataset.write_transforms(folder, planned)
+    return folder
+
+
+def _check(config: DictConfig) -> None:
+    lowest = {"resolution": 8, "spp": 1, "test_spp": 1, "seed": 0, "sky_height": 16}
+    for name, least in lowest.items():
+        if config[name] < least:
+            raise NerfroError(f"{name}={config[name]} is too small; give {least} or more")
+    for split in dataset.SPLITS:
+        if config.views[split] < 1:
+            raise NerfroError(f"views.{split}={config.views[split]} is too small; give 1 or more")
+
+
+def _render(tracer: PathTracer, folder: Path, waiting: list[dataset.View]) -> None:
+    columns = (
+        TextColumn("rendering"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("ETA"),
+        TimeRemainingColumn(),
+    )
+    # The estimate counts samples, not views: test views have more of them.
+    with Progress(*columns) as progress:
+        task = progress.add_task("rendering", total=sum(view.spp for view in waiting))
+        for view in waiting:
+            radiance = tracer.render(view.pose, view.spp, view.seed)
+            dataset.write_view(folder, view, radiance, tracer.silhouette(view.pose))
+            progress.advance(task, view.spp)
+
+
+def _versions(tracer: PathTracer) -> dict[str, str]:
+    names = ("mitsuba", "drjit", "numpy")
+    versions = {name: importlib.metadata.version(name) for name in names}
+    return {**versions, "python": platform.python_version(), "variant": tracer.mitsuba.variant()}
+
+
+def _write_exr(path: Path, linear: np.ndarray) -> None:
+    mitsuba = importlib.import_module("mitsuba")
+    bitmap = mitsuba.Bitmap(np.ascontiguousarray(linear, np.float32))
+    bitmap.convert(component_format=mitsuba.Struct.Type.Float16).write(str(path))
+
+
+@entry_point("synthesize", SynthesizeConfig)
+def main(config: DictConfig) -> None:
+    """Render, then say how to train on the result."""
+    folder = synthesize(config)
+    print(f"done: {folder}")
+    print(f"train on it: python -m nerfro.train data.root={folder} medium.mesh={folder / 'mesh.ply'} medium.ior=1.5")
+
+
+if __name__ == "__main__":
+    main()
