@@ -33,7 +33,7 @@ class SkipMLP(nn.Module):
         for i, layer in enumerate(self.layers, start=1):
             y = F.relu(layer(y))
             if i == self.skip:
-                y = torch.cat([y, x], dim=-1)
+                y = torch.cat([y, x.to(y.dtype)], dim=-1)
         return y
 
 

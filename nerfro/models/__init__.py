@@ -1,0 +1,1 @@
+"""LightningModules: rays -> renderings -> loss."""

@@ -1,0 +1,26 @@
+"""The baseline."""
+
+from __future__ import annotations
+
+from nerfro.models.base import NerfModel, Parts
+from nerfro.registry import register
+from nerfro.rendering import composite
+from nerfro.types import Rays, Rendering
+
+
+@register("model", "mip_nerf")
+class MipNerfModel(NerfModel):
+    """mip-NeRF: one field for all levels, resampled where it had weight, with a boundary term (constant or a sky)."""
+
+    def __init__(self, parts: Parts) -> None:
+        super().__init__(parts, [parts.make_field()])
+
+    def forward(self, rays: Rays) -> list[Rendering]:
+        path = self.path_sampler(rays, self.medium)
+        boundary_rgb = self.boundary(path.exit_directions)
+        (field,) = self.fields
+        renderings: list[Rendering] = []
+        for _ in range(self.point_sampler.num_levels):
+            samples = self.point_sampler(path, renderings[-1] if renderings else None)
+            renderings.append(composite(samples, field(samples), boundary_rgb, path))
+        return renderings

@@ -1,0 +1,69 @@
+"""Adam's settings, how far a run is, and the learning rate that follows from both."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Optional
+
+from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import Timer
+
+from nerfro.errors import NerfroError
+
+
+@dataclass
+class OptimizerConfig:
+    """Adam with a log-linear learning rate and a sine warm-up (authors' code; mip-NeRF, section 4).
+
+    Attributes:
+        learning_rate, final_learning_rate: at the beginning and the end of the run.
+        boundary_learning_rate: of the boundary at the beginning, decaying in proportion; none for the same.
+        warmup_steps: length of the warm-up; 0 for none.
+        warmup_factor: factor of the learning rate at its first step.
+        adam_epsilon: of Adam.
+    """
+
+    learning_rate: float = 5e-4
+    final_learning_rate: float = 5e-6
+    boundary_learning_rate: Optional[float] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    warmup_steps: int = 2500
+    warmup_factor: float = 0.01
+    adam_epsilon: float = 1e-8
+
+    def __post_init__(self) -> None:
+        if min(self.learning_rate, self.final_learning_rate, self.boundary_rate) <= 0 or self.warmup_steps < 0:
+            raise NerfroError(f"{self}: learning rates must be positive and warmup_steps not negative")
+
+    @property
+    def boundary_rate(self) -> float:
+        return self.learning_rate if self.boundary_learning_rate is None else self.boundary_learning_rate
+
+
+def learning_rate_factor(step: int, progress: float, config: OptimizerConfig) -> float:
+    """Factor of the initial learning rates: log-linear decay times mip-NeRF's sine warm-up.
+
+    Args:
+        step: optimiser steps done.
+        progress: share of the run that is done, in [0, 1].
+        config: rates and warm-up.
+    """
+    factor = (config.final_learning_rate / config.learning_rate) ** progress
+    if config.warmup_steps > 0:
+        ascent = math.sin(0.5 * math.pi * min(step / config.warmup_steps, 1.0))
+        factor *= config.warmup_factor + (1.0 - config.warmup_factor) * ascent
+    return factor
+
+
+def training_progress(trainer: Trainer) -> float:
+    """Share of the run's budget that is spent, in [0, 1]: steps of `max_steps` or time of `max_time`, whichever is more.
+
+    Under `max_time` the schedules end when the time does, so such a run depends on the machine's speed.
+    """
+    progress = trainer.global_step / trainer.max_steps if trainer.max_steps > 0 else 0.0
+    timer = next((c for c in trainer.callbacks if isinstance(c, Timer)), None)  # type: ignore[attr-defined]
+    if timer is not None:
+        elapsed, remaining = timer.time_elapsed(), timer.time_remaining()
+        if remaining is not None and elapsed + remaining > 0:
+            progress = max(progress, elapsed / (elapsed + remaining))
+    return min(progress, 1.0)

@@ -1,0 +1,35 @@
+"""The paper's model."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from nerfro.models.base import NerfModel, Parts
+from nerfro.registry import register
+from nerfro.rendering import composite
+from nerfro.types import Rays, Rendering
+
+
+@register("model", "refractive")
+class RefractiveModel(NerfModel):
+    """Radiance fields sampled along bent rays, with a boundary term (paper, section 2); one field for each level.
+
+    Args:
+        boundary_direction: where the boundary is asked: in the path's `exit` direction, or in the direction of the
+            `last_coarse` sample as in the authors' code.
+    """
+
+    def __init__(self, parts: Parts, boundary_direction: Literal["exit", "last_coarse"] = "exit") -> None:
+        super().__init__(parts, [parts.make_field() for _ in range(parts.point_sampler.num_levels)])
+        self.boundary_direction = boundary_direction
+
+    def forward(self, rays: Rays) -> list[Rendering]:
+        path = self.path_sampler(rays, self.medium)
+        samples = self.point_sampler(path, None)
+        leaving = path.exit_directions if self.boundary_direction == "exit" else samples.directions[:, -1]
+        boundary_rgb = self.boundary(leaving)
+        renderings = [composite(samples, self.fields[0](samples), boundary_rgb, path)]
+        for field in self.fields[1:]:
+            samples = self.point_sampler(path, renderings[-1])
+            renderings.append(composite(samples, field(samples), boundary_rgb, path))
+        return renderings

@@ -1,0 +1,156 @@
+"""A run's folder: what it records so that the run can be repeated, and where its checkpoints lie."""
+
+from __future__ import annotations
+
+import json
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from nerfro.errors import NerfroError
+from nerfro.evaluation.files import write_atomically
+from nerfro.paths import PACKAGE_DIR
+
+LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
+_PACKAGES = ("nerfro", "torch", "lightning", "hydra-core", "torchmetrics", "numpy", "numba", "trimesh")
+
+# A checkpoint fits a run only if these parts of the two configurations agree.
+_MUST_AGREE = ("model", "field", "boundary", "medium", "sampler", "data", "batches", "seed")
+
+
+def claim(folder: Path, resumed: bool, needed_bytes: int) -> None:
+    """Make a run folder, or refuse one that would be overwritten or whose disk is full.
+
+    Raises:
+        NerfroError: the folder holds another run, or too little space is free.
+    """
+    if (folder / LAST_CHECKPOINT).exists() and not resumed:
+        raise NerfroError(
+            f"{folder} already holds a run; go on with it (ckpt_path=last) or choose another folder (hydra.run.dir=...)"
+        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(folder).free
+    except OSError as error:
+        raise NerfroError(f"cannot write to {folder}: {error.strerror}; choose another hydra.run.dir") from error
+    if free < needed_bytes:
+        raise NerfroError(
+            f"{folder} has {free / 2**20:,.0f} MiB free and this run needs {needed_bytes / 2**20:,.0f}; "
+            "free some or choose another hydra.run.dir"
+        )
+
+
+def record(folder: Path, config: DictConfig) -> None:
+    """Write what repeats the run: config.yaml (resolved), run.json (command, versions, commit) and git.diff."""
+    write_atomically(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
+    commit, diff = _git("rev-parse", "HEAD"), _git("diff", "HEAD")
+    facts = {
+        "command": shlex.join([Path(sys.executable).name, "-m", _main_module(), *sys.argv[1:]]),
+        "seed": config.seed,
+        "commit": commit,
+        "modified": bool(diff),
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "threads": torch.get_num_threads(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "versions": {name: _version(name) for name in _PACKAGES},
+    }
+    write_atomically(folder / "run.json", json.dumps(facts, indent=2) + "\n")
+    if diff:
+        write_atomically(folder / "git.diff", diff + "\n")
+
+
+def find_checkpoint(ckpt_path: str | None, folder: Path) -> Path | None:
+    """The checkpoint to go on from: a file, or for `last` that of this folder, else the newest beside it.
+
+    Raises:
+        NerfroError: there is none.
+    """
+    if ckpt_path is None:
+        return None
+    if ckpt_path != "last":
+        path = Path(ckpt_path).expanduser()
+        if not path.is_file():
+            raise NerfroError(f"checkpoint {path} does not exist; give a .ckpt file or ckpt_path=last")
+        return path
+    if (folder / LAST_CHECKPOINT).is_file():
+        return folder / LAST_CHECKPOINT
+    siblings = sorted(folder.parent.glob(f"*/{LAST_CHECKPOINT}"), key=lambda p: p.stat().st_mtime)
+    if not siblings:
+        raise NerfroError(
+            f"ckpt_path=last: no checkpoint in {folder} or beside it; leave ckpt_path out to start from the beginning"
+        )
+    return siblings[-1]
+
+
+def load_checkpoint(path: Path) -> tuple[dict[str, Any], DictConfig]:
+    """Read a checkpoint without executing pickled code, and the configuration that it was trained with.
+
+    Raises:
+        NerfroError: missing, truncated, or not written by nerfro.
+    """
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        config = OmegaConf.create(checkpoint["nerfro_config"])
+    except FileNotFoundError as error:
+        raise NerfroError(f"checkpoint {path} does not exist; it is usually RUN/{LAST_CHECKPOINT}") from error
+    except Exception as error:  # torch.load raises nearly anything on a damaged file
+        reason = str(error).strip().split("\n", 1)[0]
+        raise NerfroError(f"{path} is not a readable nerfro checkpoint ({type(error).__name__}: {reason})") from error
+    return checkpoint, config  # type: ignore[return-value]
+
+
+def require_same_configuration(path: Path, trained: DictConfig, wanted: DictConfig) -> None:
+    """Refuse to go on from a checkpoint of another configuration.
+
+    Raises:
+        NerfroError: the first field that differs is named, with both values.
+    """
+    for section in _MUST_AGREE:
+        old = _flatten(OmegaConf.to_container(trained, resolve=True).get(section), section)  # type: ignore[union-attr]
+        new = _flatten(OmegaConf.to_container(wanted, resolve=True).get(section), section)  # type: ignore[union-attr]
+        for key in sorted(old.keys() | new.keys()):
+            if old.get(key) != new.get(key):
+                raise NerfroError(
+                    f"{path} was trained with {key}={old.get(key)}, this run has {new.get(key)}; "
+                    "use the same experiment and overrides, or start without ckpt_path"
+                )
+
+
+def _flatten(node: Any, prefix: str) -> dict[str, Any]:
+    if not isinstance(node, dict):
+        return {prefix: node}
+    return {key: value for name, child in node.items() for key, value in _flatten(child, f"{prefix}.{name}").items()}
+
+
+def _git(*command: str) -> str | None:
+    """Output of a git command on the checkout that nerfro is imported from; None outside of one."""
+    if not (PACKAGE_DIR.parent / ".git").exists():
+        return None
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(PACKAGE_DIR.parent), *command], capture_output=True, text=True, timeout=10, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
+
+
+def _main_module() -> str:
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    return spec.name if spec is not None else sys.argv[0]
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

@@ -1,0 +1,140 @@
+"""`python -m nerfro.train`: train an experiment, evaluate it on the test views, and print the table."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import warnings
+from datetime import timedelta
+from pathlib import Path
+
+import lightning.pytorch as pl
+import rich
+from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.loggers import Logger
+from omegaconf import DictConfig, OmegaConf
+
+from nerfro.callbacks import ConfigInCheckpoint, StopOnSignal, Throughput, TrainingProgress, ValidationImages
+from nerfro.cli import EXIT_INTERRUPTED, entry_point
+from nerfro.config import TrainConfig, build_model
+from nerfro.data.module import RayDataModule
+from nerfro.data.ray_batches import RayBatches
+from nerfro.errors import NerfroError
+from nerfro.evaluation.lpips import find_lpips_network
+from nerfro.evaluation.metrics import ImageMetrics
+from nerfro.evaluation.results import write_metrics_json
+from nerfro.evaluation.score_views import score_views
+from nerfro.evaluation.tables import to_rich, views_table, write_table
+from nerfro.registry import build
+from nerfro.run_folder import (
+    LAST_CHECKPOINT,
+    claim,
+    find_checkpoint,
+    load_checkpoint,
+    record,
+    require_same_configuration,
+)
+
+_SPARE_BYTES = 64 * 2**20  # pictures and logs, beside the checkpoints
+
+
+@entry_point("train", TrainConfig)
+def main(config: DictConfig) -> None:
+    """Train one experiment and evaluate it; everything that can be refused is refused before training starts."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    checkpoint = find_checkpoint(config.ckpt_path, folder)
+    if checkpoint is not None:
+        require_same_configuration(checkpoint, load_checkpoint(checkpoint)[1], config)
+    _quieten_lightning()
+    pl.seed_everything(config.seed, verbose=False)
+
+    source = build(config.data)
+    test = source.load(config.evaluation.split)
+    validation = source.load("val") if config.evaluation.every > 0 and "val" in source.splits else None
+    wanted = config.batches
+    batches = RayBatches(
+        source.load("train"),
+        wanted.size,
+        wanted.batching,
+        config.seed,
+        wanted.precrop_steps,
+        wanted.precrop_fraction,
+        wanted.jitter,
+    )
+    model = build_model(config)
+    # Weights and Adam's two moments, in an old checkpoint that goes when the new one is whole.
+    num_bytes = sum(p.numel() * p.element_size() for p in model.parameters())
+    claim(folder, checkpoint is not None, 2 * 3 * num_bytes + _SPARE_BYTES)
+    throughput, interruption = Throughput(), StopOnSignal()
+    trainer = make_trainer(config, folder, [throughput, interruption])
+    record(folder, config)
+    print(f"nerfro: {config.name} on {config.data.root} -> {folder}", flush=True)
+
+    datamodule = RayDataModule(batches, validation, config.evaluation.every)
+    trainer.fit(model, datamodule=datamodule, ckpt_path=checkpoint, weights_only=True)
+    trainer.save_checkpoint(folder / LAST_CHECKPOINT)
+    if interruption.received:
+        command = f"hydra.run.dir={folder} ckpt_path=last"
+        print(f"nerfro: interrupted after step {trainer.global_step} and saved; to go on, repeat it with {command}")
+        sys.exit(EXIT_INTERRUPTED)
+
+    model.to(trainer.strategy.root_device)
+    metrics = ImageMetrics(*find_lpips_network(config.evaluation.lpips_backbone), prefix=config.evaluation.split)
+    result = score_views(model, test, metrics, folder)
+    steps, rate = trainer.global_step, throughput.rays_per_second
+    write_metrics_json(folder / "metrics.json", result, steps, throughput.seconds, rate)
+    table = views_table(result, f"{config.name} on {config.data.root}, {config.evaluation.split} views")
+    write_table(table, folder / "metrics")
+    rich.print(to_rich(table))
+    print(f"{steps} steps in {throughput.seconds:.0f} s ({rate or 0:,.0f} rays/s). Look at:")
+    print(f"  {folder}/images/  the pictures; metrics.json, .csv, .md and .tex beside them")
+    print(f"  {folder}/checkpoints/last.ckpt  evaluate it with python -m nerfro.evaluate checkpoint=...")
+    print(f"  tensorboard --logdir {folder.parent}  losses and validation pictures")
+
+
+def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.Trainer:
+    """Lightning's Trainer with the callbacks that every run has.
+
+    Raises:
+        NerfroError: a field of the trainer, logger or checkpoint section is unknown or wrong.
+    """
+    if (config.checkpoint.every_seconds is None) == (config.checkpoint.every_steps is None):
+        raise NerfroError("set one of checkpoint.every_seconds and checkpoint.every_steps, and the other to null")
+    seconds, every = config.checkpoint.every_seconds, config.evaluation.every
+    checkpoints = ModelCheckpoint(
+        dirpath=folder / LAST_CHECKPOINT.parent,
+        filename=LAST_CHECKPOINT.stem,
+        every_n_train_steps=config.checkpoint.every_steps,
+        train_time_interval=None if seconds is None else timedelta(seconds=seconds),
+        enable_version_counter=False,
+        save_on_train_epoch_end=False,
+    )
+    in_checkpoint = ConfigInCheckpoint(OmegaConf.to_yaml(config, resolve=True))
+    return build(
+        config.trainer,
+        default_root_dir=str(folder),
+        callbacks=[checkpoints, TrainingProgress(), in_checkpoint, ValidationImages(), *extra],
+        logger=_loggers(config, folder),
+        max_epochs=-1,
+        val_check_interval=every if every > 0 else None,
+        check_val_every_n_epoch=None,
+        limit_val_batches=1 if every > 0 else 0,
+        num_sanity_val_steps=0,
+        use_distributed_sampler=False,
+    )
+
+
+def _loggers(config: DictConfig, folder: Path) -> list[Logger]:
+    return [build(node, save_dir=str(folder)) for node in (config.logger or {}).values()]
+
+
+def _quieten_lightning() -> None:
+    """Keep Lightning's hints about loaders and hardware from the user: batches are made on the device here."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    for message in (".*does not have many workers.*", ".*You are using .* devices.*", ".*Starting from v1.9.*"):
+        warnings.filterwarnings("ignore", message)
+
+
+if __name__ == "__main__":
+    main()
