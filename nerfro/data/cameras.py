@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from nerfro.errors import NerfroError
@@ -21,6 +21,11 @@ class Window(NamedTuple):
     left: int
     height: int
     width: int
+
+    def cut(self, images: Shaped[Tensor, "V H W *C"]) -> Shaped[Tensor, "V h w *C"]:
+        """The window of each image."""
+        rows, columns = slice(self.top, self.top + self.height), slice(self.left, self.left + self.width)
+        return images[:, rows, columns].contiguous()
 
 
 def central_window(height: int, width: int, fraction: float) -> Window:

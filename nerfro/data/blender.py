@@ -1,0 +1,59 @@
+"""Data in the format of the NeRF authors' Blender scenes."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from nerfro.data.base import DataSource, Views
+from nerfro.data.transforms import check_options, find_splits, is_number, make_cameras, read_images, read_manifest
+from nerfro.errors import NerfroError
+from nerfro.paths import resolve_path
+from nerfro.registry import register
+
+
+@register("data", "blender")
+class BlenderData(DataSource):
+    """Folder with transforms_{train,val,test}.json in Blender's (OpenGL) camera axes and one field of view.
+
+    Args:
+        root: the folder; `embedded:torus` is the scene that ships with nerfro.
+        near: arc length at which rays begin, world units.
+        far: arc length at which rays end, world units.
+        downscale: side of the blocks of pixels that are averaged into one.
+        alpha: `drop` ignores the images' transparency as the paper's authors do, `white` and `black` composite them
+            over that colour.
+
+    Raises:
+        NerfroError: an option is out of range.
+    """
+
+    def __init__(
+        self,
+        root: str = "embedded:torus",
+        near: float = 2.0,
+        far: float = 6.0,
+        downscale: int = 1,
+        alpha: Literal["drop", "white", "black"] = "drop",
+    ) -> None:
+        check_options(near, far, downscale)
+        self.root = resolve_path(root)
+        self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
+
+    @property
+    def splits(self) -> list[str]:
+        return list(find_splits(self.root))
+
+    def load(self, split: str) -> Views:
+        manifest = read_manifest(self.root, split)
+        angle = manifest.require("camera_angle_x", "the horizontal field of view in radians")
+        if not is_number(angle) or not 0 < angle < math.pi:
+            raise NerfroError(
+                f"{manifest.path}: camera_angle_x={angle!r} must be an angle between 0 and pi, in radians"
+            )
+        images, masks = read_images(manifest, self.downscale, self.alpha)
+        height, width = images.shape[1:3]
+        focal = 0.5 * width / math.tan(0.5 * angle)
+        intrinsics = focal, focal, 0.5 * width, 0.5 * height
+        cameras = make_cameras(manifest, "opengl", intrinsics, (width, height), self.near, self.far)
+        return Views(cameras, images, masks, [frame.name for frame in manifest.frames])

@@ -1,0 +1,76 @@
+"""Data in the format of the paper's captured scenes."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Literal
+
+from nerfro.data.base import DataSource, Views
+from nerfro.data.cameras import central_window
+from nerfro.data.transforms import check_options, find_splits, make_cameras, parse_matrix, read_images, read_manifest
+from nerfro.errors import NerfroError
+from nerfro.paths import resolve_path
+from nerfro.registry import register
+
+
+@register("data", "opencv")
+class OpenCVData(DataSource):
+    """Folder with transforms_{train,val,test}.json in OpenCV's camera axes and one 3x3 camera matrix.
+
+    The matrix takes pixel (column, row) centres to be at (column + .5, row + .5), as the paper's authors do.
+
+    Args:
+        root: the folder.
+        near: arc length at which rays begin, world units.
+        far: arc length at which rays end, world units.
+        downscale: side of the blocks of pixels that are averaged into one; the camera matrix is that of full size.
+        alpha: `drop` ignores the images' transparency as the paper's authors do, `white` and `black` composite them
+            over that colour.
+        eval_crop: share of each side that is kept, around the centre, of the images of every split but train.
+
+    Raises:
+        NerfroError: an option is out of range.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        near: float = 0.2,
+        far: float = 12.0,
+        downscale: int = 1,
+        alpha: Literal["drop", "white", "black"] = "drop",
+        eval_crop: float = 1.0,
+    ) -> None:
+        check_options(near, far, downscale)
+        if not 0 < eval_crop <= 1:
+            raise NerfroError(f"data.eval_crop={eval_crop} is not allowed; take a share in (0, 1], 1 for no crop")
+        self.root = resolve_path(root)
+        self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
+        self.eval_crop = eval_crop
+
+    @property
+    def splits(self) -> list[str]:
+        return list(find_splits(self.root))
+
+    def load(self, split: str) -> Views:
+        manifest = read_manifest(self.root, split)
+        where = f"{manifest.path}: cam_mat"
+        matrix = parse_matrix(manifest.require("cam_mat", "the 3x3 camera matrix in pixels"), ((3, 3),), where)
+        fx, fy, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        if fx <= 0 or fy <= 0 or abs(matrix[0, 1]) > 1e-6 * fx or abs(matrix[1, 0]) > 1e-6 * fy:
+            raise NerfroError(f"{where} must have positive focal lengths and no skew; it is {matrix.tolist()}")
+        images, masks = read_images(manifest, self.downscale, self.alpha)
+        height, width = images.shape[1:3]
+        if not (0 < cx < width * self.downscale and 0 < cy < height * self.downscale):
+            warnings.warn(
+                f"{where} has its principal point ({cx:g}, {cy:g}) outside the {width * self.downscale}x"
+                f"{height * self.downscale} pixels of the images; was it made for another size?",
+                stacklevel=2,
+            )
+        intrinsics = fx / self.downscale, fy / self.downscale, cx / self.downscale, cy / self.downscale
+        cameras = make_cameras(manifest, "opencv", intrinsics, (width, height), self.near, self.far)
+        if split != "train" and self.eval_crop < 1:
+            window = central_window(height, width, self.eval_crop)
+            cameras = cameras.crop(window)
+            images, masks = (t if t is None else window.cut(t) for t in (images, masks))
+        return Views(cameras, images, masks, [frame.name for frame in manifest.frames])
