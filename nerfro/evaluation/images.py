@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
 from nerfro.errors import NerfroError
@@ -34,7 +34,7 @@ def to_8bit(rgb: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
     num_bad = int((~torch.isfinite(rgb)).sum())
     if num_bad:
         raise NerfroError(
-            f"the picture holds {num_bad} NaN or infinite values of {rgb.numel()}: the model that drew it has diverged; "
+            f"{num_bad} of the picture's {rgb.numel()} values are NaN or infinite: the model that drew it has diverged; "
             "train with a lower learning rate or with gradient clipping"
         )
     return (rgb.detach().clamp(0, 1) * 255).round().to(torch.uint8)
@@ -84,6 +84,6 @@ def load_png(path: Path | str) -> Float[Tensor, "H W 3"]:
             levels = np.array(image.convert("RGB"))
     except FileNotFoundError as error:
         raise NerfroError(f"the picture {path} does not exist; check the folder and the file's name") from error
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:  # Pillow's PNG reader raises SyntaxError
+    except (OSError, SyntaxError) as error:  # Pillow's PNG reader raises both
         raise NerfroError(f"the picture {path} cannot be read ({error}); write or copy it again") from error
     return torch.from_numpy(levels).float() / 255

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 import torchmetrics
 from jaxtyping import Float
 from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+from torchmetrics.utilities import dim_zero_cat
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation.images import round_to_8bit
@@ -51,8 +54,10 @@ def ssim_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"])
     """
     if min(prediction.shape[:2]) < SSIM_WINDOW:
         raise NerfroError(f"SSIM needs at least {SSIM_WINDOW} x {SSIM_WINDOW} pixels, got {list(prediction.shape[:2])}")
-    images = [image.double().permute(2, 0, 1)[None] for image in (prediction, target)]
-    _, full = structural_similarity_index_measure(*images, sigma=1.5, data_range=1.0, return_full_image=True)
+    predictions, targets = (image.double().permute(2, 0, 1)[None] for image in (prediction, target))
+    _, full = structural_similarity_index_measure(
+        predictions, targets, sigma=1.5, data_range=1.0, return_full_image=True
+    )
     # torchmetrics pads by reflection and averages over the padded windows too; the border is cut off here.
     border = SSIM_WINDOW // 2
     return full[0].permute(1, 2, 0)[border:-border, border:-border]
@@ -80,8 +85,7 @@ class ImageMetrics(torchmetrics.Metric):
     """
 
     full_state_update = False
-    views: list[Tensor]
-    scores: list[Tensor]
+    rows: list[Tensor]
 
     def __init__(
         self,
@@ -103,8 +107,7 @@ class ImageMetrics(torchmetrics.Metric):
         self.lpips_note = lpips_note or "no LPIPS network was given"
         self.round_predictions = round_predictions
         self.prefix = prefix
-        self.add_state("views", default=[], dist_reduce_fx="cat")
-        self.add_state("scores", default=[], dist_reduce_fx="cat")
+        self.add_state("rows", default=[], dist_reduce_fx="cat")
 
     @torch.no_grad()
     def update(
@@ -127,56 +130,48 @@ class ImageMetrics(torchmetrics.Metric):
             )
         rounded = round_to_8bit(prediction)  # also refuses what is not finite
         prediction = rounded if self.round_predictions else prediction.clamp(0, 1)
-        unavailable = prediction.new_full((), torch.nan, dtype=torch.float64)
         size = min(prediction.shape[:2])
-        row = [
-            psnr(prediction, target),
-            ssim(prediction, target) if size >= SSIM_WINDOW else unavailable,
-            self.lpips_network(prediction, target)
-            if self.lpips_network is not None and size >= LPIPS_MIN_SIZE
-            else unavailable,
-        ]
-        self.views.append(torch.tensor([len(self.views) if view is None else view], device=prediction.device))
-        self.scores.append(torch.stack([score.double() for score in row])[None])
+        row = torch.full((1 + len(METRICS),), torch.nan, dtype=torch.float64, device=prediction.device)
+        row[0] = len(self.rows) if view is None else view
+        row[1] = psnr(prediction, target)
+        if size >= SSIM_WINDOW:
+            row[2] = ssim(prediction, target)
+        if self.lpips_network is not None and size >= LPIPS_MIN_SIZE:
+            row[3] = self.lpips_network(prediction, target)
+        self.rows.append(row[None])
 
-    def compute(self) -> Float[Tensor, "V 3"]:
+    def compute(self) -> Float[Tensor, "V 4"]:
         """Scores of all views, gathered from all processes.
 
         Returns:
-            Rows in order of view numbers, columns as in `METRICS`; NaN where a metric is not available.
+            A row for each view: its number, in rising order, then the scores in the order of `METRICS`; NaN where a
+            metric is not available.
 
         Raises:
             NerfroError: if no view was scored.
         """
-        return self._gathered()[1]
+        if len(self.rows) == 0:
+            raise NerfroError("no view was scored; call update with at least one, or choose a split that has views")
+        rows = dim_zero_cat(self.rows)
+        # A distributed sampler hands some views out twice to give every process as many; they count once.
+        by_view = {int(row[0]): row for row in rows}
+        return torch.stack([by_view[number] for number in sorted(by_view)])
 
     def result(self) -> EvaluationResult:
-        """The scores as named rows, with the reasons for what is missing; gathers from all processes.
+        """The scores as named rows, with the reasons for what is missing.
 
         Raises:
             NerfroError: if no view was scored.
         """
-        with self.sync_context(dist_sync_fn=self.dist_sync_fn, should_sync=self._to_sync, should_unsync=True):
-            numbers, scores = self._gathered()
-        views = tuple(
-            ViewScores(
-                f"{self.prefix}_{number:03d}",
-                {metric.name: None if value != value else value for metric, value in zip(METRICS, row, strict=True)},
-            )
-            for number, row in zip(numbers.tolist(), scores.tolist(), strict=True)
-        )
-        return EvaluationResult(views, self._notes(views), "8bit" if self.round_predictions else "float")
+        views = []
+        for number, *scores in self.compute().tolist():
+            named = zip((metric.name for metric in METRICS), scores, strict=True)
+            row = {name: None if math.isnan(score) else score for name, score in named}
+            views.append(ViewScores(f"{self.prefix}_{int(number):03d}", row))
+        notes = self._notes(views)
+        return EvaluationResult(tuple(views), notes, "8bit" if self.round_predictions else "float")
 
-    def _gathered(self) -> tuple[Tensor, Tensor]:
-        """View numbers and scores; a view that a distributed sampler handed out twice counts once."""
-        if len(self.views) == 0:
-            raise NerfroError("no view was scored; call update with at least one, or choose a split that has views")
-        numbers, scores = (torchmetrics.utilities.dim_zero_cat(state) for state in (self.views, self.scores))
-        rows = dict(zip(numbers.tolist(), scores, strict=True))
-        order = sorted(rows)
-        return torch.tensor(order), torch.stack([rows[number] for number in order])
-
-    def _notes(self, views: tuple[ViewScores, ...]) -> dict[str, str]:
+    def _notes(self, views: list[ViewScores]) -> dict[str, str]:
         notes = {}
         if any(view.scores["ssim"] is None for view in views):
             notes["ssim"] = f"pictures smaller than its window of {SSIM_WINDOW} pixels"

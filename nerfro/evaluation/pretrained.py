@@ -1,0 +1,114 @@
+"""AlexNet's ImageNet weights: from a file, from the cache of torch hub, or from the network if there is one."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import http.client
+import pickle
+import socket
+import threading
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from nerfro.errors import NerfroError
+
+ALEXNET_URL = "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"  # 233 MB; its SHA-256 begins 7be5be79
+CONNECT_SECONDS = 5.0
+STALL_SECONDS = 30.0
+
+
+def load_alexnet(path: Path | str | None = None, download: bool = True, url: str = ALEXNET_URL) -> dict[str, Tensor]:
+    """Load AlexNet's weights without executing pickled code.
+
+    Args:
+        path: a file that holds the state dict as torchvision publishes it; by default the cache of torch hub is asked,
+            `torch.hub.get_dir()/checkpoints`, which honours TORCH_HOME.
+        download: whether to fetch the file into that cache when it is not there. A network that does not answer within
+            five seconds is given up, once for the whole process.
+        url: where the file is published; the name ends in the first digits of its SHA-256, which is checked.
+
+    Returns:
+        The state dict, on the CPU.
+
+    Raises:
+        NerfroError: if the file cannot be read, or the weights are neither cached nor can be fetched; the message is
+            the reason, in one line.
+    """
+    if path is not None:
+        if not Path(path).is_file():
+            raise NerfroError(f"the AlexNet weights {path} do not exist; give the path of a downloaded {url}")
+        return _read(Path(path))
+    cached = Path(torch.hub.get_dir()) / "checkpoints" / url.rsplit("/", 1)[-1]
+    if not cached.is_file():
+        by_hand = f"put {url} there by hand"
+        if not download:
+            raise NerfroError(f"no AlexNet weights at {cached}; {by_hand}")
+        reason = unreachable(url)
+        if reason:
+            raise NerfroError(f"no AlexNet weights at {cached}, and no network ({reason}); {by_hand}")
+        try:
+            with _socket_timeout(STALL_SECONDS):
+                return torch.hub.load_state_dict_from_url(url, map_location="cpu", check_hash=True, weights_only=True)
+        except (
+            OSError,
+            http.client.HTTPException,
+            RuntimeError,
+        ) as error:  # torch hub says RuntimeError to a wrong hash
+            raise NerfroError(f"the download of AlexNet weights failed ({error}); {by_hand}") from error
+    return _read(cached)
+
+
+@functools.lru_cache
+def unreachable(url: str, seconds: float = CONNECT_SECONDS) -> str:
+    """Say why an address does not answer; the empty string if it does.
+
+    The timeout of a socket bounds neither the resolution of names nor the number of addresses that are tried in turn,
+    so the attempt runs in a thread that is left behind when the time is up.
+
+    Args:
+        url: address to ask for headers only.
+        seconds: wall-clock bound.
+
+    Returns:
+        A reason in a few words, or "".
+    """
+    reasons = [f"no answer within {seconds:g} s"]
+
+    def ask() -> None:
+        try:
+            urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=seconds).close()
+            reasons.append("")
+        except (OSError, http.client.HTTPException) as error:  # URLError, HTTPError and timeouts are OSErrors
+            cause = getattr(error, "reason", error)
+            reasons.append(getattr(cause, "strerror", None) or str(cause))
+
+    thread = threading.Thread(target=ask, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    return reasons[-1]
+
+
+@contextlib.contextmanager
+def _socket_timeout(seconds: float) -> Iterator[None]:
+    """Bound each wait for data: torch hub opens its address without a timeout and would wait for ever."""
+    before = socket.getdefaulttimeout()
+    socket.setdefaulttimeout(seconds)
+    try:
+        yield
+    finally:
+        socket.setdefaulttimeout(before)
+
+
+def _read(path: Path) -> dict[str, Tensor]:
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
+        reason = str(error).partition("\n")[0]
+        raise NerfroError(
+            f"the AlexNet weights {path} cannot be read ({reason}); delete it to fetch it anew"
+        ) from error

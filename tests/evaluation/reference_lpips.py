@@ -1,0 +1,92 @@
+"""LPIPS as torchmetrics or lpips compute it, on a seeded random AlexNet; run as a program of its own.
+
+    python reference_lpips.py {torchmetrics,lpips} INPUT.pt OUTPUT.pt
+
+Both packages take AlexNet from torchvision, which does not load beside a CPU build of torch. Here a module of that name
+that holds nothing but AlexNet stands in for it, which is why this cannot run inside the test process. INPUT holds
+`predictions` and `targets` [B, 3, H, W] in [0, 1]; OUTPUT the backbone's state dict, the distances and, of lpips, the
+distance maps.
+"""
+
+import importlib.machinery
+import sys
+import types
+
+import torch
+from torch import nn
+
+
+class AlexNet(nn.Module):
+    """The feature layers of torchvision's AlexNet, in its numbering, with seeded He initialisation."""
+
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed(7)
+        self.features = nn.Sequential(
+            nn.Conv2d(3, 64, kernel_size=11, stride=4, padding=2),
+            nn.ReLU(inplace=True),
+            nn.MaxPool2d(kernel_size=3, stride=2),
+            nn.Conv2d(64, 192, kernel_size=5, padding=2),
+            nn.ReLU(inplace=True),
+            nn.MaxPool2d(kernel_size=3, stride=2),
+            nn.Conv2d(192, 384, kernel_size=3, padding=1),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(384, 256, kernel_size=3, padding=1),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(256, 256, kernel_size=3, padding=1),
+            nn.ReLU(inplace=True),
+            nn.MaxPool2d(kernel_size=3, stride=2),
+        )
+        for module in self.features:
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight)
+                nn.init.normal_(module.bias, std=0.1)
+
+
+def stand_in_for_torchvision():
+    torchvision = types.ModuleType("torchvision")
+    torchvision.__spec__ = importlib.machinery.ModuleSpec("torchvision", None)
+    torchvision.models = types.ModuleType("torchvision.models")
+    torchvision.models.alexnet = lambda pretrained=True, weights=None: AlexNet()
+    torchvision.models.AlexNet_Weights = types.SimpleNamespace(DEFAULT="seeded")
+    sys.modules["torchvision"] = torchvision
+    sys.modules["torchvision.models"] = torchvision.models
+
+
+def by_torchmetrics(predictions, targets):
+    # The stand-in comes after the import: were it there before, torchmetrics would look for the rest of torchvision.
+    import torchmetrics.functional.image.lpips
+    import torchmetrics.image.lpip
+
+    stand_in_for_torchvision()
+    torchmetrics.functional.image.lpips._TORCHVISION_AVAILABLE = True
+    torchmetrics.image.lpip._TORCHVISION_AVAILABLE = True
+    metric = torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity(
+        net_type="alex", reduction="mean", normalize=True
+    )
+    pairs = zip(predictions[:, None], targets[:, None], strict=True)
+    distances = torch.stack([metric(prediction, target) for prediction, target in pairs])
+    return {"distances": distances, "mean": metric.compute()}
+
+
+def by_lpips(predictions, targets):
+    stand_in_for_torchvision()
+    import lpips
+
+    distances = lpips.LPIPS(net="alex", version="0.1")(predictions, targets, normalize=True).flatten()
+    maps = lpips.LPIPS(net="alex", version="0.1", spatial=True)(predictions, targets, normalize=True)[:, 0]
+    return {"distances": distances, "mean": distances.mean(), "maps": maps}
+
+
+def main():
+    package, source, destination = sys.argv[1:]
+    pictures = torch.load(source)
+    with torch.no_grad():
+        results = {"torchmetrics": by_torchmetrics, "lpips": by_lpips}[package](
+            pictures["predictions"], pictures["targets"]
+        )
+    torch.save({"backbone": AlexNet().state_dict(), **results}, destination)
+
+
+if __name__ == "__main__":
+    main()

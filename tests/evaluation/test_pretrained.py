@@ -1,0 +1,139 @@
+import hashlib
+import http.server
+import io
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerfro.errors import NerfroError
+from nerfro.evaluation import pretrained
+from nerfro.evaluation.pretrained import load_alexnet, unreachable
+
+WEIGHTS = {"features.0.weight": torch.arange(6.0)}
+
+
+def weights_file() -> bytes:
+    stream = io.BytesIO()
+    torch.save(WEIGHTS, stream)
+    return stream.getvalue()
+
+
+class Site(http.server.BaseHTTPRequestHandler):
+    """Answers every address with the weights; below /stalling/ only with the first half of them."""
+
+    content = weights_file()
+    closing = threading.Event()
+
+    def do_HEAD(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(self.content)))
+        self.end_headers()
+
+    def do_GET(self) -> None:
+        self.do_HEAD()
+        if self.path.startswith("/stalling/"):
+            self.wfile.write(self.content[: len(self.content) // 2])
+            self.closing.wait()
+        else:
+            self.wfile.write(self.content)
+
+    def log_message(self, format: str, *arguments: object) -> None:
+        pass
+
+
+@pytest.fixture
+def site() -> Iterator[str]:
+    Site.closing.clear()
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Site) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        Site.closing.set()
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """An empty cache of torch hub."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    unreachable.cache_clear()
+    yield tmp_path / "hub" / "checkpoints"
+    unreachable.cache_clear()
+
+
+def right_name() -> str:
+    return f"alexnet-{hashlib.sha256(Site.content).hexdigest()[:8]}.pth"
+
+
+def assert_same(weights: dict[str, torch.Tensor]) -> None:
+    assert weights.keys() == WEIGHTS.keys()
+    torch.testing.assert_close(weights["features.0.weight"], WEIGHTS["features.0.weight"])
+
+
+def test_weights_are_fetched_once_and_then_read_from_the_cache(site: str, cache: Path) -> None:
+    url = f"{site}/{right_name()}"
+    assert_same(load_alexnet(url=url))
+    assert (cache / right_name()).is_file()
+    assert_same(load_alexnet(url=url, download=False))
+
+
+def test_weights_with_another_hash_are_refused_and_not_kept(site: str, cache: Path) -> None:
+    with pytest.raises(NerfroError, match="hash"):
+        load_alexnet(url=f"{site}/alexnet-00000000.pth")
+    assert list(cache.iterdir()) == []
+
+
+def test_stalled_download_is_given_up_and_leaves_nothing(site: str, cache: Path, monkeypatch) -> None:
+    monkeypatch.setattr(pretrained, "STALL_SECONDS", 0.3)
+    with pytest.raises(NerfroError, match="timed out"):
+        load_alexnet(url=f"{site}/stalling/{right_name()}")
+    assert list(cache.iterdir()) == []
+    assert socket.getdefaulttimeout() is None
+
+
+def test_silent_host_is_given_up() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        url = f"http://127.0.0.1:{silent.getsockname()[1]}/alexnet-00000000.pth"
+        assert unreachable(url, seconds=0.3) in ("no answer within 0.3 s", "timed out")
+
+
+def test_refused_connection_is_the_reason_in_one_line() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        port = closed.getsockname()[1]
+    with pytest.raises(NerfroError, match=r"no network \(Connection refused\)") as caught:
+        load_alexnet(url=f"http://127.0.0.1:{port}/alexnet-00000000.pth")
+    assert "\n" not in str(caught.value)
+
+
+def test_nothing_is_fetched_when_downloads_are_off(site: str, cache: Path) -> None:
+    with pytest.raises(NerfroError, match="no AlexNet weights at"):
+        load_alexnet(url=f"{site}/{right_name()}", download=False)
+    assert not cache.exists()
+
+
+def test_damaged_file_is_named(tmp_path: Path) -> None:
+    damaged = tmp_path / "damaged.pth"
+    damaged.write_bytes(weights_file()[:200])
+    with pytest.raises(NerfroError, match=r"damaged\.pth cannot be read") as caught:
+        load_alexnet(damaged)
+    assert "\n" not in str(caught.value)
+
+
+class Code:
+    """An object whose unpickling runs code."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return (print, ("this must never run",))
+
+
+def test_pickled_code_is_not_executed(tmp_path: Path, capsys) -> None:
+    torch.save({"features.0.weight": Code()}, tmp_path / "evil.pth")
+    with pytest.raises(NerfroError, match="cannot be read"):
+        load_alexnet(tmp_path / "evil.pth")
+    assert "must never run" not in capsys.readouterr().out
