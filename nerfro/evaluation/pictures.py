@@ -1,0 +1,284 @@
+"""Labelled grids of pictures: reference and methods side by side, with enlarged insets and error maps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from nerfro.errors import NerfroError
+from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, magma, squared_error_map
+from nerfro.evaluation.images import to_8bit
+
+GAP = 6  # pixels between pictures
+ROW_GAP = 18  # pixels between views
+TEXT_SIZE = 14  # pixels
+LINE_HEIGHT = 22  # pixels
+CROP_COLOURS = ((225, 60, 50), (45, 125, 235), (40, 165, 85))  # frames of the first, second, ... inset
+PAPER, INK, EMPTY = (255, 255, 255), (25, 25, 25), (225, 225, 225)
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A square part of a picture, in pixels from the upper left corner."""
+
+    top: int
+    left: int
+    size: int
+
+    def of(self, picture: Float[Tensor, "H W C"]) -> Float[Tensor, "size size C"]:
+        """Cut the square out.
+
+        Raises:
+            NerfroError: if it does not lie inside the picture.
+        """
+        height, width = picture.shape[:2]
+        if min(self.top, self.left) < 0 or self.top + self.size > height or self.left + self.size > width:
+            raise NerfroError(f"{self} does not lie inside a picture of {height} x {width} pixels; choose another one")
+        return picture[self.top : self.top + self.size, self.left : self.left + self.size]
+
+
+@dataclass(frozen=True)
+class PictureRow:
+    """One view in a grid.
+
+    Attributes:
+        reference: ground truth, sRGB in [0, 1].
+        predictions: the same view by each method; None where a method has none.
+        label: written at the left, upwards; empty for none.
+        captions: a text below each prediction, such as its PSNR; empty for none.
+        crops: squares that are shown enlarged below the pictures.
+    """
+
+    reference: Float[Tensor, "H W 3"]
+    predictions: Sequence[Float[Tensor, "H W 3"] | None]
+    label: str = ""
+    captions: Sequence[str] = ()
+    crops: Sequence[Crop] = ()
+
+
+def picture_grid(
+    rows: Sequence[PictureRow],
+    titles: Sequence[str],
+    width: int = 256,
+    error_limit: float | None = SQUARED_ERROR_LIMIT,
+) -> Float[Tensor, "H W 3"]:
+    """Draw views as rows and methods as columns, the reference first.
+
+    Each row shows the pictures, below them the insets, below those the squared errors with their colour scale in the
+    column of the reference. Pictures are enlarged without smoothing, so that pixels are seen as they are.
+
+    Args:
+        rows: views.
+        titles: headings of the columns, the reference's first.
+        width: pixels across each column; pictures are brought to it.
+        error_limit: squared error at the last colour of the scale; None to draw no error maps.
+
+    Returns:
+        The drawn grid, sRGB in [0, 1].
+
+    Raises:
+        NerfroError: if there is no row, titles or captions do not fit the predictions, or sizes differ in a row.
+    """
+    _check(rows, titles)
+    margin = LINE_HEIGHT if any(row.label for row in rows) else 0
+    across = margin + len(titles) * (width + GAP) - GAP
+    bands = [_titles_band(titles, margin, width, across)]
+    for index, row in enumerate(rows):
+        if index > 0:
+            bands.append(np.asarray(_paper(across, ROW_GAP)))
+        bands.append(_row_band(row, margin, width, across, error_limit))
+    return torch.from_numpy(np.concatenate(bands)).float() / 255
+
+
+def triptych(
+    prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], error_limit: float = SQUARED_ERROR_LIMIT
+) -> Float[Tensor, "H 3W 3"]:
+    """Prediction, reference and squared error side by side, without text: the picture for a training log.
+
+    Args:
+        prediction: sRGB in [0, 1].
+        target: sRGB in [0, 1].
+        error_limit: squared error at the last colour of the scale.
+
+    Returns:
+        sRGB in [0, 1], on the CPU.
+
+    Raises:
+        NerfroError: if the shapes differ.
+    """
+    error = magma(squared_error_map(prediction, target), error_limit)
+    return torch.cat([prediction.detach().cpu().float().clamp(0, 1), target.detach().cpu().float(), error], dim=1)
+
+
+def most_telling_crop(
+    reference: Float[Tensor, "H W 3"], predictions: Sequence[Float[Tensor, "H W 3"]], size: int
+) -> Crop:
+    """The square in which methods differ most: the largest sum of variances among their squared errors.
+
+    Args:
+        reference: ground truth, sRGB in [0, 1].
+        predictions: the same view by two or more methods; by one, the square of its largest error is taken.
+        size: side of the square in pixels.
+
+    Returns:
+        A square inside the picture.
+
+    Raises:
+        NerfroError: if there is no prediction, or the square is larger than the picture.
+    """
+    if not predictions or not 0 < size <= min(reference.shape[:2]):
+        raise NerfroError(
+            f"cannot choose a crop of {size} pixels among {len(predictions)} pictures of {list(reference.shape[:2])}; "
+            "give at least one prediction and a smaller crop"
+        )
+    errors = torch.stack([squared_error_map(prediction, reference) for prediction in predictions])
+    interest = errors.var(0, correction=0) if len(predictions) > 1 else errors[0]
+    sums = F.avg_pool2d(interest.double()[None, None], size, stride=1)[0, 0]
+    top, left = divmod(int(sums.argmax()), sums.shape[1])
+    return Crop(top, left, size)
+
+
+def _check(rows: Sequence[PictureRow], titles: Sequence[str]) -> None:
+    if not rows:
+        raise NerfroError("a picture grid needs at least one row; give a view that was rendered")
+    for row in rows:
+        if len(row.predictions) + 1 != len(titles):
+            raise NerfroError(
+                f"{len(titles)} titles for a reference and {len(row.predictions)} predictions; give one for each column"
+            )
+        if row.captions and len(row.captions) != len(row.predictions):
+            raise NerfroError(f"{len(row.captions)} captions for {len(row.predictions)} predictions; give one for each")
+        for prediction in row.predictions:
+            if prediction is not None and prediction.shape != row.reference.shape:
+                raise NerfroError(
+                    f"a prediction {list(prediction.shape)} stands beside a reference {list(row.reference.shape)}; "
+                    "all pictures of a row must be of one size"
+                )
+
+
+def _titles_band(titles: Sequence[str], margin: int, width: int, across: int) -> np.ndarray:
+    band = _paper(across, LINE_HEIGHT)
+    for column, title in enumerate(titles):
+        _write(band, title, margin + column * (width + GAP) + width // 2, LINE_HEIGHT // 2)
+    return np.asarray(band)
+
+
+def _row_band(row: PictureRow, margin: int, width: int, across: int, error_limit: float | None) -> np.ndarray:
+    """One row of the grid: a column of stacked cells for each picture, and the row's label."""
+    columns = [
+        _column(row, picture, _caption(row, index), width, error_limit)
+        for index, picture in enumerate([row.reference, *row.predictions])
+    ]
+    band = _paper(across, columns[0].height)
+    for index, column in enumerate(columns):
+        band.paste(column, (margin + index * (width + GAP), 0))
+    if row.label:
+        label = _paper(band.height, margin)
+        _write(label, row.label, band.height // 2, margin // 2)
+        band.paste(label.rotate(90, expand=True), (0, 0))
+    return np.asarray(band)
+
+
+def _caption(row: PictureRow, column: int) -> str | None:
+    """Caption of a column; None where the row has no captions at all, and so no room for them."""
+    if not row.captions:
+        return None
+    return row.captions[column - 1] if column > 0 else ""
+
+
+def _column(
+    row: PictureRow, picture: Tensor | None, caption: str | None, width: int, error_limit: float | None
+) -> Image.Image:
+    """A picture, its caption, its insets and its error map, one above the other."""
+    height = round(width * row.reference.shape[0] / row.reference.shape[1])
+    cells = [_picture_cell(row, picture, width, height)]
+    if caption is not None:
+        cells.append(_paper(width, LINE_HEIGHT))
+        _write(cells[-1], caption, width // 2, LINE_HEIGHT // 2)
+    if row.crops:
+        cells.append(_insets_cell(row.crops, picture, width))
+    if error_limit is not None and picture is row.reference:
+        cells.append(_scale_cell(width, height, error_limit))
+    elif error_limit is not None:
+        error = None if picture is None else magma(squared_error_map(picture.cpu(), row.reference.cpu()), error_limit)
+        cells.append(_fit(error, width, height))
+    column = _paper(width, sum(cell.height + GAP for cell in cells))
+    top = 0
+    for cell in cells:
+        column.paste(cell, (0, top))
+        top += cell.height + GAP
+    return column
+
+
+def _picture_cell(row: PictureRow, picture: Tensor | None, width: int, height: int) -> Image.Image:
+    cell = _fit(picture, width, height)
+    zoom = width / row.reference.shape[1]
+    for index, crop in enumerate(row.crops if picture is not None else ()):
+        corners = [crop.left, crop.top, crop.left + crop.size, crop.top + crop.size]
+        frame = [round(zoom * corner) for corner in corners]
+        ImageDraw.Draw(cell).rectangle(
+            [frame[0], frame[1], frame[2] - 1, frame[3] - 1], outline=_crop_colour(index), width=2
+        )
+    return cell
+
+
+def _insets_cell(crops: Sequence[Crop], picture: Tensor | None, width: int) -> Image.Image:
+    """The crops side by side over the width of the column, framed in their colours."""
+    side = (width - (len(crops) - 1) * GAP) // len(crops)
+    cell = _paper(width, side)
+    for index, crop in enumerate(crops):
+        inset = _fit(None if picture is None else crop.of(picture), side, side)
+        ImageDraw.Draw(inset).rectangle([0, 0, side - 1, side - 1], outline=_crop_colour(index), width=3)
+        cell.paste(inset, (index * (side + GAP), 0))
+    return cell
+
+
+def _scale_cell(width: int, height: int, error_limit: float) -> Image.Image:
+    """The colour scale of the error maps with its ends: without it the maps mean nothing."""
+    cell = _paper(width, height)
+    length, thickness = round(0.8 * width), max(height // 12, 4)
+    left, top = (width - length) // 2, (height - thickness) // 2
+    ramp = magma(torch.linspace(0, error_limit, length).expand(thickness, length), error_limit)
+    cell.paste(_fit(ramp, length, thickness), (left, top))
+    _write(cell, "squared error", width // 2, top - LINE_HEIGHT // 2)
+    below = top + thickness + LINE_HEIGHT // 2
+    _write(cell, "0", left, below)
+    _write(cell, f"≥ {error_limit:g}", left + length, below)
+    return cell
+
+
+def _fit(picture: Float[Tensor, "h w 3"] | None, width: int, height: int) -> Image.Image:
+    """A picture at a size: enlarged by repeating pixels, reduced by averaging; grey where there is none."""
+    if picture is None:
+        cell = Image.new("RGB", (width, height), EMPTY)
+        _write(cell, "n/a", width // 2, height // 2)
+        return cell
+    image = Image.fromarray(to_8bit(picture).cpu().numpy())
+    method = Image.Resampling.NEAREST if width >= image.width else Image.Resampling.BOX
+    return image.resize((width, height), method)
+
+
+def _write(image: Image.Image, text: str, x: int, y: int) -> None:
+    """Write a text around a centre, moved inwards where it would leave the picture."""
+    # Pillow's own font lacks signs such as ≥ and ↑; the one that matplotlib brings along has them.
+    font = ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", TEXT_SIZE)
+    draw = ImageDraw.Draw(image)
+    half = draw.textlength(text, font=font) / 2
+    draw.text((min(max(x, half), image.width - half), y), text, fill=INK, font=font, anchor="mm")
+
+
+def _paper(width: int, height: int) -> Image.Image:
+    return Image.new("RGB", (width, height), PAPER)
+
+
+def _crop_colour(index: int) -> tuple[int, int, int]:
+    return CROP_COLOURS[index % len(CROP_COLOURS)]
