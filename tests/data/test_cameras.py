@@ -1,0 +1,164 @@
+"""Cameras against hand-checked cases and an independent projection in float64."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from nerfro.data.cameras import Cameras, Window, central_window
+from nerfro.errors import NerfroError
+
+
+def cameras_at(poses: np.ndarray, width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Cameras:
+    fill = lambda value: torch.full((len(poses),), value)  # noqa: E731
+    pose = torch.tensor(poses[:, :3], dtype=torch.float32)
+    return Cameras(pose, fill(fx), fill(fy), fill(cx), fill(cy), width, height, 2.0, 6.0)
+
+
+@pytest.fixture
+def cameras() -> Cameras:
+    """Five cameras of any orientation, with unequal focal lengths and the principal point off centre."""
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :3, :3] = Rotation.random(5, random_state=0).as_matrix()
+    poses[:, :3, 3] = np.random.default_rng(0).normal(size=(5, 3))
+    return cameras_at(poses, width=20, height=14, fx=15.0, fy=17.0, cx=9.2, cy=7.7)
+
+
+def distance_to_ray(point: list[float], origin: torch.Tensor, direction: torch.Tensor) -> float:
+    offset = torch.tensor(point) - origin
+    return float(torch.linalg.norm(offset - (offset @ direction) * direction))
+
+
+def test_ray_meets_the_point_that_is_projected_onto_its_pixel_by_hand():
+    # From (0, 0, 4) along -z: (0.4, 0.2, 0) lies 4 in front, so it is seen at 32 + 100 * 0.4 / 4 = 42 from the left
+    # and 24 - 100 * 0.2 / 4 = 19 from the top: the corner of pixel (19, 42).
+    pose = np.eye(4)[None]
+    pose[0, 2, 3] = 4
+    camera = cameras_at(pose, 64, 48, 100.0, 100.0, 32.0, 24.0)
+    zero = torch.tensor([0])
+    corner = camera.rays(zero, torch.tensor([19]), torch.tensor([42]), torch.zeros(1, 2))
+    assert distance_to_ray([0.4, 0.2, 0.0], corner.origins[0], corner.directions[0]) < 1e-6
+    centre = camera.rays(zero, torch.tensor([19]), torch.tensor([42]))
+    assert distance_to_ray([0.42, 0.18, 0.0], centre.origins[0], centre.directions[0]) < 1e-6
+
+
+def test_orbit_camera_looks_at_the_origin_with_the_world_upright():
+    # From (0, -4, 0) with world z up, as Blender writes it: right is +x, up is +z, backward is -y.
+    pose = np.array([[[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]]], dtype=float)
+    camera = cameras_at(pose, 9, 7, 10.0, 10.0, 4.5, 3.5)
+    directions = camera.image_rays(0).directions.reshape(7, 9, 3)
+    assert torch.allclose(directions[3, 4], torch.tensor([0.0, 1.0, 0.0]))
+    assert (directions[0, :, 2] > 0).all() and (directions[-1, :, 2] < 0).all()
+    assert (directions[:, 0, 0] < 0).all() and (directions[:, -1, 0] > 0).all()
+
+
+def test_points_on_rays_project_back_onto_their_pixels(cameras):
+    generator = np.random.default_rng(1)
+    view, row, column = generator.integers(0, [5, 14, 20], size=(200, 3)).T
+    jitter = generator.random((200, 2)).astype(np.float32)
+    rays = cameras.rays(*(torch.from_numpy(a) for a in (view, row, column, jitter)))
+    points = (rays.origins + 3.7 * rays.directions).double().numpy()
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :3] = cameras.camera_to_world.double()
+    # OpenCV's projection matrix K [R | t], from the other end: world to camera, y down, z forward.
+    world_to_camera = np.diag([1.0, -1, -1, 1]) @ np.linalg.inv(poses)
+    camera_matrix = np.array([[15.0, 0, 9.2], [0, 17.0, 7.7], [0, 0, 1]])
+    homogeneous = np.concatenate([points, np.ones((200, 1))], 1)
+    image = np.einsum("ij,rjk,rk->ri", camera_matrix, world_to_camera[view, :3], homogeneous)
+    assert (image[:, 2] > 0).all()
+    np.testing.assert_allclose(image[:, 0] / image[:, 2], column + jitter[:, 0], atol=2e-5)
+    np.testing.assert_allclose(image[:, 1] / image[:, 2], row + jitter[:, 1], atol=2e-5)
+
+
+def test_directions_have_unit_length_and_bounds_are_the_cameras(cameras):
+    rays = cameras.image_rays(2)
+    assert len(rays) == 14 * 20
+    assert torch.allclose(rays.directions.norm(dim=-1), torch.ones(280), atol=1e-6)
+    assert (rays.near == 2).all() and (rays.far == 6).all()
+    assert torch.equal(rays.origins, cameras.camera_to_world[2, :, 3].expand(280, 3))
+
+
+def test_image_rays_go_row_by_row(cameras):
+    index = torch.arange(14 * 20)
+    expected = cameras.rays(torch.full_like(index, 3), index // 20, index % 20)
+    assert torch.equal(cameras.image_rays(3).directions, expected.directions)
+
+
+def test_radii_match_finite_differences_between_neighbouring_pixels(cameras):
+    rays = cameras.image_rays(1)
+    forward = -cameras.camera_to_world[1, :, 2].double()
+    directions = rays.directions.double()
+    at_unit_depth = (directions / (directions @ forward)[:, None]).reshape(14, 20, 3)
+    width = (at_unit_depth[:, 1:] - at_unit_depth[:, :-1]).norm(dim=-1)
+    distance = at_unit_depth[:, :-1].norm(dim=-1)
+    expected = width / distance * 2 / math.sqrt(12)
+    torch.testing.assert_close(rays.radii.double().reshape(14, 20)[:, :-1], expected, rtol=1e-5, atol=0)
+
+
+def test_disc_of_the_radius_has_the_variance_of_the_pixel():
+    camera = cameras_at(np.eye(4)[None], 1, 1, 8.0, 8.0, 0.5, 0.5)
+    radius = float(camera.image_rays(0).radii)
+    # A disc of radius r has variance r^2 / 4 along an axis, a square of side w has w^2 / 12.
+    assert radius**2 / 4 == pytest.approx((1 / 8) ** 2 / 12, rel=1e-6)
+
+
+def test_cropped_cameras_see_the_same_rays_as_the_window_of_the_image(cameras):
+    window = Window(top=3, left=5, height=6, width=9)
+    full = cameras.image_rays(4).directions.reshape(14, 20, 3)
+    cropped = cameras.crop(window)
+    assert (cropped.width, cropped.height) == (9, 6)
+    part = cropped.image_rays(4).directions.reshape(6, 9, 3)
+    torch.testing.assert_close(part, full[3:9, 5:14])
+    images = torch.rand(5, 14, 20, 3)
+    assert torch.equal(window.cut(images), images[:, 3:9, 5:14])
+
+
+@pytest.mark.parametrize(
+    ("size", "fraction", "window"),
+    [((960, 1280), 0.5, (240, 320, 480, 640)), ((15, 11), 0.6, (3, 2, 8, 6)), ((15, 11), 1.0, (0, 0, 15, 11))],
+)
+def test_central_window_has_the_authors_size_and_is_centred(size, fraction, window):
+    assert central_window(*size, fraction) == window
+
+
+@pytest.mark.parametrize("fraction", [0.0, -0.5, 1.5, math.nan, 0.01])
+def test_impossible_crop_is_refused(fraction):
+    with pytest.raises(NerfroError, match="central crop"):
+        central_window(20, 20, fraction)
+
+
+def test_tile_is_a_window_of_some_view(cameras):
+    directions = torch.stack([cameras.image_rays(v).directions for v in range(5)]).reshape(5, 14, 20, 3)
+    windows = directions.unfold(1, 6, 1).unfold(2, 6, 1).permute(0, 1, 2, 4, 5, 3)
+    seen = set()
+    for seed in range(40):
+        tile = cameras.tile(6, torch.Generator().manual_seed(seed))
+        found = ((windows - tile).abs().amax((-1, -2, -3)) < 1e-6).nonzero()
+        assert len(found) == 1
+        seen.add(tuple(found[0].tolist()))
+    view, top, left = (set(place) for place in zip(*seen))
+    assert view == set(range(5)) and len(top) > 5 and len(left) > 8
+
+
+def test_tile_is_clipped_to_the_image_and_repeatable(cameras):
+    first, second = (cameras.tile(128, torch.Generator().manual_seed(7)) for _ in range(2))
+    assert first.shape == (14, 14, 3) and torch.equal(first, second)
+
+
+def test_making_rays_never_waits_for_the_device(cameras):
+    # Tensors on the meta device have no values: reading one on the host raises.
+    there = cameras.to("meta")
+    index = torch.zeros(4, dtype=torch.long, device="meta")
+    assert there.rays(index, index, index, torch.zeros(4, 2, device="meta")).directions.device.type == "meta"
+    assert there.image_rays(1).directions.shape == (280, 3)
+    assert there.tile(4).shape == (4, 4, 3)
+
+
+def test_directions_stay_unit_where_the_rotation_is_rounded(cameras):
+    rounded = replace(cameras, camera_to_world=(cameras.camera_to_world * 1000).round() / 1000)
+    assert torch.allclose(rounded.image_rays(0).directions.norm(dim=-1), torch.ones(280), atol=1e-6)

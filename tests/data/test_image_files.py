@@ -1,0 +1,134 @@
+"""Images and masks of every kind, against slow means and hand-written values."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from nerfro.data.image_files import area_mean, read_mask, read_rgb, read_stack
+from nerfro.errors import NerfroError
+
+
+@pytest.fixture
+def save(tmp_path: Path):
+    def write(levels: np.ndarray, name: str = "image.png", mode: str | None = None) -> Path:
+        image = Image.fromarray(levels)
+        (image.convert(mode) if mode else image).save(tmp_path / name)
+        return tmp_path / name
+
+    return write
+
+
+def levels(*shape: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
+
+
+def test_8bit_levels_are_divided_by_255(save):
+    picture = levels(5, 4, 3)
+    rgb = read_rgb(save(picture), "drop")
+    assert rgb.dtype == np.float32
+    np.testing.assert_allclose(rgb, picture / 255, rtol=1e-6)
+
+
+def test_16bit_levels_keep_all_their_bits(tmp_path: Path):
+    mitsuba = pytest.importorskip("mitsuba")
+    mitsuba.set_variant("scalar_rgb")
+    picture = np.random.default_rng(0).integers(0, 65536, (9, 7, 4), dtype=np.uint16)
+    mitsuba.Bitmap(picture).write(str(tmp_path / "image.png"))
+    rgb = read_rgb(tmp_path / "image.png", "drop")
+    np.testing.assert_array_equal(np.round(rgb.astype(np.float64) * 65535).astype(np.uint16), picture[..., :3])
+
+
+@pytest.mark.parametrize("mode", ["L", "P", "1"])
+def test_grey_palette_and_bilevel_images_become_rgb(save, mode):
+    grey = np.where(levels(5, 4) > 127, 255, 0).astype(np.uint8)
+    expected = np.repeat(grey[..., None] / 255, 3, -1)
+    np.testing.assert_allclose(read_rgb(save(grey, mode=mode), "drop"), expected)
+
+
+def test_transparency_is_dropped_or_composited(save):
+    picture = levels(5, 4, 4)
+    path = save(picture)
+    rgb, opacity = picture[..., :3] / 255, picture[..., 3:] / 255
+    np.testing.assert_allclose(read_rgb(path, "drop"), rgb, rtol=1e-6)
+    np.testing.assert_allclose(read_rgb(path, "white"), rgb * opacity + 1 - opacity, atol=1e-6)
+    np.testing.assert_allclose(read_rgb(path, "black"), rgb * opacity, atol=1e-6)
+
+
+def test_transparent_grey_is_composited(save):
+    picture = levels(5, 4, 2)
+    grey, opacity = picture[..., :1] / 255, picture[..., 1:] / 255
+    expected = np.repeat(grey * opacity + 1 - opacity, 3, -1)
+    np.testing.assert_allclose(read_rgb(save(picture), "white"), expected, atol=1e-6)
+
+
+def test_mask_is_the_share_of_the_pixel(save):
+    mask = np.array([[0, 51, 255]], np.uint8)
+    np.testing.assert_allclose(read_mask(save(mask)), [[0, 0.2, 1]], atol=1e-6)
+
+
+def test_mask_of_labels_and_coloured_mask_mark_the_object(save):
+    labels = np.array([[0, 1, 1, 0]], np.uint8)
+    np.testing.assert_array_equal(read_mask(save(labels)), [[0, 1, 1, 0]])
+    coloured = np.zeros((1, 4, 3), np.uint8)
+    coloured[0, 1:3, 2] = 255
+    np.testing.assert_array_equal(read_mask(save(coloured)), [[0, 1, 1, 0]])
+    assert (read_mask(save(np.zeros((2, 2), np.uint8))) == 0).all()
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 6])
+def test_downscaling_is_the_mean_over_each_block(factor):
+    values = np.random.default_rng(0).random((12, 18, 3), dtype=np.float32)
+    small = area_mean(values, factor, Path("image.png"))
+    assert small.shape == (12 // factor, 18 // factor, 3)
+    for i in range(small.shape[0]):
+        for j in range(small.shape[1]):
+            block = values[i * factor : (i + 1) * factor, j * factor : (j + 1) * factor].astype(np.float64)
+            np.testing.assert_allclose(small[i, j], block.reshape(-1, 3).mean(0), rtol=1e-6)
+
+
+def test_factor_that_does_not_divide_names_those_that_do():
+    with pytest.raises(NerfroError, match=r"downscale=4 does not divide the 18x12 .* choose one of 1, 2, 3, 6"):
+        area_mean(np.zeros((12, 18)), 4, Path("image.png"))
+
+
+def test_stack_keeps_the_order_of_the_files(save):
+    pictures = [levels(4, 6, 3, seed=i) for i in range(9)]
+    paths = [save(picture, f"{i}.png") for i, picture in enumerate(pictures)]
+    stack = read_stack(paths, lambda path: read_rgb(path, "drop"), 2)
+    expected = np.stack(pictures).reshape(9, 2, 2, 3, 2, 3).mean((2, 4)) / 255
+    torch.testing.assert_close(stack, torch.from_numpy(expected).float())
+
+
+@pytest.mark.parametrize("kept", [0, 20, 60, 150])
+def test_truncated_or_corrupt_image_is_named(save, kept):
+    path = save(levels(20, 20, 3))
+    path.write_bytes(path.read_bytes()[:kept])
+    with pytest.raises(NerfroError, match=r"image\.png cannot be read"):
+        read_rgb(path, "drop")
+
+
+def test_file_that_is_no_image_is_named(tmp_path: Path):
+    (tmp_path / "image.png").write_text("no image")
+    with pytest.raises(NerfroError, match=r"image\.png cannot be read"):
+        read_rgb(tmp_path / "image.png", "drop")
+
+
+def test_corrupt_16bit_image_is_named(tmp_path: Path):
+    mitsuba = pytest.importorskip("mitsuba")
+    mitsuba.set_variant("scalar_rgb")
+    path = tmp_path / "image.png"
+    mitsuba.Bitmap(np.ones((20, 20, 3), np.uint16)).write(str(path))
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(NerfroError, match=r"image\.png cannot be read \(it is truncated\)"):
+        read_rgb(path, "drop")
+
+
+def test_floating_point_image_is_refused(tmp_path: Path):
+    Image.fromarray(np.zeros((2, 2), np.float32)).save(tmp_path / "image.tif")
+    with pytest.raises(NerfroError, match=r"mode F, which is not supported; save it as 8- or 16-bit PNG"):
+        read_rgb(tmp_path / "image.tif", "drop")

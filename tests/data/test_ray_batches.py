@@ -1,0 +1,153 @@
+"""Random training pixels: which ones, how often, and the same ones after a resume."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+import numpy as np
+import pytest
+import torch
+
+from nerfro.data.base import Views
+from nerfro.data.cameras import Cameras
+from nerfro.data.ray_batches import RayBatches
+from nerfro.errors import NerfroError
+
+NUM_VIEWS, HEIGHT, WIDTH = 5, 12, 16
+
+
+@pytest.fixture
+def views() -> Views:
+    """Views whose colours name the pixel: view, row and column."""
+    generator = torch.Generator().manual_seed(0)
+    poses = torch.linalg.qr(torch.randn(NUM_VIEWS, 3, 3, generator=generator)).Q
+    poses = torch.cat([poses, torch.randn(NUM_VIEWS, 3, 1, generator=generator)], -1)
+    full = torch.ones(NUM_VIEWS)
+    cameras = Cameras(poses, 20 * full, 20 * full, 8 * full, 6 * full, WIDTH, HEIGHT, 2.0, 6.0)
+    index = torch.meshgrid(*(torch.arange(n) for n in (NUM_VIEWS, HEIGHT, WIDTH)), indexing="ij")
+    return Views(cameras, torch.stack(index, -1).float() / 16, None, [f"r_{i}" for i in range(NUM_VIEWS)])
+
+
+def place(index: torch.Tensor) -> torch.Tensor:
+    """View, row and column [R, 3] of ray identities, the slow way."""
+    return torch.tensor(np.stack(np.unravel_index(index.numpy(), (NUM_VIEWS, HEIGHT, WIDTH)), -1))
+
+
+@pytest.mark.parametrize("batching", ["single_image", "all_images"])
+def test_rays_and_colours_belong_to_the_index(views, batching):
+    batch = RayBatches(views, 50, batching, seed=3).batch(7)
+    view, row, column = place(batch.index).unbind(-1)
+    assert torch.equal(batch.rgb, torch.stack([view, row, column], -1).float() / 16)
+    assert torch.equal(batch.rays.directions, views.cameras.rays(view, row, column).directions)
+    assert torch.equal(batch.rays.origins, views.cameras.camera_to_world[view, :, 3])
+
+
+@pytest.mark.parametrize("batching", ["single_image", "all_images"])
+def test_batch_depends_on_seed_and_step_alone(views, batching):
+    batches = RayBatches(views, 30, batching, seed=3, jitter=True)
+    in_order = [batches.batch(step) for step in range(6)]
+    again = RayBatches(views, 30, batching, seed=3, jitter=True)
+    for step in (5, 0, 3):
+        assert torch.equal(again.batch(step).index, in_order[step].index)
+        assert torch.equal(again.batch(step).rays.directions, in_order[step].rays.directions)
+    other = RayBatches(views, 30, batching, seed=4, jitter=True)
+    assert not torch.equal(other.batch(0).index, in_order[0].index)
+    assert not torch.equal(in_order[0].index, in_order[1].index)
+
+
+def test_iteration_resumed_at_a_step_goes_on_with_the_same_batches(views):
+    whole = list(islice(RayBatches(views, 30, seed=1), 8))
+    rest = list(islice(RayBatches(views, 30, seed=1, first_step=5), 3))
+    assert [b.index.tolist() for b in rest] == [b.index.tolist() for b in whole[5:]]
+
+
+def test_batches_ignore_and_spare_the_global_generators(views):
+    torch.manual_seed(0)
+    np.random.seed(0)
+    before = torch.get_rng_state(), np.random.get_state()[1].copy()
+    first = RayBatches(views, 30, seed=1).batch(0).index
+    assert torch.equal(torch.get_rng_state(), before[0]) and (np.random.get_state()[1] == before[1]).all()
+    torch.manual_seed(99)
+    assert torch.equal(RayBatches(views, 30, seed=1).batch(0).index, first)
+
+
+def test_single_image_draws_different_pixels_of_one_image(views):
+    batches = RayBatches(views, HEIGHT * WIDTH, "single_image", seed=0)
+    seen = set()
+    for step in range(40):
+        index = batches.batch(step).index
+        view = index // (HEIGHT * WIDTH)
+        assert len(index.unique()) == HEIGHT * WIDTH and len(view.unique()) == 1
+        seen.add(int(view[0]))
+    assert seen == set(range(NUM_VIEWS))
+
+
+@pytest.mark.parametrize("batching", ["single_image", "all_images"])
+def test_every_pixel_is_drawn_equally_often(views, batching):
+    batches = RayBatches(views, 96, batching, seed=0)
+    counts = torch.zeros(NUM_VIEWS * HEIGHT * WIDTH)
+    for step in range(2000):
+        counts += torch.bincount(batches.batch(step).index, minlength=len(counts))
+    mean = 2000 * 96 / len(counts)
+    # A pixel is drawn 200 +- 14 times either way; six deviations.
+    assert counts.sum() == 2000 * 96
+    assert (counts - mean).abs().max() < 6 * mean**0.5
+
+
+@pytest.mark.parametrize("batching", ["single_image", "all_images"])
+def test_precrop_draws_from_the_middle_and_ends_on_time(views, batching):
+    batches = RayBatches(views, 40, batching, seed=0, precrop_steps=30, precrop_fraction=0.5)
+    cropped = torch.cat([place(batches.batch(step).index) for step in range(30)])
+    assert cropped[:, 1].unique().tolist() == list(range(3, 9))
+    assert cropped[:, 2].unique().tolist() == list(range(4, 12))
+    whole = torch.cat([place(batches.batch(step).index) for step in range(30, 60)])
+    assert whole[:, 1].unique().tolist() == list(range(HEIGHT))
+    assert whole[:, 2].unique().tolist() == list(range(WIDTH))
+
+
+def test_batch_carries_the_cameras_of_the_window_it_is_drawn_from(views):
+    batches = RayBatches(views, 40, seed=0, precrop_steps=1)
+    middle, whole = batches.batch(0).cameras, batches.batch(1).cameras
+    assert (middle.width, middle.height) == (8, 6) and (whole.width, whole.height) == (WIDTH, HEIGHT)
+    full = views.cameras.image_rays(2).directions.reshape(HEIGHT, WIDTH, 3)
+    torch.testing.assert_close(middle.image_rays(2).directions.reshape(6, 8, 3), full[3:9, 4:12])
+
+
+def test_jittered_rays_stay_inside_their_pixels_and_fill_them(views):
+    batches = RayBatches(views, 192, seed=0, jitter=True)
+    offsets = []
+    for step in range(20):
+        batch = batches.batch(step)
+        view, row, column = place(batch.index).unbind(-1)
+        axes = views.cameras.camera_to_world[view, :, :3]
+        x, y, z = torch.einsum("rij,ri->rj", axes, batch.rays.directions).unbind(-1)
+        offsets.append(torch.stack([8 - 20 * x / z - column, 6 + 20 * y / z - row], -1))
+    offset = torch.cat(offsets)
+    assert offset.min() > -1e-4 and offset.max() < 1 + 1e-4
+    # The mean of 3840 uniform numbers is .5 +- .0047.
+    assert torch.allclose(offset.mean(0), torch.tensor(0.5), atol=0.025)
+    assert torch.allclose(offset.std(0), torch.tensor(12**-0.5), atol=0.02)
+
+
+def test_making_a_batch_never_waits_for_the_device(views):
+    batches = RayBatches(views, 30, seed=0, precrop_steps=1, jitter=True)
+    there = batches.to("meta")
+    assert there.batch(0).rgb.device.type == "meta" and there.batch(1).rays.radii.device.type == "meta"
+    assert batches.batch(0).rgb.device.type == "cpu"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"batch_size": 193}, "batch_size=193 exceeds the 16x12 pixels"),
+        ({"batch_size": 49, "precrop_steps": 1}, "batch_size=49 exceeds the 8x6 pixels"),
+        ({"batch_size": 0}, "batch_size=0 is too small"),
+        ({"batch_size": 1, "seed": -1}, "seed=-1 is too small"),
+        ({"batch_size": 1, "precrop_steps": -1}, "precrop_steps=-1 is too small"),
+        ({"batch_size": 1, "batching": "both"}, "batching='both' is unknown; choose 'single_image' or 'all_images'"),
+        ({"batch_size": 1, "precrop_steps": 1, "precrop_fraction": 2.0}, "central crop of 2.0"),
+    ],
+)
+def test_option_out_of_range_is_refused(views, options, message):
+    with pytest.raises(NerfroError, match=message):
+        RayBatches(views, **options)
