@@ -78,7 +78,7 @@ class TrainingProgress(ProgressBar):
         self._begun, self._begun_at = time.perf_counter(), training_progress(trainer)
         form = "{desc} {percentage:3.0f}%|{bar}| {postfix}"
         self._bar = tqdm(
-            total=1.0, desc="train", bar_format=form, dynamic_ncols=True, disable=not (self._enabled and self.is_enabled)
+            total=1.0, desc="train", bar_format=form, dynamic_ncols=True, disable=not self._enabled
         )
 
     def on_train_batch_end(

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -32,26 +33,37 @@ def entry_point(config_name: str, schema: type) -> Callable[[Callable[[DictConfi
 
     def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
         @functools.wraps(task)
+        def job(config: DictConfig) -> None:
+            with _errors_in_one_line():  # inside the job too, or Hydra prints a line of its own first
+                task(config)
+
+        @functools.wraps(task)
         def run() -> None:
             # Without this Hydra prints its own report of errors and exits, before we can.
             os.environ["HYDRA_FULL_ERROR"] = "1"
-            try:
+            with _errors_in_one_line():
                 ConfigStore.instance().store(name=f"{config_name}_schema", node=schema, provider="nerfro")
                 discover()
-                hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(task)()
-            except NerfroError as error:
-                _fail(str(error))
-            except (HydraException, OmegaConfBaseException) as error:
-                _fail(" ".join(_messages(error)))
-            except OSError as error:
-                _fail(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}")
-            except KeyboardInterrupt:
-                print("nerfro: interrupted", file=sys.stderr)
-                sys.exit(EXIT_INTERRUPTED)
+                hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(job)()
 
         return run
 
     return decorate
+
+
+@contextlib.contextmanager
+def _errors_in_one_line() -> Iterator[None]:
+    try:
+        yield
+    except NerfroError as error:
+        _fail(str(error))
+    except (HydraException, OmegaConfBaseException) as error:
+        _fail(" ".join(_messages(error)))
+    except OSError as error:
+        _fail(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}")
+    except KeyboardInterrupt:
+        print("nerfro: interrupted", file=sys.stderr)
+        sys.exit(EXIT_INTERRUPTED)
 
 
 def _messages(error: BaseException) -> list[str]:

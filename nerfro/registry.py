@@ -25,6 +25,7 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from torch import nn
 
 from nerfro.errors import NerfroError
 from nerfro.paths import PLUGINS_DIR
@@ -173,7 +174,9 @@ def configure(plugin: Plugin, node: DictConfig | Mapping[str, object]) -> dict[s
     """
     where = f"{plugin.kind}={plugin.name}"
     try:
-        merged = OmegaConf.merge(OmegaConf.structured(plugin.config), node)
+        # Resolved in its place first: a merged copy could not look its interpolations up.
+        given = OmegaConf.to_container(node, resolve=True) if isinstance(node, DictConfig) else dict(node)
+        merged = OmegaConf.merge(OmegaConf.structured(plugin.config), given)
         values = OmegaConf.to_container(merged, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
         known = ", ".join(name for name, _, _ in plugin.fields()) or "none"
@@ -246,7 +249,9 @@ def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
     fields: list[tuple[str, Any, Any]] = []
     choices: dict[str, tuple[object, ...]] = {}
     parts: set[str] = set()
-    for parameter in list(inspect.signature(cls.__init__).parameters.values())[1:]:
+    # Classes without a constructor of their own have no configuration; nn.Module's takes anything.
+    own = cls.__init__ not in (object.__init__, nn.Module.__init__)
+    for parameter in list(inspect.signature(cls.__init__).parameters.values())[1:] if own else []:
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             raise NerfroError(f"{kind}={name}: its constructor takes *{parameter.name}; name every parameter instead")
         hint = hints.get(parameter.name)

@@ -1,0 +1,158 @@
+"""Our modules against one forward and backward pass of the authors' code, recorded in reference_sphere.npz.
+
+Set NERFRO_REFERENCE to compare with another recording of the same keys.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from nerfro.boundaries.skybox import Skybox
+from nerfro.fields.nerf import NerfField
+from nerfro.losses.base import Loss
+from nerfro.losses.boundary import BoundaryRegulariser
+from nerfro.losses.photometric import Photometric
+from nerfro.losses.smoothness import Smoothness
+from nerfro.media.voxel_grid import VoxelGrid
+from nerfro.models.base import Parts
+from nerfro.models.optimizer import OptimizerConfig
+from nerfro.models.refractive import RefractiveModel
+from nerfro.samplers.eikonal import Eikonal
+from nerfro.samplers.hierarchical import Hierarchical
+from nerfro.types import Batch, Rays, Rendering
+
+RECORDING = Path(os.environ.get("NERFRO_REFERENCE", Path(__file__).parent / "reference_sphere.npz"))
+
+
+class RecordedTile:
+    """Stands in for the training cameras: its one tile of directions is the recorded one."""
+
+    def __init__(self, directions: Tensor) -> None:
+        self.directions = directions
+
+    def tile(self, size: int) -> Tensor:
+        assert self.directions.shape[:2] == (size, size)
+        return self.directions
+
+
+@pytest.fixture(scope="module")
+def recorded() -> dict[str, Tensor]:
+    with np.load(RECORDING, allow_pickle=False) as file:
+        return {key: torch.from_numpy(np.asarray(file[key])) for key in file.files}
+
+
+@pytest.fixture(scope="module")
+def medium(recorded: dict[str, Tensor]) -> VoxelGrid:
+    size, sigma = recorded["kernel"].tolist()
+    return VoxelGrid.from_occupancy(
+        recorded["occupancy"], recorded["box"], float(recorded["n_object"]), int(size), sigma
+    )
+
+
+@pytest.fixture(scope="module")
+def batch(recorded: dict[str, Tensor]) -> Batch:
+    num_rays = len(recorded["origins"])
+    near, far = (recorded[key].expand(num_rays) for key in ("near", "far"))
+    rays = Rays(recorded["origins"], recorded["directions"], torch.zeros(num_rays), near, far)
+    tile = RecordedTile(recorded["sky_patch_directions"])
+    return Batch(rays, recorded["target_rgb"], torch.arange(num_rays), tile)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def model(recorded: dict[str, Tensor], medium: VoxelGrid) -> RefractiveModel:
+    num_coarse, steps = int(recorded["num_coarse"]), int(recorded["steps_per_coarse"])
+    losses: dict[str, Loss] = {
+        "photometric": Photometric(),
+        "boundary": BoundaryRegulariser(weight=0.025, start=0),
+        "smoothness": Smoothness(weight=1.0, start=0, tile_size=len(recorded["sky_patch_directions"])),
+    }
+    width = recorded["weight/coarse_mlp/Dense_0/kernel"].shape[1]
+    view_width = recorded["weight/coarse_mlp/Dense_10/kernel"].shape[1]
+    parts = Parts(
+        medium=medium,
+        path_sampler=Eikonal("euler", num_coarse * steps),
+        point_sampler=Hierarchical(num_coarse, int(recorded["num_fine"]), draw="vertices", offset=0.0),
+        make_field=lambda: NerfField(width=width, view_width=view_width),
+        boundary=Skybox(width=recorded["weight/bkgd_mlp/Dense_0/kernel"].shape[1]),
+        losses=losses,
+        optimizer=OptimizerConfig(),
+    )
+    model = RefractiveModel(parts, boundary_direction="last_coarse").eval()
+    for name, layer in layers(model).items():
+        layer.weight.data.copy_(recorded[f"weight/{name}/kernel"].T)
+        layer.bias.data.copy_(recorded[f"weight/{name}/bias"])
+    return model
+
+
+@pytest.fixture(scope="module")
+def renderings(model: RefractiveModel, batch: Batch) -> list[Rendering]:
+    return model(batch.rays)
+
+
+def layers(model: RefractiveModel) -> dict[str, nn.Linear]:
+    """Our layers by the authors' names."""
+    named: dict[str, nn.Linear] = {}
+    for network, field in zip(("coarse_mlp", "fine_mlp"), model.fields, strict=True):
+        mlp = field.mlp
+        for i, layer in enumerate((*mlp.trunk.layers, mlp.density, mlp.bottleneck, mlp.view, mlp.rgb)):
+            named[f"{network}/Dense_{i}"] = layer
+    for i, layer in enumerate((*model.boundary.trunk.layers, model.boundary.rgb)):
+        named[f"bkgd_mlp/Dense_{i}"] = layer
+    return named
+
+
+def test_parity_of_the_smoothed_grid(recorded: dict[str, Tensor], medium: VoxelGrid) -> None:
+    assert_close(medium.table[..., 0], recorded["n_smoothed"], 1e-5)
+
+
+def test_parity_of_the_path(recorded: dict[str, Tensor], renderings: list[Rendering], medium: VoxelGrid) -> None:
+    path = renderings[0].path
+    assert_close(path.positions, recorded["path_positions"], 1e-4)
+    assert_close(path.s, recorded["path_distances"], 1e-4)
+    assert_close(path.directions, recorded["path_directions"], 1e-4)
+    ior, gradient = medium(path.positions)
+    assert_close(ior, recorded["path_ior"], 1e-4)
+    # The gradient jumps from cell to cell of a 40^3 grid, so positions 1e-5 apart may see it differ by more.
+    assert_close(gradient, recorded["path_ior_gradient"], 1e-3)
+
+
+@pytest.mark.parametrize(("level", "name"), [(0, "coarse"), (1, "fine")])
+def test_parity_of_the_rendering(
+    level: int, name: str, recorded: dict[str, Tensor], renderings: list[Rendering]
+) -> None:
+    rendering = renderings[level]
+    assert_close(rendering.rgb, recorded[f"{name}_rgb"], 1e-3)
+    assert_close(rendering.transmittance, recorded[f"{name}_transmittance"][:, 0], 1e-3)
+    assert_close(rendering.opacity, recorded[f"{name}_opacity"], 1e-3)
+
+
+def test_parity_of_the_losses_and_their_gradients(
+    recorded: dict[str, Tensor], renderings: list[Rendering], model: RefractiveModel, batch: Batch
+) -> None:
+    values = {name: loss(renderings, batch, model) for name, loss in model.losses.items()}
+    fine_only = model.losses["photometric"](renderings[1:], batch, model)
+    assert_relative(fine_only, recorded["loss_rgb_fine"], 1e-3)
+    assert_relative(values["photometric"] - fine_only, recorded["loss_rgb_coarse"], 1e-3)
+    assert_relative(values["boundary"], recorded["loss_boundary"], 1e-3)
+    assert_relative(values["smoothness"], recorded["loss_smoothness"], 1e-3)
+    total = sum(loss.weight_at(0) * values[name] for name, loss in model.losses.items())
+    assert_relative(total, recorded["loss_total"], 1e-3)
+    model.zero_grad()
+    total.backward()
+    for name, layer in layers(model).items():
+        assert_relative(layer.weight.grad.norm(), recorded[f"gradnorm/{name}/kernel"], 1e-2)
+        assert_relative(layer.bias.grad.norm(), recorded[f"gradnorm/{name}/bias"], 1e-2)
+
+
+def assert_close(ours: Tensor, theirs: Tensor, tolerance: float) -> None:
+    torch.testing.assert_close(ours.detach(), theirs, rtol=0, atol=tolerance)
+
+
+def assert_relative(ours: Tensor, theirs: Tensor, tolerance: float) -> None:
+    torch.testing.assert_close(ours.detach(), theirs, rtol=tolerance, atol=0)
