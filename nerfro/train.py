@@ -9,7 +9,6 @@ from datetime import timedelta
 from pathlib import Path
 
 import lightning.pytorch as pl
-import rich
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.loggers import Logger
@@ -21,11 +20,10 @@ from nerfro.config import TrainConfig, build_model
 from nerfro.data.module import RayDataModule
 from nerfro.data.ray_batches import RayBatches
 from nerfro.errors import NerfroError
+from nerfro.evaluate import report
 from nerfro.evaluation.lpips import find_lpips_network
 from nerfro.evaluation.metrics import ImageMetrics
-from nerfro.evaluation.results import write_metrics_json
 from nerfro.evaluation.score_views import score_views
-from nerfro.evaluation.tables import to_rich, views_table, write_table
 from nerfro.registry import build
 from nerfro.run_folder import (
     LAST_CHECKPOINT,
@@ -82,12 +80,10 @@ def main(config: DictConfig) -> None:
     model.to(trainer.strategy.root_device)
     metrics = ImageMetrics(*find_lpips_network(config.evaluation.lpips_backbone), prefix=config.evaluation.split)
     result = score_views(model, test, metrics, folder)
-    steps, rate = trainer.global_step, throughput.rays_per_second
-    write_metrics_json(folder / "metrics.json", result, steps, throughput.seconds, rate)
-    table = views_table(result, f"{config.name} on {config.data.root}, {config.evaluation.split} views")
-    write_table(table, folder / "metrics")
-    rich.print(to_rich(table))
-    print(f"{steps} steps in {throughput.seconds:.0f} s ({rate or 0:,.0f} rays/s). Look at:")
+    title = f"{config.name} on {config.data.root}, {config.evaluation.split} views"
+    report(result, title, folder, trainer.global_step, throughput.state_dict())
+    print(f"{trainer.global_step} steps in {throughput.seconds:.0f} s, {throughput.rays_per_second or 0:,.0f} rays/s.")
+    print("Look at:")
     print(f"  {folder}/images/  the pictures; metrics.json, .csv, .md and .tex beside them")
     print(f"  {folder}/checkpoints/last.ckpt  evaluate it with python -m nerfro.evaluate checkpoint=...")
     print(f"  tensorboard --logdir {folder.parent}  losses and validation pictures")
