@@ -18,5 +18,7 @@ class Medium(nn.Module, ABC):
     box: Float[Tensor, "2 3"]
 
     @abstractmethod
-    def forward(self, positions: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+    def forward(
+        self, positions: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         """Refractive index and its gradient (per world unit)."""

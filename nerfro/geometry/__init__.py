@@ -1,0 +1,1 @@
+"""Meshes, grids made of them, and interpolation on grids."""

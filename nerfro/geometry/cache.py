@@ -1,0 +1,92 @@
+"""Arrays that are dear to compute, kept on disk under a hash of everything they depend on."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from nerfro.errors import NerfroError
+
+
+def cache_dir() -> Path:
+    """Where computed grids and paths are kept: `NERFRO_CACHE`, else ~/.cache/nerfro."""
+    return Path(os.environ.get("NERFRO_CACHE") or "~/.cache/nerfro").expanduser()
+
+
+def content_hash(*parts: np.ndarray | str | float | int | bool) -> str:
+    """Hexadecimal hash of arrays (type, shape and bytes) and plain values, in order."""
+    digest = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, np.ndarray):
+            digest.update(f"{part.dtype}{part.shape}".encode())
+            digest.update(np.ascontiguousarray(part).data)
+        else:
+            digest.update(f"{type(part).__name__}:{part!r};".encode())
+    return digest.hexdigest()[:32]
+
+
+def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write a compressed .npz so that the file is either complete or not there.
+
+    Raises:
+        NerfroError: the folder cannot be written or the disk is full; nothing that was there is lost.
+    """
+    temporary = ""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
+            temporary = file.name
+            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+        os.replace(temporary, path)
+    except OSError as error:
+        if temporary:
+            Path(temporary).unlink(missing_ok=True)
+        raise NerfroError(f"cannot write {path}: {error.strerror}; free space or choose another folder") from error
+
+
+def load_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Read a .npz without executing pickled code.
+
+    Raises:
+        NerfroError: the file is missing, truncated or holds anything but plain arrays.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except FileNotFoundError as error:
+        raise NerfroError(f"{path} does not exist; check the path") from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise NerfroError(f"{path} is not a readable .npz of plain arrays ({error}); make it again") from error
+
+
+Arrays = dict[str, np.ndarray]
+
+
+def cached_arrays(key: str, compute: Callable[[], Arrays], enabled: bool = True) -> Arrays:
+    """Arrays from the cache, or computed and kept there; a damaged or unwritable cache costs time, never the result.
+
+    Args:
+        key: name of the entry, with a hash of all that the arrays depend on in it.
+        compute: makes the arrays.
+        enabled: whether to read and write the cache at all.
+    """
+    if not enabled:
+        return compute()
+    path = cache_dir() / f"{key}.npz"
+    if path.is_file():
+        try:
+            return load_arrays(path)
+        except NerfroError:
+            path.unlink(missing_ok=True)
+    arrays = compute()
+    try:
+        save_arrays(path, arrays)
+    except NerfroError:
+        return arrays
+    return arrays

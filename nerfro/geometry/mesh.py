@@ -1,0 +1,80 @@
+"""Triangle meshes as two arrays, read from any format trimesh knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from nerfro.errors import NerfroError
+
+
+@dataclass(frozen=True)
+class TriangleMesh:
+    """Triangles in world units; outward faces are counter-clockwise.
+
+    Attributes:
+        vertices: corner positions.
+        faces: vertex indices of each triangle.
+    """
+
+    vertices: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
+
+    @property
+    def triangles(self) -> Float[np.ndarray, "F 3 3"]:
+        return self.vertices[self.faces]
+
+    @property
+    def bounds(self) -> Float[np.ndarray, "2 3"]:
+        return np.stack([self.vertices.min(0), self.vertices.max(0)])
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether every edge belongs to an even number of triangles, so that inside and outside are defined."""
+        edges = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        _, uses = np.unique(edges, axis=0, return_counts=True)
+        return bool((uses % 2 == 0).all())
+
+
+def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
+    """Read a triangle mesh and merge its duplicate vertices.
+
+    Args:
+        path: file of any format trimesh reads (ply, obj, stl, glb, ...).
+        accept_open_mesh: take meshes with holes as well.
+
+    Raises:
+        NerfroError: the file is missing, unreadable, empty, not finite, or has holes.
+    """
+    import trimesh
+
+    if not path.is_file():
+        raise NerfroError(f"mesh {path} does not exist; set medium.mesh to a closed triangle mesh (ply, obj, stl, glb)")
+    try:
+        loaded = trimesh.load(path, force="mesh", process=False)
+    except Exception as error:  # trimesh's readers raise whatever their parsers do
+        raise NerfroError(f"mesh {path} cannot be read ({error}); export it as ply, obj, stl or glb") from error
+    vertices = np.asarray(getattr(loaded, "vertices", ()), np.float64)
+    faces = np.asarray(getattr(loaded, "faces", ()), np.int64)
+    if len(vertices) == 0 or len(faces) == 0:
+        raise NerfroError(f"mesh {path} has no triangles; export a surface, not a point cloud or a scene without one")
+    if not np.isfinite(vertices).all():
+        raise NerfroError(f"mesh {path} has vertices that are not finite; export it again")
+    mesh = merge_vertices(vertices, faces)
+    if not accept_open_mesh and not mesh.is_closed:
+        raise NerfroError(
+            f"mesh {path} is not watertight, so its inside is not defined; close its holes, "
+            "or set medium.accept_open_mesh=true to decide by majority along the three axes"
+        )
+    return mesh
+
+
+def merge_vertices(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> TriangleMesh:
+    """Unite vertices at equal positions (texture seams and STL files repeat them) and drop collapsed triangles."""
+    unique, inverse = np.unique(vertices, axis=0, return_inverse=True)
+    merged = inverse.reshape(-1)[faces]
+    distinct = (merged[:, 0] != merged[:, 1]) & (merged[:, 1] != merged[:, 2]) & (merged[:, 2] != merged[:, 0])
+    return TriangleMesh(unique, merged[distinct])

@@ -1,0 +1,230 @@
+"""The paper's medium: a mesh, voxelised to occupancy fractions and smoothed (paper, section 3.1)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from nerfro.errors import NerfroError
+from nerfro.geometry.cache import cached_arrays, content_hash, load_arrays, save_arrays
+from nerfro.geometry.interpolation import trilinear
+from nerfro.geometry.mesh import TriangleMesh, load_mesh
+from nerfro.geometry.occupancy import occupancy_fraction
+from nerfro.media.base import Medium
+from nerfro.paths import resolve_path
+from nerfro.registry import register
+
+
+@register("medium", "voxel_grid")
+class VoxelGrid(Medium):
+    """A grid of refractive index and gradient, made of a mesh by super-sampling and Gaussian smoothing (the paper's).
+
+    n = 1 + (ior - 1) * smooth(occupancy); grad n is the central difference of n on the grid; both are interpolated
+    trilinearly between the vertices, so the gradient that is returned is not the derivative of the n that is returned.
+
+    Attributes:
+        table: n and grad n (per world unit) at each vertex.
+        occupancy: fraction inside the mesh, before smoothing.
+    """
+
+    table: Float[Tensor, "X Y Z 4"]
+    occupancy: Float[Tensor, "X Y Z"]
+
+    def __init__(
+        self,
+        mesh: str | None = None,
+        ior: float = 1.5,
+        resolution: int = 128,
+        box_min: list[float] = [-1.5, -1.5, -1.5],  # noqa: B006 (the registry reads and copies it)
+        box_max: list[float] = [1.5, 1.5, 1.5],  # noqa: B006
+        smoothing_size: int = 9,
+        smoothing_sigma: float = 1.0,
+        subsamples: int = 4,
+        accept_open_mesh: bool = False,
+        cache: bool = True,
+        grid: str | None = None,
+    ) -> None:
+        """Voxelise a mesh, or load a grid.
+
+        Args:
+            mesh: closed triangle mesh in world units, any format trimesh reads.
+            ior: refractive index inside the mesh.
+            resolution: grid vertices a side.
+            box_min, box_max: corners of the grid, world units; the object needs a margin of air inside.
+            smoothing_size: taps of the Gaussian kernel a side, odd; 0 for none.
+            smoothing_sigma: standard deviation of the kernel, voxels.
+            subsamples: inside tests a side around each vertex.
+            accept_open_mesh: take a mesh with holes; the majority of three axes decides what is inside.
+            cache: keep the occupancy in the cache folder.
+            grid: file written by `save`, used with the box, index and smoothing it holds instead of all the above.
+
+        Raises:
+            NerfroError: no or two sources, a bad mesh, a bad box, or an object without a margin.
+        """
+        super().__init__()
+        if (mesh is None) == (grid is None):
+            raise NerfroError("medium=voxel_grid needs one source; set either medium.mesh or medium.grid")
+        if grid is not None:
+            stored = _load_grid(resolve_path(grid))
+            self._set(*stored)
+            return
+        box = check_box(box_min, box_max, resolution)
+        loaded = load_mesh(resolve_path(str(mesh)), accept_open_mesh)
+        # One voxel for the sub-samples, one for the gradient's difference, and what the smoothing spreads.
+        check_margin(loaded, box, (2 + smoothing_size // 2) * (box[1] - box[0]) / (resolution - 1))
+        key = "occupancy_" + content_hash(loaded.vertices, loaded.faces, box, resolution, subsamples)
+        occupancy = cached_arrays(
+            key,
+            # Multiples of 1/64 are exact in half precision.
+            lambda: {"occupancy": occupancy_fraction(loaded, box, resolution, subsamples).astype(np.float16)},
+            cache,
+        )["occupancy"]
+        fractions, corners = torch.from_numpy(occupancy).float(), torch.from_numpy(box).float()
+        self._set(fractions, corners, ior, smoothing_size, smoothing_sigma)
+
+    @classmethod
+    def from_occupancy(
+        cls,
+        occupancy: Float[Tensor, "X Y Z"],
+        box: Float[Tensor, "2 3"],
+        ior: float,
+        size: int,
+        sigma: float,
+    ) -> VoxelGrid:
+        """Make the medium of given occupancy fractions.
+
+        Args:
+            occupancy: fraction of object at each vertex, 0 to 1; air at the border.
+            box: corners of the grid, world units.
+            ior: refractive index of the object.
+            size, sigma: taps a side and standard deviation (voxels) of the smoothing kernel.
+        """
+        medium = cls.__new__(cls)
+        Medium.__init__(medium)
+        medium._set(occupancy, box, ior, size, sigma)
+        return medium
+
+    def _set(self, occupancy: Tensor, box: Tensor, ior: float, size: int, sigma: float) -> None:
+        if not ior > 0:
+            raise NerfroError(f"medium.ior={ior} is not a refractive index; give a positive number such as 1.5")
+        if any(float(face.abs().max()) > 0 for face in _faces(occupancy)):
+            raise NerfroError("the object touches the grid's border; enlarge medium.box_min and medium.box_max")
+        self.ior, self.smoothing_size, self.smoothing_sigma = float(ior), int(size), float(sigma)
+        # Grids are made of the mesh at every start and do not belong in checkpoints.
+        self.register_buffer("occupancy", occupancy, persistent=False)
+        self.register_buffer("box", box, persistent=False)
+        n = 1 + (ior - 1) * smooth(occupancy, size, sigma)
+        spacing = (box[1] - box[0]) / (torch.tensor(n.shape) - 1)
+        table = torch.cat([n[..., None], gradient(n, spacing)], -1)
+        self.register_buffer("table", table, persistent=False)
+
+    @property
+    def spacing(self) -> Float[Tensor, "3"]:
+        """Distance between neighbouring vertices, world units."""
+        shape = torch.tensor(self.table.shape[:3], device=self.box.device)
+        return (self.box[1] - self.box[0]) / (shape - 1)
+
+    def forward(
+        self, positions: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+        """Refractive index and its gradient (per world unit), trilinear; n = 1 and grad n = 0 outside the box."""
+        values = trilinear(self.table, self.box, positions)
+        inside = ((positions >= self.box[0]) & (positions <= self.box[1])).all(-1)
+        n = torch.where(inside, values[..., 0], 1.0)
+        return n, torch.where(inside[..., None], values[..., 1:], 0.0)
+
+    def save(self, path: Path) -> None:
+        """Write occupancy, box, index and smoothing to a .npz that `medium.grid` loads."""
+        save_arrays(
+            path,
+            {
+                "occupancy": self.occupancy.cpu().numpy(),
+                "box": self.box.cpu().numpy(),
+                "ior": np.float64(self.ior),
+                "smoothing": np.array([self.smoothing_size, self.smoothing_sigma]),
+            },
+        )
+
+
+def smooth(values: Float[Tensor, "X Y Z"], size: int, sigma: float) -> Float[Tensor, "X Y Z"]:
+    """Convolve with a normalised Gaussian of size^3 taps; the border repeats outwards. Size 0 changes nothing.
+
+    Raises:
+        NerfroError: the size is even or negative, or sigma is not positive.
+    """
+    if size == 0:
+        return values
+    if size < 0 or size % 2 == 0 or not sigma > 0:
+        raise NerfroError(
+            f"smoothing_size={size}, smoothing_sigma={sigma} is no kernel; "
+            "the size must be odd (or 0 for none) and sigma positive"
+        )
+    taps = torch.arange(size, dtype=values.dtype, device=values.device) - size // 2
+    kernel = torch.exp(-0.5 * (taps / sigma) ** 2)
+    kernel = (kernel / kernel.sum())[None, None, :, None]
+    for axis in range(3):
+        columns = values.movedim(axis, 0)
+        padded = functional.pad(columns.reshape(1, 1, columns.shape[0], -1), (0, 0, size // 2, size // 2), "replicate")
+        values = functional.conv2d(padded, kernel).reshape(columns.shape).movedim(0, axis)
+    return values.contiguous()
+
+
+def gradient(values: Float[Tensor, "X Y Z"], spacing: Float[Tensor, "3"]) -> Float[Tensor, "X Y Z 3"]:
+    """Central differences, (next - previous) / 2h; the border repeats outwards, so its gradient is half."""
+    parts = []
+    for axis in range(3):
+        first, last = values.narrow(axis, 0, 1), values.narrow(axis, values.shape[axis] - 1, 1)
+        padded = torch.cat([first, values, last], axis)
+        ahead, behind = padded.narrow(axis, 2, values.shape[axis]), padded.narrow(axis, 0, values.shape[axis])
+        parts.append((ahead - behind) / (2 * spacing[axis]))
+    return torch.stack(parts, -1)
+
+
+def check_box(box_min: list[float], box_max: list[float], resolution: int) -> Float[np.ndarray, "2 3"]:
+    """Corners as an array.
+
+    Raises:
+        NerfroError: they are not a box, or the resolution is too small for a gradient.
+    """
+    box = np.array([box_min, box_max], np.float64) if len(box_min) == len(box_max) == 3 else np.zeros((2, 3))
+    if not (np.isfinite(box).all() and (box[1] > box[0]).all()):
+        raise NerfroError(f"box_min={box_min}, box_max={box_max} is no box; give three numbers each, min below max")
+    if resolution < 4:
+        raise NerfroError(f"medium.resolution={resolution} is too small; give at least 4 (64 to 512 are usual)")
+    return box
+
+
+def check_margin(mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], margin: Float[np.ndarray, "3"]) -> None:
+    """Refuse a mesh that leaves no margin of air inside the box.
+
+    Raises:
+        NerfroError: with the smallest box that would do.
+    """
+    low, high = mesh.bounds[0] - margin, mesh.bounds[1] + margin
+    if (low < box[0]).any() or (high > box[1]).any():
+        least = f"medium.box_min={_rounded(low, -1)} medium.box_max={_rounded(high, 1)}"
+        raise NerfroError(f"the mesh does not fit into the box with a margin of air; it needs at least {least}")
+
+
+def _rounded(corner: Float[np.ndarray, "3"], direction: int) -> str:
+    outward = np.floor if direction < 0 else np.ceil
+    return "[" + ",".join(f"{value:g}" for value in outward(corner * 100) / 100) + "]"
+
+
+def _faces(values: Tensor) -> list[Tensor]:
+    return [values.select(axis, end) for axis in range(3) for end in (0, -1)]
+
+
+def _load_grid(path: Path) -> tuple[Tensor, Tensor, float, int, float]:
+    arrays = load_arrays(path)
+    missing = {"occupancy", "box", "ior", "smoothing"} - arrays.keys()
+    if missing:
+        raise NerfroError(f"{path} is no voxel grid, it lacks {', '.join(sorted(missing))}; make it again")
+    size, sigma = arrays["smoothing"]
+    occupancy, box = torch.from_numpy(arrays["occupancy"]).float(), torch.from_numpy(arrays["box"]).float()
+    return occupancy, box, float(arrays["ior"]), int(size), float(sigma)

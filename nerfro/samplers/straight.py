@@ -1,0 +1,29 @@
+"""Rays of ordinary radiance fields."""
+
+from __future__ import annotations
+
+import torch
+
+from nerfro.media.base import Medium
+from nerfro.registry import register
+from nerfro.samplers.base import PathSampler
+from nerfro.types import Path, Rays
+
+
+@register("sampler/path", "straight")
+class Straight(PathSampler):
+    """Straight rays: o + s d, whatever the medium."""
+
+    @torch.no_grad()
+    def forward(self, rays: Rays, medium: Medium) -> Path:
+        """The two-vertex path of every ray; `refracted` is false throughout."""
+        return straight_path(rays)
+
+
+def straight_path(rays: Rays) -> Path:
+    """Paths of two vertices, at near and far."""
+    s = torch.stack([rays.near, rays.far], -1)
+    positions = rays.origins[:, None] + s[..., None] * rays.directions[:, None]
+    directions = rays.directions[:, None].expand_as(positions)
+    refracted = torch.zeros(len(rays), dtype=torch.bool, device=s.device)
+    return Path(positions, directions, s, rays.directions, refracted, rays.radii)
