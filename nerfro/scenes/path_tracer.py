@@ -172,14 +172,13 @@ def envmap_texture(sky: Sky, height: int, to_world: np.ndarray) -> np.ndarray:
         height: rows H.
         to_world: rotation [3, 3] from the emitter's frame (y up) to ours.
     """
-    width, k = 2 * height, 2  # k x k samples per texel
-    jitter = (np.arange(k) + 0.5) / k - 0.5
-    phi = (2 * np.pi * (np.arange(width)[:, None] + 0.5 + jitter) / width).ravel()
+    width = 2 * height
+    phi = 2 * np.pi * (np.arange(width) + 0.5) / width
     texture = np.empty((height, width, 3), np.float32)
     for row in range(height):
-        theta = (np.pi * (row + jitter) / (height - 1))[:, None]
-        local = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi, -np.sin(theta) * np.cos(phi)], -1)
-        texture[row] = sky(local @ to_world.T).reshape(k, width, k, 3).mean((0, 2))
+        theta = np.pi * row / (height - 1)
+        ring = np.stack([np.sin(theta) * np.sin(phi), 0 * phi + np.cos(theta), -np.sin(theta) * np.cos(phi)], -1)
+        texture[row] = sky(ring @ to_world.T)
     return texture
 
 

@@ -16,7 +16,7 @@ MAJOR_RADIUS, MINOR_RADIUS = 0.38, 0.16
 TILT_DEGREES = (35.0, 20.0)  # about x, then about y: the hole is seen from most sides
 
 RIBBONS = np.array(
-    [[0.86, 0.20, 0.16], [0.96, 0.72, 0.15], [0.13, 0.45, 0.62], [0.95, 0.93, 0.86], [0.16, 0.55, 0.38]]
+    [[0.92, 0.30, 0.22], [0.98, 0.80, 0.24], [0.20, 0.56, 0.80], [0.96, 0.94, 0.88], [0.24, 0.70, 0.46]]
 )
 FACADES = np.array(
     [[0.80, 0.46, 0.33], [0.91, 0.82, 0.64], [0.42, 0.60, 0.62], [0.86, 0.66, 0.40], [0.70, 0.36, 0.36], [0.66, 0.68, 0.74]]
@@ -32,11 +32,11 @@ def torus_colours(angles: np.ndarray) -> np.ndarray:
     ribbon, step = np.floor(across).astype(int), np.floor(along).astype(int)
     colours = RIBBONS[ribbon % len(RIBBONS)]
     piece = hashed(np.stack([ribbon % len(RIBBONS), step % 8], -1), seed=3)
-    colours = colours * (0.70 + 0.30 * piece)[:, None]
-    seam = (np.abs(across - ribbon - 0.5) > 0.44) | (np.abs(along - step - 0.5) > 0.43)
+    colours = colours * (0.80 + 0.20 * piece)[:, None]
+    seam = (np.abs(across - ribbon - 0.5) > 0.46) | (np.abs(along - step - 0.5) > 0.45)
     dot = np.hypot((across - ribbon - 0.5) * 1.2, along - step - 0.5) < 0.17
     colours = np.where(dot[:, None], chosen(RIBBONS, 1 - piece * 0.999), colours)
-    return np.where(seam[:, None], np.array([0.10, 0.09, 0.12]), colours)
+    return np.where(seam[:, None], np.array([0.20, 0.16, 0.20]), colours)
 
 
 def sky(directions: np.ndarray) -> np.ndarray:
