@@ -127,8 +127,7 @@ def read_stack(
             f"image {paths[0]} has {width}x{height} pixels where {expected_size[0]}x{expected_size[1]} are expected; "
             "restore the right image or correct the transforms file"
         )
-    stack = torch.from_numpy(np.ascontiguousarray(area_mean(first, downscale, paths[0])))
-    stack = stack.new_empty((len(paths), *stack.shape))
+    stack = np.empty((len(paths), *area_mean(first, downscale, paths[0]).shape), np.float32)
 
     def read_into(index: int) -> None:
         path = paths[index]
@@ -138,7 +137,7 @@ def read_stack(
                 f"image {path} has {values.shape[1]}x{values.shape[0]} pixels but {paths[0]} has {width}x{height}; "
                 "all images of a split must have one size"
             )
-        stack[index] = torch.from_numpy(np.ascontiguousarray(area_mean(values, downscale, path)))
+        stack[index] = area_mean(values, downscale, path)
 
     # Decoding releases the interpreter's lock, so threads suffice.
     with ThreadPoolExecutor(min(len(paths), os.cpu_count() or 1)) as pool:
@@ -148,4 +147,4 @@ def read_stack(
                 future.result()
         finally:
             pool.shutdown(cancel_futures=True)
-    return stack
+    return torch.from_numpy(stack)

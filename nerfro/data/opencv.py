@@ -5,6 +5,8 @@ from __future__ import annotations
 import warnings
 from typing import Literal
 
+import numpy as np
+
 from nerfro.data.base import DataSource, Views
 from nerfro.data.cameras import central_window
 from nerfro.data.transforms import check_options, find_splits, make_cameras, parse_matrix, read_images, read_manifest
@@ -59,6 +61,8 @@ class OpenCVData(DataSource):
         fx, fy, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
         if fx <= 0 or fy <= 0 or abs(matrix[0, 1]) > 1e-6 * fx or abs(matrix[1, 0]) > 1e-6 * fy:
             raise NerfroError(f"{where} must have positive focal lengths and no skew; it is {matrix.tolist()}")
+        if np.abs(matrix[2] - [0, 0, 1]).max() > 1e-6:
+            raise NerfroError(f"{where} must have the last row 0, 0, 1; it has {matrix[2].tolist()}")
         images, masks = read_images(manifest, self.downscale, self.alpha)
         height, width = images.shape[1:3]
         if not (0 < cx < width * self.downscale and 0 < cy < height * self.downscale):

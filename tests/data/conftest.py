@@ -15,17 +15,27 @@ from scipy.spatial.transform import Rotation
 Writer = Callable[..., Path]
 
 
-def random_pose(seed: int) -> np.ndarray:
-    """A camera-to-world matrix [4, 4] with any orientation."""
+def _random_pose(seed: int) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, :3] = Rotation.random(random_state=seed).as_matrix()
     pose[:3, 3] = np.random.default_rng(seed).normal(size=3)
     return pose
 
 
-def random_image(seed: int, width: int = 8, height: int = 6, num_channels: int = 3) -> np.ndarray:
-    """8-bit levels [H, W, C]."""
+def _random_image(seed: int, width: int = 8, height: int = 6, num_channels: int = 3) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (height, width, num_channels), dtype=np.uint8)
+
+
+@pytest.fixture
+def random_pose() -> Callable[[int], np.ndarray]:
+    """Camera-to-world matrix [4, 4] of a seed, with any orientation."""
+    return _random_pose
+
+
+@pytest.fixture
+def random_image() -> Callable[..., np.ndarray]:
+    """8-bit levels [H, W, C] of a seed, 8x6 RGB by default; H, W and C may be given."""
+    return _random_image
 
 
 @pytest.fixture
@@ -44,7 +54,7 @@ def write_blender(tmp_path: Path) -> Writer:
         frames = []
         for i, image in enumerate(images):
             Image.fromarray(image).save(tmp_path / split / f"r_{i}.png")
-            pose = random_pose(i) if poses is None else poses[i]
+            pose = _random_pose(i) if poses is None else poses[i]
             frames.append({"file_path": f"./{split}/r_{i}{suffix}", "rotation": 0.1, "transform_matrix": pose.tolist()})
         for i, mask in enumerate(masks):
             Image.fromarray(mask).save(tmp_path / split / f"mask_r_{i}.png")

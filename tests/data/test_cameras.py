@@ -53,8 +53,10 @@ def test_orbit_camera_looks_at_the_origin_with_the_world_upright():
     camera = cameras_at(pose, 9, 7, 10.0, 10.0, 4.5, 3.5)
     directions = camera.image_rays(0).directions.reshape(7, 9, 3)
     assert torch.allclose(directions[3, 4], torch.tensor([0.0, 1.0, 0.0]))
-    assert (directions[0, :, 2] > 0).all() and (directions[-1, :, 2] < 0).all()
-    assert (directions[:, 0, 0] < 0).all() and (directions[:, -1, 0] > 0).all()
+    assert (directions[0, :, 2] > 0).all()
+    assert (directions[-1, :, 2] < 0).all()
+    assert (directions[:, 0, 0] < 0).all()
+    assert (directions[:, -1, 0] > 0).all()
 
 
 def test_points_on_rays_project_back_onto_their_pixels(cameras):
@@ -79,7 +81,8 @@ def test_directions_have_unit_length_and_bounds_are_the_cameras(cameras):
     rays = cameras.image_rays(2)
     assert len(rays) == 14 * 20
     assert torch.allclose(rays.directions.norm(dim=-1), torch.ones(280), atol=1e-6)
-    assert (rays.near == 2).all() and (rays.far == 6).all()
+    assert (rays.near == 2).all()
+    assert (rays.far == 6).all()
     assert torch.equal(rays.origins, cameras.camera_to_world[2, :, 3].expand(280, 3))
 
 
@@ -141,13 +144,16 @@ def test_tile_is_a_window_of_some_view(cameras):
         found = ((windows - tile).abs().amax((-1, -2, -3)) < 1e-6).nonzero()
         assert len(found) == 1
         seen.add(tuple(found[0].tolist()))
-    view, top, left = (set(place) for place in zip(*seen))
-    assert view == set(range(5)) and len(top) > 5 and len(left) > 8
+    view, top, left = (set(place) for place in zip(*seen, strict=True))
+    assert view == set(range(5))
+    assert len(top) > 5
+    assert len(left) > 8
 
 
 def test_tile_is_clipped_to_the_image_and_repeatable(cameras):
     first, second = (cameras.tile(128, torch.Generator().manual_seed(7)) for _ in range(2))
-    assert first.shape == (14, 14, 3) and torch.equal(first, second)
+    assert first.shape == (14, 14, 3)
+    assert torch.equal(first, second)
 
 
 def test_making_rays_never_waits_for_the_device(cameras):

@@ -132,3 +132,12 @@ def test_floating_point_image_is_refused(tmp_path: Path):
     Image.fromarray(np.zeros((2, 2), np.float32)).save(tmp_path / "image.tif")
     with pytest.raises(NerfroError, match=r"mode F, which is not supported; save it as 8- or 16-bit PNG"):
         read_rgb(tmp_path / "image.tif", "drop")
+
+
+def test_flipped_bit_in_an_8bit_image_is_found(save):
+    path = save(levels(20, 20, 3))
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 16
+    path.write_bytes(content)
+    with pytest.raises(NerfroError, match=r"image\.png cannot be read"):
+        read_rgb(path, "drop")

@@ -65,7 +65,9 @@ def test_files_written_by_libpng_are_decoded_exactly(num_channels, tmp_path: Pat
 def test_8bit_png_and_other_files_are_not_16bit():
     content = bytearray(encode_png16(picture(3), [0] * 10))
     content[24] = 8
-    assert not is_png16(bytes(content)) and not is_png16(b"") and not is_png16(b"\xff\xd8\xff" + bytes(40))
+    assert not is_png16(bytes(content))
+    assert not is_png16(b"")
+    assert not is_png16(b"\xff\xd8\xff" + bytes(40))
 
 
 @pytest.mark.parametrize("kept", [30, 60, -13, -3])
