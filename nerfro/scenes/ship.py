@@ -11,7 +11,7 @@ from nerfro.scenes.skies import azimuth, clouds, elevation, skyline
 from nerfro.scenes.surface import Surface, join, rounded_box
 
 HALF_SIDES, EDGE_RADIUS = (0.80, 0.50, 0.66), 0.07
-TINT = (0.80, 0.97, 0.86)
+TINT = (0.86, 0.98, 0.90)
 KEEL, DECK, HALF_LENGTH, HALF_BEAM = -0.40, -0.16, 0.54, 0.17
 MASTS = ((-0.20, 0.36), (0.16, 0.44))  # x of the mast and height of its top
 # x, lowest and highest z, half width of each sail
@@ -135,11 +135,11 @@ def _sea(directions: np.ndarray) -> np.ndarray:
     water = mix(np.array([0.06, 0.32, 0.44]), np.array([0.22, 0.60, 0.66]), wave)
     foam = smoothstep(0.80, 0.88, wave) * (swirl > 0.48)
     water = mix(water, np.array([0.93, 0.97, 0.96]), foam)
-    cell = np.floor(place / 0.8).astype(int)
-    offset = place / 0.8 - cell - 0.5
-    buoy = np.linalg.norm(offset - 0.25 * (hashed(cell, 42) - 0.5)[..., None], axis=-1)
-    painted_buoy = np.where((buoy < 0.09)[..., None], np.array([0.98, 0.95, 0.88]), chosen(HOUSES * [1, 0.7, 0.5], hashed(cell, 43)))
-    water = np.where(((buoy < 0.2) & (hashed(cell, 44) < 0.35))[..., None], painted_buoy, water)
+    cell = np.floor(place / 0.5).astype(int)
+    offset = place / 0.5 - cell - 0.5
+    buoy = np.linalg.norm(offset - 0.3 * (hashed(cell, 42) - 0.5)[..., None], axis=-1)
+    painted_buoy = np.where((buoy < 0.05)[..., None], np.array([0.98, 0.95, 0.88]), chosen(HOUSES * [1, 0.7, 0.5], hashed(cell, 43)))
+    water = np.where(((buoy < 0.11) & (hashed(cell, 44) < 0.35))[..., None], painted_buoy, water)
     return mix(np.array([0.80, 0.72, 0.64]), water, smoothstep(0.0, 0.12, depth))
 
 
