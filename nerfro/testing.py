@@ -1,0 +1,254 @@
+"""Contracts that every plugin keeps; the test suite runs them over all that are registered, yours included.
+
+`check(plugin)` builds the plugin with its defaults, asks it as the model would, and raises `ContractError` with what it
+broke. Plugins whose required fields have no default are checked with the fields that you give.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import torch
+
+from nerfro.boundaries.base import Boundary
+from nerfro.boundaries.constant import ConstantBoundary
+from nerfro.data.cameras import Cameras
+from nerfro.fields.base import Field
+from nerfro.fields.nerf import NerfField
+from nerfro.losses.base import Loss
+from nerfro.losses.photometric import Photometric
+from nerfro.media.analytic import Luneburg
+from nerfro.media.base import Medium
+from nerfro.models.base import NerfModel, Parts
+from nerfro.models.optimizer import OptimizerConfig
+from nerfro.models.refractive import RefractiveModel
+from nerfro.registry import Plugin, build
+from nerfro.rendering import composite
+from nerfro.samplers.base import PathSampler, PointSampler
+from nerfro.samplers.eikonal import Eikonal
+from nerfro.samplers.stratified import Stratified, point_samples
+from nerfro.samplers.straight import Straight
+from nerfro.types import Batch, Path, Radiance, Rays, Rendering, Samples
+
+NUM_RAYS = 24
+
+
+class ContractError(AssertionError):
+    """A plugin does not do what its kind promises."""
+
+
+def check(plugin: Plugin, fields: Mapping[str, object] | None = None) -> None:
+    """Check a registered plugin against the contract of its kind.
+
+    Args:
+        plugin: see `nerfro.registry.plugins`.
+        fields: configuration that differs from the defaults.
+
+    Raises:
+        ContractError: the contract is broken.
+    """
+    _require(bool(plugin.summary), "the class has no docstring, which `python -m nerfro.plugins` shows")
+    _CONTRACTS[plugin.kind](plugin, dict(fields or {}))
+
+
+def example_rays(num_rays: int = NUM_RAYS) -> Rays:
+    """Rays from around the unit cube towards it; most meet a ball of radius 1."""
+    generator = torch.Generator().manual_seed(7)
+    origins = torch.nn.functional.normalize(torch.randn(num_rays, 3, generator=generator), dim=-1) * 4
+    targets = torch.randn(num_rays, 3, generator=generator) * 0.6
+    directions = torch.nn.functional.normalize(targets - origins, dim=-1)
+    like = torch.ones(num_rays)
+    return Rays(origins, directions, 1e-3 * like, 2 * like, 6 * like)
+
+
+def example_path(num_rays: int = NUM_RAYS) -> Path:
+    """Paths bent by a Luneburg lens."""
+    return Eikonal("leapfrog", 64)(example_rays(num_rays), Luneburg())
+
+
+def example_samples() -> Samples:
+    """Sixteen samples on each example path."""
+    path = example_path()
+    fractions = torch.linspace(0.0, 0.95, 16)
+    return point_samples(path, path.near[:, None] + fractions * (path.far - path.near)[:, None])
+
+
+def example_rendering() -> Rendering:
+    """A rendering of the example samples with a smooth density, whose densities and colours want gradients."""
+    samples = example_samples()
+    density = torch.exp(-samples.positions.square().sum(-1)).requires_grad_()
+    rgb = torch.sigmoid(samples.positions).requires_grad_()
+    return composite(samples, Radiance(density, rgb), torch.full((NUM_RAYS, 3), 0.3), example_path())
+
+
+def example_batch() -> Batch:
+    """A batch of the example rays with two small training cameras."""
+    pose = torch.eye(4)[:3].repeat(2, 1, 1)
+    pose[:, 2, 3] = 4
+    two = torch.full((2,), 8.0)
+    cameras = Cameras(pose, two, two, two, two, width=16, height=16, near=2.0, far=6.0)
+    return Batch(example_rays(), torch.full((NUM_RAYS, 3), 0.5), torch.arange(NUM_RAYS), cameras)
+
+
+def _make(plugin: Plugin, fields: dict[str, object], **parts: object) -> object:
+    return build({"_target_": plugin.target, **fields}, **parts)
+
+
+def _check_medium(plugin: Plugin, fields: dict[str, object]) -> None:
+    medium = _make(plugin, fields)
+    _require(isinstance(medium, Medium), "a medium derives from nerfro.media.base.Medium")
+    low, high = medium.box
+    points = low + torch.rand(200, 3) * (high - low)
+    ior, gradient = medium(points)
+    _require(ior.shape == (200,) and gradient.shape == (200, 3), "forward returns n [...] and grad n [..., 3]")
+    _require(bool((ior > 0).all()) and bool(gradient.isfinite().all()), "n is positive and grad n finite")
+    ior, gradient = medium(high + (high - low) * (1 + torch.rand(50, 3)))
+    _require(bool((ior == 1).all()) and bool((gradient == 0).all()), "outside the box n = 1 and grad n = 0")
+
+
+def _check_path_sampler(plugin: Plugin, fields: dict[str, object]) -> None:
+    sampler = _make(plugin, fields)
+    _require(isinstance(sampler, PathSampler), "a path sampler derives from nerfro.samplers.base.PathSampler")
+    rays = example_rays()
+    path = sampler(rays, Luneburg())
+    num_vertices = path.s.shape[1]
+    _require(num_vertices >= 2, "a path has two vertices or more")
+    _require(path.positions.shape == (NUM_RAYS, num_vertices, 3), "positions are [R, S, 3]")
+    _require(path.directions.shape == path.positions.shape, "directions are [R, S, 3]")
+    _require(bool((path.s.diff(dim=1) >= 0).all()), "arc length does not decrease")
+    _require(torch.allclose(path.near, rays.near, atol=1e-4), "the path begins at near")
+    _require(_unit(path.directions) and _unit(path.exit_directions), "directions have unit length")
+    lengths = path.positions.diff(dim=1).norm(dim=-1)
+    _require(torch.allclose(lengths, path.s.diff(dim=1), atol=1e-4), "s is the length of the polyline")
+    steps = path.directions[:, :-1] * path.s.diff(dim=1)[..., None]
+    _require(
+        torch.allclose(path.positions[:, :-1] + steps, path.positions[:, 1:], atol=0.05),
+        "following a vertex's direction leads to the next vertex",
+    )
+
+
+def _check_point_sampler(plugin: Plugin, fields: dict[str, object]) -> None:
+    sampler = _make(plugin, fields)
+    _require(isinstance(sampler, PointSampler), "a point sampler derives from nerfro.samplers.base.PointSampler")
+    path = example_path()
+    for training in (True, False):
+        sampler.train(training)
+        drawn = []
+        for _ in range(2):
+            rendering: Rendering | None = None
+            for _ in range(sampler.num_levels):
+                samples = sampler(path, rendering)
+                _check_samples(samples, path)
+                density = torch.ones_like(samples.s)
+                radiance = Radiance(density, samples.positions.sigmoid())
+                rendering = composite(samples, radiance, torch.zeros(NUM_RAYS, 3), path)
+            drawn.append(samples.s)
+        same = torch.equal(drawn[0], drawn[1])
+        _require(same != training, "samples are random in training and repeat in evaluation")
+
+
+def _check_samples(samples: Samples, path: Path) -> None:
+    num_samples = samples.s.shape[1]
+    _require(samples.edges.shape == (NUM_RAYS, num_samples + 1), "a sampler returns one edge more than samples")
+    _require(bool((samples.s.diff(dim=1) >= 0).all()), "samples are sorted by arc length")
+    _require(bool((samples.deltas >= 0).all()), "edges do not decrease")
+    inside = (samples.s >= path.near[:, None] - 1e-4) & (samples.s <= path.far[:, None] + 1e-4)
+    _require(bool(inside.all()), "samples lie between near and far")
+    expected, _ = path.at(samples.s)
+    _require(torch.allclose(samples.positions, expected, atol=1e-3), "positions lie on the path at arc length s")
+
+
+def _check_field(plugin: Plugin, fields: dict[str, object]) -> None:
+    field = _make(plugin, fields)
+    _require(isinstance(field, Field), "a field derives from nerfro.fields.base.Field")
+    samples = example_samples()
+    radiance = field(samples)
+    _require(radiance.density.shape == samples.s.shape, "density is [R, N]")
+    _require(radiance.rgb.shape == samples.positions.shape, "rgb is [R, N, 3]")
+    _require(bool((radiance.density >= 0).all()), "density is not negative")
+    _require(bool(((radiance.rgb > -0.01) & (radiance.rgb < 1.01)).all()), "rgb lies in [0, 1]")
+    (radiance.density.sum() + radiance.rgb.sum()).backward()
+    _require_gradients(field)
+
+
+def _check_boundary(plugin: Plugin, fields: dict[str, object]) -> None:
+    boundary = _make(plugin, fields)
+    _require(isinstance(boundary, Boundary), "a boundary derives from nerfro.boundaries.base.Boundary")
+    directions = torch.nn.functional.normalize(torch.randn(4, 5, 3), dim=-1)
+    rgb = boundary(directions)
+    _require(rgb.shape == directions.shape, "forward keeps all leading axes: [..., 3] -> [..., 3]")
+    _require(bool(((rgb > -0.01) & (rgb < 1.01)).all()), "rgb lies in [0, 1]")
+    if any(parameter.requires_grad for parameter in boundary.parameters()):
+        rgb.sum().backward()
+        _require_gradients(boundary)
+
+
+def _check_loss(plugin: Plugin, fields: dict[str, object]) -> None:
+    loss = _make(plugin, fields)
+    _require(isinstance(loss, Loss), "a loss derives from nerfro.losses.base.Loss")
+    rendering = example_rendering()
+    value = loss([rendering, rendering], example_batch(), _example_model())
+    _require(value.shape == (), "a loss is a scalar")
+    _require(bool(value.isfinite()), "a loss is finite")
+
+
+def _check_model(plugin: Plugin, fields: dict[str, object]) -> None:
+    model = _make(plugin, fields, parts=_example_parts())
+    _require(isinstance(model, NerfModel), "a model derives from nerfro.models.base.NerfModel")
+    renderings = model(example_rays())
+    _require(len(renderings) >= 1, "forward returns a rendering for each level")
+    _require(renderings[-1].rgb.shape == (NUM_RAYS, 3), "rgb is [R, 3]")
+    renderings[-1].rgb.sum().backward()
+    _require_gradients(model.fields)
+
+
+def _check_data(plugin: Plugin, fields: dict[str, object]) -> None:
+    source = _make(plugin, fields)
+    for split in source.splits:
+        views = source.load(split)
+        size = (len(views), views.cameras.height, views.cameras.width)
+        _require(views.images.shape == (*size, 3), "images are [V, H, W, 3]")
+        _require(len(views.cameras) == len(views), "there is a camera for each image")
+        _require(views.masks is None or views.masks.shape == size, "masks are [V, H, W]")
+
+
+_CONTRACTS: dict[str, Callable[[Plugin, dict[str, object]], None]] = {
+    "medium": _check_medium,
+    "sampler/path": _check_path_sampler,
+    "sampler/points": _check_point_sampler,
+    "field": _check_field,
+    "boundary": _check_boundary,
+    "loss": _check_loss,
+    "model": _check_model,
+    "data": _check_data,
+}
+
+
+def _example_parts() -> Parts:
+    return Parts(
+        medium=Luneburg(),
+        path_sampler=Straight(),
+        point_sampler=Stratified(8),
+        make_field=lambda: NerfField(width=16, depth=2, skip=1, view_width=8),
+        boundary=ConstantBoundary(),
+        losses={"photometric": Photometric()},
+        optimizer=OptimizerConfig(),
+    )
+
+
+def _example_model() -> NerfModel:
+    return RefractiveModel(_example_parts())
+
+
+def _unit(directions: torch.Tensor) -> bool:
+    return torch.allclose(directions.norm(dim=-1), torch.ones(directions.shape[:-1]), atol=1e-4)
+
+
+def _require_gradients(module: torch.nn.Module) -> None:
+    for name, parameter in module.named_parameters():
+        _require(parameter.grad is not None and bool(parameter.grad.isfinite().all()), f"{name} gets a finite gradient")
+
+
+def _require(condition: bool, contract: str) -> None:
+    if not condition:
+        raise ContractError(f"contract broken: {contract}")

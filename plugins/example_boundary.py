@@ -1,0 +1,32 @@
+"""Template: a boundary of your own in one file. Use it with `boundary=gradient_sky`."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerfro.boundaries.base import Boundary
+from nerfro.errors import NerfroError
+from nerfro.registry import register
+
+
+@register("boundary", "gradient_sky")
+class GradientSky(Boundary):
+    """Two learned colours, blended by the height of the direction.
+
+    Args:
+        up: axis that points up, 0, 1 or 2.
+    """
+
+    def __init__(self, up: int = 2) -> None:
+        super().__init__()
+        if up not in (0, 1, 2):
+            raise NerfroError(f"gradient_sky: up={up} is no axis; choose 0, 1 or 2")
+        self.up = up
+        self.raw = nn.Parameter(torch.zeros(2, 3))  # ground and zenith, before the sigmoid
+
+    def forward(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        height = 0.5 * (1 + directions[..., self.up, None])
+        ground, zenith = torch.sigmoid(self.raw)
+        return ground + height * (zenith - ground)

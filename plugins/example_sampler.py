@@ -1,0 +1,40 @@
+"""Template: a point sampler of your own in one file. Use it with `sampler/points=logarithmic`.
+
+Copy this file, rename the class and the registered name, and change `forward`. Nothing else needs to know.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from nerfro.errors import NerfroError
+from nerfro.registry import register
+from nerfro.samplers.base import PointSampler
+from nerfro.samplers.stratified import point_samples
+from nerfro.types import Path, Rendering, Samples
+
+
+@register("sampler/points", "logarithmic")
+class LogarithmicSampler(PointSampler):
+    """Samples whose spacing grows with distance: denser where a pixel's footprint is small.
+
+    Args:
+        num_samples: on each path.
+        growth: ratio of the last spacing to the first.
+    """
+
+    num_levels = 1
+
+    def __init__(self, num_samples: int = 64, growth: float = 4.0) -> None:
+        super().__init__()
+        if num_samples < 2 or growth <= 1:
+            raise NerfroError(f"logarithmic: num_samples={num_samples} growth={growth}; take 2 or more, and above 1")
+        self.num_samples, self.growth = num_samples, growth
+
+    def forward(self, path: Path, previous: Rendering | None) -> Samples:
+        num_rays, like = len(path.s), path.s
+        bins = torch.arange(self.num_samples, device=like.device, dtype=like.dtype).expand(num_rays, -1)
+        # Random in training, central in evaluation: the contract of every sampler.
+        u = (bins + (torch.rand_like(bins) if self.training else 0.5)) / self.num_samples
+        fraction = (self.growth**u - 1) / (self.growth - 1)
+        return point_samples(path, path.near[:, None] + fraction * (path.far - path.near)[:, None])

@@ -1,0 +1,24 @@
+"""Every registered plugin, local ones included, keeps the contract of its kind."""
+
+from __future__ import annotations
+
+import pytest
+
+from nerfro.registry import Plugin, discover, plugins
+from nerfro.testing import check
+
+discover()
+
+# What has no default that builds, or is needlessly large with its defaults.
+FIELDS: dict[str, dict[str, object]] = {
+    "medium/voxel_grid": {"mesh": "embedded:torus/mesh.ply", "resolution": 32, "smoothing_size": 3},
+    "sampler/path/eikonal": {"num_steps": 128},
+    "field/nerf": {"width": 16, "depth": 3, "skip": 2, "view_width": 8},
+    "field/mip_nerf": {"width": 16, "depth": 3, "skip": 2, "view_width": 8},
+    "loss/smoothness": {"tile_size": 8},
+}
+
+
+@pytest.mark.parametrize("plugin", plugins(), ids=lambda p: f"{p.kind}/{p.name}")
+def test_plugin_keeps_its_contract(plugin: Plugin) -> None:
+    check(plugin, FIELDS.get(f"{plugin.kind}/{plugin.name}"))
