@@ -5,7 +5,9 @@ from __future__ import annotations
 import sys
 
 import rich
+from rich.console import Group
 from rich.table import Table
+from rich.text import Text
 
 from nerfro.errors import NerfroError
 from nerfro.registry import KINDS, Plugin, discover, plugins
@@ -22,15 +24,13 @@ def main() -> None:
         sys.exit(1)
 
 
-def describe(plugin: Plugin) -> Table:
-    """A plugin's fields as a table."""
-    table = Table(title=f"{plugin.kind}={plugin.name}", caption=plugin.summary, title_justify="left", box=None)
-    for heading in ("field", "type", "default"):
-        table.add_column(heading)
+def describe(plugin: Plugin) -> Group:
+    """A plugin's name, summary and fields, for the console."""
+    table = Table("field", "type", "default", box=None, pad_edge=False, show_header=False)
     for name, kind, default in plugin.fields():
-        table.add_row(f"  {name}", kind, str(default))
-    table.caption_justify = "left"
-    return table
+        table.add_row(f"    {name}", kind, str(default))
+    heading = Text.assemble((f"{plugin.kind}={plugin.name}", "bold"), f"  {plugin.summary}")
+    return Group(heading, table) if table.rows else Group(heading)
 
 
 def _chosen(arguments: list[str]) -> list[Plugin]:
