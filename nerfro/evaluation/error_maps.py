@@ -51,6 +51,7 @@ def magma(values: Float[Tensor, "H W"], limit: float) -> Float[Tensor, "H W 3"]:
     """
     if not limit > 0:
         raise NerfroError(f"the limit of a colour scale must be positive, got {limit}")
-    table = torch.tensor(matplotlib.colormaps["magma"].colors, dtype=torch.float32)
-    index = (values.detach().cpu().float() / limit * (len(table) - 1)).round().clamp(0, len(table) - 1)
+    num_colours = 256
+    table = torch.from_numpy(matplotlib.colormaps["magma"](range(num_colours))[:, :3]).float()
+    index = (values.detach().cpu().float() / limit * (num_colours - 1)).round().clamp(0, num_colours - 1)
     return table[index.long()]

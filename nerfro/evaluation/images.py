@@ -34,7 +34,7 @@ def to_8bit(rgb: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
     num_bad = int((~torch.isfinite(rgb)).sum())
     if num_bad:
         raise NerfroError(
-            f"{num_bad} of the picture's {rgb.numel()} values are NaN or infinite: the model that drew it has diverged; "
+            f"{num_bad} of the picture's {rgb.numel()} values are NaN or infinite: the model has diverged; "
             "train with a lower learning rate or with gradient clipping"
         )
     return (rgb.detach().clamp(0, 1) * 255).round().to(torch.uint8)

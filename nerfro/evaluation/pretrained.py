@@ -54,11 +54,7 @@ def load_alexnet(path: Path | str | None = None, download: bool = True, url: str
         try:
             with _socket_timeout(STALL_SECONDS):
                 return torch.hub.load_state_dict_from_url(url, map_location="cpu", check_hash=True, weights_only=True)
-        except (
-            OSError,
-            http.client.HTTPException,
-            RuntimeError,
-        ) as error:  # torch hub says RuntimeError to a wrong hash
+        except (OSError, http.client.HTTPException, RuntimeError) as error:  # RuntimeError: torch hub on a wrong hash
             raise NerfroError(f"the download of AlexNet weights failed ({error}); {by_hand}") from error
     return _read(cached)
 
@@ -109,6 +105,4 @@ def _read(path: Path) -> dict[str, Tensor]:
         return torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
         reason = str(error).partition("\n")[0]
-        raise NerfroError(
-            f"the AlexNet weights {path} cannot be read ({reason}); delete it to fetch it anew"
-        ) from error
+        raise NerfroError(f"AlexNet weights {path} cannot be read ({reason}); delete it to fetch it again") from error

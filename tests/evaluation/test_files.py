@@ -1,0 +1,39 @@
+import errno
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from nerfro.errors import NerfroError
+from nerfro.evaluation.files import write_atomically
+
+
+@pytest.mark.parametrize("step", ["fsync", "replace"])
+def test_full_disk_leaves_the_old_file_whole_and_nothing_beside_it(tmp_path: Path, monkeypatch, step: str) -> None:
+    path = tmp_path / "metrics.json"
+    write_atomically(path, "old")
+
+    def fail(*arguments: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, step, fail)
+    with pytest.raises(NerfroError, match=r"metrics\.json: No space left on device"):
+        write_atomically(path, "new")
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_text_is_utf8_and_has_the_permissions_of_other_new_files(tmp_path: Path) -> None:
+    (tmp_path / "ordinary").touch()
+    write_atomically(tmp_path / "new" / "table.md", "PSNR ↑\n")
+    assert (tmp_path / "new" / "table.md").read_bytes() == "PSNR ↑\n".encode()
+    modes = {stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "ordinary", tmp_path / "new" / "table.md")}
+    assert len(modes) == 1
+
+
+def test_folder_that_cannot_be_made_is_an_error_of_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(NerfroError, match="cannot write") as caught:
+        write_atomically(tmp_path / "file" / "metrics.json", "{}")
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,68 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from nerfro.errors import NerfroError
+from nerfro.evaluation.images import load_png, round_to_8bit, save_png, to_8bit
+
+
+def test_values_are_rounded_to_the_nearest_level() -> None:
+    rgb = torch.rand(50, 40, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    error = to_8bit(rgb).double() - 255 * rgb
+    assert error.abs().max() <= 0.5
+    assert error.abs().max() > 0.49  # the bound is reached on both sides, as by no truncation
+    assert abs(error.mean()) < 0.02
+    assert to_8bit(torch.tensor([[[0.9999, -0.3, 1.7]]])).tolist() == [[[255, 0, 255]]]
+
+
+def test_every_level_survives_a_file(tmp_path: Path) -> None:
+    levels = (torch.arange(16 * 16 * 3) % 256).reshape(16, 16, 3)
+    save_png(tmp_path / "new" / "picture.png", levels / 255)
+    loaded = load_png(tmp_path / "new" / "picture.png")
+    assert torch.equal((loaded * 255).round().long(), levels)
+    assert torch.equal(loaded, round_to_8bit(loaded))
+
+
+def test_file_holds_what_another_reader_sees(tmp_path: Path) -> None:
+    rgb = torch.rand(7, 9, 3, generator=torch.Generator().manual_seed(0))
+    save_png(tmp_path / "picture.png", rgb)
+    with Image.open(tmp_path / "picture.png") as image:
+        assert image.mode == "RGB"
+        assert np.array_equal(np.asarray(image), np.rint(rgb.numpy() * 255))
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_diverged_picture_is_refused_and_overwrites_nothing(tmp_path: Path, bad: float) -> None:
+    save_png(tmp_path / "picture.png", torch.zeros(4, 4, 3))
+    diverged = torch.ones(4, 4, 3)
+    diverged[1, 2, 0] = bad
+    with pytest.raises(NerfroError, match="1 of the picture's 48 values"):
+        save_png(tmp_path / "picture.png", diverged)
+    assert load_png(tmp_path / "picture.png").max() == 0
+
+
+def test_tensor_that_is_no_colour_picture_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(NerfroError, match=r"\[H, W, 3\], got \[3, 8, 8\]"):
+        save_png(tmp_path / "picture.png", torch.rand(3, 8, 8))
+    with pytest.raises(NerfroError, match="divide levels by 255"):
+        save_png(tmp_path / "picture.png", torch.zeros(8, 8, 3, dtype=torch.uint8))
+
+
+def test_unreadable_pictures_are_named(tmp_path: Path) -> None:
+    with pytest.raises(NerfroError, match=r"missing\.png does not exist"):
+        load_png(tmp_path / "missing.png")
+    save_png(tmp_path / "whole.png", torch.rand(40, 40, 3))
+    content = (tmp_path / "whole.png").read_bytes()
+    for length in (10, 60, len(content) // 2):
+        (tmp_path / "part.png").write_bytes(content[:length])
+        with pytest.raises(NerfroError, match=r"part\.png cannot be read"):
+            load_png(tmp_path / "part.png")
+    Image.new("RGBA", (4, 4)).save(tmp_path / "transparent.png")
+    with pytest.raises(NerfroError, match="mode RGBA"):
+        load_png(tmp_path / "transparent.png")
+    Image.fromarray(np.zeros((4, 4), np.uint16)).save(tmp_path / "deep.png")
+    with pytest.raises(NerfroError, match="mode I;16"):
+        load_png(tmp_path / "deep.png")

@@ -1,0 +1,70 @@
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from nerfro.errors import NerfroError
+from nerfro.evaluation.results import EvaluationResult, ViewScores, read_metrics_json, write_metrics_json
+
+
+def result() -> EvaluationResult:
+    views = (
+        ViewScores("test_000", {"psnr": 25.123456789012345, "ssim": 0.8, "lpips": None}),
+        ViewScores("test_001", {"psnr": 27.0, "ssim": 0.9, "lpips": None}),
+    )
+    return EvaluationResult(views, {"lpips": "no network"}, "float")
+
+
+def refuse(constant: str) -> None:
+    raise AssertionError(f"{constant} is no JSON")
+
+
+def test_file_holds_means_rows_and_budget(tmp_path: Path) -> None:
+    write_metrics_json(tmp_path / "metrics.json", result(), 1500, 312.5, 81000.0)
+    content = json.loads((tmp_path / "metrics.json").read_text(), parse_constant=refuse)
+    assert content["test"] == {"psnr": (25.123456789012345 + 27.0) / 2, "ssim": pytest.approx(0.85), "lpips": None}
+    assert content["views"][0] == {"name": "test_000", "psnr": 25.123456789012345, "ssim": 0.8, "lpips": None}
+    assert len(content["views"]) == 2
+    assert (content["steps"], content["train_seconds"], content["rays_per_second"]) == (1500, 312.5, 81000.0)
+
+
+def test_read_returns_what_was_written(tmp_path: Path) -> None:
+    write_metrics_json(tmp_path / "metrics.json", result(), 1500, 312.5, None)
+    run = read_metrics_json(tmp_path / "metrics.json")
+    assert run.result == result()
+    assert (run.steps, run.train_seconds, run.rays_per_second) == (1500, 312.5, None)
+
+
+def test_mean_over_some_of_the_views_is_not_given() -> None:
+    views = (ViewScores("a", {"psnr": 20.0, "ssim": None}), ViewScores("b", {"psnr": 30.0, "ssim": 0.9}))
+    assert EvaluationResult(views).means == {"psnr": 25.0, "ssim": None, "lpips": None}
+    assert EvaluationResult(()).mean("psnr") is None
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_numbers_that_json_lacks_are_refused_and_the_old_file_stays(tmp_path: Path, bad: float) -> None:
+    path = tmp_path / "metrics.json"
+    write_metrics_json(path, result(), 1, 1.0, 1.0)
+    before = path.read_text()
+    with pytest.raises(NerfroError, match=r"metrics\.rays_per_second"):
+        write_metrics_json(path, result(), 1, 1.0, bad)
+    diverged = EvaluationResult((ViewScores("test_000", {"psnr": 20.0, "ssim": bad, "lpips": None}),))
+    with pytest.raises(NerfroError, match="ssim"):
+        write_metrics_json(path, diverged, 1, 1.0, 1.0)
+    assert path.read_text() == before
+
+
+@pytest.mark.parametrize(
+    "content", ["", '{"test": {"ps', "[]", "{}", '{"views": [3]}', '{"views": [{"psnr": 3}]}', "\xff"]
+)
+def test_damaged_files_are_an_error_of_one_line(tmp_path: Path, content: str) -> None:
+    (tmp_path / "metrics.json").write_bytes(content.encode("latin-1"))
+    with pytest.raises(NerfroError, match=r"metrics\.json") as caught:
+        read_metrics_json(tmp_path / "metrics.json")
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_file_names_the_next_step(tmp_path: Path) -> None:
+    with pytest.raises(NerfroError, match=r"does not exist.*run nerfro\.evaluate"):
+        read_metrics_json(tmp_path / "metrics.json")
