@@ -15,7 +15,7 @@ from jaxtyping import Float
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
-from nerfro.data.png16 import PngError, decode_png16, is_png16
+from nerfro.data.png16 import decode_png16, is_png16
 from nerfro.errors import NerfroError
 
 Alpha = Literal["drop", "white", "black"]
@@ -38,18 +38,19 @@ def read_levels(path: Path) -> Float[np.ndarray, "H W C"]:
         return _read_8bit(content, path)
     except FileNotFoundError as error:
         raise NerfroError(f"image {path} does not exist; restore it or take it out of the frames") from error
-    # Pillow reports a corrupt PNG as SyntaxError, or ValueError.
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        reason = str(error) if isinstance(error, PngError) else f"{type(error).__name__}: {error}"
-        raise NerfroError(f"image {path} cannot be read ({reason}); copy or export it again") from error
+    except UnidentifiedImageError as error:
+        raise NerfroError(f"image {path} cannot be read (it is no image); copy or export it again") from error
+    # Pillow reports a corrupt PNG as SyntaxError or ValueError, and PngError is one.
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise NerfroError(f"image {path} cannot be read ({error}); copy or export it again") from error
 
 
 def _read_8bit(content: bytes, path: Path) -> Float[np.ndarray, "H W C"]:
     with Image.open(io.BytesIO(content)) as image:
-        if image.mode in ("I", "F") or image.mode.startswith("I;"):
-            raise NerfroError(
-                f"image {path} has pixels of mode {image.mode}, which is not supported; save it as 8- or 16-bit PNG"
-            )
+        # Pillow reduces colour TIFF of more bits without a word, as it does PNG; tag 258 is BitsPerSample.
+        deep_tiff = image.format == "TIFF" and max(image.tag_v2.get(258, (1,))) > 8
+        if deep_tiff or image.mode in ("I", "F") or image.mode.startswith("I;"):
+            raise NerfroError(f"image {path} has more than 8 bits per channel; save it as 8- or 16-bit PNG")
         if image.mode not in ("L", "LA", "RGB", "RGBA"):
             transparent = image.has_transparency_data
             image = image.convert("RGBA" if transparent else "L" if image.mode == "1" else "RGB")

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import torch
 from lightning.pytorch import LightningDataModule
 
-from nerfro.data.base import DataSource, Views
+from nerfro.data.base import Views
 from nerfro.data.ray_batches import RayBatches
 from nerfro.types import Batch
 

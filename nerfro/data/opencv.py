@@ -76,5 +76,6 @@ class OpenCVData(DataSource):
         if split != "train" and self.eval_crop < 1:
             window = central_window(height, width, self.eval_crop)
             cameras = cameras.crop(window)
-            images, masks = (t if t is None else window.cut(t) for t in (images, masks))
+            images = window.cut(images)
+            masks = None if masks is None else window.cut(masks)
         return Views(cameras, images, masks, [frame.name for frame in manifest.frames])

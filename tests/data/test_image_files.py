@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 import torch
 from PIL import Image
 
@@ -114,7 +115,7 @@ def test_truncated_or_corrupt_image_is_named(save, kept):
 
 def test_file_that_is_no_image_is_named(tmp_path: Path):
     (tmp_path / "image.png").write_text("no image")
-    with pytest.raises(NerfroError, match=r"image\.png cannot be read"):
+    with pytest.raises(NerfroError, match=r"image\.png cannot be read \(it is no image\)"):
         read_rgb(tmp_path / "image.png", "drop")
 
 
@@ -128,10 +129,18 @@ def test_corrupt_16bit_image_is_named(tmp_path: Path):
         read_rgb(path, "drop")
 
 
-def test_floating_point_image_is_refused(tmp_path: Path):
-    Image.fromarray(np.zeros((2, 2), np.float32)).save(tmp_path / "image.tif")
-    with pytest.raises(NerfroError, match=r"mode F, which is not supported; save it as 8- or 16-bit PNG"):
-        read_rgb(tmp_path / "image.tif", "drop")
+def test_tiff_of_more_than_8_bits_is_refused(tmp_path: Path):
+    path = tmp_path / "image.tif"
+    for picture in (np.zeros((4, 4), np.float32), np.zeros((4, 4, 3), np.uint16)):
+        tifffile.imwrite(path, picture, photometric="rgb" if picture.ndim == 3 else "minisblack")
+        with pytest.raises(NerfroError, match=r"more than 8 bits per channel; save it as 8- or 16-bit PNG"):
+            read_rgb(path, "drop")
+
+
+def test_8bit_tiff_is_read(tmp_path: Path):
+    picture = levels(5, 4, 3)
+    tifffile.imwrite(tmp_path / "image.tif", picture, photometric="rgb")
+    np.testing.assert_allclose(read_rgb(tmp_path / "image.tif", "drop"), picture / 255, rtol=1e-6)
 
 
 def test_flipped_bit_in_an_8bit_image_is_found(save):
