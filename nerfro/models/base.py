@@ -101,7 +101,7 @@ class NerfModel(LightningModule, ABC):
         rendered = self.render(views.cameras.to(self.device).image_rays(view))
         prediction = rendered.rgb.reshape(target.shape)
         error = (prediction - target).square()
-        self.log("val/psnr", -10 * torch.log10(error.mean()), prog_bar=True)
+        self.log("val/psnr", -10 * torch.log10(error.mean()), prog_bar=True, batch_size=1)
         grey = (error.mean(-1, keepdim=True).sqrt() * 4).clamp(max=1).expand_as(target)
         far = views.cameras.far
         maps = [m.reshape(*target.shape[:2], 1).expand_as(target) for m in (rendered.depth / far, rendered.opacity)]
