@@ -259,8 +259,9 @@ def _check_pose(matrix: Float[np.ndarray, "rows 4"], where: str) -> Float[np.nda
 
 
 def _check_names(manifest: Manifest) -> None:
-    counts = Counter(frame.name for frame in manifest.frames)
-    repeated = [name for name, count in counts.items() if count > 1]
+    # By file: `r_0` and `r_0.png` are one image.
+    counts = Counter(frame.image for frame in manifest.frames)
+    repeated = list(dict.fromkeys(frame.name for frame in manifest.frames if counts[frame.image] > 1))
     if repeated:
         raise NerfroError(f"{manifest.path}: {_listing(repeated)} occurs in several frames; keep one of each")
 

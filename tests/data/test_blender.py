@@ -171,6 +171,7 @@ FRAME = r"transforms_train\.json: frame 1 \('train/r_1'\)"
         (lambda d: d["frames"][1].pop("transform_matrix"), r"frame 1 has no 'transform_matrix'"),
         (lambda d: d["frames"][1].update(file_path=3), "'file_path' and 'mask_path' must be text"),
         (lambda d: d["frames"][1].update(file_path="train/r_0"), "'train/r_0' occurs in several frames"),
+        (lambda d: d["frames"][1].update(file_path="train/r_0.png"), "'train/r_0', 'train/r_0.png' occurs in several"),
         (
             lambda d: d["frames"][1].update(file_path="train/no"),
             r"\('train/no'\): image .*no\.png does not exist",
