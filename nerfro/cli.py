@@ -7,6 +7,7 @@ import functools
 import os
 import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -21,14 +22,17 @@ from nerfro.registry import discover
 EXIT_INTERRUPTED = 130
 
 
-def entry_point(config_name: str, schema: type) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
-    """Decorate `main(cfg)` so that it is composed from conf/<config_name>.yaml, checked against a dataclass.
+def entry_point(
+    config_name: str, schema: type, config_dir: Path = CONF_DIR
+) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
+    """Decorate `main(cfg)` so that it is composed from <config_dir>/<config_name>.yaml, checked against a dataclass.
 
     The YAML's defaults list must begin with `<config_name>_schema`, or misspelt root keys pass unnoticed.
 
     Args:
-        config_name: file in conf/, without extension.
+        config_name: file in `config_dir`, without extension.
         schema: dataclass of the root.
+        config_dir: conf/, or a folder in it whose entry point must not see the groups of conf/.
     """
 
     def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
@@ -44,7 +48,7 @@ def entry_point(config_name: str, schema: type) -> Callable[[Callable[[DictConfi
             with _errors_in_one_line():
                 ConfigStore.instance().store(name=f"{config_name}_schema", node=schema, provider="nerfro")
                 discover()
-                hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(job)()
+                hydra.main(version_base="1.3", config_path=str(config_dir), config_name=config_name)(job)()
 
         return run
 

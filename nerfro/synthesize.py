@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
+from nerfro.paths import CONF_DIR
 from nerfro.scenes import dataset
 from nerfro.scenes.path_tracer import PathTracer
 from nerfro.scenes.patterns import to_srgb
@@ -66,8 +67,8 @@ def build_scene(name: str, resolution: int) -> Scene:
     return importlib.import_module(f"nerfro.scenes.{name}").build(spacing=max(0.5 * pixel, 0.0025))
 
 
-def synthesize(config: DictConfig) -> Path:
-    """Render what is missing of a data set and return its folder.
+def synthesize(config: DictConfig) -> tuple[Scene, Path]:
+    """Render what is missing of a data set; return the scene and the folder.
 
     Args:
         config: resolved `SynthesizeConfig`.
@@ -103,7 +104,7 @@ def synthesize(config: DictConfig) -> Path:
         scene.interior.save(folder / "interior.ply")
         _write_exr(folder / "sky.exr", sky)
     dataset.write_transforms(folder, planned)
-    return folder
+    return scene, folder
 
 
 def _check(config: DictConfig) -> None:
@@ -146,12 +147,13 @@ def _write_exr(path: Path, linear: np.ndarray) -> None:
     bitmap.convert(component_format=mitsuba.Struct.Type.Float16).write(str(path))
 
 
-@entry_point("synthesize", SynthesizeConfig)
+@entry_point("synthesize", SynthesizeConfig, CONF_DIR / "synthesize")  # conf/scene would turn `scene=` into a group
 def main(config: DictConfig) -> None:
     """Render, then say how to train on the result."""
-    folder = synthesize(config)
+    scene, folder = synthesize(config)
     print(f"done: {folder}")
-    print(f"train on it: python -m nerfro.train data.root={folder} medium.mesh={folder / 'mesh.ply'} medium.ior=1.5")
+    mesh = folder / "mesh.ply"
+    print(f"train on it: python -m nerfro.train data.root={folder} medium.mesh={mesh} medium.ior={scene.ior}")
 
 
 if __name__ == "__main__":
