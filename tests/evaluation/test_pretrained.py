@@ -37,7 +37,7 @@ class Site(http.server.BaseHTTPRequestHandler):
         self.do_HEAD()
         if self.path.startswith("/stalling/"):
             self.wfile.write(self.content[: len(self.content) // 2])
-            self.closing.wait()
+            self.closing.wait(timeout=20)
         else:
             self.wfile.write(self.content)
 
