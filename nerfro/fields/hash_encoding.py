@@ -1,0 +1,117 @@
+"""Multi-resolution hash encoding in plain PyTorch: the reference of the compiled kernels, and the path on a GPU.
+
+Source: Mueller et al., Instant Neural Graphics Primitives, 2022, section 3.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.errors import NerfroError
+
+# Features at a vertex. The compiled kernels are written for a pair, which one 64-bit load fetches.
+NUM_FEATURES = 2
+
+# Factors of the spatial hash (Eqn. 4); the factor of x is 1, so that neighbours in x share a cache line.
+HASH_Y, HASH_Z = 2654435761, 805459861
+
+
+@dataclass(frozen=True)
+class GridLevels:
+    """Where each level's vertices lie in one table, coarse to fine.
+
+    A level whose (resolution + 1)^3 vertices fit into `size` entries is dense; a finer one is hashed.
+
+    Attributes:
+        resolutions: cells along the unit cube's side.
+        sizes: entries of the table; a power of two where hashed.
+        offsets: first entry.
+    """
+
+    resolutions: tuple[int, ...]
+    sizes: tuple[int, ...]
+    offsets: tuple[int, ...]
+
+    @property
+    def num_entries(self) -> int:
+        return self.offsets[-1] + self.sizes[-1]
+
+    @property
+    def dense(self) -> tuple[bool, ...]:
+        return tuple((n + 1) ** 3 <= size for n, size in zip(self.resolutions, self.sizes, strict=True))
+
+    def __len__(self) -> int:
+        return len(self.resolutions)
+
+
+def grid_levels(num_levels: int, base_resolution: int, finest_resolution: int, log2_table_size: int) -> GridLevels:
+    """Levels in geometric progression of resolution (Eqns. 2 and 3).
+
+    Args:
+        num_levels: at least 1.
+        base_resolution, finest_resolution: cells along the side of the coarsest and the finest level.
+        log2_table_size: logarithm of the largest number of entries of a level.
+
+    Raises:
+        NerfroError: no level, a resolution below 1, a finest one below the base, or a table size out of 2^4 .. 2^24.
+    """
+    if num_levels < 1 or not 1 <= base_resolution <= finest_resolution:
+        raise NerfroError(
+            f"hash grid of {num_levels} levels from {base_resolution} to {finest_resolution} cells: take 1 or more "
+            "levels and 1 <= base_resolution <= finest_resolution"
+        )
+    if not 4 <= log2_table_size <= 24:
+        raise NerfroError(f"log2_table_size={log2_table_size} is not within 4 to 24; usual values are 14 to 19")
+    growth = math.log(finest_resolution / base_resolution) / max(num_levels - 1, 1)
+    # The small addend keeps the last level from rounding down to one cell less than was asked for.
+    resolutions = [math.floor(base_resolution * math.exp(level * growth) + 1e-6) for level in range(num_levels)]
+    sizes = [min((n + 1) ** 3, 2**log2_table_size) for n in resolutions]
+    offsets = [sum(sizes[:level]) for level in range(num_levels)]
+    return GridLevels(tuple(resolutions), tuple(sizes), tuple(offsets))
+
+
+def hash_encode(
+    positions: Float[Tensor, "P 3"], table: Float[Tensor, "T 2"], levels: GridLevels
+) -> Float[Tensor, "P 2*L"]:
+    """Trilinearly interpolated features of every level, side by side.
+
+    Differentiable in the table only; positions are taken as constants.
+
+    Args:
+        positions: in the unit cube; what lies outside is clamped to it.
+        table: features of all levels' vertices.
+        levels: where they lie.
+
+    Returns:
+        Features in single precision, those of a level next to each other.
+    """
+    index, weight = _vertices(positions.detach().float(), levels)
+    # index_select, because its gradient is one index_add: indexing with brackets would sort all indices first.
+    features = table.index_select(0, index.flatten()).view(*index.shape, NUM_FEATURES)
+    return (features * weight[..., None]).sum(2).flatten(1)
+
+
+def _vertices(
+    positions: Float[Tensor, "P 3"], levels: GridLevels
+) -> tuple[Float[Tensor, "P L 8"], Float[Tensor, "P L 8"]]:
+    """Table entries and interpolation weights of the eight vertices around each position, on every level."""
+    device = positions.device
+    resolution = torch.tensor(levels.resolutions, device=device)
+    size, offset = torch.tensor(levels.sizes, device=device), torch.tensor(levels.offsets, device=device)
+    scaled = positions.clamp(0, 1)[:, None] * resolution[:, None]
+    cell = torch.minimum(scaled.long(), resolution[:, None] - 1)
+    fraction = scaled - cell
+    corner = torch.tensor([(i, j, k) for k in (0, 1) for j in (0, 1) for i in (0, 1)], device=device)
+    x, y, z = (cell[:, :, None] + corner).unbind(-1)
+    stride = resolution[:, None] + 1
+    dense = x + stride * (y + stride * z)
+    hashed = (x ^ (y * HASH_Y) ^ (z * HASH_Z)) % size[:, None]
+    is_dense = torch.tensor(levels.dense, device=device)
+    index = torch.where(is_dense[:, None], dense, hashed) + offset[:, None]
+    weight = torch.where(corner.bool(), fraction[:, :, None], 1 - fraction[:, :, None]).prod(-1)
+    return index, weight

@@ -1,0 +1,111 @@
+"""The fast field: a multi-resolution hash grid with two small MLPs."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerfro.errors import NerfroError
+from nerfro.fields import hash_encoding
+from nerfro.fields.base import Field
+from nerfro.fields.mlp import padded_sigmoid
+from nerfro.fields.selection import evaluate_selected, inside_box
+from nerfro.fields.spherical_harmonics import spherical_harmonics
+from nerfro.registry import register
+from nerfro.types import Radiance, Samples
+
+# What the density network hands to the colour network.
+_GEOMETRY_FEATURES = 16
+
+# Density may grow to e^15 times its start before the exponential is cut off, value and gradient.
+_MAX_EXPONENT = 15.0
+
+
+@register("field", "hash_grid")
+class HashGridField(Field):
+    """Hash encoding, a density MLP and a colour MLP that sees the direction (Instant-NGP, sections 3 and 5.4).
+
+    Density is exponential: exp(raw) scaled so that at the start a ray across the box has an optical depth of about
+    `initial_depth`. Samples outside the box are not evaluated; nothing is there.
+
+    Args:
+        box_min, box_max: opposite corners of the content's bounds, world units.
+        num_levels: of the encoding, with 2 features each.
+        base_resolution, finest_resolution: cells along the box's longest side.
+        log2_table_size: logarithm of the largest number of entries of a level.
+        width: of the hidden layers.
+        direction_bands: bands of spherical harmonics that encode the direction; 1 makes colour independent of it.
+        initial_depth: optical depth of the untrained field along the box's longest side.
+        precision: of the MLPs' matrix products; `float32` for processors without bfloat16 units.
+    """
+
+    def __init__(
+        self,
+        box_min: list[float] = (-1.0, -1.0, -1.0),  # type: ignore[assignment]
+        box_max: list[float] = (1.0, 1.0, 1.0),  # type: ignore[assignment]
+        num_levels: int = 12,
+        base_resolution: int = 16,
+        finest_resolution: int = 256,
+        log2_table_size: int = 15,
+        width: int = 64,
+        direction_bands: int = 4,
+        initial_depth: float = 0.1,
+        precision: Literal["bfloat16", "float32"] = "bfloat16",
+    ) -> None:
+        super().__init__()
+        if len(box_min) != 3 or len(box_max) != 3 or not all(a < b for a, b in zip(box_min, box_max, strict=True)):
+            raise NerfroError(
+                f"field=hash_grid: box from {list(box_min)} to {list(box_max)} is empty; "
+                "give three numbers each, box_min below box_max"
+            )
+        if width < 1 or initial_depth <= 0:
+            raise NerfroError(f"field=hash_grid: width={width} and initial_depth={initial_depth} must be positive")
+        self.register_buffer("box_min", torch.tensor(list(box_min)), persistent=False)
+        self.register_buffer("box_max", torch.tensor(list(box_max)), persistent=False)
+        self.side = max(b - a for a, b in zip(box_min, box_max, strict=True))
+        self.initial_density = initial_depth / self.side
+        self.direction_bands, self.precision = direction_bands, precision
+        self.levels = hash_encoding.grid_levels(num_levels, base_resolution, finest_resolution, log2_table_size)
+        self.table = nn.Parameter(torch.empty(self.levels.num_entries, hash_encoding.NUM_FEATURES))
+        nn.init.uniform_(self.table, -1e-4, 1e-4)
+        num_harmonics = spherical_harmonics(torch.zeros(1, 3), direction_bands).shape[-1]
+        self.density_mlp = _mlp(hash_encoding.NUM_FEATURES * num_levels, width, 1, _GEOMETRY_FEATURES)
+        self.colour_mlp = _mlp(_GEOMETRY_FEATURES + num_harmonics, width, 2, 3)
+
+    def forward(self, samples: Samples) -> Radiance:
+        return evaluate_selected(self.decode, samples, inside_box(samples.positions, self.box_min, self.box_max))
+
+    def decode(
+        self, positions: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]
+    ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P 3"]]:
+        """Density and colour at positions within the box."""
+        harmonics = spherical_harmonics(directions, self.direction_bands)
+        features = self.encode(positions)
+        with torch.autocast(positions.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
+            geometry = self.density_mlp(features)
+            raw = self.colour_mlp(torch.cat([geometry, harmonics.to(geometry.dtype)], dim=-1))
+        density = self.initial_density * torch.exp(geometry[:, 0].float().clamp(max=_MAX_EXPONENT))
+        return density, padded_sigmoid(raw)
+
+    def encode(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P F"]:
+        """Hash encoding in single precision, compiled on the CPU."""
+        unit = (positions - self.box_min) / self.side
+        if unit.device.type == "cpu":
+            from nerfro.kernels.hash_encoding import hash_encode  # compiled code, so only where it is used
+        else:
+            hash_encode = hash_encoding.hash_encode
+        return hash_encode(unit, self.table, self.levels)
+
+
+def _mlp(num_inputs: int, width: int, num_hidden: int, num_outputs: int) -> nn.Sequential:
+    """ReLU layers without biases, Glorot-uniform."""
+    widths = [num_inputs, *[width] * num_hidden, num_outputs]
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(widths):
+        layers += [nn.Linear(inputs, outputs, bias=False), nn.ReLU()]
+        nn.init.xavier_uniform_(layers[-2].weight)
+    return nn.Sequential(*layers[:-1])

@@ -1,0 +1,40 @@
+"""Asking a field only where it can hold something."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerfro.types import Radiance, Samples
+
+Decoder = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""Maps positions and unit directions [P, 3] to density [P] and colour [P, 3]."""
+
+
+def evaluate_selected(decoder: Decoder, samples: Samples, selected: Bool[Tensor, "R N"]) -> Radiance:
+    """Evaluate `decoder` at the selected samples alone; elsewhere density and colour are zero.
+
+    On a GPU the number of selected samples is waited for, one synchronisation with the host.
+
+    Args:
+        decoder: asked once, with the selected samples in one list in the order of `samples`; possibly an empty one.
+        samples: R rays of N samples.
+        selected: where to evaluate.
+    """
+    index = selected.flatten().nonzero().squeeze(1)
+    positions = samples.positions.flatten(0, 1).index_select(0, index)
+    directions = samples.directions.flatten(0, 1).index_select(0, index)
+    density, rgb = decoder(positions, directions)
+    # Written out of place into zeros, so that gradients flow from the full tensors back to the selected samples.
+    all_density = density.new_zeros(selected.numel()).index_copy(0, index, density)
+    all_rgb = rgb.new_zeros(selected.numel(), 3).index_copy(0, index, rgb)
+    return Radiance(all_density.view(selected.shape), all_rgb.view(*selected.shape, 3))
+
+
+def inside_box(
+    positions: Float[Tensor, "*batch 3"], box_min: Float[Tensor, "3"], box_max: Float[Tensor, "3"]
+) -> Bool[Tensor, "*batch"]:
+    """Whether positions lie in an axis-aligned box, faces included."""
+    return ((positions >= box_min) & (positions <= box_max)).all(-1)

@@ -1,0 +1,1 @@
+"""Compiled kernels, each behind the plain-torch reference that it is tested against."""

@@ -1,0 +1,122 @@
+"""The hash encoding: interpolation in plain PyTorch, and the compiled kernels against it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from nerfro.errors import NerfroError
+from nerfro.fields import hash_encoding
+from nerfro.kernels import hash_encoding as kernels
+
+# Two dense levels and three hashed ones, the last of them much finer than its table.
+LEVELS = hash_encoding.grid_levels(num_levels=5, base_resolution=4, finest_resolution=64, log2_table_size=10)
+
+
+def random_table(seed: int = 0) -> torch.Tensor:
+    return torch.randn(LEVELS.num_entries, 2, generator=torch.Generator().manual_seed(seed))
+
+
+def random_positions(num_points: int) -> torch.Tensor:
+    """Points in the unit cube, with its corners, faces and a few outside among them."""
+    points = torch.rand(num_points, 3, generator=torch.Generator().manual_seed(1))
+    special = torch.tensor([[0.0, 0, 0], [1, 1, 1], [1, 0, 0.5], [0.25, 1, 0.75], [-0.5, 0.5, 1.5], [0.5, 2, -3]])
+    return torch.cat([points, special])
+
+
+def test_levels_grow_geometrically_and_hash_only_what_does_not_fit() -> None:
+    assert LEVELS.resolutions == (4, 8, 16, 32, 64)
+    assert LEVELS.dense == (True, True, False, False, False)
+    assert LEVELS.sizes == (125, 729, 1024, 1024, 1024)
+    assert LEVELS.num_entries == sum(LEVELS.sizes)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [((0, 4, 8, 10), "1 or more"), ((2, 8, 4, 10), "base_resolution <= finest"), ((2, 4, 8, 40), "4 to 24")],
+)
+def test_impossible_grids_are_refused(arguments: tuple[int, int, int, int], message: str) -> None:
+    with pytest.raises(NerfroError, match=message):
+        hash_encoding.grid_levels(*arguments)
+
+
+@pytest.mark.parametrize("encode", [hash_encoding.hash_encode, kernels.hash_encode])
+def test_dense_levels_reproduce_trilinear_functions(encode) -> None:
+    # Trilinear interpolation is exact for 1, x, y, z, xy, ..., xyz; entries are ordered with x fastest.
+    levels = hash_encoding.grid_levels(num_levels=2, base_resolution=3, finest_resolution=7, log2_table_size=12)
+
+    def functions(p: torch.Tensor) -> torch.Tensor:
+        x, y, z = p.unbind(-1)
+        return torch.stack([1 + 2 * x - 3 * y + 5 * z, x * y * z - 2 * y * z], -1)
+
+    vertices = []
+    for n in levels.resolutions:
+        k, j, i = torch.meshgrid(*[torch.linspace(0, 1, n + 1)] * 3, indexing="ij")
+        vertices.append(torch.stack([i, j, k], -1).reshape(-1, 3))
+    positions = torch.rand(100, 3, generator=torch.Generator().manual_seed(2))
+    encoded = encode(positions, functions(torch.cat(vertices)), levels)
+    torch.testing.assert_close(encoded, functions(positions).repeat(1, 2), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("encode", [hash_encoding.hash_encode, kernels.hash_encode])
+def test_encoding_is_continuous_across_cells(encode) -> None:
+    # Steps of 2^-18 across the faces of all levels' cells: no feature may jump by more than its steepest slope allows.
+    table, step = random_table(), 2.0**-18
+    face = torch.arange(1, 64) / 64
+    around = face[:, None] + torch.tensor([-step, step])
+    positions = torch.stack([around, torch.full_like(around, 0.3), torch.full_like(around, 0.7)], -1)
+    encoded = encode(positions.reshape(-1, 3), table, LEVELS).view(63, 2, -1)
+    steepest = 2 * table.abs().max() * 64
+    assert (encoded[:, 1] - encoded[:, 0]).abs().max() < steepest * 2 * step
+
+
+@pytest.mark.parametrize("num_points", [0, 1, 3000])
+def test_kernels_match_the_reference_forward_and_backward(num_points: int) -> None:
+    positions = random_positions(num_points)
+    ours, reference = random_table().requires_grad_(), random_table().requires_grad_()
+    encoded, expected = (
+        kernels.hash_encode(positions, ours, LEVELS),
+        hash_encoding.hash_encode(positions, reference, LEVELS),
+    )
+    torch.testing.assert_close(encoded, expected, rtol=1e-5, atol=1e-5)
+    upstream = torch.randn(expected.shape, generator=torch.Generator().manual_seed(3))
+    encoded.backward(upstream)
+    expected.backward(upstream)
+    torch.testing.assert_close(ours.grad, reference.grad, rtol=1e-5, atol=1e-5 * float(reference.grad.abs().max()))
+
+
+def test_kernels_accept_an_empty_list() -> None:
+    table = random_table().requires_grad_()
+    encoded = kernels.hash_encode(torch.zeros(0, 3), table, LEVELS)
+    assert encoded.shape == (0, 10)
+    encoded.sum().backward()
+    assert torch.equal(table.grad, torch.zeros_like(table))
+
+
+def test_gradient_does_not_depend_on_the_number_of_threads() -> None:
+    threads, gradients = torch.get_num_threads(), []
+    try:
+        for wanted in (1, 2):
+            torch.set_num_threads(wanted)
+            table = random_table().requires_grad_()
+            kernels.hash_encode(random_positions(5000), table, LEVELS).sin().sum().backward()
+            gradients.append(table.grad)
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(*gradients)
+
+
+def test_positions_that_are_not_numbers_are_answered_with_nan() -> None:
+    encoded = kernels.hash_encode(torch.full((4, 3), float("nan")), random_table(), LEVELS)
+    assert encoded.isnan().all()
+
+
+def test_hashed_vertices_spread_over_the_table() -> None:
+    # 65^3 vertices in 1024 entries: a fair hash leaves each entry with 268 +- 16 of them; allow twenty sigma.
+    n = torch.arange(65)
+    vertices = torch.stack(torch.meshgrid(n, n, n, indexing="ij"), -1).reshape(-1, 3) / 64
+    table = torch.zeros(LEVELS.num_entries, 2, requires_grad=True)
+    kernels.hash_encode(vertices, table, LEVELS)[:, -2:].sum().backward()
+    counts = table.grad[LEVELS.offsets[-1] :, 0]
+    assert counts.min() > 268 * 0.5
+    assert counts.max() < 268 * 2

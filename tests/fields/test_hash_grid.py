@@ -1,0 +1,154 @@
+"""The hash-grid field and its evaluation of selected samples."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from nerfro.errors import NerfroError
+from nerfro.fields import hash_encoding
+from nerfro.fields.hash_grid import HashGridField
+from nerfro.fields.selection import evaluate_selected, inside_box
+from nerfro.types import Samples
+
+
+def make_samples(num_rays: int = 6, num_samples: int = 9, scale: float = 2.0) -> Samples:
+    generator = torch.Generator().manual_seed(0)
+    positions = scale * (2 * torch.rand(num_rays, num_samples, 3, generator=generator) - 1)
+    directions = torch.nn.functional.normalize(torch.randn(num_rays, num_samples, 3, generator=generator), dim=-1)
+    edges = torch.linspace(0, 1, num_samples + 1).expand(num_rays, -1)
+    return Samples(positions, directions, edges[:, :-1], edges, torch.ones(num_rays))
+
+
+def make_field(precision: str = "float32", **changes: object) -> HashGridField:
+    torch.manual_seed(0)
+    settings = {"num_levels": 4, "finest_resolution": 32, "log2_table_size": 10, "precision": precision} | changes
+    field = HashGridField(**settings)
+    torch.nn.init.normal_(field.table, std=0.5)
+    return field
+
+
+def test_selected_samples_get_what_they_would_get_alone() -> None:
+    samples = make_samples()
+    selected = torch.rand(6, 9, generator=torch.Generator().manual_seed(4)) < 0.4
+    asked = []
+
+    def decoder(positions: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        asked.append(positions.shape[0])
+        return positions.square().sum(-1), directions.abs()
+
+    radiance = evaluate_selected(decoder, samples, selected)
+    density, rgb = decoder(samples.positions, samples.directions)
+    assert asked[0] == int(selected.sum())
+    assert torch.equal(radiance.density, torch.where(selected, density, 0))
+    assert torch.equal(radiance.rgb, torch.where(selected[..., None], rgb, 0))
+
+
+def test_nothing_selected_still_has_gradients() -> None:
+    field = make_field()
+    radiance = field(make_samples(scale=0.0))  # all in the middle
+    assert (radiance.density > 0).all()
+    outside = make_samples()
+    outside = Samples(outside.positions + 100, outside.directions, outside.s, outside.edges, outside.radii)
+    radiance = field(outside)
+    assert not radiance.density.any()
+    assert not radiance.rgb.any()
+    (radiance.density.sum() + radiance.rgb.sum()).backward()
+    assert all(p.grad is not None and not p.grad.any() for p in field.parameters())
+
+
+def test_only_samples_inside_the_box_are_evaluated() -> None:
+    field, samples = make_field(box_min=[-1, -0.5, 0], box_max=[1, 0.5, 1.5]), make_samples()
+    inside = ((samples.positions >= field.box_min) & (samples.positions <= field.box_max)).all(-1)
+    assert 0 < inside.sum() < inside.numel()
+    radiance = field(samples)
+    assert torch.equal(radiance.density > 0, inside)
+    assert torch.equal(inside_box(torch.full((2, 3), float("nan")), field.box_min, field.box_max), torch.zeros(2) > 0)
+
+
+def test_compiled_field_equals_the_plain_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples, results = make_samples(), []
+    for plain in (False, True):
+        field = make_field()
+        if plain:
+            monkeypatch.setattr(
+                field,
+                "encode",
+                lambda p, f=field: hash_encoding.hash_encode((p - f.box_min) / f.side, f.table, f.levels),
+            )
+        radiance = field(samples)
+        (radiance.density.sum() + radiance.rgb.square().sum()).backward()
+        results.append([radiance.density.detach(), radiance.rgb.detach(), *(p.grad for p in field.parameters())])
+    for compiled, expected in zip(*results, strict=True):
+        torch.testing.assert_close(compiled, expected, rtol=1e-5, atol=1e-5 * float(expected.abs().max()))
+
+
+def test_bfloat16_products_stay_close_to_single_precision() -> None:
+    # bfloat16 keeps 8 significant bits; three layers may lose a few of them.
+    exact, rounded = make_field("float32")(make_samples()), make_field("bfloat16")(make_samples())
+    assert rounded.density.dtype == rounded.rgb.dtype == torch.float32
+    torch.testing.assert_close(rounded.density, exact.density, rtol=0.1, atol=0)
+    torch.testing.assert_close(rounded.rgb, exact.rgb, rtol=0, atol=0.03)
+
+
+def test_field_runs_under_autocast_with_encodings_in_single_precision() -> None:
+    field = make_field()
+    with torch.autocast("cpu", torch.bfloat16):
+        assert field.encode(torch.zeros(5, 3)).dtype == torch.float32
+        radiance = field(make_samples())
+    assert radiance.density.dtype == torch.float32
+    radiance.density.sum().backward()
+    assert field.table.grad is not None
+    assert field.table.grad.dtype == torch.float32
+
+
+def test_untrained_field_is_thin_fog_whatever_the_box() -> None:
+    for side in (0.1, 20.0):
+        torch.manual_seed(0)
+        field = HashGridField([0.0] * 3, [side] * 3, initial_depth=0.2)
+        with torch.no_grad():
+            density, _ = field.decode(side * torch.rand(100, 3), torch.tensor([[0.0, 0, 1]]).expand(100, 3))
+        torch.testing.assert_close(density * side, torch.full((100,), 0.2), rtol=0.02, atol=0)
+
+
+def test_one_direction_band_makes_colour_independent_of_direction() -> None:
+    field, samples = make_field(direction_bands=1), make_samples()
+    turned = Samples(samples.positions, -samples.directions, samples.s, samples.edges, samples.radii)
+    assert torch.equal(field(samples).rgb, field(turned).rgb)
+
+
+def test_state_restores_the_field() -> None:
+    field, other = make_field(), make_field()
+    torch.nn.init.normal_(other.table)
+    other.load_state_dict(field.state_dict())
+    assert torch.equal(field(make_samples()).rgb, other(make_samples()).rgb)
+
+
+def test_field_learns_a_coloured_ball() -> None:
+    # Density and colour of a ball of radius 0.6 from samples alone; a constant answer has an error of about 0.2.
+    torch.manual_seed(0)
+    field = HashGridField(num_levels=6, finest_resolution=32, log2_table_size=12)
+    optimiser = torch.optim.Adam(field.parameters(), lr=1e-2, eps=1e-15)
+    for _ in range(150):
+        positions = 2 * torch.rand(2048, 3) - 1
+        ball = (positions.norm(dim=-1) < 0.6).float()
+        density, rgb = field.decode(positions, torch.nn.functional.normalize(torch.randn(2048, 3), dim=-1))
+        alpha = 1 - torch.exp(-density)
+        loss = (alpha - ball).square().mean() + (ball[:, None] * (rgb - (positions + 1) / 2).square()).mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    assert loss < 0.02
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"box_min": [0.0, 0, 0], "box_max": [1.0, 0, 1]}, "box_min below box_max"),
+        ({"box_min": [0.0, 0]}, "three numbers"),
+        ({"width": 0}, "must be positive"),
+    ],
+)
+def test_impossible_fields_are_refused(settings: dict, message: str) -> None:
+    with pytest.raises(NerfroError, match=message):
+        HashGridField(**settings)
