@@ -77,9 +77,7 @@ class TrainingProgress(ProgressBar):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._begun, self._begun_at = time.perf_counter(), training_progress(trainer)
         form = "{desc} {percentage:3.0f}%|{bar}| {postfix}"
-        self._bar = tqdm(
-            total=1.0, desc="train", bar_format=form, dynamic_ncols=True, disable=not self._enabled
-        )
+        self._bar = tqdm(total=1.0, desc="train", bar_format=form, dynamic_ncols=True, disable=not self._enabled)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int

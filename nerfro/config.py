@@ -10,6 +10,7 @@ from omegaconf import MISSING, DictConfig
 
 from nerfro.errors import NerfroError
 from nerfro.losses.base import Loss
+from nerfro.media.analytic import Vacuum
 from nerfro.models.base import NerfModel, Parts
 from nerfro.models.optimizer import OptimizerConfig
 from nerfro.registry import build, configure, find
@@ -77,6 +78,26 @@ class CheckpointConfig:
 
 
 @dataclass
+class AuthorsConfig:
+    """What the authors of the paper set for a scene, taken up by the `paper_*` experiments alone.
+
+    Attributes:
+        resolution: vertices a side of the index grid.
+        smoothing_size, smoothing_sigma: taps and standard deviation (voxels) of its smoothing.
+        num_steps: Eikonal steps, N_c x N_e.
+        boundary_weight: of the boundary regulariser.
+        max_steps: iterations.
+    """
+
+    resolution: int = 512
+    smoothing_size: int = 9
+    smoothing_sigma: float = 1.0
+    num_steps: int = 768
+    boundary_weight: float = 0.025
+    max_steps: int = 200_000
+
+
+@dataclass
 class TrainConfig:
     """Everything that `python -m nerfro.train` composes from conf/train.yaml.
 
@@ -86,7 +107,7 @@ class TrainConfig:
         data, medium, field, boundary, model: one plugin of that kind.
         sampler: path and point sampler.
         loss: fields of each training loss, by the loss's registered name.
-        optimizer, batches, evaluation, checkpoint: see there.
+        authors, optimizer, batches, evaluation, checkpoint: see there.
         trainer, logger: Lightning objects.
         ckpt_path: checkpoint to go on from, or `last` for the newest of this experiment.
     """
@@ -100,6 +121,7 @@ class TrainConfig:
     boundary: Any = MISSING
     model: Any = MISSING
     loss: dict[str, Any] = dataclasses.field(default_factory=dict)
+    authors: AuthorsConfig = dataclasses.field(default_factory=AuthorsConfig)
     optimizer: OptimizerConfig = dataclasses.field(default_factory=OptimizerConfig)
     batches: BatchesConfig = dataclasses.field(default_factory=BatchesConfig)
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
@@ -131,7 +153,8 @@ def build_model(config: DictConfig) -> NerfModel:
     optimizer = OptimizerConfig(**config.optimizer)
     path_sampler, point_sampler = build(config.sampler.path), build(config.sampler.points)
     boundary = build(config.boundary)
-    medium = build(config.medium)  # last, since voxelisation takes longest
+    # Last, since voxelisation takes longest.
+    medium = build(config.medium) if path_sampler.needs_medium else Vacuum()
     parts = Parts(
         medium=medium,
         path_sampler=path_sampler,

@@ -65,10 +65,18 @@ def main(config: DictConfig) -> None:
     device = _device(config.device)
     views = build(trained.data).load(config.split)
     model = restore(checkpoint, trained).to(device)
-    metrics = ImageMetrics(*find_lpips_network(config.lpips_backbone or trained.evaluation.lpips_backbone), prefix=config.split)
+    metrics = ImageMetrics(
+        *find_lpips_network(config.lpips_backbone or trained.evaluation.lpips_backbone), prefix=config.split
+    )
     result = score_views(model, views, metrics, folder)
     throughput = checkpoint["callbacks"].get("Throughput", {})
-    report(result, f"{trained.name} on {trained.data.root}, {config.split} views", folder, checkpoint["global_step"], throughput)
+    report(
+        result,
+        f"{trained.name} on {trained.data.root}, {config.split} views",
+        folder,
+        checkpoint["global_step"],
+        throughput,
+    )
     print(f"pictures and tables: {folder}")
 
 
@@ -83,7 +91,9 @@ def restore(checkpoint: dict, config: DictConfig) -> NerfModel:
         model.load_state_dict(checkpoint["state_dict"])
     except RuntimeError as error:
         reason = str(error).strip().split("\n")[-1].strip()
-        raise NerfroError(f"the checkpoint's weights do not fit its configuration: {reason}; was nerfro updated?") from error
+        raise NerfroError(
+            f"the checkpoint's weights do not fit its configuration: {reason}; was nerfro updated?"
+        ) from error
     return model.eval()
 
 

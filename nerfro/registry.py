@@ -184,7 +184,9 @@ def configure(plugin: Plugin, node: DictConfig | Mapping[str, object]) -> dict[s
     values = {str(key): value for key, value in typing.cast(dict, values).items() if key != "_target_"}
     for name, allowed in plugin.choices.items():
         if values[name] not in allowed:
-            raise NerfroError(f"{where}: {name}={values[name]!r} is not allowed; choose {', '.join(map(repr, allowed))}")
+            raise NerfroError(
+                f"{where}: {name}={values[name]!r} is not allowed; choose {', '.join(map(repr, allowed))}"
+            )
     return values
 
 

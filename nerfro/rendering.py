@@ -28,9 +28,7 @@ def volume_weights(
     return weights, transmittance[:, -1]
 
 
-def composite(
-    samples: Samples, radiance: Radiance, boundary_rgb: Float[Tensor, "R 3"], path: Path
-) -> Rendering:
+def composite(samples: Samples, radiance: Radiance, boundary_rgb: Float[Tensor, "R 3"], path: Path) -> Rendering:
     """Render one level: C = sum_i w_i c_i + T_{N+1} C'(d_N) (paper, Eqn. volrendBd)."""
     density, rgb = radiance.density.float(), radiance.rgb.float()  # sums over a ray stay in single precision
     weights, transmittance = volume_weights(density, samples.deltas)

@@ -26,8 +26,8 @@ from nerfro.registry import Plugin, build
 from nerfro.rendering import composite
 from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.eikonal import Eikonal
-from nerfro.samplers.stratified import Stratified, point_samples
 from nerfro.samplers.straight import Straight
+from nerfro.samplers.stratified import Stratified, point_samples
 from nerfro.types import Batch, Path, Radiance, Rays, Rendering, Samples
 
 NUM_RAYS = 24

@@ -60,6 +60,7 @@ def main(config: DictConfig) -> None:
         wanted.precrop_fraction,
         wanted.jitter,
     )
+    lpips = find_lpips_network(config.evaluation.lpips_backbone)
     model = build_model(config)
     # Weights and Adam's two moments, in an old checkpoint that goes when the new one is whole.
     num_bytes = sum(p.numel() * p.element_size() for p in model.parameters())
@@ -78,7 +79,7 @@ def main(config: DictConfig) -> None:
         sys.exit(EXIT_INTERRUPTED)
 
     model.to(trainer.strategy.root_device)
-    metrics = ImageMetrics(*find_lpips_network(config.evaluation.lpips_backbone), prefix=config.evaluation.split)
+    metrics = ImageMetrics(*lpips, prefix=config.evaluation.split)
     result = score_views(model, test, metrics, folder)
     title = f"{config.name} on {config.data.root}, {config.evaluation.split} views"
     report(result, title, folder, trainer.global_step, throughput.state_dict())

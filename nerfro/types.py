@@ -81,6 +81,23 @@ class Path:
         fields = ("positions", "directions", "s", "exit_directions", "refracted", "radii")
         return Path(*(getattr(self, name)[index] for name in fields))
 
+    def span(self, box: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
+        """Arc lengths between which the path runs inside a box, from its first entry to its last exit.
+
+        Rows that never meet the box have an empty span at far.
+        """
+        starts, directions = self.positions[:, :-1], self.directions[:, :-1]
+        lengths = self.s[:, 1:] - self.s[:, :-1]
+        # Slab test; a direction parallel to a slab divides by zero, and the infinities compare as they should.
+        to_low, to_high = (box[0] - starts) / directions, (box[1] - starts) / directions
+        enter = torch.minimum(to_low, to_high).nan_to_num(-torch.inf).amax(-1).clamp(min=0)
+        leave = torch.minimum(torch.maximum(to_low, to_high).nan_to_num(torch.inf).amin(-1), lengths)
+        meets = enter < leave
+        far = self.far[:, None]
+        first = torch.where(meets, self.s[:, :-1] + enter, far).amin(-1)
+        last = torch.where(meets, self.s[:, :-1] + leave, -torch.inf).amax(-1)
+        return first, torch.maximum(first, last)
+
     def at(self, s: Float[Tensor, "R N"]) -> tuple[Float[Tensor, "R N 3"], Float[Tensor, "R N 3"]]:
         """Positions and directions at arc lengths `s` (paper, section 2: the nearest former vertex, floor of t).
 
@@ -177,5 +194,3 @@ class Batch:
     rgb: Float[Tensor, "R 3"]
     index: Int[Tensor, "R"]
     cameras: Cameras
-
-

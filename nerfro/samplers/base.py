@@ -11,7 +11,13 @@ from nerfro.types import Path, Rays, Rendering, Samples
 
 
 class PathSampler(nn.Module, ABC):
-    """Bends rays into paths."""
+    """Bends rays into paths.
+
+    Attributes:
+        needs_medium: whether it asks the medium at all; if not, none is built.
+    """
+
+    needs_medium = True
 
     @abstractmethod
     def forward(self, rays: Rays, medium: Medium) -> Path:

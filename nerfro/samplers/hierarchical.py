@@ -28,7 +28,7 @@ class Hierarchical(PointSampler):
         union: render the sorted union of both (NeRF, the paper) or the fine ones alone (mip-NeRF).
         blur: filter the coarse weights with mip-NeRF's max-blur first.
         padding: weight added to every bin before drawing; mip-NeRF's is 0.01, the authors' code has 0.
-        draw, cast, offset: of the coarse samples, see `stratified`.
+        draw, cast, offset, box_min, box_max: of the coarse samples, see `stratified`.
     """
 
     num_levels = 2
@@ -43,6 +43,8 @@ class Hierarchical(PointSampler):
         draw: Literal["arc_length", "vertices"] = "arc_length",
         cast: Literal["points", "cones"] = "points",
         offset: float = 0.5,
+        box_min: list[float] | None = None,
+        box_max: list[float] | None = None,
     ) -> None:
         super().__init__()
         if num_coarse < 4 or num_fine < 1:
@@ -54,7 +56,7 @@ class Hierarchical(PointSampler):
             raise NerfroError(f"sampler/points: padding={padding} is negative; 0 switches it off")
         if cast == "cones" and union:
             raise NerfroError("sampler/points: cones are not merged with coarse ones; set union=false")
-        self.coarse = Stratified(num_coarse, draw, cast, offset)
+        self.coarse = Stratified(num_coarse, draw, cast, offset, box_min, box_max)
         self.num_fine, self.union, self.blur, self.padding, self.cast = num_fine, union, blur, padding, cast
 
     def forward(self, path: Path, previous: Rendering | None) -> Samples:

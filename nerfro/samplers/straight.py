@@ -14,6 +14,8 @@ from nerfro.types import Path, Rays
 class Straight(PathSampler):
     """Straight rays: o + s d, whatever the medium."""
 
+    needs_medium = False
+
     @torch.no_grad()
     def forward(self, rays: Rays, medium: Medium) -> Path:
         """The two-vertex path of every ray; `refracted` is false throughout."""

@@ -27,6 +27,7 @@ class Stratified(PointSampler):
             paper does with its Eikonal samples, and needs a path of S = N_c * N_e vertices.
         cast: `points`, or `cones` whose samples fill the bins (mip-NeRF).
         offset: bin position used in evaluation, 0 the bin's start, 0.5 its centre.
+        box_min, box_max: corners of a box outside of which there is nothing to sample, world units; none for no box.
     """
 
     num_levels = 1
@@ -37,6 +38,8 @@ class Stratified(PointSampler):
         draw: Literal["arc_length", "vertices"] = "arc_length",
         cast: Literal["points", "cones"] = "points",
         offset: float = 0.5,
+        box_min: list[float] | None = None,
+        box_max: list[float] | None = None,
     ) -> None:
         super().__init__()
         if num_samples < 2:
@@ -45,15 +48,22 @@ class Stratified(PointSampler):
             raise NerfroError(f"sampler/points: offset={offset} is outside [0, 1)")
         if cast == "cones" and draw == "vertices":
             raise NerfroError("sampler/points: cones have no vertices to draw; set draw=arc_length")
+        if (box_min is None) != (box_max is None) or (box_min is not None and draw == "vertices"):
+            raise NerfroError("sampler/points: give both box_min and box_max or neither, and with draw=arc_length only")
         self.num_samples, self.draw, self.cast, self.offset = num_samples, draw, cast, offset
+        box = None if box_min is None or box_max is None else torch.tensor([list(box_min), list(box_max)])
+        self.register_buffer("box", box, persistent=False)
 
     def forward(self, path: Path, previous: Rendering | None) -> Samples:
         if self.draw == "vertices":
             return self._draw_vertices(path)
-        if self.cast == "cones":
-            return cone_samples(path, self._cone_edges(path))
-        fractions = (self._bins(path.s) + self._offsets(path.s)) / self.num_samples
-        return point_samples(path, path.near[:, None] + fractions * (path.far - path.near)[:, None])
+        near, far = (path.near, path.far) if self.box is None else path.span(self.box)
+        cones = self.cast == "cones"
+        fractions = (
+            self._cone_fractions(path.s) if cones else (self._bins(path.s) + self._offsets(path.s)) / self.num_samples
+        )
+        s = near[:, None] + fractions * (far - near)[:, None]
+        return cone_samples(path, s) if cones else point_samples(path, s)
 
     def _bins(self, like: Tensor) -> Float[Tensor, "N"]:
         return torch.arange(self.num_samples, device=like.device, dtype=like.dtype)
@@ -64,15 +74,14 @@ class Stratified(PointSampler):
             return torch.rand(shape, device=like.device, dtype=like.dtype)
         return torch.full(shape, self.offset, device=like.device, dtype=like.dtype)
 
-    def _cone_edges(self, path: Path) -> Float[Tensor, "R N+1"]:
-        fractions = torch.linspace(0.0, 1.0, self.num_samples + 1, device=path.s.device, dtype=path.s.dtype)
+    def _cone_fractions(self, like: Tensor) -> Float[Tensor, "R N+1"]:
+        fractions = torch.linspace(0.0, 1.0, self.num_samples + 1, device=like.device, dtype=like.dtype)
         if self.training:  # each edge moves within half a bin of its place, as mip-NeRF's do
             middle = 0.5 * (fractions[1:] + fractions[:-1])
             low = torch.cat([fractions[:1], middle])
             high = torch.cat([middle, fractions[-1:]])
-            draw = torch.rand(len(path.s), self.num_samples + 1, device=path.s.device, dtype=path.s.dtype)
-            fractions = low + (high - low) * draw
-        return path.near[:, None] + fractions * (path.far - path.near)[:, None]
+            return low + (high - low) * torch.rand(len(like), len(fractions), device=like.device, dtype=like.dtype)
+        return fractions.expand(len(like), -1)
 
     def _draw_vertices(self, path: Path) -> Samples:
         steps, remainder = divmod(path.s.shape[1], self.num_samples)

@@ -1,0 +1,31 @@
+"""Paths in arc length."""
+
+from __future__ import annotations
+
+import torch
+
+from nerfro.testing import example_path
+
+BOX = torch.tensor([[-0.5, -0.7, -0.4], [0.6, 0.5, 0.7]])
+
+
+def test_span_holds_just_what_is_inside_the_box() -> None:
+    path = example_path(64)
+    first, last = path.span(BOX)
+    s = torch.linspace(2.0, 6.0, 4001).expand(64, -1).contiguous()
+    positions, _ = path.at(s)
+    inside = ((positions > BOX[0]) & (positions < BOX[1])).all(-1)
+    assert 10 < inside.any(-1).sum() < 60
+    for ray in range(64):
+        if not inside[ray].any():
+            continue
+        seen = s[ray][inside[ray]]
+        assert abs(seen.min() - first[ray]) < 2e-3
+        assert abs(seen.max() - last[ray]) < 2e-3
+
+
+def test_span_of_a_path_that_misses_the_box_is_empty() -> None:
+    path = example_path(16)
+    first, last = path.span(BOX + 20)
+    torch.testing.assert_close(first, path.far)
+    torch.testing.assert_close(last, path.far)
