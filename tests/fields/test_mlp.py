@@ -1,0 +1,98 @@
+"""The networks: sizes as published, activations, and where the input is fed in again."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from nerfro.errors import NerfroError
+from nerfro.fields.mip_nerf import MipNerfField
+from nerfro.fields.mlp import RGB_PADDING, RadianceMLP, SkipMLP, glorot_linear, padded_sigmoid
+from nerfro.fields.nerf import NerfField
+from nerfro.samplers.stratified import Stratified
+from nerfro.testing import example_path, example_samples
+
+
+def test_input_is_fed_in_again_after_the_skip_layer() -> None:
+    mlp = SkipMLP(num_inputs=7, width=16, depth=8, skip=5)
+    assert [layer.in_features for layer in mlp.layers] == [7, 16, 16, 16, 16, 16 + 7, 16, 16]
+    assert mlp.num_outputs == 16
+
+
+def test_forward_equals_a_slow_loop_over_layers() -> None:
+    mlp = SkipMLP(num_inputs=5, width=8, depth=4, skip=2)
+    x = torch.randn(11, 5)
+    y = x
+    for i in range(4):
+        layer = mlp.layers[i]
+        y = (y @ layer.weight.T + layer.bias).clamp(min=0)
+        if i == 1:
+            y = torch.cat([y, x], -1)
+    torch.testing.assert_close(mlp(x), y)
+
+
+def test_skip_at_the_last_layer_widens_the_output() -> None:
+    mlp = SkipMLP(num_inputs=5, width=8, depth=3, skip=3)
+    assert mlp(torch.randn(2, 5)).shape == (2, mlp.num_outputs) == (2, 13)
+
+
+def test_published_nerf_has_its_number_of_weights() -> None:
+    def linear(num_inputs: int, num_outputs: int) -> int:
+        return (num_inputs + 1) * num_outputs
+
+    expected = linear(63, 256) + 6 * linear(256, 256) + linear(256 + 63, 256)  # trunk
+    expected += linear(256, 1) + linear(256, 256) + linear(256 + 27, 128) + linear(128, 3)
+    assert sum(p.numel() for p in NerfField().parameters()) == expected
+
+
+def test_density_is_a_shifted_softplus() -> None:
+    mlp = RadianceMLP(6, 6, width=8, depth=2, skip=1, view_width=4)
+    torch.nn.init.zeros_(mlp.density.weight)
+    density, _ = mlp(torch.randn(9, 6), torch.randn(9, 6))
+    torch.testing.assert_close(density, torch.full((9,), math.log1p(math.exp(-1.0))))
+
+
+def test_density_does_not_depend_on_the_direction_but_colour_does() -> None:
+    mlp = RadianceMLP(6, 6, width=32, depth=2, skip=1, view_width=16)
+    position = torch.randn(9, 6)
+    (density, rgb), (same, other) = (mlp(position, torch.randn(9, 6)) for _ in range(2))
+    assert torch.equal(density, same)
+    assert not torch.allclose(rgb, other)
+
+
+def test_colour_reaches_a_thousandth_beyond_black_and_white() -> None:
+    ends = padded_sigmoid(torch.tensor([-100.0, 0.0, 100.0]))
+    torch.testing.assert_close(ends, torch.tensor([-RGB_PADDING, 0.5, 1 + RGB_PADDING]))
+
+
+def test_weights_are_glorot_uniform_and_biases_zero() -> None:
+    layer = glorot_linear(300, 200)
+    bound = math.sqrt(6 / (300 + 200))
+    assert layer.weight.abs().max() <= bound
+    assert layer.weight.std().item() == pytest.approx(bound / math.sqrt(3), rel=0.02)
+    assert (layer.bias == 0).all()
+
+
+def test_nerf_field_depends_on_position_through_the_unit_of_length() -> None:
+    torch.manual_seed(1)
+    field = NerfField(width=16, depth=2, skip=1, view_width=8)
+    torch.manual_seed(1)
+    scaled = NerfField(width=16, depth=2, skip=1, view_width=8, normalise=2.0)
+    samples = example_samples()
+    doubled = type(samples)(2 * samples.positions, samples.directions, samples.s, samples.edges, samples.radii)
+    torch.testing.assert_close(field(samples).density, scaled(doubled).density)
+
+
+def test_mip_nerf_field_sees_the_size_of_the_cone() -> None:
+    field = MipNerfField(width=16, depth=2, skip=1, view_width=8)
+    samples = Stratified(8, cast="cones").eval()(example_path(), None)
+    wider = type(samples)(samples.positions, samples.directions, samples.s, samples.edges, 100 * samples.radii)
+    assert not torch.allclose(field(samples).density, field(wider).density)
+
+
+@pytest.mark.parametrize(("width", "depth"), [(0, 4), (8, 0)])
+def test_empty_networks_are_refused(width: int, depth: int) -> None:
+    with pytest.raises(NerfroError, match=f"width {width} and depth {depth} is empty; take 1 or more of each"):
+        SkipMLP(3, width, depth, 1)

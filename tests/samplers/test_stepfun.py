@@ -1,0 +1,114 @@
+"""Inverse transform sampling against its analytic distribution and against a slow loop."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from nerfro.samplers.stepfun import blur_weights, invert_cdf, midpoints, spread_uniform
+
+
+def slow_invert_cdf(edges: np.ndarray, weights: np.ndarray, u: float) -> float:
+    """Walk through the bins until their share of the weight exceeds u, then interpolate inside the bin."""
+    shares = weights / weights.sum()
+    below = 0.0
+    for i, share in enumerate(shares):
+        if u < below + share:
+            return edges[i] + (u - below) / share * (edges[i + 1] - edges[i])
+        below += share
+    return edges[-1]
+
+
+def random_step_function(num_rays: int, num_bins: int) -> tuple[Tensor, Tensor]:
+    """Edges that ascend unevenly and weights of which a quarter is zero."""
+    edges = 2 + torch.rand(num_rays, num_bins + 1, dtype=torch.float64).cumsum(-1)
+    weights = torch.rand(num_rays, num_bins, dtype=torch.float64)
+    weights[torch.rand(num_rays, num_bins) < 0.25] = 0
+    return edges, weights
+
+
+def test_inverse_of_the_cumulative_distribution_equals_a_slow_loop() -> None:
+    edges, weights = random_step_function(20, 9)
+    u = torch.rand(20, 30, dtype=torch.float64)
+    fast = invert_cdf(edges, weights, u)
+    slow = [
+        [slow_invert_cdf(edges[r].numpy(), weights[r].numpy(), float(u[r, i])) for i in range(30)] for r in range(20)
+    ]
+    torch.testing.assert_close(fast, torch.tensor(slow, dtype=torch.float64), rtol=0, atol=1e-9)
+
+
+def test_samples_follow_the_step_function() -> None:
+    edges, weights = random_step_function(3, 12)
+    num_samples = 40_000
+    s = invert_cdf(edges, weights, torch.rand(3, num_samples, dtype=torch.float64))
+    for ray in range(3):
+        cdf = np.concatenate([[0], np.cumsum(weights[ray].numpy())])
+        expected = np.interp(s[ray].sort().values.numpy(), edges[ray].numpy(), cdf / cdf[-1])
+        empirical = (np.arange(num_samples) + 0.5) / num_samples
+        # Kolmogorov-Smirnov: the largest deviation exceeds 1.95 / sqrt(N) with probability 1e-3.
+        assert np.abs(empirical - expected).max() < 1.95 / math.sqrt(num_samples)
+
+
+def test_no_sample_falls_into_a_bin_without_weight() -> None:
+    edges = torch.arange(7.0).expand(2, -1)
+    weights = torch.tensor([[0.0, 1, 0, 0, 2, 0], [1, 0, 0, 0, 0, 1]])
+    bins = invert_cdf(edges, weights, torch.rand(2, 500)).floor().clamp(max=5).long()
+    assert (weights.gather(1, bins) > 0).all()
+
+
+def test_samples_stay_inside_at_both_ends_of_u() -> None:
+    edges, weights = random_step_function(50, 7)
+    edges, weights = edges.float(), weights.float()
+    u = torch.tensor([0.0, 1 - torch.finfo(torch.float32).eps]).expand(50, -1)
+    s = invert_cdf(edges, weights, u)
+    assert (s >= edges[:, :1]).all()
+    assert (s <= edges[:, -1:]).all()
+
+
+def test_ascending_u_gives_ascending_samples() -> None:
+    edges, weights = random_step_function(50, 40)
+    s = invert_cdf(edges.float(), weights.float(), spread_uniform(50, 128, True, edges.float()))
+    assert (s.diff(dim=1) >= -1e-6).all()
+
+
+def test_ray_without_weight_is_sampled_uniformly() -> None:
+    edges = torch.tensor([[2.0, 3, 4, 5, 6]])
+    u = torch.linspace(0, 0.999, 50)[None]
+    torch.testing.assert_close(invert_cdf(edges, torch.zeros(1, 4), u), 2 + 4 * u)
+
+
+def test_scaling_the_weights_changes_nothing() -> None:
+    edges, weights = random_step_function(5, 9)
+    u = torch.rand(5, 20, dtype=torch.float64)
+    torch.testing.assert_close(invert_cdf(edges, weights, u), invert_cdf(edges, 1000 * weights, u))
+
+
+def test_blur_equals_a_slow_loop() -> None:
+    weights = torch.rand(4, 11)
+    slow = torch.empty_like(weights)
+    for ray in range(4):
+        for i in range(11):
+            here, left, right = (weights[ray, j] for j in (i, max(i - 1, 0), min(i + 1, 10)))
+            slow[ray, i] = 0.5 * (max(left, here) + max(here, right)) + 0.01
+    torch.testing.assert_close(blur_weights(weights, 0.01), slow)
+
+
+@pytest.mark.parametrize("num_samples", [1, 5, 64])
+def test_random_u_has_one_draw_in_each_bin(num_samples: int) -> None:
+    u = spread_uniform(100, num_samples, True, torch.zeros(()))
+    assert ((u * num_samples).floor() == torch.arange(num_samples)).all()
+    assert len(u.unique()) > 0.9 * u.numel()
+
+
+def test_even_u_runs_from_zero_to_just_below_one() -> None:
+    u = spread_uniform(2, 9, False, torch.zeros(()))
+    torch.testing.assert_close(u, torch.linspace(0, 1, 9).expand(2, -1))
+    assert (u < 1).all()
+
+
+def test_midpoints_halve_the_intervals() -> None:
+    assert midpoints(torch.tensor([[0.0, 2, 6]])).tolist() == [[1, 4]]

@@ -1,0 +1,158 @@
+"""Volume rendering against a slow loop and a closed form, and paths as polylines."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from nerfro.media.analytic import Luneburg, Vacuum
+from nerfro.rendering import composite, volume_weights
+from nerfro.samplers.eikonal import Eikonal
+from nerfro.samplers.hierarchical import Hierarchical
+from nerfro.samplers.integrators import INTEGRATORS
+from nerfro.samplers.straight import Straight, straight_path
+from nerfro.samplers.stratified import Stratified, point_samples
+from nerfro.testing import NUM_RAYS, example_path, example_rays, example_rendering, example_samples
+from nerfro.types import Path, Radiance, Rays, Samples
+
+
+def smooth_radiance(samples: Samples) -> Radiance:
+    """Density and colour as smooth functions of position and direction."""
+    density = 3 * torch.exp(-samples.positions.square().sum(-1))
+    return Radiance(density, torch.sigmoid(samples.positions + samples.directions))
+
+
+def test_weights_and_final_transmittance_sum_to_one() -> None:
+    density, deltas = 100 * torch.rand(50, 64) ** 4, torch.rand(50, 64)
+    weights, transmittance = volume_weights(density, deltas)
+    torch.testing.assert_close(weights.sum(-1) + transmittance, torch.ones(50), atol=1e-5, rtol=0)
+    assert (weights >= 0).all()
+
+
+@pytest.mark.parametrize("density", [0.0, 1e-8, 1e8])
+def test_extreme_densities_stay_finite_and_have_finite_gradients(density: float) -> None:
+    raw = torch.full((2, 8), density, requires_grad=True)
+    weights, transmittance = volume_weights(raw, torch.ones(2, 8))
+    torch.testing.assert_close(weights.sum(-1) + transmittance, torch.ones(2))
+    (weights[:, 0].sum() + transmittance.sum()).backward()
+    assert raw.grad is not None
+    assert raw.grad.isfinite().all()
+
+
+def test_constant_density_attenuates_exponentially() -> None:
+    deltas = torch.rand(3, 20, dtype=torch.float64)
+    _, transmittance = volume_weights(torch.full_like(deltas, 0.7), deltas)
+    torch.testing.assert_close(transmittance, torch.exp(-0.7 * deltas.sum(-1)))
+
+
+def test_compositing_equals_a_slow_loop() -> None:
+    samples, boundary = example_samples(), torch.rand(NUM_RAYS, 3)
+    radiance = smooth_radiance(samples)
+    rendering = composite(samples, radiance, boundary, example_path())
+    for ray in range(NUM_RAYS):
+        colour, transmittance = torch.zeros(3), 1.0
+        for i in range(samples.s.shape[1]):
+            alpha = 1 - math.exp(-float(radiance.density[ray, i] * samples.deltas[ray, i]))
+            colour += transmittance * alpha * radiance.rgb[ray, i]
+            transmittance *= 1 - alpha
+        colour += transmittance * boundary[ray]
+        torch.testing.assert_close(rendering.rgb[ray], colour, atol=1e-5, rtol=0)
+        assert rendering.transmittance[ray] == pytest.approx(transmittance, abs=1e-5)
+
+
+def test_empty_volume_shows_the_boundary() -> None:
+    samples, boundary = example_samples(), torch.rand(NUM_RAYS, 3)
+    empty = Radiance(torch.zeros_like(samples.s), torch.ones_like(samples.positions))
+    rendering = composite(samples, empty, boundary, example_path())
+    torch.testing.assert_close(rendering.rgb, boundary)
+    torch.testing.assert_close(rendering.depth, rendering.path.far)
+
+
+def test_opaque_wall_hides_the_boundary_and_gives_its_depth() -> None:
+    samples = example_samples()
+    density = torch.where(torch.arange(16) == 5, 1e6, 0.0).expand_as(samples.s)
+    rgb = torch.full_like(samples.positions, 0.25)
+    rendering = composite(samples, Radiance(density, rgb), torch.ones(NUM_RAYS, 3), example_path())
+    torch.testing.assert_close(rendering.rgb, torch.full((NUM_RAYS, 3), 0.25))
+    assert (rendering.depth >= samples.edges[:, 5]).all()
+    assert (rendering.depth <= samples.edges[:, 6]).all()
+
+
+def test_half_precision_radiance_is_summed_in_single_precision() -> None:
+    samples = example_samples()
+    radiance = smooth_radiance(samples)
+    half = Radiance(radiance.density.bfloat16(), radiance.rgb.bfloat16())
+    assert composite(samples, half, torch.zeros(NUM_RAYS, 3).bfloat16(), example_path()).rgb.dtype == torch.float32
+
+
+def test_opacity_is_what_does_not_pass() -> None:
+    rendering = example_rendering()
+    torch.testing.assert_close(rendering.opacity, 1 - rendering.transmittance)
+
+
+@pytest.mark.parametrize("integrator", sorted(INTEGRATORS))
+@pytest.mark.parametrize("levels", ["stratified", "hierarchical"])
+def test_straight_and_eikonal_render_the_same_image_where_n_is_one(integrator: str, levels: str) -> None:
+    rays, vacuum = example_rays(), Vacuum()
+    images = []
+    for path_sampler in (Straight(), Eikonal(integrator, 96)):  # type: ignore[arg-type]
+        path = path_sampler(rays, vacuum)
+        sampler = (Stratified(32) if levels == "stratified" else Hierarchical(16, 32)).eval()
+        rendering = None
+        for _ in range(sampler.num_levels):
+            samples = sampler(path, rendering)
+            rendering = composite(samples, smooth_radiance(samples), 0.5 + 0.5 * path.exit_directions, path)
+        assert rendering is not None
+        images.append(rendering.rgb)
+    torch.testing.assert_close(images[0], images[1], atol=2e-4, rtol=0)
+
+
+def test_rendering_converges_with_the_number_of_samples() -> None:
+    path = straight_path(example_rays())
+
+    def transmittance(num_samples: int) -> torch.Tensor:
+        samples = Stratified(num_samples).eval()(path, None)
+        return composite(samples, smooth_radiance(samples), torch.zeros(NUM_RAYS, 3), path).transmittance.double()
+
+    exact = transmittance(8192)
+    errors = [float((transmittance(n) - exact).abs().max()) for n in (32, 128)]
+    # A sample stands for the interval after it: a first-order rule, four times the samples a quarter of the error.
+    assert 3 < errors[0] / errors[1] < 6
+
+
+def corner() -> Path:
+    """A path of three vertices with a right angle: along x for 2, then along y for 3."""
+    positions = torch.tensor([[[0.0, 0, 0], [2, 0, 0], [2, 3, 0]]])
+    directions = torch.tensor([[[1.0, 0, 0], [0, 1, 0], [0, 1, 0]]])
+    s = torch.tensor([[1.0, 3, 6]])
+    return Path(positions, directions, s, directions[:, -1], torch.tensor([True]), torch.tensor([0.01]))
+
+
+def test_point_of_a_bent_path_follows_the_nearest_former_vertex() -> None:
+    positions, directions = corner().at(torch.tensor([[1.0, 2.5, 3.0, 3.5, 6.0]]))
+    expected = torch.tensor([[[0.0, 0, 0], [1.5, 0, 0], [2, 0, 0], [2, 0.5, 0], [2, 3, 0]]])
+    torch.testing.assert_close(positions, expected)
+    # At a vertex (s = 3) the direction is still that of the segment that led there.
+    assert directions[0, :, 0].tolist() == [1, 1, 1, 0, 0]
+
+
+def test_point_before_near_or_beyond_far_goes_straight_on() -> None:
+    positions, _ = corner().at(torch.tensor([[0.5, 7.0]]))
+    torch.testing.assert_close(positions, torch.tensor([[[-0.5, 0.0, 0.0], [2, 4, 0]]]))
+
+
+def test_every_vertex_of_a_path_is_found_at_its_arc_length() -> None:
+    path = Eikonal("leapfrog", 64)(example_rays(), Luneburg())
+    positions, _ = path.at(path.s)
+    # Between vertices the path is followed along a tangent, off by half the squared step at the next vertex.
+    torch.testing.assert_close(positions, path.positions, atol=0.5 * float(path.s.diff(dim=1).max()) ** 2, rtol=0)
+
+
+def test_samples_of_sliced_rays_and_paths_are_slices_of_the_samples() -> None:
+    path, rays = example_path(), example_rays()
+    whole, part = point_samples(path, path.s[:, ::4]), point_samples(path[3:9], path[3:9].s[:, ::4])
+    torch.testing.assert_close(whole.positions[3:9], part.positions)
+    assert isinstance(rays[3:9], Rays)
+    assert len(rays[3:9]) == 6
