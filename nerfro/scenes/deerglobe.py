@@ -64,7 +64,9 @@ def deer_colours(points: np.ndarray) -> np.ndarray:
     fur = np.where(spotted[:, None], np.array([0.98, 0.94, 0.84]), fur)
     pale = smoothstep(-0.05, -0.08, z) * (x > -0.2) * (x < 0.2) * (z > -0.13)
     fur = mix(fur, np.array([0.96, 0.90, 0.78]), np.maximum(pale, smoothstep(-0.235, -0.25, x)))
-    dark = (z < -0.215) | (x > 0.385) | (np.linalg.norm(np.abs(points) - np.array([0.29, 0.045, 0.265]), axis=1) < 0.018)
+    dark = (
+        (z < -0.215) | (x > 0.385) | (np.linalg.norm(np.abs(points) - np.array([0.29, 0.045, 0.265]), axis=1) < 0.018)
+    )
     return np.where(dark[:, None], np.array([0.08, 0.06, 0.06]), fur)
 
 
@@ -127,7 +129,9 @@ def sky(directions: np.ndarray) -> np.ndarray:
     fold = np.concatenate([3 * directions[..., :2], 0.4 * directions[..., 2:]], -1)
     curtain = np.abs(fractal_noise(fold, 4, seed=51) - 0.5)
     colour = mix(colour, np.array([0.62, 0.98, 0.78]), smoothstep(0.05, 0.01, curtain) * smoothstep(0.15, 0.5, up))
-    colour = mix(colour, np.array([0.96, 0.72, 0.90]), smoothstep(0.03, 0.0, np.abs(curtain - 0.09)) * smoothstep(0.2, 0.6, up))
+    colour = mix(
+        colour, np.array([0.96, 0.72, 0.90]), smoothstep(0.03, 0.0, np.abs(curtain - 0.09)) * smoothstep(0.2, 0.6, up)
+    )
     circle = np.stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)], -1)
     for scale, base, size, rock, seed in (
         (3.0, 8.0, 26.0, (0.60, 0.66, 0.82), 52),

@@ -1,7 +1,7 @@
 """Signed distances (negative inside) of simple solids, and their triangulation.
 
-Points are [..., 3] in world units. Some distances are bounds only (ellipsoids, unions): they have the right sign and zero
-set and never change faster than 1 per unit of length, which is all that `triangulate` needs.
+Points are [..., 3] in world units. Some distances are bounds only (ellipsoids, unions): they have the right sign and
+zero set and never change faster than 1 per unit of length, which is all that `triangulate` needs.
 """
 
 from __future__ import annotations
@@ -16,30 +16,31 @@ from nerfro.scenes.surface import Surface
 Distance = Callable[[np.ndarray], np.ndarray]
 Colour = Callable[[np.ndarray], np.ndarray]
 
+Vector = Sequence[float] | np.ndarray
+"""Three numbers along x, y, z."""
+
 _BLOCK = 16  # cells per side of the blocks that are skipped where no surface passes
 
 
-def ball(points: np.ndarray, centre: Sequence[float], radius: float) -> np.ndarray:
+def ball(points: np.ndarray, centre: Vector, radius: float) -> np.ndarray:
     """Distance to a ball."""
     return np.linalg.norm(points - np.asarray(centre), axis=-1) - radius
 
 
-def ellipsoid(points: np.ndarray, centre: Sequence[float], radii: Sequence[float]) -> np.ndarray:
+def ellipsoid(points: np.ndarray, centre: Vector, radii: Vector) -> np.ndarray:
     """Bound on the distance to an ellipsoid with axes along x, y, z."""
     scaled = (points - np.asarray(centre)) / np.asarray(radii)
     return (np.linalg.norm(scaled, axis=-1) - 1) * min(radii)
 
 
-def block(points: np.ndarray, centre: Sequence[float], half_sides: Sequence[float], rounding: float) -> np.ndarray:
+def block(points: np.ndarray, centre: Vector, half_sides: Vector, rounding: float) -> np.ndarray:
     """Distance to a box with rounded edges; `half_sides` include the rounding."""
     excess = np.abs(points - np.asarray(centre)) - (np.asarray(half_sides) - rounding)
     outside = np.linalg.norm(np.maximum(excess, 0.0), axis=-1)
     return outside + np.minimum(excess.max(-1), 0.0) - rounding
 
 
-def capsule(
-    points: np.ndarray, start: Sequence[float], end: Sequence[float], start_radius: float, end_radius: float
-) -> np.ndarray:
+def capsule(points: np.ndarray, start: Vector, end: Vector, start_radius: float, end_radius: float) -> np.ndarray:
     """Bound on the distance to a rod with round ends whose radius changes linearly from `start` to `end`."""
     first, axis = np.asarray(start, np.float64), np.asarray(end, np.float64) - np.asarray(start, np.float64)
     offset = points - first
@@ -49,7 +50,7 @@ def capsule(
     return (distance - (start_radius + (end_radius - start_radius) * along)) / np.sqrt(1 + slope**2)
 
 
-def cylinder(points: np.ndarray, centre: Sequence[float], radius: float, half_height: float) -> np.ndarray:
+def cylinder(points: np.ndarray, centre: Vector, radius: float, half_height: float) -> np.ndarray:
     """Bound on the distance to an upright cylinder."""
     offset = points - np.asarray(centre)
     return np.maximum(np.hypot(offset[..., 0], offset[..., 1]) - radius, np.abs(offset[..., 2]) - half_height)
@@ -87,7 +88,7 @@ def smooth_union(distances: Sequence[np.ndarray], width: float) -> np.ndarray:
     return total
 
 
-def triangulate(distance: Distance, low: Sequence[float], high: Sequence[float], spacing: float) -> Surface:
+def triangulate(distance: Distance, low: Vector, high: Vector, spacing: float) -> Surface:
     """Mesh the zero set of a distance with marching cubes, then pull the vertices and normals onto the exact surface.
 
     Args:
@@ -115,7 +116,7 @@ def triangulate(distance: Distance, low: Sequence[float], high: Sequence[float],
     for _ in range(3):
         gradient = _gradient(distance, vertices, 0.02 * spacing)
         squared = np.maximum((gradient**2).sum(-1), 1e-2)
-        # Half a cell at most: where two solids meet in a crease the gradient jumps and Newton's step is not to be trusted.
+        # Half a cell at most: where two solids meet in a crease the gradient jumps and Newton's step goes astray.
         step = np.clip(distance(vertices) / squared, -0.5 * spacing, 0.5 * spacing)
         vertices = vertices - step[:, None] * gradient
     gradient = _gradient(distance, vertices, 0.25 * spacing)
@@ -123,7 +124,7 @@ def triangulate(distance: Distance, low: Sequence[float], high: Sequence[float],
     return Surface(vertices.astype(np.float32), faces.astype(np.int32), normals.astype(np.float32))
 
 
-def painted(distance: Distance, colour: Colour, low: Sequence[float], high: Sequence[float], spacing: float) -> Surface:
+def painted(distance: Distance, colour: Colour, low: Vector, high: Vector, spacing: float) -> Surface:
     """Mesh a solid as `triangulate` does and colour its vertices with `colour`(points [V, 3]) -> sRGB [V, 3]."""
     surface = triangulate(distance, low, high, spacing)
     colours = np.clip(colour(surface.vertices.astype(np.float64)), 0.0, 1.0).astype(np.float32)

@@ -10,9 +10,9 @@ PLUGIN = "transmitting_glass"
 def register_transmitting_glass(mitsuba: ModuleType) -> None:
     """Register the BSDF `transmitting_glass` for the active Mitsuba variant.
 
-    A ray that meets the surface below the critical angle is transmitted as Snell's law says and keeps its radiance (no
-    partial Fresnel reflection, no division by n^2; both ends of every path lie in air, where the latter cancels anyway); above
-    the critical angle it is reflected totally. That is the image formation of the refractive-field paper: one path per ray.
+    A ray that meets the surface below the critical angle is transmitted as Snell's law says and keeps its radiance:
+    there is no partial Fresnel reflection, and no scaling by n^2, which cancels anyway as both ends of every path lie
+    in air. Above the critical angle it is reflected totally. That is the paper's image formation: one path per ray.
 
     Parameters of the plugin: `ior` (float, inside over outside) and `tint` (linear RGB factor per transmission).
 

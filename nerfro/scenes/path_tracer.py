@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import warnings
 from types import ModuleType
 
 import numpy as np
@@ -16,10 +17,11 @@ from nerfro.scenes.surface import Surface
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "scalar_rgb")
 SAMPLES_PER_PASS = 6_000_000  # a wavefront of paths is held in memory at once: about 1 GB per 10 M paths
+_GET_LLVM = "llvm_ad_rgb needs the LLVM library, 16 or newer (Debian: apt-get install libllvm19)"
 ROULETTE_DEPTH, MAX_DEPTH = 32, 1024  # light bounces long between the walls of a cube: cut late and without bias
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def load_mitsuba(variant: str = "auto") -> ModuleType:
     """Import Mitsuba, choose its variant and register our material.
 
@@ -45,13 +47,22 @@ def load_mitsuba(variant: str = "auto") -> ModuleType:
     for name in VARIANTS if variant == "auto" else (variant,):
         backend = {"llvm": drjit.JitBackend.LLVM, "cuda": drjit.JitBackend.CUDA}.get(name.split("_")[0])
         if backend is None or drjit.has_backend(backend):
+            if variant == "auto" and name == "scalar_rgb":
+                warnings.warn(f"rendering without LLVM, some seventy times slower; {_GET_LLVM}", stacklevel=2)
             mitsuba.set_variant(name)
-            register_transmitting_glass(mitsuba)
+            _register_materials(name)
             return mitsuba
     raise NerfroError(
-        f"Mitsuba variant '{variant}' does not run on this machine; "
-        "llvm_ad_rgb needs the LLVM library (Debian: apt-get install libllvm19), or use variant=scalar_rgb, which is slower"
+        f"Mitsuba variant '{variant}' does not run on this machine; {_GET_LLVM}, or take variant=scalar_rgb"
     )
+
+
+@functools.cache
+def _register_materials(variant: str) -> None:
+    """Register our material once per variant, which must be the active one."""
+    import mitsuba
+
+    register_transmitting_glass(mitsuba)
 
 
 class PathTracer:

@@ -57,7 +57,9 @@ def sail(points: np.ndarray, x: float, low: float, high: float, half_width: floa
     v = np.clip((2 * points[..., 2] - low - high) / (high - low), -1, 1)
     belly = x + 0.02 + 0.07 * (1 - u**2) * (1 - v**2)
     sheet = np.abs(points[..., 0] - belly) - 0.007
-    frame = np.maximum(np.abs(points[..., 1]) - half_width, np.abs(points[..., 2] - (low + high) / 2) - (high - low) / 2)
+    frame = np.maximum(
+        np.abs(points[..., 1]) - half_width, np.abs(points[..., 2] - (low + high) / 2) - (high - low) / 2
+    )
     return 0.5 * np.maximum(sheet, frame)
 
 
@@ -72,7 +74,9 @@ def sail_colours(points: np.ndarray) -> np.ndarray:
     radius = np.hypot(y, z - 0.03)
     colours = np.where((radius < 0.075)[:, None], np.array([0.97, 0.80, 0.25]), colours)
     rays = np.sin(8 * np.arctan2(z - 0.03, y)) > 0
-    return np.where((((radius < 0.062) & rays & (radius > 0.03)) | (radius < 0.02))[:, None], np.array([0.13, 0.26, 0.50]), colours)
+    return np.where(
+        (((radius < 0.062) & rays & (radius > 0.03)) | (radius < 0.02))[:, None], np.array([0.13, 0.26, 0.50]), colours
+    )
 
 
 def rigging(points: np.ndarray) -> np.ndarray:
@@ -82,7 +86,9 @@ def rigging(points: np.ndarray) -> np.ndarray:
         rods.append(capsule(points, (x, 0, DECK - 0.02), (x, 0, top + 0.06), 0.020, 0.010))
         rods.append(ball(points, (x, 0, top + 0.02), 0.035))
     for x, _, high, half_width in SAILS:
-        rods.append(capsule(points, (x + 0.01, -half_width - 0.03, high), (x + 0.01, half_width + 0.03, high), 0.012, 0.012))
+        rods.append(
+            capsule(points, (x + 0.01, -half_width - 0.03, high), (x + 0.01, half_width + 0.03, high), 0.012, 0.012)
+        )
     return np.minimum.reduce(rods)
 
 
@@ -112,7 +118,9 @@ def sky(directions: np.ndarray) -> np.ndarray:
     """Return linear radiance [..., 3] of a bay at sunset: clouds, a town, a lighthouse, islands and waves."""
     colour = clouds(directions, horizon=(0.99, 0.80, 0.60), zenith=(0.38, 0.52, 0.82), cover=0.70, seed=23)
     height, turn = elevation(directions), azimuth(directions)
-    ridge = 3 + 9 * fractal_noise(np.stack([turn * 30, 0 * turn, 0 * turn], -1), 4, seed=31) * (np.sin(4 * np.pi * turn) > 0)
+    ridge = 3 + 9 * fractal_noise(np.stack([turn * 30, 0 * turn, 0 * turn], -1), 4, seed=31) * (
+        np.sin(4 * np.pi * turn) > 0
+    )
     rock = 0.6 + 0.6 * fractal_noise(np.stack([turn * 160, height / 1.5, 0 * turn], -1), 3, seed=32)
     island = np.array([0.36, 0.46, 0.36]) * rock[..., None]
     colour = mix(colour, island, (height < ridge) & (np.sin(4 * np.pi * turn) > 0.05))
@@ -120,7 +128,9 @@ def sky(directions: np.ndarray) -> np.ndarray:
     colour = mix(colour, houses, covered * (np.sin(4 * np.pi * turn) < -0.15))
     across = (turn - 0.17) * 360
     tower = (np.abs(across) < 2.6 - 0.05 * height) & (height < 26)
-    bands = np.where((np.floor(height / 4.0) % 2 == 0)[..., None], np.array([0.80, 0.18, 0.16]), np.array([0.97, 0.95, 0.90]))
+    bands = np.where(
+        (np.floor(height / 4.0) % 2 == 0)[..., None], np.array([0.80, 0.18, 0.16]), np.array([0.97, 0.95, 0.90])
+    )
     colour = mix(colour, bands, tower)
     colour = mix(colour, np.array([1.0, 0.93, 0.62]), (np.abs(across) < 2.0) & (height > 22) & (height < 25))
     colour = mix(colour, _sea(directions), height < 0)
@@ -138,7 +148,9 @@ def _sea(directions: np.ndarray) -> np.ndarray:
     cell = np.floor(place / 0.5).astype(int)
     offset = place / 0.5 - cell - 0.5
     buoy = np.linalg.norm(offset - 0.3 * (hashed(cell, 42) - 0.5)[..., None], axis=-1)
-    painted_buoy = np.where((buoy < 0.05)[..., None], np.array([0.98, 0.95, 0.88]), chosen(HOUSES * [1, 0.7, 0.5], hashed(cell, 43)))
+    painted_buoy = np.where(
+        (buoy < 0.05)[..., None], np.array([0.98, 0.95, 0.88]), chosen(HOUSES * [1, 0.7, 0.5], hashed(cell, 43))
+    )
     water = np.where(((buoy < 0.11) & (hashed(cell, 44) < 0.35))[..., None], painted_buoy, water)
     return mix(np.array([0.80, 0.72, 0.64]), water, smoothstep(0.0, 0.12, depth))
 

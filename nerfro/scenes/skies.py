@@ -116,9 +116,7 @@ def lat_long_directions(height: int, width: int) -> np.ndarray:
     """
     rows, columns = (np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width
     theta, phi = np.pi * rows[:, None], 2 * np.pi * (0.5 - columns[None])
-    return np.stack(
-        [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi], -1
-    )
+    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi], -1)
 
 
 def lat_long_texture(sky: Sky, height: int, supersampling: int = 2) -> np.ndarray:

@@ -14,7 +14,14 @@ PLANET_RADIUS, RING_RADII = 0.21, (0.27, 0.37)
 AXIS = np.array([0.20, -0.82, 0.53]) / np.linalg.norm([0.20, -0.82, 0.53])  # the ring lies nearly in the star's plane
 ROOM_LOW, ROOM_HIGH = np.array([-1.7, -1.4, -1.0]), np.array([1.7, 1.4, 1.2])
 BOOKS = np.array(
-    [[0.70, 0.20, 0.18], [0.16, 0.33, 0.52], [0.88, 0.70, 0.28], [0.22, 0.46, 0.33], [0.90, 0.86, 0.76], [0.45, 0.26, 0.48]]
+    [
+        [0.70, 0.20, 0.18],
+        [0.16, 0.33, 0.52],
+        [0.88, 0.70, 0.28],
+        [0.22, 0.46, 0.33],
+        [0.90, 0.86, 0.76],
+        [0.45, 0.26, 0.48],
+    ]
 )
 GLASS_SPACING = 0.018
 
@@ -34,7 +41,9 @@ def planet_colours(points: np.ndarray) -> np.ndarray:
     swirl = fractal_noise(points * 14.0, 4, seed=2)
     band = 7.0 * latitude + 1.6 * swirl
     stripe = np.floor(band).astype(int)
-    palette = np.array([[0.93, 0.80, 0.58], [0.80, 0.46, 0.26], [0.97, 0.92, 0.80], [0.62, 0.36, 0.30], [0.88, 0.64, 0.36]])
+    palette = np.array(
+        [[0.93, 0.80, 0.58], [0.80, 0.46, 0.26], [0.97, 0.92, 0.80], [0.62, 0.36, 0.30], [0.88, 0.64, 0.36]]
+    )
     colours = palette[stripe % len(palette)] * (0.85 + 0.3 * (swirl - 0.5))[:, None]
     spot = np.linalg.norm(points / PLANET_RADIUS - np.array([0.5, -0.78, 0.3]), axis=1)
     colours = mix(colours, np.array([0.80, 0.16, 0.12]), smoothstep(0.34, 0.30, spot))
@@ -53,7 +62,9 @@ def ring(points: np.ndarray) -> np.ndarray:
     """Bound on the distance to the flat ring around the planet."""
     height = points @ AXIS
     radius = np.linalg.norm(points - height[..., None] * AXIS, axis=-1)
-    flat = np.maximum(np.abs(radius - sum(RING_RADII) / 2) - (RING_RADII[1] - RING_RADII[0]) / 2, np.abs(height) - 0.012)
+    flat = np.maximum(
+        np.abs(radius - sum(RING_RADII) / 2) - (RING_RADII[1] - RING_RADII[0]) / 2, np.abs(height) - 0.012
+    )
     return flat - 0.004
 
 
@@ -66,7 +77,9 @@ def sky(directions: np.ndarray) -> np.ndarray:
     x, y, z = np.moveaxis(directions * reach.min(-1)[..., None], -1, 0)
     colour = np.where((directions[..., 0] > 0)[..., None], _bookcase(y, z), _panelling(y, z))
     colour = np.where((wall == 1)[..., None], _windows(x, z, directions[..., 1] > 0), colour)
-    return to_linear(np.clip(np.where((wall == 2)[..., None], _floor_and_ceiling(x, y, directions[..., 2] > 0), colour), 0, 0.98))
+    return to_linear(
+        np.clip(np.where((wall == 2)[..., None], _floor_and_ceiling(x, y, directions[..., 2] > 0), colour), 0, 0.98)
+    )
 
 
 def _bookcase(y: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -136,7 +149,5 @@ def build(spacing: float) -> Scene:
     )
     extent = np.full(3, 1.1 * RING_RADII[1])
     rings = distance.painted(ring, ring_colours, -extent, extent, min(spacing, 0.006))
-    glass = distance.triangulate(
-        star_prism, (-OUTER, -HALF_DEPTH, -OUTER), (OUTER, HALF_DEPTH, OUTER), GLASS_SPACING
-    )
+    glass = distance.triangulate(star_prism, (-OUTER, -HALF_DEPTH, -OUTER), (OUTER, HALF_DEPTH, OUTER), GLASS_SPACING)
     return Scene(name="starlamp", ior=1.5, glass=glass, interior=join([planet, rings]), sky=sky)

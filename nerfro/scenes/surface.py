@@ -39,7 +39,7 @@ class Surface:
 
     def save(self, path: Path) -> None:
         """Write a binary PLY with normals, and sRGB vertex colours where there are any."""
-        path.write_bytes(self.as_trimesh().export(file_type="ply", vertex_normal=True))
+        path.write_bytes(trimesh.exchange.ply.export_ply(self.as_trimesh(), vertex_normal=True))
 
 
 def join(surfaces: Sequence[Surface]) -> Surface:
@@ -100,9 +100,7 @@ def sphere(radius: float, subdivisions: int) -> Surface:
     """Mesh a sphere around the origin as a subdivided icosahedron (20 * 4^subdivisions faces) with exact normals."""
     mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
     normals = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
-    return Surface(
-        (normals * radius).astype(np.float32), np.asarray(mesh.faces, np.int32), normals.astype(np.float32)
-    )
+    return Surface((normals * radius).astype(np.float32), np.asarray(mesh.faces, np.int32), normals.astype(np.float32))
 
 
 def torus_angles(major_radius: float, minor_radius: float, spacing: float) -> tuple[Surface, np.ndarray]:
