@@ -15,6 +15,7 @@ from nerfro.config import build_model
 from nerfro.errors import NerfroError
 from nerfro.evaluation.lpips import find_lpips_network
 from nerfro.evaluation.metrics import ImageMetrics
+from nerfro.evaluation.render_view import Supersampling
 from nerfro.evaluation.results import EvaluationResult, write_metrics_json
 from nerfro.evaluation.score_views import score_views
 from nerfro.evaluation.tables import to_rich, views_table, write_table
@@ -34,6 +35,7 @@ class EvaluateConfig:
         out: folder for pictures and tables; beside the checkpoint's folder by default.
         chunk_size: rays rendered at once, which bounds the memory; the trained one by default.
         lpips_backbone: file of AlexNet weights, if torch's hub cache has none.
+        supersample, divergence: rays per pixel (see docs/experiments.md); as trained by default.
         device: `cpu`, `cuda`, or `auto` for a GPU if there is one.
         overwrite: whether an earlier evaluation in `out` may be replaced.
     """
@@ -44,6 +46,8 @@ class EvaluateConfig:
     out: Optional[str] = None  # noqa: UP045
     chunk_size: Optional[int] = None  # noqa: UP045
     lpips_backbone: Optional[str] = None  # noqa: UP045
+    supersample: Optional[int] = None  # noqa: UP045
+    divergence: Optional[float] = None  # noqa: UP045
     device: str = "auto"
     overwrite: bool = False
 
@@ -60,15 +64,16 @@ def main(config: DictConfig) -> None:
         raise NerfroError(f"{folder} holds an evaluation already; give another out=... or overwrite=true")
     if config.root is not None:
         trained.data.root = config.root
-    if config.chunk_size is not None:
-        trained.evaluation.chunk_size = config.chunk_size
+    for name in ("chunk_size", "lpips_backbone", "supersample", "divergence"):
+        if config[name] is not None:
+            trained.evaluation[name] = config[name]
+    wanted = trained.evaluation
+    supersampling = Supersampling(wanted.supersample, wanted.divergence)
     device = _device(config.device)
     views = build(trained.data).load(config.split)
     model = restore(checkpoint, trained).to(device)
-    metrics = ImageMetrics(
-        *find_lpips_network(config.lpips_backbone or trained.evaluation.lpips_backbone), prefix=config.split
-    )
-    result = score_views(model, views, metrics, folder)
+    metrics = ImageMetrics(*find_lpips_network(wanted.lpips_backbone), prefix=config.split)
+    result = score_views(model, views, metrics, folder, supersampling)
     throughput = checkpoint["callbacks"].get("Throughput", {})
     report(
         result,

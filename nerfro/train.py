@@ -23,6 +23,7 @@ from nerfro.errors import NerfroError
 from nerfro.evaluate import report
 from nerfro.evaluation.lpips import find_lpips_network
 from nerfro.evaluation.metrics import ImageMetrics
+from nerfro.evaluation.render_view import Supersampling
 from nerfro.evaluation.score_views import score_views
 from nerfro.registry import build
 from nerfro.run_folder import (
@@ -60,6 +61,7 @@ def main(config: DictConfig) -> None:
         wanted.precrop_fraction,
         wanted.jitter,
     )
+    supersampling = Supersampling(config.evaluation.supersample, config.evaluation.divergence)
     lpips = find_lpips_network(config.evaluation.lpips_backbone)
     model = build_model(config)
     # Weights and Adam's two moments, in an old checkpoint that goes when the new one is whole.
@@ -80,7 +82,7 @@ def main(config: DictConfig) -> None:
 
     model.to(trainer.strategy.root_device)
     metrics = ImageMetrics(*lpips, prefix=config.evaluation.split)
-    result = score_views(model, test, metrics, folder)
+    result = score_views(model, test, metrics, folder, supersampling)
     title = f"{config.name} on {config.data.root}, {config.evaluation.split} views"
     report(result, title, folder, trainer.global_step, throughput.state_dict())
     print(f"{trainer.global_step} steps in {throughput.seconds:.0f} s, {throughput.rays_per_second or 0:,.0f} rays/s.")

@@ -9,11 +9,14 @@ from tqdm import tqdm
 from nerfro.data.base import Views
 from nerfro.evaluation.images import save_png
 from nerfro.evaluation.metrics import ImageMetrics
+from nerfro.evaluation.render_view import Supersampling, render_view
 from nerfro.evaluation.results import EvaluationResult
 from nerfro.models.base import NerfModel
 
 
-def score_views(model: NerfModel, views: Views, metrics: ImageMetrics, folder: Path) -> EvaluationResult:
+def score_views(
+    model: NerfModel, views: Views, metrics: ImageMetrics, folder: Path, supersampling: Supersampling
+) -> EvaluationResult:
     """Render every view as `folder/images/<prefix>_NNN.png` (8-bit sRGB, rounded) and score it.
 
     Memory: one view's rays and pictures, plus `model.chunk_size` rays' samples and activations.
@@ -23,13 +26,14 @@ def score_views(model: NerfModel, views: Views, metrics: ImageMetrics, folder: P
         views: what is compared with, on any device.
         metrics: collects the scores and names the pictures.
         folder: the run's folder.
+        supersampling: rays per pixel.
     """
     height, width = views.cameras.height, views.cameras.width
     cameras = views.cameras.to(model.device)
     progress = tqdm(total=len(views) * height * width, unit="ray", unit_scale=True, desc="evaluate", dynamic_ncols=True)
     with progress:
         for view in range(len(views)):
-            rgb = model.render(cameras.image_rays(view)).rgb.reshape(height, width, 3).cpu()
+            rgb = render_view(model, cameras, view, supersampling).rgb.reshape(height, width, 3).cpu()
             save_png(folder / "images" / f"{metrics.prefix}_{view:03d}.png", rgb)
             metrics.update(rgb, views.images[view].cpu(), view)
             progress.update(height * width)

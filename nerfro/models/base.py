@@ -89,6 +89,9 @@ class NerfModel(LightningModule, ABC):
         for group in self.optimizers().param_groups:
             group["lr"] = group["initial_lr"] * factor
 
+    def on_train_batch_end(self, outputs: object, batch: Batch, batch_index: int) -> None:
+        self.point_sampler.after_step(self.global_step, self.fields)
+
     def configure_optimizers(self) -> torch.optim.Optimizer:
         config = self.optimizer_config
         rates = {self.fields: config.learning_rate, self.boundary: config.boundary_rate}
@@ -124,18 +127,19 @@ class NerfModel(LightningModule, ABC):
             self.train(was_training)
         return RenderedRays(*(torch.cat(parts) for parts in zip(*chunks, strict=True)))
 
-    def _render_chunk(self, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
+    def _render_chunk(self, rays: Rays) -> tuple[Tensor, ...]:
         rendering = self(rays)[-1]
-        return rendering.rgb.clamp(0, 1), rendering.depth, rendering.opacity
+        return rendering.rgb.clamp(0, 1), rendering.depth, rendering.opacity, rendering.path.exit_directions
 
 
 @dataclass(frozen=True)
 class RenderedRays:
-    """What evaluation keeps of a rendering: colour (sRGB in [0, 1]), expected arc length and opacity."""
+    """What evaluation keeps of a rendering: colour (sRGB in [0, 1]), expected arc length, opacity, leaving direction."""
 
     rgb: Float[Tensor, "R 3"]
     depth: Float[Tensor, "R"]
     opacity: Float[Tensor, "R"]
+    exit_directions: Float[Tensor, "R 3"]
 
 
 def step_seed(seed: int, step: int, rank: int = 0) -> int:

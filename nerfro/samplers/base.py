@@ -36,3 +36,11 @@ class PointSampler(nn.Module, ABC):
     @abstractmethod
     def forward(self, path: Path, previous: Rendering | None) -> Samples:
         """Sample the path, first without and then with the previous level's rendering."""
+
+    def after_step(self, step: int, fields: nn.ModuleList) -> None:  # noqa: B027 - most samplers remember nothing
+        """Learn from the radiance fields after a training step, if the sampler remembers anything of them.
+
+        Args:
+            step: optimiser steps done.
+            fields: one for each level, or one for all.
+        """

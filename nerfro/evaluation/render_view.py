@@ -1,0 +1,75 @@
+"""Rendering one view, with more than one ray where a pixel's centre does not stand for the pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.data.cameras import Cameras
+from nerfro.errors import NerfroError
+from nerfro.models.base import NerfModel, RenderedRays
+
+
+@dataclass(frozen=True)
+class Supersampling:
+    """How many rays a pixel is given.
+
+    Attributes:
+        side: rays in each direction; a chosen pixel costs side^2 more rays.
+        divergence: pixels are chosen whose exit direction differs from a neighbour's by more than this many pixel
+            angles; 0 chooses all.
+    """
+
+    side: int = 1
+    divergence: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.side < 1 or self.divergence < 0:
+            raise NerfroError(
+                f"supersampling side={self.side} divergence={self.divergence}; take 1 or more, and 0 or more"
+            )
+
+
+def render_view(model: NerfModel, cameras: Cameras, view: int, supersampling: Supersampling) -> RenderedRays:
+    """Render all pixels of one view, row by row, as box averages over the pixel where it is supersampled.
+
+    Args:
+        model: the trained model.
+        cameras: on the model's device.
+        view: which of them.
+        supersampling: rays per pixel.
+    """
+    rendered = model.render(cameras.image_rays(view))
+    if supersampling.side == 1:
+        return rendered
+    diverging = exit_divergence(rendered.exit_directions.view(cameras.height, cameras.width, 3))
+    pixel_angle = 1 / float(cameras.fx[view])
+    chosen = (diverging >= supersampling.divergence * pixel_angle).flatten().nonzero()[:, 0]
+    if len(chosen) == 0:
+        return rendered
+    row, column = chosen // cameras.width, chosen % cameras.width
+    total = torch.zeros_like(rendered.rgb[chosen])
+    for offset in grid_offsets(supersampling.side).to(cameras.device):
+        rays = cameras.rays(torch.full_like(row, view), row, column, offset.expand(len(chosen), 2))
+        total += model.render(rays).rgb
+    rgb = rendered.rgb.clone()
+    rgb[chosen] = total / supersampling.side**2
+    return RenderedRays(rgb, rendered.depth, rendered.opacity, rendered.exit_directions)
+
+
+def exit_divergence(directions: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
+    """Largest angle in radians between a pixel's exit direction and those of its four neighbours."""
+    padded = F.pad(directions.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="replicate")[0].permute(1, 2, 0)
+    neighbours = (padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:])
+    chords = torch.stack([(directions - other).norm(dim=-1) for other in neighbours]).amax(0)
+    return 2 * torch.asin((0.5 * chords).clamp(max=1))
+
+
+def grid_offsets(side: int) -> Float[Tensor, "K 2"]:
+    """Centres of side x side equal parts of a pixel, as (x, y) in [0, 1)."""
+    ticks = (torch.arange(side) + 0.5) / side
+    return torch.cartesian_prod(ticks, ticks).view(-1, 2)

@@ -1,0 +1,107 @@
+"""Sampling where a remembered density says that something is: the role of a coarse network, at the cost of a lookup."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerfro.errors import NerfroError
+from nerfro.fields.base import Field
+from nerfro.registry import register
+from nerfro.rendering import volume_weights
+from nerfro.samplers.base import PointSampler
+from nerfro.samplers.stepfun import invert_cdf, spread_uniform
+from nerfro.samplers.stratified import cone_samples
+from nerfro.types import Path, Rendering, Samples
+
+
+@register("sampler/points", "density_grid")
+class DensityGridSampler(PointSampler):
+    """Inverse transform sampling of weights that a grid of the field's density predicts on arc length.
+
+    The grid lies over the content's box. It remembers the largest density found in each cell, decaying, and looks at
+    some cells of the finest field now and then while training (Instant-NGP's occupancy grid, appendix C, kept as
+    density so that it can be drawn from along a bent path). Weights include transmittance, so that nothing is sampled
+    behind what is opaque, and a share of the samples stays uniform, so that nothing is forgotten.
+
+    Args:
+        num_samples: intervals on each path.
+        num_bins: places along the path at which the grid is asked.
+        box_min, box_max: corners of the content's box; nothing is sampled outside.
+        resolution: cells of the grid along each side.
+        uniform: share of the samples that are spread evenly.
+        every: steps between two looks at the field.
+        decay: factor of the remembered density at each look.
+    """
+
+    num_levels = 1
+
+    def __init__(
+        self,
+        num_samples: int = 32,
+        num_bins: int = 96,
+        box_min: list[float] = (-1.0, -1.0, -1.0),  # type: ignore[assignment]
+        box_max: list[float] = (1.0, 1.0, 1.0),  # type: ignore[assignment]
+        resolution: int = 64,
+        uniform: float = 0.2,
+        every: int = 8,
+        decay: float = 0.9,
+    ) -> None:
+        super().__init__()
+        if num_samples < 1 or num_bins < 2 or resolution < 2 or every < 1:
+            raise NerfroError(
+                f"sampler/points=density_grid: num_samples={num_samples} num_bins={num_bins} resolution={resolution} "
+                f"every={every}; take at least 1, 2, 2 and 1"
+            )
+        if not 0 < uniform <= 1 or not 0 < decay < 1:
+            raise NerfroError(
+                f"sampler/points=density_grid: uniform={uniform} decay={decay}; take both between 0 and 1"
+            )
+        self.num_samples, self.num_bins, self.resolution = num_samples, num_bins, resolution
+        self.uniform, self.every, self.decay = uniform, every, decay
+        self.register_buffer("box", torch.tensor([list(box_min), list(box_max)]), persistent=False)
+        self.register_buffer("density", torch.zeros(resolution, resolution, resolution))
+
+    @torch.no_grad()
+    def forward(self, path: Path, previous: Rendering | None) -> Samples:
+        near, far = path.span(self.box)
+        fractions = torch.linspace(0, 1, self.num_bins + 1, device=near.device)
+        edges = near[:, None] + fractions * (far - near)[:, None]
+        positions, _ = path.at(0.5 * (edges[:, 1:] + edges[:, :-1]))
+        weights, _ = volume_weights(self.lookup(positions), edges[:, 1:] - edges[:, :-1])
+        share = weights / weights.sum(-1, keepdim=True).clamp(min=1e-6)
+        weights = share + self.uniform / (1 - self.uniform + 1e-6) / self.num_bins
+        u = spread_uniform(len(edges), self.num_samples + 1, self.training, edges)
+        return cone_samples(path, invert_cdf(edges, weights, u))
+
+    def lookup(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Remembered density of the cell that each position lies in."""
+        cell = ((positions - self.box[0]) / (self.box[1] - self.box[0]) * self.resolution).long()
+        x, y, z = cell.clamp(0, self.resolution - 1).unbind(-1)
+        return self.density.view(-1)[(x * self.resolution + y) * self.resolution + z]
+
+    @torch.no_grad()
+    def after_step(self, step: int, fields: nn.ModuleList) -> None:
+        """Look at a random sixteenth of the cells, at a random place in each."""
+        if step % self.every:
+            return
+        num_cells = self.resolution**3
+        device = self.density.device
+        cells = torch.randint(num_cells, (num_cells // 16,), device=device)
+        corners = torch.stack(
+            [cells // self.resolution**2, cells // self.resolution % self.resolution, cells % self.resolution], dim=-1
+        )
+        unit = (corners + torch.rand(len(cells), 3, device=device)) / self.resolution
+        found = field_density(fields[-1], self.box[0] + unit * (self.box[1] - self.box[0]))
+        flat = self.density.view(-1)
+        flat[cells] = torch.maximum(flat[cells] * self.decay, found)
+
+
+def field_density(field: Field, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
+    """A field's density at points, seen from above; density does not depend on the direction."""
+    directions = torch.zeros_like(positions)
+    directions[:, 2] = -1
+    s = torch.zeros(len(positions), 1, device=positions.device)
+    samples = Samples(positions[:, None], directions[:, None], s, torch.cat([s, s], dim=1), s[:, 0])
+    return field(samples).density[:, 0].float()
