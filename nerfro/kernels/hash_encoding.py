@@ -7,15 +7,16 @@ write to the same entry, so there are no atomics, and the sums do not depend on 
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
 from nerfro.fields.hash_encoding import HASH_Y, HASH_Z, NUM_FEATURES, GridLevels
+from nerfro.kernels.compilation import compiled, compiled_parallel
+from nerfro.kernels.threads import use_threads
 
 _BLOCK = 1024
 _ONE = np.float32(1)
@@ -36,7 +37,7 @@ class _HashEncode(torch.autograd.Function):
         ctx.save_for_backward(positions)
         ctx.levels, ctx.num_entries = levels, table.shape[0]
         features = positions.new_empty(positions.shape[0], NUM_FEATURES * len(levels))
-        _use_threads()
+        use_threads()
         _forward(positions.numpy(), table.detach().contiguous().numpy(), *_layout(levels), features.numpy())
         return features
 
@@ -45,7 +46,7 @@ class _HashEncode(torch.autograd.Function):
     def backward(ctx: FunctionCtx, gradient: Float[Tensor, "P 2*L"]) -> tuple[None, Float[Tensor, "T 2"], None]:
         (positions,) = ctx.saved_tensors
         table = torch.zeros(ctx.num_entries, NUM_FEATURES)
-        threads = min(_use_threads(), len(ctx.levels))
+        threads = min(use_threads(), len(ctx.levels))
         _backward(positions.numpy(), gradient.contiguous().numpy(), *_layout(ctx.levels), threads, table.numpy())
         return None, table, None
 
@@ -54,14 +55,7 @@ def _layout(levels: GridLevels) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
     return np.array(levels.resolutions), np.array(levels.sizes), np.array(levels.offsets), np.array(levels.dense)
 
 
-def _use_threads() -> int:
-    """Let kernels use as many threads as PyTorch does."""
-    threads = min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)
-    numba.set_num_threads(threads)
-    return threads
-
-
-@njit(inline="always")
+@compiled
 def _vertices(x, y, z, resolution, size, dense):
     """Offsets of the cell's eight vertices in its level, x fastest, and the position's fractions in the cell."""
     scale = np.float32(resolution)
@@ -74,31 +68,29 @@ def _vertices(x, y, z, resolution, size, dense):
     k = max(min(np.int64(z), resolution - 1), 0)
     if dense:
         stride = resolution + 1
-        first = i + stride * (j + stride * k)
-        second, third = first + stride, first + stride * stride
-        fourth = third + stride
-        vertices = (first, first + 1, second, second + 1, third, third + 1, fourth, fourth + 1)
+        a = i + stride * (j + stride * k)
+        b, c = a + stride, a + stride * stride
+        d = c + stride
+        e, f, g, h = a + 1, b + 1, c + 1, d + 1
     else:
         # Sizes of hashed levels are powers of two, so that the remainder is a mask.
-        mask = size - 1
+        mask, right = size - 1, i + 1
         y0, z0 = j * HASH_Y, k * HASH_Z
         y1, z1 = y0 + HASH_Y, z0 + HASH_Z
-        a, b, c, d = y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1
-        i1 = i + 1
-        vertices = (
-            (i ^ a) & mask,
-            (i1 ^ a) & mask,
-            (i ^ b) & mask,
-            (i1 ^ b) & mask,
-            (i ^ c) & mask,
-            (i1 ^ c) & mask,
-            (i ^ d) & mask,
-            (i1 ^ d) & mask,
+        a, b, c, d = (i ^ y0 ^ z0) & mask, (i ^ y1 ^ z0) & mask, (i ^ y0 ^ z1) & mask, (i ^ y1 ^ z1) & mask
+        e, f, g, h = (
+            (right ^ y0 ^ z0) & mask,
+            (right ^ y1 ^ z0) & mask,
+            (right ^ y0 ^ z1) & mask,
+            (right ^ y1 ^ z1) & mask,
         )
+    # Unsigned, because Numba counts signed ones from the end where they are negative, a test for each access.
+    index = np.uintp
+    vertices = (index(a), index(e), index(b), index(f), index(c), index(g), index(d), index(h))
     return vertices, x - np.float32(i), y - np.float32(j), z - np.float32(k)
 
 
-@njit(parallel=True, fastmath={"contract", "reassoc", "nsz"}, cache=True)
+@compiled_parallel
 def _forward(positions, table, resolutions, sizes, offsets, dense, features):
     num_points = positions.shape[0]
     for block in prange((num_points + _BLOCK - 1) // _BLOCK):
@@ -116,7 +108,7 @@ def _forward(positions, table, resolutions, sizes, offsets, dense, features):
                     features[p, 2 * level + f] = (_ONE - x) * left + x * right
 
 
-@njit(parallel=True, fastmath={"contract", "reassoc", "nsz"}, cache=True)
+@compiled_parallel
 def _backward(positions, gradient, resolutions, sizes, offsets, dense, threads, table):
     num_points = positions.shape[0]
     # Levels are dealt out in turn, because fine ones cost more than coarse ones.
@@ -130,9 +122,10 @@ def _backward(positions, gradient, resolutions, sizes, offsets, dense, threads, 
                         positions[p, 0], positions[p, 1], positions[p, 2], resolution, size, is_dense
                     )
                     w0, w1, w2, w3 = (_ONE - y) * (_ONE - z), y * (_ONE - z), (_ONE - y) * z, y * z
+                    # Both are read before any entry is written, which might overlap for all the compiler knows.
+                    both = (gradient[p, 2 * level], gradient[p, 2 * level + 1])
                     for f in range(2):
-                        right = x * gradient[p, 2 * level + f]
-                        left = gradient[p, 2 * level + f] - right
+                        left, right = (_ONE - x) * both[f], x * both[f]
                         entries[v[0], f] += w0 * left
                         entries[v[1], f] += w0 * right
                         entries[v[2], f] += w1 * left

@@ -1,0 +1,117 @@
+"""Lat-long pictures of the sky, and their files.
+
+World z is up: the top row looks along +z, the middle of the picture along +x, and the azimuth from +x to +y runs to the
+left, so that a viewer inside sees the sky unmirrored. Blender's environment textures use the same convention.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from nerfro.boundaries import radiance_hdr
+from nerfro.errors import NerfroError
+from nerfro.evaluation.files import write_atomically
+from nerfro.evaluation.images import save_png
+from nerfro.scenes.patterns import to_linear, to_srgb
+
+_FORMATS = (".png", ".jpg", ".jpeg", ".hdr", ".exr")
+
+
+def directions(height: int) -> Float[Tensor, "H 2*H 3"]:
+    """Unit directions at the pixels' centres of a lat-long picture."""
+    polar = (torch.arange(height) + 0.5) / height * math.pi
+    azimuth = math.pi - (torch.arange(2 * height) + 0.5) / height * math.pi
+    polar, azimuth = torch.meshgrid(polar, azimuth, indexing="ij")
+    return torch.stack([polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos()], dim=-1)
+
+
+def sample(rgb: Float[Tensor, "H W 3"], where: Float[Tensor, "P 3"], width: int) -> Float[Tensor, "P 3"]:
+    """Bilinear lookup in a lat-long picture that was first averaged to at most `width` columns, against aliasing."""
+    picture = rgb.permute(2, 0, 1)[None]
+    if rgb.shape[1] > width:
+        picture = torch.nn.functional.interpolate(picture, size=(width // 2, width), mode="area")
+    # One column more on each side closes the seam.
+    picture = torch.cat([picture[..., -1:], picture, picture[..., :1]], dim=-1)
+    columns = picture.shape[-1] - 2
+    u = (0.5 - torch.atan2(where[:, 1], where[:, 0]) / (2 * math.pi)) * columns + 1
+    v = torch.acos(where[:, 2].clamp(-1, 1)) / math.pi
+    grid = torch.stack([u / (columns + 2) * 2 - 1, v * 2 - 1], dim=-1)[None, None]
+    found = torch.nn.functional.grid_sample(picture, grid, padding_mode="border", align_corners=False)
+    return found[0, :, 0].T
+
+
+def load_lat_long(path: Path | str) -> Float[Tensor, "H 2*H 3"]:
+    """Read a lat-long picture as sRGB in [0, 1]; what is brighter than 1 in a .hdr or .exr is clipped.
+
+    Raises:
+        NerfroError: the file is missing, not readable, of another format, or not twice as wide as high.
+    """
+    path = Path(path)
+    suffix = _format(path)
+    if not path.is_file():
+        raise NerfroError(f"the sky {path} does not exist; correct boundary.image")
+    try:
+        if suffix == ".hdr":
+            rgb = to_srgb(np.clip(radiance_hdr.decode(path.read_bytes()), 0, 1))
+        elif suffix == ".exr":
+            rgb = to_srgb(np.clip(_mitsuba_bitmap()(str(path)), 0, 1)[..., :3])
+        else:
+            with Image.open(path) as image:
+                rgb = np.array(image.convert("RGB")) / 255
+    except (OSError, ValueError, RuntimeError, SyntaxError) as error:
+        raise NerfroError(f"the sky {path} cannot be read ({error}); write or copy it again") from error
+    height, width = rgb.shape[:2]
+    if width != 2 * height:
+        raise NerfroError(f"the sky {path} has {width}x{height} pixels; a lat-long picture is twice as wide as high")
+    return torch.from_numpy(np.ascontiguousarray(rgb)).float()
+
+
+def save_lat_long(path: Path | str, rgb: Float[Tensor, "H 2*H 3"]) -> None:
+    """Write a lat-long picture: 8-bit sRGB for .png, linear radiance for .hdr and .exr.
+
+    Args:
+        path: its ending chooses the format.
+        rgb: sRGB in [0, 1].
+
+    Raises:
+        NerfroError: another format, or the file cannot be written.
+    """
+    path = Path(path)
+    suffix = _format(path)
+    if suffix == ".png":
+        save_png(path, rgb)
+        return
+    linear = to_linear(rgb.double().numpy()).astype(np.float32)
+    if suffix == ".hdr":
+        write_atomically(path, radiance_hdr.encode(linear))
+    elif suffix == ".exr":
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _mitsuba_bitmap()(linear).write(str(path))
+    else:
+        raise NerfroError(f"a sky is not written as {suffix}, which loses detail; use .png, .hdr or .exr")
+
+
+def _format(path: Path) -> str:
+    suffix = path.suffix.lower()
+    if suffix not in _FORMATS:
+        raise NerfroError(f"the sky {path} ends in '{suffix}'; allowed are {', '.join(_FORMATS)}")
+    return suffix
+
+
+def _mitsuba_bitmap() -> type:
+    try:
+        import mitsuba
+    except ImportError as error:
+        raise NerfroError(
+            "OpenEXR files need Mitsuba: pip install 'nerfro[synthesize]', or convert the sky to .hdr or .png"
+        ) from error
+    if mitsuba.variant() is None:
+        mitsuba.set_variant("scalar_rgb")
+    return mitsuba.Bitmap

@@ -1,0 +1,151 @@
+"""The environment map: learning, files and conventions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from nerfro.boundaries import cube_map, lat_long, radiance_hdr
+from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.errors import NerfroError
+from nerfro.evaluation.images import save_png
+
+
+def random_directions(num: int, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.nn.functional.normalize(torch.randn(num, 3, generator=generator), dim=-1)
+
+
+def smooth_sky(directions: torch.Tensor) -> torch.Tensor:
+    """A different smooth function in each channel, within [0.1, 0.9] and with no symmetry."""
+    x, y, z = directions.unbind(-1)
+    return 0.5 + 0.2 * torch.stack([x + 0.5 * y, y - 0.7 * z * x, z + 0.4 * x * y], dim=-1)
+
+
+def test_it_starts_grey() -> None:
+    assert torch.allclose(EnvironmentMap()(random_directions(10)), torch.full((10, 3), 0.5))
+
+
+def test_any_batch_shape_is_kept() -> None:
+    assert EnvironmentMap([4])(random_directions(12).view(3, 2, 2, 3)).shape == (3, 2, 2, 3)
+
+
+def test_compiled_and_plain_colours_agree() -> None:
+    boundary = EnvironmentMap([4, 8])
+    torch.nn.init.normal_(boundary.texels)
+    directions = random_directions(200)
+    raw = cube_map.lookup(*cube_map.project(directions), boundary.texels, boundary.padded, boundary.levels)
+    torch.testing.assert_close(boundary(directions), torch.sigmoid(raw) * 1.002 - 0.001, rtol=1e-5, atol=1e-6)
+
+
+def test_sum_of_levels_learns_a_sky_from_few_rays() -> None:
+    # 300 steps of 64 rays see 19200 directions; the finest level alone has 6144 texels and leaves gaps.
+    errors = []
+    for resolutions in ([4, 8, 16, 32], [32]):
+        torch.manual_seed(0)
+        boundary = EnvironmentMap(resolutions)
+        optimiser = torch.optim.Adam(boundary.parameters(), lr=0.02, eps=1e-15)
+        for step in range(300):
+            optimiser.param_groups[0]["lr"] = 0.02 * 0.05 ** (step / 300)
+            directions = torch.nn.functional.normalize(torch.randn(64, 3), dim=-1)
+            loss = (boundary(directions) - smooth_sky(directions)).square().mean()
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+        unseen = random_directions(2000, seed=9)
+        errors.append(float((boundary(unseen) - smooth_sky(unseen)).detach().square().mean().sqrt()))
+    pyramid, single = errors
+    assert pyramid < 0.01
+    assert pyramid < 0.2 * single
+
+
+def test_directions_are_not_differentiated() -> None:
+    directions = random_directions(5).requires_grad_()
+    EnvironmentMap([4])(directions).sum().backward()
+    assert directions.grad is None
+
+
+def test_lat_long_convention_is_blenders() -> None:
+    directions = lat_long.directions(64)
+    assert directions.shape == (64, 128, 3)
+    middle = directions[32, 64]
+    torch.testing.assert_close(middle, torch.tensor([1.0, 0, 0]), rtol=0, atol=0.04)
+    torch.testing.assert_close(directions[0, 10], torch.tensor([0.0, 0, 1]), rtol=0, atol=0.04)
+    torch.testing.assert_close(directions[32, 32], torch.tensor([0.0, 1, 0]), rtol=0, atol=0.04)  # left of +x
+
+
+@pytest.mark.parametrize(("suffix", "tolerance"), [(".png", 0.015), (".hdr", 0.02)])
+def test_sky_survives_a_file(tmp_path: Path, suffix: str, tolerance: float) -> None:
+    original = EnvironmentMap([64])
+    original.set_lat_long(smooth_sky(lat_long.directions(128)))
+    original.save_lat_long(tmp_path / f"sky{suffix}", height=128)
+    restored = EnvironmentMap([4, 64], image=str(tmp_path / f"sky{suffix}"))
+    directions = random_directions(3000)
+    assert (original(directions) - smooth_sky(directions)).abs().max() < 0.01
+    assert (restored(directions) - smooth_sky(directions)).abs().max() < tolerance
+
+
+def test_sky_survives_openexr(tmp_path: Path) -> None:
+    pytest.importorskip("mitsuba")
+    lat_long.save_lat_long(tmp_path / "sky.exr", smooth_sky(lat_long.directions(16)))
+    restored = lat_long.load_lat_long(tmp_path / "sky.exr")
+    torch.testing.assert_close(restored, smooth_sky(lat_long.directions(16)), rtol=0, atol=1e-3)
+
+
+def test_a_finer_picture_is_averaged_not_sampled() -> None:
+    # One-pixel stripes are far below the texture's resolution: every texel must become their mean.
+    stripes = torch.zeros(256, 512, 3)
+    stripes[:, ::2] = 0.8
+    boundary = EnvironmentMap([4])
+    boundary.set_lat_long(stripes)
+    colours = boundary(cube_map.texel_directions(4))
+    torch.testing.assert_close(colours, torch.full_like(colours, 0.4), rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize("width", [4, 300])
+def test_hdr_files_keep_bright_radiance(width: int) -> None:
+    # Eight bits of mantissa shared by the channels: the error is below 1/256 of the brightest channel.
+    picture = np.random.default_rng(0).lognormal(0, 3, (5, width, 3)).astype(np.float32)
+    picture[0, 0] = 0
+    decoded = radiance_hdr.decode(radiance_hdr.encode(picture))
+    assert (np.abs(decoded - picture) <= picture.max(-1, keepdims=True) / 256 + 1e-30).all()
+
+
+def test_hdr_runs_are_decoded() -> None:
+    # Written by hand: one scanline of eight pixels, each channel a run, an exponent of 129 doubles mantissa / 256.
+    header = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 8\n"
+    body = bytes([2, 2, 0, 8, 136, 127, 136, 63, 4, 1, 2, 3, 4, 132, 9, 136, 129])
+    decoded = radiance_hdr.decode(header + body)
+    assert decoded.shape == (1, 8, 3)
+    np.testing.assert_allclose(decoded[0, :, 0], 127.5 / 128)
+    np.testing.assert_allclose(decoded[0, :, 1], 63.5 / 128)
+    np.testing.assert_allclose(decoded[0, :, 2], (np.array([1, 2, 3, 4, 9, 9, 9, 9]) + 0.5) / 128)
+    with pytest.raises(ValueError, match="cut short"):
+        radiance_hdr.decode(header + body[:-3])
+
+
+def test_state_restores_the_sky() -> None:
+    boundary, other = EnvironmentMap([4, 8]), EnvironmentMap([4, 8])
+    torch.nn.init.normal_(boundary.texels)
+    other.load_state_dict(boundary.state_dict())
+    assert torch.equal(boundary.to_lat_long(8), other.to_lat_long(8))
+
+
+def test_bad_settings_and_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(NerfroError, match="at least 1"):
+        EnvironmentMap([])
+    with pytest.raises(NerfroError, match="does not exist"):
+        EnvironmentMap(image=str(tmp_path / "none.hdr"))
+    with pytest.raises(NerfroError, match="allowed are"):
+        EnvironmentMap(image=str(tmp_path / "sky.tiff"))
+    with pytest.raises(NerfroError, match=r"use \.png"):
+        EnvironmentMap([4]).save_lat_long(tmp_path / "sky.jpg", 8)
+    (tmp_path / "broken.hdr").write_bytes(b"#?RADIANCE\n")
+    with pytest.raises(NerfroError, match="cannot be read"):
+        EnvironmentMap(image=str(tmp_path / "broken.hdr"))
+    save_png(tmp_path / "square.png", torch.zeros(4, 4, 3))
+    with pytest.raises(NerfroError, match="twice as wide"):
+        EnvironmentMap(image=str(tmp_path / "square.png"))
