@@ -1,0 +1,63 @@
+"""Total variation of the boundary."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from nerfro.errors import NerfroError
+from nerfro.losses.base import Loss
+from nerfro.registry import register
+from nerfro.types import Batch, Rendering
+
+if TYPE_CHECKING:
+    from nerfro.models.base import NerfModel
+
+
+@register("loss", "total_variation")
+class TotalVariation(Loss):
+    """Absolute difference of the boundary's colour between directions `angle` apart, all over the sphere.
+
+    Unlike `smoothness`, which squares differences, it does not prefer many small steps to one edge (Rudin, Osher and
+    Fatemi, 1992), and it reaches directions in which no training ray leaves.
+
+    Args:
+        num_directions: random pairs for each step.
+        angle: between the two directions of a pair, degrees; about a texel of the boundary.
+    """
+
+    def __init__(
+        self, weight: float = 1e-3, start: int = 0, ramp: int = 0, num_directions: int = 1024, angle: float = 0.7
+    ) -> None:
+        super().__init__(weight, start, ramp)
+        if num_directions < 1 or not 0 < angle < 90:
+            raise NerfroError(
+                f"loss=total_variation: num_directions={num_directions} and angle={angle}; "
+                "take at least 1 direction and an angle between 0 and 90 degrees"
+            )
+        self.num_directions, self.angle = num_directions, angle
+
+    def forward(self, renderings: list[Rendering], batch: Batch, model: NerfModel) -> Float[Tensor, ""]:
+        first, second = direction_pairs(self.num_directions, math.radians(self.angle), batch.rgb.device)
+        rgb = model.boundary(torch.cat([first, second]))
+        return (rgb[self.num_directions :] - rgb[: self.num_directions]).abs().mean()
+
+
+def direction_pairs(
+    num: int, angle: float, device: torch.device | str
+) -> tuple[Float[Tensor, "num 3"], Float[Tensor, "num 3"]]:
+    """Uniformly random unit directions, and for each another one in a random direction from it.
+
+    Args:
+        num: pairs.
+        angle: between the two, radians.
+        device: where to make them.
+    """
+    first = normalize(torch.randn(num, 3, device=device), dim=-1)
+    tangent = normalize(torch.linalg.cross(first, torch.randn(num, 3, device=device)), dim=-1)
+    return first, math.cos(angle) * first + math.sin(angle) * tangent

@@ -1,0 +1,76 @@
+"""The distortion loss against its definition."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from nerfro.losses.distortion import Distortion, distortion
+from nerfro.types import Path, Rendering, Samples
+
+
+def random_intervals(num_rays: int, num_samples: int, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.rand(num_rays, num_samples, generator=generator, dtype=dtype) ** 4
+    edges = torch.rand(num_rays, num_samples + 1, generator=generator, dtype=dtype).cumsum(-1)
+    return weights / weights.sum(-1, keepdim=True), edges / edges[:, -1:]
+
+
+def double_loop(weights: torch.Tensor, edges: torch.Tensor) -> torch.Tensor:
+    """Eqn. 15 of mip-NeRF 360 as it is written."""
+    total = weights.new_zeros(len(weights))
+    middle = (edges[:, 1:] + edges[:, :-1]) / 2
+    for i in range(weights.shape[1]):
+        for j in range(weights.shape[1]):
+            total = total + weights[:, i] * weights[:, j] * (middle[:, i] - middle[:, j]).abs()
+        total = total + weights[:, i] ** 2 * (edges[:, i + 1] - edges[:, i]) / 3
+    return total
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
+def test_prefix_sums_equal_the_double_loop(dtype: torch.dtype, tolerance: float) -> None:
+    weights, edges = random_intervals(7, 13, dtype)
+    ours, reference = weights.clone().requires_grad_(), weights.clone().requires_grad_()
+    value, expected = distortion(ours, edges), double_loop(reference, edges)
+    torch.testing.assert_close(value, expected, rtol=tolerance, atol=0)
+    value.sum().backward()
+    expected.sum().backward()
+    torch.testing.assert_close(ours.grad, reference.grad, rtol=tolerance, atol=tolerance)
+
+
+def test_even_weights_have_the_mean_distance_of_a_uniform_density() -> None:
+    # Integral of |u - v| over the unit square: 1/3, however the unit interval is divided.
+    _, edges = random_intervals(4, 9, torch.float64)
+    edges = torch.cat([torch.zeros(4, 1, dtype=torch.float64), edges[:, 1:]], dim=-1)
+    torch.testing.assert_close(distortion(edges.diff(dim=-1), edges), torch.full((4,), 1 / 3, dtype=torch.float64))
+
+
+def test_splitting_an_interval_changes_nothing() -> None:
+    weights, edges = random_intervals(5, 6, torch.float64)
+    middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
+    finer = torch.stack([edges[:, :-1], middle], -1).flatten(1)
+    finer = torch.cat([finer, edges[:, -1:]], dim=-1)
+    torch.testing.assert_close(distortion(weights.repeat_interleave(2, -1) / 2, finer), distortion(weights, edges))
+
+
+def test_loss_does_not_depend_on_the_scenes_scale_or_place() -> None:
+    weights, edges = random_intervals(5, 6, torch.float32)
+
+    def loss(scale: float, near: float) -> torch.Tensor:
+        s = near + scale * edges
+        ends = s[:, [0, -1]]
+        vectors = torch.zeros(5, 2, 3)
+        path = Path(vectors, vectors, ends, vectors[:, 0], torch.zeros(5, dtype=torch.bool), torch.ones(5))
+        positions = torch.zeros(5, 6, 3)
+        samples = Samples(positions, positions, s[:, :-1], s, torch.ones(5))
+        colour = torch.zeros(5, 3)
+        rendering = Rendering(colour, weights, torch.zeros(5), colour, samples, path)
+        return Distortion()([rendering], None, None)  # type: ignore[arg-type]  # neither batch nor model is asked
+
+    torch.testing.assert_close(loss(1.0, 0.0), loss(30.0, 2.0), rtol=1e-4, atol=0)
+
+
+def test_a_single_sharp_sample_has_none() -> None:
+    weights = torch.tensor([[0.0, 1.0, 0.0]])
+    edges = torch.tensor([[0.0, 0.5, 0.5 + 1e-6, 1.0]])
+    assert distortion(weights, edges) < 1e-6

@@ -1,0 +1,53 @@
+"""The boundary's total variation."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.errors import NerfroError
+from nerfro.losses.total_variation import TotalVariation, direction_pairs
+
+BATCH = SimpleNamespace(rgb=torch.zeros(1, 3))
+
+
+def test_pairs_are_the_angle_apart_and_uniform() -> None:
+    torch.manual_seed(0)
+    first, second = direction_pairs(20_000, 0.3, "cpu")
+    for directions in (first, second):
+        torch.testing.assert_close(directions.norm(dim=-1), torch.ones(20_000))
+        # A uniform direction has mean 0 and covariance 1/3; the means scatter by 0.004.
+        assert directions.mean(0).abs().max() < 0.02
+        torch.testing.assert_close(directions.T @ directions / 20_000, torch.eye(3) / 3, rtol=0, atol=0.02)
+    torch.testing.assert_close((first * second).sum(-1), torch.full((20_000,), math.cos(0.3)), rtol=0, atol=1e-5)
+
+
+def test_value_is_that_of_a_linear_sky() -> None:
+    # For C = d . a the mean of |C(d') - C(d)| is angle |a| / 2, the mean of |cos| over the sphere, to second order.
+    torch.manual_seed(0)
+    sky = SimpleNamespace(boundary=lambda d: (d * 0.8).sum(-1, keepdim=True).expand(-1, 3) * 0.5 / math.sqrt(3))
+    value = TotalVariation(num_directions=100_000, angle=1.0)([], BATCH, sky)
+    assert float(value) == pytest.approx(math.radians(1.0) * 0.4 / 2, rel=0.02)
+
+
+def test_descending_it_flattens_a_sky() -> None:
+    torch.manual_seed(0)
+    boundary, loss = EnvironmentMap([8]), TotalVariation(num_directions=512, angle=5.0)
+    torch.nn.init.normal_(boundary.texels)
+    optimiser, values = torch.optim.Adam(boundary.parameters(), lr=0.05), []
+    for _ in range(100):
+        value = loss([], BATCH, SimpleNamespace(boundary=boundary))
+        values.append(float(value.detach()))
+        optimiser.zero_grad()
+        value.backward()
+        optimiser.step()
+    assert values[-1] < 0.3 * values[0]
+
+
+def test_impossible_settings_are_refused() -> None:
+    with pytest.raises(NerfroError, match="between 0 and 90"):
+        TotalVariation(angle=0.0)
