@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from jaxtyping import Float
-from numba import njit, prange
+from jaxtyping import Float, Int
+from numba import prange
 
 from nerfro.geometry.mesh import TriangleMesh
+from nerfro.kernels.compilation import compiled, compiled_parallel
 
 
 def occupancy_fraction(
@@ -46,20 +47,30 @@ def _fraction_along_z(
     origin = np.asarray(box[0], np.float64)
     spacing = (np.asarray(box[1], np.float64) - origin) / (resolution - 1)
     offsets = np.linspace(-1.0, 1.0, subsamples) if subsamples > 1 else np.zeros(1)
-    # Triangles by the planes of constant x that they can touch.
-    low = np.floor((triangles[:, :, 0].min(1) - origin[0]) / spacing[0]).astype(np.int64) - 1
-    high = np.ceil((triangles[:, :, 0].max(1) - origin[0]) / spacing[0]).astype(np.int64) + 1
-    low, high = low.clip(0, resolution), high.clip(-1, resolution - 1)
-    uses = (high - low + 1).clip(0)
-    triangle = np.repeat(np.arange(len(triangles)), uses)
-    plane = np.repeat(low - np.cumsum(uses) + uses, uses) + np.arange(uses.sum())
-    order = triangle[np.argsort(plane, kind="stable")]
-    starts = np.concatenate([[0], np.cumsum(np.bincount(plane, minlength=resolution))])
+    order, starts = triangles_by_plane(triangles, origin[0], spacing[0], resolution, float(spacing[0]))
     counts = _count_inside(np.ascontiguousarray(triangles), order, starts, origin, spacing, offsets, resolution)
     return counts.astype(np.float32) / subsamples**3
 
 
-@njit(cache=True)
+def triangles_by_plane(
+    triangles: Float[np.ndarray, "F 3 3"], origin: float, spacing: float, num_planes: int, reach: float
+) -> tuple[Int[np.ndarray, "U"], Int[np.ndarray, "P+1"]]:
+    """Sort triangles by the planes x = origin + i spacing that they come within `reach` of.
+
+    Returns:
+        order: triangles of the first plane, then of the second, and so on.
+        starts: where each plane's begin, and the end.
+    """
+    low = np.ceil((triangles[:, :, 0].min(1) - reach - origin) / spacing).astype(np.int64).clip(0, num_planes)
+    high = np.floor((triangles[:, :, 0].max(1) + reach - origin) / spacing).astype(np.int64).clip(-1, num_planes - 1)
+    uses = (high - low + 1).clip(0)
+    triangle = np.repeat(np.arange(len(triangles)), uses)
+    plane = np.repeat(low - np.cumsum(uses) + uses, uses) + np.arange(uses.sum())
+    starts = np.concatenate([[0], np.cumsum(np.bincount(plane, minlength=num_planes))])
+    return triangle[np.argsort(plane, kind="stable")], starts
+
+
+@compiled
 def _edge_side(ax: float, ay: float, bx: float, by: float, px: float, py: float) -> float:
     """Twice the signed area of (a, b, p), computed so that it is exactly negated when a and b are swapped."""
     if ax < bx or (ax == bx and ay < by):
@@ -67,7 +78,7 @@ def _edge_side(ax: float, ay: float, bx: float, by: float, px: float, py: float)
     return -((ax - bx) * (py - by) - (ay - by) * (px - bx))
 
 
-@njit(cache=True)
+@compiled
 def _is_left(side: float, ax: float, ay: float, bx: float, by: float) -> bool:
     """Sign of `_edge_side`; a point on the line counts as moved by (e, e^2), so that no line is hit twice or missed."""
     if side != 0.0:
@@ -77,7 +88,7 @@ def _is_left(side: float, ax: float, ay: float, bx: float, by: float) -> bool:
     return bx > ax
 
 
-@njit(parallel=True, cache=True)
+@compiled_parallel
 def _count_inside(triangles, order, starts, origin, spacing, offsets, resolution):
     num = len(offsets)
     counts = np.zeros((resolution, resolution, resolution), np.uint16)

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+
+# Steps along the diagonal of a medium that says nothing about where its index varies.
+_STEPS_PER_DIAGONAL = 512
 
 
 class Medium(nn.Module, ABC):
@@ -22,3 +26,14 @@ class Medium(nn.Module, ABC):
         self, positions: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         """Refractive index and its gradient (per world unit)."""
+
+    def clearance(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Distance around each point of the box within which the index surely does not vary; 0 where unknown."""
+        return torch.zeros_like(positions[..., 0])
+
+    def step_length(
+        self, directions: Float[Tensor, "*batch 3"], gradients: Float[Tensor, "*batch 3"]
+    ) -> Float[Tensor, "*batch"]:
+        """Arc length of a step that resolves the medium, for a ray of that unit direction where grad n is as given."""
+        diagonal = torch.linalg.vector_norm(self.box[1] - self.box[0])
+        return (diagonal / _STEPS_PER_DIAGONAL).expand(directions.shape[:-1])

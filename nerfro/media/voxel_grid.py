@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional
 
 from nerfro.errors import NerfroError
 from nerfro.geometry.cache import cached_arrays, content_hash, load_arrays, save_arrays
 from nerfro.geometry.interpolation import trilinear
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.occupancy import occupancy_fraction
+from nerfro.geometry.signed_distance import distance_to_set
+from nerfro.geometry.smoothing import gradient, smooth
 from nerfro.media.base import Medium
 from nerfro.paths import resolve_path
 from nerfro.registry import register
@@ -138,6 +140,33 @@ class VoxelGrid(Medium):
         n = torch.where(inside, values[..., 0], 1.0)
         return n, torch.where(inside[..., None], values[..., 1:], 0.0)
 
+    @functools.cached_property
+    def clearance_grid(self) -> Float[Tensor, "X-1 Y-1 Z-1"]:
+        """Distance from any point of each cell within which grad n is zero, world units."""
+        varies = (self.table[..., 1:] != 0).any(-1).cpu()
+        for axis in range(3):
+            length = varies.shape[axis] - 1
+            varies = varies.narrow(axis, 0, length) | varies.narrow(axis, 1, length)
+        spacing = self.spacing.double().cpu().numpy()
+        # Between the centres of two cells it is at most a cell's diagonal farther than between any of their points.
+        distance = distance_to_set(varies.numpy(), spacing) - np.linalg.norm(spacing)
+        diagonal = float(torch.linalg.vector_norm(self.box[1] - self.box[0]))
+        return torch.from_numpy(distance.clip(0, diagonal)).to(self.table)
+
+    def clearance(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Distance within which grad n is zero, for the cell that holds each point."""
+        grid = self.clearance_grid
+        shape = torch.tensor(grid.shape, device=grid.device)
+        cell = ((positions - self.box[0]) / self.spacing).floor().long()
+        x, y, z = torch.minimum(cell.clamp(min=0), shape - 1).unbind(-1)
+        return grid[x, y, z]
+
+    def step_length(
+        self, directions: Float[Tensor, "*batch 3"], gradients: Float[Tensor, "*batch 3"]
+    ) -> Float[Tensor, "*batch"]:
+        """Half a voxel."""
+        return (0.5 * self.spacing.min()).expand(directions.shape[:-1])
+
     def save(self, path: Path) -> None:
         """Write occupancy, box, index and smoothing to a .npz that `medium.grid` loads."""
         save_arrays(
@@ -149,40 +178,6 @@ class VoxelGrid(Medium):
                 "smoothing": np.array([self.smoothing_size, self.smoothing_sigma]),
             },
         )
-
-
-def smooth(values: Float[Tensor, "X Y Z"], size: int, sigma: float) -> Float[Tensor, "X Y Z"]:
-    """Convolve with a normalised Gaussian of size^3 taps; the border repeats outwards. Size 0 changes nothing.
-
-    Raises:
-        NerfroError: the size is even or negative, or sigma is not positive.
-    """
-    if size == 0:
-        return values
-    if size < 0 or size % 2 == 0 or not sigma > 0:
-        raise NerfroError(
-            f"smoothing_size={size}, smoothing_sigma={sigma} is no kernel; "
-            "the size must be odd (or 0 for none) and sigma positive"
-        )
-    taps = torch.arange(size, dtype=values.dtype, device=values.device) - size // 2
-    kernel = torch.exp(-0.5 * (taps / sigma) ** 2)
-    kernel = (kernel / kernel.sum())[None, None, :, None]
-    for axis in range(3):
-        columns = values.movedim(axis, 0)
-        padded = functional.pad(columns.reshape(1, 1, columns.shape[0], -1), (0, 0, size // 2, size // 2), "replicate")
-        values = functional.conv2d(padded, kernel).reshape(columns.shape).movedim(0, axis)
-    return values.contiguous()
-
-
-def gradient(values: Float[Tensor, "X Y Z"], spacing: Float[Tensor, "3"]) -> Float[Tensor, "X Y Z 3"]:
-    """Central differences, (next - previous) / 2h; the border repeats outwards, so its gradient is half."""
-    parts = []
-    for axis in range(3):
-        first, last = values.narrow(axis, 0, 1), values.narrow(axis, values.shape[axis] - 1, 1)
-        padded = torch.cat([first, values, last], axis)
-        ahead, behind = padded.narrow(axis, 2, values.shape[axis]), padded.narrow(axis, 0, values.shape[axis])
-        parts.append((ahead - behind) / (2 * spacing[axis]))
-    return torch.stack(parts, -1)
 
 
 def check_box(box_min: list[float], box_max: list[float], resolution: int) -> Float[np.ndarray, "2 3"]:

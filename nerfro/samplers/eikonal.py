@@ -5,36 +5,82 @@ from __future__ import annotations
 from typing import Literal
 
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from nerfro.errors import NerfroError
+from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.solid import STEPS_PER_SHELL
+from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.registry import register
 from nerfro.samplers.base import PathSampler
-from nerfro.samplers.integrators import INTEGRATORS, Integrator, RayState
+from nerfro.samplers.compiled import eikonal_on_grid, uniform_on_grid
+from nerfro.samplers.integrators import INTEGRATORS, Integrator, RayState, with_length
+from nerfro.samplers.polylines import Polylines
 from nerfro.types import Path, Rays
+
+# Below this share of n^2 the part of v along the gradient, squared, is too small to be corrected alone.
+_MIN_NORMAL_PART = 0.01
+# Squared change of a unit direction (1e-7 radians) below which a path counts as straight.
+_MIN_TURN = 1e-14
+# Within this share of a step the shell counts as reached.
+_REACHED = 1e-3
 
 
 @register("sampler/path", "eikonal")
 class Eikonal(PathSampler):
-    """Paths that solve the Eikonal equation in steps of equal arc length (the paper's, with integrator euler)."""
+    """Paths that solve the Eikonal equation: adaptive steps, or equal ones (the paper's: integrator=euler)."""
 
-    def __init__(self, integrator: Literal["leapfrog", "rk4", "euler"] = "leapfrog", num_steps: int = 768) -> None:
+    def __init__(
+        self,
+        integrator: Literal["adaptive", "euler", "leapfrog", "rk4"] = "adaptive",
+        num_steps: int = 768,
+        tolerance: float = 1e-4,
+        max_steps: int = 16384,
+    ) -> None:
         """Choose how to step.
 
         Args:
-            integrator: euler is the paper's; leapfrog and rk4 hold |v| = n.
-            num_steps: vertices of a path, evenly spaced from near to far.
+            integrator: adaptive is a leapfrog that steps only where the index varies, jumps elsewhere and keeps few
+                vertices; the others take equal steps from near to far and keep them all. euler is the paper's,
+                leapfrog and rk4 hold |v| = n.
+            num_steps: vertices of a path of equal steps.
+            tolerance: adaptive: distance of a path from its last tangent at which it gets a vertex, as a share of the
+                box's diagonal.
+            max_steps: adaptive: steps of a ray, at most; beyond them it goes straight on.
+
+        Raises:
+            NerfroError: a number is out of range.
         """
         super().__init__()
         if num_steps < 2:
             raise NerfroError(f"sampler.path.num_steps={num_steps} makes no path; give at least 2 (the paper: 768)")
+        if not (tolerance > 0 and max_steps > 0):
+            raise NerfroError(
+                f"sampler.path.tolerance={tolerance}, max_steps={max_steps} must be positive; 1e-4 and 16384 are usual"
+            )
         self.integrator = integrator
         self.num_steps = num_steps
+        self.tolerance = tolerance
+        self.max_steps = max_steps
 
     @torch.no_grad()
     def forward(self, rays: Rays, medium: Medium) -> Path:
-        """Trace every ray from near to far; all vertices are kept."""
-        return march_uniform(rays, medium, INTEGRATORS[self.integrator], self.num_steps)
+        """Trace every ray from near to far."""
+        on_cpu = rays.origins.device.type == "cpu"
+        if self.integrator != "adaptive":
+            if on_cpu and isinstance(medium, VoxelGrid):
+                return uniform_on_grid(rays, medium, self.integrator, self.num_steps)
+            return march_uniform(rays, medium, INTEGRATORS[self.integrator], self.num_steps)
+        tolerance = self.tolerance * float(torch.linalg.vector_norm(medium.box[1] - medium.box[0]))
+        if on_cpu and isinstance(medium, VoxelGrid):
+            return eikonal_on_grid(rays, medium, 0.5 * float(medium.spacing.min()), tolerance, self.max_steps)[0]
+        if on_cpu and isinstance(medium, SdfGrid):
+            step = 2 * medium.shell / STEPS_PER_SHELL
+            return eikonal_on_grid(rays, medium, step, tolerance, self.max_steps)[0]
+        return march_adaptive(rays, medium, tolerance, self.max_steps)[0]
 
 
 def march_uniform(rays: Rays, medium: Medium, integrator: Integrator, num_steps: int) -> Path:
@@ -56,3 +102,89 @@ def march_uniform(rays: Rays, medium: Medium, integrator: Integrator, num_steps:
     s = torch.cat([rays.near[:, None], rays.near[:, None] + lengths.cumsum(-1)], -1)
     refracted = torch.stack([(state.gradients != 0).any(-1) for state in states], -1).any(-1)
     return Path(positions, directions, s, directions[:, -1], refracted, rays.radii)
+
+
+def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int) -> tuple[Path, Bool[Tensor, "R"]]:
+    """Leapfrog steps where the index varies, straight jumps elsewhere: the plain reference of the compiled kernel.
+
+    The box is entered and left along straight lines. Inside it a ray jumps by the medium's clearance where there is
+    any, and else takes a kick-drift-kick step of the medium's step length. After each step |v| = n is restored by v's
+    component along the kick alone: the component across, n sin(angle) at a surface, is what refraction conserves, so a
+    flat interface is refracted exactly however few steps it takes. A vertex is kept where the path has left the tangent
+    of the last one by `tolerance`, and at the start of jumps.
+
+    Args:
+        rays: in world space.
+        medium: any.
+        tolerance: world units.
+        max_steps: steps and jumps of a ray, at most.
+
+    Returns:
+        Paths, and whether a ray met the limit; such a ray goes straight on.
+    """
+    num_rays = len(rays)
+    rows = torch.arange(num_rays, device=rays.near.device)
+    x, d, s = rays.origins + rays.near[:, None] * rays.directions, rays.directions.clone(), rays.near.clone()
+    lines = Polylines(num_rays, x)
+    lines.append(rows, x, d, s)
+    kept_x, kept_d, kept_s = x.clone(), d.clone(), s.clone()
+
+    def keep(chosen: Tensor) -> None:
+        lines.append(chosen, x[chosen], d[chosen], s[chosen])
+        kept_x[chosen], kept_d[chosen], kept_s[chosen] = x[chosen], d[chosen], s[chosen]
+
+    def turned(chosen: Tensor) -> Tensor:
+        return chosen[(d[chosen] - kept_d[chosen]).square().sum(-1) > _MIN_TURN]
+
+    refracted = torch.zeros(num_rays, dtype=torch.bool, device=x.device)
+    enter, leave = intersect_box(medium.box, x, d)
+    active = rows[(enter < leave) & (leave > 0) & (enter < rays.far - s)]
+    jump = enter[active].clamp(min=0)
+    x[active] += jump[:, None] * d[active]
+    s[active] += jump
+    n, g = medium(x)
+    for _ in range(max_steps):
+        if not len(active):
+            break
+        step = medium.step_length(d[active], g[active])
+        remaining = rays.far[active] - s[active]
+        free = medium.clearance(x[active])
+        jumps = free > _REACHED * step
+        jumping, stepping = active[jumps], active[~jumps]
+        keep(turned(jumping))
+        length = torch.minimum(free, remaining)[jumps]
+        x[jumping] += length[:, None] * d[jumping]
+        s[jumping] += length
+        n[jumping], g[jumping] = medium(x[jumping])
+        refracted[stepping] |= (g[stepping] != 0).any(-1)
+        ds = torch.minimum(step, remaining)[~jumps]
+        state = RayState(x[stepping], n[stepping, None] * d[stepping], n[stepping], g[stepping])
+        state = _leapfrog_along_gradient(state, ds, medium)
+        s[stepping] += torch.linalg.vector_norm(state.positions - x[stepping], dim=-1)
+        x[stepping], n[stepping], g[stepping] = state.positions, state.n, state.gradients
+        d[stepping] = state.velocities / state.n[:, None]
+        tangent = kept_x[stepping] + (s - kept_s)[stepping, None] * kept_d[stepping]
+        keep(stepping[(x[stepping] - tangent).square().sum(-1) > tolerance**2])
+        outside = ((x[active] < medium.box[0]) | (x[active] > medium.box[1])).any(-1)
+        active = active[~outside & (s[active] < rays.far[active])]
+    exceeded = torch.zeros_like(refracted)
+    exceeded[active] = True
+    keep(turned(rows))
+    lines.append(rows, x + (rays.far - s)[:, None] * d, d, rays.far)
+    return lines.path(rays, refracted), exceeded
+
+
+def _leapfrog_along_gradient(state: RayState, ds: Float[Tensor, "R"], medium: Medium) -> RayState:
+    """`integrators.leapfrog`, but |v| = n is restored along the kick where that is well-conditioned."""
+    x, v, n, g = state
+    dsigma = (ds / n)[:, None]
+    kicked = v + 0.5 * dsigma * n[:, None] * g
+    x = x + dsigma * kicked
+    n, g = medium(x)
+    kicked = kicked + 0.5 * dsigma * n[:, None] * g
+    kick = torch.nn.functional.normalize(kicked - v, dim=-1, eps=torch.finfo(v.dtype).tiny)
+    along = (kicked * kick).sum(-1)
+    squared = n**2 - (kicked.square().sum(-1) - along**2)
+    corrected = kicked + (torch.copysign(squared.clamp(min=0).sqrt(), along) - along)[:, None] * kick
+    sound = (along**2 >= _MIN_NORMAL_PART * n**2) & (squared >= _MIN_NORMAL_PART * n**2)
+    return RayState(x, torch.where(sound[:, None], corrected, with_length(kicked, n)), n, g)

@@ -1,0 +1,213 @@
+"""The Eikonal equation through a voxel grid or through bodies with thin shells, one thread per ray.
+
+The same algorithms as `samplers.eikonal`, for one ray at a time.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from nerfro.kernels.compilation import compiled, compiled_parallel
+from nerfro.kernels.lookup import box_span, put_vertex, repeat_last, solid_index, voxel_clearance, voxel_index
+
+EULER, LEAPFROG, RK4 = 0, 1, 2
+
+
+@compiled
+def _rescaled(vx, vy, vz, n):
+    scale = n / math.sqrt(vx * vx + vy * vy + vz * vz)
+    return vx * scale, vy * scale, vz * scale
+
+
+@compiled_parallel
+def march_uniform(origins, directions, near, far, table, low, inverse_spacing, integrator, num_steps, keep_all):
+    """Steps of equal arc length through a voxel grid.
+
+    Returns:
+        positions [R, V, 3], directions [R, V, 3], s [R, V]: with V the number of steps, or 1 (the last vertex alone) if
+            not `keep_all`.
+        refracted [R]: whether the index varied along the path.
+    """
+    num_rays = origins.shape[0]
+    kept = num_steps if keep_all else 1
+    out_positions = np.empty((num_rays, kept, 3), origins.dtype)
+    out_directions = np.empty((num_rays, kept, 3), origins.dtype)
+    out_s = np.empty((num_rays, kept), origins.dtype)
+    refracted = np.zeros(num_rays, np.bool_)
+    for ray in prange(num_rays):
+        vx, vy, vz = float(directions[ray, 0]), float(directions[ray, 1]), float(directions[ray, 2])
+        s = float(near[ray])
+        x, y, z = origins[ray, 0] + s * vx, origins[ray, 1] + s * vy, origins[ray, 2] + s * vz
+        ds = (far[ray] - s) / (num_steps - 1)
+        n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
+        bent = False
+        for step in range(num_steps):
+            if keep_all or step == num_steps - 1:
+                norm = math.sqrt(vx * vx + vy * vy + vz * vz)
+                slot = step if keep_all else 0
+                put_vertex(
+                    out_positions[ray], out_directions[ray], out_s[ray],
+                    slot, x, y, z, vx / norm, vy / norm, vz / norm, s,
+                )  # fmt: skip
+            bent = bent or gx != 0.0 or gy != 0.0 or gz != 0.0
+            if step == num_steps - 1:
+                break
+            x0, y0, z0 = x, y, z
+            if integrator == EULER:
+                h = ds / n
+                x, y, z = x + h * vx, y + h * vy, z + h * vz
+                vx, vy, vz = vx + ds * gx, vy + ds * gy, vz + ds * gz
+                n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
+            elif integrator == LEAPFROG:
+                h = ds / n
+                kick = 0.5 * h * n
+                vx, vy, vz = vx + kick * gx, vy + kick * gy, vz + kick * gz
+                x, y, z = x + h * vx, y + h * vy, z + h * vz
+                n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
+                kick = 0.5 * h * n
+                vx, vy, vz = _rescaled(vx + kick * gx, vy + kick * gy, vz + kick * gz, n)
+            else:
+                half = 0.5 * ds
+                ax, ay, az = vx / n, vy / n, vz / n
+                n2, bgx, bgy, bgz = voxel_index(
+                    table, low, inverse_spacing, x + half * ax, y + half * ay, z + half * az
+                )
+                bx, by, bz = (vx + half * gx) / n2, (vy + half * gy) / n2, (vz + half * gz) / n2
+                n3, cgx, cgy, cgz = voxel_index(
+                    table, low, inverse_spacing, x + half * bx, y + half * by, z + half * bz
+                )
+                cx, cy, cz = (vx + half * bgx) / n3, (vy + half * bgy) / n3, (vz + half * bgz) / n3
+                px, py, pz = x + ds * cx, y + ds * cy, z + ds * cz
+                n4, dgx, dgy, dgz = voxel_index(table, low, inverse_spacing, px, py, pz)
+                ex, ey, ez = (vx + ds * cgx) / n4, (vy + ds * cgy) / n4, (vz + ds * cgz) / n4
+                sixth = ds / 6.0
+                x += sixth * (ax + 2.0 * bx + 2.0 * cx + ex)
+                y += sixth * (ay + 2.0 * by + 2.0 * cy + ey)
+                z += sixth * (az + 2.0 * bz + 2.0 * cz + ez)
+                vx += sixth * (gx + 2.0 * bgx + 2.0 * cgx + dgx)
+                vy += sixth * (gy + 2.0 * bgy + 2.0 * cgy + dgy)
+                vz += sixth * (gz + 2.0 * bgz + 2.0 * cgz + dgz)
+                n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
+                vx, vy, vz = _rescaled(vx, vy, vz, n)
+            s += math.sqrt((x - x0) ** 2 + (y - y0) ** 2 + (z - z0) ** 2)
+        refracted[ray] = bent
+    return out_positions, out_directions, out_s, refracted
+
+
+@compiled
+def _look_up(table, clearance, coefficients, iors, shell, low, inverse_spacing, x, y, z):
+    """Index, gradient and clearance from whichever of the two grids is given."""
+    if coefficients.shape[0] > 0:
+        return solid_index(coefficients, iors, shell, low, inverse_spacing, x, y, z)
+    n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
+    return n, gx, gy, gz, float(voxel_clearance(clearance, low, inverse_spacing, x, y, z))
+
+
+@compiled
+def _with_length(vx, vy, vz, kx, ky, kz, n):
+    """Set the length of v to n by its component along the kick, or as a whole where that component is small."""
+    kick = kx * kx + ky * ky + kz * kz
+    if kick == 0.0:
+        return _rescaled(vx, vy, vz, n)
+    scale = 1.0 / math.sqrt(kick)
+    kx, ky, kz = kx * scale, ky * scale, kz * scale
+    along = vx * kx + vy * ky + vz * kz
+    squared = n * n - (vx * vx + vy * vy + vz * vz - along * along)
+    if along * along < MIN_NORMAL_PART * n * n or squared < MIN_NORMAL_PART * n * n:
+        return _rescaled(vx, vy, vz, n)
+    change = math.copysign(math.sqrt(squared), along) - along
+    return vx + change * kx, vy + change * ky, vz + change * kz
+
+
+# See samplers.eikonal, which explains them.
+MIN_NORMAL_PART = 0.01
+MIN_COSINE = 0.25
+MIN_TURN = 1e-14
+
+
+@compiled_parallel
+def march_adaptive(
+    origins, directions, near, far, table, clearance, coefficients, iors, shell, low, high, inverse_spacing,
+    step, tolerance, max_steps, capacity,
+):  # fmt: skip
+    """Steps where the index varies, straight jumps elsewhere; vertices where the path leaves its last tangent.
+
+    Returns:
+        positions [R, V, 3], directions [R, V, 3], s [R, V]: with V the capacity, in the rays' precision.
+        counts [R]: vertices of each path, more than the capacity where it did not suffice.
+        refracted [R]: whether the index varied along the path.
+        exceeded [R]: whether a ray took `max_steps`; it goes straight on from there.
+    """
+    num_rays = origins.shape[0]
+    out_positions = np.empty((num_rays, capacity, 3), origins.dtype)
+    out_directions = np.empty((num_rays, capacity, 3), origins.dtype)
+    out_s = np.empty((num_rays, capacity), origins.dtype)
+    counts = np.empty(num_rays, np.int64)
+    refracted = np.zeros(num_rays, np.bool_)
+    exceeded = np.zeros(num_rays, np.bool_)
+    skip = 1e-3 * step
+    for ray in prange(num_rays):
+        dx, dy, dz = float(directions[ray, 0]), float(directions[ray, 1]), float(directions[ray, 2])
+        s, end = float(near[ray]), float(far[ray])
+        x, y, z = origins[ray, 0] + s * dx, origins[ray, 1] + s * dy, origins[ray, 2] + s * dz
+        row = (out_positions[ray], out_directions[ray], out_s[ray])
+        count = put_vertex(*row, 0, x, y, z, dx, dy, dz, s)
+        enter, leave = box_span(low, high, x, y, z, dx, dy, dz)
+        if enter < leave and leave > 0.0 and enter < end - s:
+            # Position, direction and length at the last vertex that was kept.
+            kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
+            jump = max(enter, 0.0)
+            x, y, z, s = x + jump * dx, y + jump * dy, z + jump * dz, s + jump
+            n, gx, gy, gz, free = _look_up(table, clearance, coefficients, iors, shell, low, inverse_spacing, x, y, z)
+            vx, vy, vz = n * dx, n * dy, n * dz
+            exceeded[ray] = True
+            for _ in range(max_steps):
+                turned = (dx - kdx) ** 2 + (dy - kdy) ** 2 + (dz - kdz) ** 2
+                if free > skip:
+                    if turned > MIN_TURN:
+                        count = put_vertex(*row, count, x, y, z, dx, dy, dz, s)
+                        kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
+                    ds = min(free, end - s)
+                    x, y, z, s = x + ds * dx, y + ds * dy, z + ds * dz, s + ds
+                    n, gx, gy, gz, free = _look_up(
+                        table, clearance, coefficients, iors, shell, low, inverse_spacing, x, y, z
+                    )
+                else:
+                    slope = math.sqrt(gx * gx + gy * gy + gz * gz)
+                    ds = step
+                    if coefficients.shape[0] > 0 and slope > 0.0:
+                        cosine = abs(dx * gx + dy * gy + dz * gz) / slope
+                        ds = step / max(cosine, MIN_COSINE)
+                    ds = min(ds, end - s)
+                    h = ds / n
+                    kick = 0.5 * h * n
+                    px, py, pz = vx + kick * gx, vy + kick * gy, vz + kick * gz
+                    x, y, z = x + h * px, y + h * py, z + h * pz
+                    s += h * math.sqrt(px * px + py * py + pz * pz)
+                    refracted[ray] = refracted[ray] or slope > 0.0
+                    n, gx, gy, gz, free = _look_up(
+                        table, clearance, coefficients, iors, shell, low, inverse_spacing, x, y, z
+                    )
+                    kick = 0.5 * h * n
+                    px, py, pz = px + kick * gx, py + kick * gy, pz + kick * gz
+                    vx, vy, vz = _with_length(px, py, pz, px - vx, py - vy, pz - vz, n)
+                    dx, dy, dz = vx / n, vy / n, vz / n
+                    ahead = s - ks
+                    ex, ey, ez = x - kx - ahead * kdx, y - ky - ahead * kdy, z - kz - ahead * kdz
+                    if ex * ex + ey * ey + ez * ez > tolerance * tolerance:
+                        count = put_vertex(*row, count, x, y, z, dx, dy, dz, s)
+                        kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
+                outside = x < low[0] or x > high[0] or y < low[1] or y > high[1] or z < low[2] or z > high[2]
+                if outside or s >= end:
+                    exceeded[ray] = False
+                    break
+            if (dx - kdx) ** 2 + (dy - kdy) ** 2 + (dz - kdz) ** 2 > MIN_TURN:
+                count = put_vertex(*row, count, x, y, z, dx, dy, dz, s)
+        jump = end - s
+        count = put_vertex(*row, count, x + jump * dx, y + jump * dy, z + jump * dz, dx, dy, dz, end)
+        counts[ray] = count
+        repeat_last(*row, min(count, capacity))
+    return out_positions, out_directions, out_s, counts, refracted, exceeded

@@ -1,0 +1,163 @@
+"""Refractive index at a point, for kernels: from a voxel grid, or from signed distances on grids.
+
+The same mathematics as `geometry.interpolation` and `media.solid`, for one point at a time.
+"""
+
+from __future__ import annotations
+
+import math
+
+from nerfro.kernels.compilation import compiled
+
+
+@compiled
+def spline_value(coefficients, low, inverse_spacing, x, y, z):
+    """Quadratic B-spline on a grid."""
+    fx = (x - low[0]) * inverse_spacing[0]
+    fy = (y - low[1]) * inverse_spacing[1]
+    fz = (z - low[2]) * inverse_spacing[2]
+    i = min(max(math.floor(fx + 0.5), 1), coefficients.shape[0] - 2)
+    j = min(max(math.floor(fy + 0.5), 1), coefficients.shape[1] - 2)
+    k = min(max(math.floor(fz + 0.5), 1), coefficients.shape[2] - 2)
+    tx = min(max(fx - i, -1.5), 1.5)
+    ty = min(max(fy - j, -1.5), 1.5)
+    tz = min(max(fz - k, -1.5), 1.5)
+    wx = (0.5 * (0.5 - tx) * (0.5 - tx), 0.75 - tx * tx, 0.5 * (0.5 + tx) * (0.5 + tx))
+    wy = (0.5 * (0.5 - ty) * (0.5 - ty), 0.75 - ty * ty, 0.5 * (0.5 + ty) * (0.5 + ty))
+    wz = (0.5 * (0.5 - tz) * (0.5 - tz), 0.75 - tz * tz, 0.5 * (0.5 + tz) * (0.5 + tz))
+    value = 0.0
+    for a in range(3):
+        plane = 0.0
+        for b in range(3):
+            row = coefficients[i + a - 1, j + b - 1]
+            plane += wy[b] * (wz[0] * row[k - 1] + wz[1] * row[k] + wz[2] * row[k + 1])
+        value += wx[a] * plane
+    return value
+
+
+@compiled
+def spline_value_gradient(coefficients, low, inverse_spacing, x, y, z):
+    """Quadratic B-spline on a grid, and its exact gradient."""
+    fx = (x - low[0]) * inverse_spacing[0]
+    fy = (y - low[1]) * inverse_spacing[1]
+    fz = (z - low[2]) * inverse_spacing[2]
+    i = min(max(math.floor(fx + 0.5), 1), coefficients.shape[0] - 2)
+    j = min(max(math.floor(fy + 0.5), 1), coefficients.shape[1] - 2)
+    k = min(max(math.floor(fz + 0.5), 1), coefficients.shape[2] - 2)
+    tx = min(max(fx - i, -1.5), 1.5)
+    ty = min(max(fy - j, -1.5), 1.5)
+    tz = min(max(fz - k, -1.5), 1.5)
+    wx = (0.5 * (0.5 - tx) * (0.5 - tx), 0.75 - tx * tx, 0.5 * (0.5 + tx) * (0.5 + tx))
+    wy = (0.5 * (0.5 - ty) * (0.5 - ty), 0.75 - ty * ty, 0.5 * (0.5 + ty) * (0.5 + ty))
+    wz = (0.5 * (0.5 - tz) * (0.5 - tz), 0.75 - tz * tz, 0.5 * (0.5 + tz) * (0.5 + tz))
+    ux = (tx - 0.5, -2.0 * tx, tx + 0.5)
+    uy = (ty - 0.5, -2.0 * ty, ty + 0.5)
+    uz = (tz - 0.5, -2.0 * tz, tz + 0.5)
+    value, gx, gy, gz = 0.0, 0.0, 0.0, 0.0
+    for a in range(3):
+        plane, plane_y, plane_z = 0.0, 0.0, 0.0
+        for b in range(3):
+            row = coefficients[i + a - 1, j + b - 1]
+            line = wz[0] * row[k - 1] + wz[1] * row[k] + wz[2] * row[k + 1]
+            plane += wy[b] * line
+            plane_y += uy[b] * line
+            plane_z += wy[b] * (uz[0] * row[k - 1] + uz[1] * row[k] + uz[2] * row[k + 1])
+        value += wx[a] * plane
+        gx += ux[a] * plane
+        gy += wx[a] * plane_y
+        gz += wx[a] * plane_z
+    return value, gx * inverse_spacing[0], gy * inverse_spacing[1], gz * inverse_spacing[2]
+
+
+@compiled
+def solid_index(coefficients, iors, shell, low, inverse_spacing, x, y, z):
+    """Index, its gradient and the clearance of nested bodies with smooth shells (`media.solid`)."""
+    n, gx, gy, gz, clearance = 1.0, 0.0, 0.0, 0.0, math.inf
+    for body in range(coefficients.shape[0]):
+        phi, px, py, pz = spline_value_gradient(coefficients[body], low, inverse_spacing, x, y, z)
+        clearance = min(clearance, abs(phi) - shell)
+        t = 0.5 - 0.5 * phi / shell
+        if t <= 0.0:
+            continue
+        if t >= 1.0:
+            n, gx, gy, gz = iors[body], 0.0, 0.0, 0.0
+            continue
+        step = t * t * (3.0 - 2.0 * t)
+        slope = (iors[body] - n) * 6.0 * t * (1.0 - t) * (-0.5 / shell)
+        gx = gx * (1.0 - step) + slope * px
+        gy = gy * (1.0 - step) + slope * py
+        gz = gz * (1.0 - step) + slope * pz
+        n += (iors[body] - n) * step
+    return n, gx, gy, gz, max(clearance, 0.0)
+
+
+@compiled
+def voxel_index(table, low, inverse_spacing, x, y, z):
+    """Index and gradient from a grid, trilinear; n = 1 and no gradient outside."""
+    fx = (x - low[0]) * inverse_spacing[0]
+    fy = (y - low[1]) * inverse_spacing[1]
+    fz = (z - low[2]) * inverse_spacing[2]
+    top_x, top_y, top_z = table.shape[0] - 1, table.shape[1] - 1, table.shape[2] - 1
+    if not (0.0 <= fx <= top_x and 0.0 <= fy <= top_y and 0.0 <= fz <= top_z):
+        return 1.0, 0.0, 0.0, 0.0
+    i, j, k = min(int(fx), top_x - 1), min(int(fy), top_y - 1), min(int(fz), top_z - 1)
+    tx, ty, tz = fx - i, fy - j, fz - k
+    n, gx, gy, gz = 0.0, 0.0, 0.0, 0.0
+    for a in range(2):
+        wa = tx if a else 1.0 - tx
+        for b in range(2):
+            wb = wa * (ty if b else 1.0 - ty)
+            for c in range(2):
+                w = wb * (tz if c else 1.0 - tz)
+                row = table[i + a, j + b, k + c]
+                n += w * row[0]
+                gx += w * row[1]
+                gy += w * row[2]
+                gz += w * row[3]
+    return n, gx, gy, gz
+
+
+@compiled
+def voxel_clearance(clearance, low, inverse_spacing, x, y, z):
+    """Distance within which a grid's index surely does not vary, from the cell that holds the point."""
+    i = min(max(int((x - low[0]) * inverse_spacing[0]), 0), clearance.shape[0] - 1)
+    j = min(max(int((y - low[1]) * inverse_spacing[1]), 0), clearance.shape[1] - 1)
+    k = min(max(int((z - low[2]) * inverse_spacing[2]), 0), clearance.shape[2] - 1)
+    return clearance[i, j, k]
+
+
+@compiled
+def box_span(low, high, x, y, z, dx, dy, dz):
+    """Distances at which a line enters and leaves a box; the first exceeds the second where it misses."""
+    enter, leave = -math.inf, math.inf
+    for axis in range(3):
+        position = x if axis == 0 else (y if axis == 1 else z)
+        direction = dx if axis == 0 else (dy if axis == 1 else dz)
+        if direction == 0.0:
+            if position < low[axis] or position > high[axis]:
+                return math.inf, -math.inf
+            continue
+        first = (low[axis] - position) / direction
+        second = (high[axis] - position) / direction
+        enter = max(enter, min(first, second))
+        leave = min(leave, max(first, second))
+    return enter, leave
+
+
+@compiled
+def put_vertex(positions, directions, s, count, x, y, z, dx, dy, dz, length):
+    """Append a vertex to a row of polylines; beyond their capacity vertices are counted, not kept."""
+    if count < s.shape[0]:
+        positions[count, 0], positions[count, 1], positions[count, 2] = x, y, z
+        directions[count, 0], directions[count, 1], directions[count, 2] = dx, dy, dz
+        s[count] = length
+    return count + 1
+
+
+@compiled
+def repeat_last(positions, directions, s, count):
+    """Fill a row of polylines with its last vertex."""
+    for i in range(count, s.shape[0]):
+        positions[i] = positions[count - 1]
+        directions[i] = directions[count - 1]
+        s[i] = s[count - 1]

@@ -1,0 +1,147 @@
+"""Homogeneous bodies made of meshes, as signed distances on a grid with a continuous gradient."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.errors import NerfroError
+from nerfro.geometry.cache import cached_arrays, content_hash
+from nerfro.geometry.interpolation import quadratic_spline, spline_coefficients
+from nerfro.geometry.intersection import MeshIntersector
+from nerfro.geometry.mesh import TriangleMesh, load_mesh
+from nerfro.geometry.signed_distance import signed_distance_grid
+from nerfro.geometry.smoothing import smooth
+from nerfro.media.solid import Solid
+from nerfro.media.voxel_grid import check_box, check_margin
+from nerfro.paths import resolve_path
+from nerfro.registry import register
+
+# Voxels around the surface in which the distance is exact: the spline's support and the step that finds the surface.
+_BAND = 3.0
+
+
+@register("medium", "sdf_grid")
+class SdfGrid(Solid):
+    """Bodies of constant index with the surfaces of meshes; thin shell for eikonal, sharp surface for snell.
+
+    Attributes:
+        coefficients: of the quadratic B-spline of each body's signed distance.
+        meshes: the surfaces themselves; empty where the medium was made of distances.
+    """
+
+    coefficients: Float[Tensor, "K X Y Z"]
+
+    def __init__(
+        self,
+        mesh: str,
+        ior: float = 1.5,
+        inner_meshes: list[str] = [],  # noqa: B006 (the registry reads and copies it)
+        inner_iors: list[float] = [],  # noqa: B006
+        resolution: int = 128,
+        box_min: list[float] = [-1.5, -1.5, -1.5],  # noqa: B006
+        box_max: list[float] = [1.5, 1.5, 1.5],  # noqa: B006
+        shell_voxels: float = 0.25,
+        crease_degrees: float = 30.0,
+        smoothing_size: int = 0,
+        smoothing_sigma: float = 1.0,
+        accept_open_mesh: bool = False,
+        cache: bool = True,
+    ) -> None:
+        """Compute signed distances to meshes.
+
+        Args:
+            mesh: closed triangle mesh of the outer body, world units, any format trimesh reads.
+            ior: refractive index inside the mesh.
+            inner_meshes: bodies inside it (a liquid, a bubble), each inside those before; opaque things do not belong
+                here, because rays do not bend on them.
+            inner_iors: their refractive indices.
+            resolution: grid vertices a side.
+            box_min, box_max: corners of the grid, world units; the object needs a margin of air inside.
+            shell_voxels: half width of the smooth interface that the Eikonal equation sees, voxels.
+            crease_degrees: edges with larger angles between their faces stay sharp.
+            smoothing_size, smoothing_sigma: Gaussian taps a side and standard deviation (voxels) that the distance is
+                smoothed with, for noisy silhouette hulls; size 0 for none. The kernel is of fourth order: it flattens
+                noise and keeps curvature.
+            accept_open_mesh: take meshes with holes; the majority of three axes decides what is inside.
+            cache: keep the distances in the cache folder.
+
+        Raises:
+            NerfroError: a bad mesh, a bad box, an object without a margin, or indices that do not match the meshes.
+        """
+        if len(inner_meshes) != len(inner_iors):
+            raise NerfroError(
+                f"medium.inner_meshes has {len(inner_meshes)} entries and medium.inner_iors {len(inner_iors)}; "
+                "give one index for each inner mesh"
+            )
+        box = check_box(box_min, box_max, resolution)
+        spacing = (box[1] - box[0]) / (resolution - 1)
+        super().__init__([ior, *inner_iors], shell_voxels * float(spacing.min()))
+        self.crease_degrees = crease_degrees
+        self.meshes = [load_mesh(resolve_path(path), accept_open_mesh) for path in (mesh, *inner_meshes)]
+        band = _BAND + smoothing_size
+        distances = []
+        for body in self.meshes:
+            check_margin(body, box, 2 * spacing)
+            distances.append(_cached_distance(body, box, resolution, band, crease_degrees, cache))
+        values = torch.from_numpy(np.stack(distances))
+        if smoothing_size:
+            # 2 G - G * G: the curvature's share of the blur cancels.
+            values = torch.stack([smooth(2 * v - smooth(v, smoothing_size, smoothing_sigma), smoothing_size,
+                                         smoothing_sigma) for v in values])  # fmt: skip
+        self._set(values, torch.from_numpy(box).float())
+
+    @classmethod
+    def from_distances(
+        cls, distances: Float[Tensor, "K X Y Z"], box: Float[Tensor, "2 3"], iors: list[float], shell: float
+    ) -> SdfGrid:
+        """Make the medium of given signed distances.
+
+        Args:
+            distances: of each body at the grid's vertices, negative inside; positive at the border.
+            box: corners of the grid, world units.
+            iors: refractive index of each body; later bodies lie inside earlier ones.
+            shell: half width of the smooth interface that the Eikonal equation sees, world units.
+        """
+        medium = cls.__new__(cls)
+        Solid.__init__(medium, iors, shell)
+        medium.meshes = []
+        medium._set(distances, box)
+        return medium
+
+    @functools.cached_property
+    def intersector(self) -> MeshIntersector:
+        """Finds the triangles of the meshes that rays hit."""
+        return MeshIntersector(self.meshes, self.crease_degrees)
+
+    def _set(self, distances: Tensor, box: Tensor) -> None:
+        # Grids are made of the mesh at every start and do not belong in checkpoints.
+        self.register_buffer("box", box, persistent=False)
+        coefficients = torch.stack([spline_coefficients(values) for values in distances])
+        self.register_buffer("coefficients", coefficients, persistent=False)
+
+    def signed_distances(
+        self, positions: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
+        """Splines of the distances and their exact gradients."""
+        splines = [quadratic_spline(coefficients, self.box, positions) for coefficients in self.coefficients]
+        return torch.stack([phi for phi, _ in splines], -1), torch.stack([gradient for _, gradient in splines], -2)
+
+
+def _cached_distance(
+    mesh: TriangleMesh,
+    box: Float[np.ndarray, "2 3"],
+    resolution: int,
+    band: float,
+    crease_degrees: float,
+    cache: bool,
+) -> Float[np.ndarray, "X Y Z"]:
+    key = "distance_" + content_hash(mesh.vertices, mesh.faces, box, resolution, band, crease_degrees)
+    arrays = cached_arrays(
+        key, lambda: {"distance": signed_distance_grid(mesh, box, resolution, band, crease_degrees)}, cache
+    )
+    return arrays["distance"]

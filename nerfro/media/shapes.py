@@ -1,0 +1,99 @@
+"""Solids whose signed distance is known in closed form."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from nerfro.media.solid import Solid
+from nerfro.registry import register
+
+# Air around a shape, as a share of its size: the shell lies outside its surface.
+_MARGIN = 0.05
+
+
+@register("medium", "ball")
+class Ball(Solid):
+    """A ball around the origin."""
+
+    def __init__(self, radius: float = 0.8, ior: float = 1.5, shell: float = 0.002) -> None:
+        """Make a ball.
+
+        Args:
+            radius: world units.
+            ior: refractive index.
+            shell: half width of the smooth interface that the Eikonal equation sees, world units.
+        """
+        super().__init__([ior], shell)
+        self.radius = radius
+        side = radius * (1 + _MARGIN) + shell
+        self.register_buffer("box", torch.tensor([[-side] * 3, [side] * 3]), persistent=False)
+
+    def signed_distances(
+        self, positions: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*batch 1"], Float[Tensor, "*batch 1 3"]]:
+        """|x| - R and x / |x|."""
+        distance = torch.linalg.vector_norm(positions, dim=-1, keepdim=True)
+        return distance - self.radius, functional.normalize(positions, dim=-1)[..., None, :]
+
+
+@register("medium", "rounded_box")
+class RoundedBox(Solid):
+    """A cube around the origin with rounded edges and corners."""
+
+    def __init__(
+        self, half_side: float = 0.75, edge_radius: float = 0.08, ior: float = 1.52, shell: float = 0.002
+    ) -> None:
+        """Make a rounded cube.
+
+        Args:
+            half_side: from the centre to a face, world units.
+            edge_radius: of the rounding, world units.
+            ior: refractive index.
+            shell: half width of the smooth interface that the Eikonal equation sees, world units.
+        """
+        super().__init__([ior], shell)
+        self.half_side, self.edge_radius = half_side, edge_radius
+        side = half_side * (1 + _MARGIN) + shell
+        self.register_buffer("box", torch.tensor([[-side] * 3, [side] * 3]), persistent=False)
+
+    def signed_distances(
+        self, positions: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*batch 1"], Float[Tensor, "*batch 1 3"]]:
+        """|max(q, 0)| + min(max q, 0) - r with q = |x| - (a - r): the distance to a smaller cube, less the radius."""
+        q = positions.abs() - (self.half_side - self.edge_radius)
+        outward = q.clamp(min=0)
+        outside = torch.linalg.vector_norm(outward, dim=-1, keepdim=True)
+        distance = outside + q.amax(-1, keepdim=True).clamp(max=0) - self.edge_radius
+        nearest_face = functional.one_hot(q.argmax(-1), 3).to(q)
+        direction = torch.where(outside > 0, functional.normalize(outward, dim=-1), nearest_face)
+        return distance, (direction * positions.sign())[..., None, :]
+
+
+@register("medium", "slab")
+class Slab(Solid):
+    """A plate across the z axis, as wide as its box."""
+
+    def __init__(self, thickness: float = 0.5, ior: float = 1.5, half_width: float = 2.0, shell: float = 0.002) -> None:
+        """Make a plate.
+
+        Args:
+            thickness: along z, world units.
+            ior: refractive index.
+            half_width: half side of the box along x and y, world units.
+            shell: half width of the smooth interface that the Eikonal equation sees, world units.
+        """
+        super().__init__([ior], shell)
+        self.thickness = thickness
+        corner = torch.tensor([half_width, half_width, thickness * (0.5 + _MARGIN) + shell])
+        self.register_buffer("box", torch.stack([-corner, corner]), persistent=False)
+
+    def signed_distances(
+        self, positions: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*batch 1"], Float[Tensor, "*batch 1 3"]]:
+        """|z| - h / 2 and the sign of z."""
+        z = positions[..., 2:]
+        normal = torch.cat([torch.zeros_like(positions[..., :2]), z.sign()], -1)
+        return z.abs() - 0.5 * self.thickness, normal[..., None, :]

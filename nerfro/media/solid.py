@@ -1,0 +1,87 @@
+"""Homogeneous bodies with a surface: sharp for Snell's law, a thin smooth shell for the Eikonal equation."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerfro.errors import NerfroError
+from nerfro.media.base import Medium
+
+# A ray that crosses the shell along its normal takes this many steps in it.
+STEPS_PER_SHELL = 8
+# Steps of slanting rays grow with 1 / cosine of their angle to the normal, up to here, where the shell turns them.
+MIN_COSINE = 0.25
+
+
+class Solid(Medium):
+    """Bodies of constant index, bounded by the zero levels of signed distances; later bodies lie inside earlier ones.
+
+    For the Eikonal equation the surface is a shell of half width w around the zero level, in which the index rises as
+    a cubic step of the signed distance phi: S = t^2 (3 - 2 t), t = (1 - phi / w) / 2. Body after body,
+    n <- n + (ior - n) S.
+
+    Attributes:
+        iors: refractive index of each body.
+        shell: half width w, world units.
+    """
+
+    def __init__(self, iors: list[float], shell: float) -> None:
+        """Set what all solids share.
+
+        Raises:
+            NerfroError: an index or the width is not positive.
+        """
+        super().__init__()
+        if not iors or not all(ior > 0 for ior in iors):
+            raise NerfroError(f"{iors} are no refractive indices; give positive numbers such as 1.5")
+        if not shell > 0:
+            raise NerfroError(f"a shell of half width {shell} is impossible; give a positive number")
+        self.iors = tuple(float(ior) for ior in iors)
+        self.shell = float(shell)
+
+    @abstractmethod
+    def signed_distances(
+        self, positions: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
+        """Signed distance to each body's surface, negative inside, and its gradient; a lower bound far away will do."""
+
+    def index_inside(self, inside: Bool[Tensor, "*batch K"]) -> Float[Tensor, "*batch"]:
+        """Index of the last body that a point is in, 1 in none."""
+        n = torch.ones(inside.shape[:-1], dtype=self.box.dtype, device=inside.device)
+        for body, ior in enumerate(self.iors):
+            n = torch.where(inside[..., body], ior, n)
+        return n
+
+    def forward(
+        self, positions: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+        """Index of the smooth shells and its exact gradient."""
+        phi, normals = self.signed_distances(positions)
+        in_box = ((positions >= self.box[0]) & (positions <= self.box[1])).all(-1)
+        n, gradient = torch.ones_like(phi[..., 0]), torch.zeros_like(positions)
+        for body, ior in enumerate(self.iors):
+            t = (0.5 - 0.5 * phi[..., body] / self.shell).clamp(0, 1)
+            step = (t * t * (3 - 2 * t))[..., None]
+            slope = (ior - n) * 6 * t * (1 - t) * (-0.5 / self.shell)
+            gradient = gradient * (1 - step) + slope[..., None] * normals[..., body, :]
+            n = n + (ior - n) * step[..., 0]
+        return torch.where(in_box, n, 1.0), torch.where(in_box[..., None], gradient, 0.0)
+
+    def clearance(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Distance to the nearest shell."""
+        phi, _ = self.signed_distances(positions)
+        return (phi.abs().amin(-1) - self.shell).clamp(min=0)
+
+    def step_length(
+        self, directions: Float[Tensor, "*batch 3"], gradients: Float[Tensor, "*batch 3"]
+    ) -> Float[Tensor, "*batch"]:
+        """The shell's width over `STEPS_PER_SHELL`, longer for slanting rays."""
+        slope = torch.linalg.vector_norm(gradients, dim=-1)
+        cosine = ((directions * gradients).sum(-1) / slope).abs()
+        # Where there is no gradient there is no normal either.
+        cosine = torch.where(slope > 0, cosine, 1.0)
+        return 2 * self.shell / STEPS_PER_SHELL / cosine.clamp(min=MIN_COSINE)

@@ -1,0 +1,117 @@
+"""From rays and media to the compiled kernels' arrays, and back to paths."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from nerfro.types import Path, Rays
+
+if TYPE_CHECKING:
+    from nerfro.media.sdf_grid import SdfGrid
+    from nerfro.media.voxel_grid import VoxelGrid
+
+# Vertices that a first attempt has room for; the few rays that need more are traced again with twice as many.
+_CAPACITY = 12
+
+
+def snell_on_grid(
+    rays: Rays, medium: SdfGrid, min_step: float, max_events: int
+) -> tuple[Path, Int[Tensor, "R"], Bool[Tensor, "R"]]:
+    """`samplers.snell.trace_interfaces` by the compiled kernel.
+
+    Args:
+        rays: on the CPU.
+        medium: signed distances on a grid.
+        min_step: shortest step of the search, as a share of the box's shortest side.
+        max_events: refractions and reflections, at most.
+    """
+    from nerfro.kernels.snell import trace_snell
+
+    low, high, inverse_spacing = _frame(medium.box, medium.coefficients.shape[1:])
+    settings = (
+        medium.coefficients.numpy(), np.array(medium.iors), low, high, inverse_spacing,
+        min_step * float((high - low).min()), max_events,
+    )  # fmt: skip
+    vertices, (events, exceeded) = _with_enough_vertices(rays, trace_snell, settings)
+    num_events = torch.from_numpy(events)
+    return _path(rays, vertices, num_events > 0), num_events, torch.from_numpy(exceeded)
+
+
+def eikonal_on_grid(
+    rays: Rays, medium: VoxelGrid | SdfGrid, step: float, tolerance: float, max_steps: int
+) -> tuple[Path, Bool[Tensor, "R"]]:
+    """`samplers.eikonal.march_adaptive` by the compiled kernel.
+
+    Args:
+        rays: on the CPU.
+        medium: either kind of grid.
+        step: arc length of a step across the shell or through the grid, world units.
+        tolerance: distance from its last tangent at which a path gets a vertex, world units.
+        max_steps: steps of a ray, at most.
+    """
+    from nerfro.kernels.eikonal import march_adaptive
+    from nerfro.media.sdf_grid import SdfGrid
+
+    if isinstance(medium, SdfGrid):
+        low, high, inverse_spacing = _frame(medium.box, medium.coefficients.shape[1:])
+        table, clearance = np.empty((0, 0, 0, 4), np.float32), np.empty((0, 0, 0), np.float32)
+        coefficients, iors, shell = medium.coefficients.numpy(), np.array(medium.iors), medium.shell
+    else:
+        low, high, inverse_spacing = _frame(medium.box, medium.table.shape[:3])
+        table, clearance = medium.table.numpy(), medium.clearance_grid.numpy()
+        coefficients, iors, shell = np.empty((0, 0, 0, 0), table.dtype), np.empty(0), 1.0
+    settings = (
+        table, clearance, coefficients, iors, shell, low, high, inverse_spacing, step, tolerance, max_steps,
+    )  # fmt: skip
+    vertices, (refracted, exceeded) = _with_enough_vertices(rays, march_adaptive, settings)
+    return _path(rays, vertices, torch.from_numpy(refracted)), torch.from_numpy(exceeded)
+
+
+def uniform_on_grid(rays: Rays, medium: VoxelGrid, integrator: str, num_steps: int) -> Path:
+    """`samplers.eikonal.march_uniform` by the compiled kernel."""
+    from nerfro.kernels import eikonal
+
+    code = {"euler": eikonal.EULER, "leapfrog": eikonal.LEAPFROG, "rk4": eikonal.RK4}[integrator]
+    low, _, inverse_spacing = _frame(medium.box, medium.table.shape[:3])
+    *vertices, refracted = eikonal.march_uniform(
+        *_arrays(rays), medium.table.numpy(), low, inverse_spacing, code, num_steps, True
+    )
+    return _path(rays, tuple(vertices), torch.from_numpy(refracted))
+
+
+def _with_enough_vertices(rays: Rays, kernel, settings: tuple) -> tuple[tuple, tuple]:
+    """Run a kernel, and run it again for the rays whose vertices did not fit."""
+    arrays = _arrays(rays)
+    capacity = _CAPACITY
+    positions, directions, s, counts, *rest = kernel(*arrays, *settings, capacity)
+    width = max(int(counts.max(initial=2)), 2)
+    if width > capacity:
+        rows = np.nonzero(counts > capacity)[0]
+        again = kernel(*(array[rows] for array in arrays), *settings, width)[:3]
+        longer = []
+        for short, long in zip((positions, directions, s), again, strict=True):
+            padded = np.concatenate([short, np.repeat(short[:, -1:], width - capacity, axis=1)], axis=1)
+            padded[rows] = long
+            longer.append(padded)
+        positions, directions, s = longer
+    return (positions[:, :width], directions[:, :width], s[:, :width]), tuple(rest)
+
+
+def _arrays(rays: Rays) -> tuple[np.ndarray, ...]:
+    tensors = (rays.origins, rays.directions, rays.near, rays.far)
+    return tuple(np.ascontiguousarray(tensor.detach().numpy()) for tensor in tensors)
+
+
+def _frame(box: Tensor, shape: torch.Size) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    low, high = box.double().numpy()
+    return low, high, (np.array(shape) - 1) / (high - low)
+
+
+def _path(rays: Rays, vertices: tuple, refracted: Tensor) -> Path:
+    positions, directions, s = (torch.from_numpy(np.ascontiguousarray(array)) for array in vertices)
+    return Path(positions, directions, s, directions[:, -1], refracted, rays.radii)

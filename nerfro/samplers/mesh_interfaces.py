@@ -1,0 +1,94 @@
+"""Snell's law at the triangles of meshes."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from nerfro.geometry.interpolation import intersect_box
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.samplers.polylines import Polylines
+from nerfro.samplers.snell_law import refract
+from nerfro.types import Path, Rays
+
+# A new ray starts this share of the box's diagonal ahead, beyond the rounding of Embree's single precision.
+_OFFSET = 1e-6
+
+
+def snell_on_mesh(rays: Rays, medium: SdfGrid, max_events: int) -> tuple[Path, Int[Tensor, "R"], Bool[Tensor, "R"]]:
+    """Follow rays from triangle to triangle.
+
+    Whether a ray is in a body is known from how often it crossed its surface, not from the triangles' orientation.
+
+    Args:
+        rays: in world space; they are traced on the CPU, in double precision.
+        medium: with meshes; its signed distance says which rays begin inside.
+        max_events: refractions and reflections, at most.
+
+    Returns:
+        Paths, the number of events on each, and whether a ray met the limit.
+    """
+    scene = medium.intersector
+    iors = torch.tensor([1.0, *medium.iors], dtype=torch.float64)
+    box, device = medium.box.double().cpu(), rays.origins.device
+    origins, far = rays.origins.double().cpu(), rays.far.double().cpu()
+    d, s = rays.directions.double().cpu().clone(), rays.near.double().cpu().clone()
+    x = origins + s[:, None] * d
+    lines = Polylines(len(rays), x)
+    rows = torch.arange(len(rays))
+    lines.append(rows, x, d, s)
+    enter, leave = intersect_box(box, x, d)
+    active = rows[(enter < leave) & (leave > 0) & (enter < far - s)]
+    inside = torch.zeros(len(rays), len(medium.iors), dtype=torch.bool)
+    within = active[enter[active] < 0]
+    if len(within):
+        inside[within] = (medium.signed_distances(x[within].to(medium.box))[0] < 0).cpu()
+    num_events, exceeded = torch.zeros_like(rows), torch.zeros(len(rays), dtype=torch.bool)
+    last_face = torch.full_like(rows, -1)
+    offset = _OFFSET * float(torch.linalg.vector_norm(box[1] - box[0]))
+    start = torch.zeros_like(s)
+    while len(active):
+        face = scene.first_hits(x[active] + start[active, None] * d[active], d[active])
+        active, face = active[face >= 0], face[face >= 0]
+        length = scene.distance(x[active], d[active], face)
+        # A straight line meets a plane once: the triangle that the ray comes from is found again only by rounding.
+        again = face == last_face[active]
+        start[active[again]] += offset
+        retry, ahead = active[again], ~again & (length < far[active] - s[active])
+        active, face, length = active[ahead], face[ahead], length[ahead].clamp(min=0)
+        flipped = inside[active]
+        body = scene.body[face][:, None]
+        flipped = flipped.scatter(1, body, ~flipped.gather(1, body))
+        n_before, n_after = (_innermost(iors, flags) for flags in (inside[active], flipped))
+        visible = n_before != n_after
+        over = visible & (num_events[active] >= max_events)
+        exceeded[active] = over
+        hit = x[active] + length[:, None] * d[active]
+        turned, reflected = refract(d[active], scene.normal(hit, face), n_before, n_after)
+        reflected &= visible
+        keep = ~over
+        active, face, hit, length = active[keep], face[keep], hit[keep], length[keep]
+        visible, reflected = visible[keep], reflected[keep]
+        inside[active] = torch.where(reflected[:, None], inside[active], flipped[keep])
+        x[active], s[active], last_face[active] = hit, s[active] + length, face
+        start[active] = offset
+        d[active] = torch.where(visible[:, None], turned[keep], d[active])
+        num_events[active] += visible
+        bent = active[visible]
+        lines.append(bent, x[bent], d[bent], s[bent])
+        active = torch.cat([active, retry])
+    lines.append(rows, x + (far - s)[:, None] * d, d, far)
+    path = lines.path(rays, num_events > 0)
+    like = rays.origins
+    path = Path(
+        path.positions.to(like), path.directions.to(like), path.s.to(like), path.exit_directions.to(like),
+        path.refracted.to(device), rays.radii,
+    )  # fmt: skip
+    return path, num_events.to(device), exceeded.to(device)
+
+
+def _innermost(iors: Float[Tensor, "K+1"], inside: Bool[Tensor, "R K"]) -> Float[Tensor, "R"]:
+    """Index of the last body that a ray is in; `iors` begins with that of air."""
+    numbers = torch.arange(1, inside.shape[1] + 1)
+    return iors[torch.where(inside, numbers, 0).amax(-1)]

@@ -1,0 +1,38 @@
+"""Growing polylines of many rays at once."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from nerfro.types import Path, Rays
+
+
+class Polylines:
+    """Paths under construction: rows of vertices, each row as long as it needs to be."""
+
+    def __init__(self, num_rays: int, like: Float[Tensor, "..."]) -> None:
+        self._vertices = like.new_zeros(num_rays, 4, 7)
+        self.counts = torch.zeros(num_rays, dtype=torch.long, device=like.device)
+
+    def append(
+        self,
+        rows: Int[Tensor, "A"],
+        positions: Float[Tensor, "A 3"],
+        directions: Float[Tensor, "A 3"],
+        s: Float[Tensor, "A"],
+    ) -> None:
+        """Add one vertex to each of the given rows."""
+        if len(rows) and int(self.counts[rows].max()) == self._vertices.shape[1]:
+            self._vertices = torch.cat([self._vertices, torch.zeros_like(self._vertices)], 1)
+        self._vertices[rows, self.counts[rows]] = torch.cat([positions, directions, s[:, None]], -1)
+        self.counts[rows] += 1
+
+    def path(self, rays: Rays, refracted: Bool[Tensor, "R"]) -> Path:
+        """The finished paths; shorter rows repeat their last vertex."""
+        capacity = int(self.counts.max()) if len(self.counts) else 2
+        index = torch.arange(capacity, device=self.counts.device).minimum(self.counts[:, None] - 1)
+        vertices = self._vertices.gather(1, index[..., None].expand(-1, -1, 7))
+        directions = vertices[..., 3:6]
+        return Path(vertices[..., :3], directions, vertices[..., 6], directions[:, -1], refracted, rays.radii)

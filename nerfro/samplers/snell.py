@@ -1,0 +1,177 @@
+"""Rays that are refracted and totally reflected at sharp surfaces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from nerfro.errors import NerfroError
+from nerfro.geometry.interpolation import intersect_box
+from nerfro.media.analytic import Vacuum
+from nerfro.media.base import Medium
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.solid import Solid
+from nerfro.registry import register
+from nerfro.samplers.base import PathSampler
+from nerfro.samplers.compiled import snell_on_grid
+from nerfro.samplers.mesh_interfaces import snell_on_mesh
+from nerfro.samplers.polylines import Polylines
+from nerfro.samplers.snell_law import refract
+from nerfro.samplers.straight import straight_path
+from nerfro.types import Path, Rays
+
+# The shortest step of the search for a surface, as a share of the box's shortest side: thinner sheets are overlooked.
+_MIN_STEP = 2e-4
+_ROOT_ITERATIONS = 60
+
+
+@dataclass(frozen=True)
+class SnellTrace:
+    """Paths and what happened on them.
+
+    Attributes:
+        path: minimal polylines, a vertex for each event beside near and far.
+        num_events: refractions and total reflections of each ray.
+        exceeded: whether a ray met the limit of events; such a ray goes straight on from there.
+    """
+
+    path: Path
+    num_events: Int[Tensor, "R"]
+    exceeded: Bool[Tensor, "R"]
+
+
+@register("sampler/path", "snell")
+class Snell(PathSampler):
+    """Exact refraction (Snell's law) and total reflection at the surface of a solid."""
+
+    def __init__(self, interface: Literal["sdf", "mesh"] = "sdf", max_events: int = 16) -> None:
+        """Choose the surface.
+
+        Args:
+            interface: sdf is the zero level of the signed distance (smooth normals, tolerates noisy hulls);
+                mesh is the triangles themselves (sharp edges, vertex normals where the mesh is smooth).
+            max_events: refractions and reflections of a ray, at most.
+        """
+        super().__init__()
+        if max_events < 1:
+            raise NerfroError(f"sampler.path.max_events={max_events} lets no ray in; give at least 2 (16 is usual)")
+        self.interface = interface
+        self.max_events = max_events
+
+    @torch.no_grad()
+    def forward(self, rays: Rays, medium: Medium) -> Path:
+        """Trace every ray from near to far; straight runs are two vertices."""
+        return self.trace(rays, medium).path
+
+    @torch.no_grad()
+    def trace(self, rays: Rays, medium: Medium) -> SnellTrace:
+        """Paths, the number of events on each, and which rays had too many.
+
+        Raises:
+            NerfroError: the medium has no surface, or not of the kind that was asked for.
+        """
+        if isinstance(medium, Vacuum):
+            none = torch.zeros(len(rays), dtype=torch.long, device=rays.near.device)
+            return SnellTrace(straight_path(rays), none, none.bool())
+        if not isinstance(medium, Solid):
+            raise NerfroError("sampler/path=snell needs a medium with a surface; take medium=sdf_grid, or path=eikonal")
+        if self.interface == "mesh":
+            if not isinstance(medium, SdfGrid) or not medium.meshes:
+                raise NerfroError("sampler.path.interface=mesh needs a medium made of a mesh; take medium=sdf_grid")
+            return SnellTrace(*snell_on_mesh(rays, medium, self.max_events))
+        if isinstance(medium, SdfGrid) and rays.origins.device.type == "cpu":
+            return SnellTrace(*snell_on_grid(rays, medium, _MIN_STEP, self.max_events))
+        return SnellTrace(*trace_interfaces(rays, medium, self.max_events))
+
+
+def trace_interfaces(rays: Rays, medium: Solid, max_events: int) -> tuple[Path, Int[Tensor, "R"], Bool[Tensor, "R"]]:
+    """Follow rays from surface to surface of any solid: the plain reference of the compiled kernel.
+
+    Surfaces are found by sphere tracing: the signed distance is a step that cannot jump over them. A change of sign
+    ends the search, and the root is bracketed. A refracted ray goes on from the far end of the bracket, a reflected one
+    from its near end, so that both begin on their own side.
+    """
+    num_rays = len(rays)
+    rows = torch.arange(num_rays, device=rays.near.device)
+    x, d, s = rays.origins + rays.near[:, None] * rays.directions, rays.directions.clone(), rays.near.clone()
+    lines = Polylines(num_rays, x)
+    lines.append(rows, x, d, s)
+    enter, leave = intersect_box(medium.box, x, d)
+    num_events = torch.zeros_like(rows)
+    exceeded = torch.zeros_like(rows, dtype=torch.bool)
+    active = rows[(enter < leave) & (leave > 0) & (enter < rays.far - s)]
+    jump = enter[active].clamp(min=0)
+    x[active] += jump[:, None] * d[active]
+    s[active] += jump
+    inside = medium.signed_distances(x)[0] < 0
+    min_step = _MIN_STEP * float((medium.box[1] - medium.box[0]).min())
+    while len(active):
+        _, leave = intersect_box(medium.box, x[active], d[active])
+        limit = torch.minimum(leave, rays.far[active] - s[active])
+        before, after, crossed = _search(medium, x[active], d[active], inside[active], limit, min_step)
+        active, before, after = active[crossed], before[crossed], after[crossed]
+        if not len(active):
+            break
+        before, after, body = _first_crossing(medium, x[active], d[active], inside[active], before, after)
+        n_before = medium.index_inside(inside[active])
+        flipped = inside[active]
+        flipped.scatter_(1, body[:, None], ~flipped.gather(1, body[:, None]))
+        n_after = medium.index_inside(flipped)
+        visible = n_before != n_after
+        over = visible & (num_events[active] >= max_events)
+        exceeded[active] = over
+        _, normals = medium.signed_distances(x[active] + after[:, None] * d[active])
+        normal = normals.gather(1, body[:, None, None].expand(-1, 1, 3))[:, 0]
+        normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+        turned, reflected = refract(d[active], normal, n_before, n_after)
+        reflected &= visible
+        length = torch.where(reflected, before, after)
+        keep = ~over
+        active, length, turned = active[keep], length[keep], turned[keep]
+        visible, reflected = visible[keep], reflected[keep]
+        inside[active] = torch.where(reflected[:, None], inside[active], flipped[keep])
+        x[active] += length[:, None] * d[active]
+        s[active] += length
+        d[active] = torch.where(visible[:, None], turned, d[active])
+        num_events[active] += visible
+        bent = active[visible]
+        lines.append(bent, x[bent], d[bent], s[bent])
+    lines.append(rows, x + (rays.far - s)[:, None] * d, d, rays.far)
+    return lines.path(rays, num_events > 0), num_events, exceeded
+
+
+def _search(
+    medium: Solid, x: Tensor, d: Tensor, inside: Tensor, limit: Tensor, min_step: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Sphere tracing up to `limit`: the last step's start and end, and whether a surface was crossed in it."""
+    before, after = torch.zeros_like(limit), torch.zeros_like(limit)
+    crossed = torch.zeros_like(limit, dtype=torch.bool)
+    going = torch.arange(len(limit), device=limit.device)
+    while len(going):
+        phi, _ = medium.signed_distances(x[going] + after[going, None] * d[going])
+        crossed[going] = ((phi < 0) != inside[going]).any(-1)
+        more = ~crossed[going] & (after[going] < limit[going])
+        going, phi = going[more], phi[more]
+        before[going] = after[going]
+        step = phi.abs().amin(-1).clamp(min=min_step)
+        after[going] = torch.minimum(after[going] + step, limit[going])
+    return before, after, crossed
+
+
+def _first_crossing(
+    medium: Solid, x: Tensor, d: Tensor, inside: Tensor, before: Tensor, after: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Shrink each bracket by bisection around the first change of sign of any body, and say which body it was."""
+    for _ in range(_ROOT_ITERATIONS):
+        middle = 0.5 * (before + after)
+        phi, _ = medium.signed_distances(x + middle[:, None] * d)
+        changed = ((phi < 0) != inside).any(-1)
+        after = torch.where(changed, middle, after)
+        before = torch.where(changed, before, middle)
+    phi, _ = medium.signed_distances(x + after[:, None] * d)
+    changed = (phi < 0) != inside
+    return before, after, changed.long().argmax(-1)

@@ -1,0 +1,37 @@
+"""Snell's law."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+def refract(
+    directions: Float[Tensor, "R 3"],
+    normals: Float[Tensor, "R 3"],
+    n_before: Float[Tensor, "R"],
+    n_after: Float[Tensor, "R"],
+) -> tuple[Float[Tensor, "R 3"], Bool[Tensor, "R"]]:
+    """Snell's law in vector form, and total reflection where it has no solution.
+
+    With r = n_before / n_after, N against d and c = -N . d: t = r d + (r c - sqrt(1 - r^2 (1 - c^2))) N, or d + 2 c N.
+
+    Args:
+        directions: unit, towards the surface.
+        normals: unit, of either orientation.
+        n_before, n_after: index on the ray's side and beyond.
+
+    Returns:
+        Unit directions after the event, and whether it was a reflection.
+    """
+    cosine = -(directions * normals).sum(-1)
+    normals = torch.where(cosine[..., None] < 0, -normals, normals)
+    cosine = cosine.abs()
+    ratio = n_before / n_after
+    squared = 1 - ratio**2 * (1 - cosine**2)
+    reflected = squared < 0
+    along = torch.where(reflected, 2 * cosine, ratio * cosine - squared.clamp(min=0).sqrt())
+    scale = torch.where(reflected, 1.0, ratio)
+    after = scale[..., None] * directions + along[..., None] * normals
+    return after / torch.linalg.vector_norm(after, dim=-1, keepdim=True), reflected
