@@ -81,14 +81,12 @@ class View:
 
 def fingerprint(scene: Scene) -> str:
     """Return a short hash of a scene's geometry, colours, index, tint and sky."""
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(repr((scene.ior, scene.tint)).encode())
     for surface in (scene.glass, scene.interior):
-        for array in (surface.vertices, surface.faces, surface.colours):
+        for array in (surface.vertices, surface.faces, surface.normals, surface.colours):
             if array is not None:
-                # Rounded: the last bit of a sine may differ between machines, the scene does not.
-                digest.update(np.round(array.astype(np.float64), 4).tobytes())
-    digest.update(np.round(scene.sky(lat_long_directions(64, 128)), 3).tobytes())
-    digest.update(repr((scene.ior, scene.tint)).encode())
+                digest.update(array.tobytes())
+    digest.update(scene.sky(lat_long_directions(64, 128)).astype(np.float32).tobytes())
     return digest.hexdigest()[:16]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from types import ModuleType
 
 import numpy as np
@@ -17,6 +18,7 @@ from nerfro.scenes.surface import Surface
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "scalar_rgb")
 SAMPLES_PER_PASS = 6_000_000  # a wavefront of paths is held in memory at once: about 1 GB per 10 M paths
+_TEXELS_PER_TASK, _EDGE_CONTRAST = 1 << 17, 0.1
 _GET_LLVM = "llvm_ad_rgb needs the LLVM library, 16 or newer (Debian: apt-get install libllvm19)"
 ROULETTE_DEPTH, MAX_DEPTH = 32, 1024  # light bounces long between the walls of a cube: cut late and without bias
 
@@ -176,7 +178,7 @@ def envmap_texture(sky: Sky, height: int, to_world: np.ndarray) -> np.ndarray:
     """Return the sky sampled where Mitsuba's `envmap` looks it up, float32 [H, 2H, 3].
 
     Mitsuba reads row j at the polar angle pi j / (H - 1), the first and last rows being the poles, but column i at the
-    azimuth 2 pi (i + 1/2) / W.
+    azimuth 2 pi (i + 1/2) / W. Texels at edges of the sky are averages of several samples; elsewhere one is enough.
 
     Args:
         sky: the radiance.
@@ -184,13 +186,33 @@ def envmap_texture(sky: Sky, height: int, to_world: np.ndarray) -> np.ndarray:
         to_world: rotation [3, 3] from the emitter's frame (y up) to ours.
     """
     width = 2 * height
-    phi = 2 * np.pi * (np.arange(width) + 0.5) / width
-    texture = np.empty((height, width, 3), np.float32)
-    for row in range(height):
-        theta = np.pi * row / (height - 1)
-        ring = np.stack([np.sin(theta) * np.sin(phi), 0 * phi + np.cos(theta), -np.sin(theta) * np.cos(phi)], -1)
-        texture[row] = sky(ring @ to_world.T)
+
+    def sample(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        theta, phi = np.broadcast_arrays(np.pi * rows / (height - 1), 2 * np.pi * (columns + 0.5) / width)
+        local = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], -1)
+        return sky(local @ to_world.T).astype(np.float32)
+
+    def refined(texels: np.ndarray) -> np.ndarray:
+        offsets = np.mgrid[-1:2, -1:2].reshape(2, 9) / 3
+        return sample(texels[:, :1] + offsets[0], texels[:, 1:] + offsets[1]).mean(1)
+
+    bands = np.array_split(np.arange(height), -(-height * width // _TEXELS_PER_TASK))
+    with ThreadPoolExecutor() as pool:
+        texture = np.concatenate(list(pool.map(lambda rows: sample(rows[:, None], np.arange(width)), bands)))
+        edges = np.argwhere(_contrast(texture) > _EDGE_CONTRAST)
+        tasks = np.array_split(edges, -(-9 * len(edges) // _TEXELS_PER_TASK) or 1)
+        texture[edges[:, 0], edges[:, 1]] = np.concatenate(list(pool.map(refined, tasks)))
     return texture
+
+
+def _contrast(texture: np.ndarray) -> np.ndarray:
+    """Return the largest difference [H, W] of each texel to its neighbours to the right, left, above and below."""
+    right = np.abs(texture - np.roll(texture, -1, 1)).max(-1)
+    below = np.zeros_like(right)
+    below[:-1] = np.abs(texture[:-1] - texture[1:]).max(-1)
+    contrast = np.maximum(np.maximum(right, np.roll(right, 1, 1)), below)
+    contrast[1:] = np.maximum(contrast[1:], below[:-1])
+    return contrast
 
 
 def _mesh(mi: ModuleType, name: str, surface: Surface, material: dict):
