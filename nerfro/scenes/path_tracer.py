@@ -224,7 +224,9 @@ def _mesh(mi: ModuleType, name: str, surface: Surface, material: dict):
         mesh.add_attribute("vertex_color", 3, to_linear(surface.colours).astype(np.float32).ravel())
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = surface.vertices.ravel()
-    parameters["vertex_normals"] = surface.normals.ravel()
     parameters["faces"] = surface.faces.astype(np.uint32).ravel()
+    parameters.update()
+    # Normals last: some versions of Mitsuba replace them by averages over facets when positions change.
+    parameters["vertex_normals"] = surface.normals.ravel()
     parameters.update()
     return mesh
