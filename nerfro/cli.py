@@ -63,6 +63,11 @@ def _errors_in_one_line() -> Iterator[None]:
         _fail(str(error))
     except (HydraException, OmegaConfBaseException) as error:
         _fail(" ".join(_messages(error)))
+    except ValueError as error:
+        # Hydra's refusal of a group that is set to no option (field=null); any other ValueError is a bug.
+        if not str(error).startswith("Config group override"):
+            raise
+        _fail(f"{error}; give the name of an option, as in field=nerf")
     except OSError as error:
         _fail(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}")
     except KeyboardInterrupt:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Optional
 
@@ -11,6 +12,7 @@ from omegaconf import MISSING, DictConfig
 from nerfro.errors import NerfroError
 from nerfro.losses.base import Loss
 from nerfro.media.analytic import Vacuum
+from nerfro.media.base import Medium
 from nerfro.models.base import NerfModel, Parts
 from nerfro.models.optimizer import OptimizerConfig
 from nerfro.registry import build, configure, find
@@ -82,6 +84,18 @@ class CheckpointConfig:
 
 
 @dataclass
+class ContentConfig:
+    """The box outside of which there is nothing but the boundary, for fields and samplers that stay inside one.
+
+    Attributes:
+        box_min, box_max: its corners, world units; none takes the bounds of the object.
+    """
+
+    box_min: Optional[list[float]] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    box_max: Optional[list[float]] = None  # noqa: UP045
+
+
+@dataclass
 class AuthorsConfig:
     """What the authors of the paper set for a scene, taken up by the `paper_*` experiments alone.
 
@@ -111,7 +125,7 @@ class TrainConfig:
         data, medium, field, boundary, model: one plugin of that kind.
         sampler: path and point sampler.
         loss: fields of each training loss, by the loss's registered name.
-        authors, optimizer, batches, evaluation, checkpoint: see there.
+        content, authors, optimizer, batches, evaluation, checkpoint: see there.
         trainer, logger: Lightning objects.
         ckpt_path: checkpoint to go on from, or `last` for the newest of this experiment.
     """
@@ -125,6 +139,7 @@ class TrainConfig:
     boundary: Any = MISSING
     model: Any = MISSING
     loss: dict[str, Any] = dataclasses.field(default_factory=dict)
+    content: ContentConfig = dataclasses.field(default_factory=ContentConfig)
     authors: AuthorsConfig = dataclasses.field(default_factory=AuthorsConfig)
     optimizer: OptimizerConfig = dataclasses.field(default_factory=OptimizerConfig)
     batches: BatchesConfig = dataclasses.field(default_factory=BatchesConfig)
@@ -139,14 +154,19 @@ def build_losses(nodes: DictConfig) -> dict[str, Loss]:
     """Build the training losses from `loss.<registered name>.<field>`.
 
     Raises:
-        NerfroError: no loss is registered under a name, or a field is wrong.
+        NerfroError: there is no loss, none is registered under a name, or a field is wrong.
     """
+    if not nodes:
+        raise NerfroError("there is no loss to train with; give one, such as +loss.photometric.weight=1")
+    for name, node in nodes.items():
+        if node is not None and not isinstance(node, Mapping):
+            raise NerfroError(f"loss.{name}={node} is no set of fields; write loss.{name}.weight={node} for its weight")
     plugins = {str(name): find("loss", str(name)) for name in nodes}
     return {name: plugin.cls(**configure(plugin, nodes[name] or {})) for name, plugin in plugins.items()}
 
 
 def build_model(config: DictConfig) -> NerfModel:
-    """Compose the model of a configuration (see `TrainConfig`).
+    """Compose the model of a configuration (see `TrainConfig`); fills in `config.content` where it is left open.
 
     Raises:
         NerfroError: a part is not registered or is configured wrongly.
@@ -155,14 +175,14 @@ def build_model(config: DictConfig) -> NerfModel:
         raise NerfroError(f"evaluation.chunk_size={config.evaluation.chunk_size} renders nothing; take 1 or more")
     losses = build_losses(config.loss)
     optimizer = OptimizerConfig(**config.optimizer)
-    path_sampler, point_sampler = build(config.sampler.path), build(config.sampler.points)
     boundary = build(config.boundary)
-    # Last, since voxelisation takes longest.
+    path_sampler = build(config.sampler.path)
     medium = build(config.medium) if path_sampler.needs_medium else Vacuum()
+    _settle_content(config, medium)
     parts = Parts(
         medium=medium,
         path_sampler=path_sampler,
-        point_sampler=point_sampler,
+        point_sampler=build(config.sampler.points),
         make_field=lambda: build(config.field),
         boundary=boundary,
         losses=losses,
@@ -171,3 +191,11 @@ def build_model(config: DictConfig) -> NerfModel:
         chunk_size=config.evaluation.chunk_size,
     )
     return build(config.model, parts=parts)
+
+
+def _settle_content(config: DictConfig, medium: Medium) -> None:
+    if (config.content.box_min is None) != (config.content.box_max is None):
+        raise NerfroError("content: give both box_min and box_max, or neither for the bounds of the object")
+    if config.content.box_min is None and not isinstance(medium, Vacuum):
+        low, high = medium.content_box.tolist()
+        config.content.box_min, config.content.box_max = ([round(x, 6) for x in corner] for corner in (low, high))

@@ -156,6 +156,10 @@ def build(node: DictConfig | Mapping[str, object], **parts: object) -> Any:
     target = node.get("_target_")
     if target in _LIGHTNING_TARGETS:
         try:
+            # Hydra instantiates nested nodes too, whatever they name.
+            for nested in _targets(OmegaConf.to_container(node, resolve=True)):
+                if nested not in _LIGHTNING_TARGETS:
+                    raise NerfroError(f"'{nested}' inside {target} is not registered, so it is not built; remove it")
             return instantiate(node, **parts)
         except (InstantiationException, OmegaConfBaseException) as error:
             cause = error.__cause__ or error
@@ -164,6 +168,18 @@ def build(node: DictConfig | Mapping[str, object], **parts: object) -> Any:
     if plugin is None:
         raise NerfroError(f"'{target}' is not registered, so it is not built; `python -m nerfro.plugins` lists what is")
     return plugin.cls(**configure(plugin, node), **{name: parts[name] for name in plugin.parts if name in parts})
+
+
+def _targets(node: object) -> Iterator[object]:
+    """Every `_target_` in a container, at any depth."""
+    if isinstance(node, dict):
+        if "_target_" in node:
+            yield node["_target_"]
+        for child in node.values():
+            yield from _targets(child)
+    elif isinstance(node, list):
+        for child in node:
+            yield from _targets(child)
 
 
 def configure(plugin: Plugin, node: DictConfig | Mapping[str, object]) -> dict[str, Any]:

@@ -43,8 +43,8 @@ def main(config: DictConfig) -> None:
     """Train one experiment and evaluate it; everything that can be refused is refused before training starts."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     checkpoint = find_checkpoint(config.ckpt_path, folder)
-    if checkpoint is not None:
-        require_same_configuration(checkpoint, load_checkpoint(checkpoint)[1], config)
+    if not 0 <= config.seed < 2**32:
+        raise NerfroError(f"seed={config.seed} is no seed; give 0 to {2**32 - 1}")
     _quieten_lightning()
     pl.seed_everything(config.seed, verbose=False)
 
@@ -64,6 +64,8 @@ def main(config: DictConfig) -> None:
     supersampling = Supersampling(config.evaluation.supersample, config.evaluation.divergence)
     lpips = find_lpips_network(config.evaluation.lpips_backbone)
     model = build_model(config)
+    if checkpoint is not None:
+        require_same_configuration(checkpoint, load_checkpoint(checkpoint)[1], config)
     # Weights and Adam's two moments, in an old checkpoint that goes when the new one is whole.
     num_bytes = sum(p.numel() * p.element_size() for p in model.parameters())
     claim(folder, checkpoint is not None, 2 * 3 * num_bytes + _SPARE_BYTES)
@@ -110,18 +112,21 @@ def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.
         save_on_train_epoch_end=False,
     )
     in_checkpoint = ConfigInCheckpoint(OmegaConf.to_yaml(config, resolve=True))
-    return build(
-        config.trainer,
-        default_root_dir=str(folder),
-        callbacks=[checkpoints, TrainingProgress(), in_checkpoint, ValidationImages(), *extra],
-        logger=_loggers(config, folder),
-        max_epochs=-1,
-        val_check_interval=every if every > 0 else None,
-        check_val_every_n_epoch=None,
-        limit_val_batches=1 if every > 0 else 0,
-        num_sanity_val_steps=0,
-        use_distributed_sampler=False,
-    )
+    ours = {
+        "default_root_dir": str(folder),
+        "callbacks": [checkpoints, TrainingProgress(), in_checkpoint, ValidationImages(), *extra],
+        "logger": _loggers(config, folder),
+        "max_epochs": -1,
+        "val_check_interval": every if every > 0 else None,
+        "check_val_every_n_epoch": None,
+        "limit_val_batches": 1 if every > 0 else 0,
+        "num_sanity_val_steps": 0,
+        "use_distributed_sampler": False,
+    }
+    taken = sorted(ours.keys() & config.trainer.keys())
+    if taken:
+        raise NerfroError(f"trainer.{taken[0]} is set by nerfro.train itself; see evaluation, checkpoint and logger")
+    return build(config.trainer, **ours)
 
 
 def _loggers(config: DictConfig, folder: Path) -> list[Logger]:

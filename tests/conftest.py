@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+import trimesh
+from PIL import Image
+from scipy.spatial.transform import Rotation
 
 # Workers of pytest-xdist share the cores; threads that wait for each other by spinning would slow all of them down.
 if "PYTEST_XDIST_WORKER" in os.environ:
@@ -16,3 +26,80 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     torch.manual_seed(0)
+
+
+@dataclass(frozen=True)
+class Finished:
+    """How an entry point ended: its exit code and what it printed."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def train_here(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Finished]:
+    """`python -m nerfro.train`'s main in this process, on the CPU and without looking for LPIPS weights."""
+    import nerfro.train
+
+    monkeypatch.setattr(nerfro.train, "find_lpips_network", lambda backbone: (None, "not wanted in tests"))
+
+    def train(*overrides: str) -> Finished:
+        monkeypatch.setattr(sys, "argv", ["nerfro.train", *overrides])
+        monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+        capsys.readouterr()
+        code = 0
+        try:
+            nerfro.train.main()
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 1
+        printed = capsys.readouterr()
+        return Finished(code, printed.out, printed.err)
+
+    return train
+
+
+@pytest.fixture(scope="session")
+def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A Blender-format folder: a ball in front of a sky that is a linear function of direction, 16x16 pixels."""
+    root = tmp_path_factory.mktemp("tiny_scene")
+    trimesh.creation.icosphere(2, 0.6).export(root / "mesh.ply")
+    for split, num_views in (("train", 3), ("val", 2), ("test", 2)):
+        (root / split).mkdir()
+        frames = []
+        for i in range(num_views):
+            pose = np.eye(4)
+            pose[:3, :3] = Rotation.from_euler(
+                "zx", [137.5 * i + 40 * num_views, 60 + 20 * i], degrees=True
+            ).as_matrix()
+            pose[:3, 3] = 4 * pose[:3, 2]  # cameras look along -z, at the origin
+            column, row = np.meshgrid(np.arange(16) + 0.5, np.arange(16) + 0.5)
+            directions = np.stack([(column - 8) / 20, -(row - 8) / 20, -np.ones_like(row)], -1) @ pose[:3, :3].T
+            directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+            Image.fromarray(np.uint8(np.round(255 * (0.5 + 0.4 * directions)))).save(root / split / f"r_{i}.png")
+            frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose.tolist()})
+        document = {"camera_angle_x": 2 * math.atan(8 / 20), "frames": frames}
+        (root / f"transforms_{split}.json").write_text(json.dumps(document))
+    return root
+
+
+@pytest.fixture(scope="session")
+def tiny_run(tiny_scene: Path) -> list[str]:
+    """Overrides that make a training step of the default model take milliseconds."""
+    return [
+        f"data.root={tiny_scene}",
+        "medium.resolution=32",
+        "medium.smoothing_size=3",
+        "medium.cache=false",
+        "sampler.path.num_steps=32",
+        "sampler.points.num_coarse=8",
+        "sampler.points.num_fine=8",
+        "batches.size=32",
+        "field.width=8",
+        "field.view_width=8",
+        "boundary.width=8",
+        "loss.smoothness.tile_size=4",
+        "trainer.accelerator=cpu",
+        "trainer.max_time=null",
+        "logger=none",
+    ]

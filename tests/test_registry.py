@@ -1,0 +1,313 @@
+"""The registry and the typed configuration: what they accept, and how they refuse what they do not."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, Optional
+
+import pytest
+from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
+from torch import nn
+
+import nerfro.registry
+from nerfro.boundaries.constant import ConstantBoundary
+from nerfro.cli import entry_point
+from nerfro.config import TrainConfig, build_losses
+from nerfro.errors import NerfroError
+from nerfro.paths import CONF_DIR
+from nerfro.registry import KINDS, build, configure, discover, find, plugins, register
+from nerfro.samplers.eikonal import Eikonal
+
+discover()
+
+
+@pytest.fixture(autouse=True)
+def _registry_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Registrations of a test end with it."""
+    monkeypatch.setattr(nerfro.registry, "_plugins", dict(nerfro.registry._plugins))
+
+
+def refused(train_here: Callable[..., Any], *overrides: str) -> str:
+    """The one line on standard error with which a run is refused."""
+    finished = train_here(*overrides)
+    assert finished.code == 1
+    lines = finished.err.strip().splitlines()
+    assert len(lines) == 1, finished.err
+    assert lines[0].startswith("nerfro: error: ")
+    assert "nerfro:" not in finished.out, "nothing has started"
+    return lines[0]
+
+
+# What a constructor becomes.
+
+
+def test_constructor_becomes_the_configuration() -> None:
+    @register("boundary", "of_test")
+    class OfTest(nn.Module):
+        """First line.
+
+        More.
+        """
+
+        def __init__(
+            self,
+            medium: nn.Module,
+            required: int,
+            rate: float = 0.5,
+            names: tuple[str, ...] = ("a",),
+            maybe: Optional[int] = None,  # noqa: UP045 - the older spelling too
+            newer: str | None = None,
+            mode: Literal["fast", "exact"] = "fast",
+        ) -> None:
+            super().__init__()
+            self.arguments = required, rate, names, maybe, newer, mode
+            self.medium = medium
+
+    plugin = find("boundary", "of_test")
+    assert plugin.parts == {"medium"}
+    assert plugin.summary == "First line."
+    assert list(plugin.fields()) == [
+        ("required", "int", "required"),
+        ("rate", "float", 0.5),
+        ("names", "list[str]", ["a"]),
+        ("maybe", "int | none", None),
+        ("newer", "str | none", None),
+        ("mode", "fast | exact", "fast"),
+    ]
+    medium = nn.Identity()
+    built = build({"_target_": plugin.target, "required": 3}, medium=medium, something_else=1)
+    assert built.arguments == (3, 0.5, ["a"], None, None, "fast")
+    assert built.medium is medium
+
+
+def test_integer_passes_for_a_float_and_a_text_of_digits_for_an_integer() -> None:
+    plugin = find("loss", "boundary")
+    assert configure(plugin, {"weight": 1, "start": "7"})["weight"] == 1.0
+    assert configure(plugin, {"weight": 1, "start": "7"})["start"] == 7
+
+
+def test_list_defaults_are_not_shared_between_configurations() -> None:
+    plugin = find("boundary", "constant")
+    first = configure(plugin, {})
+    first["rgb"][0] = 0.7
+    assert configure(plugin, {})["rgb"] == [0.0, 0.0, 0.0]
+
+
+def test_every_plugin_is_an_option_of_hydra_and_has_a_summary() -> None:
+    options = {kind: ConfigStore.instance().list(kind) for kind in KINDS}
+    for plugin in plugins():
+        assert f"{plugin.name}.yaml" in options[plugin.kind]
+        assert plugin.summary
+    assert {p.kind for p in plugins()} == set(KINDS)
+
+
+def test_build_makes_the_registered_class() -> None:
+    target = f"{Eikonal.__module__}.{Eikonal.__qualname__}"
+    sampler = build(OmegaConf.create({"_target_": target, "num_steps": 12}))
+    assert isinstance(sampler, Eikonal)
+    assert sampler.num_steps == 12
+
+
+# Refusals by the registry.
+
+
+def test_duplicate_name_names_both_modules() -> None:
+    with pytest.raises(
+        NerfroError, match=r"boundary=constant is registered twice, by nerfro\.boundaries\.constant and "
+    ):
+
+        @register("boundary", "constant")
+        class Other(nn.Module):
+            """Another."""
+
+
+def test_the_same_class_may_register_again() -> None:
+    assert register("boundary", "constant")(ConstantBoundary) is ConstantBoundary
+
+
+def test_unknown_kind_is_refused_with_the_kinds() -> None:
+    with pytest.raises(NerfroError, match="'colour' is not a plugin kind; kinds: model, medium, sampler/path"):
+        register("colour", "red")
+
+
+def test_constructor_that_takes_anything_is_refused() -> None:
+    with pytest.raises(NerfroError, match=r"takes \*options; name every parameter instead"):
+
+        @register("boundary", "greedy")
+        class Greedy(nn.Module):
+            """Takes anything."""
+
+            def __init__(self, **options: float) -> None:
+                super().__init__()
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        (
+            {"nmu_steps": 3},
+            "sampler/path=eikonal: Key 'nmu_steps' not in 'EikonalConfig'; its fields: integrator, num_",
+        ),
+        ({"integrator": "foo"}, "integrator='foo' is not allowed; choose 'adaptive', 'euler', 'leapfrog'"),
+        ({"num_steps": "many"}, "sampler/path=eikonal: Value 'many' of type 'str' could not be converted to Integer"),
+    ],
+)
+def test_wrong_fields_are_refused(fields: dict[str, object], message: str) -> None:
+    with pytest.raises(NerfroError, match=message):
+        configure(find("sampler/path", "eikonal"), fields)
+
+
+def test_missing_required_field_is_named() -> None:
+    with pytest.raises(NerfroError, match="data=opencv: Missing mandatory value: root; its fields: root, near, far"):
+        configure(find("data", "opencv"), {})
+
+
+def test_unknown_name_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(NerfroError, match="no boundary is called 'sky'; known: constant, .*skybox"):
+        find("boundary", "sky")
+
+
+@pytest.mark.parametrize("target", ["os.system", "nerfro.samplers.eikonal.march_uniform", None])
+def test_target_that_is_not_registered_is_not_built(target: str | None, tmp_path: Path) -> None:
+    node = {"_target_": target, "command": f"touch {tmp_path / 'ran'}"}
+    with pytest.raises(NerfroError, match=f"'{target}' is not registered, so it is not built; .*nerfro.plugins"):
+        build(node)
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize("nested", ["strategy", "plugins"])
+def test_target_inside_a_lightning_object_is_not_built(nested: str, tmp_path: Path) -> None:
+    node: dict[str, Any] = {"_target_": "os.system", "command": f"touch {tmp_path / 'ran'}"}
+    trainer = {"_target_": "lightning.pytorch.Trainer", nested: node if nested == "strategy" else [node]}
+    with pytest.raises(NerfroError, match=r"'os\.system' inside lightning\.pytorch\.Trainer is not registered"):
+        build(trainer)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_target_behind_an_interpolation_is_not_built(tmp_path: Path) -> None:
+    config = OmegaConf.create(
+        {
+            "name": "os.system",
+            "trainer": {
+                "_target_": "lightning.pytorch.Trainer",
+                "strategy": {"_target_": "${name}", "command": f"touch {tmp_path / 'ran'}"},
+            },
+        }
+    )
+    with pytest.raises(NerfroError, match=r"'os\.system' inside"):
+        build(config.trainer)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_unknown_field_of_a_lightning_object_is_refused() -> None:
+    with pytest.raises(NerfroError, match=r"lightning\.pytorch\.Trainer: .*'max_step'.*; check this object's fields"):
+        build({"_target_": "lightning.pytorch.Trainer", "max_step": 3})
+
+
+@pytest.mark.parametrize(
+    ("losses", "message"),
+    [
+        ({"photometrc": {}}, "no loss is called 'photometrc'; known: boundary, .*photometric, smoothness"),
+        (
+            {"photometric": {"weigth": 1}},
+            "loss=photometric: Key 'weigth' not in 'PhotometricConfig'; its fields: weight",
+        ),
+        ({"photometric": 3}, r"loss\.photometric=3 is no set of fields; write loss\.photometric\.weight=3"),
+        ({}, r"there is no loss to train with; give one, such as \+loss\.photometric\.weight=1"),
+    ],
+)
+def test_wrong_losses_are_refused(losses: dict[str, object], message: str) -> None:
+    with pytest.raises(NerfroError, match=message):
+        build_losses(OmegaConf.create(losses))
+
+
+# Refusals on the command line.
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["nme=x"], ["Key 'nme' not in 'TrainConfig'"]),
+        (["field=nrf"], ["Could not find 'field/nrf'", "Available options", "mip_nerf", "nerf"]),
+        (["field.widht=3"], ["Key 'widht' not in 'NerfFieldConfig'"]),
+        (["+field.widht=3"], ["field=nerf: Key 'widht'", "its fields: width, depth"]),
+        (["field.width=abc"], ["Value 'abc' of type 'str' could not be converted to Integer", "field.width"]),
+        (["field=null"], ["Got NoneType; give the name of an option"]),
+        (["+loss.boundry.weight=1"], ["no loss is called 'boundry'; known: boundary"]),
+        (["sampler.path.integrator=foo"], ["integrator='foo' is not allowed; choose 'adaptive', 'euler', 'leapfrog'"]),
+        (["field._target_=os.system"], ["'os.system' is not registered"]),
+        (["trainer._target_=os.system"], ["'os.system' is not registered"]),
+        (["logger=none", "+logger.x={_target_: os.system, command: 'false'}"], ["'os.system' is not registered"]),
+        (["+trainer.callbacks=[]"], ["trainer.callbacks is set by nerfro.train itself"]),
+        (["+experiment=nope"], ["Could not find 'experiment/nope'", "ablation_noBD", "refractive"]),
+        (["foo"], ["missing EQUAL"]),
+        (["seed=-1"], ["seed=-1 is no seed; give 0 to 4294967295"]),
+        (["data.root=${nope}"], ["Interpolation key 'nope' not found"]),
+        (["batches.batching=some"], ["batching='some' is unknown; choose 'single_image' or 'all_images'"]),
+        (["evaluation.chunk_size=0"], ["chunk_size=0 renders nothing; take 1 or more"]),
+        (["trainer.max_time=soon"], ["`Timer(duration='soon')` is not a valid duration"]),
+        (["checkpoint.every_steps=3"], ["set one of checkpoint.every_seconds and checkpoint.every_steps"]),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) and "=" in value[0] else "",
+)
+def test_mistake_on_the_command_line_is_told_in_one_line(
+    overrides: list[str], words: list[str], train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    line = refused(train_here, *tiny_run, f"hydra.run.dir={folder}", *overrides)
+    for word in words:
+        assert word in line
+    assert not list(folder.rglob("*")), "nothing is written"
+
+
+# Refusals in an experiment file.
+
+
+@pytest.fixture
+def train_with_conf(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, train_here: Callable[..., Any]
+) -> Callable[..., Any]:
+    """Train with a copy of conf/ to which an experiment file has been added."""
+    import nerfro.train
+
+    conf = tmp_path / "conf"
+    shutil.copytree(CONF_DIR, conf)
+    unwrapped = nerfro.train.main.__wrapped__
+    monkeypatch.setattr(nerfro.train, "main", entry_point("train", TrainConfig, conf)(unwrapped))
+
+    def train(experiment: str, *overrides: str) -> Any:
+        (conf / "experiment" / "of_test.yaml").write_text(f"# @package _global_\n{experiment}\n")
+        return train_here("+experiment=of_test", *overrides)
+
+    return train
+
+
+@pytest.mark.parametrize(
+    ("experiment", "words"),
+    [
+        ("nmae: x", ["Key 'nmae' not in 'TrainConfig'"]),
+        ("field: {widht: 3}", ["Key 'widht' not in 'NerfFieldConfig'", "field.widht"]),
+        ("optimizer: {lerning_rate: 3}", ["Key 'lerning_rate' not in 'OptimizerConfig'"]),
+        ("evaluation: {evry: 3}", ["Key 'evry' not in 'EvaluationConfig'"]),
+        ("sampler: {points: {num_caorse: 3}}", ["Key 'num_caorse' not in 'HierarchicalConfig'"]),
+        ("loss: {boundry: {weight: 0}}", ["no loss is called 'boundry'; known: boundary"]),
+        ("loss: {boundary: {wieght: 0}}", ["loss=boundary: Key 'wieght'", "its fields: weight, start"]),
+        ("field: {width: wide}", ["Value 'wide' of type 'str' could not be converted to Integer"]),
+        ("defaults: [{override /field: nrf}]", ["Could not find 'field/nrf'"]),
+        ("trainer: {strategy: {_target_: os.system, command: 'false'}}", ["'os.system' inside lightning"]),
+    ],
+)
+def test_mistake_in_an_experiment_file_is_told_in_one_line(
+    experiment: str,
+    words: list[str],
+    train_with_conf: Callable[..., Any],
+    tiny_run: list[str],
+    tmp_path: Path,
+) -> None:
+    line = refused(train_with_conf, experiment, *tiny_run, f"hydra.run.dir={tmp_path / 'run'}")
+    for word in words:
+        assert word in line
+    assert not list((tmp_path / "run").rglob("*")), "nothing is written"
