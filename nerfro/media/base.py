@@ -27,6 +27,11 @@ class Medium(nn.Module, ABC):
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         """Refractive index and its gradient (per world unit)."""
 
+    @property
+    def content_box(self) -> Float[Tensor, "2 3"]:
+        """Corners of the object's own bounds, world units: what lies inside it lies in here."""
+        return self.box
+
     def clearance(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Distance around each point of the box within which the index surely does not vary; 0 where unknown."""
         return torch.zeros_like(positions[..., 0])

@@ -23,6 +23,8 @@ from nerfro.registry import register
 
 # Voxels around the surface in which the distance is exact: the spline's support and the step that finds the surface.
 _BAND = 3.0
+# Cells a side of the blocks in which rays look up how far they may jump before they look up distances themselves.
+BLOCK = 4
 
 
 @register("medium", "sdf_grid")
@@ -30,10 +32,12 @@ class SdfGrid(Solid):
     """Bodies of constant index with the surfaces of meshes; thin shell for eikonal, sharp surface for snell.
 
     Attributes:
-        coefficients: of the quadratic B-spline of each body's signed distance.
+        distances: signed distance of each body at the grid's vertices.
+        coefficients: of the quadratic B-splines through them.
         meshes: the surfaces themselves; empty where the medium was made of distances.
     """
 
+    distances: Float[Tensor, "K X Y Z"]
     coefficients: Float[Tensor, "K X Y Z"]
 
     def __init__(
@@ -113,16 +117,34 @@ class SdfGrid(Solid):
         medium._set(distances, box)
         return medium
 
+    @property
+    def content_box(self) -> Float[Tensor, "2 3"]:
+        """Bounds of the outer mesh; the grid's box where there is none."""
+        return torch.from_numpy(self.meshes[0].bounds).float() if self.meshes else self.box
+
     @functools.cached_property
     def intersector(self) -> MeshIntersector:
         """Finds the triangles of the meshes that rays hit."""
         return MeshIntersector(self.meshes, self.crease_degrees)
+
+    @functools.cached_property
+    def coarse_clearance(self) -> Float[Tensor, "x y z"]:
+        """Lower bound of the distance to all surfaces from any point of each block of `BLOCK`^3 cells, world units."""
+        blocks = torch.tensor(self.coefficients.shape[1:]).sub(1).div(BLOCK, rounding_mode="floor").add(1).tolist()
+        nearest = self.distances.abs().amin(0).cpu()
+        for axis, count in enumerate(blocks):
+            # Neighbouring blocks share the vertices between them.
+            last = torch.arange(count * BLOCK + 1).clamp(max=nearest.shape[axis] - 1)
+            nearest = nearest.index_select(axis, last).unfold(axis, BLOCK + 1, BLOCK).amin(-1)
+        spacing = (self.box[1] - self.box[0]).cpu() / (torch.tensor(self.coefficients.shape[1:]) - 1)
+        return (nearest - 0.5 * torch.linalg.vector_norm(spacing)).clamp(min=0)
 
     def _set(self, distances: Tensor, box: Tensor) -> None:
         # Grids are made of the mesh at every start and do not belong in checkpoints.
         self.register_buffer("box", box, persistent=False)
         coefficients = torch.stack([spline_coefficients(values) for values in distances])
         self.register_buffer("coefficients", coefficients, persistent=False)
+        self.register_buffer("distances", distances, persistent=False)
 
     def signed_distances(
         self, positions: Float[Tensor, "*batch 3"]

@@ -131,6 +131,12 @@ class VoxelGrid(Medium):
         shape = torch.tensor(self.table.shape[:3], device=self.box.device)
         return (self.box[1] - self.box[0]) / (shape - 1)
 
+    @property
+    def content_box(self) -> Float[Tensor, "2 3"]:
+        """Bounds of the occupied vertices."""
+        occupied = self.occupancy.nonzero()
+        return self.box[0] + torch.stack([occupied.amin(0), occupied.amax(0)]) * self.spacing
+
     def forward(
         self, positions: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:

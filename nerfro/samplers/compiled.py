@@ -31,11 +31,12 @@ def snell_on_grid(
         max_events: refractions and reflections, at most.
     """
     from nerfro.kernels.snell import trace_snell
+    from nerfro.media.sdf_grid import BLOCK
 
     low, high, inverse_spacing = _frame(medium.box, medium.coefficients.shape[1:])
     settings = (
-        medium.coefficients.numpy(), np.array(medium.iors), low, high, inverse_spacing,
-        min_step * float((high - low).min()), max_events,
+        medium.coefficients.numpy(), medium.coarse_clearance.numpy(), np.array(medium.iors), low, high,
+        inverse_spacing, inverse_spacing / BLOCK, min_step * float((high - low).min()), max_events,
     )  # fmt: skip
     vertices, (events, exceeded) = _with_enough_vertices(rays, trace_snell, settings)
     num_events = torch.from_numpy(events)
@@ -55,18 +56,21 @@ def eikonal_on_grid(
         max_steps: steps of a ray, at most.
     """
     from nerfro.kernels.eikonal import march_adaptive
-    from nerfro.media.sdf_grid import SdfGrid
+    from nerfro.media.sdf_grid import BLOCK, SdfGrid
 
     if isinstance(medium, SdfGrid):
         low, high, inverse_spacing = _frame(medium.box, medium.coefficients.shape[1:])
-        table, clearance = np.empty((0, 0, 0, 4), np.float32), np.empty((0, 0, 0), np.float32)
+        table, clearance = np.empty((0, 0, 0, 4), np.float32), medium.coarse_clearance.numpy()
         coefficients, iors, shell = medium.coefficients.numpy(), np.array(medium.iors), medium.shell
+        inverse_block = inverse_spacing / BLOCK
     else:
         low, high, inverse_spacing = _frame(medium.box, medium.table.shape[:3])
         table, clearance = medium.table.numpy(), medium.clearance_grid.numpy()
-        coefficients, iors, shell = np.empty((0, 0, 0, 0), table.dtype), np.empty(0), 1.0
+        coefficients, iors, shell = np.empty((0, 0, 0, 0), table.dtype), np.empty(0), 0.0
+        inverse_block = inverse_spacing
     settings = (
-        table, clearance, coefficients, iors, shell, low, high, inverse_spacing, step, tolerance, max_steps,
+        table, clearance, coefficients, iors, shell, low, high, inverse_spacing, inverse_block, step, tolerance,
+        max_steps,
     )  # fmt: skip
     vertices, (refracted, exceeded) = _with_enough_vertices(rays, march_adaptive, settings)
     return _path(rays, vertices, torch.from_numpy(refracted)), torch.from_numpy(exceeded)

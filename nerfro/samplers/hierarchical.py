@@ -43,8 +43,8 @@ class Hierarchical(PointSampler):
         draw: Literal["arc_length", "vertices"] = "arc_length",
         cast: Literal["points", "cones"] = "points",
         offset: float = 0.5,
-        box_min: list[float] | None = None,
-        box_max: list[float] | None = None,
+        box_min: list[float] = (),  # type: ignore[assignment]
+        box_max: list[float] = (),  # type: ignore[assignment]
     ) -> None:
         super().__init__()
         if num_coarse < 4 or num_fine < 1:

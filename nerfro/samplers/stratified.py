@@ -27,7 +27,7 @@ class Stratified(PointSampler):
             paper does with its Eikonal samples, and needs a path of S = N_c * N_e vertices.
         cast: `points`, or `cones` whose samples fill the bins (mip-NeRF).
         offset: bin position used in evaluation, 0 the bin's start, 0.5 its centre.
-        box_min, box_max: corners of a box outside of which there is nothing to sample, world units; none for no box.
+        box_min, box_max: corners of a box outside of which there is nothing to sample, world units; empty for no box.
     """
 
     num_levels = 1
@@ -38,8 +38,8 @@ class Stratified(PointSampler):
         draw: Literal["arc_length", "vertices"] = "arc_length",
         cast: Literal["points", "cones"] = "points",
         offset: float = 0.5,
-        box_min: list[float] | None = None,
-        box_max: list[float] | None = None,
+        box_min: list[float] = (),  # type: ignore[assignment]
+        box_max: list[float] = (),  # type: ignore[assignment]
     ) -> None:
         super().__init__()
         if num_samples < 2:
@@ -48,10 +48,10 @@ class Stratified(PointSampler):
             raise NerfroError(f"sampler/points: offset={offset} is outside [0, 1)")
         if cast == "cones" and draw == "vertices":
             raise NerfroError("sampler/points: cones have no vertices to draw; set draw=arc_length")
-        if (box_min is None) != (box_max is None) or (box_min is not None and draw == "vertices"):
-            raise NerfroError("sampler/points: give both box_min and box_max or neither, and with draw=arc_length only")
+        if len(box_min) != len(box_max) or len(box_min) not in (0, 3) or (box_min and draw == "vertices"):
+            raise NerfroError("sampler/points: give three numbers for box_min and box_max each, with draw=arc_length")
         self.num_samples, self.draw, self.cast, self.offset = num_samples, draw, cast, offset
-        box = None if box_min is None or box_max is None else torch.tensor([list(box_min), list(box_max)])
+        box = torch.tensor([list(box_min), list(box_max)]) if box_min else None
         self.register_buffer("box", box, persistent=False)
 
     def forward(self, path: Path, previous: Rendering | None) -> Samples:
