@@ -7,6 +7,7 @@ import importlib.metadata
 import platform
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 from omegaconf import MISSING, DictConfig
@@ -16,7 +17,7 @@ from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
 from nerfro.paths import CONF_DIR
 from nerfro.scenes import dataset
-from nerfro.scenes.path_tracer import PathTracer
+from nerfro.scenes.path_tracer import PathTracer, load_mitsuba
 from nerfro.scenes.patterns import to_srgb
 from nerfro.scenes.scene import Scene
 from nerfro.scenes.skies import lat_long_texture
@@ -89,20 +90,22 @@ def synthesize(config: DictConfig) -> tuple[Scene, Path]:
         seed=config.seed,
     )
     folder = Path(config.out).expanduser()
+    mitsuba = load_mitsuba(config.variant)  # before anything is cleared that could not be rendered again
     dataset.prepare(folder, settings, config.overwrite)
+    if not (folder / dataset.META).is_file():
+        dataset.write_meta(folder, settings, scene, _versions(mitsuba))
     planned = dataset.views(settings)
     waiting = list(dataset.missing(folder, planned))
     print(f"{config.scene}: {len(planned)} views, {len(planned) - len(waiting)} of them already in {folder}")
     if waiting:
         tracer = PathTracer(scene, config.fresnel, dataset.CAMERA_ANGLE_X, config.resolution, variant=config.variant)
-        dataset.write_meta(folder, settings, scene, _versions(tracer))
         _render(tracer, folder, waiting)
     scene.glass.save(folder / "mesh.ply")
     sky = lat_long_texture(scene.sky, config.sky_height)
     dataset.write_image(folder / "sky.png", to_srgb(sky))
     if config.extras:
         scene.interior.save(folder / "interior.ply")
-        _write_exr(folder / "sky.exr", sky)
+        _write_exr(mitsuba, folder / "sky.exr", sky)
     dataset.write_transforms(folder, planned)
     return scene, folder
 
@@ -135,14 +138,13 @@ def _render(tracer: PathTracer, folder: Path, waiting: list[dataset.View]) -> No
             progress.advance(task, view.spp)
 
 
-def _versions(tracer: PathTracer) -> dict[str, str]:
+def _versions(mitsuba: ModuleType) -> dict[str, str]:
     names = ("mitsuba", "drjit", "numpy")
     versions = {name: importlib.metadata.version(name) for name in names}
-    return {**versions, "python": platform.python_version(), "variant": tracer.mitsuba.variant()}
+    return {**versions, "python": platform.python_version(), "variant": mitsuba.variant()}
 
 
-def _write_exr(path: Path, linear: np.ndarray) -> None:
-    mitsuba = importlib.import_module("mitsuba")
+def _write_exr(mitsuba: ModuleType, path: Path, linear: np.ndarray) -> None:
     bitmap = mitsuba.Bitmap(np.ascontiguousarray(linear, np.float32))
     bitmap.convert(component_format=mitsuba.Struct.Type.Float16).write(str(path))
 

@@ -137,21 +137,25 @@ def test_another_data_set_is_replaced_only_on_request_and_strangers_survive(tmp_
     pytest.importorskip("mitsuba")
     _, folder = synthesize(small(tmp_path / "scene"))
     (folder / "notes.txt").write_text("mine")
+    assert (folder / "interior.ply").is_file()
     before = (folder / "train" / "r_000.png").read_bytes()
     with pytest.raises(NerfroError, match="overwrite=true"):
         synthesize(small(folder, seed=1))
     assert (folder / "train" / "r_000.png").read_bytes() == before
-    synthesize(small(folder, seed=1, views={"train": 1, "val": 1, "test": 1}, overwrite=True))
+    synthesize(small(folder, seed=1, views={"train": 1, "val": 1, "test": 1}, extras=False, overwrite=True))
+    assert not (folder / "interior.ply").exists()
     assert (folder / "train" / "r_000.png").read_bytes() != before
     assert not (folder / "train" / "r_001.png").exists()
     assert (folder / "notes.txt").read_text() == "mine"
 
 
-def test_a_folder_of_something_else_is_left_alone(tmp_path):
-    (tmp_path / "thesis.tex").write_text("chapter 1")
+@pytest.mark.parametrize(("name", "content"), [("thesis.tex", "chapter 1"), ("meta.json", "{}"), ("meta.json", "[")])
+def test_a_folder_of_something_else_is_left_alone(tmp_path, name, content):
+    pytest.importorskip("mitsuba")
+    (tmp_path / name).write_text(content)
     with pytest.raises(NerfroError, match="no data set of ours"):
         synthesize(small(tmp_path, overwrite=True))
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, content)]
 
 
 @pytest.mark.parametrize(

@@ -108,9 +108,9 @@ def prepare(folder: Path, settings: Settings, overwrite: bool) -> None:
     Raises:
         NerfroError: the folder holds another data set, or other files, and `overwrite` is not set.
     """
-    meta = folder / META
-    if meta.is_file():
-        if _stored_settings(meta) == asdict(settings):
+    stored = _stored_settings(folder / META)
+    if stored is not None:
+        if stored == asdict(settings):
             return
         if not overwrite:
             raise NerfroError(
@@ -190,10 +190,10 @@ def write_transforms(folder: Path, planned: list[View]) -> None:
 
 
 def _stored_settings(meta: Path) -> dict | None:
-    """Return the settings in a meta.json, or None when it is not one of ours."""
+    """Return the settings in a meta.json, or None when there is none or it is not one of ours."""
     try:
         return json.loads(meta.read_text()).get("settings")
-    except (ValueError, AttributeError):
+    except (FileNotFoundError, NotADirectoryError, ValueError, AttributeError):
         return None
 
 
@@ -204,4 +204,5 @@ def _remove_data_set(folder: Path) -> None:
         for pictures in (folder / split, folder / "masks" / split):
             for picture in pictures.glob("r_*.png"):
                 picture.unlink()
-    (folder / META).unlink()
+    for name in ("mesh.ply", "interior.ply", "sky.png", "sky.exr", META):
+        (folder / name).unlink(missing_ok=True)

@@ -23,7 +23,7 @@ BOOKS = np.array(
         [0.45, 0.26, 0.48],
     ]
 )
-GLASS_SPACING = 0.018
+GLASS_SPACING = 0.010
 
 
 def star_prism(points: np.ndarray) -> np.ndarray:
@@ -109,6 +109,8 @@ def _panelling(y: np.ndarray, z: np.ndarray) -> np.ndarray:
 def _windows(x: np.ndarray, z: np.ndarray, north: np.ndarray) -> np.ndarray:
     wall = np.where(north[..., None], np.array([0.90, 0.84, 0.72]), np.array([0.70, 0.50, 0.42]))
     wall = wall * (1 - 0.12 * ((np.floor(x / 0.1).astype(int) % 2) == 0))[..., None]
+    motif = np.abs((x / 0.05) % 2 - 1.5) + np.abs((z / 0.05) % 2 - 1.0)
+    wall = np.where(((motif < 0.42) & (motif > 0.2))[..., None], np.array([0.36, 0.46, 0.52]), wall)
     u, v = (x + 1.7) / 1.7, (z + 0.35) / 1.15
     across, frame_u = u % 1, np.abs((u % 1) - 0.5)
     pane = (frame_u < 0.36) & (v > 0) & (v < 1)
