@@ -36,7 +36,7 @@ class ViewCounts:
 
 @dataclass
 class SynthesizeConfig:
-    """Options of `nerfro.synthesize`; conf/synthesize.yaml gives and explains the defaults."""
+    """Options of `nerfro.synthesize`; conf/synthesize/synthesize.yaml gives and explains the defaults."""
 
     scene: str = MISSING
     out: str = MISSING

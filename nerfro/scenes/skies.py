@@ -48,7 +48,9 @@ def clouds(directions: np.ndarray, horizon: tuple, zenith: tuple, cover: float, 
     return mix(colour, shade, amount)
 
 
-def skyline(directions: np.ndarray, palette: np.ndarray, count: int, heights: tuple[float, float], seed: int):
+def skyline(
+    directions: np.ndarray, palette: np.ndarray, count: int, heights: tuple[float, float], seed: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Paint a row of houses with windows standing on the horizon.
 
     Args:
@@ -83,7 +85,7 @@ def skyline(directions: np.ndarray, palette: np.ndarray, count: int, heights: tu
     return np.where(above_roof[..., None], np.array([0.55, 0.24, 0.18]), colour), covered.astype(np.float64)
 
 
-def tiles(directions: np.ndarray, palette: np.ndarray, size: float, grout: tuple, fade: tuple, seed: int):
+def tiles(directions: np.ndarray, palette: np.ndarray, size: float, grout: tuple, fade: tuple, seed: int) -> np.ndarray:
     """Paint a tiled floor at height -1 below the viewer, fading to one colour towards the horizon.
 
     Args:
