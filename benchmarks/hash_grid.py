@@ -1,0 +1,137 @@
+"""Hash-grid field and environment map: compiled CPU kernels against their plain-PyTorch twins.
+
+    python benchmarks/hash_grid.py [--rays 1024] [--samples 64] [--threads 2] [--rounds 9]
+
+Prints a Markdown table. The two sides of a ratio take turns within one run, and the fastest turn of each counts, so
+that other load on the machine disturbs both alike.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import time
+from collections.abc import Callable
+from datetime import date
+
+import torch
+from torch import Tensor
+
+from nerfro.boundaries import cube_map
+from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.fields import hash_encoding
+from nerfro.fields.hash_grid import HashGridField
+from nerfro.kernels.allocator import keep_freed_memory
+from nerfro.types import Samples
+
+Task = Callable[[], object]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("--rays", type=int, default=1024)
+    parser.add_argument("--samples", type=int, default=64)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=9)
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    torch.manual_seed(0)
+    keep_freed_memory()  # as training does
+    print(
+        f"{platform.processor() or platform.machine()}, {arguments.threads} threads, torch {torch.__version__}, ",
+        end="",
+    )
+    print(f"{date.today()}, {arguments.rays} rays x {arguments.samples} samples, fastest of {arguments.rounds} turns\n")
+    print("| task | twin, ms | compiled, ms | ratio |\n|---|---|---|---|")
+    samples = random_samples(arguments.rays, arguments.samples)
+    for num_levels, log2_table_size in ((12, 15), (16, 15), (16, 17)):
+        name = f"{num_levels} levels, 2^{log2_table_size} entries"
+        for label, twin, compiled in hash_grid_tasks(samples, num_levels, log2_table_size):
+            report(f"{label}; {name}", twin, compiled, arguments.rounds)
+    for label, twin, compiled in environment_map_tasks(arguments.rays):
+        report(label, twin, compiled, arguments.rounds)
+
+
+def random_samples(num_rays: int, num_samples: int) -> Samples:
+    """Straight rays through the box [-1, 1]^3, all samples inside."""
+    directions = torch.nn.functional.normalize(torch.randn(num_rays, 1, 3), dim=-1).expand(-1, num_samples, -1)
+    edges = torch.linspace(0, 1, num_samples + 1).expand(num_rays, -1)
+    positions = 0.5 * (2 * torch.rand(num_rays, 1, 3) - 1) + directions * (edges[:, :-1, None] - 0.5)
+    return Samples(positions, directions.contiguous(), edges[:, :-1], edges, torch.zeros(num_rays))
+
+
+class TwinField(HashGridField):
+    """The field with the plain-PyTorch encoding on the CPU, too."""
+
+    def encode(self, positions: Tensor) -> Tensor:
+        return hash_encoding.hash_encode((positions - self.box_min) / self.side, self.table, self.levels)
+
+
+def hash_grid_tasks(samples: Samples, num_levels: int, log2_table_size: int) -> list[tuple[str, Task, Task]]:
+    """Encoding alone, and a whole training pass through the field (forward, backward, Adam)."""
+    settings = {"num_levels": num_levels, "finest_resolution": 512, "log2_table_size": log2_table_size}
+    compiled = HashGridField(**settings, precision="bfloat16")
+    twin = TwinField(**settings, precision="float32")
+    upstream = torch.randn(samples.positions.shape[0] * samples.positions.shape[1], 2 * num_levels)
+    positions = samples.positions.flatten(0, 1)
+
+    def encode(field: HashGridField) -> Task:
+        return lambda: field.encode(positions)
+
+    def encode_and_back(field: HashGridField) -> Task:
+        return lambda: torch.autograd.grad(field.encode(positions), field.table, upstream)
+
+    def decode(field: HashGridField) -> Task:
+        parameters = list(field.parameters())
+
+        def run() -> None:
+            radiance = field(samples)
+            torch.autograd.grad(radiance.density.sum() + radiance.rgb.square().sum(), parameters)
+
+        return run
+
+    def adam(field: HashGridField, fused: bool) -> Task:
+        optimiser = torch.optim.Adam(field.parameters(), fused=fused)
+        for parameter in field.parameters():
+            parameter.grad = torch.randn_like(parameter)
+        return optimiser.step
+
+    same = HashGridField(**settings, precision="float32")
+    return [
+        ("encode, forward", encode(twin), encode(compiled)),
+        ("encode, forward and backward", encode_and_back(twin), encode_and_back(compiled)),
+        ("encode + decode in float32, forward and backward", decode(twin), decode(same)),
+        ("encode + decode in bfloat16, forward and backward", decode(twin), decode(compiled)),
+        ("Adam (plain, fused)", adam(twin, fused=False), adam(compiled, fused=True)),
+    ]
+
+
+def environment_map_tasks(num_rays: int) -> list[tuple[str, Task, Task]]:
+    """Lookup with gradient, and what the whole boundary costs in a step."""
+    boundary = EnvironmentMap()
+    directions = torch.nn.functional.normalize(torch.randn(num_rays, 3), dim=-1)
+
+    def twin() -> None:
+        raw = cube_map.lookup(*cube_map.project(directions), boundary.texels, boundary.padded, boundary.levels)
+        torch.autograd.grad(torch.sigmoid(raw).square().sum(), boundary.texels)
+
+    def compiled() -> None:
+        torch.autograd.grad(boundary(directions).square().sum(), boundary.texels)
+
+    return [("environment map, one direction a ray, forward and backward", twin, compiled)]
+
+
+def report(label: str, twin: Task, compiled: Task, rounds: int) -> None:
+    """Print a table row; both tasks run once before they are timed."""
+    fastest = [float("inf"), float("inf")]
+    for turn in range(rounds + 1):
+        for side, task in enumerate((twin, compiled)):
+            start = time.perf_counter()
+            task()
+            if turn > 0:
+                fastest[side] = min(fastest[side], 1e3 * (time.perf_counter() - start))
+    print(f"| {label} | {fastest[0]:.2f} | {fastest[1]:.2f} | {fastest[0] / fastest[1]:.1f}x |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

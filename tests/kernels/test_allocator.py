@@ -1,0 +1,33 @@
+"""The allocator's settings, in a process of its own so that other tests keep theirs."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+SCRIPT = """
+import resource, torch
+from nerfro.kernels.allocator import keep_freed_memory
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(20):
+        torch.zeros(8, 2**20)  # 32 MiB, 8192 pages
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+torch.set_num_threads(1)
+print(keep_freed_memory())
+faults()
+print(faults())
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a setting of Linux's C library")
+def test_repeated_tensors_reuse_memory_without_page_faults() -> None:
+    result = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True)
+    accepted, faults = result.stdout.split()
+    if accepted != "True":
+        pytest.skip("the C library is not glibc")
+    assert int(faults) < 20 * 8192 / 10
