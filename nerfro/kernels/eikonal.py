@@ -11,7 +11,7 @@ import numpy as np
 from numba import prange
 
 from nerfro.kernels.compilation import compiled, compiled_parallel
-from nerfro.kernels.lookup import box_span, put_vertex, repeat_last, solid_index, voxel_clearance, voxel_index
+from nerfro.kernels.lookup import block_clearance, box_span, put_vertex, repeat_last, solid_index, voxel_index
 
 EULER, LEAPFROG, RK4 = 0, 1, 2
 
@@ -103,7 +103,7 @@ def _look_up(table, clearance, coefficients, iors, shell, low, inverse_spacing, 
     if coefficients.shape[0] > 0:
         return solid_index(coefficients, iors, shell, low, inverse_spacing, x, y, z)
     n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
-    return n, gx, gy, gz, float(voxel_clearance(clearance, low, inverse_spacing, x, y, z))
+    return n, gx, gy, gz, float(block_clearance(clearance, low, inverse_spacing, x, y, z))
 
 
 @compiled
@@ -131,7 +131,7 @@ MIN_TURN = 1e-14
 @compiled_parallel
 def march_adaptive(
     origins, directions, near, far, table, clearance, coefficients, iors, shell, low, high, inverse_spacing,
-    step, tolerance, max_steps, capacity,
+    inverse_block, step, tolerance, max_steps, capacity,
 ):  # fmt: skip
     """Steps where the index varies, straight jumps elsewhere; vertices where the path leaves its last tangent.
 
@@ -161,21 +161,26 @@ def march_adaptive(
             kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
             jump = max(enter, 0.0)
             x, y, z, s = x + jump * dx, y + jump * dy, z + jump * dz, s + jump
-            n, gx, gy, gz, free = _look_up(table, clearance, coefficients, iors, shell, low, inverse_spacing, x, y, z)
-            vx, vy, vz = n * dx, n * dy, n * dz
+            known, n, gx, gy, gz, free = False, 1.0, 0.0, 0.0, 0.0, 0.0
             exceeded[ray] = True
             for _ in range(max_steps):
-                turned = (dx - kdx) ** 2 + (dy - kdy) ** 2 + (dz - kdz) ** 2
+                if not known:
+                    # Blocks are cheap to ask; only near a surface the index itself is looked up.
+                    free = block_clearance(clearance, low, inverse_block, x, y, z) - shell
+                    if free <= skip:
+                        n, gx, gy, gz, free = _look_up(
+                            table, clearance, coefficients, iors, shell, low, inverse_spacing, x, y, z
+                        )
+                        known = True
                 if free > skip:
-                    if turned > MIN_TURN:
+                    if (dx - kdx) ** 2 + (dy - kdy) ** 2 + (dz - kdz) ** 2 > MIN_TURN:
                         count = put_vertex(*row, count, x, y, z, dx, dy, dz, s)
                         kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
                     ds = min(free, end - s)
                     x, y, z, s = x + ds * dx, y + ds * dy, z + ds * dz, s + ds
-                    n, gx, gy, gz, free = _look_up(
-                        table, clearance, coefficients, iors, shell, low, inverse_spacing, x, y, z
-                    )
+                    known = False
                 else:
+                    vx, vy, vz = n * dx, n * dy, n * dz
                     slope = math.sqrt(gx * gx + gy * gy + gz * gz)
                     ds = step
                     if coefficients.shape[0] > 0 and slope > 0.0:

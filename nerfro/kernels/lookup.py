@@ -118,11 +118,11 @@ def voxel_index(table, low, inverse_spacing, x, y, z):
 
 
 @compiled
-def voxel_clearance(clearance, low, inverse_spacing, x, y, z):
-    """Distance within which a grid's index surely does not vary, from the cell that holds the point."""
-    i = min(max(int((x - low[0]) * inverse_spacing[0]), 0), clearance.shape[0] - 1)
-    j = min(max(int((y - low[1]) * inverse_spacing[1]), 0), clearance.shape[1] - 1)
-    k = min(max(int((z - low[2]) * inverse_spacing[2]), 0), clearance.shape[2] - 1)
+def block_clearance(clearance, low, inverse_size, x, y, z):
+    """Distance within which the index surely does not vary, from the cell (of any size) that holds the point."""
+    i = min(max(int((x - low[0]) * inverse_size[0]), 0), clearance.shape[0] - 1)
+    j = min(max(int((y - low[1]) * inverse_size[1]), 0), clearance.shape[1] - 1)
+    k = min(max(int((z - low[2]) * inverse_size[2]), 0), clearance.shape[2] - 1)
     return clearance[i, j, k]
 
 

@@ -11,7 +11,14 @@ import numpy as np
 from numba import prange
 
 from nerfro.kernels.compilation import compiled, compiled_parallel
-from nerfro.kernels.lookup import box_span, put_vertex, repeat_last, spline_value, spline_value_gradient
+from nerfro.kernels.lookup import (
+    block_clearance,
+    box_span,
+    put_vertex,
+    repeat_last,
+    spline_value,
+    spline_value_gradient,
+)
 
 # Root search ends at this fraction of the shortest step.
 _ROOT_TOLERANCE = 1e-6
@@ -56,7 +63,20 @@ def _index(inside, iors):
 
 @compiled_parallel
 def trace_snell(
-    origins, directions, near, far, coefficients, iors, low, high, inverse_spacing, min_step, max_events, capacity
+    origins,
+    directions,
+    near,
+    far,
+    coefficients,
+    clearance,
+    iors,
+    low,
+    high,
+    inverse_spacing,
+    inverse_block,
+    min_step,
+    max_events,
+    capacity,
 ):
     """Polylines of all rays.
 
@@ -93,6 +113,13 @@ def trace_snell(
                 limit = min(leave, end - s)
                 t, before, crossed = 0.0, 0.0, False
                 while not crossed:
+                    free = block_clearance(clearance, low, inverse_block, x + t * dx, y + t * dy, z + t * dz)
+                    if free > 2.0 * min_step:
+                        before = t
+                        t += free
+                        if t >= limit:
+                            break
+                        continue
                     distance = math.inf
                     for body in range(num_bodies):
                         value = spline_value(

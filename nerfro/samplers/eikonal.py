@@ -37,7 +37,7 @@ class Eikonal(PathSampler):
         self,
         integrator: Literal["adaptive", "euler", "leapfrog", "rk4"] = "adaptive",
         num_steps: int = 768,
-        tolerance: float = 1e-4,
+        tolerance: float = 2e-4,
         max_steps: int = 16384,
     ) -> None:
         """Choose how to step.
@@ -59,7 +59,7 @@ class Eikonal(PathSampler):
             raise NerfroError(f"sampler.path.num_steps={num_steps} makes no path; give at least 2 (the paper: 768)")
         if not (tolerance > 0 and max_steps > 0):
             raise NerfroError(
-                f"sampler.path.tolerance={tolerance}, max_steps={max_steps} must be positive; 1e-4 and 16384 are usual"
+                f"sampler.path.tolerance={tolerance}, max_steps={max_steps} must be positive; 2e-4 and 16384 are usual"
             )
         self.integrator = integrator
         self.num_steps = num_steps

@@ -1,0 +1,168 @@
+"""Paths of all training rays, traced once."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path as FilePath
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+import nerfro
+from nerfro.data.cameras import Cameras
+from nerfro.errors import NerfroError
+from nerfro.geometry.cache import cache_dir, content_hash, load_arrays, save_arrays
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.media.base import Medium
+from nerfro.samplers.base import PathSampler
+from nerfro.types import Path, Rays
+
+# Position, direction and arc length of a vertex.
+_COLUMNS = 7
+_BYTES_PER_VERTEX = 4 * _COLUMNS
+_RAYS_AT_ONCE = 8192
+
+
+class PathCache:
+    """The bent paths through all pixel centres of a set of cameras, one row of vertices after another.
+
+    Poses and medium do not change in training, so neither do the paths. Rays that miss the medium are not stored: they
+    are straight. A bent path takes 28 bytes a vertex and usually four to ten vertices.
+
+    Attributes:
+        starts: where each ray's vertices begin, and the end; a ray is its view * H * W + row * W + column.
+        vertices: position, direction and arc length; in memory, or mapped from disk.
+    """
+
+    def __init__(self, starts: Int[Tensor, "R+1"], vertices: Float[Tensor, "U 7"]) -> None:
+        self.starts = starts
+        self.vertices = vertices
+
+    @classmethod
+    def build(cls, path_sampler: PathSampler, medium: Medium, cameras: Cameras, memory_limit: float = 2.0) -> PathCache:
+        """Trace the rays through all pixel centres, or load them when the same was traced before.
+
+        The file's name is a hash of cameras, medium, sampler and nerfro's version, so paths of anything else are never
+        found. The trace itself needs the memory of one chunk of rays.
+
+        Args:
+            path_sampler, medium: how rays bend.
+            cameras: of the training images.
+            memory_limit: gigabytes of vertices that are kept in memory; more are mapped from disk.
+
+        Raises:
+            NerfroError: the cache folder cannot be written.
+        """
+        key = content_hash(nerfro.__version__, *_describe(path_sampler), *_describe(medium), *_camera_parts(cameras))
+        index_file, vertex_file = cache_dir() / f"paths_{key}.npz", cache_dir() / f"paths_{key}.f32"
+        if not (index_file.is_file() and vertex_file.is_file()):
+            _trace_to_disk(path_sampler, medium, cameras, index_file, vertex_file)
+        starts = load_arrays(index_file)["starts"]
+        if vertex_file.stat().st_size != starts[-1] * _BYTES_PER_VERTEX:
+            index_file.unlink()
+            raise NerfroError(f"{vertex_file} is truncated; it was taken out of the cache, start again")
+        shape = (int(starts[-1]), _COLUMNS)
+        if starts[-1] == 0:
+            vertices = np.zeros(shape, np.float32)
+        elif vertex_file.stat().st_size <= memory_limit * 1e9:
+            vertices = np.fromfile(vertex_file, np.float32).reshape(shape)
+        else:
+            # Copy-on-write, because tensors cannot be read-only; nothing is ever written.
+            vertices = np.memmap(vertex_file, np.float32, "c", shape=shape)
+        return cls(torch.from_numpy(starts), torch.from_numpy(vertices))
+
+    def __call__(self, index: Int[Tensor, "R"], rays: Rays) -> Path:
+        """Paths of rays through pixel centres.
+
+        Args:
+            index: identity of each ray, `view * H * W + row * W + column`.
+            rays: the same rays; those that are not stored go straight.
+
+        Raises:
+            NerfroError: a stored path does not begin at its ray, as when rays are jittered within their pixels.
+        """
+        index = index.cpu()
+        first = self.starts[index]
+        counts = self.starts[index + 1] - first
+        bent = counts > 0
+        width = max(int(counts.max()) if len(counts) else 2, 2)
+        slots = first[:, None] + torch.arange(width).minimum((counts - 1).clamp(min=0)[:, None])
+        stored = self.vertices[torch.where(bent[:, None], slots, 0)] if bent.any() else None
+        near, far = rays.near[:, None], rays.far[:, None]
+        s = torch.cat([near, far.expand(-1, width - 1)], 1)
+        directions = rays.directions[:, None].expand(-1, width, -1)
+        if stored is not None:
+            stored, mask = stored.to(near.device), bent.to(near.device)
+            self._check(stored[:, 0], rays, mask)
+            s = torch.where(mask[:, None], stored[..., 6], s)
+            directions = torch.where(mask[:, None, None], stored[..., 3:6], directions)
+        positions = rays.origins[:, None] + s[..., None] * rays.directions[:, None]
+        if stored is not None:
+            positions = torch.where(mask[:, None, None], stored[..., :3], positions)
+        return Path(positions, directions, s, directions[:, -1], bent.to(near.device), rays.radii)
+
+    @staticmethod
+    def _check(first: Float[Tensor, "R 7"], rays: Rays, bent: Tensor) -> None:
+        wrong = (first[:, 3:6] - rays.directions).abs().amax(-1) > 1e-5
+        if bool((wrong & bent).any()):
+            raise NerfroError("cached paths are of other rays; they hold for pixel centres only, so switch jitter off")
+
+
+def _trace_to_disk(
+    path_sampler: PathSampler, medium: Medium, cameras: Cameras, index_file: FilePath, vertex_file: FilePath
+) -> None:
+    counts = []
+    temporary = ""
+    try:
+        index_file.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=vertex_file.parent, suffix=".tmp", delete=False) as file:
+            temporary = file.name
+            for view in range(len(cameras)):
+                for rays in _chunks(cameras.image_rays(view)):
+                    path = path_sampler(rays, medium)
+                    ends = (path.s[:, 1:] > path.s[:, :-1]).long()
+                    # Rows end where s stops growing; what follows repeats the last vertex.
+                    lengths = torch.where(path.refracted, path.s.shape[1] - ends.flip(1).cumsum(1).eq(0).sum(1), 0)
+                    used = torch.arange(path.s.shape[1], device=path.s.device) < lengths[:, None]
+                    rows = torch.cat([path.positions, path.directions, path.s[..., None]], -1)[used]
+                    rows.float().cpu().numpy().tofile(file)
+                    counts.append(lengths.cpu())
+        os.replace(temporary, vertex_file)
+    except OSError as error:
+        if temporary:
+            FilePath(temporary).unlink(missing_ok=True)
+        raise NerfroError(
+            f"cannot keep paths in {vertex_file.parent}: {error.strerror}; free space or set NERFRO_CACHE elsewhere"
+        ) from error
+    starts = torch.cat([torch.zeros(1, dtype=torch.long), torch.cat(counts).cumsum(0)])
+    save_arrays(index_file, {"starts": starts.numpy()})
+
+
+def _chunks(rays: Rays) -> Iterator[Rays]:
+    for start in range(0, len(rays), _RAYS_AT_ONCE):
+        yield rays[start : start + _RAYS_AT_ONCE]
+
+
+def _describe(part: nn.Module) -> list[np.ndarray | str]:
+    """All that a medium or sampler computes with: its class, plain settings, tensors and meshes."""
+    description: list[np.ndarray | str] = [f"{type(part).__module__}.{type(part).__qualname__}"]
+    for name, value in sorted(vars(part).items()):
+        if isinstance(value, (bool, int, float, str, tuple)) and name != "training":
+            description.append(f"{name}={value!r}")
+        elif isinstance(value, list):
+            for mesh in value:
+                if isinstance(mesh, TriangleMesh):
+                    description += [mesh.vertices, mesh.faces]
+    for name, tensor in sorted([*part.named_buffers(), *part.named_parameters()]):
+        description += [name, tensor.detach().cpu().numpy()]
+    return description
+
+
+def _camera_parts(cameras: Cameras) -> list[np.ndarray | str]:
+    tensors = (cameras.camera_to_world, cameras.fx, cameras.fy, cameras.cx, cameras.cy)
+    numbers = (cameras.width, cameras.height, cameras.near, cameras.far)
+    return [*(tensor.cpu().numpy() for tensor in tensors), repr(numbers)]
