@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.colour import to_linear, to_srgb
 from nerfro.data.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.models.base import NerfModel, RenderedRays
@@ -35,7 +36,7 @@ class Supersampling:
 
 
 def render_view(model: NerfModel, cameras: Cameras, view: int, supersampling: Supersampling) -> RenderedRays:
-    """Render all pixels of one view, row by row, as box averages over the pixel where it is supersampled.
+    """Render all pixels of one view, row by row, as box averages (of linear radiance) over pixels that are supersampled.
 
     Args:
         model: the trained model.
@@ -55,9 +56,9 @@ def render_view(model: NerfModel, cameras: Cameras, view: int, supersampling: Su
     total = torch.zeros_like(rendered.rgb[chosen])
     for offset in grid_offsets(supersampling.side).to(cameras.device):
         rays = cameras.rays(torch.full_like(row, view), row, column, offset.expand(len(chosen), 2))
-        total += model.render(rays).rgb
+        total += to_linear(model.render(rays).rgb)
     rgb = rendered.rgb.clone()
-    rgb[chosen] = total / supersampling.side**2
+    rgb[chosen] = to_srgb(total / supersampling.side**2)
     return RenderedRays(rgb, rendered.depth, rendered.opacity, rendered.exit_directions)
 
 
