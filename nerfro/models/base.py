@@ -96,7 +96,9 @@ class NerfModel(LightningModule, ABC):
         config = self.optimizer_config
         rates = {self.fields: config.learning_rate, self.boundary: config.boundary_rate}
         groups = [{"params": list(part.parameters()), "lr": rate, "initial_lr": rate} for part, rate in rates.items()]
-        return torch.optim.Adam([g for g in groups if g["params"]], eps=config.adam_epsilon, fused=True)
+        # Lightning cannot clip the gradients of a fused optimiser under mixed precision.
+        fused = self._trainer is None or not self._trainer.gradient_clip_val
+        return torch.optim.Adam([g for g in groups if g["params"]], eps=config.adam_epsilon, fused=fused)
 
     def validation_step(self, view: int, batch_index: int) -> dict[str, Tensor]:
         views = self.trainer.datamodule.validation  # type: ignore[attr-defined]
