@@ -17,7 +17,8 @@ from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.models.optimizer import OptimizerConfig, learning_rate_factor, training_progress
 from nerfro.samplers.base import PathSampler, PointSampler
-from nerfro.types import Batch, Rays, Rendering
+from nerfro.samplers.path_cache import PathCache
+from nerfro.types import Batch, Path, Rays, Rendering
 
 
 @dataclass(frozen=True)
@@ -61,14 +62,21 @@ class NerfModel(LightningModule, ABC):
         self.fields = nn.ModuleList(fields)
         self.boundary = parts.boundary
         self.losses = nn.ModuleDict(dict(parts.losses))
+        # Training paths that are known already; nerfro.train sets it where rays do not change from step to step.
+        self.path_cache: PathCache | None = None
         self.optimizer_config, self.chunk_size, self.seed = parts.optimizer, parts.chunk_size, parts.seed
 
     @abstractmethod
+    def render_path(self, path: Path) -> list[Rendering]:
+        """Render paths, one rendering for each sampling level."""
+
     def forward(self, rays: Rays) -> list[Rendering]:
-        """Render rays, one rendering for each sampling level."""
+        """Bend rays and render their paths."""
+        return self.render_path(self.path_sampler(rays, self.medium))
 
     def training_step(self, batch: Batch, batch_index: int) -> Float[Tensor, ""]:
-        renderings = self(batch.rays)
+        cached = None if self.path_cache is None else self.path_cache(batch.index, batch.rays)
+        renderings = self(batch.rays) if cached is None else self.render_path(cached)
         total = torch.zeros((), device=self.device)
         for name, loss in self.losses.items():
             weight = loss.weight_at(self.global_step)

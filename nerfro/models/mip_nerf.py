@@ -5,7 +5,7 @@ from __future__ import annotations
 from nerfro.models.base import NerfModel, Parts
 from nerfro.registry import register
 from nerfro.rendering import composite
-from nerfro.types import Rays, Rendering
+from nerfro.types import Path, Rendering
 
 
 @register("model", "mip_nerf")
@@ -15,8 +15,7 @@ class MipNerfModel(NerfModel):
     def __init__(self, parts: Parts) -> None:
         super().__init__(parts, [parts.make_field()])
 
-    def forward(self, rays: Rays) -> list[Rendering]:
-        path = self.path_sampler(rays, self.medium)
+    def render_path(self, path: Path) -> list[Rendering]:
         boundary_rgb = self.boundary(path.exit_directions)
         (field,) = self.fields
         renderings: list[Rendering] = []

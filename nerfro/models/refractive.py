@@ -7,7 +7,7 @@ from typing import Literal
 from nerfro.models.base import NerfModel, Parts
 from nerfro.registry import register
 from nerfro.rendering import composite
-from nerfro.types import Rays, Rendering
+from nerfro.types import Path, Rendering
 
 
 @register("model", "refractive")
@@ -23,8 +23,7 @@ class RefractiveModel(NerfModel):
         super().__init__(parts, [parts.make_field() for _ in range(parts.point_sampler.num_levels)])
         self.boundary_direction = boundary_direction
 
-    def forward(self, rays: Rays) -> list[Rendering]:
-        path = self.path_sampler(rays, self.medium)
+    def render_path(self, path: Path) -> list[Rendering]:
         samples = self.point_sampler(path, None)
         leaving = path.exit_directions if self.boundary_direction == "exit" else samples.directions[:, -1]
         boundary_rgb = self.boundary(leaving)
