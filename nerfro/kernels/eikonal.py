@@ -43,6 +43,7 @@ def march_uniform(origins, directions, near, far, table, low, inverse_spacing, i
         x, y, z = origins[ray, 0] + s * vx, origins[ray, 1] + s * vy, origins[ray, 2] + s * vz
         ds = (far[ray] - s) / (num_steps - 1)
         n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
+        vx, vy, vz = n * vx, n * vy, n * vz
         bent = False
         for step in range(num_steps):
             if keep_all or step == num_steps - 1:

@@ -49,7 +49,7 @@ class SdfGrid(Solid):
         resolution: int = 128,
         box_min: list[float] = [-1.5, -1.5, -1.5],  # noqa: B006
         box_max: list[float] = [1.5, 1.5, 1.5],  # noqa: B006
-        shell_voxels: float = 0.25,
+        shell_voxels: float = 0.1,
         crease_degrees: float = 30.0,
         smoothing_size: int = 0,
         smoothing_sigma: float = 1.0,

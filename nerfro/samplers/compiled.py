@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from nerfro.kernels.threads import use_threads
 from nerfro.types import Path, Rays
 
 if TYPE_CHECKING:
@@ -81,6 +82,7 @@ def uniform_on_grid(rays: Rays, medium: VoxelGrid, integrator: str, num_steps: i
     from nerfro.kernels import eikonal
 
     code = {"euler": eikonal.EULER, "leapfrog": eikonal.LEAPFROG, "rk4": eikonal.RK4}[integrator]
+    use_threads()
     low, _, inverse_spacing = _frame(medium.box, medium.table.shape[:3])
     *vertices, refracted = eikonal.march_uniform(
         *_arrays(rays), medium.table.numpy(), low, inverse_spacing, code, num_steps, True
@@ -90,6 +92,7 @@ def uniform_on_grid(rays: Rays, medium: VoxelGrid, integrator: str, num_steps: i
 
 def _with_enough_vertices(rays: Rays, kernel, settings: tuple) -> tuple[tuple, tuple]:
     """Run a kernel, and run it again for the rays whose vertices did not fit."""
+    use_threads()
     arrays = _arrays(rays)
     capacity = _CAPACITY
     positions, directions, s, counts, *rest = kernel(*arrays, *settings, capacity)

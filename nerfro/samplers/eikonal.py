@@ -86,11 +86,12 @@ class Eikonal(PathSampler):
 def march_uniform(rays: Rays, medium: Medium, integrator: Integrator, num_steps: int) -> Path:
     """Vertices at equal steps ds = (far - near) / (num_steps - 1) (paper, Eqn. eikonal).
 
-    s is the length of the polyline. The refractive index at near is taken to be 1.
+    s is the length of the polyline. At near, v = n d.
     """
     ds = (rays.far - rays.near) / (num_steps - 1)
     x = rays.origins + rays.near[:, None] * rays.directions
-    state = RayState(x, rays.directions, *medium(x))
+    n, gradients = medium(x)
+    state = RayState(x, n[:, None] * rays.directions, n, gradients)
     states = [state]
     for _ in range(num_steps - 1):
         state = integrator(state, ds, medium)

@@ -1,0 +1,66 @@
+"""Pictures of paths through a medium."""
+
+from __future__ import annotations
+
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.media.base import Medium
+from nerfro.types import Path
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_RESOLUTION = 600
+# Share of the box's diagonal that is shown around it.
+_MARGIN = 0.15
+
+
+def draw_paths(path: Path, medium: Medium, file: FilePath) -> None:
+    """Write a picture of a few paths and the medium that they cross (see `plot_paths`)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 7), layout="constrained")
+    FigureCanvasAgg(figure)
+    plot_paths(figure.add_subplot(), path, medium)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file, dpi=150)
+
+
+def plot_paths(axes: Axes, path: Path, medium: Medium, colour: str = "tab:red") -> None:
+    """Draw paths, projected on the plane in which they spread most, over the refractive index in that plane.
+
+    The plane goes through the centre of the medium's box. Rays outside it are drawn by their projection.
+    """
+    centre = medium.box.mean(0)
+    across, up = _plane(path.positions, centre)
+    half = (0.5 + _MARGIN) * float((medium.box[1] - medium.box[0]).max())
+    steps = torch.linspace(-half, half, _RESOLUTION)
+    points = centre + steps[None, :, None] * across + steps[:, None, None] * up
+    n = torch.cat([medium(rows)[0] for rows in points.split(50)])
+    extent = (-half, half, -half, half)
+    axes.imshow(n, cmap="Blues", vmin=1, vmax=2 * float(n.max()) - 1, extent=extent, origin="lower")
+    for positions in path.positions:
+        flat = positions - centre
+        axes.plot(flat @ across, flat @ up, color=colour, linewidth=0.8)
+    axes.set_xlim(-half, half)
+    axes.set_ylim(-half, half)
+    axes.set_aspect("equal")
+    axes.set_xlabel("world units")
+
+
+def _plane(
+    positions: Float[Tensor, "R S 3"], centre: Float[Tensor, "3"]
+) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Two orthogonal unit vectors: the rays' main direction, and the one across in which they spread most."""
+    along = torch.nn.functional.normalize((positions[:, -1] - positions[:, 0]).mean(0), dim=0)
+    offsets = (positions - centre).reshape(-1, 3)
+    offsets = offsets - (offsets @ along)[:, None] * along
+    _, _, spread = torch.linalg.svd(offsets, full_matrices=False)
+    across = spread[0] - (spread[0] @ along) * along
+    return along, torch.nn.functional.normalize(across, dim=0)
