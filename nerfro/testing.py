@@ -17,15 +17,15 @@ from nerfro.fields.base import Field
 from nerfro.fields.nerf import NerfField
 from nerfro.losses.base import Loss
 from nerfro.losses.photometric import Photometric
-from nerfro.media.analytic import Luneburg
 from nerfro.media.base import Medium
+from nerfro.media.shapes import Ball
 from nerfro.models.base import NerfModel, Parts
 from nerfro.models.optimizer import OptimizerConfig
 from nerfro.models.refractive import RefractiveModel
 from nerfro.registry import Plugin, build
 from nerfro.rendering import composite
 from nerfro.samplers.base import PathSampler, PointSampler
-from nerfro.samplers.eikonal import Eikonal
+from nerfro.samplers.snell import Snell
 from nerfro.samplers.straight import Straight
 from nerfro.samplers.stratified import Stratified, point_samples
 from nerfro.types import Batch, Path, Radiance, Rays, Rendering, Samples
@@ -52,7 +52,7 @@ def check(plugin: Plugin, fields: Mapping[str, object] | None = None) -> None:
 
 
 def example_rays(num_rays: int = NUM_RAYS) -> Rays:
-    """Rays from around the unit cube towards it; most meet a ball of radius 1."""
+    """Rays from around the unit cube towards it; many meet a ball of radius 0.8."""
     generator = torch.Generator().manual_seed(7)
     origins = torch.nn.functional.normalize(torch.randn(num_rays, 3, generator=generator), dim=-1) * 4
     targets = torch.randn(num_rays, 3, generator=generator) * 0.6
@@ -62,8 +62,8 @@ def example_rays(num_rays: int = NUM_RAYS) -> Rays:
 
 
 def example_path(num_rays: int = NUM_RAYS) -> Path:
-    """Paths bent by a Luneburg lens."""
-    return Eikonal("leapfrog", 64)(example_rays(num_rays), Luneburg())
+    """Paths bent by a glass ball."""
+    return Snell()(example_rays(num_rays), Ball())
 
 
 def example_samples() -> Samples:
@@ -110,7 +110,7 @@ def _check_path_sampler(plugin: Plugin, fields: dict[str, object]) -> None:
     sampler = _make(plugin, fields)
     _require(isinstance(sampler, PathSampler), "a path sampler derives from nerfro.samplers.base.PathSampler")
     rays = example_rays()
-    path = sampler(rays, Luneburg())
+    path = sampler(rays, Ball())
     num_vertices = path.s.shape[1]
     _require(num_vertices >= 2, "a path has two vertices or more")
     _require(path.positions.shape == (NUM_RAYS, num_vertices, 3), "positions are [R, S, 3]")
@@ -119,7 +119,7 @@ def _check_path_sampler(plugin: Plugin, fields: dict[str, object]) -> None:
     _require(torch.allclose(path.near, rays.near, atol=1e-4), "the path begins at near")
     _require(_unit(path.directions) and _unit(path.exit_directions), "directions have unit length")
     lengths = path.positions.diff(dim=1).norm(dim=-1)
-    _require(torch.allclose(lengths, path.s.diff(dim=1), atol=1e-4), "s is the length of the polyline")
+    _require(torch.allclose(lengths, path.s.diff(dim=1), atol=1e-3), "s is the length of the polyline")
     steps = path.directions[:, :-1] * path.s.diff(dim=1)[..., None]
     _require(
         torch.allclose(path.positions[:, :-1] + steps, path.positions[:, 1:], atol=0.05),
@@ -226,7 +226,7 @@ _CONTRACTS: dict[str, Callable[[Plugin, dict[str, object]], None]] = {
 
 def _example_parts() -> Parts:
     return Parts(
-        medium=Luneburg(),
+        medium=Ball(),
         path_sampler=Straight(),
         point_sampler=Stratified(8),
         make_field=lambda: NerfField(width=16, depth=2, skip=1, view_width=8),
