@@ -85,9 +85,21 @@ def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def tiny_run(tiny_scene: Path) -> list[str]:
-    """Overrides that make a training step of the default model take milliseconds."""
+    """Overrides that make a training step take milliseconds."""
     return [
         f"data.root={tiny_scene}",
+        # Named, so that these tests do not depend on what the default experiment is made of.
+        "medium=voxel_grid",
+        "medium.mesh=${data.root}/mesh.ply",
+        "sampler/path=eikonal",
+        "sampler/points=hierarchical",
+        "field=nerf",
+        "boundary=skybox",
+        "sampler.path.integrator=leapfrog",
+        "loss.boundary.weight=0.025",
+        "loss.smoothness.weight=1",
+        "evaluation.supersample=1",
+        "batches.jitter=false",
         "medium.resolution=32",
         "medium.smoothing_size=3",
         "medium.cache=false",
@@ -99,6 +111,31 @@ def tiny_run(tiny_scene: Path) -> list[str]:
         "field.view_width=8",
         "boundary.width=8",
         "loss.smoothness.tile_size=4",
+        "trainer.accelerator=cpu",
+        "trainer.max_time=null",
+        "logger=none",
+    ]
+
+
+@pytest.fixture(scope="session")
+def tiny_default_run(tiny_scene: Path) -> list[str]:
+    """Overrides that make a training step of the default experiment take milliseconds."""
+    return [
+        f"data.root={tiny_scene}",
+        "medium.resolution=32",
+        "medium.cache=false",
+        "sampler.points.num_samples=8",
+        "sampler.points.num_bins=16",
+        "sampler.points.resolution=16",
+        "sampler.points.every=2",
+        "field.num_levels=4",
+        "field.log2_table_size=10",
+        "field.width=16",
+        "boundary.resolutions=[4,8]",
+        "batches.size=32",
+        "loss.boundary={weight: 0.01, start: 2}",
+        "loss.smoothness={weight: 0.1, start: 3, tile_size: 4}",
+        "evaluation.supersample=2",
         "trainer.accelerator=cpu",
         "trainer.max_time=null",
         "logger=none",

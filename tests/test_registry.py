@@ -115,9 +115,7 @@ def test_build_makes_the_registered_class() -> None:
 
 
 def test_duplicate_name_names_both_modules() -> None:
-    with pytest.raises(
-        NerfroError, match=r"boundary=constant is registered twice, by nerfro\.boundaries\.constant and "
-    ):
+    with pytest.raises(NerfroError, match=r"constant is registered twice, by nerfro\.boundaries\.constant and "):
 
         @register("boundary", "constant")
         class Other(nn.Module):
@@ -149,7 +147,7 @@ def test_constructor_that_takes_anything_is_refused() -> None:
     [
         (
             {"nmu_steps": 3},
-            "sampler/path=eikonal: Key 'nmu_steps' not in 'EikonalConfig'; its fields: integrator, num_",
+            "sampler/path=eikonal: Key 'nmu_steps' not in 'EikonalConfig'; its fields: integrator",
         ),
         ({"integrator": "foo"}, "integrator='foo' is not allowed; choose 'adaptive', 'euler', 'leapfrog'"),
         ({"num_steps": "many"}, "sampler/path=eikonal: Value 'many' of type 'str' could not be converted to Integer"),
@@ -161,12 +159,12 @@ def test_wrong_fields_are_refused(fields: dict[str, object], message: str) -> No
 
 
 def test_missing_required_field_is_named() -> None:
-    with pytest.raises(NerfroError, match="data=opencv: Missing mandatory value: root; its fields: root, near, far"):
+    with pytest.raises(NerfroError, match=r"data=opencv: Missing mandatory value: root; its fields: root, near, far"):
         configure(find("data", "opencv"), {})
 
 
 def test_unknown_name_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(NerfroError, match="no boundary is called 'sky'; known: constant, .*skybox"):
+    with pytest.raises(NerfroError, match=r"no boundary is called 'sky'; known: constant, .*skybox"):
         find("boundary", "sky")
 
 

@@ -1,0 +1,91 @@
+"""The learning rate's endpoints, and how far a run is."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from datetime import timedelta
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from lightning.pytorch.callbacks import Timer
+
+from nerfro.errors import NerfroError
+from nerfro.models.optimizer import OptimizerConfig, learning_rate_factor, training_progress
+
+PAPER = OptimizerConfig(learning_rate=5e-4, final_learning_rate=5e-6, warmup_steps=2500, warmup_factor=0.01)
+
+
+def rate(step: int, num_steps: int = 200_000) -> float:
+    return PAPER.learning_rate * learning_rate_factor(step, step / num_steps, PAPER)
+
+
+def test_learning_rate_at_the_beginning_the_end_of_the_warm_up_and_the_end() -> None:
+    assert rate(0) == pytest.approx(0.01 * 5e-4)
+    assert rate(2500) == pytest.approx(5e-4 * 0.01 ** (2500 / 200_000))
+    assert rate(200_000) == pytest.approx(5e-6)
+
+
+def test_decay_is_linear_in_the_logarithm() -> None:
+    logarithms = [math.log(rate(step)) for step in range(10_000, 200_000, 10_000)]
+    slopes = [b - a for a, b in itertools.pairwise(logarithms)]
+    assert slopes == pytest.approx([math.log(0.01) / 20] * len(slopes))
+
+
+def test_warm_up_rises_as_a_quarter_of_a_sine() -> None:
+    constant = OptimizerConfig(learning_rate=1.0, final_learning_rate=1.0, warmup_steps=100, warmup_factor=0.2)
+    assert learning_rate_factor(50, 0.0, constant) == pytest.approx(0.2 + 0.8 * math.sin(math.pi / 4))
+    assert learning_rate_factor(1000, 0.5, constant) == 1
+
+
+def test_without_warm_up_the_first_step_has_the_full_rate() -> None:
+    assert learning_rate_factor(0, 0.0, OptimizerConfig(warmup_steps=0)) == 1
+
+
+def run(step: int, max_steps: int, timer: Timer | None = None) -> Any:
+    return SimpleNamespace(global_step=step, max_steps=max_steps, callbacks=[] if timer is None else [timer])
+
+
+class StoppedClock(Timer):
+    """A budget of which a given time is spent."""
+
+    def __init__(self, budget: float, spent: float) -> None:
+        super().__init__(duration=timedelta(seconds=budget))
+        self._spent = spent
+
+    def time_elapsed(self, stage: Any = None) -> float:
+        return self._spent
+
+    def time_remaining(self, stage: Any = None) -> float:
+        return self._duration - self._spent
+
+
+@pytest.mark.parametrize(("step", "progress"), [(0, 0.0), (50, 0.25), (200, 1.0), (300, 1.0)])
+def test_progress_by_steps(step: int, progress: float) -> None:
+    assert training_progress(run(step, 200)) == progress
+
+
+@pytest.mark.parametrize(("spent", "progress"), [(0.0, 0.0), (15.0, 0.25), (60.0, 1.0), (61.0, 1.0)])
+def test_progress_by_time(spent: float, progress: float) -> None:
+    assert training_progress(run(10, -1, StoppedClock(60, spent))) == pytest.approx(progress)
+
+
+def test_progress_is_that_of_the_budget_that_ends_first() -> None:
+    assert training_progress(run(50, 200, StoppedClock(60, 30))) == 0.5
+    assert training_progress(run(150, 200, StoppedClock(60, 30))) == 0.75
+
+
+def test_run_without_a_budget_makes_no_progress() -> None:
+    assert training_progress(run(1000, -1)) == 0
+
+
+def test_boundary_has_the_fields_rate_unless_given_its_own() -> None:
+    assert OptimizerConfig(learning_rate=3e-4).boundary_rate == 3e-4
+    assert OptimizerConfig(learning_rate=3e-4, boundary_learning_rate=1e-5).boundary_rate == 1e-5
+
+
+@pytest.mark.parametrize("wrong", [{"learning_rate": 0.0}, {"final_learning_rate": -1.0}, {"warmup_steps": -1}])
+def test_impossible_settings_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(NerfroError, match="learning rates must be positive and warmup_steps not negative"):
+        OptimizerConfig(**wrong)

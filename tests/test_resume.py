@@ -1,0 +1,279 @@
+"""Runs that are killed, interrupted, resumed, or asked to go on from the wrong thing."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import random
+import signal
+import subprocess
+import sys
+from collections import namedtuple
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from nerfro.errors import NerfroError
+from nerfro.run_folder import (
+    LAST_CHECKPOINT,
+    claim,
+    find_checkpoint,
+    load_checkpoint,
+    require_same_configuration,
+)
+
+SCHEDULE = ["checkpoint.every_steps=3", "checkpoint.every_seconds=null", "evaluation.every=5", "trainer.max_steps=12"]
+
+# Sleeps in every step, so that there is a moment to interrupt, and says which step it is at.
+SLOW_LOSS = '''
+"""Waits."""
+import sys, time
+import torch
+from nerfro.losses.base import Loss
+from nerfro.registry import register
+
+@register("loss", "waiting")
+class Waiting(Loss):
+    """Waits a little in every step."""
+
+    def forward(self, renderings, batch, model):
+        print(f"at step {model.global_step}", flush=True)
+        time.sleep(0.15)
+        return renderings[-1].rgb.sum() * 0
+'''
+
+
+@pytest.fixture
+def start(tmp_path: Path, tiny_run: list[str], tiny_default_run: list[str]) -> Callable[..., subprocess.Popen[str]]:
+    """Start a real training process with a loss that waits; its folder is tmp_path/<name>."""
+    plugins = tmp_path / "slow_plugins"
+    plugins.mkdir()
+    (plugins / "waiting.py").write_text(SLOW_LOSS)
+    environment = {
+        **os.environ,
+        "NERFRO_PLUGINS": str(plugins),
+        "OMP_NUM_THREADS": "1",
+        # Nobody listens there: the search for LPIPS weights ends at once.
+        "https_proxy": "http://127.0.0.1:9",
+        "TORCH_HOME": str(tmp_path / "torch"),
+    }
+
+    def start(name: str, *overrides: str, preset: str = "paper") -> subprocess.Popen[str]:
+        small = tiny_run if preset == "paper" else tiny_default_run
+        command = [sys.executable, "-m", "nerfro.train", *small, *SCHEDULE, "+loss.waiting.weight=1"]
+        command += [f"hydra.run.dir={tmp_path / name}", *overrides]
+        return subprocess.Popen(
+            command, env=environment, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+
+    return start
+
+
+def wait_for_step(process: subprocess.Popen[str], step: int) -> None:
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.strip() == f"at step {step}":
+            return
+    pytest.fail(f"the run ended before step {step}: {process.stderr.read() if process.stderr else ''}")
+
+
+def tensors(node: Any, prefix: str = "") -> dict[str, torch.Tensor]:
+    """All tensors of a nested container by their place in it."""
+    if isinstance(node, torch.Tensor):
+        return {prefix: node}
+    items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, (list, tuple)) else ()
+    return {name: value for key, child in items for name, value in tensors(child, f"{prefix}/{key}").items()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["paper", "default"])
+def test_killed_and_resumed_run_ends_with_the_weights_of_an_undisturbed_one(
+    preset: str, start: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    undisturbed = start("undisturbed", preset=preset)
+    killed_at = random.Random(os.urandom(8)).randint(4, 11)  # any step will do; the message names it
+    killed = start("killed", preset=preset)
+    wait_for_step(killed, killed_at)
+    killed.send_signal(signal.SIGKILL)
+    killed.communicate(timeout=60)
+    assert killed.returncode == -signal.SIGKILL
+    assert not (tmp_path / "killed" / "metrics.json").exists()
+    resumed = start("killed", "ckpt_path=last", preset=preset)
+    _, errors = resumed.communicate(timeout=300)
+    assert resumed.returncode == 0, errors
+    _, errors = undisturbed.communicate(timeout=300)
+    assert undisturbed.returncode == 0, errors
+
+    one, other = (load_checkpoint(tmp_path / name / LAST_CHECKPOINT)[0] for name in ("undisturbed", "killed"))
+    assert one["global_step"] == other["global_step"] == 12
+    for part in ("state_dict", "optimizer_states"):
+        expected, got = tensors(one[part]), tensors(other[part])
+        assert expected.keys() == got.keys()
+        assert expected
+        for name in expected:
+            assert torch.equal(expected[name], got[name]), f"{part}{name} differs after a kill at step {killed_at}"
+    for view in ("test_000.png", "test_001.png"):
+        pictures = [(tmp_path / name / "images" / view).read_bytes() for name in ("undisturbed", "killed")]
+        assert pictures[0] == pictures[1]
+
+
+@pytest.mark.slow
+def test_interrupted_run_saves_and_says_how_to_go_on(
+    start: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    process = start("run", "trainer.max_steps=500", "checkpoint.every_steps=400")
+    wait_for_step(process, 4)
+    process.send_signal(signal.SIGINT)
+    out, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert "Traceback" not in errors
+    steps = load_checkpoint(tmp_path / "run" / LAST_CHECKPOINT)[0]["global_step"]
+    assert 4 <= steps <= 8
+    folder = tmp_path / "run"
+    expected = (
+        f"interrupted after step {steps} and saved; to go on, repeat it with hydra.run.dir={folder} ckpt_path=last"
+    )
+    assert expected in out
+    # What the message says works, and goes on from there.
+    resumed = start("run", f"trainer.max_steps={steps + 2}", "checkpoint.every_steps=400", "ckpt_path=last")
+    out, errors = resumed.communicate(timeout=120)
+    assert resumed.returncode == 0, errors
+    seen = [int(line.rsplit(" ", 1)[1]) for line in out.splitlines() if line.startswith("at step")]
+    assert seen == [steps, steps + 1]
+
+
+def test_folder_of_another_run_is_refused_and_kept(
+    train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path
+) -> None:
+    overrides = [*tiny_run, "trainer.max_steps=2", "evaluation.every=0", f"hydra.run.dir={tmp_path / 'run'}"]
+    assert train_here(*overrides).code == 0
+    before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    finished = train_here(*overrides, "seed=1")
+    assert finished.code == 1
+    assert "already holds a run; go on with it (ckpt_path=last) or choose another folder" in finished.err
+    assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == before
+
+
+def test_resuming_a_finished_run_with_more_steps_trains_the_rest(
+    train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path
+) -> None:
+    overrides = [*tiny_run, "evaluation.every=0", f"hydra.run.dir={tmp_path / 'run'}"]
+    assert train_here(*overrides, "trainer.max_steps=2").code == 0
+    assert train_here(*overrides, "trainer.max_steps=5", "ckpt_path=last").code == 0
+    checkpoint, _ = load_checkpoint(tmp_path / "run" / LAST_CHECKPOINT)
+    assert checkpoint["global_step"] == 5
+    assert checkpoint["callbacks"]["Throughput"]["num_rays"] == 5 * 32
+
+
+def test_last_finds_the_newest_run_beside_a_new_folder(tmp_path: Path) -> None:
+    for name in ("older", "newer"):
+        (tmp_path / name / LAST_CHECKPOINT).parent.mkdir(parents=True)
+        (tmp_path / name / LAST_CHECKPOINT).touch()
+    os.utime(tmp_path / "older" / LAST_CHECKPOINT, (1, 1))
+    assert find_checkpoint("last", tmp_path / "new") == tmp_path / "newer" / LAST_CHECKPOINT
+    assert find_checkpoint("last", tmp_path / "older") == tmp_path / "older" / LAST_CHECKPOINT
+    assert find_checkpoint(None, tmp_path / "new") is None
+
+
+@pytest.mark.parametrize(
+    ("ckpt_path", "message"),
+    [("last", "no checkpoint in .* or beside it; leave ckpt_path out"), ("no.ckpt", "no.ckpt does not exist; give a")],
+)
+def test_missing_checkpoint_is_refused(ckpt_path: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(NerfroError, match=message):
+        find_checkpoint(ckpt_path, tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"field": {"width": 16}}, "was trained with field.width=8, this run has 16; use the same experiment"),
+        ({"seed": 1}, "was trained with seed=0, this run has 1"),
+        ({"medium": {"ior": 1.3}}, "was trained with medium.ior=1.5, this run has 1.3"),
+        ({"batches": {"jitter": True}}, "was trained with batches.jitter=None, this run has True"),
+    ],
+)
+def test_checkpoint_of_another_configuration_is_refused(change: dict, message: str, tmp_path: Path) -> None:
+    trained = OmegaConf.create({"field": {"width": 8}, "seed": 0, "medium": {"ior": 1.5}, "batches": {"size": 4}})
+    require_same_configuration(tmp_path / "a.ckpt", trained, trained)
+    with pytest.raises(NerfroError, match=message):
+        require_same_configuration(tmp_path / "a.ckpt", trained, OmegaConf.merge(trained, change))
+
+
+def test_budget_and_name_may_change_between_runs(tmp_path: Path) -> None:
+    trained = OmegaConf.create({"seed": 0, "name": "a", "trainer": {"max_steps": 5}, "evaluation": {"every": 0}})
+    wanted = OmegaConf.merge(trained, {"name": "b", "trainer": {"max_steps": 9}, "evaluation": {"every": 3}})
+    require_same_configuration(tmp_path / "a.ckpt", trained, wanted)
+
+
+def test_damaged_checkpoints_are_refused_in_one_line(tmp_path: Path) -> None:
+    whole = tmp_path / "whole.ckpt"
+    torch.save({"nerfro_config": "seed: 0", "state_dict": {"w": torch.zeros(100)}}, whole)
+    assert load_checkpoint(whole)[1].seed == 0
+    content = whole.read_bytes()
+    foreign = tmp_path / "foreign.ckpt"
+    torch.save({"state_dict": {}}, foreign)
+    for name, data in (("half", content[: len(content) // 2]), ("empty", b""), ("text", b"hello")):
+        (tmp_path / name).write_bytes(data)
+    for path in (tmp_path / "half", tmp_path / "empty", tmp_path / "text", foreign):
+        with pytest.raises(NerfroError, match=r"is not a readable nerfro checkpoint \(") as caught:
+            load_checkpoint(path)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(NerfroError, match="does not exist"):
+        load_checkpoint(tmp_path / "missing.ckpt")
+
+
+class Bomb:
+    """Runs a command when it is unpickled."""
+
+    def __init__(self, command: str) -> None:
+        self.command = command
+
+    def __reduce__(self) -> tuple[Callable[[str], int], tuple[str]]:
+        return os.system, (self.command,)
+
+
+@pytest.mark.parametrize("format", ["torch", "pickle"])
+def test_pickled_code_in_a_checkpoint_is_not_executed(format: str, tmp_path: Path) -> None:
+    path, traces = tmp_path / "bomb.ckpt", tmp_path / "it_ran"
+    content = {"nerfro_config": "seed: 0", "state_dict": Bomb(f"touch {traces}")}
+    if format == "torch":
+        torch.save(content, path)
+    else:
+        path.write_bytes(pickle.dumps(content))
+    with pytest.raises(NerfroError, match="is not a readable nerfro checkpoint"):
+        load_checkpoint(path)
+    assert not traces.exists()
+
+
+def test_truncated_checkpoint_is_refused_before_training_and_kept(
+    train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "run" / LAST_CHECKPOINT
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"PK\x03\x04 and then nothing")
+    finished = train_here(*tiny_run, "trainer.max_steps=2", f"hydra.run.dir={tmp_path / 'run'}", "ckpt_path=last")
+    assert finished.code == 1
+    assert "is not a readable nerfro checkpoint" in finished.err
+    assert path.read_bytes() == b"PK\x03\x04 and then nothing"
+
+
+def test_full_disk_is_refused_before_training(
+    train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr("shutil.disk_usage", lambda path: usage(100 * 2**20, 99 * 2**20, 2**20))
+    finished = train_here(*tiny_run, "trainer.max_steps=2", f"hydra.run.dir={tmp_path / 'run'}")
+    assert finished.code == 1
+    assert "has 1 MiB free and this run needs " in finished.err
+    assert not [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
+
+
+def test_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(NerfroError, match=r"cannot write to .*/file/run: .*; choose another hydra\.run\.dir"):
+        claim(tmp_path / "file" / "run", resumed=False, needed_bytes=0)

@@ -1,0 +1,225 @@
+"""A training run from beginning to end, its files, and its evaluation afterwards."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from PIL import Image
+
+import nerfro.evaluate
+from nerfro.data.blender import BlenderData
+from nerfro.evaluate import restore
+from nerfro.run_folder import LAST_CHECKPOINT, load_checkpoint
+
+
+@pytest.fixture(scope="module")
+def overrides(tiny_run: list[str]) -> list[str]:
+    return [*tiny_run, "trainer.max_steps=6", "evaluation.every=4", "loss.boundary.start=2", "loss.smoothness.start=3"]
+
+
+@pytest.fixture
+def run(train_here: Callable[..., Any], overrides: list[str], tmp_path: Path) -> Path:
+    """The folder of a finished run."""
+    folder = tmp_path / "run"
+    finished = train_here(*overrides, f"hydra.run.dir={folder}", "logger=tensorboard")
+    assert finished.code == 0, finished.err
+    return folder
+
+
+@pytest.fixture
+def evaluate_here(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str]]:
+    """`python -m nerfro.evaluate`'s main in this process; exit code and standard error."""
+    monkeypatch.setattr(nerfro.evaluate, "find_lpips_network", lambda backbone: (None, "not wanted in tests"))
+
+    def evaluate(*arguments: str) -> tuple[int, str]:
+        monkeypatch.setattr("sys.argv", ["nerfro.evaluate", "device=cpu", *arguments])
+        code = 0
+        try:
+            nerfro.evaluate.main()
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 1
+        return code, capsys.readouterr().err
+
+    return evaluate
+
+
+def read(path: Path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+def test_run_writes_metrics_pictures_and_what_repeats_it(run: Path, overrides: list[str], tiny_scene: Path) -> None:
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert {"test", "views", "steps", "train_seconds", "rays_per_second"} <= metrics.keys()
+    assert {"psnr", "ssim", "lpips"} <= metrics["test"].keys()
+    assert metrics["steps"] == 6
+    assert metrics["test"]["lpips"] is None
+    assert [view["name"] for view in metrics["views"]] == ["test_000", "test_001"]
+    assert metrics["test"]["psnr"] == pytest.approx(np.mean([view["psnr"] for view in metrics["views"]]))
+    assert metrics["rays_per_second"] == pytest.approx(6 * 32 / metrics["train_seconds"])
+
+    pictures = sorted((run / "images").iterdir())
+    assert [path.name for path in pictures] == ["test_000.png", "test_001.png"]
+    references = BlenderData(str(tiny_scene)).load("test").images.numpy()
+    for path, reference, view in zip(pictures, references, metrics["views"], strict=True):
+        picture = read(path)
+        assert picture.shape == (16, 16, 3)
+        assert picture.dtype == np.uint8
+        # The score of the written picture is the score that is reported.
+        error = np.mean((picture / 255 - reference.astype(np.float64)) ** 2)
+        assert view["psnr"] == pytest.approx(-10 * np.log10(error), abs=1e-3)
+
+    config = OmegaConf.load(run / "config.yaml")
+    assert config.field.width == 8
+    assert config.medium.mesh == f"{tiny_scene}/mesh.ply", "interpolations are resolved"
+    facts = json.loads((run / "run.json").read_text())
+    assert facts["seed"] == 0
+    assert facts["versions"]["torch"] == torch.__version__
+    assert all(override in facts["command"] for override in overrides if "{" not in override)
+
+
+def test_losses_and_weights_are_logged_by_name(run: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(run / "tensorboard")).Reload()
+    assert "val/psnr" in events.Tags()["scalars"]
+    assert {"val/prediction_reference_error", "val/depth_opacity"} <= set(events.Tags()["images"])
+
+
+def test_every_loss_and_weight_follows_its_schedule_in_the_log(
+    train_here: Callable[..., Any], overrides: list[str], tmp_path: Path
+) -> None:
+    finished = train_here(
+        *overrides, f"hydra.run.dir={tmp_path / 'run'}", "logger=tensorboard", "trainer.log_every_n_steps=1"
+    )
+    assert finished.code == 0, finished.err
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(tmp_path / "run" / "tensorboard")).Reload()
+    weights = {name: [event.value for event in events.Scalars(f"weight/{name}")] for name in ("boundary", "smoothness")}
+    assert weights["boundary"] == pytest.approx([0, 0] + [0.025] * 4)
+    assert weights["smoothness"] == pytest.approx([0, 0, 0] + [1.0] * 3)
+    assert len(events.Scalars("loss/photometric")) == 6
+    assert [event.step for event in events.Scalars("loss/boundary")] == [2, 3, 4, 5]
+    assert {"train/psnr", "train/rays_per_second", "loss/total"} <= set(events.Tags()["scalars"])
+
+
+def test_two_runs_of_one_seed_are_equal_and_of_another_are_not(
+    train_here: Callable[..., Any], overrides: list[str], tmp_path: Path
+) -> None:
+    weights = []
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        assert train_here(*overrides, f"hydra.run.dir={tmp_path / name}", f"seed={seed}").code == 0
+        weights.append(load_checkpoint(tmp_path / name / LAST_CHECKPOINT)[0]["state_dict"])
+    assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
+    assert not all(torch.equal(weights[0][key], weights[2][key]) for key in weights[0])
+
+
+def test_looking_at_validation_views_changes_no_weight(
+    train_here: Callable[..., Any], overrides: list[str], tmp_path: Path
+) -> None:
+    weights = []
+    for every in (0, 2):
+        folder = tmp_path / str(every)
+        assert train_here(*overrides, f"hydra.run.dir={folder}", f"evaluation.every={every}").code == 0
+        weights.append(load_checkpoint(folder / LAST_CHECKPOINT)[0]["state_dict"])
+    assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
+
+
+def test_training_learns_the_scene(train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path) -> None:
+    psnr = []
+    for steps in (1, 150):
+        folder = tmp_path / str(steps)
+        finished = train_here(
+            *tiny_run,
+            f"hydra.run.dir={folder}",
+            f"trainer.max_steps={steps}",
+            "evaluation.every=0",
+            "optimizer.warmup_steps=0",
+            "optimizer.learning_rate=1e-2",
+            "batches.size=128",
+        )
+        assert finished.code == 0, finished.err
+        psnr.append(json.loads((folder / "metrics.json").read_text())["test"]["psnr"])
+    assert psnr[1] > psnr[0] + 3
+
+
+def test_time_ends_a_run(train_here: Callable[..., Any], overrides: list[str], tmp_path: Path) -> None:
+    finished = train_here(
+        *overrides, f"hydra.run.dir={tmp_path / 'run'}", "trainer.max_steps=-1", "trainer.max_time=00:00:00:01"
+    )
+    assert finished.code == 0, finished.err
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["steps"] > 0
+    assert metrics["train_seconds"] < 30
+
+
+def test_evaluation_of_the_checkpoint_repeats_the_runs_own(
+    run: Path, evaluate_here: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    code, errors = evaluate_here(f"checkpoint={run / LAST_CHECKPOINT}", f"out={tmp_path / 'again'}")
+    assert code == 0, errors
+    first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (run, tmp_path / "again"))
+    assert first["views"] == second["views"]
+    assert first["steps"] == second["steps"]
+    assert first["rays_per_second"] == pytest.approx(second["rays_per_second"])
+    for name in ("test_000.png", "test_001.png"):
+        assert np.array_equal(read(run / "images" / name), read(tmp_path / "again" / "images" / name))
+
+
+def test_evaluation_never_replaces_an_earlier_one_unasked(
+    run: Path, evaluate_here: Callable[..., tuple[int, str]]
+) -> None:
+    checkpoint = f"checkpoint={run / LAST_CHECKPOINT}"
+    assert evaluate_here(checkpoint, "split=val")[0] == 0
+    assert (run / "evaluate_val" / "images" / "val_001.png").exists()
+    code, errors = evaluate_here(checkpoint, "split=val")
+    assert code == 1
+    assert "holds an evaluation already; give another out=... or overwrite=true" in errors
+    assert evaluate_here(checkpoint, "split=val", "overwrite=true")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["split=night"], "has no split 'night'; it has train, val, test"),
+        (["chunk_size=0"], "chunk_size=0 renders nothing"),
+        (["root=/nowhere"], "data.root=/nowhere is not a folder"),
+        (["chekpoint=x"], "Key 'chekpoint' not in 'EvaluateConfig'"),
+        (["device=tpu9"], "device=tpu9 cannot be used; choose cpu, cuda or auto"),
+    ],
+)
+def test_evaluation_refuses_in_one_line(
+    arguments: list[str], message: str, run: Path, evaluate_here: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    code, errors = evaluate_here(f"checkpoint={run / LAST_CHECKPOINT}", f"out={tmp_path / 'out'}", *arguments)
+    assert code == 1
+    assert message in errors.strip().splitlines()[-1]
+    assert not (tmp_path / "out").exists()
+
+
+def test_evaluation_without_a_checkpoint_asks_for_one(evaluate_here: Callable[..., tuple[int, str]]) -> None:
+    code, errors = evaluate_here()
+    assert code == 1
+    assert "which model? give checkpoint=RUN/checkpoints/last.ckpt" in errors
+
+
+@pytest.mark.parametrize("chunk_size", [1, 37, 256])
+def test_picture_does_not_depend_on_the_chunk_size(chunk_size: int, run: Path, tiny_scene: Path) -> None:
+    checkpoint, config = load_checkpoint(run / LAST_CHECKPOINT)
+    rays = BlenderData(str(tiny_scene)).load("test").cameras.image_rays(0)[:128]
+    pictures = []
+    for size in (chunk_size, 8192):
+        config.evaluation.chunk_size = size
+        pictures.append(restore(checkpoint, config).render(rays))
+    for name in ("rgb", "depth", "opacity"):
+        torch.testing.assert_close(getattr(pictures[0], name), getattr(pictures[1], name), atol=1e-5, rtol=1e-5)
