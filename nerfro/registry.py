@@ -219,7 +219,7 @@ def discover(plugins_dir: Path = PLUGINS_DIR) -> None:
         for package in _BUILT_IN:
             _import_all(f"nerfro.{package}")
         for entry_point in importlib.metadata.entry_points(group=_ENTRY_POINTS):
-            _import_plugin(entry_point.value, f"installed plugin '{entry_point.name}' ({entry_point.value})")
+            _import_plugin(entry_point.value, f"'{entry_point.name}' of an installed package ({entry_point.value})")
         _discovered.add("built-in")
     extra = os.environ.get("NERFRO_PLUGINS", "")
     for folder in (plugins_dir, *(Path(p) for p in extra.split(os.pathsep) if p)):
@@ -294,7 +294,7 @@ def _config_type(hint: Any) -> Any:
     origin, args = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType) and type(None) in args and len(args) == 2:
         inner = _config_type(next(a for a in args if a is not type(None)))
-        return None if inner is None else Optional[inner]
+        return None if inner is None else Optional[inner]  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     if origin in (list, tuple):
         element = next((a for a in args if a is not Ellipsis), Any)
         return list[element] if element is Any or _config_type(element) is not None else None
