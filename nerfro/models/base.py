@@ -96,9 +96,9 @@ class NerfModel(LightningModule, ABC):
         factor = learning_rate_factor(self.global_step, training_progress(self.trainer), self.optimizer_config)
         for group in self.optimizers().param_groups:
             group["lr"] = group["initial_lr"] * factor
-
-    def on_train_batch_end(self, outputs: object, batch: Batch, batch_index: int) -> None:
-        self.point_sampler.after_step(self.global_step, self.fields)
+        # Not at the end of the step before, which comes after its checkpoint: a resumed run would miss the update.
+        if self.global_step > 0:
+            self.point_sampler.after_step(self.global_step, self.fields)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         config = self.optimizer_config
