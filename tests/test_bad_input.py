@@ -1,0 +1,156 @@
+"""Input that cannot be trained on is refused in one line, before training starts and with nothing written."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+
+def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+
+
+def put_nan(document: dict[str, Any]) -> None:
+    document["frames"][1]["transform_matrix"][0][3] = float("nan")
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def open_mesh(root: Path) -> None:
+    mesh = trimesh.load(root / "mesh.ply", force="mesh")
+    mesh.faces = mesh.faces[1:]
+    mesh.export(root / "mesh.ply")
+
+
+def large_mesh(root: Path) -> None:
+    trimesh.creation.icosphere(2, 1.49).export(root / "mesh.ply")
+
+
+def wrong_size(root: Path) -> None:
+    Image.fromarray(np.zeros((16, 12, 3), np.uint8)).save(root / "train" / "r_1.png")
+
+
+DAMAGES: dict[str, tuple[Callable[[Path], object], list[str]]] = {
+    "no json": (lambda root: (root / "transforms_train.json").unlink(), ["train"]),
+    "truncated json": (lambda root: truncate(root / "transforms_train.json"), ["transforms_train.json"]),
+    "truncated test json": (lambda root: truncate(root / "transforms_test.json"), ["transforms_test.json"]),
+    "missing image": (lambda root: (root / "train" / "r_1.png").unlink(), ["r_1.png"]),
+    "truncated image": (lambda root: truncate(root / "train" / "r_1.png"), ["r_1.png"]),
+    "wrong size": (wrong_size, ["r_1", "12", "16"]),
+    "pose that is not a number": (lambda root: edit(root / "transforms_train.json", put_nan), ["r_1"]),
+    "no field of view": (
+        lambda root: edit(root / "transforms_train.json", lambda d: d.pop("camera_angle_x")),
+        ["camera_angle_x"],
+    ),
+    "no frames": (lambda root: edit(root / "transforms_train.json", lambda d: d.update(frames=[])), ["frames"]),
+    "no mesh": (lambda root: (root / "mesh.ply").unlink(), ["mesh.ply does not exist"]),
+    "unreadable mesh": (lambda root: (root / "mesh.ply").write_bytes(b"ply?"), ["mesh.ply"]),
+    "open mesh": (open_mesh, ["not watertight", "medium.accept_open_mesh=true"]),
+    "object outside the box": (large_mesh, ["does not fit into the box", "medium.box_min=[", "medium.box_max=["]),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_data_is_refused(
+    damage: str, train_here: Callable[..., Any], tiny_scene: Path, tiny_run: list[str], tmp_path: Path
+) -> None:
+    root = tmp_path / "data"
+    shutil.copytree(tiny_scene, root)
+    break_it, words = DAMAGES[damage]
+    break_it(root)
+    folder = tmp_path / "run"
+    finished = train_here(*tiny_run, f"data.root={root}", "trainer.max_steps=1", f"hydra.run.dir={folder}")
+    assert finished.code == 1
+    lines = finished.err.strip().splitlines()
+    assert len(lines) == 1, finished.err
+    assert lines[0].startswith("nerfro: error: ")
+    for word in words:
+        assert word in lines[0]
+    assert not list(folder.rglob("*")), "nothing is written"
+
+
+def test_open_mesh_is_accepted_when_asked(
+    train_here: Callable[..., Any], tiny_scene: Path, tiny_run: list[str], tmp_path: Path
+) -> None:
+    root = tmp_path / "data"
+    shutil.copytree(tiny_scene, root)
+    open_mesh(root)
+    finished = train_here(
+        *tiny_run,
+        f"data.root={root}",
+        "medium.accept_open_mesh=true",
+        "trainer.max_steps=1",
+        "evaluation.every=0",
+        f"hydra.run.dir={tmp_path / 'run'}",
+    )
+    assert finished.code == 0, finished.err
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("data.near=7", ["data.near=7.0", "data.far=6.0", "near < far"]),
+        ("data.near=-1", ["data.near=-1.0"]),
+        ("data.downscale=0", ["downscale=0"]),
+        ("evaluation.split=night", ["no split 'night'; it has train, val, test"]),
+        ("data.root=embedded:nothing", ["embedded scenes: torus"]),
+        ("data.root=/nowhere", ["/nowhere is not a folder"]),
+        ("medium.ior=0", ["medium.ior=0.0 is not a refractive index"]),
+        ("medium.resolution=2", ["medium.resolution=2 is too small"]),
+        ("medium.smoothing_size=4", ["must be odd"]),
+        ("batches.size=100000", ["batch_size=100000 exceeds the 16x16 pixels"]),
+    ],
+)
+def test_impossible_options_are_refused(
+    override: str, words: list[str], train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path
+) -> None:
+    finished = train_here(
+        *tiny_run, "batches.batching=single_image", "trainer.max_steps=1", override, f"hydra.run.dir={tmp_path / 'run'}"
+    )
+    assert finished.code == 1
+    lines = finished.err.strip().splitlines()
+    assert len(lines) == 1, finished.err
+    for word in words:
+        assert word in lines[0]
+    assert not list((tmp_path / "run").rglob("*")), "nothing is written"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("module", "override", "words"),
+    [
+        ("nerfro.train", "field.widht=3", "Key 'widht' not in"),
+        ("nerfro.train", "data.root=/nowhere", "/nowhere is not a folder"),
+        ("nerfro.evaluate", "checkpoint=no.ckpt", "checkpoint no.ckpt does not exist"),
+    ],
+)
+def test_user_sees_one_line_and_exit_code_one(module: str, override: str, words: str, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", module, override],
+        cwd=tmp_path,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 1
+    assert done.stdout == ""
+    (line,) = done.stderr.strip().splitlines()
+    assert line.startswith("nerfro: error: ")
+    assert words in line
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()], "nothing is written"

@@ -1,0 +1,75 @@
+"""The wheel carries conf/, plugins/ and the embedded scene, and works from any folder."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from nerfro.paths import PACKAGE_DIR
+
+PROJECT = PACKAGE_DIR.parent
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    builders = pytest.importorskip("hatchling.builders.wheel")
+    if not (PROJECT / "pyproject.toml").is_file():
+        pytest.skip("there is no checkout to build a wheel of")
+    built = builders.WheelBuilder(str(PROJECT)).build(
+        directory=str(tmp_path_factory.mktemp("wheel")), versions=["standard"]
+    )
+    return Path(next(iter(built)))
+
+
+def names(wheel: Path) -> set[str]:
+    with zipfile.ZipFile(wheel) as archive:
+        return set(archive.namelist())
+
+
+@pytest.mark.slow
+def test_wheel_holds_every_configuration_plugin_and_asset(wheel: Path) -> None:
+    inside = names(wheel)
+    for folder in ("conf", "plugins"):
+        files = [p for p in (PROJECT / folder).rglob("*") if p.suffix in (".yaml", ".py")]
+        assert files
+        assert {f"nerfro/_project/{p.relative_to(PROJECT).as_posix()}" for p in files} <= inside
+    assets = [p for p in (PACKAGE_DIR / "assets").rglob("*") if p.is_file()]
+    assert {p.relative_to(PROJECT).as_posix() for p in assets} <= inside
+    assert not [name for name in inside if name.startswith(("tests/", "outputs/")) or "__pycache__" in name]
+
+
+@pytest.mark.slow
+def test_installed_wheel_composes_and_lists_its_plugins_from_a_foreign_folder(wheel: Path, tmp_path: Path) -> None:
+    site, elsewhere = tmp_path / "site", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    # A pure-Python wheel is installed by unpacking it.
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(site)
+
+    def python(*arguments: str) -> str:
+        done = subprocess.run(
+            [sys.executable, *arguments],
+            cwd=elsewhere,
+            env={**os.environ, "PYTHONPATH": str(site), "COLUMNS": "200"},
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    assert python("-c", "import nerfro; print(nerfro.__file__)").strip().startswith(str(site))
+    listed = python("-m", "nerfro.plugins")
+    assert "boundary=skybox" in listed
+    assert "boundary=gradient_sky" in listed, "plugins/ travels with it"
+    job = python("-m", "nerfro.train", "+experiment=paper_refractive", "--cfg", "job")
+    assert "name: paper_refractive" in job
+    source = "from nerfro.data.blender import BlenderData as B; print(len(B().load('val')), B().root)"
+    number, root = python("-c", source).split()
+    assert int(number) > 0
+    assert root.startswith(str(site))
