@@ -41,6 +41,7 @@ class BatchesConfig:
         jitter: draw each ray anywhere inside its pixel instead of through its centre.
         precrop_steps: number of first steps that see only the central window of the images.
         precrop_fraction: side of that window.
+        cache_paths: trace all training rays once and keep their paths, where they do not change (no jitter).
     """
 
     size: int = 1024
@@ -48,6 +49,7 @@ class BatchesConfig:
     jitter: bool = False
     precrop_steps: int = 0
     precrop_fraction: float = 0.5
+    cache_paths: bool = True
 
 
 @dataclass

@@ -25,6 +25,7 @@ from nerfro.evaluation.lpips import find_lpips_network
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.render_view import Supersampling
 from nerfro.evaluation.score_views import score_views
+from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.registry import build
 from nerfro.run_folder import (
     LAST_CHECKPOINT,
@@ -34,6 +35,7 @@ from nerfro.run_folder import (
     record,
     require_same_configuration,
 )
+from nerfro.samplers.path_cache import PathCache
 
 _SPARE_BYTES = 64 * 2**20  # pictures and logs, beside the checkpoints
 
@@ -46,14 +48,15 @@ def main(config: DictConfig) -> None:
     if not 0 <= config.seed < 2**32:
         raise NerfroError(f"seed={config.seed} is no seed; give 0 to {2**32 - 1}")
     _quieten_lightning()
+    keep_freed_memory()
     pl.seed_everything(config.seed, verbose=False)
 
     source = build(config.data)
     test = source.load(config.evaluation.split)
     validation = source.load("val") if config.evaluation.every > 0 and "val" in source.splits else None
-    wanted = config.batches
+    wanted, training = config.batches, source.load("train")
     batches = RayBatches(
-        source.load("train"),
+        training,
         wanted.size,
         wanted.batching,
         config.seed,
@@ -73,6 +76,8 @@ def main(config: DictConfig) -> None:
     trainer = make_trainer(config, folder, [throughput, interruption])
     record(folder, config)
     print(f"nerfro: {config.name} on {config.data.root} -> {folder}", flush=True)
+    if wanted.cache_paths and not wanted.jitter and model.path_sampler.few_vertices:
+        model.path_cache = PathCache.build(model.path_sampler, model.medium, training.cameras)
 
     datamodule = RayDataModule(batches, validation, config.evaluation.every)
     trainer.fit(model, datamodule=datamodule, ckpt_path=checkpoint, weights_only=True)

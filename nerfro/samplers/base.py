@@ -15,9 +15,11 @@ class PathSampler(nn.Module, ABC):
 
     Attributes:
         needs_medium: whether it asks the medium at all; if not, none is built.
+        few_vertices: whether its paths are short enough to be kept for all training rays.
     """
 
     needs_medium = True
+    few_vertices = False
 
     @abstractmethod
     def forward(self, rays: Rays, medium: Medium) -> Path:

@@ -61,6 +61,7 @@ class Eikonal(PathSampler):
             raise NerfroError(
                 f"sampler.path.tolerance={tolerance}, max_steps={max_steps} must be positive; 2e-4 and 16384 are usual"
             )
+        self.few_vertices = integrator == "adaptive"
         self.integrator = integrator
         self.num_steps = num_steps
         self.tolerance = tolerance

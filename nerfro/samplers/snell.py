@@ -48,6 +48,8 @@ class SnellTrace:
 class Snell(PathSampler):
     """Exact refraction (Snell's law) and total reflection at the surface of a solid."""
 
+    few_vertices = True
+
     def __init__(self, interface: Literal["sdf", "mesh"] = "sdf", max_events: int = 16) -> None:
         """Choose the surface.
 
