@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float, Int
@@ -108,21 +109,30 @@ def lookup(
         padded: `padded_texels` of all levels, flattened one after the other.
         levels: where the texels lie.
     """
-    total = texels.new_zeros(len(face), 3)
-    first = 0
-    for n, offset in zip(levels.resolutions, levels.offsets, strict=True):
-        place = (coordinates + 1) * (0.5 * n) + 0.5  # in padded texels, whose centres are integers
-        corner = place.long().clamp(0, n)
-        (u, v), (column, row) = (place - corner).unbind(-1), corner.unbind(-1)
-        weights = torch.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], dim=-1)
-        # Where three faces meet, the missing fourth texel is the mean of the three.
-        missing = torch.stack([c & r for r in (row == 0, row == n) for c in (column == 0, column == n)], dim=-1)
-        absent = (weights * missing).sum(-1, keepdim=True)
-        weights = torch.where(missing, 0.0, weights + absent / 3)
-        width = n + 2
-        index = first + (face * width + row) * width + column
-        index = index[:, None] + torch.tensor([0, 1, width, width + 1], device=index.device)
-        entries = padded.index_select(0, index.flatten()) + offset
-        total = total + (texels.index_select(0, entries).view(-1, 4, 3) * weights[..., None]).sum(1)
-        first += 6 * width * width
-    return total
+    resolution, offset, padded_offset = _layout(levels, texels.device)
+    place = (coordinates[:, None] + 1) * (0.5 * resolution[:, None]) + 0.5  # of padded texels, with integer centres
+    corner = torch.minimum(place.long().clamp(min=0), resolution[:, None])
+    (u, v), (column, row) = (place - corner).unbind(-1), corner.unbind(-1)
+    weights = torch.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], dim=-1)
+    # Where three faces meet, the missing fourth texel is the mean of the three.
+    ends = (0, resolution)
+    missing = torch.stack([(column == c) & (row == r) for r in ends for c in ends], dim=-1)
+    absent = (weights * missing).sum(-1, keepdim=True)
+    weights = torch.where(missing, 0.0, weights + absent / 3)
+    width = resolution + 2
+    first = padded_offset + (face[:, None] * width + row) * width + column
+    index = torch.stack([first, first + 1, first + width, first + width + 1], dim=-1)
+    texel = padded.index_select(0, index.flatten()).view(index.shape) + offset[:, None]
+    # index_select, because its gradient is one index_add: indexing with brackets would sort all indices first.
+    return (texels.index_select(0, texel.flatten()).view(*texel.shape, 3) * weights[..., None]).sum((1, 2))
+
+
+@lru_cache(maxsize=8)
+def _layout(levels: CubeLevels, device: torch.device) -> tuple[Int[Tensor, "L"], Int[Tensor, "L"], Int[Tensor, "L"]]:
+    """Resolutions, first texels and first padded places; kept, because a copy to a GPU at each step would stall it."""
+    padded_sizes = [6 * (n + 2) ** 2 for n in levels.resolutions]
+    padded_offsets = [sum(padded_sizes[:level]) for level in range(len(levels))]
+    resolution, offset, padded_offset = (
+        torch.tensor(values, device=device) for values in (levels.resolutions, levels.offsets, padded_offsets)
+    )
+    return resolution, offset, padded_offset

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from nerfro.boundaries import cube_map, lat_long
@@ -25,6 +25,8 @@ class EnvironmentMap(Boundary):
         resolutions: texels along a face's side (90 degrees) of each level; the default's finest texel is 0.7 degrees.
         image: lat-long picture to start from (.png, .jpg, .hdr or .exr); none for grey.
     """
+
+    padded: Int[Tensor, "Q"]
 
     def __init__(
         self,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float
@@ -100,18 +101,28 @@ def _vertices(
     positions: Float[Tensor, "P 3"], levels: GridLevels
 ) -> tuple[Float[Tensor, "P L 8"], Float[Tensor, "P L 8"]]:
     """Table entries and interpolation weights of the eight vertices around each position, on every level."""
-    device = positions.device
-    resolution = torch.tensor(levels.resolutions, device=device)
-    size, offset = torch.tensor(levels.sizes, device=device), torch.tensor(levels.offsets, device=device)
+    resolution, size, offset, is_dense, corner = _layout(levels, positions.device)
     scaled = positions.clamp(0, 1)[:, None] * resolution[:, None]
     cell = torch.minimum(scaled.long(), resolution[:, None] - 1)
     fraction = scaled - cell
-    corner = torch.tensor([(i, j, k) for k in (0, 1) for j in (0, 1) for i in (0, 1)], device=device)
     x, y, z = (cell[:, :, None] + corner).unbind(-1)
     stride = resolution[:, None] + 1
     dense = x + stride * (y + stride * z)
     hashed = (x ^ (y * HASH_Y) ^ (z * HASH_Z)) % size[:, None]
-    is_dense = torch.tensor(levels.dense, device=device)
     index = torch.where(is_dense[:, None], dense, hashed) + offset[:, None]
     weight = torch.where(corner.bool(), fraction[:, :, None], 1 - fraction[:, :, None]).prod(-1)
     return index, weight
+
+
+@lru_cache(maxsize=8)
+def _layout(levels: GridLevels, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Resolution, size, offset and density of the levels, and the corners of a cell, x fastest.
+
+    Kept, because a copy to a GPU at each step would stall it.
+    """
+    corners = [(i, j, k) for k in (0, 1) for j in (0, 1) for i in (0, 1)]
+    resolution, size, offset, dense, corner = (
+        torch.tensor(values, device=device)
+        for values in (levels.resolutions, levels.sizes, levels.offsets, levels.dense, corners)
+    )
+    return resolution, size, offset, dense, corner

@@ -43,6 +43,9 @@ class HashGridField(Field):
         precision: of the MLPs' matrix products; `float32` for processors without bfloat16 units.
     """
 
+    box_min: Float[Tensor, "3"]
+    box_max: Float[Tensor, "3"]
+
     def __init__(
         self,
         box_min: list[float] = (-1.0, -1.0, -1.0),  # type: ignore[assignment]
@@ -106,6 +109,7 @@ def _mlp(num_inputs: int, width: int, num_hidden: int, num_outputs: int) -> nn.S
     widths = [num_inputs, *[width] * num_hidden, num_outputs]
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
-        layers += [nn.Linear(inputs, outputs, bias=False), nn.ReLU()]
-        nn.init.xavier_uniform_(layers[-2].weight)
+        linear = nn.Linear(inputs, outputs, bias=False)
+        nn.init.xavier_uniform_(linear.weight)
+        layers += [linear, nn.ReLU()]
     return nn.Sequential(*layers[:-1])

@@ -5,12 +5,14 @@ Forward, threads share the directions; backward, the levels, so that no two thre
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from numba import prange
 from torch import Tensor
-from torch.autograd.function import FunctionCtx, once_differentiable
+from torch.autograd.function import once_differentiable
 
 from nerfro.boundaries.cube_map import CubeLevels
 from nerfro.kernels.compilation import compiled, compiled_parallel
@@ -33,7 +35,7 @@ def lookup(
 class _Lookup(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: FunctionCtx,
+        ctx: Any,
         face: Int[Tensor, "P"],
         coordinates: Float[Tensor, "P 2"],
         texels: Float[Tensor, "T 3"],
@@ -51,7 +53,7 @@ class _Lookup(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: FunctionCtx, gradient: Float[Tensor, "P 3"]) -> tuple:
+    def backward(ctx: Any, gradient: Float[Tensor, "P 3"]) -> tuple:
         face, coordinates, padded = ctx.saved_tensors
         texels = torch.zeros(ctx.levels.num_texels, 3)
         threads = min(use_threads(), len(ctx.levels))

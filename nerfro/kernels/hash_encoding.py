@@ -7,12 +7,14 @@ write to the same entry, so there are no atomics, and the sums do not depend on 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Float
 from numba import prange
 from torch import Tensor
-from torch.autograd.function import FunctionCtx, once_differentiable
+from torch.autograd.function import once_differentiable
 
 from nerfro.fields.hash_encoding import HASH_Y, HASH_Z, NUM_FEATURES, GridLevels
 from nerfro.kernels.compilation import compiled, compiled_parallel
@@ -32,7 +34,7 @@ def hash_encode(
 class _HashEncode(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: FunctionCtx, positions: Float[Tensor, "P 3"], table: Float[Tensor, "T 2"], levels: GridLevels
+        ctx: Any, positions: Float[Tensor, "P 3"], table: Float[Tensor, "T 2"], levels: GridLevels
     ) -> Float[Tensor, "P 2*L"]:
         ctx.save_for_backward(positions)
         ctx.levels, ctx.num_entries = levels, table.shape[0]
@@ -43,7 +45,7 @@ class _HashEncode(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: FunctionCtx, gradient: Float[Tensor, "P 2*L"]) -> tuple[None, Float[Tensor, "T 2"], None]:
+    def backward(ctx: Any, gradient: Float[Tensor, "P 2*L"]) -> tuple[None, Float[Tensor, "T 2"], None]:
         (positions,) = ctx.saved_tensors
         table = torch.zeros(ctx.num_entries, NUM_FEATURES)
         threads = min(use_threads(), len(ctx.levels))
