@@ -139,7 +139,7 @@ class StopOnSignal(Callback):
 
 
 class ConfigInCheckpoint(Callback):
-    """Puts the resolved configuration into every checkpoint, so that it can be rebuilt and compared from the file alone.
+    """Puts the resolved configuration into every checkpoint, so that the file alone tells how to rebuild the model.
 
     Args:
         config: as YAML.

@@ -36,7 +36,7 @@ class Supersampling:
 
 
 def render_view(model: NerfModel, cameras: Cameras, view: int, supersampling: Supersampling) -> RenderedRays:
-    """Render all pixels of one view, row by row, as box averages (of linear radiance) over pixels that are supersampled.
+    """Render all pixels of one view, row by row, as averages (of linear radiance) over supersampled pixels.
 
     Args:
         model: the trained model.

@@ -144,7 +144,7 @@ class NerfModel(LightningModule, ABC):
 
 @dataclass(frozen=True)
 class RenderedRays:
-    """What evaluation keeps of a rendering: colour (sRGB in [0, 1]), expected arc length, opacity, leaving direction."""
+    """What evaluation keeps: colour (sRGB in [0, 1]), expected arc length, opacity and leaving direction."""
 
     rgb: Float[Tensor, "R 3"]
     depth: Float[Tensor, "R"]

@@ -56,7 +56,7 @@ def learning_rate_factor(step: int, progress: float, config: OptimizerConfig) ->
 
 
 def training_progress(trainer: Trainer) -> float:
-    """Share of the run's budget that is spent, in [0, 1]: steps of `max_steps` or time of `max_time`, whichever is more.
+    """Share of the run's budget that is spent, in [0, 1]: of `max_steps` or of `max_time`, whichever is more.
 
     Under `max_time` the schedules end when the time does, so such a run depends on the machine's speed.
     """

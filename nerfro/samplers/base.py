@@ -39,7 +39,7 @@ class PointSampler(nn.Module, ABC):
     def forward(self, path: Path, previous: Rendering | None) -> Samples:
         """Sample the path, first without and then with the previous level's rendering."""
 
-    def after_step(self, step: int, fields: nn.ModuleList) -> None:  # noqa: B027 - most samplers remember nothing
+    def after_step(self, step: int, fields: nn.ModuleList) -> None:
         """Learn from the radiance fields after a training step, if the sampler remembers anything of them.
 
         Args:
