@@ -14,6 +14,4 @@ def to_linear(srgb: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
 def to_srgb(linear: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """sRGB values of linear radiance in [0, 1] (IEC 61966-2-1)."""
-    return torch.where(
-        linear <= 0.0031308, linear * 12.92, 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
-    )
+    return torch.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055)
