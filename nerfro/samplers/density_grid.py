@@ -54,7 +54,7 @@ class DensityGridSampler(PointSampler):
                 f"sampler/points=density_grid: num_samples={num_samples} num_bins={num_bins} resolution={resolution} "
                 f"every={every}; take at least 1, 2, 2 and 1"
             )
-        if not 0 < uniform <= 1 or not 0 < decay < 1:
+        if not 0 < uniform < 1 or not 0 < decay < 1:
             raise NerfroError(
                 f"sampler/points=density_grid: uniform={uniform} decay={decay}; take both between 0 and 1"
             )
@@ -65,15 +65,34 @@ class DensityGridSampler(PointSampler):
 
     @torch.no_grad()
     def forward(self, path: Path, previous: Rendering | None) -> Samples:
+        u = spread_uniform(len(path.s), self.num_samples + 1, self.training, path.s)
+        return self.draw_compiled(path, u) if path.s.device.type == "cpu" else self.draw(path, u)
+
+    def draw(self, path: Path, u: Float[Tensor, "R N+1"]) -> Samples:
+        """Samples at places `u` of the cumulative weights: the plain reference of the compiled kernel."""
         near, far = path.span(self.box)
         fractions = torch.linspace(0, 1, self.num_bins + 1, device=near.device)
         edges = near[:, None] + fractions * (far - near)[:, None]
         positions, _ = path.at(0.5 * (edges[:, 1:] + edges[:, :-1]))
         weights, _ = volume_weights(self.lookup(positions), edges[:, 1:] - edges[:, :-1])
         share = weights / weights.sum(-1, keepdim=True).clamp(min=1e-6)
-        weights = share + self.uniform / (1 - self.uniform + 1e-6) / self.num_bins
-        u = spread_uniform(len(edges), self.num_samples + 1, self.training, edges)
-        return cone_samples(path, invert_cdf(edges, weights, u))
+        return cone_samples(path, invert_cdf(edges, share + self._floor, u))
+
+    def draw_compiled(self, path: Path, u: Float[Tensor, "R N+1"]) -> Samples:
+        """The same as `draw`, on the CPU."""
+        from nerfro.kernels.density_grid import draw  # compiled code, so only where it is used
+        from nerfro.kernels.threads import use_threads
+
+        use_threads()
+        given = (path.positions, path.directions, path.s, self.box[0], self.box[1], self.density, u)
+        drawn = draw(*(tensor.contiguous().numpy() for tensor in given), self.num_bins, self._floor)
+        edges, s, positions, directions = (torch.from_numpy(array) for array in drawn)
+        return Samples(positions, directions, s, edges, path.radii)
+
+    @property
+    def _floor(self) -> float:
+        """Weight of each bin that makes `uniform` of the samples even, when the shares sum to one."""
+        return self.uniform / (1 - self.uniform) / self.num_bins
 
     def lookup(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Remembered density of the cell that each position lies in."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from nerfro.errors import NerfroError
@@ -17,12 +17,10 @@ from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.registry import register
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.compiled import eikonal_on_grid, uniform_on_grid
-from nerfro.samplers.integrators import INTEGRATORS, Integrator, RayState, with_length
+from nerfro.samplers.integrators import INTEGRATORS, Integrator, RayState, leapfrog
 from nerfro.samplers.polylines import Polylines
 from nerfro.types import Path, Rays
 
-# Below this share of n^2 the part of v along the gradient, squared, is too small to be corrected alone.
-_MIN_NORMAL_PART = 0.01
 # Squared change of a unit direction (1e-7 radians) below which a path counts as straight.
 _MIN_TURN = 1e-14
 # Within this share of a step the shell counts as reached.
@@ -110,9 +108,7 @@ def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int)
     """Leapfrog steps where the index varies, straight jumps elsewhere: the plain reference of the compiled kernel.
 
     The box is entered and left along straight lines. Inside it a ray jumps by the medium's clearance where there is
-    any, and else takes a kick-drift-kick step of the medium's step length. After each step |v| = n is restored by v's
-    component along the kick alone: the component across, n sin(angle) at a surface, is what refraction conserves, so a
-    flat interface is refracted exactly however few steps it takes. A vertex is kept where the path has left the tangent
+    any, and else takes a leapfrog step of the medium's step length. A vertex is kept where the path has left the tangent
     of the last one by `tolerance`, and at the start of jumps.
 
     Args:
@@ -145,6 +141,7 @@ def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int)
     x[active] += jump[:, None] * d[active]
     s[active] += jump
     n, g = medium(x)
+    v = n[:, None] * d
     for _ in range(max_steps):
         if not len(active):
             break
@@ -158,13 +155,13 @@ def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int)
         x[jumping] += length[:, None] * d[jumping]
         s[jumping] += length
         n[jumping], g[jumping] = medium(x[jumping])
+        v[jumping] = n[jumping, None] * d[jumping]
         refracted[stepping] |= (g[stepping] != 0).any(-1)
         ds = torch.minimum(step, remaining)[~jumps]
-        state = RayState(x[stepping], n[stepping, None] * d[stepping], n[stepping], g[stepping])
-        state = _leapfrog_along_gradient(state, ds, medium)
+        state = leapfrog(RayState(x[stepping], v[stepping], n[stepping], g[stepping]), ds, medium)
         s[stepping] += torch.linalg.vector_norm(state.positions - x[stepping], dim=-1)
-        x[stepping], n[stepping], g[stepping] = state.positions, state.n, state.gradients
-        d[stepping] = state.velocities / state.n[:, None]
+        x[stepping], v[stepping], n[stepping], g[stepping] = state
+        d[stepping] = torch.nn.functional.normalize(state.velocities, dim=-1)
         tangent = kept_x[stepping] + (s - kept_s)[stepping, None] * kept_d[stepping]
         keep(stepping[(x[stepping] - tangent).square().sum(-1) > tolerance**2])
         outside = ((x[active] < medium.box[0]) | (x[active] > medium.box[1])).any(-1)
@@ -174,19 +171,3 @@ def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int)
     keep(turned(rows))
     lines.append(rows, x + (rays.far - s)[:, None] * d, d, rays.far)
     return lines.path(rays, refracted), exceeded
-
-
-def _leapfrog_along_gradient(state: RayState, ds: Float[Tensor, "R"], medium: Medium) -> RayState:
-    """`integrators.leapfrog`, but |v| = n is restored along the kick where that is well-conditioned."""
-    x, v, n, g = state
-    dsigma = (ds / n)[:, None]
-    kicked = v + 0.5 * dsigma * n[:, None] * g
-    x = x + dsigma * kicked
-    n, g = medium(x)
-    kicked = kicked + 0.5 * dsigma * n[:, None] * g
-    kick = torch.nn.functional.normalize(kicked - v, dim=-1, eps=torch.finfo(v.dtype).tiny)
-    along = (kicked * kick).sum(-1)
-    squared = n**2 - (kicked.square().sum(-1) - along**2)
-    corrected = kicked + (torch.copysign(squared.clamp(min=0).sqrt(), along) - along)[:, None] * kick
-    sound = (along**2 >= _MIN_NORMAL_PART * n**2) & (squared >= _MIN_NORMAL_PART * n**2)
-    return RayState(x, torch.where(sound[:, None], corrected, with_length(kicked, n)), n, g)

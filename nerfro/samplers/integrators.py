@@ -8,8 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
+
+# Squared share of |v| below which the component along the kick is left alone.
+MIN_NORMAL_PART = 0.01
 
 Index = Callable[[Tensor], tuple[Tensor, Tensor]]
 
@@ -40,17 +45,35 @@ def euler(state: RayState, ds: Float[Tensor, "R"], index: Index) -> RayState:
 
 
 def leapfrog(state: RayState, ds: Float[Tensor, "R"], index: Index) -> RayState:
-    """Kick, drift, kick with the force n grad n of dx/dsigma = v, dsigma = ds / n; second order, one lookup a step.
+    """Kick, drift, kick with the force n grad n of dx/dsigma = v; second order, one look-up a step.
 
-    Exact where n^2 is linear in space. The length of v is set to n after the step, as the Eikonal equation demands.
+    dsigma = ds / n with n in the middle of the step, n + ds/2 dn/ds, so that the step is ds long to second order.
+    Exact where n^2 is linear in space.
+
+    |v| = n is restored after the step by v's component along the kick alone. The component across, n sin(angle) at a
+    surface, is what refraction conserves, so a flat interface is refracted exactly however few steps it takes. Where
+    the component along the kick is small (the ray turns) it is left as it is: there it is not determined by |v| = n.
     """
     x, v, n, g = state
-    dsigma = (ds / n)[:, None]
-    v = v + 0.5 * dsigma * n[:, None] * g
-    x = x + dsigma * v
+    middle = n + 0.5 * ds * (g * v).sum(-1) / n
+    dsigma = (ds / torch.maximum(middle, 0.5 * n))[:, None]
+    kicked = v + 0.5 * dsigma * n[:, None] * g
+    x = x + dsigma * kicked
     n, g = index(x)
-    v = v + 0.5 * dsigma * n[:, None] * g
-    return RayState(x, with_length(v, n), n, g)
+    kicked = kicked + 0.5 * dsigma * n[:, None] * g
+    return RayState(x, _with_length_along(kicked, kicked - v, n), n, g)
+
+
+def _with_length_along(
+    v: Float[Tensor, "R 3"], axis: Float[Tensor, "R 3"], length: Float[Tensor, "R"]
+) -> Float[Tensor, "R 3"]:
+    """Change the component of v along an axis so that |v| becomes `length`, where that component is not small."""
+    unit = functional.normalize(axis, dim=-1, eps=torch.finfo(v.dtype).tiny)
+    along = (v * unit).sum(-1)
+    squared = length**2 - (v.square().sum(-1) - along**2)
+    change = torch.copysign(squared.clamp(min=0).sqrt(), along) - along
+    sound = torch.minimum(along**2, squared) >= MIN_NORMAL_PART * length**2
+    return v + torch.where(sound, change, 0.0)[:, None] * unit
 
 
 def rk4(state: RayState, ds: Float[Tensor, "R"], index: Index) -> RayState:

@@ -1,0 +1,76 @@
+"""The README's table and picture grid: every method on the embedded scene, trained for the same time, one by one.
+
+    python benchmarks/comparison.py 00:00:05:00
+
+writes outputs/comparison/<method>/ (finished runs are kept), docs/images/comparison.png and docs/comparison.md.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from nerfro.evaluation.images import load_png, save_png
+from nerfro.evaluation.pictures import PictureRow, most_telling_crop, picture_grid
+from nerfro.evaluation.results import RunMetrics, read_metrics_json
+from nerfro.evaluation.tables import Column, Row, Table, to_markdown
+from nerfro.paths import ASSETS_DIR
+
+METHODS = {
+    "mipnerf": "mip-NeRF",
+    "mipnerf_sky": "mip-NeRF + sky",
+    "ablation_noH": "refractive w/o H",
+    "ablation_noBD": "refractive w/o BD",
+    "refractive": "refractive",
+}
+SHOWN = ("mipnerf", "refractive", "ablation_noH", "ablation_noBD")
+VIEWS = (1, 3, 13)
+ROOT = Path(__file__).resolve().parent.parent
+RUNS = ROOT / "outputs" / "comparison"
+
+
+def main() -> None:
+    """Train what is not trained yet, then draw and tabulate."""
+    max_time = sys.argv[1] if len(sys.argv) > 1 else "00:00:05:00"
+    for name in METHODS:
+        folder = RUNS / name
+        if not (folder / "metrics.json").exists():
+            command = [sys.executable, "-m", "nerfro.train", f"+experiment={name}", f"hydra.run.dir={folder}"]
+            subprocess.run([*command, f"trainer.max_time={max_time}"], check=True, cwd=ROOT)
+    metrics = {name: read_metrics_json(RUNS / name / "metrics.json") for name in METHODS}
+    (ROOT / "docs" / "comparison.md").write_text(to_markdown(table(metrics)))
+    save_png(ROOT / "docs" / "images" / "comparison.png", grid(metrics))
+
+
+def table(metrics: dict[str, RunMetrics]) -> Table:
+    """Mean scores, optimiser steps and rays per second of every method."""
+    columns = (
+        Column("PSNR", "higher", 2),
+        Column("SSIM", "higher", 3),
+        Column("LPIPS", "lower", 3),
+        Column("steps", None, 0),
+        Column("rays/s", None, 0),
+    )
+    rows = [
+        Row(METHODS[name], (*run.result.means.values(), run.steps, run.rays_per_second))
+        for name, run in metrics.items()
+    ]
+    notes = dict.fromkeys(f"{key} n/a: {note}" for run in metrics.values() for key, note in run.result.notes.items())
+    return Table("Embedded torus, 20 test views", "method", columns, tuple(rows), mark_best=True, notes=tuple(notes))
+
+
+def grid(metrics: dict[str, RunMetrics]):
+    """Some test views by the methods of the paper's figure."""
+    rows = []
+    for view in VIEWS:
+        reference = load_png(ASSETS_DIR / "torus" / "test" / f"r_{view:03d}.png")
+        predictions = [load_png(RUNS / name / "images" / f"test_{view:03d}.png") for name in SHOWN]
+        scores = [f"{metrics[name].result.views[view].scores['psnr']:.2f} dB" for name in SHOWN]
+        crop = most_telling_crop(reference, predictions, 32)
+        rows.append(PictureRow(reference, predictions, captions=scores, crops=[crop]))
+    return picture_grid(rows, ["reference", *(METHODS[name] for name in SHOWN)])
+
+
+if __name__ == "__main__":
+    main()
