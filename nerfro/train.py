@@ -107,6 +107,8 @@ def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.
     """
     if (config.checkpoint.every_seconds is None) == (config.checkpoint.every_steps is None):
         raise NerfroError("set one of checkpoint.every_seconds and checkpoint.every_steps, and the other to null")
+    if config.trainer.get("max_time") is None and config.trainer.get("max_steps", -1) < 0:
+        raise NerfroError("the run would never end; set trainer.max_time (DD:HH:MM:SS), trainer.max_steps, or both")
     seconds, every = config.checkpoint.every_seconds, config.evaluation.every
     checkpoints = ModelCheckpoint(
         dirpath=folder / LAST_CHECKPOINT.parent,
