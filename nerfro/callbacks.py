@@ -156,7 +156,13 @@ class ValidationImages(Callback):
     """Logs prediction, reference and squared error side by side, with depth and opacity, to TensorBoard and W&B."""
 
     def on_validation_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
     ) -> None:
         if not outputs:
             return

@@ -160,7 +160,7 @@ def build_losses(nodes: DictConfig) -> dict[str, Loss]:
     """
     if not nodes:
         raise NerfroError("there is no loss to train with; give one, such as +loss.photometric.weight=1")
-    for name, node in nodes.items():
+    for name, node in ((str(name), node) for name, node in nodes.items()):
         if node is not None and not isinstance(node, Mapping):
             raise NerfroError(f"loss.{name}={node} is no set of fields; write loss.{name}.weight={node} for its weight")
     plugins = {str(name): find("loss", str(name)) for name in nodes}

@@ -193,11 +193,11 @@ def configure(plugin: Plugin, node: DictConfig | Mapping[str, object]) -> dict[s
         # Resolved in its place first: a merged copy could not look its interpolations up.
         given = OmegaConf.to_container(node, resolve=True) if isinstance(node, DictConfig) else dict(node)
         merged = OmegaConf.merge(OmegaConf.structured(plugin.config), given)
-        values = OmegaConf.to_container(merged, resolve=True, throw_on_missing=True)
+        settled = OmegaConf.to_container(merged, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
         known = ", ".join(name for name, _, _ in plugin.fields()) or "none"
         raise NerfroError(f"{where}: {_first_line(error)}; its fields: {known}") from error
-    values = {str(key): value for key, value in typing.cast(dict, values).items() if key != "_target_"}
+    values = {str(key): value for key, value in typing.cast(dict, settled).items() if key != "_target_"}
     for name, allowed in plugin.choices.items():
         if values[name] not in allowed:
             raise NerfroError(
@@ -263,13 +263,14 @@ def _import_plugin(module: str, where: str) -> None:
 
 
 def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
-    hints = typing.get_type_hints(cls.__init__)
+    constructor = cls.__init__  # type: ignore[misc]
+    hints = typing.get_type_hints(constructor)
     fields: list[tuple[str, Any, Any]] = []
     choices: dict[str, tuple[object, ...]] = {}
     parts: set[str] = set()
     # Classes without a constructor of their own have no configuration; nn.Module's takes anything.
-    own = cls.__init__ not in (object.__init__, nn.Module.__init__)
-    for parameter in list(inspect.signature(cls.__init__).parameters.values())[1:] if own else []:
+    own = constructor not in (object.__init__, nn.Module.__init__)
+    for parameter in list(inspect.signature(constructor).parameters.values())[1:] if own else []:
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             raise NerfroError(f"{kind}={name}: its constructor takes *{parameter.name}; name every parameter instead")
         hint = hints.get(parameter.name)

@@ -7,6 +7,7 @@ broke. Plugins whose required fields have no default are checked with the fields
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 
@@ -90,7 +91,7 @@ def example_batch() -> Batch:
     return Batch(example_rays(), torch.full((NUM_RAYS, 3), 0.5), torch.arange(NUM_RAYS), cameras)
 
 
-def _make(plugin: Plugin, fields: dict[str, object], **parts: object) -> object:
+def _make(plugin: Plugin, fields: dict[str, object], **parts: object) -> Any:
     return build({"_target_": plugin.target, **fields}, **parts)
 
 

@@ -19,6 +19,8 @@ class ConstantBoundary(Boundary):
         rgb: the colour, sRGB.
     """
 
+    rgb: Float[Tensor, "3"]
+
     def __init__(self, rgb: list[float] = (0.0, 0.0, 0.0)) -> None:  # type: ignore[assignment]
         super().__init__()
         if len(rgb) != 3:

@@ -26,6 +26,7 @@ class RayDataModule(LightningDataModule):
         self.batches, self.validation, self.every = batches, validation, every
 
     def train_dataloader(self) -> RayBatches:
+        assert self.trainer is not None  # Lightning attaches it before it asks
         batches = self.batches.to(self.trainer.strategy.root_device)
         # Lightning asks after it has restored a checkpoint, so a resumed run goes on with the batch it would have had.
         batches.first_step = self.trainer.global_step
@@ -49,5 +50,6 @@ class RotatingView:
 
     def __iter__(self) -> Iterator[int]:
         module = self._module
+        assert module.trainer is not None
         look = module.trainer.global_step // max(module.every, 1)
         yield look % len(module.validation or [0])

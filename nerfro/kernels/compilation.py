@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numba
 
@@ -22,7 +22,7 @@ def compiled_parallel(function: Function) -> Function:
 
 def _compile(function: Function, parallel: bool) -> Function:
     # Fused multiply-add is the only liberty taken with floating point: infinities and exact comparisons stay.
-    options = {"parallel": parallel, "fastmath": {"contract"}, "error_model": "numpy"}
+    options: dict[str, Any] = {"parallel": parallel, "fastmath": {"contract"}, "error_model": "numpy"}
     try:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:

@@ -53,7 +53,12 @@ class NerfModel(LightningModule, ABC):
     Args:
         parts: what the model is composed of.
         fields: radiance field of each sampling level, or one for all.
+
+    Attributes:
+        path_cache: training paths that are known already; nerfro.train sets it where rays do not change.
     """
+
+    path_cache: PathCache | None
 
     def __init__(self, parts: Parts, fields: list[Field]) -> None:
         super().__init__()
@@ -62,8 +67,7 @@ class NerfModel(LightningModule, ABC):
         self.fields = nn.ModuleList(fields)
         self.boundary = parts.boundary
         self.losses = nn.ModuleDict(dict(parts.losses))
-        # Training paths that are known already; nerfro.train sets it where rays do not change from step to step.
-        self.path_cache: PathCache | None = None
+        self.path_cache = None
         self.optimizer_config, self.chunk_size, self.seed = parts.optimizer, parts.chunk_size, parts.seed
 
     @abstractmethod
@@ -76,7 +80,7 @@ class NerfModel(LightningModule, ABC):
 
     def training_step(self, batch: Batch, batch_index: int) -> Float[Tensor, ""]:
         cached = None if self.path_cache is None else self.path_cache(batch.index, batch.rays)
-        renderings = self(batch.rays) if cached is None else self.render_path(cached)
+        renderings: list[Rendering] = self(batch.rays) if cached is None else self.render_path(cached)
         total = torch.zeros((), device=self.device)
         for name, loss in self.losses.items():
             weight = loss.weight_at(self.global_step)
@@ -94,11 +98,11 @@ class NerfModel(LightningModule, ABC):
         # Every step draws from its own seed, so that a resumed run repeats the steps of an undisturbed one.
         torch.manual_seed(step_seed(self.seed, self.global_step, self.global_rank))
         factor = learning_rate_factor(self.global_step, training_progress(self.trainer), self.optimizer_config)
-        for group in self.optimizers().param_groups:
+        for group in self.trainer.optimizers[0].param_groups:
             group["lr"] = group["initial_lr"] * factor
         # Not at the end of the step before, which comes after its checkpoint: a resumed run would miss the update.
         if self.global_step > 0:
-            self.point_sampler.after_step(self.global_step, self.fields)
+            self.point_sampler.after_step(self.global_step, list(self.fields))  # type: ignore[arg-type]
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         config = self.optimizer_config

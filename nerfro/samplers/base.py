@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 from torch import nn
 
+from nerfro.fields.base import Field
 from nerfro.media.base import Medium
 from nerfro.types import Path, Rays, Rendering, Samples
 
@@ -39,7 +41,7 @@ class PointSampler(nn.Module, ABC):
     def forward(self, path: Path, previous: Rendering | None) -> Samples:
         """Sample the path, first without and then with the previous level's rendering."""
 
-    def after_step(self, step: int, fields: nn.ModuleList) -> None:
+    def after_step(self, step: int, fields: Sequence[Field]) -> None:
         """Learn from the radiance fields after a training step, if the sampler remembers anything of them.
 
         Args:

@@ -84,8 +84,9 @@ def uniform_on_grid(rays: Rays, medium: VoxelGrid, integrator: str, num_steps: i
     code = {"euler": eikonal.EULER, "leapfrog": eikonal.LEAPFROG, "rk4": eikonal.RK4}[integrator]
     use_threads()
     low, _, inverse_spacing = _frame(medium.box, medium.table.shape[:3])
+    origins, directions, near, far = _arrays(rays)
     *vertices, refracted = eikonal.march_uniform(
-        *_arrays(rays), medium.table.numpy(), low, inverse_spacing, code, num_steps, True
+        origins, directions, near, far, medium.table.numpy(), low, inverse_spacing, code, num_steps, True
     )
     return _path(rays, tuple(vertices), torch.from_numpy(refracted))
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
@@ -36,6 +38,8 @@ class DensityGridSampler(PointSampler):
     """
 
     num_levels = 1
+    box: Float[Tensor, "2 3"]
+    density: Float[Tensor, "C C C"]
 
     def __init__(
         self,
@@ -84,8 +88,17 @@ class DensityGridSampler(PointSampler):
         from nerfro.kernels.threads import use_threads
 
         use_threads()
-        given = (path.positions, path.directions, path.s, self.box[0], self.box[1], self.density, u)
-        drawn = draw(*(tensor.contiguous().numpy() for tensor in given), self.num_bins, self._floor)
+        drawn = draw(
+            path.positions.contiguous().numpy(),
+            path.directions.contiguous().numpy(),
+            path.s.contiguous().numpy(),
+            self.box[0].numpy(),
+            self.box[1].numpy(),
+            self.density.numpy(),
+            u.contiguous().numpy(),
+            self.num_bins,
+            self._floor,
+        )
         edges, s, positions, directions = (torch.from_numpy(array) for array in drawn)
         return Samples(positions, directions, s, edges, path.radii)
 
@@ -101,7 +114,7 @@ class DensityGridSampler(PointSampler):
         return self.density.view(-1)[(x * self.resolution + y) * self.resolution + z]
 
     @torch.no_grad()
-    def after_step(self, step: int, fields: nn.ModuleList) -> None:
+    def after_step(self, step: int, fields: Sequence[Field]) -> None:
         """Look at a random sixteenth of the cells, at a random place in each."""
         if step % self.every:
             return

@@ -66,6 +66,7 @@ class PathCache:
             index_file.unlink()
             raise NerfroError(f"{vertex_file} is truncated; it was taken out of the cache, start again")
         shape = (int(starts[-1]), _COLUMNS)
+        vertices: np.ndarray
         if starts[-1] == 0:
             vertices = np.zeros(shape, np.float32)
         elif vertex_file.stat().st_size <= memory_limit * 1e9:

@@ -31,6 +31,7 @@ class Stratified(PointSampler):
     """
 
     num_levels = 1
+    box: Float[Tensor, "2 3"] | None
 
     def __init__(
         self,
