@@ -83,7 +83,7 @@ class NerfModel(LightningModule, ABC):
         renderings: list[Rendering] = self(batch.rays) if cached is None else self.render_path(cached)
         total = torch.zeros((), device=self.device)
         for name, loss in self.losses.items():
-            weight = loss.weight_at(self.global_step)
+            weight = loss.weight_at(self.global_step)  # type: ignore[operator]
             self.log(f"weight/{name}", weight)
             if weight > 0:
                 value = loss(renderings, batch, self)
