@@ -9,6 +9,11 @@ import numba
 
 Function = TypeVar("Function", bound=Callable)
 
+# OpenMP threads spin while they wait. Numba's and PyTorch's are two pools, so that each would keep the other from the
+# cores: a training step took five times as long. Numba's own work queue sleeps. NUMBA_THREADING_LAYER overrides this.
+if numba.config.THREADING_LAYER == "default":  # type: ignore[attr-defined]
+    numba.config.THREADING_LAYER = "workqueue"  # type: ignore[attr-defined]
+
 
 def compiled(function: Function) -> Function:
     """Compile for one thread on the first call, and keep the machine code on disk."""
