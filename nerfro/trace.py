@@ -137,9 +137,7 @@ def _read_rays(file: Path) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
         if name not in arrays:
             raise NerfroError(f"{file} has no array '{name}'; it needs origins and directions, both [R, 3]")
         if arrays[name].ndim != 2 or arrays[name].shape[1] != 3 or len(arrays[name]) == 0:
-            raise NerfroError(
-                f"{name} in {file} has shape {arrays[name].shape}; it must be [R, 3] with at least one ray"
-            )
+            raise NerfroError(f"{name} in {file} has shape {arrays[name].shape}; it must be [R, 3], not empty")
         if not np.isfinite(arrays[name]).all():
             raise NerfroError(f"{name} in {file} has values that are not finite; correct them")
     origins, directions = arrays["origins"], arrays["directions"]

@@ -12,8 +12,14 @@ from numba import prange
 
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.lookup import block_clearance, box_span, put_vertex, repeat_last, solid_index, voxel_index
+from nerfro.media.solid import MIN_COSINE
+from nerfro.samplers.integrators import MIN_NORMAL_PART
 
 EULER, LEAPFROG, RK4 = 0, 1, 2
+
+# See samplers.eikonal and media.solid, which explain them.
+MIN_TURN = 1e-14
+REACHED = 1e-3
 
 
 @compiled
@@ -63,13 +69,14 @@ def march_uniform(origins, directions, near, far, table, low, inverse_spacing, i
                 vx, vy, vz = vx + ds * gx, vy + ds * gy, vz + ds * gz
                 n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
             elif integrator == LEAPFROG:
-                h = ds / n
+                h = ds / max(n + 0.5 * ds * (gx * vx + gy * vy + gz * vz) / n, 0.5 * n)
                 kick = 0.5 * h * n
-                vx, vy, vz = vx + kick * gx, vy + kick * gy, vz + kick * gz
-                x, y, z = x + h * vx, y + h * vy, z + h * vz
+                px, py, pz = vx + kick * gx, vy + kick * gy, vz + kick * gz
+                x, y, z = x + h * px, y + h * py, z + h * pz
                 n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
                 kick = 0.5 * h * n
-                vx, vy, vz = _rescaled(vx + kick * gx, vy + kick * gy, vz + kick * gz, n)
+                px, py, pz = px + kick * gx, py + kick * gy, pz + kick * gz
+                vx, vy, vz = _with_length_along(px, py, pz, px - vx, py - vy, pz - vz, n)
             else:
                 half = 0.5 * ds
                 ax, ay, az = vx / n, vy / n, vz / n
@@ -108,25 +115,17 @@ def _look_up(table, clearance, coefficients, iors, shell, low, inverse_spacing, 
 
 
 @compiled
-def _with_length(vx, vy, vz, kx, ky, kz, n):
-    """Set the length of v to n by its component along the kick, or as a whole where that component is small."""
+def _with_length_along(vx, vy, vz, kx, ky, kz, n):
+    """Set the length of v to n by its component along the kick, where that component is not small."""
     kick = kx * kx + ky * ky + kz * kz
     if kick == 0.0:
-        return _rescaled(vx, vy, vz, n)
-    scale = 1.0 / math.sqrt(kick)
-    kx, ky, kz = kx * scale, ky * scale, kz * scale
-    along = vx * kx + vy * ky + vz * kz
+        return vx, vy, vz
+    along = (vx * kx + vy * ky + vz * kz) / math.sqrt(kick)
     squared = n * n - (vx * vx + vy * vy + vz * vz - along * along)
-    if along * along < MIN_NORMAL_PART * n * n or squared < MIN_NORMAL_PART * n * n:
-        return _rescaled(vx, vy, vz, n)
-    change = math.copysign(math.sqrt(squared), along) - along
+    if min(along * along, squared) < MIN_NORMAL_PART * n * n:
+        return vx, vy, vz
+    change = (math.copysign(math.sqrt(squared), along) - along) / math.sqrt(kick)
     return vx + change * kx, vy + change * ky, vz + change * kz
-
-
-# See samplers.eikonal, which explains them.
-MIN_NORMAL_PART = 0.01
-MIN_COSINE = 0.25
-MIN_TURN = 1e-14
 
 
 @compiled_parallel
@@ -149,7 +148,7 @@ def march_adaptive(
     counts = np.empty(num_rays, np.int64)
     refracted = np.zeros(num_rays, np.bool_)
     exceeded = np.zeros(num_rays, np.bool_)
-    skip = 1e-3 * step
+    skip = REACHED * step
     for ray in prange(num_rays):
         dx, dy, dz = float(directions[ray, 0]), float(directions[ray, 1]), float(directions[ray, 2])
         s, end = float(near[ray]), float(far[ray])
@@ -162,6 +161,7 @@ def march_adaptive(
             kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
             jump = max(enter, 0.0)
             x, y, z, s = x + jump * dx, y + jump * dy, z + jump * dz, s + jump
+            vx, vy, vz = dx, dy, dz
             known, n, gx, gy, gz, free = False, 1.0, 0.0, 0.0, 0.0, 0.0
             exceeded[ray] = True
             for _ in range(max_steps):
@@ -172,6 +172,7 @@ def march_adaptive(
                         n, gx, gy, gz, free = _look_up(
                             table, clearance, coefficients, iors, shell, low, inverse_spacing, x, y, z
                         )
+                        vx, vy, vz = n * dx, n * dy, n * dz
                         known = True
                 if free > skip:
                     if (dx - kdx) ** 2 + (dy - kdy) ** 2 + (dz - kdz) ** 2 > MIN_TURN:
@@ -181,14 +182,13 @@ def march_adaptive(
                     x, y, z, s = x + ds * dx, y + ds * dy, z + ds * dz, s + ds
                     known = False
                 else:
-                    vx, vy, vz = n * dx, n * dy, n * dz
                     slope = math.sqrt(gx * gx + gy * gy + gz * gz)
                     ds = step
                     if coefficients.shape[0] > 0 and slope > 0.0:
                         cosine = abs(dx * gx + dy * gy + dz * gz) / slope
                         ds = step / max(cosine, MIN_COSINE)
                     ds = min(ds, end - s)
-                    h = ds / n
+                    h = ds / max(n + 0.5 * ds * (gx * vx + gy * vy + gz * vz) / n, 0.5 * n)
                     kick = 0.5 * h * n
                     px, py, pz = vx + kick * gx, vy + kick * gy, vz + kick * gz
                     x, y, z = x + h * px, y + h * py, z + h * pz
@@ -199,8 +199,9 @@ def march_adaptive(
                     )
                     kick = 0.5 * h * n
                     px, py, pz = px + kick * gx, py + kick * gy, pz + kick * gz
-                    vx, vy, vz = _with_length(px, py, pz, px - vx, py - vy, pz - vz, n)
-                    dx, dy, dz = vx / n, vy / n, vz / n
+                    vx, vy, vz = _with_length_along(px, py, pz, px - vx, py - vy, pz - vz, n)
+                    norm = math.sqrt(vx * vx + vy * vy + vz * vz)
+                    dx, dy, dz = vx / norm, vy / norm, vz / norm
                     ahead = s - ks
                     ex, ey, ez = x - kx - ahead * kdx, y - ky - ahead * kdy, z - kz - ahead * kdz
                     if ex * ex + ey * ey + ez * ez > tolerance * tolerance:

@@ -90,7 +90,7 @@ class SdfGrid(Solid):
         band = _BAND + smoothing_size
         distances = []
         for body in self.meshes:
-            check_margin(body, box, 2 * spacing)
+            check_margin(body, box, resolution, 2)
             distances.append(_cached_distance(body, box, resolution, band, crease_degrees, cache))
         values = torch.from_numpy(np.stack(distances))
         if smoothing_size:
@@ -137,7 +137,19 @@ class SdfGrid(Solid):
             last = torch.arange(count * BLOCK + 1).clamp(max=nearest.shape[axis] - 1)
             nearest = nearest.index_select(axis, last).unfold(axis, BLOCK + 1, BLOCK).amin(-1)
         spacing = (self.box[1] - self.box[0]).cpu() / (torch.tensor(self.coefficients.shape[1:]) - 1)
-        return (nearest - 0.5 * torch.linalg.vector_norm(spacing)).clamp(min=0)
+        return (nearest - 0.5 * torch.linalg.vector_norm(spacing)).clamp(min=0).to(self.distances.device)
+
+    def clearance(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Distance to the nearest shell: a lower bound from the blocks, or where that is none the distance itself."""
+        grid = self.coarse_clearance
+        vertices = torch.tensor(self.coefficients.shape[1:], device=grid.device)
+        block = ((positions - self.box[0]) * (vertices - 1) / (self.box[1] - self.box[0]) / BLOCK).floor().long()
+        x, y, z = torch.minimum(block.clamp(min=0), torch.tensor(grid.shape, device=grid.device) - 1).unbind(-1)
+        coarse = grid[x, y, z] - self.shell
+        near = coarse <= 0
+        clearance = coarse.to(positions.dtype, copy=True)
+        clearance[near] = super().clearance(positions[near])
+        return clearance
 
     def _set(self, distances: Tensor, box: Tensor) -> None:
         # Grids are made of the mesh at every start and do not belong in checkpoints.

@@ -78,7 +78,7 @@ class VoxelGrid(Medium):
         box = check_box(box_min, box_max, resolution)
         loaded = load_mesh(resolve_path(str(mesh)), accept_open_mesh)
         # One voxel for the sub-samples, one for the gradient's difference, and what the smoothing spreads.
-        check_margin(loaded, box, (2 + smoothing_size // 2) * (box[1] - box[0]) / (resolution - 1))
+        check_margin(loaded, box, resolution, 2 + smoothing_size // 2)
         key = "occupancy_" + content_hash(loaded.vertices, loaded.faces, box, resolution, subsamples)
         occupancy = cached_arrays(
             key,
@@ -200,16 +200,25 @@ def check_box(box_min: list[float], box_max: list[float], resolution: int) -> Fl
     return box
 
 
-def check_margin(mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], margin: Float[np.ndarray, "3"]) -> None:
-    """Refuse a mesh that leaves no margin of air inside the box.
+def check_margin(mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], resolution: int, voxels: int) -> None:
+    """Refuse a mesh that does not leave so many voxels of air on each side of the box.
 
     Raises:
-        NerfroError: with the smallest box that would do.
+        NerfroError: with a box that would do.
     """
-    low, high = mesh.bounds[0] - margin, mesh.bounds[1] + margin
-    if (low < box[0]).any() or (high > box[1]).any():
-        least = f"medium.box_min={_rounded(low, -1)} medium.box_max={_rounded(high, 1)}"
-        raise NerfroError(f"the mesh does not fit into the box with a margin of air; it needs at least {least}")
+    low, high = mesh.bounds
+    margin = voxels * (box[1] - box[0]) / (resolution - 1)
+    if (low - margin >= box[0]).all() and (high + margin <= box[1]).all():
+        return
+    # A larger box has larger voxels.
+    share = 2 * voxels / (resolution - 1)
+    if share >= 0.9:
+        raise NerfroError(f"medium.resolution={resolution} leaves no room for {voxels} voxels of air; raise it")
+    margin = 0.5 * (high - low).max() * share / (1 - share)
+    raise NerfroError(
+        f"the mesh does not fit into the box with {voxels} voxels of air; it needs a box such as "
+        f"medium.box_min={_rounded(low - margin, -1)} medium.box_max={_rounded(high + margin, 1)}"
+    )
 
 
 def _rounded(corner: Float[np.ndarray, "3"], direction: int) -> str:

@@ -108,8 +108,8 @@ def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int)
     """Leapfrog steps where the index varies, straight jumps elsewhere: the plain reference of the compiled kernel.
 
     The box is entered and left along straight lines. Inside it a ray jumps by the medium's clearance where there is
-    any, and else takes a leapfrog step of the medium's step length. A vertex is kept where the path has left the tangent
-    of the last one by `tolerance`, and at the start of jumps.
+    any, and else takes a leapfrog step of the medium's step length. A vertex is kept where the path has left the
+    tangent of the last one by `tolerance`, and at the start of jumps.
 
     Args:
         rays: in world space.

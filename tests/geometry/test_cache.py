@@ -1,0 +1,79 @@
+"""The disk cache never gives stale or damaged arrays, and never fails a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nerfro.errors import NerfroError
+from nerfro.geometry.cache import cached_arrays, content_hash, load_arrays, save_arrays
+
+
+class _Counter:
+    calls = 0
+
+    def compute(self) -> dict[str, np.ndarray]:
+        self.calls += 1
+        return {"values": np.arange(5.0)}
+
+
+def test_arrays_are_computed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NERFRO_CACHE", str(tmp_path))
+    counter = _Counter()
+    for _ in range(3):
+        np.testing.assert_array_equal(cached_arrays("entry", counter.compute)["values"], np.arange(5.0))
+    assert counter.calls == 1
+    cached_arrays("entry", counter.compute, enabled=False)
+    assert counter.calls == 2
+
+
+def test_a_truncated_file_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NERFRO_CACHE", str(tmp_path))
+    counter = _Counter()
+    cached_arrays("entry", counter.compute)
+    file = tmp_path / "entry.npz"
+    file.write_bytes(file.read_bytes()[:50])
+    np.testing.assert_array_equal(cached_arrays("entry", counter.compute)["values"], np.arange(5.0))
+    assert counter.calls == 2
+    assert "values" in load_arrays(file)
+
+
+def test_a_folder_that_cannot_be_made_costs_only_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("NERFRO_CACHE", str(tmp_path / "file" / "below"))
+    assert len(cached_arrays("entry", _Counter().compute)["values"]) == 5
+
+
+def test_hash_depends_on_values_shapes_types_and_order() -> None:
+    a = np.arange(6.0)
+    hashes = [
+        content_hash(a, 1),
+        content_hash(1, a),
+        content_hash(a.reshape(2, 3), 1),
+        content_hash(a.astype(np.float32), 1),
+        content_hash(a + 1e-12, 1),
+        content_hash(a, 1.0),
+        content_hash(a, "1"),
+    ]
+    assert len(set(hashes)) == len(hashes)
+    assert content_hash(a, 1) == content_hash(a.copy(), 1)
+
+
+def test_pickled_code_is_not_executed(tmp_path: Path) -> None:
+    np.savez(tmp_path / "evil.npz", values=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(NerfroError, match="plain arrays"):
+        load_arrays(tmp_path / "evil.npz")
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
+    class Unwritable:
+        def __array__(self, dtype: object = None, copy: object = None) -> np.ndarray:
+            raise OSError(28, "No space left on device")
+
+    save_arrays(tmp_path / "grid.npz", {"values": np.ones(3)})
+    with pytest.raises(NerfroError, match="No space left"):
+        save_arrays(tmp_path / "grid.npz", {"values": Unwritable()})  # type: ignore[dict-item]
+    np.testing.assert_array_equal(load_arrays(tmp_path / "grid.npz")["values"], np.ones(3))
+    assert [file.name for file in tmp_path.iterdir()] == ["grid.npz"]

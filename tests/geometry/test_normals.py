@@ -1,0 +1,35 @@
+"""Normals of meshes whose surface is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+
+from nerfro.geometry.mesh import TriangleMesh, merge_vertices
+from nerfro.geometry.normals import corner_normals
+
+
+def _mesh(shape: trimesh.Trimesh) -> TriangleMesh:
+    return merge_vertices(np.asarray(shape.vertices, np.float64), np.asarray(shape.faces))
+
+
+def test_normals_of_an_irregular_sphere_are_exact() -> None:
+    # Max's weights are exact when a vertex and its neighbours lie on one sphere, however unevenly.
+    points = np.random.default_rng(0).normal(size=(150, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    mesh = _mesh(trimesh.convex.convex_hull(points))
+    normals = corner_normals(mesh, crease_degrees=180.0)
+    np.testing.assert_allclose(normals, mesh.triangles, atol=1e-9)
+
+
+def test_creases_split_normals() -> None:
+    mesh = _mesh(trimesh.creation.box(extents=[1.0, 1.0, 1.0]))
+    normals = corner_normals(mesh, crease_degrees=30.0)
+    flat = np.cross(mesh.triangles[:, 1] - mesh.triangles[:, 0], mesh.triangles[:, 2] - mesh.triangles[:, 0])
+    np.testing.assert_allclose(normals, np.repeat(flat[:, None], 3, axis=1), atol=1e-12)
+
+
+def test_a_mesh_with_no_crease_limit_averages_around_corners() -> None:
+    mesh = _mesh(trimesh.creation.box(extents=[1.0, 1.0, 1.0]))
+    normals = corner_normals(mesh, crease_degrees=180.0)
+    np.testing.assert_allclose(np.abs((normals * mesh.triangles).sum(-1)), np.sqrt(0.75), rtol=0.05)

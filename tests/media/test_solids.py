@@ -1,0 +1,143 @@
+"""Bodies with surfaces: distances, shells, nesting, grids made of meshes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+import trimesh
+
+from nerfro.errors import NerfroError
+from nerfro.media.analytic import Luneburg, Vacuum
+from nerfro.media.base import Medium
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.shapes import Ball, RoundedBox, Slab
+from nerfro.media.solid import Solid
+
+BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
+
+
+def _nested_balls(size: int = 48) -> SdfGrid:
+    axis = torch.linspace(-1.5, 1.5, size)
+    radius = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).norm(dim=-1)
+    return SdfGrid.from_distances(torch.stack([radius - 0.9, radius - 0.5]), BOX, [1.5, 1.33], 0.1)
+
+
+MEDIA = [
+    Vacuum(),
+    Luneburg(),
+    Ball(shell=0.3),
+    RoundedBox(shell=0.05, edge_radius=0.3),
+    Slab(shell=0.1),
+    _nested_balls(),
+]
+
+
+@pytest.mark.parametrize("medium", MEDIA, ids=lambda medium: type(medium).__name__)
+def test_gradient_is_the_derivative_of_the_index(medium: Medium) -> None:
+    medium = medium.double()
+    low, high = 0.97 * medium.box
+    positions = low + (high - low) * torch.rand(300, 3, dtype=torch.float64)
+    # Central differences are of no use across a kink.
+    smooth = (medium(positions * (1 + 1e-3))[1] != 0).any(-1) == (medium(positions * (1 - 1e-3))[1] != 0).any(-1)
+    positions = positions[smooth].requires_grad_()
+    n, gradient = medium(positions)
+    if n.requires_grad:
+        (automatic,) = torch.autograd.grad(n.sum(), positions)
+        torch.testing.assert_close(gradient, automatic, rtol=1e-4, atol=1e-4)
+    else:
+        assert (gradient == 0).all()
+
+
+@pytest.mark.parametrize("solid", [Ball(), RoundedBox(), Slab()], ids=lambda solid: type(solid).__name__)
+def test_gradient_of_a_distance_has_unit_length(solid: Solid) -> None:
+    positions = torch.randn(200, 3)
+    _, normals = solid.signed_distances(positions)
+    torch.testing.assert_close(normals.norm(dim=-1), torch.ones(200, 1))
+
+
+def test_rounded_box_has_its_faces_edges_and_corners_where_they_belong() -> None:
+    a, r = 0.75, 0.08
+    diagonal = (a - r) + r / 2**0.5
+    corner = (a - r) + r / 3**0.5
+    on_surface = torch.tensor([[a, 0.1, -0.2], [0.3, -a, 0.3], [diagonal, diagonal, 0.0], [-corner, corner, corner]])
+    phi, _ = RoundedBox(a, r).signed_distances(on_surface)
+    torch.testing.assert_close(phi[:, 0], torch.zeros(4), atol=1e-6, rtol=0)
+
+
+def test_the_innermost_body_decides_the_index() -> None:
+    medium = _nested_balls()
+    n, gradient = medium(torch.tensor([[0.0, 0.0, 0.0], [0.7, 0.0, 0.0], [0.0, 1.2, 0.0], [0.5, 0.0, 0.0]]))
+    torch.testing.assert_close(n, torch.tensor([1.33, 1.5, 1.0, 1.415]), atol=2e-3, rtol=0)
+    assert (gradient[:3] == 0).all()
+    # From liquid into glass the index rises outwards.
+    assert gradient[3, 0] > 0.5
+
+
+def test_clearance_reaches_no_shell() -> None:
+    medium = _nested_balls()
+    positions = torch.rand(500, 3) * 2.8 - 1.4
+    clearance = medium.clearance(positions)
+    directions = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
+    _, gradient = medium(positions + 0.99 * clearance[:, None] * directions)
+    assert (gradient[clearance > 0.01] == 0).all()
+
+
+def test_coarse_clearance_is_a_lower_bound() -> None:
+    medium = _nested_balls(43)
+    block = 4 * 3 / 42
+    positions = torch.rand(2000, 3) * 3 - 1.5
+    x, y, z = ((positions + 1.5) / block).long().unbind(-1)
+    coarse = medium.coarse_clearance[x, y, z]
+    radius = positions.norm(dim=-1)
+    exact = torch.minimum((radius - 0.9).abs(), (radius - 0.5).abs())
+    assert (coarse <= exact + 1e-6).all()
+    # Short by the diagonals of a block and half a cell, at most.
+    assert (coarse >= exact - 3**0.5 * (block + 0.5 * 3 / 42) - 1e-6).all()
+
+
+def test_mesh_becomes_a_distance_that_is_smooth_where_the_mesh_is(tmp_path: Path) -> None:
+    trimesh.creation.icosphere(3, 0.8).export(tmp_path / "ball.ply")
+    medium = SdfGrid(str(tmp_path / "ball.ply"), resolution=64, cache=False)
+    directions = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
+    phi, normals = medium.signed_distances(0.8 * directions)
+    assert phi.abs().max() < 5e-4
+    cosine = (torch.nn.functional.normalize(normals[:, 0], dim=-1) * directions).sum(-1)
+    # Facets of this mesh are 5 degrees wide.
+    assert torch.rad2deg(torch.acos(cosine.clamp(max=1)).quantile(0.95)) < 0.5
+
+
+def test_smoothing_flattens_noise_and_keeps_the_radius(tmp_path: Path) -> None:
+    shape = trimesh.creation.icosphere(4, 0.8)
+    generator = torch.Generator().manual_seed(0)
+    noise = 0.01 * torch.randn(len(shape.vertices), 1, generator=generator).numpy()
+    shape.vertices *= 1 + noise
+    shape.export(tmp_path / "noisy.ply")
+    directions = torch.nn.functional.normalize(torch.randn(2000, 3), dim=-1)
+
+    def tilt_and_radius_error(size: int) -> tuple[float, float]:
+        medium = SdfGrid(
+            str(tmp_path / "noisy.ply"), resolution=64, smoothing_size=size, smoothing_sigma=2.5, cache=False
+        )
+        phi, normals = medium.signed_distances(0.8 * directions)
+        cosine = (torch.nn.functional.normalize(normals[:, 0], dim=-1) * directions).sum(-1)
+        return float(cosine.clamp(-1, 1).acos().mean()), float(phi.mean().abs())
+
+    rough, _ = tilt_and_radius_error(0)
+    tilt, radius_error = tilt_and_radius_error(13)
+    assert tilt < 0.4 * rough
+    assert radius_error < 2e-3
+
+
+def test_bad_solids_are_named(tmp_path: Path) -> None:
+    trimesh.creation.icosphere(2, 0.8).export(tmp_path / "ball.ply")
+    mesh = str(tmp_path / "ball.ply")
+    with pytest.raises(NerfroError, match="one index for each inner mesh"):
+        SdfGrid(mesh, inner_meshes=[mesh], resolution=16, cache=False)
+    with pytest.raises(NerfroError, match="no refractive indices"):
+        Ball(ior=0.0)
+    with pytest.raises(NerfroError, match="half width"):
+        Ball(shell=0.0)
+    with pytest.raises(NerfroError, match=r"box_min=.*box_max="):
+        SdfGrid(mesh, box_max=[0.7] * 3, resolution=16, cache=False)

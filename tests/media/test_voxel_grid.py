@@ -1,0 +1,128 @@
+"""The paper's medium: smoothing, gradient, look-up, files and refusals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.ndimage import gaussian_filter1d
+
+from nerfro.errors import NerfroError
+from nerfro.geometry.smoothing import gradient, smooth
+from nerfro.media.voxel_grid import VoxelGrid
+
+BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
+
+
+@pytest.fixture
+def sphere(tmp_path: Path) -> str:
+    trimesh.creation.icosphere(3, 0.8).export(tmp_path / "sphere.ply")
+    return str(tmp_path / "sphere.ply")
+
+
+def _ball_occupancy(size: int) -> torch.Tensor:
+    axis = torch.linspace(-1.5, 1.5, size)
+    radius = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).norm(dim=-1)
+    return (radius < 0.8).float()
+
+
+def test_smoothing_is_scipys_truncated_gaussian() -> None:
+    values = torch.rand(9, 10, 11, dtype=torch.float64)
+    expected = values.numpy()
+    for axis in range(3):
+        expected = gaussian_filter1d(expected, 1.3, axis=axis, mode="nearest", radius=3)
+    np.testing.assert_allclose(smooth(values, 7, 1.3).numpy(), expected, rtol=1e-12)
+
+
+def test_smoothing_keeps_its_input() -> None:
+    values = torch.rand(5, 5, 5)
+    before = values.clone()
+    smooth(values, 3, 1.0)
+    torch.testing.assert_close(values, before, rtol=0, atol=0)
+
+
+def test_gradient_is_central_inside_and_half_at_the_border() -> None:
+    x = torch.arange(6.0)
+    values = (3 * x)[:, None, None].expand(6, 4, 4)
+    result = gradient(values, torch.tensor([0.5, 1.0, 1.0]))
+    assert (result[1:-1, ..., 0] == 6).all()
+    assert (result[[0, -1], ..., 0] == 3).all()
+    assert (result[..., 1:] == 0).all()
+
+
+def test_index_is_that_of_object_inside_and_air_outside(sphere: str) -> None:
+    medium = VoxelGrid(sphere, ior=1.33, resolution=48, cache=False)
+    n, grad = medium(torch.tensor([[0.0, 0.0, 0.0], [1.35, 0.0, 0.0], [5.0, 0.0, 0.0], [0.0, -0.8, 0.0]]))
+    torch.testing.assert_close(n[:3], torch.tensor([1.33, 1.0, 1.0]))
+    assert 1.05 < n[3] < 1.28
+    assert (grad[:3] == 0).all()
+    # The index rises towards the centre.
+    assert grad[3, 1] > 1
+    assert grad[3, [0, 2]].abs().max() < 0.1
+
+
+def test_clearance_holds_no_gradient() -> None:
+    medium = VoxelGrid.from_occupancy(_ball_occupancy(32), BOX, 1.5, 5, 1.0)
+    positions = torch.rand(500, 3) * 3 - 1.5
+    clearance = medium.clearance(positions)
+    assert (clearance > 0).float().mean() > 0.3
+    directions = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
+    _, grad = medium(positions + 0.999 * clearance[:, None] * directions)
+    assert (grad[clearance > 0] == 0).all()
+
+
+def test_saved_grid_is_loaded_as_it_was(sphere: str, tmp_path: Path) -> None:
+    medium = VoxelGrid(sphere, ior=1.4, resolution=40, smoothing_size=5, smoothing_sigma=1.5, cache=False)
+    medium.save(tmp_path / "grid.npz")
+    with np.load(tmp_path / "grid.npz", allow_pickle=False) as file:
+        assert {"box", "ior", "smoothing"} <= set(file.files)
+    loaded = VoxelGrid(grid=str(tmp_path / "grid.npz"))
+    torch.testing.assert_close(loaded.table, medium.table, rtol=0, atol=0)
+    torch.testing.assert_close(loaded.box, medium.box, rtol=0, atol=0)
+
+
+def test_cached_occupancy_is_bit_for_bit_the_computed_one(
+    sphere: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NERFRO_CACHE", str(tmp_path / "cache"))
+    tables = [VoxelGrid(sphere, resolution=40, cache=cache).table for cache in (False, True, True)]
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+    torch.testing.assert_close(tables[1], tables[0], rtol=0, atol=0)
+    torch.testing.assert_close(tables[2], tables[0], rtol=0, atol=0)
+
+
+def test_grids_are_not_in_checkpoints() -> None:
+    assert not VoxelGrid.from_occupancy(_ball_occupancy(16), BOX, 1.5, 3, 1.0).state_dict()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"mesh": None}, "medium.mesh or medium.grid"),
+        ({"box_max": [1.0, 0.8, 1.0]}, r"box_min=.*box_max="),
+        ({"box_max": [1.5, -2.0, 1.5]}, "min below max"),
+        ({"resolution": 2}, "medium.resolution=2"),
+        ({"smoothing_size": 4}, "must be odd"),
+        ({"ior": -1.0}, "medium.ior=-1.0"),
+        ({"grid": "missing.npz", "mesh": None}, "missing.npz does not exist"),
+    ],
+)
+def test_bad_options_are_named(sphere: str, options: dict, message: str) -> None:
+    with pytest.raises(NerfroError, match=message):
+        VoxelGrid(**{"mesh": sphere, "resolution": 32, "smoothing_size": 3, "cache": False, **options})
+
+
+def test_the_box_that_the_margin_message_names_is_accepted(sphere: str) -> None:
+    with pytest.raises(NerfroError, match="voxels of air") as error:
+        VoxelGrid(sphere, resolution=64, box_min=[-0.8] * 3, box_max=[0.8] * 3, cache=False)
+    low, high = (part.split("[")[1].split("]")[0] for part in str(error.value).split("medium.box_")[1:])
+    corners = [[float(number) for number in corner.split(",")] for corner in (low, high)]
+    VoxelGrid(sphere, resolution=64, box_min=corners[0], box_max=corners[1], cache=False)
+
+
+def test_a_grid_without_margin_is_refused() -> None:
+    with pytest.raises(NerfroError, match="touches the grid's border"):
+        VoxelGrid.from_occupancy(torch.ones(8, 8, 8), BOX, 1.5, 3, 1.0)

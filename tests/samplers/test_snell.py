@@ -1,0 +1,453 @@
+"""Snell paths against closed-form optics, independent tracers, and the plain reference of the compiled kernel."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path as FilePath
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+from nerfro.errors import NerfroError
+from nerfro.media.analytic import Luneburg, Vacuum
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.shapes import Ball, RoundedBox, Slab
+from nerfro.samplers.snell import Snell, trace_interfaces
+from nerfro.samplers.snell_law import refract
+from nerfro.types import Rays
+
+BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
+
+
+def _rays(origins: list | Tensor, directions: list | Tensor, near: float = 0.5, far: float = 9.0) -> Rays:
+    o = torch.as_tensor(origins, dtype=torch.float64)
+    d = torch.nn.functional.normalize(torch.as_tensor(directions, dtype=torch.float64), dim=-1)
+    ones = torch.ones(len(o), dtype=torch.float64)
+    return Rays(o, d, 0 * ones, near * ones, far * ones)
+
+
+def _angle(a: Tensor, b: Tensor) -> Tensor:
+    """Angle between unit vectors in degrees, exact for small ones."""
+    return torch.rad2deg(2 * torch.asin((0.5 * torch.linalg.vector_norm(a.double() - b.double(), dim=-1)).clamp(max=1)))
+
+
+def _beam(heights: Tensor) -> Rays:
+    """Parallel rays along +x at the given heights in y."""
+    return _rays(torch.stack([torch.full_like(heights, -3), heights, 0 * heights], -1), [[1, 0, 0]] * len(heights))
+
+
+def _ball_exit(heights: Tensor, radius: float, n: float) -> Tensor:
+    """Exit directions of the beam: deviation 2 (i - t) with sin i = b / R, sin t = b / (n R)."""
+    deviation = 2 * (torch.asin(heights / radius) - torch.asin(heights / (n * radius)))
+    return torch.stack([deviation.cos(), -deviation.sin(), 0 * heights], -1)
+
+
+def _grid(values: Tensor, iors: list[float]) -> SdfGrid:
+    return SdfGrid.from_distances(values, BOX, iors, 0.02)
+
+
+def _points(size: int) -> Tensor:
+    axis = torch.linspace(-1.5, 1.5, size)
+    return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+
+
+def _mesh_medium(shape: trimesh.Trimesh, folder: FilePath, ior: float = 1.5, resolution: int = 48) -> SdfGrid:
+    shape.export(folder / "shape.ply")
+    return SdfGrid(str(folder / "shape.ply"), ior, resolution=resolution, cache=False)
+
+
+# --- the law ---
+
+
+def test_refraction_keeps_n_times_sine_and_the_plane_of_incidence() -> None:
+    d = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
+    normal = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
+    n1, n2 = torch.rand(50, dtype=torch.float64) + 1, torch.rand(50, dtype=torch.float64) + 1
+    t, reflected = refract(d, normal, n1, n2)
+    sine = torch.linalg.cross(d, normal)
+    critical = n1 * sine.norm(dim=-1) > n2
+    assert (reflected == critical).all()
+    assert reflected.any()
+    expected = torch.where(reflected, 1.0, n1 / n2)[:, None] * sine
+    torch.testing.assert_close(torch.linalg.cross(t, normal), expected)
+    forward = (d * normal).sum(-1) * (t * normal).sum(-1) > 0
+    assert (forward == ~reflected).all()
+
+
+@pytest.mark.parametrize("n", [1.33, 1.52])
+def test_total_reflection_begins_at_the_critical_angle(n: float) -> None:
+    critical = math.degrees(math.asin(1 / n))
+    assert critical == pytest.approx({1.33: 48.75, 1.52: 41.14}[n], abs=0.01)
+    angles = torch.tensor([critical - 1e-6, critical + 1e-6], dtype=torch.float64).deg2rad()
+    d = torch.stack([angles.sin(), 0 * angles, angles.cos()], -1)
+    normal = torch.tensor([[0.0, 0.0, 1.0]]).double().expand(2, 3)
+    ones = torch.ones(2, dtype=torch.float64)
+    t, reflected = refract(d, normal, n * ones, ones)
+    assert reflected.tolist() == [False, True]
+    assert t[0, 2] == pytest.approx(0.0, abs=1e-3)
+    torch.testing.assert_close(t[1], torch.tensor([1.0, 1.0, -1.0]).double() * d[1])
+
+
+# --- shapes in closed form ---
+
+
+def test_ball_deviates_by_twice_the_difference_of_its_angles() -> None:
+    heights = torch.linspace(-0.99, 0.99, 101, dtype=torch.float64) * 0.8
+    trace = Snell().trace(_beam(heights), Ball(0.8, 1.5).double())
+    assert _angle(trace.path.exit_directions, _ball_exit(heights, 0.8, 1.5)).max() < 1e-7
+    assert (trace.num_events == 2).all()
+    assert trace.path.s.shape[1] == 4
+    # The chord inside is 2 R cos t.
+    chord = trace.path.s[:, 2] - trace.path.s[:, 1]
+    torch.testing.assert_close(chord, 1.6 * (1 - (heights / 1.2) ** 2).sqrt())
+
+
+def test_ball_deviation_changes_with_the_index_as_its_derivative() -> None:
+    # d(2 (i - t))/dn = 2 tan(t) / n.
+    heights = torch.linspace(0.1, 0.7, 7, dtype=torch.float64)
+    step = 1e-5
+    exits = [Snell()(_beam(heights), Ball(0.8, 1.5 + sign * step).double()).exit_directions for sign in (-1, 1)]
+    deviation = [-torch.atan2(e[:, 1], e[:, 0]) for e in exits]
+    t = torch.asin(heights / (0.8 * 1.5))
+    torch.testing.assert_close((deviation[1] - deviation[0]) / (2 * step), 2 * t.tan() / 1.5, rtol=1e-6, atol=0)
+
+
+def test_paraxial_rays_meet_at_the_back_focus() -> None:
+    heights = torch.tensor([1e-4], dtype=torch.float64)
+    path = Snell()(_beam(heights), Ball(0.8, 1.5).double())
+    x, d = path.exit_positions[0], path.exit_directions[0]
+    focus = x[0] - x[1] * d[0] / d[1]
+    assert float(focus) - 0.8 == pytest.approx(0.8 * (2 - 1.5) / (2 * (1.5 - 1)), rel=1e-5)
+
+
+def test_slab_shifts_and_does_not_turn() -> None:
+    angles = torch.linspace(0, 85, 18, dtype=torch.float64).deg2rad()
+    directions = torch.stack([angles.sin(), 0 * angles, angles.cos()], -1)
+    path = Snell()(_rays(-5 * directions, directions, 0, 12), Slab(0.5, 1.5, half_width=9.0).double())
+    torch.testing.assert_close(path.exit_directions, directions)
+    shift = 0.5 * angles.sin() * (1 - angles.cos() / (1.5**2 - angles.sin() ** 2).sqrt())
+    moved = torch.linalg.cross(path.exit_positions, directions).norm(dim=-1)
+    torch.testing.assert_close(moved, shift, atol=1e-9, rtol=0)
+
+
+def _rounded_box_exit(x: np.ndarray, d: np.ndarray, a: float, r: float) -> float:
+    """Distance to the exit from a rounded cube that contains x, by its boxes, cylinders and balls one by one.
+
+    It is convex, so a ray inside leaves it where it leaves the last of the convex pieces that make it up.
+    """
+    inner, last = a - r, 0.0
+
+    def quadratic(p: np.ndarray, q: np.ndarray) -> tuple[float, float] | None:
+        qq, pq, pp = q @ q, p @ q, p @ p - r * r
+        root = pq * pq - qq * pp
+        if qq < 1e-300 or root < 0:
+            return None
+        return (-pq - math.sqrt(root)) / qq, (-pq + math.sqrt(root)) / qq
+
+    for wide in range(3):  # boxes that reach two opposite faces
+        half = np.full(3, inner)
+        half[wide] = a
+        with np.errstate(divide="ignore"):
+            planes = np.stack([(-half - x) / d, (half - x) / d])
+        enter, leave = planes.min(0).max(), planes.max(0).min()
+        if enter < leave:
+            last = max(last, leave)
+    for axis in range(3):
+        others = [i for i in range(3) if i != axis]
+        for u in (-inner, inner):
+            for v in (-inner, inner):
+                span = quadratic(x[others] - (u, v), d[others])
+                if span is None:
+                    continue
+                ends = sorted([(-inner - x[axis]) / d[axis], (inner - x[axis]) / d[axis]])
+                enter, leave = max(span[0], ends[0]), min(span[1], ends[1])
+                if enter < leave:
+                    last = max(last, leave)
+    for corner in np.stack(np.meshgrid(*[[-inner, inner]] * 3), -1).reshape(-1, 3):
+        span = quadratic(x - corner, d)
+        if span is not None:
+            last = max(last, span[1])
+    return last
+
+
+def _rounded_box_trace(x: np.ndarray, d: np.ndarray, a: float, r: float, n: float) -> tuple[np.ndarray, int]:
+    """Exit direction and number of total reflections, in double precision, apart from all of nerfro's code."""
+    inner = a - r
+
+    def normal(p: np.ndarray) -> np.ndarray:
+        outward = p - p.clip(-inner, inner)
+        return outward / np.linalg.norm(outward)
+
+    middle = x + d * max(0.0, -(x @ d))
+    if _signed(middle, a, r) > 0:
+        return d, -1
+    # The entry of a ray is the exit of its reverse.
+    entry = middle - d * _rounded_box_exit(middle, -d, a, r)
+    m = normal(entry)
+    c = -m @ d
+    d = d / n + (c / n - math.sqrt(1 - (1 - c * c) / n**2)) * m
+    x, bounces = entry + 1e-12 * d, 0
+    while True:
+        x = x + d * _rounded_box_exit(x, d, a, r)
+        m = -normal(x)
+        c = -m @ d
+        squared = 1 - n * n * (1 - c * c)
+        if squared >= 0:
+            return n * d + (n * c - math.sqrt(squared)) * m, bounces
+        d = d + 2 * c * m
+        d /= np.linalg.norm(d)
+        x, bounces = x + 1e-12 * d, bounces + 1
+        if bounces > 12:
+            return d, bounces
+
+
+def _signed(p: np.ndarray, a: float, r: float) -> float:
+    q = np.abs(p) - (a - r)
+    return float(np.linalg.norm(q.clip(0)) + min(q.max(), 0.0) - r)
+
+
+def test_rounded_cube_is_traced_as_by_its_pieces() -> None:
+    generator = np.random.default_rng(0)
+    directions = generator.normal(size=(400, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = generator.uniform(-0.6, 0.6, (400, 3)) - 3 * directions
+    exact = [_rounded_box_trace(x, d, 0.75, 0.08, 1.52) for x, d in zip(origins, directions, strict=True)]
+    trace = Snell().trace(_rays(origins, directions), RoundedBox().double())
+    bounces = torch.tensor([count for _, count in exact])
+    chosen = (bounces >= 0) & (bounces <= 3)
+    assert (bounces[chosen] > 0).sum() > 30
+    # A ray within rounding of an edge of the pieces may go another way.
+    agree = trace.num_events[chosen] == bounces[chosen] + 2
+    assert agree.float().mean() > 0.98
+    error = _angle(trace.path.exit_directions, torch.tensor(np.stack([e for e, _ in exact])))[chosen]
+    assert error.median() < 1e-6
+    assert error.quantile(0.95) < 1e-4
+
+
+def _prism(apex: float, height: float) -> trimesh.Trimesh:
+    """A prism along z whose apex points up y."""
+    half = height * math.tan(apex / 2)
+    corners = [(x, y, z) for z in (-0.8, 0.8) for x, y in ((-half, -height / 2), (half, -height / 2), (0, height / 2))]
+    return trimesh.convex.convex_hull(np.array(corners))
+
+
+def test_prism_deviates_as_its_formula(tmp_path: FilePath) -> None:
+    apex, n = math.radians(50), 1.5
+    medium = _mesh_medium(_prism(apex, 0.9), tmp_path, n)
+    angles = np.radians([35.0, 40.0, 50.0, 60.0])
+    # The left face's normal lies at half the apex angle above the horizontal; rays come from below it.
+    directions = np.stack([np.cos(angles - apex / 2), np.sin(angles - apex / 2), 0 * angles], -1)
+    target = np.array([-0.225 * math.tan(apex / 2) * 2, 0.0, 0.1])
+    path = Snell("mesh")(_rays(target - 2 * directions, directions), medium)
+    measured = torch.deg2rad(_angle(path.exit_directions, torch.tensor(directions)))
+    s = np.sin(angles)
+    expected = angles + np.arcsin(math.sin(apex) * np.sqrt(n**2 - s**2) - math.cos(apex) * s) - apex
+    np.testing.assert_allclose(measured, expected, atol=1e-9)
+    # Fraunhofer: n = sin((A + Dmin) / 2) / sin(A / 2).
+    assert measured.min() >= 2 * math.asin(n * math.sin(apex / 2)) - apex
+
+
+@pytest.mark.parametrize(("n", "total"), [(1.40, False), (1.43, True)])
+def test_right_angle_prism_reflects_totally_above_root_two(tmp_path: FilePath, n: float, total: bool) -> None:
+    # The base of this prism is its hypotenuse; a ray falls normally on the left leg.
+    medium = _mesh_medium(_prism(math.pi / 2, 0.8), tmp_path, n)
+    direction = np.array([[math.sqrt(0.5), -math.sqrt(0.5), 0.0]])
+    trace = Snell("mesh").trace(_rays([[-0.4 - 1, 0.0 + 1, 0.1]], direction), medium)
+    expected = [math.sqrt(0.5), math.sqrt(0.5), 0.0]
+    turned_by_90 = torch.allclose(trace.path.exit_directions[0], torch.tensor(expected).double(), atol=1e-9)
+    assert turned_by_90 == total
+    assert trace.num_events[0] == (3 if total else 2)
+
+
+# --- meshes and grids ---
+
+
+@pytest.mark.parametrize("interface", ["mesh", "sdf"])
+def test_smooth_mesh_refracts_as_the_ball_that_it_stands_for(tmp_path: FilePath, interface: str) -> None:
+    heights = torch.linspace(-0.95, 0.95, 60, dtype=torch.float64) * 0.8
+    medium = _mesh_medium(trimesh.creation.icosphere(4, 0.8), tmp_path, resolution=64)
+    path = Snell(interface)(_beam(heights), medium)  # type: ignore[arg-type]
+    error = _angle(path.exit_directions, _ball_exit(heights, 0.8, 1.5))
+    impact = (heights / 0.8).abs()
+    # Facets of this mesh are 5 degrees wide; with their flat normals errors would be of that order.
+    assert error[impact < 0.5].median() < 0.02
+    assert error[(impact >= 0.5) & (impact < 0.8)].median() < 0.05
+    assert error[impact >= 0.8].median() < 0.2
+
+
+def test_grid_of_distances_refracts_as_the_ball() -> None:
+    heights = torch.linspace(-0.95, 0.95, 60, dtype=torch.float64) * 0.8
+    path = Snell()(_beam(heights), _grid(_points(64).norm(dim=-1)[None] - 0.8, [1.5]))
+    assert _angle(path.exit_directions, _ball_exit(heights, 0.8, 1.5)).max() < 0.05
+
+
+@pytest.mark.parametrize("inner_ior", [1.0, 1.33, 1.8])
+def test_ball_in_a_ball_deviates_as_its_conserved_moment(inner_ior: float) -> None:
+    outer, inner, n = 1.2, 0.6, 1.5
+    heights = torch.linspace(0.02, 1.1, 60, dtype=torch.float64)
+    radius = _points(96).norm(dim=-1)
+    trace = Snell().trace(_beam(heights), _grid(torch.stack([radius - outer, radius - inner]), [n, inner_ior]))
+    # n r sin(phi) = b everywhere.
+    deviation = 2 * (torch.asin(heights / outer) - torch.asin(heights / (n * outer)))
+    meets = heights < n * inner
+    reflected = meets & (heights > inner_ior * inner)
+    i = torch.asin((heights / (n * inner)).clamp(max=1))
+    t = torch.asin((heights / (inner_ior * inner)).clamp(max=1))
+    bent = torch.where(reflected, 2 * i - math.pi, 2 * (i - t))
+    deviation = deviation + torch.where(meets, bent, 0.0)
+    exact = torch.stack([deviation.cos(), -deviation.sin(), 0 * heights], -1)
+    error = _angle(trace.path.exit_directions, exact)
+    events = torch.where(meets, torch.where(reflected, 3, 4), 2)
+    # Just at grazing the grid decides otherwise than the ball.
+    clear = ((heights - n * inner).abs() > 0.02) & ((heights - inner_ior * inner).abs() > 0.02)
+    assert (trace.num_events == events)[clear].all()
+    assert error[clear].max() < 0.3
+    assert error[clear].median() < 0.02
+    if inner_ior == 1.0:
+        assert reflected.any()
+
+
+def test_bodies_of_equal_index_are_one() -> None:
+    radius = _points(48).norm(dim=-1)
+    heights = torch.linspace(-0.7, 0.7, 15, dtype=torch.float64)
+    nested = Snell().trace(_beam(heights), _grid(torch.stack([radius - 0.8, radius - 0.4]), [1.5, 1.5]))
+    single = Snell().trace(_beam(heights), _grid(radius[None] - 0.8, [1.5]))
+    assert (nested.num_events == 2).all()
+    torch.testing.assert_close(nested.path.exit_directions, single.path.exit_directions, atol=1e-8, rtol=0)
+
+
+def _through_ball(x: np.ndarray, d: np.ndarray, centre: np.ndarray, radius: float, n: float) -> tuple:
+    """Refraction into and out of one ball, by vectors."""
+    for ratio in (1 / n, n):
+        o = x - centre
+        b, c = o @ d, o @ o - radius**2
+        x = x + d * (-b + (-1 if ratio < 1 else 1) * math.sqrt(b * b - c))
+        normal = (x - centre) / radius * (1 if ratio < 1 else -1)
+        cosine = -normal @ d
+        d = ratio * d + (ratio * cosine - math.sqrt(1 - ratio**2 * (1 - cosine**2))) * normal
+    return x, d
+
+
+@pytest.mark.parametrize("interface", ["mesh", "sdf"])
+def test_rays_may_enter_again(tmp_path: FilePath, interface: str) -> None:
+    first, second = np.array([-0.7, 0.0, 0.0]), np.array([0.7, 0.1, 0.0])
+    shape = trimesh.util.concatenate(
+        [trimesh.creation.icosphere(5, 0.5).apply_translation(centre) for centre in (first, second)]
+    )
+    medium = _mesh_medium(shape, tmp_path, 1.1, resolution=64)
+    heights = torch.linspace(-0.15, 0.15, 7, dtype=torch.float64)
+    trace = Snell(interface).trace(_beam(heights), medium)  # type: ignore[arg-type]
+    assert (trace.num_events == 4).all()
+    for row, height in enumerate(heights.tolist()):
+        x, d = _through_ball(np.array([-3.0, height, 0]), np.array([1.0, 0, 0]), first, 0.5, 1.1)
+        _, d = _through_ball(x, d, second, 0.5, 1.1)
+        assert float(_angle(trace.path.exit_directions[row], torch.tensor(d))) < 0.03
+
+
+def test_flat_faces_of_a_mesh_refract_exactly(tmp_path: FilePath) -> None:
+    medium = _mesh_medium(trimesh.creation.box(extents=[1.0, 2.0, 2.0]), tmp_path)
+    angles = torch.linspace(0, 40, 9, dtype=torch.float64).deg2rad()
+    directions = torch.stack([angles.cos(), angles.sin(), 0 * angles], -1)
+    path = Snell("mesh")(_rays(-2 * directions, directions), medium)
+    # The mesh is built in single precision.
+    torch.testing.assert_close(path.exit_directions, directions, atol=1e-6, rtol=0)
+    shift = 1.0 * angles.sin() * (1 - angles.cos() / (1.5**2 - angles.sin() ** 2).sqrt())
+    moved = torch.linalg.cross(path.exit_positions, directions).norm(dim=-1)
+    torch.testing.assert_close(moved, shift, atol=1e-6, rtol=0)
+
+
+# --- bookkeeping ---
+
+
+def _bundle(num: int = 300) -> Rays:
+    generator = torch.Generator().manual_seed(2)
+    directions = torch.nn.functional.normalize(torch.randn(num, 3, generator=generator, dtype=torch.float64), dim=-1)
+    targets = 2.4 * torch.rand(num, 3, generator=generator, dtype=torch.float64) - 1.2
+    return _rays(targets - 3.5 * directions, directions)
+
+
+def test_compiled_paths_are_those_of_torch() -> None:
+    p = _points(40)
+    torus = (((p[..., 0] ** 2 + p[..., 1] ** 2).sqrt() - 0.8) ** 2 + p[..., 2] ** 2).sqrt() - 0.4
+    medium = _grid(torch.stack([torus, torus + 0.2]), [1.5, 1.3])
+    rays = _bundle()
+    compiled = Snell(max_events=12).trace(rays, medium)
+    path, num_events, exceeded = trace_interfaces(rays, medium.double(), 12)
+    # Rays that graze a surface differ by rounding.
+    same = compiled.num_events == num_events
+    assert same.float().mean() > 0.98
+    assert (compiled.exceeded == exceeded)[same].all()
+    assert num_events.max() >= 6
+    assert (num_events == 0).any()
+    error = _angle(compiled.path.exit_directions, path.exit_directions)[same]
+    assert error.median() < 1e-6
+    assert error.quantile(0.95) < 1e-2
+    assert (compiled.path.refracted == path.refracted)[same].all()
+
+
+def test_paths_are_continuous_and_end_at_far() -> None:
+    rays = _bundle()
+    path = Snell()(rays, _grid(_points(40).norm(dim=-1)[None] - 0.8, [1.5]))
+    torch.testing.assert_close(path.near, rays.near)
+    torch.testing.assert_close(path.far, rays.far)
+    steps = path.s.diff()
+    assert (steps >= 0).all()
+    ahead = path.positions[:, :-1] + steps[..., None] * path.directions[:, :-1]
+    torch.testing.assert_close(ahead, path.positions[:, 1:], atol=1e-6, rtol=0)
+    torch.testing.assert_close(path.directions.norm(dim=-1), torch.ones_like(path.s))
+
+
+def test_rays_that_miss_are_two_vertices() -> None:
+    path = Snell()(_beam(torch.tensor([0.9, -1.4, 2.0]).double()), _grid(_points(40).norm(dim=-1)[None] - 0.8, [1.5]))
+    assert path.s.shape == (3, 2)
+    assert not path.refracted.any()
+
+
+def test_rays_with_too_many_events_are_flagged_and_go_straight_on() -> None:
+    # Within a cube of index 2 rays are totally reflected at all faces for ever.
+    rays = _rays([[0.1, 0.2, -0.1]], [[0.55, 0.6, 0.58]], 0.0, 20.0)
+    distances = RoundedBox(0.75, 0.1).signed_distances(_points(64))[0]
+    for medium in (RoundedBox(0.75, 0.01, 2.0).double(), _grid(distances.movedim(-1, 0), [2.0])):
+        trace = Snell(max_events=5).trace(rays, medium)
+        assert trace.exceeded.all()
+        assert trace.num_events[0] == 5
+        assert trace.path.far[0] == 20
+    assert not Snell().trace(_beam(torch.zeros(1).double()), Ball().double()).exceeded.any()
+
+
+def test_a_camera_inside_the_glass_sees_out(tmp_path: FilePath) -> None:
+    medium = _mesh_medium(trimesh.creation.icosphere(4, 0.8), tmp_path)
+    for interface in ("sdf", "mesh"):
+        trace = Snell(interface).trace(_rays([[0.0, 0.3, 0.1]], [[0, 1, 0]], 0.0, 4), medium)  # type: ignore[arg-type]
+        assert trace.num_events[0] == 1
+        i = math.asin(0.1 / 0.8)
+        deviation = math.asin(1.5 * math.sin(i)) - i
+        # Away from the normal, which leans towards z.
+        expected = torch.tensor([0.0, math.cos(deviation), -math.sin(deviation)])
+        assert float(_angle(trace.path.exit_directions[0], expected)) < 0.02
+
+
+def test_rays_are_not_written_to(tmp_path: FilePath) -> None:
+    medium = _mesh_medium(trimesh.creation.icosphere(2, 0.8), tmp_path, resolution=24)
+    for interface in ("sdf", "mesh"):
+        rays = _beam(torch.tensor([0.3]).double())
+        Snell(interface)(rays, medium)  # type: ignore[arg-type]
+        torch.testing.assert_close(rays.directions, torch.tensor([[1.0, 0, 0]]).double(), rtol=0, atol=0)
+        assert rays.near[0] == 0.5
+
+
+def test_vacuum_bends_nothing() -> None:
+    path = Snell()(_bundle(5), Vacuum())
+    torch.testing.assert_close(path.exit_directions, _bundle(5).directions)
+
+
+def test_media_without_a_surface_are_refused() -> None:
+    with pytest.raises(NerfroError, match="medium=sdf_grid"):
+        Snell()(_bundle(2), Luneburg())
+    with pytest.raises(NerfroError, match="interface=mesh needs a medium made of a mesh"):
+        Snell("mesh")(_bundle(2), Ball())
+    with pytest.raises(NerfroError, match="max_events=0"):
+        Snell(max_events=0)

@@ -1,0 +1,133 @@
+"""`python -m nerfro.trace`: its files, its options, its refusals."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+import nerfro.trace
+
+
+@pytest.fixture
+def trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Run the entry point in this process on a glass ball; returns what it printed."""
+    trimesh.creation.icosphere(4, 0.8).export(tmp_path / "ball.ply")
+    monkeypatch.chdir(tmp_path)
+
+    def run(*overrides: str) -> str:
+        common = ["medium.mesh=ball.ply", "medium.resolution=64", "medium.cache=false", "rays=rays.npz", "out=out.npz"]
+        monkeypatch.setattr(sys, "argv", ["nerfro.trace", *common, *overrides])
+        try:
+            nerfro.trace.main()
+        except SystemExit:
+            return capsys.readouterr().err
+        return capsys.readouterr().out
+
+    return run
+
+
+def _write_rays(file: Path, num: int = 40) -> tuple[np.ndarray, np.ndarray]:
+    """A beam along +x that the ball covers in part; returns heights and exact exit directions for n = 1.5."""
+    heights = np.linspace(-0.95, 0.95, num)
+    origins = np.stack([0 * heights - 4, heights, 0 * heights], -1)
+    np.savez(file, origins=origins, directions=np.tile([[1.0, 0.0, 0.0]], (num, 1)))
+    share = np.clip(heights / 0.8, -1, 1)
+    deviation = np.where(np.abs(heights) < 0.8, 2 * (np.arcsin(share) - np.arcsin(share / 1.5)), 0)
+    return heights, np.stack([np.cos(deviation), -np.sin(deviation), 0 * heights], -1)
+
+
+SAMPLERS = [["sampler/path=snell"], ["sampler.path.interface=mesh"], ["sampler/path=eikonal"]]
+
+
+@pytest.mark.parametrize("options", SAMPLERS, ids=["snell", "mesh", "eikonal"])
+def test_rays_leave_a_ball_as_in_closed_form(trace: Callable[..., str], tmp_path: Path, options: list[str]) -> None:
+    heights, exact = _write_rays(tmp_path / "rays.npz")
+    assert "40 rays traced" in trace("medium.ior=1.5", *options)
+    with np.load(tmp_path / "out.npz") as out:
+        clear = np.abs(np.abs(heights) - 0.8) > 0.01  # the eikonal shell has a width
+        assert out["hit"][clear].tolist() == (np.abs(heights) < 0.8)[clear].tolist()
+        error = np.degrees(np.arccos(np.clip((out["exit_directions"] * exact).sum(-1), -1, 1)))
+        # The shell that eikonal sees is a tenth of these coarse voxels.
+        assert np.median(error) < (0.15 if "sampler/path=eikonal" in options else 0.02)
+        assert error[np.abs(heights) < 0.7].max() < 0.5
+        # Where the box is left, on the line that leaves the ball.
+        np.testing.assert_allclose(np.abs(out["exit_positions"]).max(-1), 1.5, atol=1e-4)
+        missed = ~out["hit"] & clear
+        np.testing.assert_allclose(out["path_lengths"][missed], 5.5, atol=1e-4)
+        assert (out["path_lengths"][out["hit"]] > 5.3).all()
+
+
+def test_with_far_paths_end_at_far(trace: Callable[..., str], tmp_path: Path) -> None:
+    _write_rays(tmp_path / "rays.npz")
+    trace("sampler/path=eikonal", "near=2", "far=6")
+    with np.load(tmp_path / "out.npz") as out:
+        np.testing.assert_allclose(out["path_lengths"], 6, atol=1e-5)
+
+
+def test_the_papers_tracker_is_an_option(trace: Callable[..., str], tmp_path: Path) -> None:
+    _, exact = _write_rays(tmp_path / "rays.npz")
+    paper = ["medium=voxel_grid", "medium.smoothing_size=3", "sampler/path=eikonal", "sampler.path.integrator=euler"]
+    trace(*paper, "near=2", "far=6")
+    with np.load(tmp_path / "out.npz") as out:
+        error = np.degrees(np.arccos(np.clip((out["exit_directions"] * exact).sum(-1), -1, 1)))
+        assert 0.05 < np.median(error) < 5
+
+
+def test_plot_is_written_beside_the_result(trace: Callable[..., str], tmp_path: Path) -> None:
+    _write_rays(tmp_path / "rays.npz")
+    assert "drew 24" in trace("plot=true")
+    from PIL import Image
+
+    picture = np.asarray(Image.open(tmp_path / "out.png").convert("RGB")).astype(int)
+    red = (picture[..., 0] > 150) & (picture[..., 1] < 100)
+    blue = (picture[..., 2] > picture[..., 0] + 40) & ~red
+    assert 0.002 < red.mean() < 0.2
+    assert 0.05 < blue.mean() < 0.5
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"origins": np.zeros((2, 3))}, "no array 'directions'"),
+        ({"origins": np.zeros((2, 3)), "directions": np.zeros((3, 2))}, "must be [R, 3]"),
+        ({"origins": np.zeros((2, 3)), "directions": np.full((2, 3), np.nan)}, "not finite"),
+        ({"origins": np.zeros((2, 3)), "directions": np.ones((2, 3))}, "make them 1"),
+        ({"origins": np.zeros((2, 3)), "directions": np.eye(3)}, "one for each ray"),
+        ({"origins": np.zeros((0, 3)), "directions": np.zeros((0, 3))}, "not empty"),
+    ],
+)
+def test_bad_rays_are_one_clear_line(trace: Callable[..., str], tmp_path: Path, arrays: dict, message: str) -> None:
+    np.savez(tmp_path / "rays.npz", **arrays)
+    printed = trace()
+    assert message in printed
+    assert len(printed.strip().splitlines()) == 1
+    assert not (tmp_path / "out.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["medium.mesh=none.ply"], "none.ply does not exist"),
+        (["out=result.txt"], "must end in .npz"),
+        (["near=5", "far=2"], "near=5.0, far=2.0 is no range"),
+        (["medium.nothing=1"], "nothing"),
+        (["medium=voxel_grid", "medium.smoothing_size=3"], "medium=sdf_grid"),
+    ],
+)
+def test_bad_options_are_one_clear_line(
+    trace: Callable[..., str], tmp_path: Path, options: list[str], message: str
+) -> None:
+    _write_rays(tmp_path / "rays.npz")
+    assert message in trace(*options)
+
+
+def test_an_existing_result_may_be_protected(trace: Callable[..., str], tmp_path: Path) -> None:
+    _write_rays(tmp_path / "rays.npz")
+    (tmp_path / "out.npz").write_text("precious")
+    assert "overwrite=true" in trace("overwrite=false")
+    assert (tmp_path / "out.npz").read_text() == "precious"
