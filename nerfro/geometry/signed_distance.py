@@ -52,7 +52,7 @@ def signed_distance_grid(
     half_diagonal = 0.5 * float(np.linalg.norm(spacing))
     far = distance_to_set(distance <= half_diagonal, spacing) - half_diagonal
     sign = np.where(occupancy_fraction(mesh, box, resolution, subsamples=1) > 0.5, -1.0, 1.0)
-    return np.where(near, sign * distance - height, sign * np.maximum(far, half_diagonal)).astype(np.float32)
+    return np.where(near, sign * distance - height, sign * np.maximum(far, reach)).astype(np.float32)
 
 
 def distance_to_set(members: Bool[np.ndarray, "X Y Z"], spacing: Float[np.ndarray, "3"]) -> Float[np.ndarray, "X Y Z"]:

@@ -1,11 +1,20 @@
-"""How kernels are compiled."""
+"""How kernels are compiled, and where the machine code is kept."""
 
 from __future__ import annotations
 
+import functools
+import hashlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
+
+from nerfro.geometry.cache import cache_dir
+from nerfro.paths import PACKAGE_DIR
+
+# Kernels, and the constants that are compiled into them, live in these folders.
+_SOURCES = ("kernels", "geometry")
 
 Function = TypeVar("Function", bound=Callable)
 
@@ -28,9 +37,28 @@ def compiled_parallel(function: Function) -> Function:
 def _compile(function: Function, parallel: bool) -> Function:
     # Fused multiply-add is the only liberty taken with floating point: infinities and exact comparisons stay.
     options: dict[str, Any] = {"parallel": parallel, "fastmath": {"contract"}, "error_model": "numpy"}
+    before = numba.config.CACHE_DIR  # type: ignore[attr-defined]
+    # Numba looks at this once, when it makes the function's cache. An install may be read-only, hence a folder of ours.
+    folder = (Path(before) if before else cache_dir() / "kernels") / _fingerprint()
+    numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
     try:
         return numba.njit(cache=True, **options)(function)
-    except RuntimeError:
-        # Numba keeps compiled code beside the source, else in NUMBA_CACHE_DIR or the user's cache folder. Where none of
-        # them can be written (a read-only install without a home) it refuses; then every process compiles anew.
+    except (RuntimeError, OSError):
+        # Where no folder can be written, every process compiles anew.
         return numba.njit(**options)(function)
+    finally:
+        numba.config.CACHE_DIR = before  # type: ignore[attr-defined]
+
+
+@functools.cache
+def _fingerprint() -> str:
+    """Hash of all sources that kernels are made of.
+
+    Numba itself compiles again when a function's own file has changed, but not when the file of a function that it
+    calls has: it would go on running old machine code.
+    """
+    digest = hashlib.sha256()
+    for folder in _SOURCES:
+        for file in sorted((PACKAGE_DIR / folder).glob("*.py")):
+            digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]

@@ -10,16 +10,11 @@ import math
 import numpy as np
 from numba import prange
 
+from nerfro.geometry.tolerances import MIN_COSINE, MIN_NORMAL_PART, MIN_TURN, REACHED
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.lookup import block_clearance, box_span, put_vertex, repeat_last, solid_index, voxel_index
-from nerfro.media.solid import MIN_COSINE
-from nerfro.samplers.integrators import MIN_NORMAL_PART
 
 EULER, LEAPFROG, RK4 = 0, 1, 2
-
-# See samplers.eikonal and media.solid, which explain them.
-MIN_TURN = 1e-14
-REACHED = 1e-3
 
 
 @compiled

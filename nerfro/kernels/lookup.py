@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+from nerfro.geometry.tolerances import SAFE_SHARE
 from nerfro.kernels.compilation import compiled
 
 
@@ -75,7 +76,7 @@ def solid_index(coefficients, iors, shell, low, inverse_spacing, x, y, z):
     n, gx, gy, gz, clearance = 1.0, 0.0, 0.0, 0.0, math.inf
     for body in range(coefficients.shape[0]):
         phi, px, py, pz = spline_value_gradient(coefficients[body], low, inverse_spacing, x, y, z)
-        clearance = min(clearance, abs(phi) - shell)
+        clearance = min(clearance, SAFE_SHARE * abs(phi) - shell)
         t = 0.5 - 0.5 * phi / shell
         if t <= 0.0:
             continue

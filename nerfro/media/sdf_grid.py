@@ -25,6 +25,8 @@ from nerfro.registry import register
 _BAND = 3.0
 # Cells a side of the blocks in which rays look up how far they may jump before they look up distances themselves.
 BLOCK = 4
+# Part of the cache's key: raise it when the same mesh and settings give other distances than before.
+_VERSION = 2
 
 
 @register("medium", "sdf_grid")
@@ -137,7 +139,9 @@ class SdfGrid(Solid):
             last = torch.arange(count * BLOCK + 1).clamp(max=nearest.shape[axis] - 1)
             nearest = nearest.index_select(axis, last).unfold(axis, BLOCK + 1, BLOCK).amin(-1)
         spacing = (self.box[1] - self.box[0]).cpu() / (torch.tensor(self.coefficients.shape[1:]) - 1)
-        return (nearest - 0.5 * torch.linalg.vector_norm(spacing)).clamp(min=0).to(self.distances.device)
+        # A point is within half a cell's diagonal of a vertex; the spline's surface is a little off the data's.
+        margin = 0.5 * torch.linalg.vector_norm(spacing) + 0.25 * spacing.min()
+        return (nearest - margin).clamp(min=0).to(self.distances.device)
 
     def clearance(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Distance to the nearest shell: a lower bound from the blocks, or where that is none the distance itself."""
@@ -174,7 +178,7 @@ def _cached_distance(
     crease_degrees: float,
     cache: bool,
 ) -> Float[np.ndarray, "X Y Z"]:
-    key = "distance_" + content_hash(mesh.vertices, mesh.faces, box, resolution, band, crease_degrees)
+    key = "distance_" + content_hash(_VERSION, mesh.vertices, mesh.faces, box, resolution, band, crease_degrees)
     arrays = cached_arrays(
         key, lambda: {"distance": signed_distance_grid(mesh, box, resolution, band, crease_degrees)}, cache
     )

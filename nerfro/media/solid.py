@@ -9,12 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfro.errors import NerfroError
+from nerfro.geometry.tolerances import MIN_COSINE, SAFE_SHARE, STEPS_PER_SHELL
 from nerfro.media.base import Medium
-
-# A ray that crosses the shell along its normal takes this many steps in it.
-STEPS_PER_SHELL = 8
-# Steps of slanting rays grow with 1 / cosine of their angle to the normal, up to here, where the shell turns them.
-MIN_COSINE = 0.25
 
 
 class Solid(Medium):
@@ -72,9 +68,9 @@ class Solid(Medium):
         return torch.where(in_box, n, 1.0), torch.where(in_box[..., None], gradient, 0.0)
 
     def clearance(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Distance to the nearest shell."""
+        """Most of the distance to the nearest shell."""
         phi, _ = self.signed_distances(positions)
-        return (phi.abs().amin(-1) - self.shell).clamp(min=0)
+        return (SAFE_SHARE * phi.abs().amin(-1) - self.shell).clamp(min=0)
 
     def step_length(
         self, directions: Float[Tensor, "*batch 3"], gradients: Float[Tensor, "*batch 3"]

@@ -21,6 +21,9 @@ from nerfro.media.base import Medium
 from nerfro.paths import resolve_path
 from nerfro.registry import register
 
+# Part of the cache's key: raise it when the same mesh and settings give other fractions than before.
+_VERSION = 1
+
 
 @register("medium", "voxel_grid")
 class VoxelGrid(Medium):
@@ -79,7 +82,7 @@ class VoxelGrid(Medium):
         loaded = load_mesh(resolve_path(str(mesh)), accept_open_mesh)
         # One voxel for the sub-samples, one for the gradient's difference, and what the smoothing spreads.
         check_margin(loaded, box, resolution, 2 + smoothing_size // 2)
-        key = "occupancy_" + content_hash(loaded.vertices, loaded.faces, box, resolution, subsamples)
+        key = "occupancy_" + content_hash(_VERSION, loaded.vertices, loaded.faces, box, resolution, subsamples)
         occupancy = cached_arrays(
             key,
             # Multiples of 1/64 are exact in half precision.

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import intersect_box
+from nerfro.geometry.tolerances import MIN_TURN, REACHED, STEPS_PER_SHELL
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.solid import STEPS_PER_SHELL
 from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.registry import register
 from nerfro.samplers.base import PathSampler
@@ -20,11 +20,6 @@ from nerfro.samplers.compiled import eikonal_on_grid, uniform_on_grid
 from nerfro.samplers.integrators import INTEGRATORS, Integrator, RayState, leapfrog
 from nerfro.samplers.polylines import Polylines
 from nerfro.types import Path, Rays
-
-# Squared change of a unit direction (1e-7 radians) below which a path counts as straight.
-_MIN_TURN = 1e-14
-# Within this share of a step the shell counts as reached.
-_REACHED = 1e-3
 
 
 @register("sampler/path", "eikonal")
@@ -132,7 +127,7 @@ def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int)
         kept_x[chosen], kept_d[chosen], kept_s[chosen] = x[chosen], d[chosen], s[chosen]
 
     def turned(chosen: Tensor) -> Tensor:
-        return chosen[(d[chosen] - kept_d[chosen]).square().sum(-1) > _MIN_TURN]
+        return chosen[(d[chosen] - kept_d[chosen]).square().sum(-1) > MIN_TURN]
 
     refracted = torch.zeros(num_rays, dtype=torch.bool, device=x.device)
     enter, leave = intersect_box(medium.box, x, d)
@@ -148,7 +143,7 @@ def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int)
         step = medium.step_length(d[active], g[active])
         remaining = rays.far[active] - s[active]
         free = medium.clearance(x[active])
-        jumps = free > _REACHED * step
+        jumps = free > REACHED * step
         jumping, stepping = active[jumps], active[~jumps]
         keep(turned(jumping))
         length = torch.minimum(free, remaining)[jumps]

@@ -13,8 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-# Squared share of |v| below which the component along the kick is left alone.
-MIN_NORMAL_PART = 0.01
+from nerfro.geometry.tolerances import MIN_NORMAL_PART
 
 Index = Callable[[Tensor], tuple[Tensor, Tensor]]
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import intersect_box
+from nerfro.geometry.tolerances import MIN_SEARCH_STEP
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
@@ -24,8 +25,6 @@ from nerfro.samplers.snell_law import refract
 from nerfro.samplers.straight import straight_path
 from nerfro.types import Path, Rays
 
-# The shortest step of the search for a surface, as a share of the box's shortest side: thinner sheets are overlooked.
-_MIN_STEP = 2e-4
 _ROOT_ITERATIONS = 60
 
 
@@ -86,7 +85,7 @@ class Snell(PathSampler):
                 raise NerfroError("sampler.path.interface=mesh needs a medium made of a mesh; take medium=sdf_grid")
             return SnellTrace(*snell_on_mesh(rays, medium, self.max_events))
         if isinstance(medium, SdfGrid) and rays.origins.device.type == "cpu":
-            return SnellTrace(*snell_on_grid(rays, medium, _MIN_STEP, self.max_events))
+            return SnellTrace(*snell_on_grid(rays, medium, MIN_SEARCH_STEP, self.max_events))
         return SnellTrace(*trace_interfaces(rays, medium, self.max_events))
 
 
@@ -110,7 +109,7 @@ def trace_interfaces(rays: Rays, medium: Solid, max_events: int) -> tuple[Path, 
     x[active] += jump[:, None] * d[active]
     s[active] += jump
     inside = medium.signed_distances(x)[0] < 0
-    min_step = _MIN_STEP * float((medium.box[1] - medium.box[0]).min())
+    min_step = MIN_SEARCH_STEP * float((medium.box[1] - medium.box[0]).min())
     while len(active):
         _, leave = intersect_box(medium.box, x[active], d[active])
         limit = torch.minimum(leave, rays.far[active] - s[active])

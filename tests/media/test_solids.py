@@ -93,8 +93,8 @@ def test_coarse_clearance_is_a_lower_bound() -> None:
     radius = positions.norm(dim=-1)
     exact = torch.minimum((radius - 0.9).abs(), (radius - 0.5).abs())
     assert (coarse <= exact + 1e-6).all()
-    # Short by the diagonals of a block and half a cell, at most.
-    assert (coarse >= exact - 3**0.5 * (block + 0.5 * 3 / 42) - 1e-6).all()
+    # Short by the diagonals of a block and a cell, at most.
+    assert (coarse >= exact - 3**0.5 * (block + 3 / 42) - 1e-6).all()
 
 
 def test_mesh_becomes_a_distance_that_is_smooth_where_the_mesh_is(tmp_path: Path) -> None:
