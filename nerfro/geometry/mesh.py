@@ -18,10 +18,12 @@ class TriangleMesh:
     Attributes:
         vertices: corner positions.
         faces: vertex indices of each triangle.
+        normals: unit normals at the corners of the triangles, where the file has normals of its own.
     """
 
     vertices: Float[np.ndarray, "V 3"]
     faces: Int[np.ndarray, "F 3"]
+    normals: Float[np.ndarray, "F 3 3"] | None = None
 
     @property
     def triangles(self) -> Float[np.ndarray, "F 3 3"]:
@@ -54,7 +56,9 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
     if not path.is_file():
         raise NerfroError(f"mesh {path} does not exist; set medium.mesh to a closed triangle mesh (ply, obj, stl, glb)")
     try:
-        loaded = trimesh.load(path, force="mesh", process=False)
+        loaded = trimesh.load(path, process=False)
+        if isinstance(loaded, trimesh.Scene):  # several bodies, or one in a format for scenes
+            loaded = loaded.to_mesh()
     except Exception as error:  # trimesh's readers raise whatever their parsers do
         raise NerfroError(f"mesh {path} cannot be read ({error}); export it as ply, obj, stl or glb") from error
     vertices = np.asarray(getattr(loaded, "vertices", ()), np.float64)
@@ -63,7 +67,9 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
         raise NerfroError(f"mesh {path} has no triangles; export a surface, not a point cloud or a scene without one")
     if not np.isfinite(vertices).all():
         raise NerfroError(f"mesh {path} has vertices that are not finite; export it again")
-    mesh = merge_vertices(vertices, faces)
+    # trimesh computes normals on demand; in its cache before anybody asked are only those that were read.
+    read = loaded.vertex_normals if "vertex_normals" in loaded._cache else None
+    mesh = merge_vertices(vertices, faces, None if read is None else _unit(np.asarray(read, np.float64))[faces])
     if not accept_open_mesh and not mesh.is_closed:
         raise NerfroError(
             f"mesh {path} is not watertight, so its inside is not defined; close its holes, "
@@ -72,9 +78,20 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
     return mesh
 
 
-def merge_vertices(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> TriangleMesh:
+def merge_vertices(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    normals: Float[np.ndarray, "F 3 3"] | None = None,
+) -> TriangleMesh:
     """Unite vertices at equal positions (texture seams and STL files repeat them) and drop collapsed triangles."""
     unique, inverse = np.unique(vertices, axis=0, return_inverse=True)
     merged = inverse.reshape(-1)[faces]
     distinct = (merged[:, 0] != merged[:, 1]) & (merged[:, 1] != merged[:, 2]) & (merged[:, 2] != merged[:, 0])
-    return TriangleMesh(unique, merged[distinct])
+    return TriangleMesh(unique, merged[distinct], None if normals is None else normals[distinct])
+
+
+def _unit(vectors: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
+    """Vectors of length one; zero where there is none or it is not finite."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    valid = np.isfinite(length) & (length > 0)
+    return np.divide(vectors, length, out=np.zeros_like(vectors), where=valid)

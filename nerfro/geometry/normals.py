@@ -19,8 +19,9 @@ def face_normals(mesh: TriangleMesh) -> Float[np.ndarray, "F 3"]:
 def corner_normals(mesh: TriangleMesh, crease_degrees: float = 30.0) -> Float[np.ndarray, "F 3 3"]:
     """Unit normal at each corner of each triangle, smooth over the vertex up to creases.
 
-    It is the mean normal of the faces around the vertex whose normals are within the crease angle of the corner's own
-    face, with the weights |e1 x e2| / (|e1|^2 |e2|^2), e the edges at the vertex, which are exact for spheres.
+    The mesh's own normals are taken where it has them and they lie within the crease angle of the face. Else it is the
+    mean normal of the faces around the vertex whose normals are within the crease angle of the corner's own face, with
+    the weights |e1 x e2| / (|e1|^2 |e2|^2), e the edges at the vertex, which are exact for spheres.
 
     Args:
         mesh: triangles.
@@ -49,4 +50,9 @@ def corner_normals(mesh: TriangleMesh, crease_degrees: float = 30.0) -> Float[np
     sums = np.stack([np.bincount(first, contribution[:, axis], len(corner_vertex)) for axis in range(3)], -1)
     length = np.linalg.norm(sums, axis=1, keepdims=True)
     own = np.repeat(normals, 3, axis=0)
-    return np.where(length > 0, sums / np.where(length > 0, length, 1), own).reshape(-1, 3, 3)
+    smoothed = np.where(length > 0, sums / np.where(length > 0, length, 1), own).reshape(-1, 3, 3)
+    if mesh.normals is None:
+        return smoothed
+    # Averages tilt where large flat triangles meet small round ones; a modeller's normals do not.
+    trusted = (mesh.normals * normals[:, None]).sum(-1, keepdims=True) >= np.cos(np.radians(crease_degrees))
+    return np.where(trusted, mesh.normals, smoothed)

@@ -178,7 +178,8 @@ def _cached_distance(
     crease_degrees: float,
     cache: bool,
 ) -> Float[np.ndarray, "X Y Z"]:
-    key = "distance_" + content_hash(_VERSION, mesh.vertices, mesh.faces, box, resolution, band, crease_degrees)
+    normals = "none" if mesh.normals is None else mesh.normals
+    key = "distance_" + content_hash(_VERSION, mesh.vertices, mesh.faces, normals, box, resolution, band, crease_degrees)
     arrays = cached_arrays(
         key, lambda: {"distance": signed_distance_grid(mesh, box, resolution, band, crease_degrees)}, cache
     )
