@@ -1,6 +1,6 @@
 """The README's table and picture grid: every method on the embedded scene, trained for the same time, one by one.
 
-    python benchmarks/comparison.py 00:00:05:00
+    python benchmarks/comparison.py 00:00:04:00
 
 writes outputs/comparison/<method>/ (finished runs are kept), docs/images/comparison.png and docs/comparison.md.
 """
@@ -32,7 +32,7 @@ RUNS = ROOT / "outputs" / "comparison"
 
 def main() -> None:
     """Train what is not trained yet, then draw and tabulate."""
-    max_time = sys.argv[1] if len(sys.argv) > 1 else "00:00:05:00"
+    max_time = sys.argv[1] if len(sys.argv) > 1 else "00:00:04:00"
     for name in METHODS:
         folder = RUNS / name
         if not (folder / "metrics.json").exists():

@@ -22,7 +22,7 @@ class EnvironmentMap(Boundary):
     It starts as an even grey, or as the given picture. There is no preferred axis; lat-long pictures have z up.
 
     Args:
-        resolutions: texels along a face's side (90 degrees) of each level; the default's finest texel is 0.7 degrees.
+        resolutions: texels along a face's side (90 degrees) of each level; the default's finest texel is 0.35 degrees.
         image: lat-long picture to start from (.png, .jpg, .hdr or .exr); none for grey.
     """
 
@@ -30,7 +30,7 @@ class EnvironmentMap(Boundary):
 
     def __init__(
         self,
-        resolutions: list[int] = (4, 8, 16, 32, 64, 128),  # type: ignore[assignment]
+        resolutions: list[int] = (4, 8, 16, 32, 64, 128, 256),  # type: ignore[assignment]
         image: str | None = None,
     ) -> None:
         super().__init__()
