@@ -7,6 +7,9 @@ from jaxtyping import Float
 
 from nerfro.geometry.mesh import TriangleMesh
 
+# Ratio of the largest to the smallest triangle around a vertex from which on the large one decides.
+_UNEVEN = 8.0
+
 
 def face_normals(mesh: TriangleMesh) -> Float[np.ndarray, "F 3"]:
     """Unit normals by the right-hand rule; zero for triangles without area."""
@@ -21,7 +24,9 @@ def corner_normals(mesh: TriangleMesh, crease_degrees: float = 30.0) -> Float[np
 
     The mesh's own normals are taken where it has them and they lie within the crease angle of the face. Else it is the
     mean normal of the faces around the vertex whose normals are within the crease angle of the corner's own face, with
-    the weights |e1 x e2| / (|e1|^2 |e2|^2), e the edges at the vertex, which are exact for spheres.
+    the weights |e1 x e2| / (|e1|^2 |e2|^2), e the edges at the vertex, which are exact for spheres. Where a large face
+    meets much smaller ones, as a flat side meets its rounded edge, the weights are the areas instead: there the large
+    face knows the normal.
 
     Args:
         mesh: triangles.
@@ -46,7 +51,12 @@ def corner_normals(mesh: TriangleMesh, crease_degrees: float = 30.0) -> Float[np
     within = np.arange(runs.sum()) - np.repeat(np.cumsum(runs) - runs, runs)
     second = order[np.repeat(starts[corner_vertex], runs) + within]
     smooth = (normals[first // 3] * normals[second // 3]).sum(1) >= np.cos(np.radians(crease_degrees))
-    contribution = normals[second // 3] * (weights.reshape(-1)[second] * smooth)[:, None]
+    area = areas.reshape(-1)
+    fan_areas = np.where(smooth, area[second], area[first])
+    fans = np.cumsum(runs) - runs
+    uneven = np.maximum.reduceat(fan_areas, fans) > _UNEVEN * np.minimum.reduceat(fan_areas, fans)
+    weight = np.where(uneven[first], area[second], weights.reshape(-1)[second]) * smooth
+    contribution = normals[second // 3] * weight[:, None]
     sums = np.stack([np.bincount(first, contribution[:, axis], len(corner_vertex)) for axis in range(3)], -1)
     length = np.linalg.norm(sums, axis=1, keepdims=True)
     own = np.repeat(normals, 3, axis=0)

@@ -12,7 +12,15 @@ from numba import prange
 
 from nerfro.geometry.tolerances import MIN_COSINE, MIN_NORMAL_PART, MIN_TURN, REACHED
 from nerfro.kernels.compilation import compiled, compiled_parallel
-from nerfro.kernels.lookup import block_clearance, box_span, put_vertex, repeat_last, solid_index, voxel_index
+from nerfro.kernels.lookup import (
+    block_clearance,
+    box_span,
+    put_vertex,
+    repeat_last,
+    solid_clearance,
+    solid_index,
+    voxel_index,
+)
 
 EULER, LEAPFROG, RK4 = 0, 1, 2
 
@@ -163,6 +171,8 @@ def march_adaptive(
                 if not known:
                     # Blocks are cheap to ask; only near a surface the index itself is looked up.
                     free = block_clearance(clearance, low, inverse_block, x, y, z) - shell
+                    if free <= skip and coefficients.shape[0] > 0:
+                        free = solid_clearance(coefficients, shell, low, inverse_spacing, x, y, z)
                     if free <= skip:
                         n, gx, gy, gz, free = _look_up(
                             table, clearance, coefficients, iors, shell, low, inverse_spacing, x, y, z

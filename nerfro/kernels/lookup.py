@@ -71,6 +71,16 @@ def spline_value_gradient(coefficients, low, inverse_spacing, x, y, z):
 
 
 @compiled
+def solid_clearance(coefficients, shell, low, inverse_spacing, x, y, z):
+    """Most of the distance to the nearest shell of nested bodies (`media.solid`)."""
+    clearance = math.inf
+    for body in range(coefficients.shape[0]):
+        phi = spline_value(coefficients[body], low, inverse_spacing, x, y, z)
+        clearance = min(clearance, SAFE_SHARE * abs(phi) - shell)
+    return max(clearance, 0.0)
+
+
+@compiled
 def solid_index(coefficients, iors, shell, low, inverse_spacing, x, y, z):
     """Index, its gradient and the clearance of nested bodies with smooth shells (`media.solid`)."""
     n, gx, gy, gz, clearance = 1.0, 0.0, 0.0, 0.0, math.inf

@@ -26,7 +26,7 @@ _BAND = 3.0
 # Cells a side of the blocks in which rays look up how far they may jump before they look up distances themselves.
 BLOCK = 4
 # Part of the cache's key: raise it when the same mesh and settings give other distances than before.
-_VERSION = 2
+_VERSION = 3
 
 
 @register("medium", "sdf_grid")
@@ -179,7 +179,9 @@ def _cached_distance(
     cache: bool,
 ) -> Float[np.ndarray, "X Y Z"]:
     normals = "none" if mesh.normals is None else mesh.normals
-    key = "distance_" + content_hash(_VERSION, mesh.vertices, mesh.faces, normals, box, resolution, band, crease_degrees)
+    key = "distance_" + content_hash(
+        _VERSION, mesh.vertices, mesh.faces, normals, box, resolution, band, crease_degrees
+    )
     arrays = cached_arrays(
         key, lambda: {"distance": signed_distance_grid(mesh, box, resolution, band, crease_degrees)}, cache
     )

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerfro.kernels.threads import use_threads
@@ -79,16 +79,25 @@ def eikonal_on_grid(
 
 def uniform_on_grid(rays: Rays, medium: VoxelGrid, integrator: str, num_steps: int) -> Path:
     """`samplers.eikonal.march_uniform` by the compiled kernel."""
+    *vertices, refracted = _march_uniform(rays, medium, integrator, num_steps, keep_all=True)
+    return _path(rays, tuple(vertices), torch.from_numpy(refracted))
+
+
+def uniform_exit_on_grid(rays: Rays, medium: VoxelGrid, integrator: str, num_steps: int) -> Float[Tensor, "R 3"]:
+    """Exit directions alone of `uniform_on_grid`, without the memory of all vertices."""
+    return torch.from_numpy(_march_uniform(rays, medium, integrator, num_steps, keep_all=False)[1][:, 0])
+
+
+def _march_uniform(
+    rays: Rays, medium: VoxelGrid, integrator: str, num_steps: int, keep_all: bool
+) -> tuple[np.ndarray, ...]:
     from nerfro.kernels import eikonal
 
     code = {"euler": eikonal.EULER, "leapfrog": eikonal.LEAPFROG, "rk4": eikonal.RK4}[integrator]
     use_threads()
     low, _, inverse_spacing = _frame(medium.box, medium.table.shape[:3])
-    origins, directions, near, far = _arrays(rays)
-    *vertices, refracted = eikonal.march_uniform(
-        origins, directions, near, far, medium.table.numpy(), low, inverse_spacing, code, num_steps, True
-    )
-    return _path(rays, tuple(vertices), torch.from_numpy(refracted))
+    table = medium.table.numpy()
+    return eikonal.march_uniform(*_arrays(rays), table, low, inverse_spacing, code, num_steps, keep_all)
 
 
 def _with_enough_vertices(rays: Rays, kernel, settings: tuple) -> tuple[tuple, tuple]:

@@ -1,0 +1,293 @@
+"""How exact and how fast rays are traced: `python benchmarks/tracing.py`, about five minutes on two cores.
+
+Prints the tables of docs/benchmarks.md as Markdown. Every error is against a closed form or an independent tracer,
+every speed is the best of several passes that alternate between the samplers, in one process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from rounded_cube import trace_rounded_cube
+from torch import Tensor
+
+from nerfro.data.cameras import Cameras
+from nerfro.geometry.cache import cache_dir
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.shapes import Ball, RoundedBox
+from nerfro.media.voxel_grid import VoxelGrid
+from nerfro.samplers.compiled import uniform_exit_on_grid
+from nerfro.samplers.eikonal import Eikonal
+from nerfro.samplers.path_cache import PathCache
+from nerfro.samplers.snell import Snell
+from nerfro.types import Rays
+
+RADIUS, N_BALL = 0.8, 1.5
+HALF_SIDE, EDGE, N_CUBE = 0.75, 0.08, 1.52
+NEAR, FAR = 2.0, 6.0
+NUM_EULER_STEPS = 768
+BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
+CHUNK = 8192  # rays at once, as in evaluation
+SIDE = 400
+BINS = (("b/R < .5", 0.0, 0.5), (".5 to .8", 0.5, 0.8), (".8 to .95", 0.8, 0.951))
+
+Trace = Callable[[Rays], Tensor]
+
+
+def main() -> None:
+    """Print all tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--resolution", type=int, default=256, help="of the signed-distance grids")
+    parser.add_argument("--euler-resolution", type=int, default=512, help="of the paper's voxel grid (authors: 512)")
+    arguments = parser.parse_args()
+    torch.set_grad_enabled(False)
+    with tempfile.TemporaryDirectory() as folder:
+        ball, cube = Path(folder) / "ball.ply", Path(folder) / "cube.ply"
+        sphere = trimesh.creation.icosphere(6, RADIUS)
+        sphere.export(ball)
+        rounded_cube_mesh().export(cube)
+        print(f"{torch.get_num_threads()} threads; ball of {len(sphere.faces)} faces\n")
+        start = time.perf_counter()
+        voxels = VoxelGrid(str(ball), N_BALL, arguments.euler_resolution, cache=False)
+        built = time.perf_counter()
+        mesh_ball = SdfGrid(str(ball), N_BALL, resolution=arguments.resolution, cache=False)
+        print(
+            f"building from the mesh: {arguments.euler_resolution}^3 voxel grid {built - start:.1f} s, "
+            f"{arguments.resolution}^3 signed distance {time.perf_counter() - built:.1f} s (compilation included)\n"
+        )
+        mesh_cube = SdfGrid(str(cube), N_CUBE, resolution=arguments.resolution, cache=False)
+        sphere_errors(voxels, mesh_ball, arguments.resolution)
+        cube_errors(mesh_cube, arguments.resolution)
+        coarse = VoxelGrid(str(ball), N_BALL, arguments.resolution, cache=False)
+        speed([voxels, coarse], {"sphere": mesh_ball, "cube": mesh_cube})
+        cached_paths(mesh_ball)
+    print("\nGPU: not measured, there was none.")
+
+
+def sphere_errors(voxels: VoxelGrid, mesh_ball: SdfGrid, resolution: int) -> None:
+    """Error of the exit direction against 2 (asin(b / R) - asin(b / (n R))), 4000 rays of random directions."""
+    num = 4000
+    generator = np.random.default_rng(0)
+    d = generator.normal(size=(num, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    u = np.cross(d, generator.normal(size=(num, 3)))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    share = np.linspace(0, 0.95, num)
+    deviation = 2 * (np.arcsin(share) - np.arcsin(share / N_BALL))[:, None]
+    exact = torch.from_numpy(d * np.cos(deviation) - u * np.sin(deviation))
+    rays = make_rays(u * share[:, None] * RADIUS - 4 * d, d)
+
+    analytic = Ball(RADIUS, N_BALL).double()
+    exact_grid = SdfGrid.from_distances(grid_distances(analytic, resolution), BOX, [N_BALL], mesh_ball.shell)
+    rows: list[tuple[str, Trace, tuple[float, ...] | None]] = [
+        (f"euler, {NUM_EULER_STEPS} steps, {voxels.table.shape[0]}^3 voxels 9/1 (the paper's)", euler(voxels), None),
+        (f"eikonal, {resolution}^3 signed distance", exits(Eikonal(), exact_grid), (0.05, 0.15, 1.0)),
+        (f"eikonal, {resolution}^3 signed distance of the mesh", exits(Eikonal(), mesh_ball), (0.05, 0.15, 1.0)),
+        ("snell, analytic signed distance", exits(Snell(), analytic), (0.001, 0.001, 0.001)),
+        (f"snell, {resolution}^3 signed distance", exits(Snell(), exact_grid), (0.02, 0.05, 0.2)),
+        (f"snell, {resolution}^3 signed distance of the mesh", exits(Snell(), mesh_ball), (0.02, 0.05, 0.2)),
+        ("snell, mesh", exits(Snell("mesh"), mesh_ball), (0.02, 0.05, 0.2)),
+    ]
+    print(f"### Exit direction behind a glass ball (R {RADIUS}, n {N_BALL}), degrees: median (maximum)\n")
+    print("| sampler | " + " | ".join(name for name, _, _ in BINS) + " | bound on the median | met |")
+    print("|---|---|---|---|---|---|")
+    for name, trace, bounds in rows:
+        error = angles(trace(rays), exact)
+        chosen = [error[(share >= low) & (share < high)] for _, low, high in BINS]
+        cells = [f"{np.median(part):.4f} ({part.max():.3f})" for part in chosen]
+        met = "" if bounds is None else verdict(all(np.median(p) <= b for p, b in zip(chosen, bounds, strict=True)))
+        limit = "" if bounds is None else " / ".join(f"{bound:g}" for bound in bounds)
+        print(f"| {name} | {' | '.join(cells)} | {limit} | {met} |", flush=True)
+
+
+def cube_errors(mesh_cube: SdfGrid, resolution: int) -> None:
+    """Error of the exit direction behind the rounded cube against the independent tracer.
+
+    A ray is well-conditioned when neighbours 1e-4 units beside it see as many reflections and leave within 0.5 degrees.
+    """
+    num = 1500
+    generator = np.random.default_rng(1)
+    d = generator.normal(size=(num, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    x = generator.uniform(-0.7, 0.7, (num, 3)) - 3.5 * d
+    side = np.cross(d, generator.normal(size=(num, 3)))
+    side *= 1e-4 / np.linalg.norm(side, axis=1, keepdims=True)
+    shape = (HALF_SIDE, EDGE, N_CUBE)
+    traces = [
+        [trace_rounded_cube(p, q, *shape) for p, q in zip(start, d, strict=True)] for start in (x, x + side, x - side)
+    ]
+    exact, beside, opposite = (np.stack([direction for direction, _ in trace]) for trace in traces)
+    bounces = np.array([[count for _, count in trace] for trace in traces])
+    same = (bounces == bounces[0]).all(0) & (bounces[0] >= 0) & (bounces[0] <= 3)
+    moved = np.maximum(angles(torch.from_numpy(beside), torch.from_numpy(exact)),
+                       angles(torch.from_numpy(opposite), torch.from_numpy(exact)))  # fmt: skip
+    sound = same & (moved < 0.5)
+    rays = make_rays(x, d, near=0.0, far=14.0)  # reflected paths are long
+    analytic = RoundedBox(HALF_SIDE, EDGE, N_CUBE).double()
+    grid = SdfGrid.from_distances(grid_distances(analytic, resolution), BOX, [N_CUBE], mesh_cube.shell)
+    print(
+        f"\n### Exit direction behind a rounded glass cube (half side {HALF_SIDE}, edge {EDGE}, n {N_CUBE}), degrees\n"
+    )
+    print(f"{sound.sum()} of {(bounces[0] >= 0).sum()} rays are well-conditioned with at most 3 total reflections, "
+          f"{(sound & (bounces[0] > 0)).sum()} of them with any.\n")  # fmt: skip
+    print("| sampler | median | 95th percentile | bound | met |\n|---|---|---|---|---|")
+    for name, trace in (
+        ("snell, analytic signed distance", exits(Snell(), analytic)),
+        (f"snell, {resolution}^3 signed distance", exits(Snell(), grid)),
+        (f"snell, {resolution}^3 signed distance of the mesh", exits(Snell(), mesh_cube)),
+        ("snell, mesh", exits(Snell("mesh"), mesh_cube)),
+        (f"eikonal, {resolution}^3 signed distance", exits(Eikonal(), grid)),
+    ):
+        error = angles(trace(rays), torch.from_numpy(exact))[sound]
+        median, high = np.median(error), np.quantile(error, 0.95)
+        met = verdict(median <= 0.02 and high <= 0.5) if name.startswith("snell") else ""
+        bound = "0.02 / 0.5" if name.startswith("snell") else ""
+        print(f"| {name} | {median:.5f} | {high:.4f} | {bound} | {met} |", flush=True)
+
+
+def speed(baselines: list[VoxelGrid], solids: dict[str, SdfGrid]) -> None:
+    """Rays per second over all rays of a view, against Euler steps in the same kind of compiled kernel.
+
+    Euler's cost does not depend on the object; a smaller grid is faster, because more of it stays in the CPU's caches.
+    """
+    print(f"\n### All {SIDE}x{SIDE} rays of a view, {CHUNK} at once\n")
+    print("| object | sampler | ms | million rays/s | against the faster euler | bound | met |")
+    print("|---|---|---|---|---|---|---|")
+    rays = view().image_rays(0)
+    for scene, solid in solids.items():
+        rows: list[tuple[str, Trace, float]] = [
+            *((f"euler, {NUM_EULER_STEPS} steps, {grid.table.shape[0]}^3", euler(grid), 0.0) for grid in baselines),
+            ("eikonal", exits(Eikonal(), solid), 10.0),
+            ("snell", exits(Snell(), solid), 20.0),
+        ]
+        best = [math.inf] * len(rows)
+        for _ in range(4):  # the first pass warms up; it can only be slower
+            for i, (_, trace, _) in enumerate(rows):
+                start = time.perf_counter()
+                for first in range(0, len(rays), CHUNK):
+                    trace(rays[first : first + CHUNK])
+                best[i] = min(best[i], time.perf_counter() - start)
+        baseline = min(best[: len(baselines)])
+        for (name, _, bound), seconds in zip(rows, best, strict=True):
+            ratio = baseline / seconds
+            limit, met = (f"{bound:g}x", verdict(ratio >= bound)) if bound else ("", "")
+            rate = len(rays) / seconds / 1e6
+            print(
+                f"| {scene} | {name} | {1e3 * seconds:.0f} | {rate:.2f} | {ratio:.1f}x | {limit} | {met} |", flush=True
+            )
+
+
+def cached_paths(solid: SdfGrid) -> None:
+    """Time to get the paths of a training batch, from the cache and live."""
+    camera, batch = view(), 1024
+    rays = camera.image_rays(0)
+    index = torch.randint(0, SIDE * SIDE, (batch,))
+    chosen = rays[index]
+    print(f"\n### Paths of {batch} random rays of that view (sphere)\n")
+    print("| sampler | live, ms | cached, ms | bytes of cache per ray of the view |\n|---|---|---|---|")
+    for name, sampler in (("snell", Snell()), ("eikonal", Eikonal())):
+        cache = PathCache.build(sampler, solid, camera)
+        live = best_time(lambda s=sampler: s(chosen, solid))
+        warm = best_time(lambda c=cache: c(index, chosen))
+        size = (cache.vertices.numel() * 4 + cache.starts.numel() * 8) / (SIDE * SIDE)
+        print(f"| {name} | {1e3 * live:.2f} | {1e3 * warm:.2f} | {size:.0f} |", flush=True)
+    for file in cache_dir().glob("paths_*"):
+        if file.stat().st_mtime > time.time() - 60:
+            file.unlink()
+
+
+def best_time(function: Callable[[], object], repetitions: int = 50) -> float:
+    """Seconds of the fastest of many calls."""
+    best = math.inf
+    for _ in range(repetitions):
+        start = time.perf_counter()
+        function()
+        best = min(best, time.perf_counter() - start)
+    return best
+
+
+def exits(sampler: Eikonal | Snell, medium: torch.nn.Module) -> Trace:
+    """Exit directions by a sampler."""
+    return lambda rays: sampler(rays, medium).exit_directions
+
+
+def euler(voxels: VoxelGrid) -> Trace:
+    """Exit directions by the paper's tracker; only the last vertex is written, which flatters its speed."""
+    return lambda rays: uniform_exit_on_grid(rays, voxels, "euler", NUM_EULER_STEPS)
+
+
+def make_rays(origins: np.ndarray, directions: np.ndarray, near: float = NEAR, far: float = FAR) -> Rays:
+    """Rays in double precision."""
+    ones = torch.ones(len(origins), dtype=torch.float64)
+    return Rays(torch.from_numpy(origins), torch.from_numpy(directions), 0 * ones, near * ones, far * ones)
+
+
+def grid_distances(shape: Ball | RoundedBox, resolution: int) -> Tensor:
+    """A shape's signed distance at the vertices of a grid."""
+    axis = torch.linspace(-1.5, 1.5, resolution, dtype=torch.float64)
+    planes = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1)
+    slices = [torch.cat([torch.full_like(planes[..., :1], float(x)), planes], -1) for x in axis]
+    return torch.stack([shape.signed_distances(points)[0][..., 0].float() for points in slices])[None]
+
+
+def rounded_cube_mesh(per_edge: int = 24, per_face: int = 8) -> trimesh.Trimesh:
+    """A rounded cube with fine facets on edges and corners and coarse ones on the faces."""
+    inner = HALF_SIDE - EDGE
+    # Tangents spaced evenly in angle over the rounding, and evenly over the flat part.
+    bend = inner + EDGE * np.tan(np.linspace(0, np.pi / 4, per_edge + 1)[1:])
+    flat = np.linspace(-inner, inner, per_face + 1)
+    line = np.concatenate([-bend[::-1], flat, bend])
+    u, v = np.meshgrid(line, line, indexing="ij")
+    square = np.stack([u, v, np.full_like(u, inner + EDGE)], -1).reshape(-1, 3)
+    size = len(line)
+    corner = (np.arange(size - 1)[:, None] * size + np.arange(size - 1)).reshape(-1)
+    faces = np.concatenate([
+        np.stack([corner, corner + size, corner + size + 1], -1),
+        np.stack([corner, corner + size + 1, corner + 1], -1),
+    ])  # fmt: skip
+    sides = []
+    for axis in range(3):
+        for sign in (1, -1):
+            rotation = np.roll(np.eye(3), axis, axis=1) * sign
+            rotation[0] *= sign * sign * np.sign(np.linalg.det(rotation))
+            sides.append(trimesh.Trimesh(square @ rotation, faces, process=False))
+    cube = trimesh.util.concatenate(sides)
+    centre = cube.vertices.clip(-inner, inner)
+    outward = cube.vertices - centre
+    cube.vertices = np.round(centre + EDGE * outward / np.linalg.norm(outward, axis=1, keepdims=True), 9)
+    cube.merge_vertices()
+    cube.fix_normals()
+    return cube
+
+
+def view() -> Cameras:
+    """A camera as in the synthetic scenes: 39.6 degrees wide, 4.03 units from the origin."""
+    z = np.array([0.5, 0.6, 0.62]) / np.linalg.norm([0.5, 0.6, 0.62])
+    x = np.cross([0.0, 0.0, 1.0], z)
+    x /= np.linalg.norm(x)
+    pose = torch.from_numpy(np.stack([x, np.cross(z, x), z, 4.03 * z], -1)[None]).float()
+    focal, centre = torch.tensor([0.5 * SIDE / math.tan(0.5 * 0.6911)]), torch.tensor([SIDE / 2])
+    return Cameras(pose, focal, focal, centre, centre, SIDE, SIDE, NEAR, FAR)
+
+
+def angles(a: Tensor, b: Tensor) -> np.ndarray:
+    """Angles between unit vectors in degrees, exact for small ones."""
+    half_chord = 0.5 * torch.linalg.vector_norm(a.double() - b.double(), dim=-1)
+    return torch.rad2deg(2 * torch.asin(half_chord.clamp(max=1))).numpy()
+
+
+def verdict(met: bool) -> str:
+    """A table cell."""
+    return "yes" if met else "**no**"
+
+
+if __name__ == "__main__":
+    main()
