@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -56,7 +57,7 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
     if not path.is_file():
         raise NerfroError(f"mesh {path} does not exist; set medium.mesh to a closed triangle mesh (ply, obj, stl, glb)")
     try:
-        loaded = trimesh.load(path, process=False)
+        loaded: Any = trimesh.load(path, process=False)
         if isinstance(loaded, trimesh.Scene):  # several bodies, or one in a format for scenes
             loaded = loaded.to_mesh()
     except Exception as error:  # trimesh's readers raise whatever their parsers do

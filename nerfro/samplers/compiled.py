@@ -96,8 +96,9 @@ def _march_uniform(
     code = {"euler": eikonal.EULER, "leapfrog": eikonal.LEAPFROG, "rk4": eikonal.RK4}[integrator]
     use_threads()
     low, _, inverse_spacing = _frame(medium.box, medium.table.shape[:3])
+    origins, directions, near, far = _arrays(rays)
     table = medium.table.numpy()
-    return eikonal.march_uniform(*_arrays(rays), table, low, inverse_spacing, code, num_steps, keep_all)
+    return eikonal.march_uniform(origins, directions, near, far, table, low, inverse_spacing, code, num_steps, keep_all)
 
 
 def _with_enough_vertices(rays: Rays, kernel, settings: tuple) -> tuple[tuple, tuple]:
