@@ -11,7 +11,7 @@ from pathlib import Path
 import lightning.pytorch as pl
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
-from lightning.pytorch.loggers import Logger
+from lightning.pytorch.loggers import Logger, WandbLogger
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.callbacks import ConfigInCheckpoint, StopOnSignal, Throughput, TrainingProgress, ValidationImages
@@ -82,6 +82,9 @@ def main(config: DictConfig) -> None:
     datamodule = RayDataModule(batches, validation, config.evaluation.every)
     trainer.fit(model, datamodule=datamodule, ckpt_path=checkpoint, weights_only=True)
     trainer.save_checkpoint(folder / LAST_CHECKPOINT)
+    for logger in trainer.loggers:
+        if isinstance(logger, WandbLogger):  # or the next job of a sweep would go on with this one's log
+            logger.experiment.finish()
     if interruption.received:
         command = f"hydra.run.dir={folder} ckpt_path=last"
         print(f"nerfro: interrupted after step {trainer.global_step} and saved; to go on, repeat it with {command}")
