@@ -10,11 +10,13 @@ from typing import Any, Optional
 from omegaconf import MISSING, DictConfig
 
 from nerfro.errors import NerfroError
+from nerfro.geometry.mesh import load_mesh
 from nerfro.losses.base import Loss
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.models.base import NerfModel, Parts
 from nerfro.models.optimizer import OptimizerConfig
+from nerfro.paths import resolve_path
 from nerfro.registry import build, configure, find
 
 
@@ -198,6 +200,13 @@ def build_model(config: DictConfig) -> NerfModel:
 def _settle_content(config: DictConfig, medium: Medium) -> None:
     if (config.content.box_min is None) != (config.content.box_max is None):
         raise NerfroError("content: give both box_min and box_max, or neither for the bounds of the object")
-    if config.content.box_min is None and not isinstance(medium, Vacuum):
-        low, high = medium.content_box.tolist()
-        config.content.box_min, config.content.box_max = ([round(x, 6) for x in corner] for corner in (low, high))
+    if config.content.box_min is not None:
+        return
+    if not isinstance(medium, Vacuum):
+        box = medium.content_box.tolist()
+    elif "mesh" in config.medium and resolve_path(config.medium.mesh).is_file():
+        # Straight rays need no medium, but a baseline is told where the object is, as ours is.
+        box = load_mesh(resolve_path(config.medium.mesh), accept_open_mesh=True).bounds.tolist()
+    else:
+        return
+    config.content.box_min, config.content.box_max = ([round(x, 6) for x in corner] for corner in box)
