@@ -37,12 +37,12 @@ def plot_paths(axes: Axes, path: Path, medium: Medium, colour: str = "tab:red") 
 
     The plane goes through the centre of the medium's box. Rays outside it are drawn by their projection.
     """
-    centre = medium.box.mean(0)
+    centre = medium.box.mean(0).to(path.positions)
     across, up = _plane(path.positions, centre)
     half = (0.5 + _MARGIN) * float((medium.box[1] - medium.box[0]).max())
-    steps = torch.linspace(-half, half, _RESOLUTION)
+    steps = torch.linspace(-half, half, _RESOLUTION).to(centre)
     points = centre + steps[None, :, None] * across + steps[:, None, None] * up
-    n = torch.cat([medium(rows)[0] for rows in points.split(50)])
+    n = torch.cat([medium(rows)[0] for rows in points.to(medium.box).split(50)])
     extent = (-half, half, -half, half)
     axes.imshow(n, cmap="Blues", vmin=1, vmax=2 * float(n.max()) - 1, extent=extent, origin="lower")
     for positions in path.positions:
