@@ -15,11 +15,23 @@ def _mesh(shape: trimesh.Trimesh) -> TriangleMesh:
 
 def test_normals_of_an_irregular_sphere_are_exact() -> None:
     # Max's weights are exact when a vertex and its neighbours lie on one sphere, however unevenly.
-    points = np.random.default_rng(0).normal(size=(150, 3))
+    points = trimesh.creation.icosphere(2).vertices + 0.04 * np.random.default_rng(0).normal(size=(162, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     mesh = _mesh(trimesh.convex.convex_hull(points))
     normals = corner_normals(mesh, crease_degrees=180.0)
     np.testing.assert_allclose(normals, mesh.triangles, atol=1e-9)
+
+
+def test_large_flat_faces_decide_the_normals_at_their_rims() -> None:
+    # A cube with narrow chamfers of 22 degrees around its top, as a modeller would round it.
+    corners = [
+        (x, y, z) for z, half in ((0.0, 1.0), (0.9, 1.0), (0.92, 0.95)) for x in (-half, half) for y in (-half, half)
+    ]
+    mesh = _mesh(trimesh.convex.convex_hull(np.array(corners)).subdivide().subdivide())
+    top = np.isclose(mesh.triangles[..., 2], 0.92).all(1)
+    normals = corner_normals(mesh, crease_degrees=45.0)
+    tilt = np.degrees(np.arccos(normals[top][..., 2].clip(-1, 1)))
+    assert tilt.max() < 2.0
 
 
 def test_creases_split_normals() -> None:
