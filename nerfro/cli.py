@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nerfro.errors import NerfroError
 from nerfro.paths import CONF_DIR
-from nerfro.registry import discover
+from nerfro.registry import discover, fields_of_config
 
 EXIT_INTERRUPTED = 130
 
@@ -81,7 +82,9 @@ def _messages(error: BaseException) -> list[str]:
     cause = error.__cause__
     if cause is not None and isinstance(cause, OmegaConfBaseException):
         lines += [line.strip() for line in str(cause).splitlines() if line.strip() and line.strip() not in lines]
-    return lines
+    refused = re.search(r"not in '(\w+)'", " ".join(lines))
+    fields = None if refused is None else fields_of_config(refused[1])
+    return lines if fields is None else [*lines, f"fields: {', '.join(fields)}"]
 
 
 def _fail(message: str) -> None:

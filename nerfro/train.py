@@ -110,8 +110,6 @@ def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.
     """
     if (config.checkpoint.every_seconds is None) == (config.checkpoint.every_steps is None):
         raise NerfroError("set one of checkpoint.every_seconds and checkpoint.every_steps, and the other to null")
-    if config.trainer.get("max_time") is None and config.trainer.get("max_steps", -1) < 0:
-        raise NerfroError("the run would never end; set trainer.max_time (DD:HH:MM:SS), trainer.max_steps, or both")
     seconds, every = config.checkpoint.every_seconds, config.evaluation.every
     checkpoints = ModelCheckpoint(
         dirpath=folder / LAST_CHECKPOINT.parent,
@@ -136,7 +134,10 @@ def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.
     taken = sorted(ours.keys() & config.trainer.keys())
     if taken:
         raise NerfroError(f"trainer.{taken[0]} is set by nerfro.train itself; see evaluation, checkpoint and logger")
-    return build(config.trainer, **ours)
+    trainer = build(config.trainer, **ours)
+    if config.trainer.get("max_time") is None and trainer.max_steps < 0:
+        raise NerfroError("the run would never end; set trainer.max_time (DD:HH:MM:SS), trainer.max_steps, or both")
+    return trainer
 
 
 def _loggers(config: DictConfig, folder: Path) -> list[Logger]:

@@ -97,6 +97,7 @@ def tiny_run(tiny_scene: Path) -> list[str]:
         "boundary=skybox",
         "sampler.path.integrator=leapfrog",
         "loss.boundary.weight=0.025",
+        "loss.boundary.ramp=0",
         "loss.smoothness.weight=1",
         "evaluation.supersample=1",
         "batches.jitter=false",

@@ -292,9 +292,9 @@ def train_with_conf(
         ("evaluation: {evry: 3}", ["Key 'evry' not in 'EvaluationConfig'"]),
         ("sampler: {points: {num_caorse: 3}}", ["Key 'num_caorse' not in 'HierarchicalConfig'"]),
         ("loss: {boundry: {weight: 0}}", ["no loss is called 'boundry'; known: boundary"]),
-        ("loss: {boundary: {wieght: 0}}", ["loss=boundary: Key 'wieght'", "its fields: weight, start"]),
+        ("loss: {boundary: {wieght: 0}}", ["Key 'wieght' not in 'BoundaryRegulariserConfig'", "fields: weight, start"]),
         ("field: {width: wide}", ["Value 'wide' of type 'str' could not be converted to Integer"]),
-        ("defaults: [{override /field: nrf}]", ["Could not find 'field/nrf'"]),
+        ("defaults: [{override /model: nrf}]", ["Could not find 'model/nrf'"]),
         ("trainer: {strategy: {_target_: os.system, command: 'false'}}", ["'os.system' inside lightning"]),
     ],
 )
