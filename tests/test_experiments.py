@@ -130,10 +130,18 @@ def test_ablation_without_regulariser_keeps_the_skybox() -> None:
     assert composed("+experiment=paper_refractive").loss.boundary.weight == 0.025
 
 
-def test_the_fair_baseline_differs_from_the_baseline_in_its_sky_alone() -> None:
+def test_the_fair_baseline_differs_from_the_baseline_in_its_sky_and_its_bounds_alone() -> None:
     plain, sky = composed("+experiment=mipnerf"), composed("+experiment=mipnerf_sky")
     differing = {key for key in plain if plain[key] != sky[key]}
-    assert {"name", "boundary"} <= differing <= {"name", "boundary", "loss"}
+    assert differing == {"name", "boundary", "sampler"}
+    assert plain.sampler.path == sky.sampler.path
+    bounds = {"box_min", "box_max"}
+    points = {
+        key
+        for key in plain.sampler.points
+        if key not in bounds and plain.sampler.points[key] != sky.sampler.points[key]
+    }
+    assert points == set()
 
 
 def test_papers_recipe_is_the_authors() -> None:
