@@ -39,14 +39,14 @@ def entry_point(
     def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
         @functools.wraps(task)
         def job(config: DictConfig) -> None:
-            with _errors_in_one_line():  # inside the job too, or Hydra prints a line of its own first
+            with errors_in_one_line():  # inside the job too, or Hydra prints a line of its own first
                 task(config)
 
         @functools.wraps(task)
         def run() -> None:
             # Without this Hydra prints its own report of errors and exits, before we can.
             os.environ["HYDRA_FULL_ERROR"] = "1"
-            with _errors_in_one_line():
+            with errors_in_one_line():
                 ConfigStore.instance().store(name=f"{config_name}_schema", node=schema, provider="nerfro")
                 discover()
                 hydra.main(version_base="1.3", config_path=str(config_dir), config_name=config_name)(job)()
@@ -57,7 +57,8 @@ def entry_point(
 
 
 @contextlib.contextmanager
-def _errors_in_one_line() -> Iterator[None]:
+def errors_in_one_line() -> Iterator[None]:
+    """Tell a user's mistake in one line and exit with status 1; a bug keeps its traceback."""
     try:
         yield
     except NerfroError as error:

@@ -162,11 +162,14 @@ def build_losses(nodes: DictConfig) -> dict[str, Loss]:
     """
     if not nodes:
         raise NerfroError("there is no loss to train with; give one, such as +loss.photometric.weight=1")
-    for name, node in ((str(name), node) for name, node in nodes.items()):
-        if node is not None and not isinstance(node, Mapping):
+    losses = {}
+    for name in map(str, nodes):
+        node = {} if nodes[name] is None else nodes[name]
+        if not isinstance(node, Mapping):
             raise NerfroError(f"loss.{name}={node} is no set of fields; write loss.{name}.weight={node} for its weight")
-    plugins = {str(name): find("loss", str(name)) for name in nodes}
-    return {name: plugin.cls(**configure(plugin, nodes[name] or {})) for name, plugin in plugins.items()}
+        plugin = find("loss", name)
+        losses[name] = plugin.cls(**configure(plugin, node))
+    return losses
 
 
 def build_model(config: DictConfig) -> NerfModel:

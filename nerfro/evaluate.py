@@ -10,6 +10,7 @@ import rich
 import torch
 from omegaconf import MISSING, DictConfig, OmegaConf
 
+from nerfro.callbacks import Throughput
 from nerfro.cli import entry_point
 from nerfro.config import build_model
 from nerfro.errors import NerfroError
@@ -74,7 +75,8 @@ def main(config: DictConfig) -> None:
     model = restore(checkpoint, trained).to(device)
     metrics = ImageMetrics(*find_lpips_network(wanted.lpips_backbone), prefix=config.split)
     result = score_views(model, views, metrics, folder, supersampling)
-    throughput = checkpoint["callbacks"].get("Throughput", {})
+    throughput = Throughput()
+    throughput.load_state_dict(checkpoint["callbacks"]["Throughput"])
     report(
         result,
         f"{trained.name} on {trained.data.root}, {config.split} views",
@@ -102,7 +104,7 @@ def restore(checkpoint: dict, config: DictConfig) -> NerfModel:
     return model.eval()
 
 
-def report(result: EvaluationResult, title: str, folder: Path, steps: int, throughput: dict[str, float]) -> None:
+def report(result: EvaluationResult, title: str, folder: Path, steps: int, throughput: Throughput) -> None:
     """Write metrics.json and the tables into a folder and print the table.
 
     Args:
@@ -110,10 +112,9 @@ def report(result: EvaluationResult, title: str, folder: Path, steps: int, throu
         title: of the table.
         folder: where the files go.
         steps: optimiser steps of the model.
-        throughput: state of the `Throughput` callback, empty if unknown.
+        throughput: of the training.
     """
-    seconds, rays = throughput.get("seconds"), throughput.get("num_rays")
-    write_metrics_json(folder / "metrics.json", result, steps, seconds, rays / seconds if rays and seconds else None)
+    write_metrics_json(folder / "metrics.json", result, steps, throughput.seconds, throughput.rays_per_second)
     table = views_table(result, title)
     write_table(table, folder / "metrics")
     rich.print(to_rich(table))

@@ -9,19 +9,16 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from nerfro.errors import NerfroError
-from nerfro.registry import KINDS, Plugin, discover, plugins
+from nerfro.cli import errors_in_one_line
+from nerfro.registry import Plugin, discover, find, plugins
 
 
 def main() -> None:
     """List the plugins of the kinds (or `kind=name`) given on the command line, or all."""
-    try:
+    with errors_in_one_line():
         discover()
         for plugin in _chosen(sys.argv[1:]):
             rich.print(describe(plugin))
-    except NerfroError as error:
-        print(f"nerfro: error: {error}", file=sys.stderr)
-        sys.exit(1)
 
 
 def describe(plugin: Plugin) -> Group:
@@ -34,16 +31,14 @@ def describe(plugin: Plugin) -> Group:
 
 
 def _chosen(arguments: list[str]) -> list[Plugin]:
+    if not arguments:
+        return plugins()
     chosen = []
     for argument in arguments:
         kind, _, name = argument.partition("=")
-        if kind not in KINDS:
-            raise NerfroError(f"'{kind}' is not a plugin kind; kinds: {', '.join(KINDS)}")
-        found = [p for p in plugins(kind) if name in ("", p.name)]
-        if not found:
-            raise NerfroError(f"no {kind} is called '{name}'; known: {', '.join(p.name for p in plugins(kind))}")
-        chosen += found
-    return chosen if arguments else plugins()
+        of_kind = plugins(kind)
+        chosen += [find(kind, name)] if name else of_kind
+    return chosen
 
 
 if __name__ == "__main__":

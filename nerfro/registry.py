@@ -106,8 +106,7 @@ def register(kind: str, name: str) -> Callable[[type[Part]], type[Part]]:
     Raises:
         NerfroError: unknown kind, or the name is taken.
     """
-    if kind not in KINDS:
-        raise NerfroError(f"'{kind}' is not a plugin kind; kinds: {', '.join(KINDS)}")
+    _require_kind(kind)
 
     def add(cls: type[Part]) -> type[Part]:
         taken = _plugins.get((kind, name))
@@ -125,7 +124,13 @@ def register(kind: str, name: str) -> Callable[[type[Part]], type[Part]]:
 
 
 def plugins(kind: str | None = None) -> list[Plugin]:
-    """All registered plugins (of one kind), by kind and name."""
+    """All registered plugins (of one kind), by kind and name.
+
+    Raises:
+        NerfroError: unknown kind.
+    """
+    if kind is not None:
+        _require_kind(kind)
     chosen = (p for p in _plugins.values() if kind in (None, p.kind))
     return sorted(chosen, key=lambda p: (KINDS.index(p.kind), p.name))
 
@@ -174,6 +179,11 @@ def build(node: DictConfig | Mapping[str, object], **parts: object) -> Any:
     if plugin is None:
         raise NerfroError(f"'{target}' is not registered, so it is not built; `python -m nerfro.plugins` lists what is")
     return plugin.cls(**configure(plugin, node), **{name: parts[name] for name in plugin.parts if name in parts})
+
+
+def _require_kind(kind: str) -> None:
+    if kind not in KINDS:
+        raise NerfroError(f"'{kind}' is not a plugin kind; kinds: {', '.join(KINDS)}")
 
 
 def _targets(node: object) -> Iterator[object]:

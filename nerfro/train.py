@@ -94,7 +94,7 @@ def main(config: DictConfig) -> None:
     metrics = ImageMetrics(*lpips, prefix=config.evaluation.split)
     result = score_views(model, test, metrics, folder, supersampling)
     title = f"{config.name} on {config.data.root}, {config.evaluation.split} views"
-    report(result, title, folder, trainer.global_step, throughput.state_dict())
+    report(result, title, folder, trainer.global_step, throughput)
     print(f"{trainer.global_step} steps in {throughput.seconds:.0f} s, {throughput.rays_per_second or 0:,.0f} rays/s.")
     print("Look at:")
     print(f"  {folder}/images/  the pictures; metrics.json, .csv, .md and .tex beside them")

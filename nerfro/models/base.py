@@ -12,6 +12,7 @@ from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 
 from nerfro.boundaries.base import Boundary
+from nerfro.evaluation.pictures import triptych
 from nerfro.fields.base import Field
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
@@ -117,13 +118,11 @@ class NerfModel(LightningModule, ABC):
         target = views.images[view].to(self.device)
         rendered = self.render(views.cameras.to(self.device).image_rays(view))
         prediction = rendered.rgb.reshape(target.shape)
-        error = (prediction - target).square()
-        self.log("val/psnr", -10 * torch.log10(error.mean()), prog_bar=True, batch_size=1)
-        grey = (error.mean(-1, keepdim=True).sqrt() * 4).clamp(max=1).expand_as(target)
+        self.log("val/psnr", -10 * torch.log10((prediction - target).square().mean()), prog_bar=True, batch_size=1)
         far = views.cameras.far
         maps = [m.reshape(*target.shape[:2], 1).expand_as(target) for m in (rendered.depth / far, rendered.opacity)]
         return {
-            "val/prediction_reference_error": torch.cat([prediction, target, grey], dim=1),
+            "val/prediction_reference_error": triptych(prediction, target),
             "val/depth_opacity": torch.cat(maps, dim=1).clamp(0, 1),
         }
 
