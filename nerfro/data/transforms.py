@@ -16,7 +16,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.data.cameras import Cameras
-from nerfro.data.image_files import Alpha, read_mask, read_rgb, read_stack
+from nerfro.data.image_files import Alpha, read_rgb, read_stack
+from nerfro.data.masks import find_mask, read_masks
 from nerfro.errors import NerfroError
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -118,7 +119,6 @@ def read_manifest(root: Path, split: str) -> Manifest:
         raise NerfroError(f"{path} has an empty list 'frames'; a split needs at least one")
     manifest = Manifest(path, document, [_read_frame(path, i, frame) for i, frame in enumerate(frames)])
     _check_names(manifest)
-    _check_masks(manifest)
     return manifest
 
 
@@ -141,11 +141,9 @@ def read_images(
     images = read_stack(
         [frame.image for frame in manifest.frames], lambda path: read_rgb(path, alpha), downscale, manifest.size
     )
-    masks = [frame.mask for frame in manifest.frames if frame.mask is not None]
-    if not masks:
-        return images, None
     size = images.shape[2] * downscale, images.shape[1] * downscale
-    return images, read_stack(masks, read_mask, downscale, size)
+    frames = manifest.frames
+    return images, read_masks([frame.image for frame in frames], [frame.mask for frame in frames], downscale, size)
 
 
 def make_cameras(
@@ -223,13 +221,7 @@ def _read_frame(path: Path, index: int, entry: object) -> Frame:
     where += f" ('{name}')"
     pose = _check_pose(parse_matrix(entry["transform_matrix"], ((4, 4), (3, 4)), f"{where}: transform_matrix"), where)
     image = _find_image(path.parent, name, where)
-    if "mask_path" in entry:
-        mask = path.parent / entry["mask_path"].replace("\\", "/")
-        if not mask.is_file():
-            raise NerfroError(f"{where}: mask {mask} does not exist; restore it or take 'mask_path' out")
-        return Frame(name, image, mask, pose)
-    beside = image.with_name(f"mask_{image.stem}.png")
-    return Frame(name, image, beside if beside.is_file() else None, pose)
+    return Frame(name, image, find_mask(path.parent, image, entry.get("mask_path")), pose)
 
 
 def _find_image(root: Path, name: str, where: str) -> Path:
@@ -264,14 +256,6 @@ def _check_names(manifest: Manifest) -> None:
     repeated = list(dict.fromkeys(frame.name for frame in manifest.frames if counts[frame.image] > 1))
     if repeated:
         raise NerfroError(f"{manifest.path}: {_listing(repeated)} occurs in several frames; keep one of each")
-
-
-def _check_masks(manifest: Manifest) -> None:
-    missing = [frame.name for frame in manifest.frames if frame.mask is None]
-    if missing and len(missing) < len(manifest.frames):
-        raise NerfroError(
-            f"{manifest.path}: {_listing(missing)} has no mask but other frames have; give all frames masks, or none"
-        )
 
 
 def _listing(names: list[str]) -> str:

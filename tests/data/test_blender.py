@@ -176,8 +176,11 @@ FRAME = r"transforms_train\.json: frame 1 \('train/r_1'\)"
             lambda d: d["frames"][1].update(file_path="train/no"),
             r"\('train/no'\): image .*no\.png does not exist",
         ),
-        (lambda d: d["frames"][1].update(mask_path="no.png"), FRAME + r": mask .*no\.png does not exist"),
-        (lambda d: d["frames"][1].update(mask_path="train/r_0.png"), r"'train/r_0', 'train/r_2' has no mask but other"),
+        (lambda d: d["frames"][1].update(mask_path="no.png"), r"mask .*no\.png of .*r_1\.png does not exist"),
+        (
+            lambda d: d["frames"][1].update(mask_path="train/r_0.png"),
+            r"2 of 3 images have no mask \(.*r_0\.png is the first\) but others",
+        ),
         (lambda d: d.update(w=9, h=6), r"r_0\.png has 8x6 pixels where 9x6 are expected"),
         (lambda d: d.update(w="wide", h=6), "w='wide' and h=6 must be numbers of pixels"),
         (set_pose(0, 3, math.nan), FRAME + ": transform_matrix holds NaN or infinite numbers"),
@@ -213,7 +216,7 @@ def test_images_of_different_sizes_are_refused(write_blender, random_image):
 
 def test_mask_of_another_size_is_refused(write_blender, random_image):
     root = write_blender([random_image(0)], masks=[np.zeros((3, 4), np.uint8)])
-    with pytest.raises(NerfroError, match=r"mask_r_0\.png has 4x3 pixels where 8x6 are expected"):
+    with pytest.raises(NerfroError, match=r"mask_r_0\.png has 4x3 pixels but its image has 8x6"):
         BlenderData(str(root)).load("train")
 
 

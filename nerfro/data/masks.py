@@ -1,0 +1,104 @@
+"""Silhouettes of the refractive object: where their files lie, and how they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from nerfro.data.image_files import read_levels, read_mask, read_stack
+from nerfro.errors import NerfroError
+
+MASKS_FOLDER = "masks"
+_SPLIT_FOLDERS = ("train", "val", "test")
+
+
+def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None:
+    """The file of an image's silhouette, or None where there is none.
+
+    Looked for in this order, `<stem>` the image's name without extension and `<folder>` its folder within the root:
+    the stated path; `mask_<stem>.png` beside the image; `masks/<folder>/<stem>.png` or `<stem>.<extension>.png`
+    (COLMAP's form) in the root, also without the folder's first part unless that is a split's (`images/a.jpg` has
+    `masks/a.png`, but `train/a.png` has only `masks/train/a.png`, for `test/a.png` is another picture).
+
+    Args:
+        root: the data set's folder.
+        image: the image's file.
+        stated: path within the root that the data set itself gives, if it does.
+
+    Raises:
+        NerfroError: a stated file does not exist.
+    """
+    if stated is not None:
+        mask = root / stated.replace("\\", "/")
+        if not mask.is_file():
+            raise NerfroError(f"mask {mask} of {image} does not exist; restore it or take its path out of the data set")
+        return mask
+    candidates = [image.with_name(f"mask_{image.stem}.png")]
+    if image.is_relative_to(root):
+        folder = image.relative_to(root).parent
+        folders = [folder]
+        if folder.parts and folder.parts[0] not in _SPLIT_FOLDERS:
+            folders.append(Path(*folder.parts[1:]))
+        for within in folders:
+            candidates += [root / MASKS_FOLDER / within / name for name in (f"{image.stem}.png", f"{image.name}.png")]
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def read_masks(
+    images: Sequence[Path], masks: Sequence[Path | None], downscale: int, size: tuple[int, int]
+) -> Float[Tensor, "V H W"] | None:
+    """Read the silhouettes of images; where they have no files, the images' transparency, if they have any.
+
+    Args:
+        images: the images' files.
+        masks: the silhouettes' files, of all images or of none.
+        downscale: side of the blocks of pixels that are averaged.
+        size: width and height of the images in pixels before downscaling.
+
+    Returns:
+        Share of each pixel that the object covers; None where there are no silhouettes.
+
+    Raises:
+        NerfroError: some images have a silhouette and others none, or one is corrupt or of another size.
+    """
+    files = [mask for mask in masks if mask is not None]
+    if not files:
+        return read_stack(images, _read_alpha, downscale, size) if _is_transparent(images[0]) else None
+    if len(files) < len(images):
+        bare = [str(image) for image, mask in zip(images, masks, strict=True) if mask is None]
+        raise NerfroError(
+            f"{len(bare)} of {len(images)} images have no mask ({bare[0]} is the first) but others have; "
+            "give all of them masks, or none"
+        )
+
+    def read(path: Path) -> Float[np.ndarray, "H W"]:
+        share = read_mask(path)
+        if share.shape != (size[1], size[0]):
+            raise NerfroError(
+                f"mask {path} has {share.shape[1]}x{share.shape[0]} pixels but its image has {size[0]}x{size[1]}; "
+                "make it again for the image as it is"
+            )
+        return share
+
+    return read_stack(files, read, downscale)
+
+
+def _is_transparent(image: Path) -> bool:
+    """Whether an image has pixels that are not opaque; alpha that is 1 everywhere says nothing."""
+    try:
+        with Image.open(image) as opened:
+            if not opened.has_transparency_data:  # known without decoding
+                return False
+    except OSError:
+        return False  # told where the colours are read
+    return bool((_read_alpha(image) < 1).any())
+
+
+def _read_alpha(image: Path) -> Float[np.ndarray, "H W"]:
+    levels = read_levels(image)
+    return levels[..., -1] if levels.shape[-1] in (2, 4) else np.ones(levels.shape[:2], np.float32)

@@ -1,0 +1,70 @@
+"""Where silhouettes are looked for, and what they are read as."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from nerfro.data.masks import find_mask, read_masks
+from nerfro.errors import NerfroError
+
+
+def _touch(path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("image", "mask"),
+    [
+        ("train/r_0.png", "train/mask_r_0.png"),
+        ("train/r_0.png", "masks/train/r_0.png"),
+        ("images/a.jpg", "masks/a.png"),
+        ("images/a.jpg", "masks/a.jpg.png"),
+        ("images/left/a.jpg", "masks/left/a.png"),
+        ("a.jpg", "masks/a.png"),
+    ],
+)
+def test_mask_is_found(tmp_path: Path, image: str, mask: str) -> None:
+    assert find_mask(tmp_path, tmp_path / image) is None
+    assert find_mask(tmp_path, _touch(tmp_path / image)) is None
+    expected = _touch(tmp_path / mask)
+    assert find_mask(tmp_path, tmp_path / image) == expected
+
+
+def test_stated_mask_wins_and_must_exist(tmp_path: Path) -> None:
+    image, beside, stated = (_touch(tmp_path / name) for name in ("a.png", "mask_a.png", "other/b.png"))
+    assert find_mask(tmp_path, image) == beside
+    assert find_mask(tmp_path, image, "other\\b.png") == stated
+    with pytest.raises(NerfroError, match=r"mask .*no\.png of .*a\.png does not exist"):
+        find_mask(tmp_path, image, "no.png")
+
+
+def test_views_of_different_splits_never_share_a_mask(tmp_path: Path) -> None:
+    _touch(tmp_path / "masks" / "r_0.png")
+    assert find_mask(tmp_path, _touch(tmp_path / "train" / "r_0.png")) is None
+
+
+def test_transparency_is_a_silhouette_where_there_are_no_files(tmp_path: Path) -> None:
+    levels = np.full((2, 4, 4), 255, np.uint8)
+    paths = [tmp_path / "0.png", tmp_path / "1.png"]
+    for path in paths:
+        Image.fromarray(levels).save(path)
+    assert read_masks(paths, [None, None], 1, (4, 2)) is None  # opaque throughout: says nothing
+    levels[0, :2, 3] = 0
+    levels[1, 3, 3] = 51
+    Image.fromarray(levels).save(paths[0])
+    share = read_masks(paths, [None, None], 2, (4, 2))
+    assert share is not None
+    torch.testing.assert_close(share, torch.tensor([[[0.5, 0.8]], [[1.0, 1.0]]]))
+
+
+def test_masks_of_some_images_only_are_refused(tmp_path: Path) -> None:
+    image = _touch(tmp_path / "a.png")
+    with pytest.raises(NerfroError, match=r"1 of 2 images have no mask \(.*a\.png is the first\)"):
+        read_masks([image, image], [None, image], 1, (4, 2))
