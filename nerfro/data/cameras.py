@@ -1,4 +1,4 @@
-"""Pinhole cameras and their rays."""
+"""Pinhole cameras, ideal or with a distorting lens, and their rays."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
+from nerfro.data.distortion import distort, undistort
 from nerfro.errors import NerfroError
 from nerfro.types import Rays
 
@@ -58,6 +59,7 @@ class Cameras:
         cx, cy: principal point, pixels from the image's left and top edge.
         width, height: resolution, pixels.
         near, far: arc length from the camera's centre at which rays begin and end, world units.
+        distortion: of the lens, see `nerfro.data.distortion.coefficients`; None for an ideal one.
     """
 
     camera_to_world: Float[Tensor, "V 3 4"]
@@ -69,6 +71,7 @@ class Cameras:
     height: int
     near: float
     far: float
+    distortion: Float[Tensor, "V 9"] | None = None
 
     def __len__(self) -> int:
         return self.camera_to_world.shape[0]
@@ -79,7 +82,8 @@ class Cameras:
 
     def to(self, device: torch.device | str) -> Cameras:
         tensors = {name: getattr(self, name).to(device) for name in ("camera_to_world", "fx", "fy", "cx", "cy")}
-        return replace(self, **tensors)
+        distortion = None if self.distortion is None else self.distortion.to(device)
+        return replace(self, **tensors, distortion=distortion)
 
     def crop(self, window: Window) -> Cameras:
         """The cameras of a window of each image: its pixel (0, 0) is pixel (top, left) of these cameras."""
@@ -98,7 +102,8 @@ class Cameras:
 
         The radius of a pixel's cone is 2 / sqrt(12) of the pixel's width (mip-NeRF, section 3.1: the disc has the
         variance of the pixel). That width is 1 / fx at unit depth, which lies at distance |d| along the ray
-        d = ((u - cx) / fx, -(v - cy) / fy, -1); at unit distance it is 1 / (fx |d|).
+        d = ((u - cx) / fx, -(v - cy) / fy, -1); at unit distance it is 1 / (fx |d|). A distorting lens changes the
+        pixel's area there, and the radius with its square root.
 
         Args:
             view, row, column: of each pixel, on the cameras' device.
@@ -111,6 +116,11 @@ class Cameras:
         fx = self.fx[view]
         x = (column + offset_x - self.cx[view]) / fx
         y = (self.cy[view] - row - offset_y) / self.fy[view]
+        width = 1 / fx
+        if self.distortion is not None:
+            ideal, area = undistort(torch.stack([x, -y], -1), self.distortion[view])
+            x, y = ideal[:, 0], -ideal[:, 1]
+            width = width * area.clamp(min=0).sqrt()
         directions = torch.stack([x, y, -torch.ones_like(x)], -1)
         length = torch.linalg.vector_norm(directions, dim=-1)
         pose = self.camera_to_world[view]
@@ -119,10 +129,28 @@ class Cameras:
         return Rays(
             origins=pose[..., 3],
             directions=torch.nn.functional.normalize(directions, dim=-1),
-            radii=2 / math.sqrt(12) / (fx * length),
+            radii=2 / math.sqrt(12) * width / length,
             near=torch.full_like(x, self.near),
             far=torch.full_like(x, self.far),
         )
+
+    def project(self, points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "V P 2"], Float[Tensor, "V P"]]:
+        """Where each camera sees points of the world.
+
+        Returns:
+            Pixel coordinates (column, row), whole numbers at the pixels' corners, and depth along the optical axis in
+            world units. Points at zero depth or behind the camera have no image: look at the depth first.
+        """
+        offset = points - self.camera_to_world[:, None, :, 3]
+        right, up, back = (offset @ self.camera_to_world[:, :, :3]).unbind(-1)
+        x, y = right / -back, up / back
+        if self.distortion is not None:
+            flat = torch.stack([x, y], -1).flatten(0, 1)
+            distorted, _ = distort(flat, self.distortion.repeat_interleave(x.shape[1], 0))
+            x, y = distorted.view(*x.shape, 2).unbind(-1)
+        columns = self.fx[:, None] * x + self.cx[:, None]
+        rows = self.fy[:, None] * y + self.cy[:, None]
+        return torch.stack([columns, rows], -1), -back
 
     def image_rays(self, view: int) -> Rays:
         """Rays through all pixel centres of one view, row by row."""

@@ -1,0 +1,84 @@
+"""Lens distortion: the polynomial and rational models of OpenCV, COLMAP and nerfstudio, and its inverse."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+# Newton's method doubles the digits at each step; from the distorted point this is enough for single precision.
+_NEWTON_STEPS = 8
+
+
+def coefficients(
+    numerator: Sequence[float] = (), tangential: Sequence[float] = (), denominator: Sequence[float] = ()
+) -> tuple[float, ...] | None:
+    """The nine numbers of the model that `distort` evaluates; None where all are zero.
+
+    Args:
+        numerator: up to four, of r^2, r^4, r^6 and r^8 (OpenCV's k1, k2, k3; nerfstudio's k1 to k4).
+        tangential: p1 and p2, or none.
+        denominator: up to three, of r^2, r^4 and r^6 (OpenCV's k4, k5, k6).
+    """
+    parts = ((numerator, 4), (tangential, 2), (denominator, 3))
+    padded = [float(number) for part, size in parts for number in (*part, *[0.0] * (size - len(part)))]
+    return tuple(padded) if any(padded) else None
+
+
+def opencv_coefficients(numbers: Sequence[float]) -> tuple[float, ...] | None:
+    """As `coefficients`, from OpenCV's order k1, k2, p1, p2[, k3[, k4, k5, k6]]; none, 4, 5 or 8 numbers."""
+    k = numbers
+    return coefficients([*k[:2], *k[4:5]], k[2:4], k[5:8])
+
+
+def distort(
+    points: Float[Tensor, "R 2"], lens: Float[Tensor, "R 9"]
+) -> tuple[Float[Tensor, "R 2"], Float[Tensor, "R 3"]]:
+    """Where the lens images points of the ideal image plane at unit depth, x right and y down (OpenCV, calib3d).
+
+    x' = x (1 + k1 r^2 + ...) / (1 + k4 r^2 + ...) + 2 p1 x y + p2 (r^2 + 2 x^2), and y' with p1 and p2 exchanged.
+
+    Returns:
+        Distorted points, and their derivatives dx'/dx, dx'/dy = dy'/dx and dy'/dy.
+    """
+    x, y = points.unbind(-1)
+    k1, k2, k3, k4, p1, p2, q1, q2, q3 = lens.unbind(-1)
+    r2 = x * x + y * y
+    above = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+    below = 1 + r2 * (q1 + r2 * (q2 + r2 * q3))
+    radial = above / below
+    slope = k1 + r2 * (2 * k2 + r2 * (3 * k3 + r2 * 4 * k4)) - radial * (q1 + r2 * (2 * q2 + r2 * 3 * q3))
+    slope = 2 * slope / below
+    mixed = x * y * slope + 2 * (p1 * x + p2 * y)
+    distorted = torch.stack(
+        [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)], -1
+    )
+    derivatives = [radial + x * x * slope + 2 * p1 * y + 6 * p2 * x, mixed]
+    derivatives.append(radial + y * y * slope + 6 * p1 * y + 2 * p2 * x)
+    return distorted, torch.stack(derivatives, -1)
+
+
+def undistort(
+    points: Float[Tensor, "R 2"], lens: Float[Tensor, "R 9"]
+) -> tuple[Float[Tensor, "R 2"], Float[Tensor, "R"]]:
+    """The ideal points that the lens images at `points`, by Newton's method.
+
+    Returns:
+        Ideal points, and the area there for each unit of area in the distorted image. The area is negative, or the
+        point wrong, beyond the radius at which the lens model folds back.
+    """
+    ideal = points
+    for _ in range(_NEWTON_STEPS):
+        distorted, (xx, xy, yy) = _unbind(distort(ideal, lens))
+        error = points - distorted
+        step_x = yy * error[:, 0] - xy * error[:, 1]
+        step_y = xx * error[:, 1] - xy * error[:, 0]
+        ideal = ideal + torch.stack([step_x, step_y], -1) / (xx * yy - xy * xy)[:, None]
+    _, (xx, xy, yy) = _unbind(distort(ideal, lens))
+    return ideal, 1 / (xx * yy - xy * xy)
+
+
+def _unbind(result: tuple[Tensor, Tensor]) -> tuple[Tensor, tuple[Tensor, ...]]:
+    return result[0], result[1].unbind(-1)

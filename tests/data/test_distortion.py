@@ -1,0 +1,118 @@
+"""Distortion against hand-worked numbers, finite differences and its own inverse; cameras that have it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from nerfro.data.cameras import Cameras
+from nerfro.data.distortion import coefficients, distort, opencv_coefficients, undistort
+
+LENSES = {
+    "barrel": coefficients([-0.18, 0.03]),
+    "tangential": coefficients([0.05], [0.01, -0.006]),
+    "nerfstudio": coefficients([-0.1, 0.02, -0.003, 0.0004], [0.001, 0.002]),
+    "rational": opencv_coefficients([0.4, 0.05, 0.001, -0.002, 0.002, 0.6, 0.1, 0.01]),
+}
+
+
+@pytest.fixture(params=LENSES, ids=str)
+def lens(request) -> torch.Tensor:
+    return torch.tensor(LENSES[request.param], dtype=torch.float64)
+
+
+@pytest.fixture
+def points() -> torch.Tensor:
+    axis = torch.linspace(-0.7, 0.7, 9, dtype=torch.float64)
+    return torch.cartesian_prod(axis, axis)
+
+
+def test_numbers_worked_by_hand():
+    point = torch.tensor([[0.5, -0.2]], dtype=torch.float64)  # r^2 = 0.29, r^4 = 0.0841
+    one = lambda *a, **b: distort(point, torch.tensor([coefficients(*a, **b)], dtype=torch.float64))[0][0].tolist()  # noqa: E731
+    assert one([0.1, 0.01]) == pytest.approx([0.5 * 1.029841, -0.2 * 1.029841])
+    # 2 p1 x y + p2 (r^2 + 2 x^2) and p1 (r^2 + 2 y^2) + 2 p2 x y
+    assert one([], [0.1, 0.0]) == pytest.approx([0.5 - 0.02, -0.2 + 0.037])
+    assert one([], [0.0, 0.1]) == pytest.approx([0.5 + 0.079, -0.2 - 0.02])
+    assert one([], [], [0.1]) == pytest.approx([0.5 / 1.029, -0.2 / 1.029])
+
+
+def test_opencv_order_and_an_ideal_lens():
+    assert opencv_coefficients([1, 2, 3, 4, 5, 6, 7, 8]) == (1, 2, 5, 0, 3, 4, 6, 7, 8)
+    assert opencv_coefficients([1, 2, 3, 4]) == (1, 2, 0, 0, 3, 4, 0, 0, 0)
+    assert coefficients() is None
+    assert opencv_coefficients([0.0] * 5) is None
+
+
+def test_derivatives_are_those_of_finite_differences(lens, points):
+    many = lens.expand(len(points), 9)
+    _, derivatives = distort(points, many)
+    for axis, found in ((0, derivatives[:, :2]), (1, derivatives[:, 1:])):
+        step = torch.zeros(2, dtype=torch.float64)
+        step[axis] = 1e-6
+        expected = (distort(points + step, many)[0] - distort(points - step, many)[0]) / 2e-6
+        torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-8)
+
+
+def test_undistorting_inverts_distorting(lens, points):
+    many = lens.expand(len(points), 9)
+    distorted, derivatives = distort(points, many)
+    ideal, area = undistort(distorted, many)
+    torch.testing.assert_close(ideal, points, rtol=0, atol=1e-12)
+    xx, xy, yy = derivatives.unbind(-1)
+    torch.testing.assert_close(area, 1 / (xx * yy - xy**2))
+
+
+@pytest.fixture
+def cameras() -> Cameras:
+    """Three cameras of any orientation, one of them without distortion."""
+    poses = torch.zeros(3, 3, 4)
+    poses[:, :, :3] = torch.from_numpy(Rotation.random(3, random_state=0).as_matrix()).float()
+    poses[:, :, 3] = torch.randn(3, 3)
+    fill = lambda value: torch.full((3,), value)  # noqa: E731
+    ideal = (0.0,) * 9
+    distortion = torch.tensor([LENSES["barrel"], ideal, LENSES["rational"]])
+    return Cameras(poses, fill(40.0), fill(42.0), fill(24.6), fill(17.1), 48, 36, 0.1, 9.0, distortion)
+
+
+def test_points_on_rays_project_onto_their_pixels(cameras):
+    row, column = np.divmod(np.arange(36 * 48), 48)
+    expected = torch.from_numpy(np.stack([column, row], -1) + 0.5).float()
+    for view in range(3):
+        rays = cameras.image_rays(view)
+        assert torch.allclose(rays.directions.norm(dim=-1), torch.ones(len(rays)), atol=1e-6)
+        pixels, depth = cameras.project(rays.origins + 2.5 * rays.directions)
+        assert (depth[view] > 0).all()
+        torch.testing.assert_close(pixels[view], expected, rtol=0, atol=5e-4)
+
+
+def test_lens_without_distortion_is_the_pinhole_camera(cameras):
+    pinhole = replace(cameras, distortion=None)
+    torch.testing.assert_close(cameras.image_rays(1).directions, pinhole.image_rays(1).directions)
+    torch.testing.assert_close(cameras.image_rays(1).radii, pinhole.image_rays(1).radii)
+    assert not torch.allclose(cameras.image_rays(0).directions, pinhole.image_rays(0).directions, atol=1e-3)
+
+
+def test_radii_follow_the_area_of_the_pixel(cameras):
+    square = replace(cameras, fy=cameras.fx)
+    rays = square.image_rays(0)
+    forward = -square.camera_to_world[0, :, 2].double()
+    directions = rays.directions.double()
+    plane = (directions / (directions @ forward)[:, None]).reshape(36, 48, 3)
+    across, down = plane[1:-1, 2:] - plane[1:-1, :-2], plane[2:, 1:-1] - plane[:-2, 1:-1]
+    area = torch.linalg.cross(across, down).norm(dim=-1) / 4
+    expected = 2 / 12**0.5 * area.sqrt() / plane[1:-1, 1:-1].norm(dim=-1)
+    torch.testing.assert_close(rays.radii.double().reshape(36, 48)[1:-1, 1:-1], expected, rtol=2e-3, atol=0)
+
+
+def test_projection_by_hand_and_behind_the_camera():
+    pose = torch.eye(4)[None, :3]
+    one = torch.ones(1)
+    camera = Cameras(pose, 100 * one, 100 * one, 32 * one, 24 * one, 64, 48, 0.1, 9.0)
+    pixels, depth = camera.project(torch.tensor([[0.4, 0.2, -4.0], [0.0, 0.0, 3.0]]))
+    torch.testing.assert_close(pixels[0, 0], torch.tensor([42.0, 19.0]))
+    assert depth[0].tolist() == [4.0, -3.0]
