@@ -115,8 +115,8 @@ def require_same_configuration(path: Path, trained: DictConfig, wanted: DictConf
         NerfroError: the first field that differs is named, with both values.
     """
     for section in _MUST_AGREE:
-        old = _flatten(OmegaConf.to_container(trained, resolve=True).get(section), section)  # type: ignore[union-attr]
-        new = _flatten(OmegaConf.to_container(wanted, resolve=True).get(section), section)  # type: ignore[union-attr]
+        old = flatten(OmegaConf.to_container(trained, resolve=True).get(section), section)  # type: ignore[union-attr]
+        new = flatten(OmegaConf.to_container(wanted, resolve=True).get(section), section)  # type: ignore[union-attr]
         for key in sorted(old.keys() | new.keys()):
             if old.get(key) != new.get(key):
                 raise NerfroError(
@@ -125,10 +125,11 @@ def require_same_configuration(path: Path, trained: DictConfig, wanted: DictConf
                 )
 
 
-def _flatten(node: Any, prefix: str) -> dict[str, Any]:
+def flatten(node: Any, prefix: str) -> dict[str, Any]:
+    """A nested configuration as one dictionary: `{"field": {"width": 64}}` below `prefix` is `prefix.field.width`."""
     if not isinstance(node, dict):
         return {prefix: node}
-    return {key: value for name, child in node.items() for key, value in _flatten(child, f"{prefix}.{name}").items()}
+    return {key: value for name, child in node.items() for key, value in flatten(child, f"{prefix}.{name}").items()}
 
 
 def _git(*command: str) -> str | None:
