@@ -2,6 +2,8 @@
 
 # Squared share of |v| below which v's component along a kick is not corrected (see samplers.integrators.leapfrog).
 MIN_NORMAL_PART = 0.01
+# Share of n^2 by which |v|^2 may differ from it after a step that resolves the index (see there too).
+RESOLVED = 1e-4
 
 # A ray that crosses the shell of a solid along its normal takes this many steps in it.
 STEPS_PER_SHELL = 8

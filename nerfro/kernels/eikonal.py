@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import prange
 
-from nerfro.geometry.tolerances import MIN_COSINE, MIN_NORMAL_PART, MIN_TURN, REACHED
+from nerfro.geometry.tolerances import MIN_COSINE, MIN_NORMAL_PART, MIN_TURN, REACHED, RESOLVED
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.lookup import (
     block_clearance,
@@ -79,7 +79,8 @@ def march_uniform(origins, directions, near, far, table, low, inverse_spacing, i
                 n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
                 kick = 0.5 * h * n
                 px, py, pz = px + kick * gx, py + kick * gy, pz + kick * gz
-                vx, vy, vz = _with_length_along(px, py, pz, px - vx, py - vy, pz - vz, n)
+                varies = gx != 0.0 or gy != 0.0 or gz != 0.0
+                vx, vy, vz = _with_length_along(px, py, pz, px - vx, py - vy, pz - vz, n, varies)
             else:
                 half = 0.5 * ds
                 ax, ay, az = vx / n, vy / n, vz / n
@@ -118,13 +119,14 @@ def _look_up(table, clearance, coefficients, iors, shell, low, inverse_spacing, 
 
 
 @compiled
-def _with_length_along(vx, vy, vz, kx, ky, kz, n):
-    """Set the length of v to n by its component along the kick, where that component is not small."""
+def _with_length_along(vx, vy, vz, kx, ky, kz, n, varies):
+    """Set the length of v to n by its component along the kick, where that is called for (`integrators.leapfrog`)."""
     kick = kx * kx + ky * ky + kz * kz
-    if kick == 0.0:
+    excess = vx * vx + vy * vy + vz * vz - n * n
+    if kick == 0.0 or (varies and abs(excess) <= RESOLVED * n * n):
         return vx, vy, vz
     along = (vx * kx + vy * ky + vz * kz) / math.sqrt(kick)
-    squared = n * n - (vx * vx + vy * vy + vz * vz - along * along)
+    squared = along * along - excess
     if min(along * along, squared) < MIN_NORMAL_PART * n * n:
         return vx, vy, vz
     change = (math.copysign(math.sqrt(squared), along) - along) / math.sqrt(kick)
@@ -204,7 +206,8 @@ def march_adaptive(
                     )
                     kick = 0.5 * h * n
                     px, py, pz = px + kick * gx, py + kick * gy, pz + kick * gz
-                    vx, vy, vz = _with_length_along(px, py, pz, px - vx, py - vy, pz - vz, n)
+                    varies = gx != 0.0 or gy != 0.0 or gz != 0.0
+                    vx, vy, vz = _with_length_along(px, py, pz, px - vx, py - vy, pz - vz, n, varies)
                     norm = math.sqrt(vx * vx + vy * vy + vz * vz)
                     dx, dy, dz = vx / norm, vy / norm, vz / norm
                     ahead = s - ks

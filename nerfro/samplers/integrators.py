@@ -9,11 +9,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from nerfro.geometry.tolerances import MIN_NORMAL_PART
+from nerfro.geometry.tolerances import MIN_NORMAL_PART, RESOLVED
 
 Index = Callable[[Tensor], tuple[Tensor, Tensor]]
 
@@ -49,29 +49,44 @@ def leapfrog(state: RayState, ds: Float[Tensor, "R"], index: Index) -> RayState:
     dsigma = ds / n with n in the middle of the step, n + ds/2 dn/ds, so that the step is ds long to second order.
     Exact where n^2 is linear in space.
 
-    |v| = n is restored after the step by v's component along the kick alone. The component across, n sin(angle) at a
-    surface, is what refraction conserves, so a flat interface is refracted exactly however few steps it takes. Where
-    the component along the kick is small (the ray turns) it is left as it is: there it is not determined by |v| = n.
+    Where a step does not resolve the index, so that |v| differs from n after it, and where the index stops varying,
+    |v| = n is restored by v's component along the kick alone. The component across, n sin(angle) at a surface, is what
+    refraction conserves, so a flat interface is refracted exactly however few steps it takes. Steps that resolve the
+    index are left alone: the error of |v| does not grow with their number, and what remains of it turns with the
+    gradient and is not along the kick. Nor is a small component along the kick (the ray turns) determined by |v| = n.
+    """
+    _, v, n, g = state
+    middle = n + 0.5 * ds * (g * v).sum(-1) / n
+    x, kicked, n, g = kick_drift_kick(state, ds / torch.maximum(middle, 0.5 * state.n), index)
+    varies = (g != 0).any(-1)
+    return RayState(x, _with_length_along(kicked, kicked - v, n, varies), n, g)
+
+
+def kick_drift_kick(state: RayState, dsigma: Float[Tensor, "R"], index: Index) -> RayState:
+    """The step of `leapfrog` in the parameter of dx/dsigma = v, dv/dsigma = n grad n.
+
+    A symplectic map, and its own inverse when v is turned round, for any fixed dsigma.
     """
     x, v, n, g = state
-    middle = n + 0.5 * ds * (g * v).sum(-1) / n
-    dsigma = (ds / torch.maximum(middle, 0.5 * n))[:, None]
+    dsigma = dsigma[:, None]
     kicked = v + 0.5 * dsigma * n[:, None] * g
     x = x + dsigma * kicked
     n, g = index(x)
-    kicked = kicked + 0.5 * dsigma * n[:, None] * g
-    return RayState(x, _with_length_along(kicked, kicked - v, n), n, g)
+    return RayState(x, kicked + 0.5 * dsigma * n[:, None] * g, n, g)
 
 
 def _with_length_along(
-    v: Float[Tensor, "R 3"], axis: Float[Tensor, "R 3"], length: Float[Tensor, "R"]
+    v: Float[Tensor, "R 3"], axis: Float[Tensor, "R 3"], length: Float[Tensor, "R"], varies: Bool[Tensor, "R"]
 ) -> Float[Tensor, "R 3"]:
-    """Change the component of v along an axis so that |v| becomes `length`, where that component is not small."""
+    """Change the component of v along an axis so that |v| becomes `length`, where that is called for (`leapfrog`)."""
     unit = functional.normalize(axis, dim=-1, eps=torch.finfo(v.dtype).tiny)
     along = (v * unit).sum(-1)
-    squared = length**2 - (v.square().sum(-1) - along**2)
-    change = torch.copysign(squared.clamp(min=0).sqrt(), along) - along
-    sound = torch.minimum(along**2, squared) >= MIN_NORMAL_PART * length**2
+    excess = v.square().sum(-1) - length**2
+    squared = along**2 - excess
+    resolved = varies & (excess.abs() <= RESOLVED * length**2)
+    sound = (torch.minimum(along**2, squared) >= MIN_NORMAL_PART * length**2) & ~resolved
+    # The root of 1 where it is not used: that of a negative number would make gradients nan.
+    change = torch.copysign(torch.where(sound, squared, 1.0).sqrt(), along) - along
     return v + torch.where(sound, change, 0.0)[:, None] * unit
 
 
