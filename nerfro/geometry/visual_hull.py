@@ -1,0 +1,234 @@
+"""Shape from silhouettes: the largest body that no view of the object contradicts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from scipy.ndimage import binary_fill_holes, label
+from skimage.measure import marching_cubes
+from torch import Tensor
+
+from nerfro.data.cameras import Cameras
+from nerfro.errors import NerfroError
+from nerfro.geometry.mesh import TriangleMesh, merge_vertices
+from nerfro.geometry.silhouettes import is_cut_by_frame, outline_distance, single_view
+
+# Each level halves the voxels and looks only at those near the surface of the level before.
+_LEVELS = 2
+# Width of that neighbourhood, voxels of the level before: more than their diagonal.
+_BAND = 2.0
+# Parts of less than this share of the largest part's volume are strays.
+_STRAY = 0.02
+_MIN_VIEWS = 2
+_CHUNK = 1 << 18
+
+
+@dataclass(frozen=True)
+class Silhouettes:
+    """What the views say about the object's outline.
+
+    Attributes:
+        cameras: of the views.
+        masks: share of each pixel that the object covers.
+        distances: of the pixels' centres to the outlines, pixels, positive inside.
+        cut: which masks touch the frame, so that nothing is known outside of it.
+    """
+
+    cameras: Cameras
+    masks: Float[Tensor, "V H W"]
+    distances: Float[Tensor, "V H W"]
+    cut: Bool[Tensor, "V"]
+
+    @classmethod
+    def of(cls, cameras: Cameras, masks: Float[Tensor, "V H W"]) -> Silhouettes:
+        """Find the outlines of masks."""
+        distances = np.stack([outline_distance(mask.numpy()) for mask in masks])
+        return cls(cameras, masks, torch.from_numpy(distances.astype(np.float32)), is_cut_by_frame(masks))
+
+    def __len__(self) -> int:
+        return len(self.masks)
+
+    def seen_from(self, cameras: Cameras) -> Silhouettes:
+        """The same outlines with other cameras."""
+        return Silhouettes(cameras, self.masks, self.distances, self.cut)
+
+    def depth_inside(
+        self, view: int, points: Float[Tensor, "P 3"]
+    ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"], Float[Tensor, "P"]]:
+        """How far points are inside one view's silhouette.
+
+        Returns:
+            Distance to the outline in pixels, positive inside, infinite where the view knows nothing: behind the
+            camera, or outside the frame where that cuts the object. The width of a pixel at the point, world units.
+            How far outside the frame the point is seen, pixels.
+        """
+        cameras = single_view(self.cameras, view)
+        pixels, depth = (values[0] for values in cameras.project(points))
+        size = torch.tensor([cameras.width, cameras.height])
+        outside = torch.linalg.vector_norm(pixels - pixels.clamp(torch.zeros(2), size), dim=-1)
+        grid = (2 * pixels / size - 1).nan_to_num(0.0)[None, None]
+        distance = F.grid_sample(
+            self.distances[view][None, None], grid, align_corners=False, padding_mode="border"
+        ).flatten()
+        visible = depth > 1e-6 * depth.abs().max().clamp(min=1e-12)
+        unknown = ~visible | ((outside > 0) & self.cut[view])
+        distance = torch.where(outside > 0, distance.clamp(max=0) - outside, distance)
+        width = depth / (0.5 * (cameras.fx + cameras.fy))
+        return torch.where(unknown, torch.inf, distance), width, outside
+
+    def carve(self, points: Float[Tensor, "P 3"], wrong_masks: int = 0) -> Float[Tensor, "P"]:
+        """About the signed distance to the visual hull, world units, negative inside; exact where it is zero.
+
+        It is the largest over the views of the distance to the silhouette's cone, the (wrong_masks + 1)-th largest if
+        that many views may be wrong about any point. A point that fewer than two views see is outside.
+        """
+        largest = torch.full((wrong_masks + 1, len(points)), -torch.inf)
+        num_seen = torch.zeros(len(points), dtype=torch.int32)
+        for view in range(len(self)):
+            inside, width, _ = self.depth_inside(view, points)
+            known = inside < torch.inf
+            num_seen += known
+            value = torch.where(known, -inside * width, -torch.inf)
+            for rank in range(wrong_masks + 1):
+                largest[rank], value = torch.maximum(largest[rank], value), torch.minimum(largest[rank], value)
+        far = torch.where(largest[-1].isfinite(), largest[-1].abs(), 1.0)
+        return torch.where(num_seen < _MIN_VIEWS, far, largest[-1])
+
+
+def find_box(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np.ndarray, "2 3"]:
+    """A cube around the object: where the lines through the masks' centres meet, and as wide as the widest mask there.
+
+    Args:
+        silhouettes: none of them empty.
+        wrong_masks: number of views that may be wrong: the widest masks are passed over.
+    """
+    cameras, inside = silhouettes.cameras, silhouettes.masks > 0.5
+    rows, columns = torch.arange(cameras.height) + 0.5, torch.arange(cameras.width) + 0.5
+    count = inside.sum((1, 2))
+    row, column = (inside.sum(2) * rows).sum(1) / count, (inside.sum(1) * columns).sum(1) / count
+    rays = cameras.rays(torch.arange(len(cameras)), row - 0.5, column - 0.5)
+    centre = _nearest_point(rays.origins.double().numpy(), rays.directions.double().numpy())
+    pixels, depth = cameras.project(torch.from_numpy(centre[None]).float())
+    radii = []
+    for view in range(len(cameras)):
+        height, width = inside[view].any(1).nonzero(), inside[view].any(0).nonzero()
+        corners = torch.tensor(
+            [[w, h] for w in (width.min(), width.max() + 1) for h in (height.min(), height.max() + 1)]
+        )
+        reach = (corners - pixels[view, 0]).abs().amax()
+        radii.append(float(reach * depth[view, 0].abs() / (0.5 * (cameras.fx[view] + cameras.fy[view]))))
+    half_side = 1.1 * sorted(radii)[-1 - min(wrong_masks, len(radii) - 1)]
+    return np.stack([centre - half_side, centre + half_side])
+
+
+def _nearest_point(origins: Float[np.ndarray, "V 3"], directions: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "3"]:
+    """The point of the least sum of distances to lines, by reweighted least squares: a few stray lines do not count."""
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    weights = np.ones(len(origins))
+    point = origins.mean(0)
+    for _ in range(20):
+        # Where all lines are parallel, any depth will do: the one nearest the cameras' centres.
+        system = (weights[:, None, None] * across).sum(0) + 1e-9 * weights.sum() * np.eye(3)
+        point = np.linalg.solve(
+            system,
+            (weights[:, None] * np.einsum("vij,vj->vi", across, origins)).sum(0)
+            + 1e-9 * weights.sum() * origins.mean(0),
+        )
+        distance = np.linalg.norm(np.einsum("vij,vj->vi", across, point - origins), axis=1)
+        weights = 1 / np.maximum(distance, 1e-3 * np.median(distance) + 1e-12)
+        weights /= weights.max()
+    return point
+
+
+def carve_grid(
+    silhouettes: Silhouettes,
+    box: Float[np.ndarray, "2 3"],
+    resolution: int,
+    wrong_masks: int = 0,
+    progress: Callable[[float], None] = lambda share: None,
+) -> tuple[Float[np.ndarray, "X Y Z"], Float[np.ndarray, "3"], float]:
+    """Carve a grid, finer and finer near the surface.
+
+    Args:
+        silhouettes: of the object.
+        box: lower and upper corner; its far sides move out to a whole number of voxels.
+        resolution: voxels along the longest side.
+        wrong_masks: number of views that may be wrong about any point.
+        progress: called with the share of each level's work that is done, from 0 to the number of levels.
+
+    Returns:
+        Signed distances at the voxels' corners (see `Silhouettes.carve`), the lower corner, and a voxel's side.
+    """
+    extent = np.asarray(box[1] - box[0], np.float64)
+    factor = 2**_LEVELS
+    spacing = float(extent.max()) / (resolution // factor * factor)
+    cells = np.ceil(np.round(extent / (factor * spacing), 6)).astype(int).clip(1)
+    values = torch.empty(0)
+    for level in range(_LEVELS + 1):
+        step = spacing * 2 ** (_LEVELS - level)
+        axes = [torch.from_numpy(box[0][a] + step * np.arange(cells[a] * 2**level + 1)) for a in range(3)]
+        points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).float()
+        if level == 0:
+            values, near = torch.empty(points.shape[:3]), torch.ones(points.shape[:3], dtype=torch.bool)
+        else:
+            values = F.interpolate(values[None, None], points.shape[:3], mode="trilinear", align_corners=True)[0, 0]
+            near = values.abs() < _BAND * 2 * step
+        wanted = points[near]
+        carved = torch.empty(len(wanted))
+        for start in range(0, len(wanted), _CHUNK):
+            carved[start : start + _CHUNK] = silhouettes.carve(wanted[start : start + _CHUNK], wrong_masks)
+            progress(level + min(start + _CHUNK, len(wanted)) / len(wanted))
+        values[near] = carved
+    return values.numpy(), np.asarray(box[0], np.float64), spacing
+
+
+def remove_strays(distances: Float[np.ndarray, "X Y Z"], keep: int | None = None) -> tuple[int, int]:
+    """Turn stray parts into air and enclosed voids into object, in place.
+
+    Silhouettes cannot show a void, and the cones of few views also meet where nothing is.
+
+    Args:
+        distances: negative inside.
+        keep: number of parts to keep, the largest ones; by default all that have 2 % of the largest one's volume.
+
+    Returns:
+        Number of parts that there were, and that were kept.
+    """
+    inside = distances < 0
+    voids = binary_fill_holes(inside) & ~inside
+    distances[voids] = -np.abs(distances[voids]) - 1e-6
+    parts, num_parts = label(distances < 0)
+    if num_parts == 0:
+        return 0, 0
+    sizes = np.bincount(parts.ravel())[1:]
+    order = np.argsort(-sizes, kind="stable")
+    num_kept = int((sizes >= _STRAY * sizes.max()).sum()) if keep is None else min(keep, num_parts)
+    strays = ~np.isin(parts, [0, *(order[:num_kept] + 1)])
+    distances[strays] = np.abs(distances[strays])
+    return num_parts, num_kept
+
+
+def extract_surface(
+    distances: Float[np.ndarray, "X Y Z"], corner: Float[np.ndarray, "3"], spacing: float
+) -> TriangleMesh:
+    """The zero level as a closed mesh in world units; where it meets the grid's border it is closed there.
+
+    Raises:
+        NerfroError: nothing is inside.
+    """
+    if not (distances < 0).any():
+        raise NerfroError("the visual hull is empty: no point is inside all masks")
+    padded = np.pad(distances, 1, constant_values=0.5 * spacing)
+    vertices, faces, _, _ = marching_cubes(padded, 0.0, spacing=(spacing,) * 3, gradient_direction="descent")
+    return merge_vertices(vertices.astype(np.float64) + corner - spacing, faces.astype(np.int64))
+
+
+def reached_sides(distances: Float[np.ndarray, "X Y Z"]) -> list[tuple[int, int]]:
+    """Sides of the grid that the body reaches, as (axis, -1 or 1)."""
+    sides: Sequence[tuple[int, int]] = [(axis, end) for axis in range(3) for end in (-1, 1)]
+    return [(a, e) for a, e in sides if (np.take(distances, 0 if e < 0 else -1, axis=a) < 0).any()]
