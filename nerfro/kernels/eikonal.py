@@ -208,8 +208,10 @@ def march_adaptive(
                     px, py, pz = px + kick * gx, py + kick * gy, pz + kick * gz
                     varies = gx != 0.0 or gy != 0.0 or gz != 0.0
                     vx, vy, vz = _with_length_along(px, py, pz, px - vx, py - vy, pz - vz, n, varies)
-                    norm = math.sqrt(vx * vx + vy * vy + vz * vz)
-                    dx, dy, dz = vx / norm, vy / norm, vz / norm
+                    # A straight step leaves the direction as it is, to the last bit.
+                    if varies or slope > 0.0:
+                        norm = math.sqrt(vx * vx + vy * vy + vz * vz)
+                        dx, dy, dz = vx / norm, vy / norm, vz / norm
                     ahead = s - ks
                     ex, ey, ez = x - kx - ahead * kdx, y - ky - ahead * kdy, z - kz - ahead * kdz
                     if ex * ex + ey * ey + ez * ez > tolerance * tolerance:

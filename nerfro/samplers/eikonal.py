@@ -151,12 +151,15 @@ def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int)
         s[jumping] += length
         n[jumping], g[jumping] = medium(x[jumping])
         v[jumping] = n[jumping, None] * d[jumping]
-        refracted[stepping] |= (g[stepping] != 0).any(-1)
+        varies = (g[stepping] != 0).any(-1)
+        refracted[stepping] |= varies
         ds = torch.minimum(step, remaining)[~jumps]
         state = leapfrog(RayState(x[stepping], v[stepping], n[stepping], g[stepping]), ds, medium)
         s[stepping] += torch.linalg.vector_norm(state.positions - x[stepping], dim=-1)
         x[stepping], v[stepping], n[stepping], g[stepping] = state
-        d[stepping] = torch.nn.functional.normalize(state.velocities, dim=-1)
+        # A straight step leaves the direction as it is, to the last bit.
+        bent = stepping[varies | (state.gradients != 0).any(-1)]
+        d[bent] = torch.nn.functional.normalize(v[bent], dim=-1)
         tangent = kept_x[stepping] + (s - kept_s)[stepping, None] * kept_d[stepping]
         keep(stepping[(x[stepping] - tangent).square().sum(-1) > tolerance**2])
         outside = ((x[active] < medium.box[0]) | (x[active] > medium.box[1])).any(-1)
