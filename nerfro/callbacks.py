@@ -110,24 +110,31 @@ class TrainingProgress(ProgressBar):
 class StopOnSignal(Callback):
     """Ends training after the current step on Ctrl-C or SIGTERM, so that it can be saved whole and resumed.
 
+    Several processes end together, whichever of them the signal reached.
+
     Attributes:
         received: whether that happened.
     """
 
     def __init__(self) -> None:
-        self.received = False
+        self.received = self._signalled = False
         self._previous: dict[signal.Signals, Any] = {}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         def stop(number: int, frame: FrameType | None) -> None:
-            self.received = True
-            trainer.should_stop = True
+            self._signalled = True
             self._restore()  # a second signal ends the process at once
 
         try:
             self._previous = {s: signal.signal(s, stop) for s in (signal.SIGINT, signal.SIGTERM)}
         except ValueError:  # not the main thread (a launcher's worker): signals are not ours to handle
             self._previous = {}
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
+    ) -> None:
+        if trainer.strategy.reduce_boolean_decision(self._signalled, all=False):
+            self.received = trainer.should_stop = True
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._restore()

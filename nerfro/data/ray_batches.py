@@ -11,6 +11,7 @@ import torch
 
 from nerfro.data.base import Views
 from nerfro.data.cameras import central_window
+from nerfro.distributed import share_of
 from nerfro.errors import NerfroError
 from nerfro.types import Batch
 
@@ -62,6 +63,7 @@ class RayBatches:
             raise NerfroError("there are no training images; give at least one")
         self.batch_size, self.batching, self.seed = batch_size, batching, seed
         self.precrop_steps, self.jitter, self.first_step = precrop_steps, jitter, first_step
+        self._share = slice(batch_size)
         cameras = views.cameras
         self._cameras = cameras
         self._pixels = views.images.reshape(-1, 3)
@@ -78,6 +80,20 @@ class RayBatches:
         moved._cameras, moved._pixels = self._cameras.to(device), self._pixels.to(device)
         return moved
 
+    def share(self, rank: int, size: int) -> RayBatches:
+        """The sequence of process `rank` of `size`: an equal part of every batch, in its order.
+
+        Raises:
+            NerfroError: the batch has no equal parts.
+        """
+        if self.batch_size % size:
+            raise NerfroError(
+                f"batches.size={self.batch_size} cannot be shared evenly by {size} processes; take a multiple of {size}"
+            )
+        shared = copy.copy(self)
+        shared._share = share_of(self.batch_size, rank, size)
+        return shared
+
     def __iter__(self) -> Iterator[Batch]:
         step = self.first_step
         while True:
@@ -85,19 +101,20 @@ class RayBatches:
             step += 1
 
     def batch(self, step: int) -> Batch:
-        """The batch of a step: a pure function of the seed and the step, on every device the same pixels."""
+        """The batch (or the share) of a step: a function of seed and step alone, on every device the same pixels."""
         cameras = self._cameras
         height, width = cameras.height, cameras.width
         window = central_window(height, width, 1.0) if step >= self.precrop_steps else self._crop
         generator = np.random.default_rng([self.seed, step])
         view, pixel = self._draw(generator, window.height * window.width)
         row, column = window.top + pixel // window.width, window.left + pixel % window.width
+        drawn = ((view * height + row) * width + column)[self._share]
         # One small copy to the device; the rest is computed there.
-        index = torch.from_numpy((view * height + row) * width + column).to(cameras.device, non_blocking=True)
+        index = torch.from_numpy(drawn).to(cameras.device, non_blocking=True)
         jitter = None
         if self.jitter:
             offsets = generator.random((self.batch_size, 2), dtype=np.float32)
-            jitter = torch.from_numpy(offsets).to(cameras.device, non_blocking=True)
+            jitter = torch.from_numpy(offsets[self._share]).to(cameras.device, non_blocking=True)
         return Batch(
             rays=cameras.rays(index // (height * width), index // width % height, index % width, jitter),
             rgb=self._pixels[index],

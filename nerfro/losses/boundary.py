@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.distributed import rank_and_size, sum_over_processes
 from nerfro.losses.base import Loss
 from nerfro.registry import register
 from nerfro.types import Batch, Rendering
@@ -44,4 +45,5 @@ class BoundaryRegulariser(Loss):
         if self.refracted_only:
             counts = counts & fine.path.refracted
         error = (fine.transmittance[:, None] * fine.boundary_rgb.detach() - batch.rgb).abs().sum(-1)
-        return (error * counts).sum() / (counts.sum() + 1)
+        # Processes average their gradients: each brings its sum as often as there are processes.
+        return (error * counts).sum() * rank_and_size()[1] / (sum_over_processes(counts.sum()) + 1)

@@ -97,8 +97,11 @@ class NerfModel(LightningModule, ABC):
 
     def on_train_batch_start(self, batch: Batch, batch_index: int) -> None:
         # Every step draws from its own seed, so that a resumed run repeats the steps of an undisturbed one.
-        torch.manual_seed(step_seed(self.seed, self.global_step, self.global_rank))
-        factor = learning_rate_factor(self.global_step, training_progress(self.trainer), self.optimizer_config)
+        # All processes have the same one: each takes its rays' share of what is drawn.
+        torch.manual_seed(step_seed(self.seed, self.global_step))
+        # Under a time limit every process has its own idea of it, and parameters would drift apart at different rates.
+        progress = self.trainer.strategy.broadcast(training_progress(self.trainer))
+        factor = learning_rate_factor(self.global_step, progress, self.optimizer_config)
         for group in self.trainer.optimizers[0].param_groups:
             group["lr"] = group["initial_lr"] * factor
         # Not at the end of the step before, which comes after its checkpoint: a resumed run would miss the update.
@@ -113,12 +116,15 @@ class NerfModel(LightningModule, ABC):
         fused = self._trainer is None or not self._trainer.gradient_clip_val
         return torch.optim.Adam([g for g in groups if g["params"]], eps=config.adam_epsilon, fused=fused)
 
-    def validation_step(self, view: int, batch_index: int) -> dict[str, Tensor]:
+    def validation_step(self, view: int, batch_index: int) -> dict[str, Tensor] | None:
+        if not self.trainer.is_global_zero:
+            return None  # one process looks, the others wait
         views = self.trainer.datamodule.validation  # type: ignore[attr-defined]
         target = views.images[view].to(self.device)
         rendered = self.render(views.cameras.to(self.device).image_rays(view))
         prediction = rendered.rgb.reshape(target.shape)
-        self.log("val/psnr", -10 * torch.log10((prediction - target).square().mean()), prog_bar=True, batch_size=1)
+        psnr = -10 * torch.log10((prediction - target).square().mean())
+        self.log("val/psnr", psnr, prog_bar=True, batch_size=1, rank_zero_only=True)
         far = views.cameras.far
         maps = [m.reshape(*target.shape[:2], 1).expand_as(target) for m in (rendered.depth / far, rendered.opacity)]
         return {
@@ -155,6 +161,6 @@ class RenderedRays:
     exit_directions: Float[Tensor, "R 3"]
 
 
-def step_seed(seed: int, step: int, rank: int = 0) -> int:
-    """A seed for one step of one process, from the run's (Weyl sequence; distinct for neighbouring arguments)."""
-    return (seed * 0x9E3779B97F4A7C15 + step * 0xBF58476D1CE4E5B9 + rank * 0x94D049BB133111EB) % 2**63
+def step_seed(seed: int, step: int) -> int:
+    """A seed for one step, from the run's (Weyl sequence; distinct for neighbouring arguments)."""
+    return (seed * 0x9E3779B97F4A7C15 + step * 0xBF58476D1CE4E5B9) % 2**63

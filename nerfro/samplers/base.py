@@ -29,7 +29,7 @@ class PathSampler(nn.Module, ABC):
 
 
 class PointSampler(nn.Module, ABC):
-    """Chooses samples on a path; random in training, deterministic in evaluation.
+    """Chooses samples on a path; random in training (by `distributed.rand_rays`), deterministic in evaluation.
 
     Attributes:
         num_levels: how often the path is sampled, each level guided by the rendering of the one before.

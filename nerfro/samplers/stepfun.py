@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.distributed import rand_rays
+
 # Below this total weight a ray is treated as empty and sampled uniformly (mip-NeRF's code).
 _MIN_TOTAL_WEIGHT = 1e-5
 
@@ -17,7 +19,7 @@ def spread_uniform(num_rays: int, num_samples: int, random: bool, like: Tensor) 
     (authors' code); `random` is the stratified draw of the paper's Eqn. stratified.
     """
     if random:
-        jitter = torch.rand(num_rays, num_samples, device=like.device, dtype=like.dtype)
+        jitter = rand_rays(num_rays, num_samples, like)
         return (torch.arange(num_samples, device=like.device, dtype=like.dtype) + jitter) / num_samples
     eps = torch.finfo(like.dtype).eps
     return torch.linspace(0.0, 1.0 - eps, num_samples, device=like.device, dtype=like.dtype).expand(num_rays, -1)

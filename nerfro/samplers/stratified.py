@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.distributed import rand_rays
 from nerfro.errors import NerfroError
 from nerfro.registry import register
 from nerfro.samplers.base import PointSampler
@@ -70,10 +71,9 @@ class Stratified(PointSampler):
         return torch.arange(self.num_samples, device=like.device, dtype=like.dtype)
 
     def _offsets(self, like: Tensor) -> Float[Tensor, "R N"]:
-        shape = (like.shape[0], self.num_samples)
         if self.training:
-            return torch.rand(shape, device=like.device, dtype=like.dtype)
-        return torch.full(shape, self.offset, device=like.device, dtype=like.dtype)
+            return rand_rays(len(like), self.num_samples, like)
+        return torch.full((len(like), self.num_samples), self.offset, device=like.device, dtype=like.dtype)
 
     def _cone_fractions(self, like: Tensor) -> Float[Tensor, "R N+1"]:
         fractions = torch.linspace(0.0, 1.0, self.num_samples + 1, device=like.device, dtype=like.dtype)
@@ -81,7 +81,7 @@ class Stratified(PointSampler):
             middle = 0.5 * (fractions[1:] + fractions[:-1])
             low = torch.cat([fractions[:1], middle])
             high = torch.cat([middle, fractions[-1:]])
-            return low + (high - low) * torch.rand(len(like), len(fractions), device=like.device, dtype=like.dtype)
+            return low + (high - low) * rand_rays(len(like), len(fractions), like)
         return fractions.expand(len(like), -1)
 
     def _draw_vertices(self, path: Path) -> Samples:
