@@ -6,7 +6,8 @@ import math
 from typing import Literal
 
 from nerfro.data.base import DataSource, Views
-from nerfro.data.transforms import check_options, find_splits, is_number, make_cameras, read_images, read_manifest
+from nerfro.data.frames import Lens, check_options, load_views
+from nerfro.data.transforms import find_splits, is_number, read_manifest
 from nerfro.errors import NerfroError
 from nerfro.paths import resolve_path
 from nerfro.registry import register
@@ -51,9 +52,10 @@ class BlenderData(DataSource):
             raise NerfroError(
                 f"{manifest.path}: camera_angle_x={angle!r} must be an angle between 0 and pi, in radians"
             )
-        images, masks = read_images(manifest, self.downscale, self.alpha)
-        height, width = images.shape[1:3]
-        focal = 0.5 * width / math.tan(0.5 * angle)
-        intrinsics = focal, focal, 0.5 * width, 0.5 * height
-        cameras = make_cameras(manifest, "opengl", intrinsics, (width, height), self.near, self.far)
-        return Views(cameras, images, masks, [frame.name for frame in manifest.frames])
+
+        def lenses(width: int, height: int) -> list[Lens]:
+            focal = 0.5 * width / math.tan(0.5 * angle)
+            return [Lens(focal, focal, 0.5 * width, 0.5 * height)] * len(manifest.frames)
+
+        bounds = self.near, self.far
+        return load_views(manifest.frames, lenses, "opengl", bounds, self.downscale, self.alpha, manifest.size)

@@ -9,7 +9,9 @@ import numpy as np
 
 from nerfro.data.base import DataSource, Views
 from nerfro.data.cameras import central_window
-from nerfro.data.transforms import check_options, find_splits, make_cameras, parse_matrix, read_images, read_manifest
+from nerfro.data.distortion import opencv_coefficients
+from nerfro.data.frames import Lens, check_options, load_views
+from nerfro.data.transforms import Manifest, find_splits, is_number, parse_matrix, read_manifest
 from nerfro.errors import NerfroError
 from nerfro.paths import resolve_path
 from nerfro.registry import register
@@ -63,19 +65,34 @@ class OpenCVData(DataSource):
             raise NerfroError(f"{where} must have positive focal lengths and no skew; it is {matrix.tolist()}")
         if np.abs(matrix[2] - [0, 0, 1]).max() > 1e-6:
             raise NerfroError(f"{where} must have the last row 0, 0, 1; it has {matrix[2].tolist()}")
-        images, masks = read_images(manifest, self.downscale, self.alpha)
-        height, width = images.shape[1:3]
-        if not (0 < cx < width * self.downscale and 0 < cy < height * self.downscale):
-            warnings.warn(
-                f"{where} has its principal point ({cx:g}, {cy:g}) outside the {width * self.downscale}x"
-                f"{height * self.downscale} pixels of the images; was it made for another size?",
-                stacklevel=2,
-            )
-        intrinsics = fx / self.downscale, fy / self.downscale, cx / self.downscale, cy / self.downscale
-        cameras = make_cameras(manifest, "opencv", intrinsics, (width, height), self.near, self.far)
-        if split != "train" and self.eval_crop < 1:
-            window = central_window(height, width, self.eval_crop)
-            cameras = cameras.crop(window)
-            images = window.cut(images)
-            masks = None if masks is None else window.cut(masks)
-        return Views(cameras, images, masks, [frame.name for frame in manifest.frames])
+        lens = Lens(fx, fy, cx, cy, _distortion(manifest))
+
+        def lenses(width: int, height: int) -> list[Lens]:
+            if not (0 < cx < width and 0 < cy < height):
+                warnings.warn(
+                    f"{where} has its principal point ({cx:g}, {cy:g}) outside the {width}x{height} pixels of the "
+                    "images; was it made for another size?",
+                    stacklevel=3,
+                )
+            return [lens] * len(manifest.frames)
+
+        bounds = self.near, self.far
+        views = load_views(manifest.frames, lenses, "opencv", bounds, self.downscale, self.alpha, manifest.size)
+        if split == "train" or self.eval_crop == 1:
+            return views
+        window = central_window(views.cameras.height, views.cameras.width, self.eval_crop)
+        masks = None if views.masks is None else window.cut(views.masks)
+        return Views(views.cameras.crop(window), window.cut(views.images), masks, views.names)
+
+
+def _distortion(manifest: Manifest) -> tuple[float, ...] | None:
+    """The lens's distortion, where the file has `dist`: 4, 5 or 8 numbers in OpenCV's order."""
+    numbers = manifest.document.get("dist", [])
+    # cv2.calibrateCamera returns a matrix of one row.
+    if isinstance(numbers, list) and len(numbers) == 1 and isinstance(numbers[0], list):
+        (numbers,) = numbers
+    if not isinstance(numbers, list) or len(numbers) not in (0, 4, 5, 8) or not all(map(is_number, numbers)):
+        raise NerfroError(
+            f"{manifest.path}: dist={numbers!r} must be 4, 5 or 8 numbers in OpenCV's order: k1, k2, p1, p2, k3, ..."
+        )
+    return opencv_coefficients(numbers)

@@ -8,38 +8,14 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Literal, TypeGuard
+from typing import TypeGuard
 
 import numpy as np
-import torch
 from jaxtyping import Float
-from torch import Tensor
 
-from nerfro.data.cameras import Cameras
-from nerfro.data.image_files import Alpha, read_rgb, read_stack
-from nerfro.data.masks import find_mask, read_masks
+from nerfro.data.frames import IMAGE_SUFFIXES, SPLITS, Frame, check_pose
+from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
-
-_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
-_SPLIT_ORDER = ("train", "val", "test")
-_ROTATION_TOLERANCE = 1e-3
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One posed image.
-
-    Attributes:
-        name: the frame's `file_path`, tidied.
-        image: the image's file.
-        mask: the mask's file, if there is one.
-        camera_to_world: rotation and centre, camera axes as in the file.
-    """
-
-    name: str
-    image: Path
-    mask: Path | None
-    camera_to_world: Float[np.ndarray, "3 4"]
 
 
 @dataclass(frozen=True)
@@ -91,7 +67,7 @@ def find_splits(root: Path) -> dict[str, Path]:
         raise NerfroError(
             f"data.root={root} holds no transforms_<split>.json; give a folder that does, see docs/data.md"
         )
-    rank = {name: i for i, name in enumerate(_SPLIT_ORDER)}
+    rank = {name: i for i, name in enumerate(SPLITS)}
     return {name: found[name] for name in sorted(found, key=lambda name: (rank.get(name, len(rank)), name))}
 
 
@@ -105,7 +81,19 @@ def read_manifest(root: Path, split: str) -> Manifest:
     splits = find_splits(root)
     if split not in splits:
         raise NerfroError(f"data.root={root} has no split '{split}'; it has {', '.join(splits)}")
-    path = splits[split]
+    return parse_manifest(splits[split])
+
+
+def parse_manifest(path: Path, mask_key: str = "mask_path") -> Manifest:
+    """Read and check a transforms file.
+
+    Args:
+        path: of the file.
+        mask_key: key of a frame's silhouette. Under another than the usual one, none is looked for beside the images.
+
+    Raises:
+        NerfroError: as `read_manifest`.
+    """
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
@@ -117,70 +105,9 @@ def read_manifest(root: Path, split: str) -> Manifest:
         raise NerfroError(f"{path} has no list 'frames'; see docs/data.md for the format")
     if not frames:
         raise NerfroError(f"{path} has an empty list 'frames'; a split needs at least one")
-    manifest = Manifest(path, document, [_read_frame(path, i, frame) for i, frame in enumerate(frames)])
+    manifest = Manifest(path, document, [_read_frame(path, i, frame, mask_key) for i, frame in enumerate(frames)])
     _check_names(manifest)
     return manifest
-
-
-def read_images(
-    manifest: Manifest, downscale: int, alpha: Alpha
-) -> tuple[Float[Tensor, "V H W 3"], Float[Tensor, "V H W"] | None]:
-    """Read the frames' images, and their masks if they have any.
-
-    Args:
-        manifest: the frames.
-        downscale: side of the blocks of pixels that are averaged.
-        alpha: what becomes of transparency, see `read_rgb`.
-
-    Returns:
-        Colours, sRGB in [0, 1], and shares of each pixel that the object covers.
-
-    Raises:
-        NerfroError: an image or mask is missing, corrupt or of the wrong size, or `downscale` does not divide it.
-    """
-    images = read_stack(
-        [frame.image for frame in manifest.frames], lambda path: read_rgb(path, alpha), downscale, manifest.size
-    )
-    size = images.shape[2] * downscale, images.shape[1] * downscale
-    frames = manifest.frames
-    return images, read_masks([frame.image for frame in frames], [frame.mask for frame in frames], downscale, size)
-
-
-def make_cameras(
-    manifest: Manifest,
-    axes: Literal["opengl", "opencv"],
-    intrinsics: tuple[float, float, float, float],
-    size: tuple[int, int],
-    near: float,
-    far: float,
-) -> Cameras:
-    """Cameras of the frames.
-
-    Args:
-        manifest: the frames.
-        axes: the camera axes of their poses: `opengl` (x right, y up, looks along -z) or `opencv` (y down, along +z).
-        intrinsics: fx, fy, cx, cy in pixels, the same for all frames.
-        size: width and height in pixels.
-        near, far: bounds of the rays in arc length.
-    """
-    poses = np.stack([frame.camera_to_world for frame in manifest.frames])
-    if axes == "opencv":
-        poses = poses * np.array([1.0, -1.0, -1.0, 1.0])
-    num_views = len(manifest.frames)
-    fx, fy, cx, cy = (torch.full((num_views,), float(value)) for value in intrinsics)
-    return Cameras(torch.from_numpy(poses).float(), fx, fy, cx, cy, *size, near, far)
-
-
-def check_options(near: float, far: float, downscale: int) -> None:
-    """Check the options that all loaders share.
-
-    Raises:
-        NerfroError: one is out of range.
-    """
-    if not 0 <= near < far < math.inf:  # also false for NaN
-        raise NerfroError(f"data.near={near} and data.far={far} are no interval; take 0 <= near < far")
-    if downscale < 1:
-        raise NerfroError(f"data.downscale={downscale} is not allowed; take 1 for full size, 2 for half, and so on")
 
 
 def parse_matrix(value: object, shapes: tuple[tuple[int, int], ...], where: str) -> Float[np.ndarray, "rows columns"]:
@@ -208,46 +135,35 @@ def is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _read_frame(path: Path, index: int, entry: object) -> Frame:
+def _read_frame(path: Path, index: int, entry: object, mask_key: str) -> Frame:
     where = f"{path}: frame {index}"
     if not isinstance(entry, dict):
         raise NerfroError(f"{where} is not an object; see docs/data.md for the format")
     for key in ("file_path", "transform_matrix"):
         if key not in entry:
             raise NerfroError(f"{where} has no '{key}'; add it or take the frame out")
-    if not isinstance(entry["file_path"], str) or not isinstance(entry.get("mask_path", ""), str):
-        raise NerfroError(f"{where}: 'file_path' and 'mask_path' must be text")
+    # RefRef's key for the silhouette.
+    stated = entry.get(mask_key, entry.get("mask_file_path"))
+    if not isinstance(entry["file_path"], str) or not isinstance(stated or "", str):
+        raise NerfroError(f"{where}: 'file_path' and '{mask_key}' must be text")
     name = PurePosixPath(entry["file_path"].replace("\\", "/")).as_posix()
     where += f" ('{name}')"
-    pose = _check_pose(parse_matrix(entry["transform_matrix"], ((4, 4), (3, 4)), f"{where}: transform_matrix"), where)
+    pose = check_pose(parse_matrix(entry["transform_matrix"], ((4, 4), (3, 4)), f"{where}: transform_matrix"), where)
     image = _find_image(path.parent, name, where)
-    return Frame(name, image, find_mask(path.parent, image, entry.get("mask_path")), pose)
+    looked_for = mask_key == "mask_path" or stated is not None
+    return Frame(name, image, find_mask(path.parent, image, stated) if looked_for else None, pose)
 
 
 def _find_image(root: Path, name: str, where: str) -> Path:
     """The image file of a `file_path` with or without extension."""
-    if PurePosixPath(name).suffix.lower() in _IMAGE_SUFFIXES:
+    if PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES:
         candidates = [root / name]
     else:
-        candidates = [root / f"{name}{suffix}" for suffix in _IMAGE_SUFFIXES]
+        candidates = [root / f"{name}{suffix}" for suffix in IMAGE_SUFFIXES]
     for candidate in candidates:
         if candidate.is_file():
             return candidate
     raise NerfroError(f"{where}: image {candidates[0]} does not exist; restore it or take the frame out")
-
-
-def _check_pose(matrix: Float[np.ndarray, "rows 4"], where: str) -> Float[np.ndarray, "3 4"]:
-    rotation = matrix[:3, :3]
-    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
-        cause = "mirrors" if error <= _ROTATION_TOLERANCE else f"is off by {error:.2g}"
-        raise NerfroError(
-            f"{where}: the 3x3 part of transform_matrix is no rotation (it {cause}); "
-            "give camera-to-world matrices without scale or reflection"
-        )
-    if len(matrix) == 4 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > _ROTATION_TOLERANCE:
-        raise NerfroError(f"{where}: the last row of transform_matrix is {matrix[3].tolist()}; it must be 0, 0, 0, 1")
-    return matrix[:3]
 
 
 def _check_names(manifest: Manifest) -> None:

@@ -113,3 +113,30 @@ def test_camera_matrix_of_another_image_size_gives_a_warning(write_opencv):
 def test_impossible_crop_is_refused(share):
     with pytest.raises(NerfroError, match=f"data.eval_crop={share} is not allowed"):
         OpenCVData("anywhere", eval_crop=share)
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_distortion_in_opencvs_order_bends_the_rays(write_opencv, edit_transforms, nested, random_pose):
+    root = write_opencv(2)
+    numbers = [-0.1, 0.02, 0.003, -0.002, 0.001]
+    edit_transforms(root, lambda document: document.update(dist=[numbers] if nested else numbers))
+    rays = OpenCVData(str(root)).load("train").cameras.image_rays(1)
+    points = (rays.origins + 2.5 * rays.directions).double().numpy()
+    x, y, z = np.linalg.inv(random_pose(1))[:3] @ np.c_[points, np.ones(len(points))].T
+    x, y = x / z, y / z
+    k1, k2, p1, p2, k3 = numbers
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    row, column = np.divmod(np.arange(len(points)), 8)
+    np.testing.assert_allclose(CAM_MAT[0][0] * u + CAM_MAT[0][2], column + 0.5, atol=1e-4)
+    np.testing.assert_allclose(CAM_MAT[1][1] * v + CAM_MAT[1][2], row + 0.5, atol=1e-4)
+
+
+@pytest.mark.parametrize("dist", [[0.1], "none", [1, 2, 3, None], [[0.1, 0.2]]])
+def test_wrong_distortion_is_refused(write_opencv, edit_transforms, dist):
+    root = write_opencv(1)
+    edit_transforms(root, lambda document: document.update(dist=dist))
+    with pytest.raises(NerfroError, match="must be 4, 5 or 8 numbers in OpenCV's order"):
+        OpenCVData(str(root)).load("train")

@@ -1,0 +1,146 @@
+"""A COLMAP reconstruction and its photographs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from nerfro.data.base import DataSource, Views
+from nerfro.data.colmap_model import ColmapCamera, ColmapModel, read_colmap
+from nerfro.data.distortion import coefficients, opencv_coefficients
+from nerfro.data.frames import SPLITS, Frame, Lens, check_options, held_out, load_views, require_root
+from nerfro.data.masks import find_mask
+from nerfro.errors import NerfroError
+from nerfro.paths import resolve_path
+from nerfro.registry import register
+
+_MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "")
+
+
+@register("data", "colmap")
+class ColmapData(DataSource):
+    """Folder with images/ and a COLMAP model (sparse/0, text or binary), in the model's own world.
+
+    Perspective cameras with any distortion that COLMAP has for them are read, fisheye lenses are refused. Images may
+    have been resized after the reconstruction.
+
+    Args:
+        root: the folder.
+        near: arc length at which rays begin, world units; none takes 0.9 of the distance of the nearest 3-D points.
+        far: arc length at which rays end, world units; none takes 1.1 of the distance of the farthest 3-D points.
+        downscale: side of the blocks of pixels that are averaged into one.
+        alpha: `drop` ignores the images' transparency, `white` and `black` composite them over that colour.
+        images: folder of the images within the root.
+        model: folder of the model within the root; none looks for sparse/0, sparse, colmap/sparse/0 and the root.
+        test_every: every such image by name, from the first, is for val and test.
+
+    Raises:
+        NerfroError: an option is out of range.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        near: float | None = None,
+        far: float | None = None,
+        downscale: int = 1,
+        alpha: Literal["drop", "white", "black"] = "drop",
+        images: str = "images",
+        model: str | None = None,
+        test_every: int = 8,
+    ) -> None:
+        check_options(near or 0.0, far or 1e30, downscale)
+        self.root = resolve_path(root)
+        self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
+        self.images, self.model, self.test_every = images, model, test_every
+
+    @property
+    def splits(self) -> list[str]:
+        return SPLITS
+
+    def load(self, split: str) -> Views:
+        require_root(self.root)
+        folder = self._model_folder()
+        model = read_colmap(folder)
+        bounds = self._bounds(model, folder)
+        images = [model.images[i] for i in held_out(len(model.images), self.test_every, split, self.root)]
+        frames = []
+        for image in images:
+            path = self.root / self.images / image.name
+            if not path.is_file():
+                raise NerfroError(f"image {path} of the model {folder} does not exist; set data.images, or restore it")
+            frames.append(Frame(image.name, path, find_mask(self.root, path), image.camera_to_world))
+
+        def lenses(width: int, height: int) -> list[Lens]:
+            found = {}
+            for number in {image.camera for image in images}:
+                camera, where = model.cameras[number], f"{folder}: camera {number}"
+                found[number] = lens_of(camera, where).resized((camera.width, camera.height), (width, height), where)
+            return [found[image.camera] for image in images]
+
+        return load_views(frames, lenses, "opencv", bounds, self.downscale, self.alpha)
+
+    def _model_folder(self) -> Path:
+        folders = [self.root / name for name in ((self.model,) if self.model is not None else _MODEL_FOLDERS)]
+        for folder in folders:
+            if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+                return folder
+        tried = ", ".join(map(str, folders))
+        raise NerfroError(f"there is no COLMAP model (cameras.bin or .txt) in {tried}; set data.model to its folder")
+
+    def _bounds(self, model: ColmapModel, folder: Path) -> tuple[float, float]:
+        if self.near is not None and self.far is not None:
+            return self.near, self.far
+        nearest, farthest = _distances(model, folder)
+        near = 0.9 * nearest if self.near is None else self.near
+        far = 1.1 * farthest if self.far is None else self.far
+        check_options(near, far, self.downscale)
+        return near, far
+
+
+def lens_of(camera: ColmapCamera, where: str) -> Lens:
+    """The lens of a COLMAP camera, whose pixel coordinates are nerfro's.
+
+    Raises:
+        NerfroError: its model is not supported.
+    """
+    p = camera.params
+    if camera.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
+        lens = Lens(p[0], p[0], p[1], p[2], coefficients(p[3:]))
+    elif camera.model in ("PINHOLE", "OPENCV", "FULL_OPENCV"):
+        lens = Lens(p[0], p[1], p[2], p[3], opencv_coefficients(p[4:]))
+    else:
+        raise NerfroError(
+            f"{where} has the model {camera.model}, which is not supported; undistort the images with "
+            "`colmap image_undistorter`, or reconstruct with PINHOLE, RADIAL, OPENCV or FULL_OPENCV"
+        )
+    if lens.fx <= 0 or lens.fy <= 0:
+        raise NerfroError(f"{where} has the focal lengths {lens.fx:g}, {lens.fy:g}; they must be positive")
+    return lens
+
+
+def _distances(model: ColmapModel, folder: Path) -> tuple[float, float]:
+    """Distances of the nearest and farthest 3-D points in any view, a thousandth at each end taken for outliers."""
+    found = []
+    for image in model.images:
+        seen = _in_view(model.points, image.camera_to_world, model.cameras[image.camera])
+        if len(seen) > 0:
+            found.append(np.quantile(seen, [0.001, 0.999]))
+    if not found:
+        raise NerfroError(f"{folder} has no 3-D points in view to take bounds from; set data.near and data.far")
+    near, far = np.array(found).T
+    return float(near.min()), float(far.max())
+
+
+def _in_view(
+    points: Float[np.ndarray, "P 3"], pose: Float[np.ndarray, "3 4"], camera: ColmapCamera
+) -> Float[np.ndarray, "Q"]:
+    """Distances of the points within a camera's cone, without its distortion."""
+    local = (points - pose[:, 3]) @ pose[:, :3]
+    local = local[local[:, 2] > 0]
+    slope = 0.5 * np.array([camera.width, camera.height]) / camera.params[0]
+    inside = (np.abs(local[:, :2]) < slope * local[:, 2:]).all(-1)
+    return np.linalg.norm(local[inside], axis=-1)

@@ -1,0 +1,232 @@
+"""Reading a COLMAP reconstruction, text or binary (https://colmap.github.io/format.html).
+
+nerfro's own reader, because pycolmap 4.2 takes a truncated cameras.bin without a word and dies, out of memory, of a
+truncated points3D.bin; an index of 3-D points with their tracks is not needed here either.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from nerfro.errors import NerfroError
+
+# Names and numbers of parameters, by the model's number in binary files.
+CAMERA_MODELS = (
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+)
+_NUM_PARAMS = dict(CAMERA_MODELS)
+
+
+@dataclass(frozen=True)
+class ColmapCamera:
+    """Intrinsics: COLMAP's model name, image size in pixels and the model's parameters."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class ColmapImage:
+    """A registered image.
+
+    Attributes:
+        name: path of its file in the folder of images.
+        camera: number of its camera.
+        camera_to_world: rotation and centre, OpenCV axes.
+    """
+
+    name: str
+    camera: int
+    camera_to_world: Float[np.ndarray, "3 4"]
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """A reconstruction: cameras by number, images by name, positions of the 3-D points."""
+
+    cameras: dict[int, ColmapCamera]
+    images: list[ColmapImage]
+    points: Float[np.ndarray, "P 3"]
+
+
+def read_colmap(folder: Path) -> ColmapModel:
+    """Read a model; without a file of 3-D points, there are none.
+
+    Raises:
+        NerfroError: cameras or images are missing, a file is truncated or corrupt, an image's camera does not exist, or
+            two images have one name.
+    """
+    suffix = next(
+        (s for s in _READERS if all((folder / f"{part}{s}").is_file() for part in ("cameras", "images"))), None
+    )
+    if suffix is None:
+        raise NerfroError(f"{folder} holds no cameras and images (.bin or .txt); give the folder of a COLMAP model")
+    read_cameras, read_images, read_points = _READERS[suffix]
+    cameras = dict(read_cameras(folder / f"cameras{suffix}"))
+    images = sorted(read_images(folder / f"images{suffix}"), key=lambda image: image.name)
+    path = folder / f"points3D{suffix}"
+    points = np.array(list(read_points(path)) if path.is_file() else [], dtype=np.float64).reshape(-1, 3)
+    if not images:
+        raise NerfroError(f"{folder / f'images{suffix}'} holds no registered image; did the reconstruction fail?")
+    for one, other in pairwise(images):
+        if one.name == other.name:
+            raise NerfroError(f"{folder}: two images are called {one.name}; keep one of them")
+    for image in images:
+        if image.camera not in cameras:
+            raise NerfroError(f"{folder}: image {image.name} has camera {image.camera}, which the model does not hold")
+    return ColmapModel(cameras, images, points)
+
+
+class _Binary:
+    """A binary file, read from its start; what is missing at its end is an error."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.content, self.offset = path, path.read_bytes(), 0
+
+    def take(self, layout: str) -> tuple:
+        """The next values, little-endian."""
+        size = struct.calcsize("<" + layout)
+        self.skip(size)
+        return struct.unpack_from("<" + layout, self.content, self.offset - size)
+
+    def skip(self, size: int) -> None:
+        self.offset += size
+        if self.offset > len(self.content):
+            raise NerfroError(f"{self.path} ends too early: truncated? copy or export it again")
+
+    def name(self) -> str:
+        end = self.content.find(b"\0", self.offset)
+        text = self.content[self.offset : end]
+        self.skip(len(text) + 1 if end >= 0 else len(self.content))
+        try:
+            return text.decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise NerfroError(f"{self.path} holds a name that is not UTF-8: corrupt? export it again") from error
+
+    def items(self) -> Iterator[int]:
+        """Counts the items, and sees that nothing follows the last one."""
+        (count,) = self.take("Q")
+        yield from range(count)
+        if self.offset != len(self.content):
+            raise NerfroError(f"{self.path} goes on after its last item: corrupt, or of an unknown version")
+
+
+def _binary_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
+    file = _Binary(path)
+    for _ in file.items():
+        number, model, width, height = file.take("iiQQ")
+        if not 0 <= model < len(CAMERA_MODELS):
+            raise NerfroError(f"{path}: camera model number {model} is unknown; undistort the images with COLMAP first")
+        name, num_params = CAMERA_MODELS[model]
+        yield number, _camera(name, width, height, file.take(f"{num_params}d"), f"{path}: camera {number}")
+
+
+def _binary_images(path: Path) -> Iterator[ColmapImage]:
+    file = _Binary(path)
+    for _ in file.items():
+        values = file.take("i4d3di")
+        name = file.name()
+        (num_features,) = file.take("Q")
+        file.skip(24 * num_features)  # x, y, number of the 3-D point
+        yield _image(name, values[1:5], values[5:8], values[8], path)
+
+
+def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
+    file = _Binary(path)
+    for _ in file.items():
+        values = file.take("Q3d3BdQ")
+        file.skip(8 * values[-1])  # track: image, feature
+        yield values[1:4]
+
+
+def _text_lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Numbered lines that are no comments; empty ones count, for an image without features has one."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise NerfroError(f"{path} is no text: corrupt? export it again") from error
+    return ((i, line.strip()) for i, line in enumerate(lines, 1) if not line.startswith("#"))
+
+
+def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
+    for i, line in _text_lines(path):
+        if not line:
+            continue
+        where = f"{path}, line {i}"
+        words = line.split()
+        try:
+            number, width, height = int(words[0]), int(words[2]), int(words[3])
+            params = tuple(map(float, words[4:]))
+        except (IndexError, ValueError) as error:
+            raise NerfroError(f"{where} is not CAMERA_ID MODEL WIDTH HEIGHT PARAMS: {line[:60]!r}") from error
+        yield number, _camera(words[1], width, height, params, where)
+
+
+def _text_images(path: Path) -> Iterator[ColmapImage]:
+    lines = _text_lines(path)
+    for i, line in lines:
+        if not line:
+            continue
+        words = line.split(maxsplit=9)
+        try:
+            values = tuple(map(float, words[1:8]))
+            camera, name = int(words[8]), words[9]
+        except (IndexError, ValueError) as error:
+            raise NerfroError(f"{path}, line {i} is not IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from error
+        next(lines, None)  # its features
+        yield _image(name, values[:4], values[4:], camera, path)
+
+
+def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
+    for i, line in _text_lines(path):
+        if not line:
+            continue
+        try:
+            x, y, z = map(float, line.split()[1:4])
+        except ValueError as error:
+            raise NerfroError(f"{path}, line {i} is not POINT3D_ID X Y Z ...: {line[:60]!r}") from error
+        yield x, y, z
+
+
+def _camera(model: str, width: int, height: int, params: tuple[float, ...], where: str) -> ColmapCamera:
+    if model in _NUM_PARAMS and len(params) != _NUM_PARAMS[model]:
+        raise NerfroError(f"{where}: {model} has {_NUM_PARAMS[model]} parameters, not {len(params)}; export it again")
+    if width < 1 or height < 1 or not np.isfinite(params).all():
+        raise NerfroError(f"{where}: size {width}x{height} and parameters {params} are no camera; export it again")
+    return ColmapCamera(model, width, height, params)
+
+
+def _image(name: str, quaternion: tuple[float, ...], shift: tuple[float, ...], camera: int, path: Path) -> ColmapImage:
+    norm = float(np.linalg.norm(quaternion))
+    if not (np.isfinite(norm) and np.isfinite(shift).all()) or abs(norm - 1) > 1e-3:
+        raise NerfroError(f"{path}: image {name} has no valid pose (quaternion {quaternion}); export the model again")
+    # COLMAP's poses lead from the world to the camera, scalar part first.
+    inverse = Rotation.from_quat([*quaternion[1:], quaternion[0]]).inv()
+    return ColmapImage(name, camera, np.column_stack([inverse.as_matrix(), -inverse.apply(shift)]))
+
+
+_READERS = {
+    ".bin": (_binary_cameras, _binary_images, _binary_points),
+    ".txt": (_text_cameras, _text_images, _text_points),
+}

@@ -1,0 +1,221 @@
+"""From frames (an image, a pose, a lens) to views: what all loaders share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.data.base import Views
+from nerfro.data.cameras import Cameras
+from nerfro.data.distortion import distort, undistort
+from nerfro.data.image_files import Alpha, read_rgb, read_stack
+from nerfro.data.masks import read_masks
+from nerfro.errors import NerfroError
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+SPLITS = ["train", "val", "test"]
+
+_ROTATION_TOLERANCE = 1e-3
+
+# Distorting what was undistorted must lead back to within this many pixels.
+_LENS_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One posed image.
+
+    Attributes:
+        name: of the image, as the data set calls it.
+        image: the image's file.
+        mask: the silhouette's file, if there is one.
+        camera_to_world: rotation and centre, camera axes as in the data set.
+    """
+
+    name: str
+    image: Path
+    mask: Path | None
+    camera_to_world: Float[np.ndarray, "3 4"]
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Focal lengths and principal point in pixels, and distortion (see `nerfro.data.distortion.coefficients`)."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] | None = None
+
+    def resized(self, made_for: tuple[float, float], size: tuple[int, int], where: str) -> Lens:
+        """The lens for images that were resized after calibration.
+
+        Args:
+            made_for, size: width and height that the lens was calibrated for, and that the images have.
+            where: the lens's place in the data set, for errors.
+
+        Raises:
+            NerfroError: the proportions differ by more than the rounding to whole pixels explains.
+        """
+        by_width, by_height = size[0] / made_for[0], size[1] / made_for[1]
+        if abs(by_width - by_height) > 1.5 * max(1 / made_for[0], 1 / made_for[1]):
+            raise NerfroError(
+                f"{where} is calibrated for {made_for[0]:g}x{made_for[1]:g} pixels but the images have "
+                f"{size[0]}x{size[1]}, of other proportions; give the images that were calibrated"
+            )
+        return Lens(self.fx * by_width, self.fy * by_height, self.cx * by_width, self.cy * by_height, self.distortion)
+
+
+def load_views(
+    frames: Sequence[Frame],
+    lenses: Callable[[int, int], Sequence[Lens]],
+    axes: Literal["opengl", "opencv"],
+    bounds: tuple[float, float],
+    downscale: int,
+    alpha: Alpha,
+    size: tuple[int, int] | None = None,
+) -> Views:
+    """Read the frames' images and silhouettes and set up their cameras.
+
+    Args:
+        frames: at least one.
+        lenses: the frames' lenses for a width and height of the images as stored.
+        axes: the camera axes of the poses: `opengl` (x right, y up, looks along -z) or `opencv` (y down, along +z).
+        bounds: arc lengths at which rays begin and end.
+        downscale: side of the blocks of pixels that are averaged.
+        alpha: what becomes of transparency, see `read_rgb`.
+        size: width and height of the images as stored, where the data set states them.
+
+    Raises:
+        NerfroError: an image or mask is missing, corrupt or of the wrong size, `downscale` does not divide it, or a
+            lens has no inverse.
+    """
+    files = [frame.image for frame in frames]
+    images = read_stack(files, lambda path: read_rgb(path, alpha), downscale, size)
+    height, width = images.shape[1:3]
+    stored = width * downscale, height * downscale
+    masks = read_masks(files, [frame.mask for frame in frames], downscale, stored)
+    full = lenses(*stored)
+    poses = np.stack([frame.camera_to_world for frame in frames])
+    if axes == "opencv":
+        poses = poses * np.array([1.0, -1.0, -1.0, 1.0])
+    fx, fy, cx, cy = (
+        torch.tensor([float(getattr(lens, name)) / downscale for lens in full]) for name in ("fx", "fy", "cx", "cy")
+    )
+    distorted = any(lens.distortion is not None for lens in full)
+    distortion = torch.tensor([lens.distortion or (0.0,) * 9 for lens in full]) if distorted else None
+    cameras = Cameras(torch.from_numpy(poses).float(), fx, fy, cx, cy, width, height, *bounds, distortion)
+    _check_distortion(cameras, frames)
+    return Views(cameras, images, masks, [frame.name for frame in frames])
+
+
+def check_options(near: float, far: float, downscale: int) -> None:
+    """Check the options that all loaders share.
+
+    Raises:
+        NerfroError: one is out of range.
+    """
+    if not 0 <= near < far < math.inf:  # also false for NaN
+        raise NerfroError(f"data.near={near} and data.far={far} are no interval; take 0 <= near < far")
+    if downscale < 1:
+        raise NerfroError(f"data.downscale={downscale} is not allowed; take 1 for full size, 2 for half, and so on")
+
+
+def check_split(split: str, root: Path) -> None:
+    """Check the name of a split of data that nerfro splits itself.
+
+    Raises:
+        NerfroError: it is unknown.
+    """
+    if split not in SPLITS:
+        raise NerfroError(f"data.root={root} has no split '{split}'; it has {', '.join(SPLITS)}")
+
+
+def held_out(num_views: int, every: int, split: str, root: Path) -> list[int]:
+    """The views of a split where the data has none: each `every`-th, from the first, is for val and test (LLFF).
+
+    Raises:
+        NerfroError: unknown split, `every` below 2, or too few views.
+    """
+    check_split(split, root)
+    if every < 2:
+        raise NerfroError(f"data.test_every={every} leaves nothing to train on; take 2 or more")
+    if num_views < 2:
+        raise NerfroError(f"data.root={root} holds one image; two or more are needed to train on one and test another")
+    return [i for i in range(num_views) if (i % every == 0) == (split != "train")]
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The images of a folder by name, masks (`mask_*`) left out.
+
+    Raises:
+        NerfroError: there is no such folder, or no image in it.
+    """
+    if not folder.is_dir():
+        raise NerfroError(f"{folder} is not a folder; it should hold the images, see docs/data.md")
+    images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
+    images = [path for path in images if not path.name.startswith("mask_")]
+    if not images:
+        raise NerfroError(f"{folder} holds no image; see docs/data.md")
+    return sorted(images)
+
+
+def require_root(root: Path) -> None:
+    """Check the folder of a data set.
+
+    Raises:
+        NerfroError: it does not exist.
+    """
+    if not root.is_dir():
+        raise NerfroError(f"data.root={root} is not a folder; give the one that holds the data set")
+
+
+def check_pose(matrix: Float[np.ndarray, "rows 4"], where: str) -> Float[np.ndarray, "3 4"]:
+    """The first three rows of a camera-to-world matrix.
+
+    Raises:
+        NerfroError: it is no rotation and shift.
+    """
+    rotation = matrix[:3, :3]
+    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        cause = "mirrors" if error <= _ROTATION_TOLERANCE else f"is off by {error:.2g}"
+        raise NerfroError(
+            f"{where}: the 3x3 part of transform_matrix is no rotation (it {cause}); "
+            "give camera-to-world matrices without scale or reflection"
+        )
+    if len(matrix) == 4 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > _ROTATION_TOLERANCE:
+        raise NerfroError(f"{where}: the last row of transform_matrix is {matrix[3].tolist()}; it must be 0, 0, 0, 1")
+    return matrix[:3]
+
+
+def _check_distortion(cameras: Cameras, frames: Sequence[Frame]) -> None:
+    """Refuse lenses whose model folds back within the image, as polynomials fitted to its middle may do."""
+    if cameras.distortion is None:
+        return
+    share = torch.linspace(0, 1, 9, dtype=torch.float64)
+    border = torch.cartesian_prod(share, share)  # the inside as well: a fold may lie within
+    for view, frame in enumerate(frames):
+        fx, fy, cx, cy = (getattr(cameras, name)[view].double() for name in ("fx", "fy", "cx", "cy"))
+        points = _plane(border, cameras, fx, fy, cx, cy)
+        lens = cameras.distortion[view].double().expand(len(points), 9)
+        ideal, area = undistort(points, lens)
+        error = (distort(ideal, lens)[0] - points).norm(dim=-1) * fx
+        if not bool(((error < _LENS_TOLERANCE) & (area > 0)).all()):
+            raise NerfroError(
+                f"{frame.name}: its lens distortion cannot be undone everywhere in the image; "
+                "check the coefficients and their order, or undistort the images first"
+            )
+
+
+def _plane(share: Tensor, cameras: Cameras, fx: Tensor, fy: Tensor, cx: Tensor, cy: Tensor) -> Tensor:
+    return torch.stack([(share[:, 0] * cameras.width - cx) / fx, (share[:, 1] * cameras.height - cy) / fy], -1)

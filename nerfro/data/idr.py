@@ -1,0 +1,143 @@
+"""Data in the format of IDR and NeuS: one matrix for each camera, world to pixel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
+
+from nerfro.data.base import DataSource, Views
+from nerfro.data.frames import SPLITS, Frame, Lens, check_options, held_out, list_images, load_views, require_root
+from nerfro.data.transforms import parse_matrix
+from nerfro.errors import NerfroError
+from nerfro.geometry.cache import load_arrays
+from nerfro.paths import resolve_path
+from nerfro.registry import register
+
+_MAX_SKEW = 1e-3
+
+
+@register("data", "idr")
+class IdrData(DataSource):
+    """Folder with image/, mask/ and cameras_sphere.npz, as IDR, NeuS, NeTO and NEMTO have it.
+
+    `world_mat_i` maps the world to pixels, `scale_mat_i` the unit sphere to the world. Masks belong to images in the
+    order of names. Pixel centres are whole numbers there (NeuS, gen_rays_at), so half a pixel is added.
+
+    Args:
+        root: the folder.
+        near: arc length at which rays begin; none takes where they enter the unit sphere at the earliest.
+        far: arc length at which rays end; none takes where they leave the unit sphere at the latest.
+        downscale: side of the blocks of pixels that are averaged into one.
+        alpha: `drop` ignores the images' transparency, `white` and `black` composite them over that colour.
+        cameras: name of the file of matrices.
+        world: `sphere` is the frame in which the object lies in the unit sphere, `file` that of `world_mat` (of which
+            `near` and `far` cannot be known).
+        test_every: every such image by name, from the first, is for val and test.
+
+    Raises:
+        NerfroError: an option is out of range.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        near: float | None = None,
+        far: float | None = None,
+        downscale: int = 1,
+        alpha: Literal["drop", "white", "black"] = "drop",
+        cameras: str = "cameras_sphere.npz",
+        world: Literal["sphere", "file"] = "sphere",
+        test_every: int = 8,
+    ) -> None:
+        check_options(near or 0.0, far or 1e30, downscale)
+        if world == "file" and (near is None or far is None):
+            raise NerfroError("data.world=file needs data.near and data.far, in units of that world")
+        self.root = resolve_path(root)
+        self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
+        self.cameras, self.world, self.test_every = cameras, world, test_every
+
+    @property
+    def splits(self) -> list[str]:
+        return SPLITS
+
+    def load(self, split: str) -> Views:
+        require_root(self.root)
+        images = list_images(_first_folder(self.root, ("image", "images", "rgb")))
+        masks = _masks(self.root, len(images))
+        file = self.root / self.cameras
+        if not file.is_file():
+            raise NerfroError(f"{file} does not exist; name the file of matrices with data.cameras")
+        arrays = load_arrays(file)
+        num_matrices = sum(name.startswith("world_mat_") and name[10:].isdigit() for name in arrays)
+        if num_matrices != len(images):
+            raise NerfroError(
+                f"{file} has {num_matrices} matrices world_mat_<i> for {len(images)} images; make them equal"
+            )
+        poses, lenses = [], []
+        for i in range(len(images)):
+            pose, lens = decompose(self._projection(arrays, i, file), f"{file}: world_mat_{i}")
+            poses.append(pose)
+            lenses.append(lens)
+        chosen = held_out(len(images), self.test_every, split, self.root)
+        frames = [Frame(images[i].name, images[i], masks[i], poses[i]) for i in chosen]
+        # Over all views, so that the splits agree.
+        distance = np.linalg.norm(np.stack(poses)[:, :, 3], axis=-1)
+        near = max(float(distance.min()) - 1, 0.0) if self.near is None else self.near
+        far = float(distance.max()) + 1 if self.far is None else self.far
+        check_options(near, far, self.downscale)
+        return load_views(
+            frames, lambda width, height: [lenses[i] for i in chosen], "opencv", (near, far), self.downscale, self.alpha
+        )
+
+    def _projection(self, arrays: dict[str, np.ndarray], index: int, file: Path) -> Float[np.ndarray, "3 4"]:
+        names = [f"world_mat_{index}"] + ([f"scale_mat_{index}"] if self.world == "sphere" else [])
+        for name in names:
+            if name not in arrays:
+                raise NerfroError(f"{file} has no '{name}'; every image needs one")
+        matrices = [parse_matrix(arrays[name], ((4, 4),), f"{file}: {name}") for name in names]
+        product = matrices[0] if len(matrices) == 1 else matrices[0] @ matrices[1]
+        return product[:3]
+
+
+def decompose(projection: Float[np.ndarray, "3 4"], where: str) -> tuple[Float[np.ndarray, "3 4"], Lens]:
+    """Camera-to-world matrix (OpenCV axes) and lens of a projection matrix that takes whole numbers as pixel centres.
+
+    By RQ factorisation; any factor of the matrix, and with it a uniform scale of the world, is immaterial.
+
+    Raises:
+        NerfroError: it is singular, or has skew.
+    """
+    square = projection[:, :3]
+    determinant = np.linalg.det(square)
+    if abs(determinant) <= 1e-12 * max(np.abs(square).max(), 1e-30) ** 3:
+        raise NerfroError(f"{where} is singular, so it is no camera; export the matrices again")
+    # A matrix of either sign projects to the same pixels; this one has what is in front at positive depth.
+    upper, rotation = scipy.linalg.rq(square * np.sign(determinant))
+    signs = np.diag(np.sign(np.diag(upper)))
+    intrinsics, rotation = upper @ signs, signs @ rotation
+    intrinsics /= intrinsics[2, 2]
+    fx, fy = float(intrinsics[0, 0]), float(intrinsics[1, 1])
+    if abs(intrinsics[0, 1]) > _MAX_SKEW * fx:
+        raise NerfroError(f"{where} has the skew {intrinsics[0, 1]:.3g}, which is not supported; calibrate without")
+    centre = -np.linalg.solve(square, projection[:, 3])
+    lens = Lens(fx, fy, float(intrinsics[0, 2]) + 0.5, float(intrinsics[1, 2]) + 0.5)
+    return np.column_stack([rotation.T, centre]), lens
+
+
+def _first_folder(root: Path, names: tuple[str, ...]) -> Path:
+    return next((root / name for name in names if (root / name).is_dir()), root / names[0])
+
+
+def _masks(root: Path, num_images: int) -> list[Path] | list[None]:
+    """The masks in the order of names; they need not be called as the images are."""
+    folder = _first_folder(root, ("mask", "masks"))
+    if not folder.is_dir():
+        return [None] * num_images
+    masks = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".png")
+    if len(masks) != num_images:
+        raise NerfroError(f"{folder} holds {len(masks)} masks for {num_images} images; give all of them one, or none")
+    return masks

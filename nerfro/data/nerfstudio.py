@@ -1,0 +1,137 @@
+"""Data in nerfstudio's format."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping
+from pathlib import PurePosixPath
+from typing import Literal
+
+from nerfro.data.base import DataSource, Views
+from nerfro.data.distortion import coefficients
+from nerfro.data.frames import SPLITS, Lens, check_options, check_split, held_out, load_views, require_root
+from nerfro.data.transforms import Manifest, find_splits, is_number, parse_manifest
+from nerfro.errors import NerfroError
+from nerfro.paths import resolve_path
+from nerfro.registry import register
+
+# What `camera_model` may say for a perspective lens; they differ in which coefficients are zero.
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
+
+
+@register("data", "nerfstudio")
+class NerfstudioData(DataSource):
+    """Folder with transforms.json (or transforms_{train,val,test}.json): OpenGL axes, intrinsics with distortion.
+
+    Poses are taken as they are: the world is that of the file, not turned, centred and scaled as nerfstudio does when
+    it trains, so that a mesh fits. `mask_path` in these files marks pixels to ignore and is not read; a frame's
+    silhouette of the refractive object is its `object_mask_path`.
+
+    Args:
+        root: the folder.
+        near: arc length at which rays begin, world units.
+        far: arc length at which rays end, world units.
+        downscale: side of the blocks of pixels that are averaged into one.
+        alpha: `drop` ignores the images' transparency, `white` and `black` composite them over that colour.
+        test_every: every such frame by name, from the first, is for val and test, where the file has no
+            {train,val,test}_filenames.
+
+    Raises:
+        NerfroError: an option is out of range.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        near: float,
+        far: float,
+        downscale: int = 1,
+        alpha: Literal["drop", "white", "black"] = "drop",
+        test_every: int = 10,
+    ) -> None:
+        check_options(near, far, downscale)
+        self.root = resolve_path(root)
+        self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
+        self.test_every = test_every
+
+    @property
+    def splits(self) -> list[str]:
+        if (self.root / "transforms.json").is_file():
+            return SPLITS
+        return list(find_splits(self.root))
+
+    def load(self, split: str) -> Views:
+        require_root(self.root)
+        single = self.root / "transforms.json"
+        if single.is_file():
+            manifest = parse_manifest(single, "object_mask_path")
+            chosen = self._choose(manifest, split)
+        else:
+            files = find_splits(self.root)
+            if split not in files:
+                raise NerfroError(f"data.root={self.root} has no split '{split}'; it has {', '.join(files)}")
+            manifest = parse_manifest(files[split], "object_mask_path")
+            chosen = list(range(len(manifest.frames)))
+        entries: list[Mapping[str, object]] = manifest.document["frames"]  # type: ignore[assignment]
+        if any("mask_path" in entries[i] for i in chosen):
+            warnings.warn(
+                f"{manifest.path}: 'mask_path' marks pixels to ignore, which nerfro does not; they are trained on. "
+                "Name silhouettes of the object 'object_mask_path'",
+                stacklevel=2,
+            )
+        names = [f"{manifest.path}: '{manifest.frames[i].name}'" for i in chosen]
+
+        def lenses(width: int, height: int) -> list[Lens]:
+            values = [{**manifest.document, **entries[i]} for i in chosen]
+            return [_read_lens(v, width, height, name) for v, name in zip(values, names, strict=True)]
+
+        frames = [manifest.frames[i] for i in chosen]
+        return load_views(frames, lenses, "opengl", (self.near, self.far), self.downscale, self.alpha)
+
+    def _choose(self, manifest: Manifest, split: str) -> list[int]:
+        """Numbers of the frames of a split."""
+        check_split(split, self.root)
+        listed = {name: manifest.document.get(f"{name}_filenames") for name in SPLITS}
+        by_name = sorted(range(len(manifest.frames)), key=lambda i: manifest.frames[i].name)
+        if not any(listed.values()):
+            return [by_name[i] for i in held_out(len(by_name), self.test_every, split, self.root)]
+        names = listed[split]
+        if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
+            raise NerfroError(
+                f"{manifest.path} lists other splits' files but no '{split}_filenames'; add it, or take all lists out"
+            )
+        known = {manifest.frames[i].name: i for i in by_name}
+        tidy = [PurePosixPath(name.replace("\\", "/")).as_posix() for name in names]
+        unknown = [name for name in tidy if name not in known]
+        if unknown:
+            raise NerfroError(f"{manifest.path}: {split}_filenames names '{unknown[0]}', which is no frame; correct it")
+        return [known[name] for name in tidy]
+
+
+def _read_lens(values: Mapping[str, object], width: int, height: int, where: str) -> Lens:
+    """The lens of a frame from its own keys, and the file's where it has none."""
+    model = values.get("camera_model", "OPENCV")
+    if model not in _PERSPECTIVE:
+        raise NerfroError(
+            f"{where}: camera_model={model!r} is not supported; undistort the images to a perspective one "
+            f"({', '.join(_PERSPECTIVE)}), for example with COLMAP's image_undistorter"
+        )
+    for key in ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_angle_x"):
+        if key in values and not is_number(values[key]):
+            raise NerfroError(f"{where}: {key}={values[key]!r} must be a number")
+    numbers = {key: float(value) for key, value in values.items() if is_number(value)}
+    made_for = numbers.get("w", width), numbers.get("h", height)
+    if "fl_x" in numbers:
+        fx = numbers["fl_x"]
+    elif 0 < numbers.get("camera_angle_x", 0) < math.pi:
+        fx = 0.5 * made_for[0] / math.tan(0.5 * numbers["camera_angle_x"])
+    else:
+        raise NerfroError(f"{where} has neither 'fl_x' nor a valid 'camera_angle_x'; add the focal length in pixels")
+    fy = numbers.get("fl_y", fx)
+    if fx <= 0 or fy <= 0 or min(made_for) <= 0:
+        raise NerfroError(f"{where}: fl_x={fx:g}, fl_y={fy:g}, w and h must be positive")
+    k1, k2, k3, k4, p1, p2 = (numbers.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    centre = numbers.get("cx", 0.5 * made_for[0]), numbers.get("cy", 0.5 * made_for[1])
+    lens = Lens(fx, fy, *centre, coefficients([k1, k2, k3, k4], [p1, p2]))
+    return lens.resized(made_for, (width, height), where)

@@ -1,0 +1,134 @@
+"""The RefRef benchmark, as its parquet files come from its host."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from nerfro.data.base import DataSource, Views
+from nerfro.data.frames import SPLITS, Frame, Lens, check_options, check_pose, check_split, load_views
+from nerfro.data.transforms import parse_matrix
+from nerfro.errors import NerfroError
+from nerfro.paths import resolve_path
+from nerfro.registry import register
+
+# Constants of RefRef's refref_dataparser.py: horizontal field of view, half side of the scene's box, views of a split.
+_CAMERA_ANGLE_X = 1.1656107902526855
+_HALF_SIDE = 7.3
+_VIEWS_PER_SPLIT = 100
+
+_COLUMNS = ["image", "mask", "transform_matrix"]
+
+
+@register("data", "refref")
+class RefRefData(DataSource):
+    """A scene of RefRef: rows of image, mask and pose (OpenGL axes), a hundred each for train, val and test.
+
+    Args:
+        root: folder with the scene's .parquet files, at any depth.
+        scene: its name, such as cube_smcvx_ampoule; none where the folder holds one scene alone.
+        near: arc length at which rays begin, world units.
+        far: arc length at which rays end; none takes the farthest corner of RefRef's box of side 14.6.
+        downscale: side of the blocks of pixels that are averaged into one.
+        alpha: `drop` ignores the images' transparency, `white` and `black` composite them over that colour.
+
+    Raises:
+        NerfroError: an option is out of range.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        scene: str | None = None,
+        near: float = 0.2,
+        far: float | None = None,
+        downscale: int = 1,
+        alpha: Literal["drop", "white", "black"] = "drop",
+    ) -> None:
+        check_options(near, far or 1e30, downscale)
+        self.root, self.scene = resolve_path(root), scene
+        self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
+
+    @property
+    def splits(self) -> list[str]:
+        return SPLITS
+
+    def load(self, split: str) -> Views:
+        check_split(split, self.root)
+        files = self._files()
+        rows = _read_rows(files, SPLITS.index(split) * _VIEWS_PER_SPLIT)
+        with tempfile.TemporaryDirectory() as folder:
+            frames = [_unpack(row, number, Path(folder), files[0]) for number, row in rows]
+
+            def lenses(width: int, height: int) -> list[Lens]:
+                focal = 0.5 * width / math.tan(0.5 * _CAMERA_ANGLE_X)
+                return [Lens(focal, focal, 0.5 * width, 0.5 * height)] * len(frames)
+
+            far = self.far
+            if far is None:
+                corner = max(float(np.linalg.norm(frame.camera_to_world[:, 3])) for frame in frames)
+                far = corner + math.sqrt(3) * _HALF_SIDE
+            return load_views(frames, lenses, "opengl", (self.near, far), self.downscale, self.alpha)
+
+    def _files(self) -> list[Path]:
+        """The scene's files in order."""
+        pattern = "*.parquet" if self.scene is None else f"{self.scene}-*.parquet"
+        files = sorted(self.root.rglob(pattern)) or sorted(self.root.rglob(f"{self.scene}.parquet"))
+        if not files:
+            raise NerfroError(f"data.root={self.root} holds no {pattern}; download the scene's files there")
+        # `cube_smcvx_ampoule-00000-of-00002.parquet`
+        scenes = sorted({path.stem.split("-")[0] for path in files})
+        if len(scenes) > 1:
+            raise NerfroError(f"data.root={self.root} holds several scenes; choose data.scene={', '.join(scenes[:5])}")
+        return files
+
+
+def _read_rows(files: list[Path], first: int) -> list[tuple[int, dict[str, Any]]]:
+    """Number and content of the rows of a split."""
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise NerfroError(
+            "data=refref reads .parquet files with pyarrow; install it: pip install nerfro[refref]"
+        ) from error
+    rows: list[tuple[int, dict[str, Any]]] = []
+    offset = 0
+    for path in files:
+        try:
+            table = pyarrow.parquet.ParquetFile(path)
+            num_rows = table.metadata.num_rows
+            wanted = range(max(first, offset), min(first + _VIEWS_PER_SPLIT, offset + num_rows))
+            if len(wanted):
+                missing = [name for name in _COLUMNS if name not in table.schema_arrow.names]
+                if missing:
+                    raise NerfroError(f"{path} has no column '{missing[0]}'; is it a file of RefRef?")
+                part = table.read(_COLUMNS).slice(wanted.start - offset, len(wanted))
+                rows += zip(wanted, part.to_pylist(), strict=True)
+        except (pyarrow.ArrowException, OSError) as error:
+            reason = str(error).split("\n")[0]
+            raise NerfroError(f"{path} cannot be read ({reason}); download it again") from error
+        offset += num_rows
+    if not rows:
+        raise NerfroError(
+            f"{files[0].parent} holds {offset} rows, none from {first} on; is a file of the scene missing?"
+        )
+    return rows
+
+
+def _unpack(row: dict[str, Any], number: int, folder: Path, source: Path) -> Frame:
+    """Write a row's pictures where the common reader finds them."""
+    where = f"{source.name}: row {number}"
+    paths = []
+    for column in ("image", "mask"):
+        content = (row[column] or {}).get("bytes")
+        if content is None:
+            raise NerfroError(f"{where}: '{column}' holds no picture; download the file again")
+        paths.append(folder / f"{column}_{number:04d}.png")
+        paths[-1].write_bytes(content)
+    pose = check_pose(parse_matrix(row["transform_matrix"], ((4, 4), (3, 4)), f"{where}: transform_matrix"), where)
+    return Frame(paths[0].name, paths[0], paths[1], pose)

@@ -1,0 +1,254 @@
+"""COLMAP's text and binary models, written here from its documentation and read back; pycolmap as a second witness."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from nerfro.data.colmap import ColmapData
+from nerfro.data.colmap_model import CAMERA_MODELS, read_colmap
+from nerfro.errors import NerfroError
+
+from .photographs import (
+    CX,
+    CY,
+    FX,
+    FY,
+    HEIGHT,
+    POINTS,
+    WIDTH,
+    camera_to_world,
+    check_views,
+    save_mask,
+    save_picture,
+    world_to_camera,
+)
+
+OPENCV = ("OPENCV", (FX, FY, CX, CY, -0.1, 0.02, 0.003, -0.002))
+TORCH_POINTS = torch.from_numpy(POINTS).float()
+NUMBERS = {name: i for i, (name, _) in enumerate(CAMERA_MODELS)}
+
+
+def quaternion(matrix: np.ndarray) -> np.ndarray:
+    """Scalar first, as COLMAP writes it."""
+    return np.roll(Rotation.from_matrix(matrix[:, :3]).as_quat(), 1)
+
+
+def write_binary(folder: Path, cameras: dict, images: list, points: np.ndarray) -> None:
+    folder.mkdir(parents=True)
+    content = struct.pack("<Q", len(cameras))
+    for number, (model, params) in cameras.items():
+        content += struct.pack("<iiQQ", number, NUMBERS[model], WIDTH, HEIGHT) + struct.pack(
+            f"<{len(params)}d", *params
+        )
+    (folder / "cameras.bin").write_bytes(content)
+    content = struct.pack("<Q", len(images))
+    for i, (name, camera, matrix) in enumerate(images, 1):
+        content += struct.pack("<i4d3di", i, *quaternion(matrix), *matrix[:, 3], camera) + name.encode() + b"\0"
+        # The second image has seen all points, the others have features that are none.
+        seen = range(1, len(points) + 1) if i == 2 else (-1, -1)
+        content += struct.pack("<Q", len(seen)) + b"".join(struct.pack("<ddq", 1.5, 2.5, n) for n in seen)
+    (folder / "images.bin").write_bytes(content)
+    content = struct.pack("<Q", len(points))
+    for i, point in enumerate(points, 1):
+        content += struct.pack("<Q3d3BdQ", i, *point, 9, 8, 7, 0.4, 1) + struct.pack("<ii", 2, i - 1)
+    (folder / "points3D.bin").write_bytes(content)
+
+
+def write_text(folder: Path, cameras: dict, images: list, points: np.ndarray) -> None:
+    folder.mkdir(parents=True)
+    row = lambda *values: " ".join(map(str, values)) + "\n"  # noqa: E731
+    lines = [row(n, model, WIDTH, HEIGHT, *map(repr, map(float, p))) for n, (model, p) in cameras.items()]
+    (folder / "cameras.txt").write_text("# Camera list\n" + "".join(lines))
+    lines = []
+    for i, (name, camera, matrix) in enumerate(images, 1):
+        pose = map(repr, map(float, (*quaternion(matrix), *matrix[:, 3])))
+        # The second line may be empty: an image without features.
+        seen = " ".join(f"1.5 2.5 {n}" for n in range(1, len(points) + 1)) if i == 2 else ""
+        lines.append(row(i, *pose, camera, name) + seen + "\n")
+    (folder / "images.txt").write_text("# Image list\n" + "".join(lines))
+    lines = [row(i, *map(repr, map(float, point)), 9, 8, 7, 0.4, 2, i - 1) for i, point in enumerate(points, 1)]
+    (folder / "points3D.txt").write_text("".join(lines))
+
+
+WRITERS = {"binary": write_binary, "text": write_text}
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Write images and a model of six views, cameras by number and the camera of each image to choose."""
+
+    def write(how="binary", cameras={1: OPENCV}, camera=lambda i: 1, masks=False, points=POINTS):  # noqa: B006
+        images = []
+        for i in (4, 0, 5, 2, 1, 3):  # in no order
+            save_picture(tmp_path / f"images/top/v{i}.png", i)
+            if masks:
+                save_mask(tmp_path / f"masks/top/v{i}.png.png", i)
+            images.append((f"top/v{i}.png", camera(i), world_to_camera(i)))
+        WRITERS[how](tmp_path / "sparse/0", cameras, images, points)
+        return tmp_path
+
+    return write
+
+
+def load(root, split="train", **options):
+    return ColmapData(str(root), **{"near": 0.5, "far": 9.0, "test_every": 3} | options).load(split)
+
+
+@pytest.mark.parametrize("how", WRITERS)
+def test_points_project_onto_their_pixels_in_both_forms(write, how):
+    root = write(how, masks=True)
+    distortion = {"k": OPENCV[1][4:6], "p": OPENCV[1][6:]}
+    check_views(load(root), [1, 2, 4, 5], **distortion)
+    test = load(root, "test")
+    check_views(test, [0, 3], **distortion)
+    assert test.names == ["top/v0.png", "top/v3.png"]
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "lens"),
+    [
+        ("SIMPLE_PINHOLE", (FX, CX, CY), {"lens": (FX, FX, CX, CY)}),
+        ("PINHOLE", (FX, FY, CX, CY), {}),
+        ("SIMPLE_RADIAL", (FX, CX, CY, -0.1), {"lens": (FX, FX, CX, CY), "k": (-0.1,)}),
+        ("RADIAL", (FX, CX, CY, -0.1, 0.02), {"lens": (FX, FX, CX, CY), "k": (-0.1, 0.02)}),
+        (
+            "FULL_OPENCV",
+            (FX, FY, CX, CY, -0.1, 0.02, 0.003, 0.001, 0.004, 0, 0, 0),
+            {"k": (-0.1, 0.02, 0.004), "p": (0.003, 0.001)},
+        ),
+    ],
+)
+def test_every_perspective_model_is_read(write, model, params, lens):
+    check_views(load(write(cameras={7: (model, params)}, camera=lambda i: 7)), [1, 2, 4, 5], **lens)
+
+
+def test_pycolmap_writes_what_is_read_and_reads_what_is_written(write, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    rational = ("FULL_OPENCV", (FX, FY, CX, CY, 0.3, 0.05, 0.001, -0.002, 0.004, 0.4, 0.1, 0.01))
+    root = write(cameras={1: OPENCV, 2: rational}, camera=lambda i: 1 + i % 2)
+    theirs = pycolmap.Reconstruction(str(root / "sparse/0"))
+    views = load(root)
+    by_name = {image.name: image for image in theirs.images.values()}
+    pixels = views.cameras.project(TORCH_POINTS)[0].numpy()
+    for name, found in zip(views.names, pixels, strict=True):
+        expected = np.array([by_name[name].project_point(point) for point in POINTS])
+        np.testing.assert_allclose(found, expected, atol=1e-4)
+    for folder, export in (("text", theirs.write_text), ("binary", theirs.write_binary)):
+        (tmp_path / folder).mkdir()
+        export(str(tmp_path / folder))
+        again = load(root, model=folder)
+        np.testing.assert_allclose(again.cameras.project(TORCH_POINTS)[0].numpy(), pixels, atol=1e-4)
+
+
+def test_cameras_differ_by_image(write):
+    other = ("PINHOLE", (FX + 2, FY, CX, CY))
+    views = load(write(cameras={1: OPENCV, 3: other}, camera=lambda i: 3 if i == 2 else 1))
+    assert views.cameras.fx.tolist() == [FX, FX + 2, FX, FX]
+    assert (views.cameras.distortion[1] == 0).all()
+
+
+def test_bounds_come_from_the_points_unless_they_are_given(write):
+    inside = np.array([[0, 0, 0.5], [0.2, 0, 0], [0, -0.1, -0.3]])
+    views = load(write(points=inside), near=None, far=None)
+    centres = np.stack([camera_to_world(i, "opencv")[:3, 3] for i in range(6)])
+    distance = np.linalg.norm(inside[:, None] - centres, axis=-1)
+    # The outermost thousandth is left out, so the ends are not quite reached.
+    assert views.cameras.near == pytest.approx(0.9 * distance.min(), rel=1e-3)
+    assert views.cameras.far == pytest.approx(1.1 * distance.max(), rel=1e-3)
+
+
+def test_without_points_bounds_must_be_given(write):
+    root = write(points=np.zeros((0, 3)))
+    with pytest.raises(NerfroError, match=r"no 3-D points in view to take bounds from; set data\.near and data\.far"):
+        load(root, far=None)
+    (root / "sparse/0/points3D.bin").unlink()
+    assert len(load(root)) == 4
+
+
+def test_images_may_be_smaller_than_those_that_were_calibrated(write):
+    root = write()
+    for i in range(6):
+        save_picture(root / f"images_2/top/v{i}.png", i, WIDTH // 2, HEIGHT // 2)
+    cameras = load(root, images="images_2").cameras
+    assert cameras.fx[0] == FX / 2
+    np.testing.assert_allclose(
+        cameras.project(TORCH_POINTS)[0].numpy(), load(root).cameras.project(TORCH_POINTS)[0].numpy() / 2, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("model", ["OPENCV_FISHEYE", "FOV", "SIMPLE_RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"])
+def test_lenses_that_are_not_perspective_are_refused(write, model):
+    params = (FX, FY, CX, CY, *[0.01] * 12)[: dict(CAMERA_MODELS)[model]]
+    with pytest.raises(NerfroError, match=f"camera 1 has the model {model}, which is not supported; undistort"):
+        load(write(cameras={1: (model, params)}))
+
+
+@pytest.mark.parametrize("file", ["cameras", "images", "points3D"])
+def test_truncated_and_overlong_binary_files_are_refused(write, file):
+    root = write()
+    path = root / f"sparse/0/{file}.bin"
+    whole = path.read_bytes()
+    for cut in (3, 20, len(whole) - 1):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(NerfroError, match=rf"{file}\.bin ends too early: truncated\?"):
+            load(root)
+    path.write_bytes(whole + b"\0")
+    with pytest.raises(NerfroError, match=rf"{file}\.bin goes on after its last item"):
+        load(root)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        ("cameras", f"OPENCV {WIDTH}", f"OPENCV {WIDTH}.5", r"cameras\.txt, line 2 is not CAMERA_ID MODEL"),
+        ("cameras", " -0.002", "", "line 2: OPENCV has 8 parameters, not 7"),
+        ("cameras", "OPENCV", "STRANGE", "camera 1 has the model STRANGE, which is not supported"),
+        ("cameras", "1 OPENCV", "2 OPENCV", "has camera 1, which the model does not hold"),
+        ("images", "top/v5.png", "top/v4.png", "two images are called top/v4.png"),
+        ("images", "top/v5.png", "top/v6.png", "image .*v6.png of the model .* does not exist; set data.images"),
+        ("images", " top/v5.png", "", r"images\.txt, line 6 is not IMAGE_ID"),
+        ("points3D", "1 ", "1 x", r"points3D\.txt, line 1 is not POINT3D_ID"),
+    ],
+)
+def test_wrong_text_files_are_refused(write, file, old, new, message):
+    root = write("text")
+    path = root / f"sparse/0/{file}.txt"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(NerfroError, match=message):
+        load(root)
+
+
+def test_what_is_missing_is_named(write, tmp_path):
+    with pytest.raises(NerfroError, match="there is no COLMAP model"):
+        load(tmp_path)
+    with pytest.raises(NerfroError, match=r"sparse/7; set data\.model to its folder"):
+        load(tmp_path, model="sparse/7")
+    root = write()
+    (root / "sparse/0/images.bin").unlink()
+    with pytest.raises(NerfroError, match="holds no cameras and images"):
+        load(root)
+
+
+def test_unknown_camera_number_in_a_binary_file(write):
+    root = write()
+    path = root / "sparse/0/cameras.bin"
+    content = bytearray(path.read_bytes())
+    content[12] = 99
+    path.write_bytes(content)
+    with pytest.raises(NerfroError, match="camera model number 99 is unknown"):
+        load(root)
+
+
+def test_model_without_its_images_is_read(write):
+    model = read_colmap(write("text") / "sparse/0")
+    assert [image.name for image in model.images] == [f"top/v{i}.png" for i in range(6)]
+    np.testing.assert_allclose(model.points, POINTS)
+    np.testing.assert_allclose(model.images[3].camera_to_world, camera_to_world(3, "opencv")[:3], atol=1e-12)

@@ -1,0 +1,164 @@
+"""LLFF's poses_bounds.npy, written here and read back, in its own world and in the frames made of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from nerfro.data.llff import LlffData, frame_transform, map_poses, read_poses_bounds
+from nerfro.errors import NerfroError
+
+from .photographs import FX, HEIGHT, POINTS, WIDTH, camera_to_world, check_views, project, save_mask, save_picture
+
+LENS = (FX, FX, WIDTH / 2, HEIGHT / 2)
+NEAR, FAR = 1.5, 4.5
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Write a folder of views: depths from 1.5 + i / 10 to 4.5 - i / 10."""
+
+    def write(seeds=range(6), folder="", size=(HEIGHT, WIDTH, FX), masks=False):
+        root = tmp_path / folder
+        rows = []
+        for i, seed in enumerate(seeds):
+            save_picture(root / f"images/img_{i:03d}.png", seed)
+            if masks:
+                save_mask(root / f"images/mask_img_{i:03d}.png", seed)
+            pose = camera_to_world(seed, "opengl")
+            right, up, back, centre = pose[:3].T
+            row = np.stack([-up, right, back, centre, size], -1)
+            rows.append([*row.ravel(), NEAR + i / 10, FAR - i / 10])
+        np.save(root / "poses_bounds.npy", np.array(rows))
+        return root
+
+    return write
+
+
+def load(root, split="train", **options):
+    return LlffData(str(root), **{"frame": "file", "test_every": 3} | options).load(split)
+
+
+def test_points_project_onto_their_pixels_in_the_files_own_world(write):
+    root = write(masks=True)
+    check_views(load(root), [1, 2, 4, 5], lens=LENS)
+    check_views(load(root, "test"), [0, 3], lens=LENS)
+
+
+@pytest.mark.parametrize("frame", ["llff", "eikonal"])
+def test_a_frame_is_a_similarity_that_takes_the_scene_along(write, frame):
+    root = write()
+    poses, depths, _ = read_poses_bounds(root / "poses_bounds.npy")
+    transform = frame_transform(poses, depths, frame)
+    linear = transform[:3, :3]
+    scale = np.cbrt(np.linalg.det(linear))
+    np.testing.assert_allclose(linear.T @ linear, scale**2 * np.eye(3), atol=1e-12)
+    moved = torch.from_numpy(POINTS @ linear.T + transform[:3, 3]).float()
+    views = load(root, frame=frame)
+    pixels, depth = views.cameras.project(moved)
+    for view, seed in enumerate([1, 2, 4, 5]):
+        np.testing.assert_allclose(pixels[view].double().numpy(), project(seed, lens=LENS), atol=2e-4)
+    torch.testing.assert_close(depth, load(root).cameras.project(torch.from_numpy(POINTS).float())[1] * float(scale))
+
+
+def test_llff_frame_is_scaled_by_the_least_depth_and_centred_on_the_average_camera(write):
+    poses, depths, _ = read_poses_bounds(write() / "poses_bounds.npy")
+    transform = frame_transform(poses, depths, "llff")
+    assert np.cbrt(np.linalg.det(transform[:3, :3])) == pytest.approx(1 / (0.75 * NEAR))
+    mapped = map_poses(poses, transform)
+    np.testing.assert_allclose(mapped[:, :, 3].mean(0), 0, atol=1e-12)
+    back = mapped[:, :, 2].mean(0)
+    np.testing.assert_allclose(back[:2], 0, atol=1e-12)  # the cameras look along -z on average
+    assert back[2] > 0
+    assert abs(mapped[:, :, 1].mean(0)[0]) < 1e-12  # and up has no part to the side
+
+
+def test_eikonal_frame_is_spherified(write):
+    poses, depths, _ = read_poses_bounds(write() / "poses_bounds.npy")
+    transform = frame_transform(poses, depths, "eikonal")
+    mapped = map_poses(poses, transform)
+    centres, axes = mapped[:, :, 3], mapped[:, :, 2]
+    assert np.square(centres).sum(-1).mean() == pytest.approx(1)
+    mean = centres.mean(0)
+    np.testing.assert_allclose(mean[:2], 0, atol=1e-12)
+    assert mean[2] > 0
+
+    def miss(point):  # summed squared distance of a point to the optical axes
+        return np.square(np.cross(point - centres, axes)).sum()
+
+    steps = 1e-3 * np.vstack([np.eye(3), -np.eye(3)])
+    assert all(miss(step) > miss(np.zeros(3)) for step in steps)
+    np.testing.assert_allclose(np.linalg.norm(axes, axis=-1), 1)
+
+
+def test_bounds_are_the_files_depths_in_the_frames_units(write):
+    root = write()
+    corner = np.hypot(1, np.hypot(WIDTH, HEIGHT) / 2 / FX)
+    own = load(root).cameras
+    assert (own.near, own.far) == (pytest.approx(0.9 * NEAR), pytest.approx(FAR * corner))
+    scaled = load(root, frame="llff").cameras
+    assert scaled.near == pytest.approx(0.9 / 0.75)
+    assert scaled.far == pytest.approx(FAR / (0.75 * NEAR) * corner)
+    poses, depths, _ = read_poses_bounds(root / "poses_bounds.npy")
+    scale = np.cbrt(np.linalg.det(frame_transform(poses, depths, "eikonal")[:3, :3]))
+    assert load(root, frame="eikonal").cameras.far == pytest.approx(min(FAR * scale, 2.0) * corner)
+    given = load(root, near=0.1, far=7.0).cameras
+    assert (given.near, given.far) == (0.1, 7.0)
+
+
+@pytest.mark.parametrize("frame", ["file", "llff", "eikonal"])
+def test_video_frames_are_mapped_with_the_training_transformation(write, frame):
+    # Videos of other depths and another path: a transformation of their own would be another one.
+    root = write(range(6))
+    write([9, 7], folder="video")
+    train = load(root, frame=frame, video="video")
+    assert len(train) == 6
+    test = load(root, "test", frame=frame, video="video")
+    assert test.names == ["img_000.png", "img_001.png"]
+    assert (test.cameras.near, test.cameras.far) == (train.cameras.near, train.cameras.far)
+    poses, depths, _ = read_poses_bounds(root / "poses_bounds.npy")
+    transform = frame_transform(poses, depths, frame)
+    moved = torch.from_numpy(POINTS @ transform[:3, :3].T + transform[:3, 3]).float()
+    for view, seed in enumerate((9, 7)):
+        found = test.cameras.project(moved)[0][view].double().numpy()
+        np.testing.assert_allclose(found, project(seed, lens=LENS), atol=2e-4)
+
+
+def test_smaller_images_scale_the_focal_length(write):
+    root = write(size=(2 * HEIGHT, 2 * WIDTH, 2 * FX))  # calibrated at twice the size
+    check_views(load(root), [1, 2, 4, 5], lens=LENS)
+
+
+def test_wrong_files_are_refused(write):
+    root = write()
+    path = root / "poses_bounds.npy"
+    rows = np.load(path)
+    turned = rows.copy()
+    turned[2, :3] *= 2
+    for content, message in (
+        (rows[:4], r"holds 6 images but .*poses_bounds.npy has 4 poses"),
+        (rows[:, :15], r"has shape \(6, 15\); it must be \[images, 17\]"),
+        (np.where(np.arange(17) == 16, 0.1, rows), "depths must ascend from above 0"),
+        (np.where(np.arange(17) == 3, np.nan, rows), "holds NaN or infinite numbers in row 0"),
+        (turned, "row 2: the 3x3 part of transform_matrix is no rotation"),
+    ):
+        np.save(path, content)
+        with pytest.raises(NerfroError, match=message):
+            load(root)
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(NerfroError, match=r"poses_bounds\.npy cannot be read"):
+        load(root)
+    path.unlink()
+    with pytest.raises(NerfroError, match="does not exist; make it with LLFF"):
+        load(root)
+    with pytest.raises(NerfroError, match="has no split 'dev'"):
+        load(root, "dev")
+
+
+def test_parallel_cameras_have_no_sphere():
+    poses = np.tile(np.eye(4)[:3], (4, 1, 1))
+    poses[:, 0, 3] = np.arange(4)
+    with pytest.raises(NerfroError, match="all cameras look the same way"):
+        frame_transform(poses, np.array([[1.0, 2.0]] * 4), "eikonal")
+    assert np.isfinite(frame_transform(poses, np.array([[1.0, 2.0]] * 4), "llff")).all()

@@ -1,0 +1,129 @@
+"""nerfstudio's format, written here and read back."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+
+from nerfro.data.nerfstudio import NerfstudioData
+from nerfro.errors import NerfroError
+
+from .photographs import CX, CY, FX, FY, HEIGHT, POINTS, WIDTH, camera_to_world, check_views, save_mask, save_picture
+
+K, P = (-0.12, 0.03, 0.004, -0.001), (0.002, -0.003)
+SHARED = {"camera_model": "OPENCV", "fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY, "w": WIDTH, "h": HEIGHT}
+DISTORTION = {"k1": K[0], "k2": K[1], "k3": K[2], "k4": K[3], "p1": P[0], "p2": P[1]}
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Write transforms.json of some frames; `frame` gives further keys of frame i, `top` of the file."""
+
+    def write(num_frames=6, top=SHARED | DISTORTION, frame=lambda i: {}, name="transforms.json", masks=False):
+        frames = []
+        for i in reversed(range(num_frames)):  # in no order
+            save_picture(tmp_path / f"images/f_{i}.png", i)
+            entry = {"file_path": f"./images/f_{i}.png", "transform_matrix": camera_to_world(i, "opengl").tolist()}
+            if masks:
+                save_mask(tmp_path / f"silhouettes/s{i}.png", i)
+                entry["object_mask_path"] = f"silhouettes/s{i}.png"
+            frames.append(entry | frame(i))
+        (tmp_path / name).write_text(json.dumps(top | {"frames": frames}))
+        return tmp_path
+
+    return write
+
+
+def load(root, split="train", **options):
+    return NerfstudioData(str(root), near=0.5, far=9.0, **options).load(split)
+
+
+def test_points_project_through_the_distorted_lens_and_every_tenth_frame_is_kept(write):
+    root = write(12, masks=True)
+    check_views(load(root), [1, 10, 11, 2, 3, 4, 5, 6, 7, 9], k=K, p=P)
+    assert [name[-7:] for name in load(root, "test").names] == ["f_0.png", "f_8.png"]
+    assert load(root, "val").names == load(root, "test").names
+
+
+def test_frames_may_have_intrinsics_of_their_own(write):
+    own = lambda i: {"fl_x": FX + 1, "k1": 0.1} if i == 2 else {}  # noqa: E731
+    views = load(write(4, top=SHARED, frame=own), test_every=4)
+    assert views.cameras.fx.tolist() == [FX, FX + 1, FX]
+    assert views.cameras.distortion[:, 0].tolist() == pytest.approx([0, 0.1, 0])
+
+
+def test_listed_splits_are_taken_in_their_order(write):
+    lists = {f"{s}_filenames": [f"images/f_{i}.png" for i in n] for s, n in (("train", (3, 1)), ("test", (0,)))}
+    root = write(4, top=SHARED | lists)
+    check_views(load(root), [3, 1])
+    check_views(load(root, "test"), [0])
+    with pytest.raises(NerfroError, match="no 'val_filenames'"):
+        load(root, "val")
+
+
+def test_a_file_for_each_split_and_a_field_of_view_instead_of_a_focal_length(write):
+    angle = 2 * math.atan(0.5 * WIDTH / FX)
+    root = write(2, top={"camera_angle_x": angle}, name="transforms_train.json")
+    assert NerfstudioData(str(root), 0.5, 9.0).splits == ["train"]
+    check_views(load(root), [1, 0], lens=(FX, FX, WIDTH / 2, HEIGHT / 2))
+
+
+def test_images_of_another_size_scale_the_intrinsics(write):
+    root = write(2, top=SHARED | DISTORTION)
+    for i in range(2):
+        save_picture(root / f"images/f_{i}.png", i, WIDTH // 2, HEIGHT // 2)
+    cameras = load(root).cameras
+    assert (cameras.width, cameras.height) == (WIDTH // 2, HEIGHT // 2)
+    assert cameras.fx.tolist() == [FX / 2]
+    assert cameras.cy.tolist() == pytest.approx([CY / 2])
+
+
+def test_downscaled_images_keep_the_directions(write):
+    root = write(2)
+    full, half = load(root).cameras, load(root, downscale=2).cameras
+    points = torch.from_numpy(POINTS).float()
+    torch.testing.assert_close(half.project(points)[0], full.project(points)[0] / 2)
+
+
+def test_masks_of_nerfstudio_mean_ignore_and_are_no_silhouettes(write):
+    root = write(2, frame=lambda i: {"mask_path": "masks/f.png"})
+    save_mask(root / "masks/f_1.png", 1)  # where a silhouette would be found in other formats
+    with pytest.warns(UserWarning, match="'mask_path' marks pixels to ignore"):
+        assert load(root).masks is None
+
+
+@pytest.mark.parametrize(
+    ("top", "frame", "message"),
+    [
+        ({"camera_model": "OPENCV_FISHEYE"}, {}, "camera_model='OPENCV_FISHEYE' is not supported; undistort"),
+        ({"fl_x": "long"}, {}, "fl_x='long' must be a number"),
+        ({"fl_x": -3}, {}, "fl_x=-3, fl_y=29, w and h must be positive"),
+        ({"w": 30}, {}, "calibrated for 30x18 pixels but the images have 24x18, of other proportions"),
+        ({"k1": -9.0}, {}, "lens distortion cannot be undone everywhere in the image"),
+        ({"test_filenames": ["images/x.png"]}, {}, "no 'train_filenames'"),
+        ({"train_filenames": ["images/x.png"]}, {}, "train_filenames names 'images/x.png', which is no frame"),
+        ({}, {"object_mask_path": "gone.png"}, "gone.png of .* does not exist"),
+        ({}, {"transform_matrix": [[1, 0], [0, 1]]}, "transform_matrix has shape 2x2"),
+    ],
+)
+def test_what_is_wrong_is_named(write, top, frame, message):
+    with pytest.raises(NerfroError, match=message):
+        load(write(3, top=SHARED | top, frame=lambda i: frame))
+
+
+def test_missing_things_are_named(write, tmp_path):
+    with pytest.raises(NerfroError, match=r"holds no transforms_<split>.json"):
+        load(tmp_path)
+    with pytest.raises(NerfroError, match="is not a folder"):
+        load(tmp_path / "gone")
+    root = write(3, top={})
+    with pytest.raises(NerfroError, match="has neither 'fl_x' nor a valid 'camera_angle_x'"):
+        load(root)
+    with pytest.raises(NerfroError, match="has no split 'dev'"):
+        load(root, "dev")
+    (root / "transforms.json").write_text('{"frames": [')
+    with pytest.raises(NerfroError, match="truncated"):
+        load(root)
