@@ -19,25 +19,13 @@ from nerfro.media.shapes import Ball, RoundedBox, Slab
 from nerfro.samplers.snell import Snell, trace_interfaces
 from nerfro.samplers.snell_law import refract
 from nerfro.types import Rays
+from tests.closed_forms import angle, beam, make_rays
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 
 
 def _rays(origins: list | Tensor, directions: list | Tensor, near: float = 0.5, far: float = 9.0) -> Rays:
-    o = torch.as_tensor(origins, dtype=torch.float64)
-    d = torch.nn.functional.normalize(torch.as_tensor(directions, dtype=torch.float64), dim=-1)
-    ones = torch.ones(len(o), dtype=torch.float64)
-    return Rays(o, d, 0 * ones, near * ones, far * ones)
-
-
-def _angle(a: Tensor, b: Tensor) -> Tensor:
-    """Angle between unit vectors in degrees, exact for small ones."""
-    return torch.rad2deg(2 * torch.asin((0.5 * torch.linalg.vector_norm(a.double() - b.double(), dim=-1)).clamp(max=1)))
-
-
-def _beam(heights: Tensor) -> Rays:
-    """Parallel rays along +x at the given heights in y."""
-    return _rays(torch.stack([torch.full_like(heights, -3), heights, 0 * heights], -1), [[1, 0, 0]] * len(heights))
+    return make_rays(origins, directions, near, far)
 
 
 def _ball_exit(heights: Tensor, radius: float, n: float) -> Tensor:
@@ -79,7 +67,7 @@ def test_refraction_keeps_n_times_sine_and_the_plane_of_incidence() -> None:
 
 
 @pytest.mark.parametrize("n", [1.33, 1.52])
-def test_total_reflection_begins_at_the_critical_angle(n: float) -> None:
+def test_total_reflection_begins_at_the_criticalangle(n: float) -> None:
     critical = math.degrees(math.asin(1 / n))
     assert critical == pytest.approx({1.33: 48.75, 1.52: 41.14}[n], abs=0.01)
     angles = torch.tensor([critical - 1e-6, critical + 1e-6], dtype=torch.float64).deg2rad()
@@ -97,8 +85,8 @@ def test_total_reflection_begins_at_the_critical_angle(n: float) -> None:
 
 def test_ball_deviates_by_twice_the_difference_of_its_angles() -> None:
     heights = torch.linspace(-0.99, 0.99, 101, dtype=torch.float64) * 0.8
-    trace = Snell().trace(_beam(heights), Ball(0.8, 1.5).double())
-    assert _angle(trace.path.exit_directions, _ball_exit(heights, 0.8, 1.5)).max() < 1e-7
+    trace = Snell().trace(beam(heights), Ball(0.8, 1.5).double())
+    assert angle(trace.path.exit_directions, _ball_exit(heights, 0.8, 1.5)).max() < 1e-7
     assert (trace.num_events == 2).all()
     assert trace.path.s.shape[1] == 4
     # The chord inside is 2 R cos t.
@@ -110,7 +98,7 @@ def test_ball_deviation_changes_with_the_index_as_its_derivative() -> None:
     # d(2 (i - t))/dn = 2 tan(t) / n.
     heights = torch.linspace(0.1, 0.7, 7, dtype=torch.float64)
     step = 1e-5
-    exits = [Snell()(_beam(heights), Ball(0.8, 1.5 + sign * step).double()).exit_directions for sign in (-1, 1)]
+    exits = [Snell()(beam(heights), Ball(0.8, 1.5 + sign * step).double()).exit_directions for sign in (-1, 1)]
     deviation = [-torch.atan2(e[:, 1], e[:, 0]) for e in exits]
     t = torch.asin(heights / (0.8 * 1.5))
     torch.testing.assert_close((deviation[1] - deviation[0]) / (2 * step), 2 * t.tan() / 1.5, rtol=1e-6, atol=0)
@@ -118,7 +106,7 @@ def test_ball_deviation_changes_with_the_index_as_its_derivative() -> None:
 
 def test_paraxial_rays_meet_at_the_back_focus() -> None:
     heights = torch.tensor([1e-4], dtype=torch.float64)
-    path = Snell()(_beam(heights), Ball(0.8, 1.5).double())
+    path = Snell()(beam(heights), Ball(0.8, 1.5).double())
     x, d = path.exit_positions[0], path.exit_directions[0]
     focus = x[0] - x[1] * d[0] / d[1]
     assert float(focus) - 0.8 == pytest.approx(0.8 * (2 - 1.5) / (2 * (1.5 - 1)), rel=1e-5)
@@ -147,7 +135,7 @@ def test_rounded_cube_is_traced_as_by_its_pieces() -> None:
     # A ray within rounding of an edge of the pieces may go another way.
     agree = trace.num_events[chosen] == bounces[chosen] + 2
     assert agree.float().mean() > 0.98
-    error = _angle(trace.path.exit_directions, torch.tensor(np.stack([e for e, _ in exact])))[chosen]
+    error = angle(trace.path.exit_directions, torch.tensor(np.stack([e for e, _ in exact])))[chosen]
     assert error.median() < 1e-6
     assert error.quantile(0.95) < 1e-4
 
@@ -167,7 +155,7 @@ def test_prism_deviates_as_its_formula(tmp_path: FilePath) -> None:
     directions = np.stack([np.cos(angles - apex / 2), np.sin(angles - apex / 2), 0 * angles], -1)
     target = np.array([-0.225 * math.tan(apex / 2) * 2, 0.0, 0.1])
     path = Snell("mesh")(_rays(target - 2 * directions, directions), medium)
-    measured = torch.deg2rad(_angle(path.exit_directions, torch.tensor(directions)))
+    measured = torch.deg2rad(angle(path.exit_directions, torch.tensor(directions)))
     s = np.sin(angles)
     expected = angles + np.arcsin(math.sin(apex) * np.sqrt(n**2 - s**2) - math.cos(apex) * s) - apex
     np.testing.assert_allclose(measured, expected, atol=1e-9)
@@ -194,8 +182,8 @@ def test_right_angle_prism_reflects_totally_above_root_two(tmp_path: FilePath, n
 def test_smooth_mesh_refracts_as_the_ball_that_it_stands_for(tmp_path: FilePath, interface: str) -> None:
     heights = torch.linspace(-0.95, 0.95, 60, dtype=torch.float64) * 0.8
     medium = _mesh_medium(trimesh.creation.icosphere(4, 0.8), tmp_path, resolution=64)
-    path = Snell(interface)(_beam(heights), medium)  # type: ignore[arg-type]
-    error = _angle(path.exit_directions, _ball_exit(heights, 0.8, 1.5))
+    path = Snell(interface)(beam(heights), medium)  # type: ignore[arg-type]
+    error = angle(path.exit_directions, _ball_exit(heights, 0.8, 1.5))
     impact = (heights / 0.8).abs()
     # Facets of this mesh are 5 degrees wide; with their flat normals errors would be of that order.
     assert error[impact < 0.5].median() < 0.02
@@ -205,8 +193,8 @@ def test_smooth_mesh_refracts_as_the_ball_that_it_stands_for(tmp_path: FilePath,
 
 def test_grid_of_distances_refracts_as_the_ball() -> None:
     heights = torch.linspace(-0.95, 0.95, 60, dtype=torch.float64) * 0.8
-    path = Snell()(_beam(heights), _grid(_points(64).norm(dim=-1)[None] - 0.8, [1.5]))
-    assert _angle(path.exit_directions, _ball_exit(heights, 0.8, 1.5)).max() < 0.05
+    path = Snell()(beam(heights), _grid(_points(64).norm(dim=-1)[None] - 0.8, [1.5]))
+    assert angle(path.exit_directions, _ball_exit(heights, 0.8, 1.5)).max() < 0.05
 
 
 @pytest.mark.parametrize("inner_ior", [1.0, 1.33, 1.8])
@@ -214,7 +202,7 @@ def test_ball_in_a_ball_deviates_as_its_conserved_moment(inner_ior: float) -> No
     outer, inner, n = 1.2, 0.6, 1.5
     heights = torch.linspace(0.02, 1.1, 60, dtype=torch.float64)
     radius = _points(96).norm(dim=-1)
-    trace = Snell().trace(_beam(heights), _grid(torch.stack([radius - outer, radius - inner]), [n, inner_ior]))
+    trace = Snell().trace(beam(heights), _grid(torch.stack([radius - outer, radius - inner]), [n, inner_ior]))
     # n r sin(phi) = b everywhere.
     deviation = 2 * (torch.asin(heights / outer) - torch.asin(heights / (n * outer)))
     meets = heights < n * inner
@@ -224,7 +212,7 @@ def test_ball_in_a_ball_deviates_as_its_conserved_moment(inner_ior: float) -> No
     bent = torch.where(reflected, 2 * i - math.pi, 2 * (i - t))
     deviation = deviation + torch.where(meets, bent, 0.0)
     exact = torch.stack([deviation.cos(), -deviation.sin(), 0 * heights], -1)
-    error = _angle(trace.path.exit_directions, exact)
+    error = angle(trace.path.exit_directions, exact)
     events = torch.where(meets, torch.where(reflected, 3, 4), 2)
     # Just at grazing the grid decides otherwise than the ball.
     clear = ((heights - n * inner).abs() > 0.02) & ((heights - inner_ior * inner).abs() > 0.02)
@@ -238,8 +226,8 @@ def test_ball_in_a_ball_deviates_as_its_conserved_moment(inner_ior: float) -> No
 def test_bodies_of_equal_index_are_one() -> None:
     radius = _points(48).norm(dim=-1)
     heights = torch.linspace(-0.7, 0.7, 15, dtype=torch.float64)
-    nested = Snell().trace(_beam(heights), _grid(torch.stack([radius - 0.8, radius - 0.4]), [1.5, 1.5]))
-    single = Snell().trace(_beam(heights), _grid(radius[None] - 0.8, [1.5]))
+    nested = Snell().trace(beam(heights), _grid(torch.stack([radius - 0.8, radius - 0.4]), [1.5, 1.5]))
+    single = Snell().trace(beam(heights), _grid(radius[None] - 0.8, [1.5]))
     assert (nested.num_events == 2).all()
     torch.testing.assert_close(nested.path.exit_directions, single.path.exit_directions, atol=1e-8, rtol=0)
 
@@ -264,12 +252,12 @@ def test_rays_may_enter_again(tmp_path: FilePath, interface: str) -> None:
     )
     medium = _mesh_medium(shape, tmp_path, 1.1, resolution=64)
     heights = torch.linspace(-0.15, 0.15, 7, dtype=torch.float64)
-    trace = Snell(interface).trace(_beam(heights), medium)  # type: ignore[arg-type]
+    trace = Snell(interface).trace(beam(heights), medium)  # type: ignore[arg-type]
     assert (trace.num_events == 4).all()
     for row, height in enumerate(heights.tolist()):
         x, d = _through_ball(np.array([-3.0, height, 0]), np.array([1.0, 0, 0]), first, 0.5, 1.1)
         _, d = _through_ball(x, d, second, 0.5, 1.1)
-        assert float(_angle(trace.path.exit_directions[row], torch.tensor(d))) < 0.03
+        assert float(angle(trace.path.exit_directions[row], torch.tensor(d))) < 0.03
 
 
 def test_flat_faces_of_a_mesh_refract_exactly(tmp_path: FilePath) -> None:
@@ -307,7 +295,7 @@ def test_compiled_paths_are_those_of_torch() -> None:
     assert (compiled.exceeded == exceeded)[same].all()
     assert num_events.max() >= 6
     assert (num_events == 0).any()
-    error = _angle(compiled.path.exit_directions, path.exit_directions)[same]
+    error = angle(compiled.path.exit_directions, path.exit_directions)[same]
     assert error.median() < 1e-6
     assert error.quantile(0.95) < 1e-2
     assert (compiled.path.refracted == path.refracted)[same].all()
@@ -326,7 +314,7 @@ def test_paths_are_continuous_and_end_at_far() -> None:
 
 
 def test_rays_that_miss_are_two_vertices() -> None:
-    path = Snell()(_beam(torch.tensor([0.9, -1.4, 2.0]).double()), _grid(_points(40).norm(dim=-1)[None] - 0.8, [1.5]))
+    path = Snell()(beam(torch.tensor([0.9, -1.4, 2.0]).double()), _grid(_points(40).norm(dim=-1)[None] - 0.8, [1.5]))
     assert path.s.shape == (3, 2)
     assert not path.refracted.any()
 
@@ -340,7 +328,7 @@ def test_rays_with_too_many_events_are_flagged_and_go_straight_on() -> None:
         assert trace.exceeded.all()
         assert trace.num_events[0] == 5
         assert trace.path.far[0] == 20
-    assert not Snell().trace(_beam(torch.zeros(1).double()), Ball().double()).exceeded.any()
+    assert not Snell().trace(beam(torch.zeros(1).double()), Ball().double()).exceeded.any()
 
 
 def test_a_camera_inside_the_glass_sees_out(tmp_path: FilePath) -> None:
@@ -352,13 +340,13 @@ def test_a_camera_inside_the_glass_sees_out(tmp_path: FilePath) -> None:
         deviation = math.asin(1.5 * math.sin(i)) - i
         # Away from the normal, which leans towards z.
         expected = torch.tensor([0.0, math.cos(deviation), -math.sin(deviation)])
-        assert float(_angle(trace.path.exit_directions[0], expected)) < 0.02
+        assert float(angle(trace.path.exit_directions[0], expected)) < 0.02
 
 
 def test_rays_are_not_written_to(tmp_path: FilePath) -> None:
     medium = _mesh_medium(trimesh.creation.icosphere(2, 0.8), tmp_path, resolution=24)
     for interface in ("sdf", "mesh"):
-        rays = _beam(torch.tensor([0.3]).double())
+        rays = beam(torch.tensor([0.3]).double())
         Snell(interface)(rays, medium)  # type: ignore[arg-type]
         torch.testing.assert_close(rays.directions, torch.tensor([[1.0, 0, 0]]).double(), rtol=0, atol=0)
         assert rays.near[0] == 0.5

@@ -1,0 +1,181 @@
+"""What every path conserves: |v| = n, moments, reversibility, phase-space volume, and straightness where n = 1."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from nerfro.media.analytic import Vacuum
+from nerfro.media.base import Medium
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.shapes import Ball
+from nerfro.media.voxel_grid import VoxelGrid
+from nerfro.rendering import composite
+from nerfro.samplers.base import PathSampler, PointSampler
+from nerfro.samplers.eikonal import Eikonal, march_uniform
+from nerfro.samplers.hierarchical import Hierarchical
+from nerfro.samplers.integrators import INTEGRATORS, RayState, kick_drift_kick
+from nerfro.samplers.snell import Snell
+from nerfro.samplers.straight import Straight
+from nerfro.samplers.stratified import Stratified
+from nerfro.testing import example_path, example_rays
+from nerfro.types import Path, Radiance, Rendering
+from tests.closed_forms import (
+    FunctionMedium,
+    Squared,
+    blurred_ball,
+    fibre,
+    fisheye,
+    luneburg,
+    make_rays,
+    sech_fibre,
+)
+
+SMOOTH = [luneburg, fisheye, fibre, sech_fibre]
+
+
+def _launch(num: int = 5) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(4)
+    x = 0.6 * (torch.rand(num, 3, generator=generator, dtype=torch.float64) - 0.5)
+    d = torch.nn.functional.normalize(torch.randn(num, 3, generator=generator, dtype=torch.float64), dim=-1)
+    return x, d
+
+
+def _steps(x: Tensor, v: Tensor, medium: Medium, dsigma: float, num_steps: int) -> tuple[Tensor, Tensor]:
+    state = RayState(x, v, *medium(x))
+    for _ in range(num_steps):
+        state = kick_drift_kick(state, torch.full_like(x[:, 0], dsigma), medium)
+    return state.positions, state.velocities
+
+
+# --- steps of fixed dsigma, the core of the leapfrog ---
+
+
+@pytest.mark.parametrize("squared", SMOOTH)
+def test_steps_of_fixed_dsigma_run_backwards_to_their_start(squared: Squared) -> None:
+    medium = FunctionMedium(squared)
+    x0, d = _launch()
+    v0 = d * medium(x0)[0][:, None]
+    x, v = _steps(x0, v0, medium, 0.004, 256)
+    assert (x - x0).norm(dim=-1).min() > 0.2
+    x, v = _steps(x, -v, medium, 0.004, 256)
+    torch.testing.assert_close(x, x0, atol=1e-12, rtol=0)
+    torch.testing.assert_close(-v, v0, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("squared", SMOOTH)
+def test_steps_of_fixed_dsigma_keep_the_phase_space_volume(squared: Squared) -> None:
+    medium = FunctionMedium(squared)
+    x0, d = _launch(1)
+    v0 = d * medium(x0)[0][:, None]
+
+    def flow(phase: Tensor) -> Tensor:
+        return torch.cat(_steps(phase[None, :3], phase[None, 3:], medium, 0.05, 20), -1)[0]
+
+    jacobian = torch.autograd.functional.jacobian(flow, torch.cat([x0, v0], -1)[0])
+    # Etendue: far from the identity, and yet of determinant 1. Symplectic maps also keep the form J.
+    assert (jacobian - torch.eye(6)).abs().max() > 0.3
+    assert float(torch.linalg.det(jacobian)) == pytest.approx(1.0, abs=1e-12)
+    form = torch.zeros(6, 6, dtype=torch.float64)
+    form[:3, 3:], form[3:, :3] = torch.eye(3), -torch.eye(3)
+    torch.testing.assert_close(jacobian.T @ form @ jacobian, form, atol=1e-12, rtol=0)
+
+
+# --- whole paths ---
+
+
+@pytest.mark.parametrize(("integrator", "level"), [("leapfrog", 1e-4), ("rk4", 1e-12)])
+@pytest.mark.parametrize("squared", [luneburg, fisheye, blurred_ball(1.52, 0.05)])
+def test_velocity_keeps_the_length_n_and_radial_media_the_moment(
+    squared: Squared, integrator: str, level: float
+) -> None:
+    medium = FunctionMedium(squared)
+    x0, d = torch.tensor([[-1.2, 0.6, 0.1]], dtype=torch.float64), torch.tensor([[1.0, 0.1, 0.0]]).double()
+    d = torch.nn.functional.normalize(d, dim=-1)
+    n, g = medium(x0)
+    state = RayState(x0, n[:, None] * d, n, g)
+    moment = torch.linalg.cross(x0, state.velocities)
+    ds = torch.full((1,), 2.4 / 256, dtype=torch.float64)
+    for _ in range(256):
+        state = INTEGRATORS[integrator](state, ds, medium)
+        assert float(state.velocities.norm() / state.n - 1) == pytest.approx(0, abs=level)
+        # v is n times the direction: n r sin(phi), by Bouguer.
+        now = torch.linalg.cross(state.positions, state.velocities)
+        torch.testing.assert_close(now, moment, atol=1e-4, rtol=0)
+
+
+def test_euler_drifts_where_the_others_do_not() -> None:
+    rays, medium = make_rays([[-1.2, 0.6, 0.1]], [[1, 0.1, 0]], 0, 2.4), FunctionMedium(fisheye)
+    drift = {}
+    for integrator in ("euler", "leapfrog"):
+        path = march_uniform(rays, medium, INTEGRATORS[integrator], 257)
+        n, _ = medium(path.exit_positions)
+        before = torch.linalg.cross(path.positions[:, 0], rays.directions) * medium(path.positions[:, 0])[0]
+        after = torch.linalg.cross(path.exit_positions, path.exit_directions) * n
+        drift[integrator] = float((after - before).norm())
+    assert drift["euler"] > 100 * drift["leapfrog"]
+
+
+def test_reversed_path_returns_to_its_start() -> None:
+    medium = FunctionMedium(luneburg)
+    out = march_uniform(make_rays([[-0.9, 0.3, 0.1]], [[1, 0.2, 0]], 0, 1.5), medium, INTEGRATORS["rk4"], 400)
+    back = march_uniform(make_rays(out.exit_positions, -out.exit_directions, 0, 1.5), medium, INTEGRATORS["rk4"], 400)
+    torch.testing.assert_close(back.exit_positions, out.positions[:, 0], atol=1e-9, rtol=0)
+    torch.testing.assert_close(back.exit_directions, -out.directions[:, 0], atol=1e-9, rtol=0)
+
+
+# --- where n = 1 ---
+
+
+def _of_index_one() -> dict[str, tuple[PathSampler, Medium]]:
+    box = torch.tensor([[-1.5] * 3, [1.5] * 3])
+    axis = torch.linspace(-1.5, 1.5, 40)
+    radius = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).norm(dim=-1)
+    distances = SdfGrid.from_distances(radius[None] - 0.8, box, [1.0], 0.02)
+    voxels = VoxelGrid.from_occupancy((radius < 0.8).float(), box, 1.0, 5, 1.0)
+    return {
+        "snell-vacuum": (Snell(), Vacuum()),
+        "snell-ball": (Snell(), Ball(ior=1.0)),
+        "snell-grid": (Snell(), distances),
+        "eikonal-vacuum": (Eikonal(), Vacuum()),
+        "eikonal-ball": (Eikonal(), Ball(ior=1.0)),
+        "eikonal-grid": (Eikonal(), distances),
+        "eikonal-voxels": (Eikonal(), voxels),
+    }
+
+
+def _levels(points: PointSampler, path: Path) -> list[Rendering]:
+    """Renderings of a smooth density, level after level."""
+    renderings: list[Rendering] = []
+    for _ in range(points.num_levels):
+        samples = points(path, renderings[-1] if renderings else None)
+        density = 3 * torch.exp(-samples.positions.square().sum(-1))
+        radiance = Radiance(density, torch.sigmoid(samples.positions))
+        renderings.append(composite(samples, radiance, torch.zeros(len(path.s), 3), path))
+    return renderings
+
+
+POINTS = pytest.mark.parametrize(
+    "points", [Stratified(32), Hierarchical(16, 32)], ids=lambda points: type(points).__name__
+)
+
+
+@POINTS
+@pytest.mark.parametrize("name", _of_index_one())
+def test_samples_are_those_of_straight_rays_bit_for_bit(name: str, points: PointSampler) -> None:
+    sampler, medium = _of_index_one()[name]
+    rays, points = example_rays(300), points.eval()
+    plain, path = Straight()(rays, Vacuum()), sampler(rays, medium)
+    for expected, found in zip(_levels(points, plain), _levels(points, path), strict=True):
+        for field in ("s", "positions", "directions", "edges"):
+            assert torch.equal(getattr(found.samples, field), getattr(expected.samples, field))
+
+
+@POINTS
+def test_weights_and_transmittance_sum_to_one_however_a_path_is_sampled(points: PointSampler) -> None:
+    path, points = example_path(200), points.train()
+    for _ in range(3):
+        for rendering in _levels(points, path):
+            total = rendering.weights.sum(-1) + rendering.transmittance
+            torch.testing.assert_close(total, torch.ones(200), atol=1e-5, rtol=0)
