@@ -13,7 +13,7 @@ from pathlib import Path
 
 from nerfro.evaluation.images import load_png, save_png
 from nerfro.evaluation.pictures import PictureRow, most_telling_crop, picture_grid
-from nerfro.evaluation.results import RunMetrics, read_metrics_json
+from nerfro.evaluation.results import METRICS, RunMetrics, read_metrics_json
 from nerfro.evaluation.tables import Column, Row, Table, to_markdown
 from nerfro.paths import ASSETS_DIR
 
@@ -45,18 +45,18 @@ def main() -> None:
 
 def table(metrics: dict[str, RunMetrics]) -> Table:
     """Mean scores, optimiser steps and rays per second of every method."""
+    shown = [metric for metric in METRICS if metric.name in ("psnr", "ssim", "lpips")]
     columns = (
-        Column("PSNR", "higher", 2),
-        Column("SSIM", "higher", 3),
-        Column("LPIPS", "lower", 3),
+        *(Column(metric.title, metric.better, metric.decimals) for metric in shown),
         Column("steps", None, 0),
         Column("rays/s", None, 0),
     )
     rows = [
-        Row(METHODS[name], (*run.result.means.values(), run.steps, run.rays_per_second))
+        Row(METHODS[name], (*(run.result.mean(metric.name) for metric in shown), run.steps, run.rays_per_second))
         for name, run in metrics.items()
     ]
-    notes = dict.fromkeys(f"{key} n/a: {note}" for run in metrics.values() for key, note in run.result.notes.items())
+    reasons = [(metric, run.result.notes.get(metric.name)) for metric in shown for run in metrics.values()]
+    notes = dict.fromkeys(f"{metric.title} n/a: {reason}" for metric, reason in reasons if reason is not None)
     return Table("Embedded torus, 20 test views", "method", columns, tuple(rows), mark_best=True, notes=tuple(notes))
 
 

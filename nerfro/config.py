@@ -62,6 +62,7 @@ class EvaluationConfig:
         split: of the data.
         chunk_size: rays rendered at once; bounds the memory.
         lpips_backbone: file of AlexNet weights; none looks in torch's hub cache and then on the network.
+        lpips_vgg_backbone: file of VGG-16 weights; none looks in torch's hub cache only.
         every: steps between two looks at one validation image while training; 0 for never.
         supersample: rays along each side of a pixel that is supersampled, see `divergence`; 1 for one central ray.
         divergence: supersample pixels whose exit direction differs from a neighbour's by this many pixels; 0 for all.
@@ -70,6 +71,7 @@ class EvaluationConfig:
     split: str = "test"
     chunk_size: int = 8192
     lpips_backbone: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    lpips_vgg_backbone: Optional[str] = None  # noqa: UP045
     every: int = 500
     supersample: int = 1
     divergence: float = 0.0

@@ -21,7 +21,7 @@ from nerfro.data.module import RayDataModule
 from nerfro.data.ray_batches import RayBatches
 from nerfro.errors import NerfroError
 from nerfro.evaluate import report
-from nerfro.evaluation.lpips import find_lpips_network
+from nerfro.evaluation.lpips import find_lpips_networks
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.render_view import Supersampling
 from nerfro.evaluation.score_views import score_views
@@ -65,7 +65,7 @@ def main(config: DictConfig) -> None:
         wanted.jitter,
     )
     supersampling = Supersampling(config.evaluation.supersample, config.evaluation.divergence)
-    lpips = find_lpips_network(config.evaluation.lpips_backbone)
+    lpips = find_lpips_networks(config.evaluation.lpips_backbone, config.evaluation.lpips_vgg_backbone)
     model = build_model(config)
     if checkpoint is not None:
         require_same_configuration(checkpoint, load_checkpoint(checkpoint)[1], config)

@@ -42,7 +42,7 @@ def train_here(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[st
     """`python -m nerfro.train`'s main in this process, on the CPU and without looking for LPIPS weights."""
     import nerfro.train
 
-    monkeypatch.setattr(nerfro.train, "find_lpips_network", lambda backbone: (None, "not wanted in tests"))
+    monkeypatch.setattr(nerfro.train, "find_lpips_networks", lambda *files: ({}, {}))
 
     def train(*overrides: str) -> Finished:
         monkeypatch.setattr(sys, "argv", ["nerfro.train", *overrides])

@@ -38,7 +38,7 @@ def evaluate_here(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., tuple[int, str]]:
     """`python -m nerfro.evaluate`'s main in this process; exit code and standard error."""
-    monkeypatch.setattr(nerfro.evaluate, "find_lpips_network", lambda backbone: (None, "not wanted in tests"))
+    monkeypatch.setattr(nerfro.evaluate, "find_lpips_networks", lambda *files: ({}, {}))
 
     def evaluate(*arguments: str) -> tuple[int, str]:
         monkeypatch.setattr("sys.argv", ["nerfro.evaluate", "device=cpu", *arguments])

@@ -2,15 +2,76 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
 import matplotlib
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.errors import NerfroError
+from nerfro.evaluation.flip import flip_map
+from nerfro.evaluation.lpips import LpipsNetwork
+from nerfro.evaluation.ssim import WINDOW, ssim_map
 
 # Squared errors from 0 to this value are told apart; 0.05 is a difference of 0.22 in every channel.
 SQUARED_ERROR_LIMIT = 0.05
+NO_VALUE = (225, 225, 225)  # levels of the grey of pixels that an error map says nothing about
+
+
+@dataclass(frozen=True)
+class ErrorMap:
+    """Error at each pixel of a picture.
+
+    Attributes:
+        name: of the metric, as in file names.
+        title: what the values are, written at the colour scale.
+        values: 0 where there is no error; NaN where there is no value.
+        limit: value of the last colour of the scale, the same for all pictures.
+    """
+
+    name: str
+    title: str
+    values: Float[Tensor, "H W"]
+    limit: float
+
+    def colours(self) -> Float[Tensor, "H W 3"]:
+        """The map in magma, sRGB in [0, 1]."""
+        return magma(self.values, self.limit)
+
+
+def error_maps(
+    prediction: Float[Tensor, "H W 3"],
+    target: Float[Tensor, "H W 3"],
+    lpips_networks: Mapping[str, LpipsNetwork] | None = None,
+) -> list[ErrorMap]:
+    """All error maps that two pictures allow: squared error, 1 - SSIM, LPIPS with each network given, and FLIP.
+
+    1 - SSIM and LPIPS are left out where the picture is too small for them. 1 - SSIM has no values on the border of
+    five pixels, whose windows stick out of the picture.
+
+    Args:
+        prediction: sRGB in [0, 1].
+        target: sRGB in [0, 1].
+        lpips_networks: by the name of their metric, see `find_lpips_networks`.
+
+    Raises:
+        NerfroError: if the shapes differ.
+    """
+    size = min(prediction.shape[:2])
+    maps = [ErrorMap("squared_error", "squared error", squared_error_map(prediction, target), SQUARED_ERROR_LIMIT)]
+    if size >= WINDOW:
+        border = WINDOW // 2
+        values = F.pad(1 - ssim_map(prediction, target).mean(-1), [border] * 4, value=torch.nan)
+        maps.append(ErrorMap("ssim", "1 - SSIM", values, 1.0))
+    for name, network in (lpips_networks or {}).items():
+        if size >= network.backbone.min_size:
+            title = f"LPIPS, {network.backbone.published.title}"
+            with torch.no_grad():
+                maps.append(ErrorMap(name, title, network.distance_map(prediction, target), 1.0))
+    return [*maps, ErrorMap("flip", "FLIP", flip_map(prediction, target), 1.0)]
 
 
 def squared_error_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
@@ -40,7 +101,7 @@ def magma(values: Float[Tensor, "H W"], limit: float) -> Float[Tensor, "H W 3"]:
     The scale is given and never fitted to the values, so that pictures can be compared.
 
     Args:
-        values: non-negative numbers.
+        values: non-negative numbers; those that are NaN become grey.
         limit: value of the last colour, positive.
 
     Returns:
@@ -53,5 +114,6 @@ def magma(values: Float[Tensor, "H W"], limit: float) -> Float[Tensor, "H W 3"]:
         raise NerfroError(f"the limit of a colour scale must be positive, got {limit}")
     num_colours = 256
     table = torch.from_numpy(matplotlib.colormaps["magma"](range(num_colours))[:, :3]).float()
-    index = (values.detach().cpu().float() / limit * (num_colours - 1)).round().clamp(0, num_colours - 1)
-    return table[index.long()]
+    values = values.detach().cpu().float()
+    index = (values.nan_to_num() / limit * (num_colours - 1)).round().clamp(0, num_colours - 1)
+    return torch.where(values.isnan()[..., None], torch.tensor(NO_VALUE) / 255, table[index.long()])

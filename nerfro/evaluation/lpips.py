@@ -1,7 +1,7 @@
-"""Learned perceptual image patch similarity (LPIPS v0.1) over the features of AlexNet.
+"""Learned perceptual image patch similarity (LPIPS v0.1) over the features of AlexNet or VGG-16.
 
-Written out here because torchmetrics and lpips both take AlexNet from torchvision, whose published builds do not load
-beside a CPU build of torch. The linear heads are those that torchmetrics carries; the values are those of both
+Written out here because torchmetrics and lpips both take the networks from torchvision, whose published builds do not
+load beside a CPU build of torch. The linear heads are those that torchmetrics carries; the values are those of both
 packages. Source: Zhang et al., "The unreasonable effectiveness of deep features as a perceptual metric", CVPR 2018.
 """
 
@@ -13,39 +13,79 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-import torchmetrics
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.pretrained import load_alexnet
-
-MIN_PICTURE_SIZE = 31  # pixels; below, AlexNet's second pooling has nothing left to pool
+from nerfro.evaluation.pretrained import ALEXNET, VGG16, Published, load_weights
+from nerfro.evaluation.regions import mean_over
 
 
 class Convolution(NamedTuple):
-    """One feature layer of AlexNet, followed by a ReLU."""
+    """One layer of a backbone, followed by a ReLU."""
 
     key: str
     channels_in: int
     channels: int
-    kernel: int
-    stride: int
-    padding: int
-    pooled: bool  # whether its input is max-pooled, 3 x 3 with stride 2
+    kernel: int = 3
+    stride: int = 1
+    padding: int = 1
+    pooling: int = 0  # side of the windows, with stride 2, over which its input is max-pooled; 0 for none
+    compared: bool = True  # whether its output is a feature of LPIPS
 
 
-ALEXNET = (
-    Convolution("features.0", 3, 64, kernel=11, stride=4, padding=2, pooled=False),
-    Convolution("features.3", 64, 192, kernel=5, stride=1, padding=2, pooled=True),
-    Convolution("features.6", 192, 384, kernel=3, stride=1, padding=1, pooled=True),
-    Convolution("features.8", 384, 256, kernel=3, stride=1, padding=1, pooled=False),
-    Convolution("features.10", 256, 256, kernel=3, stride=1, padding=1, pooled=False),
+class Backbone(NamedTuple):
+    """A network whose features are compared.
+
+    Attributes:
+        published: where its weights are.
+        heads: file of torchmetrics with the linear heads.
+        min_size: pixels; in smaller pictures the last pooling has nothing left to pool.
+        layers: its convolutions, in order.
+    """
+
+    published: Published
+    heads: str
+    min_size: int
+    layers: tuple[Convolution, ...]
+
+
+ALEX = Backbone(
+    ALEXNET,
+    "alex.pth",
+    31,
+    (
+        Convolution("features.0", 3, 64, kernel=11, stride=4, padding=2),
+        Convolution("features.3", 64, 192, kernel=5, padding=2, pooling=3),
+        Convolution("features.6", 192, 384, pooling=3),
+        Convolution("features.8", 384, 256),
+        Convolution("features.10", 256, 256),
+    ),
+)
+VGG = Backbone(
+    VGG16,
+    "vgg.pth",
+    16,
+    (
+        Convolution("features.0", 3, 64, compared=False),
+        Convolution("features.2", 64, 64),
+        Convolution("features.5", 64, 128, pooling=2, compared=False),
+        Convolution("features.7", 128, 128),
+        Convolution("features.10", 128, 256, pooling=2, compared=False),
+        Convolution("features.12", 256, 256, compared=False),
+        Convolution("features.14", 256, 256),
+        Convolution("features.17", 256, 512, pooling=2, compared=False),
+        Convolution("features.19", 512, 512, compared=False),
+        Convolution("features.21", 512, 512),
+        Convolution("features.24", 512, 512, pooling=2, compared=False),
+        Convolution("features.26", 512, 512, compared=False),
+        Convolution("features.28", 512, 512),
+    ),
 )
 
 
 class LpipsNetwork(nn.Module):
-    """AlexNet's five feature layers, and how much a difference in each channel matters.
+    """Five feature layers of a backbone, and how much a difference in each channel matters.
 
     d(x, y) = sum_l mean_hw w_l . (f_l(x) - f_l(y))^2, with f_l of unit length over channels (Eqn. 1 of the paper).
 
@@ -55,39 +95,51 @@ class LpipsNetwork(nn.Module):
     shift: Tensor
     scale: Tensor
 
-    def __init__(self, backbone: dict[str, Tensor], heads: dict[str, Tensor]) -> None:
+    def __init__(self, backbone: Backbone, weights: dict[str, Tensor], heads: dict[str, Tensor]) -> None:
         """Take the weights.
 
         Args:
-            backbone: AlexNet's state dict, `features.<i>.weight` and `features.<i>.bias`.
+            backbone: which network.
+            weights: its state dict, `features.<i>.weight` and `features.<i>.bias`.
             heads: weights of the linear heads, `lin<l>.model.1.weight`, each [1, channels, 1, 1].
 
         Raises:
             NerfroError: if a weight is missing or of another shape.
         """
         super().__init__()
-        for i, layer in enumerate(ALEXNET):
+        self.backbone = backbone
+        for i, layer in enumerate(backbone.layers):
             shape = (layer.channels, layer.channels_in, layer.kernel, layer.kernel)
-            self._take(f"kernel{i}", backbone, f"{layer.key}.weight", shape)
-            self._take(f"bias{i}", backbone, f"{layer.key}.bias", (layer.channels,))
+            self._take(f"kernel{i}", weights, f"{layer.key}.weight", shape)
+            self._take(f"bias{i}", weights, f"{layer.key}.bias", (layer.channels,))
+        for i, layer in enumerate(layer for layer in backbone.layers if layer.compared):
             self._take(f"head{i}", heads, f"lin{i}.model.1.weight", (1, layer.channels, 1, 1))
         # The colours of ImageNet, for inputs in [-1, 1].
         self.register_buffer("shift", torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("scale", torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1), persistent=False)
 
-    def forward(self, prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
+    def forward(
+        self,
+        prediction: Float[Tensor, "H W 3"],
+        target: Float[Tensor, "H W 3"],
+        inside: Bool[Tensor, "H W"] | None = None,
+    ) -> Float[Tensor, ""]:
         """Perceptual distance of two pictures.
 
         Args:
             prediction: sRGB in [0, 1].
             target: sRGB in [0, 1].
+            inside: pixels over which `distance_map` is averaged; by default the published distance is taken, the sum
+                of the layers' own means.
 
         Returns:
-            Distance, 0 for equal pictures.
+            Distance, 0 for equal pictures; NaN for an empty mask.
 
         Raises:
-            NerfroError: if the picture is smaller than `MIN_PICTURE_SIZE`.
+            NerfroError: if the picture is smaller than the backbone's `min_size`.
         """
+        if inside is not None:
+            return mean_over(self.distance_map(prediction, target), inside)
         return torch.stack([layer.mean() for layer in self._layer_distances(prediction, target)]).sum()
 
     def distance_map(self, prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
@@ -101,7 +153,7 @@ class LpipsNetwork(nn.Module):
             Distances; their mean is close to, but not the same as, that of `forward`.
 
         Raises:
-            NerfroError: if the picture is smaller than `MIN_PICTURE_SIZE`.
+            NerfroError: if the picture is smaller than the backbone's `min_size`.
         """
         size = prediction.shape[:2]
         layers = self._layer_distances(prediction, target)
@@ -112,15 +164,15 @@ class LpipsNetwork(nn.Module):
         if key not in weights or tuple(weights[key].shape) != shape:
             found = list(weights[key].shape) if key in weights else "nothing"
             raise NerfroError(
-                f"LPIPS weights: expected {key} of shape {list(shape)}, found {found}; use the file of AlexNet itself"
+                f"LPIPS weights: expected {key} of shape {list(shape)}, found {found}; "
+                f"use the file of {self.backbone.published.title} itself"
             )
         self.register_buffer(name, weights[key].detach().float().clone(), persistent=False)
 
     def _layer_distances(self, prediction: Tensor, target: Tensor) -> list[Float[Tensor, "1 1 h w"]]:
-        if min(prediction.shape[:2]) < MIN_PICTURE_SIZE:
-            raise NerfroError(
-                f"LPIPS needs at least {MIN_PICTURE_SIZE} x {MIN_PICTURE_SIZE} pixels, got {list(prediction.shape[:2])}"
-            )
+        size = self.backbone.min_size
+        if min(prediction.shape[:2]) < size:
+            raise NerfroError(f"LPIPS needs at least {size} x {size} pixels, got {list(prediction.shape[:2])}")
         # Under mixed precision the features would be half ones, and the distances 1e-3 off.
         with torch.autocast(prediction.device.type, enabled=False):
             pairs = zip(self._features(prediction), self._features(target), strict=True)
@@ -132,42 +184,14 @@ class LpipsNetwork(nn.Module):
     def _features(self, rgb: Float[Tensor, "H W 3"]) -> list[Float[Tensor, "1 C h w"]]:
         x = (2 * rgb.float().permute(2, 0, 1)[None] - 1 - self.shift) / self.scale
         features = []
-        for i, layer in enumerate(ALEXNET):
-            if layer.pooled:
-                x = F.max_pool2d(x, kernel_size=3, stride=2)
+        for i, layer in enumerate(self.backbone.layers):
+            if layer.pooling:
+                x = F.max_pool2d(x, layer.pooling, stride=2)
             kernel, bias = getattr(self, f"kernel{i}"), getattr(self, f"bias{i}")
             x = F.relu(F.conv2d(x, kernel, bias, layer.stride, layer.padding))
-            features.append(x)
+            if layer.compared:
+                features.append(x)
         return features
-
-
-class LearnedPerceptualSimilarity(torchmetrics.Metric):
-    """Mean LPIPS over pictures."""
-
-    full_state_update = False
-    total: Tensor
-    count: Tensor
-
-    def __init__(self, network: LpipsNetwork) -> None:
-        """Start with no pictures.
-
-        Args:
-            network: see `load_lpips_network`.
-        """
-        super().__init__()
-        self.network = network
-        self.add_state("total", default=torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("count", default=torch.zeros((), dtype=torch.long), dist_reduce_fx="sum")
-
-    @torch.no_grad()
-    def update(self, prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> None:
-        """Add one picture, sRGB in [0, 1]."""
-        self.total += self.network(prediction, target).double()
-        self.count += 1
-
-    def compute(self) -> Float[Tensor, ""]:
-        """Mean distance of the pictures so far."""
-        return self.total / self.count
 
 
 def unit_length(features: Float[Tensor, "1 C h w"]) -> Float[Tensor, "1 C h w"]:
@@ -175,40 +199,48 @@ def unit_length(features: Float[Tensor, "1 C h w"]) -> Float[Tensor, "1 C h w"]:
     return features / (features.square().sum(dim=1, keepdim=True).sqrt() + 1e-10)
 
 
-def load_lpips_network(backbone: Path | str | None = None, download: bool = True) -> LpipsNetwork:
-    """Build the network with the published weights.
+def load_lpips_network(backbone: Backbone, path: Path | str | None = None, download: bool = True) -> LpipsNetwork:
+    """Build a network with the published weights.
 
     Args:
-        backbone: file with AlexNet's weights; by default torch hub's cache, or the network.
+        backbone: `ALEX` or `VGG`.
+        path: file with its weights; by default torch hub's cache, or the network.
         download: whether the weights may be fetched when they are not cached.
 
     Returns:
         The network, on the CPU.
 
     Raises:
-        NerfroError: if the weights cannot be had, or are not AlexNet's.
+        NerfroError: if the weights cannot be had, or are another network's.
     """
-    with as_file(files("torchmetrics") / "functional/image/lpips_models/alex.pth") as path:
-        heads = torch.load(path, map_location="cpu", weights_only=True)
-    return LpipsNetwork(load_alexnet(backbone, download), heads)
+    with as_file(files("torchmetrics") / "functional/image/lpips_models" / backbone.heads) as heads_file:
+        heads = torch.load(heads_file, map_location="cpu", weights_only=True)
+    return LpipsNetwork(backbone, load_weights(backbone.published, path, download), heads)
 
 
-def find_lpips_network(backbone: Path | str | None = None, download: bool = True) -> tuple[LpipsNetwork | None, str]:
-    """Build the network if its weights can be had, and say why if not.
+def find_lpips_networks(
+    alex: Path | str | None = None, vgg: Path | str | None = None, download: bool = True
+) -> tuple[dict[str, LpipsNetwork], dict[str, str]]:
+    """Build the networks whose weights can be had, and say why not the others.
 
     Args:
-        backbone: file with AlexNet's weights; by default torch hub's cache, or the network.
-        download: whether the weights may be fetched when they are not cached.
+        alex: file with AlexNet's weights; by default torch hub's cache, or the network.
+        vgg: file with VGG-16's weights; by default torch hub's cache. They are never fetched unasked: 528 MB.
+        download: whether AlexNet's weights may be fetched when they are not cached.
 
     Returns:
-        The network and "", or None and the reason in one line.
+        The networks by the name of their metric, `lpips` and `lpips_vgg`, and by the same names the reasons, in one
+        line, for those that are missing.
 
     Raises:
-        NerfroError: if `backbone` is given and is not AlexNet's file: whoever names a file wants it used.
+        NerfroError: if a file is given and is not that network's: whoever names a file wants it used.
     """
-    try:
-        return load_lpips_network(backbone, download), ""
-    except NerfroError as error:
-        if backbone is not None:
-            raise
-        return None, str(error)
+    networks, reasons = {}, {}
+    for metric, backbone, path, fetched in (("lpips", ALEX, alex, download), ("lpips_vgg", VGG, vgg, False)):
+        try:
+            networks[metric] = load_lpips_network(backbone, path, fetched)
+        except NerfroError as error:
+            if path is not None:
+                raise
+            reasons[metric] = str(error)
+    return networks, reasons

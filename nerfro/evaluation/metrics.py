@@ -1,75 +1,94 @@
-"""PSNR, SSIM and LPIPS of single pictures, and the metric that collects them over views."""
+"""PSNR, the mean of any metric over pictures, and the metric that collects all of them over views and regions."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 import torchmetrics
-from jaxtyping import Float
-from torch import Tensor
-from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
 from torchmetrics.utilities import dim_zero_cat
 
 from nerfro.errors import NerfroError
+from nerfro.evaluation.error_maps import squared_error_map
+from nerfro.evaluation.flip import flip
 from nerfro.evaluation.images import round_to_8bit
-from nerfro.evaluation.lpips import MIN_PICTURE_SIZE as LPIPS_MIN_SIZE
 from nerfro.evaluation.lpips import LpipsNetwork
-from nerfro.evaluation.results import METRICS, EvaluationResult, ViewScores
+from nerfro.evaluation.regions import crop_rectangle, mean_over, object_pixels
+from nerfro.evaluation.results import FULL, METRICS, OBJECT_REGIONS, EvaluationResult, Region, Score, ViewScores
+from nerfro.evaluation.ssim import MS_SSIM_MIN_SIZE, WINDOW, ms_ssim, ssim
 
 MAX_PSNR = 100.0  # dB; equal pictures would have infinity, which no mean, table or JSON file can hold
-SSIM_WINDOW = 11  # pixels: a Gaussian of sigma 1.5, cut off at 3.5 sigma
+_REGIONS = (FULL, *OBJECT_REGIONS)
+
+# A metric of two pictures [H, W, 3], sRGB in [0, 1], over all pixels or over those of a mask [H, W].
+PictureMetric = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 
 
-def psnr(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
+def psnr(
+    prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], inside: Bool[Tensor, "H W"] | None = None
+) -> Float[Tensor, ""]:
     """Peak signal-to-noise ratio, -10 log10(mean squared error), in dB.
 
     Args:
         prediction: sRGB in [0, 1].
         target: sRGB in [0, 1].
+        inside: pixels over which the squared error is averaged; all by default.
 
     Returns:
         Decibels, at most 100: equal pictures, and those with a mean squared error below 1e-10, score `MAX_PSNR`.
     """
-    value = peak_signal_noise_ratio(prediction.double(), target.double(), data_range=1.0)
-    return value.clamp(max=MAX_PSNR)
+    errors = squared_error_map(prediction.double(), target.double())
+    return (-10 * torch.log10(mean_over(errors, inside))).clamp(max=MAX_PSNR)
 
 
-def ssim_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H-10 W-10 3"]:
-    """Structural similarity at each pixel and channel whose whole window lies inside the picture.
+class MeanOverPictures(torchmetrics.Metric):
+    """Mean of a metric over pictures: of `psnr`, `ssim`, `ms_ssim`, `flip` or an `LpipsNetwork`.
 
-    Gaussian window of 11 pixels and sigma 1.5, weighted (not unbiased) covariances, K = (0.01, 0.03), range 1; in
-    double precision, since variances are differences of nearly equal numbers. Source: Wang et al., "Image quality
-    assessment: from error visibility to structural similarity", 2004, Eqn. 13 to 16.
-
-    Args:
-        prediction: sRGB in [0, 1].
-        target: sRGB in [0, 1].
-
-    Returns:
-        Similarity in [-1, 1], five pixels smaller on each side.
-
-    Raises:
-        NerfroError: if the picture is smaller than the window.
+    Example:
+        ```
+        metric = MeanOverPictures(flip)
+        for prediction, target in views:
+            metric.update(prediction, target)
+        metric.compute()
+        ```
     """
-    if min(prediction.shape[:2]) < SSIM_WINDOW:
-        raise NerfroError(f"SSIM needs at least {SSIM_WINDOW} x {SSIM_WINDOW} pixels, got {list(prediction.shape[:2])}")
-    predictions, targets = (image.double().permute(2, 0, 1)[None] for image in (prediction, target))
-    _, full = structural_similarity_index_measure(
-        predictions, targets, sigma=1.5, data_range=1.0, return_full_image=True
-    )
-    # torchmetrics pads by reflection and averages over the padded windows too; the border is cut off here.
-    border = SSIM_WINDOW // 2
-    return full[0].permute(1, 2, 0)[border:-border, border:-border]
 
+    full_state_update = False
+    total: Tensor
+    count: Tensor
 
-def ssim(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
-    """Structural similarity, the mean of `ssim_map` over pixels and channels."""
-    return ssim_map(prediction, target).mean()
+    def __init__(self, metric: PictureMetric) -> None:
+        """Start with no pictures.
+
+        Args:
+            metric: of one picture.
+        """
+        super().__init__()
+        self.metric = metric
+        self.add_state("total", default=torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state("count", default=torch.zeros((), dtype=torch.long), dist_reduce_fx="sum")
+
+    @torch.no_grad()
+    def update(
+        self,
+        prediction: Float[Tensor, "H W 3"],
+        target: Float[Tensor, "H W 3"],
+        inside: Bool[Tensor, "H W"] | None = None,
+    ) -> None:
+        """Add one picture, sRGB in [0, 1], or its pixels inside a mask."""
+        self.total += self.metric(prediction, target, inside).double()
+        self.count += 1
+
+    def compute(self) -> Float[Tensor, ""]:
+        """Mean of the pictures so far."""
+        return self.total / self.count
 
 
 class ImageMetrics(torchmetrics.Metric):
-    """PSNR, SSIM and LPIPS of each view.
+    """Every metric of each view: on the full image, and on the object's mask and the crop around it where it is known.
 
     With `round_predictions` (the default) predictions are clipped and rounded to 8 bits first, so that the numbers can
     be computed again from the pictures that were written; without, they are clipped only. Targets are taken as they
@@ -77,7 +96,7 @@ class ImageMetrics(torchmetrics.Metric):
 
     Example:
         ```
-        metrics = ImageMetrics(*find_lpips_network())
+        metrics = ImageMetrics(*find_lpips_networks())
         for prediction, target in views:
             metrics.update(prediction, target)
         metrics.result().means
@@ -89,29 +108,35 @@ class ImageMetrics(torchmetrics.Metric):
 
     def __init__(
         self,
-        lpips_network: LpipsNetwork | None,
-        lpips_note: str = "",
+        lpips_networks: Mapping[str, LpipsNetwork] | None = None,
+        reasons: Mapping[str, str] | None = None,
         round_predictions: bool = True,
         prefix: str = "test",
     ) -> None:
         """Start with no views.
 
         Args:
-            lpips_network: the network of LPIPS; None to go without.
-            lpips_note: the reason why there is none.
+            lpips_networks: by the name of their metric, see `find_lpips_networks`; what is not there is left out.
+            reasons: why a network is missing, by the same names.
             round_predictions: whether predictions are rounded to 8 bits before they are scored.
             prefix: views are named `<prefix>_<number, three digits>`.
         """
         super().__init__()
-        self.lpips_network = lpips_network
-        self.lpips_note = lpips_note or "no LPIPS network was given"
+        self.lpips_networks = nn.ModuleDict(lpips_networks or {})
+        self.reasons = dict(reasons or {})
+        self.min_sizes = {"ssim": WINDOW, "ms_ssim": MS_SSIM_MIN_SIZE}
+        self.min_sizes.update({name: network.backbone.min_size for name, network in (lpips_networks or {}).items()})
         self.round_predictions = round_predictions
         self.prefix = prefix
         self.add_state("rows", default=[], dist_reduce_fx="cat")
 
     @torch.no_grad()
     def update(
-        self, prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], view: int | None = None
+        self,
+        prediction: Float[Tensor, "H W 3"],
+        target: Float[Tensor, "H W 3"],
+        view: int | None = None,
+        coverage: Float[Tensor, "H W"] | None = None,
     ) -> None:
         """Score one view.
 
@@ -119,6 +144,8 @@ class ImageMetrics(torchmetrics.Metric):
             prediction: rendered picture, sRGB.
             target: reference picture, sRGB in [0, 1].
             view: number of the view; by default they are counted. Processes that share the work must give it.
+            coverage: share of each pixel that the object covers; without it only the full image is scored, and so it
+                is where the object is not seen.
 
         Raises:
             NerfroError: if the shapes differ, or a value is NaN or infinite.
@@ -128,24 +155,26 @@ class ImageMetrics(torchmetrics.Metric):
                 f"cannot compare a prediction {list(prediction.shape)} with a reference {list(target.shape)}; "
                 "both must be [H, W, 3] and of one size"
             )
+        if coverage is not None and coverage.shape != target.shape[:2]:
+            raise NerfroError(f"a mask {list(coverage.shape)} does not fit a picture {list(target.shape)}; give [H, W]")
         rounded = round_to_8bit(prediction)  # also refuses what is not finite
         prediction = rounded if self.round_predictions else prediction.clamp(0, 1)
-        size = min(prediction.shape[:2])
-        row = torch.full((1 + len(METRICS),), torch.nan, dtype=torch.float64, device=prediction.device)
-        row[0] = len(self.rows) if view is None else view
-        row[1] = psnr(prediction, target)
-        if size >= SSIM_WINDOW:
-            row[2] = ssim(prediction, target)
-        if self.lpips_network is not None and size >= LPIPS_MIN_SIZE:
-            row[3] = self.lpips_network(prediction, target)
-        self.rows.append(row[None])
+        scores = torch.full((len(_REGIONS), len(METRICS)), torch.nan, dtype=torch.float64, device=prediction.device)
+        scores[0] = self._score(prediction, target, None)
+        inside = None if coverage is None else object_pixels(coverage)
+        if inside is not None and inside.any():
+            rectangle = crop_rectangle(inside)
+            scores[1] = self._score(prediction, target, inside)
+            scores[2] = self._score(rectangle.of(prediction), rectangle.of(target), None)
+        number = scores.new_tensor([len(self.rows) if view is None else view])
+        self.rows.append(torch.cat([number, scores.flatten()])[None])
 
-    def compute(self) -> Float[Tensor, "V 4"]:
+    def compute(self) -> Float[Tensor, "V 1+K"]:
         """Scores of all views, gathered from all processes.
 
         Returns:
-            A row for each view: its number, in rising order, then the scores in the order of `METRICS`; NaN where a
-            metric is not available.
+            A row for each view: its number, in rising order, then the scores on the full image in the order of
+            `METRICS`, those on the mask and those on the crop; NaN where one is not available.
 
         Raises:
             NerfroError: if no view was scored.
@@ -157,25 +186,57 @@ class ImageMetrics(torchmetrics.Metric):
         by_view = {int(row[0]): row for row in rows}
         return torch.stack([by_view[number] for number in sorted(by_view)])
 
-    def result(self) -> EvaluationResult:
+    def result(self, names: Sequence[str] | None = None) -> EvaluationResult:
         """The scores as named rows, with the reasons for what is missing.
+
+        Args:
+            names: of the views, in the order of their numbers; by default they are made from the prefix.
 
         Raises:
             NerfroError: if no view was scored.
         """
+        rows = self.compute()
+        if names is None:
+            names = [f"{self.prefix}_{int(number):03d}" for number in rows[:, 0]]
+        scores = rows[:, 1:].view(len(rows), len(_REGIONS), len(METRICS))
+        has_masks = not scores[:, 1:].isnan().all()
         views = []
-        for number, *scores in self.compute().tolist():
-            named = zip((metric.name for metric in METRICS), scores, strict=True)
-            row = {name: None if math.isnan(score) else score for name, score in named}
-            views.append(ViewScores(f"{self.prefix}_{int(number):03d}", row))
-        notes = self._notes(views)
-        return EvaluationResult(tuple(views), notes, "8bit" if self.round_predictions else "float")
+        for name, (full, *others) in zip(names, scores.tolist(), strict=True):
+            regions = zip(OBJECT_REGIONS, others, strict=True) if has_masks else ()
+            views.append(ViewScores(name, _named(full), {region: _named(row) for region, row in regions}))
+        return EvaluationResult(tuple(views), self._notes(views), "8bit" if self.round_predictions else "float")
 
-    def _notes(self, views: list[ViewScores]) -> dict[str, str]:
+    def _score(self, prediction: Tensor, target: Tensor, inside: Tensor | None) -> Float[Tensor, "K"]:
+        """All metrics in the order of `METRICS`; NaN for those that are absent, or need a larger picture."""
+        metrics: dict[str, PictureMetric] = {"psnr": psnr, "ssim": ssim, "ms_ssim": ms_ssim, "flip": flip}
+        metrics.update(self.lpips_networks.items())  # type: ignore[arg-type]
+        scores = torch.full((len(METRICS),), torch.nan, dtype=torch.float64, device=prediction.device)
+        for index, metric in enumerate(METRICS):
+            if metric.name in metrics and min(prediction.shape[:2]) >= self.min_sizes.get(metric.name, 1):
+                scores[index] = metrics[metric.name](prediction, target, inside)
+        return scores
+
+    def _notes(self, views: Sequence[ViewScores]) -> dict[str, str]:
         notes = {}
-        if any(view.scores["ssim"] is None for view in views):
-            notes["ssim"] = f"pictures smaller than its window of {SSIM_WINDOW} pixels"
-        if any(view.scores["lpips"] is None for view in views):
-            too_small = f"pictures smaller than the {LPIPS_MIN_SIZE} pixels that AlexNet needs"
-            notes["lpips"] = self.lpips_note if self.lpips_network is None else too_small
+        unseen = [view.name for view in views if view.regions and view.score("psnr", "mask") is None]
+        if unseen:
+            notes["mask"] = f"the mask is missing or empty in {', '.join(unseen)}"
+        for region in _REGIONS:
+            seen = [view for view in views if view.score("psnr", region) is not None]
+            for metric in METRICS:
+                if any(view.score(metric.name, region) is None for view in seen):
+                    notes[metric.name if region == FULL else f"{region}.{metric.name}"] = self._reason(
+                        metric.name, region
+                    )
         return notes
+
+    def _reason(self, metric: str, region: Region) -> str:
+        if metric.startswith("lpips") and metric not in self.lpips_networks:
+            return self.reasons.get(metric, "no network was given")
+        where = {FULL: "pictures", "mask": "pictures or masks", "crop": "crops"}[region]
+        return f"{where} smaller than the {self.min_sizes[metric]} pixels that it needs"
+
+
+def _named(scores: Sequence[float]) -> dict[str, Score]:
+    pairs = zip(METRICS, scores, strict=True)
+    return {metric.name: None if math.isnan(score) else score for metric, score in pairs}

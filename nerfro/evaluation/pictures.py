@@ -4,26 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
-import matplotlib
 import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 from torch import Tensor
 
 from nerfro.errors import NerfroError
+from nerfro.evaluation.drawing import GAP, LINE_HEIGHT, colour_scale, fit, paper, write
 from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, magma, squared_error_map
-from nerfro.evaluation.images import to_8bit
 
-GAP = 6  # pixels between pictures
 ROW_GAP = 18  # pixels between views
-TEXT_SIZE = 14  # pixels
-LINE_HEIGHT = 22  # pixels
 CROP_COLOURS = ((225, 60, 50), (45, 125, 235), (40, 165, 85))  # frames of the first, second, ... inset
-PAPER, INK, EMPTY = (255, 255, 255), (25, 25, 25), (225, 225, 225)
 
 
 @dataclass(frozen=True)
@@ -94,7 +88,7 @@ def picture_grid(
     bands = [_titles_band(titles, margin, width, across)]
     for index, row in enumerate(rows):
         if index > 0:
-            bands.append(np.asarray(_paper(across, ROW_GAP)))
+            bands.append(np.asarray(paper(across, ROW_GAP)))
         bands.append(_row_band(row, margin, width, across, error_limit))
     return torch.from_numpy(np.concatenate(bands)).float() / 255
 
@@ -120,7 +114,10 @@ def triptych(
 
 
 def most_telling_crop(
-    reference: Float[Tensor, "H W 3"], predictions: Sequence[Float[Tensor, "H W 3"]], size: int
+    reference: Float[Tensor, "H W 3"],
+    predictions: Sequence[Float[Tensor, "H W 3"]],
+    size: int,
+    apart_from: Sequence[Crop] = (),
 ) -> Crop:
     """The square in which methods differ most: the largest sum of variances among their squared errors.
 
@@ -128,12 +125,13 @@ def most_telling_crop(
         reference: ground truth, sRGB in [0, 1].
         predictions: the same view by two or more methods; by one, the square of its largest error is taken.
         size: side of the square in pixels.
+        apart_from: squares that are taken already; the new one does not overlap them.
 
     Returns:
         A square inside the picture.
 
     Raises:
-        NerfroError: if there is no prediction, or the square is larger than the picture.
+        NerfroError: if there is no prediction, or no room for the square.
     """
     if not predictions or not 0 < size <= min(reference.shape[:2]):
         raise NerfroError(
@@ -143,6 +141,11 @@ def most_telling_crop(
     errors = torch.stack([squared_error_map(prediction, reference) for prediction in predictions])
     interest = errors.var(0, correction=0) if len(predictions) > 1 else errors[0]
     sums = F.avg_pool2d(interest.double()[None, None], size, stride=1)[0, 0]
+    for taken in apart_from:
+        rows = slice(max(taken.top - size + 1, 0), taken.top + taken.size)
+        sums[rows, max(taken.left - size + 1, 0) : taken.left + taken.size] = -torch.inf
+    if sums.isneginf().all():
+        raise NerfroError(f"no room for another crop of {size} pixels; choose a smaller one")
     top, left = divmod(int(sums.argmax()), sums.shape[1])
     return Crop(top, left, size)
 
@@ -166,9 +169,9 @@ def _check(rows: Sequence[PictureRow], titles: Sequence[str]) -> None:
 
 
 def _titles_band(titles: Sequence[str], margin: int, width: int, across: int) -> np.ndarray:
-    band = _paper(across, LINE_HEIGHT)
+    band = paper(across, LINE_HEIGHT)
     for column, title in enumerate(titles):
-        _write(band, title, margin + column * (width + GAP) + width // 2, LINE_HEIGHT // 2)
+        write(band, title, margin + column * (width + GAP) + width // 2, LINE_HEIGHT // 2)
     return np.asarray(band)
 
 
@@ -178,12 +181,12 @@ def _row_band(row: PictureRow, margin: int, width: int, across: int, error_limit
         _column(row, picture, _caption(row, index), width, error_limit)
         for index, picture in enumerate([row.reference, *row.predictions])
     ]
-    band = _paper(across, columns[0].height)
+    band = paper(across, columns[0].height)
     for index, column in enumerate(columns):
         band.paste(column, (margin + index * (width + GAP), 0))
     if row.label:
-        label = _paper(band.height, margin)
-        _write(label, row.label, band.height // 2, margin // 2)
+        label = paper(band.height, margin)
+        write(label, row.label, band.height // 2, margin // 2)
         band.paste(label.rotate(90, expand=True), (0, 0))
     return np.asarray(band)
 
@@ -202,16 +205,16 @@ def _column(
     height = round(width * row.reference.shape[0] / row.reference.shape[1])
     cells = [_picture_cell(row, picture, width, height)]
     if caption is not None:
-        cells.append(_paper(width, LINE_HEIGHT))
-        _write(cells[-1], caption, width // 2, LINE_HEIGHT // 2)
+        cells.append(paper(width, LINE_HEIGHT))
+        write(cells[-1], caption, width // 2, LINE_HEIGHT // 2)
     if row.crops:
         cells.append(_insets_cell(row.crops, picture, width))
     if error_limit is not None and picture is row.reference:
-        cells.append(_scale_cell(width, height, error_limit))
+        cells.append(colour_scale(width, height, "squared error", error_limit))
     elif error_limit is not None:
         error = None if picture is None else magma(squared_error_map(picture.cpu(), row.reference.cpu()), error_limit)
-        cells.append(_fit(error, width, height))
-    column = _paper(width, sum(cell.height + GAP for cell in cells))
+        cells.append(fit(error, width, height))
+    column = paper(width, sum(cell.height + GAP for cell in cells))
     top = 0
     for cell in cells:
         column.paste(cell, (0, top))
@@ -220,7 +223,7 @@ def _column(
 
 
 def _picture_cell(row: PictureRow, picture: Tensor | None, width: int, height: int) -> Image.Image:
-    cell = _fit(picture, width, height)
+    cell = fit(picture, width, height)
     zoom = width / row.reference.shape[1]
     for index, crop in enumerate(row.crops if picture is not None else ()):
         corners = [crop.left, crop.top, crop.left + crop.size, crop.top + crop.size]
@@ -234,50 +237,12 @@ def _picture_cell(row: PictureRow, picture: Tensor | None, width: int, height: i
 def _insets_cell(crops: Sequence[Crop], picture: Tensor | None, width: int) -> Image.Image:
     """The crops side by side over the width of the column, framed in their colours."""
     side = (width - (len(crops) - 1) * GAP) // len(crops)
-    cell = _paper(width, side)
+    cell = paper(width, side)
     for index, crop in enumerate(crops):
-        inset = _fit(None if picture is None else crop.of(picture), side, side)
+        inset = fit(None if picture is None else crop.of(picture), side, side)
         ImageDraw.Draw(inset).rectangle([0, 0, side - 1, side - 1], outline=_crop_colour(index), width=3)
         cell.paste(inset, (index * (side + GAP), 0))
     return cell
-
-
-def _scale_cell(width: int, height: int, error_limit: float) -> Image.Image:
-    """The colour scale of the error maps with its ends: without it the maps mean nothing."""
-    cell = _paper(width, height)
-    length, thickness = round(0.8 * width), max(height // 12, 4)
-    left, top = (width - length) // 2, (height - thickness) // 2
-    ramp = magma(torch.linspace(0, error_limit, length).expand(thickness, length), error_limit)
-    cell.paste(_fit(ramp, length, thickness), (left, top))
-    _write(cell, "squared error", width // 2, top - LINE_HEIGHT // 2)
-    below = top + thickness + LINE_HEIGHT // 2
-    _write(cell, "0", left, below)
-    _write(cell, f"≥ {error_limit:g}", left + length, below)
-    return cell
-
-
-def _fit(picture: Float[Tensor, "h w 3"] | None, width: int, height: int) -> Image.Image:
-    """A picture at a size: enlarged by repeating pixels, reduced by averaging; grey where there is none."""
-    if picture is None:
-        cell = Image.new("RGB", (width, height), EMPTY)
-        _write(cell, "n/a", width // 2, height // 2)
-        return cell
-    image = Image.fromarray(to_8bit(picture).cpu().numpy())
-    method = Image.Resampling.NEAREST if width >= image.width else Image.Resampling.BOX
-    return image.resize((width, height), method)
-
-
-def _write(image: Image.Image, text: str, x: int, y: int) -> None:
-    """Write a text around a centre, moved inwards where it would leave the picture."""
-    # Pillow's own font lacks signs such as ≥ and ↑; the one that matplotlib brings along has them.
-    font = ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", TEXT_SIZE)
-    draw = ImageDraw.Draw(image)
-    half = draw.textlength(text, font=font) / 2
-    draw.text((min(max(x, half), image.width - half), y), text, fill=INK, font=font, anchor="mm")
-
-
-def _paper(width: int, height: int) -> Image.Image:
-    return Image.new("RGB", (width, height), PAPER)
 
 
 def _crop_colour(index: int) -> tuple[int, int, int]:

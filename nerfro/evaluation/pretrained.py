@@ -1,4 +1,4 @@
-"""AlexNet's ImageNet weights: from a file, from the cache of torch hub, or from the network if there is one."""
+"""ImageNet weights of AlexNet and VGG-16: from a file, from torch hub's cache, or from the network if there is one."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import socket
 import threading
 import urllib.request
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -17,20 +18,36 @@ from torch import Tensor
 
 from nerfro.errors import NerfroError
 
-ALEXNET_URL = "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"  # 233 MB; its SHA-256 begins 7be5be79
 CONNECT_SECONDS = 5.0
 STALL_SECONDS = 30.0
 
 
-def load_alexnet(path: Path | str | None = None, download: bool = True, url: str = ALEXNET_URL) -> dict[str, Tensor]:
-    """Load AlexNet's weights without executing pickled code.
+@dataclass(frozen=True)
+class Published:
+    """A file of weights.
+
+    Attributes:
+        title: the network's name.
+        url: where torchvision publishes it; the name ends in the first digits of its SHA-256, which is checked.
+    """
+
+    title: str
+    url: str
+
+
+ALEXNET = Published("AlexNet", "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth")  # 233 MB
+VGG16 = Published("VGG-16", "https://download.pytorch.org/models/vgg16-397923af.pth")  # 528 MB
+
+
+def load_weights(published: Published, path: Path | str | None = None, download: bool = True) -> dict[str, Tensor]:
+    """Load weights without executing pickled code.
 
     Args:
+        published: which.
         path: a file that holds the state dict as torchvision publishes it; by default the cache of torch hub is asked,
             `torch.hub.get_dir()/checkpoints`, which honours TORCH_HOME.
         download: whether to fetch the file into that cache when it is not there. A network that does not answer within
             five seconds is given up, once for the whole process.
-        url: where the file is published; the name ends in the first digits of its SHA-256, which is checked.
 
     Returns:
         The state dict, on the CPU.
@@ -39,24 +56,25 @@ def load_alexnet(path: Path | str | None = None, download: bool = True, url: str
         NerfroError: if the file cannot be read, or the weights are neither cached nor can be fetched; the message is
             the reason, in one line.
     """
+    title, url = published.title, published.url
     if path is not None:
         if not Path(path).is_file():
-            raise NerfroError(f"the AlexNet weights {path} do not exist; give the path of a downloaded {url}")
-        return _read(Path(path))
+            raise NerfroError(f"the {title} weights {path} do not exist; give the path of a downloaded {url}")
+        return _read(Path(path), title)
     cached = Path(torch.hub.get_dir()) / "checkpoints" / url.rsplit("/", 1)[-1]
     if not cached.is_file():
         by_hand = f"put {url} there by hand"
         if not download:
-            raise NerfroError(f"no AlexNet weights at {cached}; {by_hand}")
+            raise NerfroError(f"no {title} weights at {cached}; {by_hand}")
         reason = unreachable(url)
         if reason:
-            raise NerfroError(f"no AlexNet weights at {cached}, and no network ({reason}); {by_hand}")
+            raise NerfroError(f"no {title} weights at {cached}, and no network ({reason}); {by_hand}")
         try:
             with _socket_timeout(STALL_SECONDS):
                 return torch.hub.load_state_dict_from_url(url, map_location="cpu", check_hash=True, weights_only=True)
         except (OSError, http.client.HTTPException, RuntimeError) as error:  # RuntimeError: torch hub on a wrong hash
-            raise NerfroError(f"the download of AlexNet weights failed ({error}); {by_hand}") from error
-    return _read(cached)
+            raise NerfroError(f"the download of {title} weights failed ({error}); {by_hand}") from error
+    return _read(cached, title)
 
 
 @functools.lru_cache
@@ -100,9 +118,9 @@ def _socket_timeout(seconds: float) -> Iterator[None]:
         socket.setdefaulttimeout(before)
 
 
-def _read(path: Path) -> dict[str, Tensor]:
+def _read(path: Path, title: str) -> dict[str, Tensor]:
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
         reason = str(error).partition("\n")[0]
-        raise NerfroError(f"AlexNet weights {path} cannot be read ({reason}); delete it to fetch it again") from error
+        raise NerfroError(f"{title} weights {path} cannot be read ({reason}); delete it to fetch it again") from error

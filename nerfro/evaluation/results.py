@@ -35,8 +35,15 @@ class Metric:
 METRICS = (
     Metric("psnr", "PSNR", "higher", 2),
     Metric("ssim", "SSIM", "higher", 3),
+    Metric("ms_ssim", "MS-SSIM", "higher", 3),
     Metric("lpips", "LPIPS", "lower", 3),
+    Metric("lpips_vgg", "LPIPS-VGG", "lower", 3),
+    Metric("flip", "FLIP", "lower", 3),
 )
+
+Region = Literal["full", "mask", "crop"]  # of a picture, see nerfro/evaluation/regions.py
+FULL: Region = "full"
+OBJECT_REGIONS: tuple[Region, ...] = ("mask", "crop")  # those that need to know where the object is
 
 
 @dataclass(frozen=True)
@@ -45,11 +52,18 @@ class ViewScores:
 
     Attributes:
         name: which view it is; `images/<name>.png` is the picture.
-        scores: value of each metric by name; None where it is not available.
+        scores: value of each metric on the full image, by name; None where it is not available.
+        regions: the same on the object's mask and on the crop around it; empty where there is no mask.
     """
 
     name: str
     scores: Mapping[str, Score]
+    regions: Mapping[Region, Mapping[str, Score]] = field(default_factory=dict)
+
+    def score(self, metric: str, region: Region = FULL) -> Score:
+        """The value of one metric in one region; None where it is not available."""
+        scores = self.scores if region == FULL else self.regions.get(region, {})
+        return scores.get(metric)
 
 
 @dataclass(frozen=True)
@@ -58,7 +72,8 @@ class EvaluationResult:
 
     Attributes:
         views: one row for each view, in order.
-        notes: for each metric that is not available, the reason.
+        notes: for each metric that is not available, the reason; by its name for the full image, by
+            `<region>.<metric>` in a region, and by `mask` for views in which both regions are missing.
         protocol: "8bit" if predictions were rounded to what a PNG holds before they were scored, "float" if not.
     """
 
@@ -66,16 +81,25 @@ class EvaluationResult:
     notes: Mapping[str, str] = field(default_factory=dict)
     protocol: Literal["8bit", "float"] = "8bit"
 
-    def mean(self, metric: str) -> Score:
+    @property
+    def regions(self) -> tuple[Region, ...]:
+        """The regions that were scored, the full image first."""
+        return (FULL, *(region for region in OBJECT_REGIONS if any(region in view.regions for view in self.views)))
+
+    def mean(self, metric: str, region: Region = FULL) -> Score:
         """Mean of the per-view values; None if any view lacks one, for a mean over fewer views is another quantity."""
-        values = [view.scores.get(metric) for view in self.views]
+        values = [view.score(metric, region) for view in self.views]
         present = [value for value in values if value is not None]
         return math.fsum(present) / len(present) if present and len(present) == len(values) else None
 
+    def means_of(self, region: Region) -> dict[str, Score]:
+        """The mean of every metric in a region, by name."""
+        return {metric.name: self.mean(metric.name, region) for metric in METRICS}
+
     @property
     def means(self) -> dict[str, Score]:
-        """The mean of every metric, by name."""
-        return {metric.name: self.mean(metric.name) for metric in METRICS}
+        """The mean of every metric on the full image, by name."""
+        return self.means_of(FULL)
 
 
 @dataclass(frozen=True)
@@ -84,13 +108,13 @@ class RunMetrics:
 
     Attributes:
         result: scores of the test views.
-        steps: optimisation steps that the weights have seen.
+        steps: optimisation steps that the weights have seen; None for pictures of another program.
         train_seconds: wall-clock time spent training, without evaluation; None if nothing was trained.
         rays_per_second: training throughput; None if nothing was trained.
     """
 
     result: EvaluationResult
-    steps: int
+    steps: int | None
     train_seconds: float | None
     rays_per_second: float | None
 
@@ -98,19 +122,20 @@ class RunMetrics:
 def write_metrics_json(
     path: Path | str,
     result: EvaluationResult,
-    steps: int,
+    steps: int | None,
     train_seconds: float | None,
     rays_per_second: float | None,
 ) -> None:
     """Write the file by which other tools read a run, whole or not at all.
 
-    It holds `{"test": {"psnr", "ssim", "lpips"}, "views": [{"name", "psnr", ...}], "steps", "train_seconds",
-    "rays_per_second", "notes", "protocol"}`: means over views, per-view rows, and null for what is not available.
+    It holds `{"test": {"psnr", "ssim", ...}, "regions": {"mask": {...}, "crop": {...}}, "views": [{"name", "psnr", ...,
+    "regions"}], "steps", "train_seconds", "rays_per_second", "notes", "protocol"}`: means over views, per-view rows,
+    and null for what is not available; see docs/metrics.md.
 
     Args:
         path: usually `metrics.json` in the run folder.
         result: scores of the test views.
-        steps: optimisation steps done.
+        steps: optimisation steps done; None for pictures of another program.
         train_seconds: wall-clock time spent training.
         rays_per_second: training throughput.
 
@@ -119,7 +144,11 @@ def write_metrics_json(
     """
     content = {
         "test": result.means,
-        "views": [{"name": view.name, **view.scores} for view in result.views],
+        "regions": {region: result.means_of(region) for region in result.regions if region != FULL},
+        "views": [
+            {"name": view.name, **view.scores, "regions": {name: dict(row) for name, row in view.regions.items()}}
+            for view in result.views
+        ],
         "steps": steps,
         "train_seconds": train_seconds,
         "rays_per_second": rays_per_second,
@@ -131,7 +160,9 @@ def write_metrics_json(
 
 
 def read_metrics_json(path: Path | str) -> RunMetrics:
-    """Read what `write_metrics_json` wrote; means are computed again from the rows.
+    """Read what `write_metrics_json` wrote, now or when it knew fewer metrics and no regions.
+
+    Means are computed again from the rows.
 
     Args:
         path: a run's `metrics.json`.
@@ -146,7 +177,15 @@ def read_metrics_json(path: Path | str) -> RunMetrics:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         views = tuple(
-            ViewScores(row["name"], {metric.name: row.get(metric.name) for metric in METRICS})
+            ViewScores(
+                row["name"],
+                _scores(row),
+                {
+                    region: _scores(row["regions"][region])
+                    for region in OBJECT_REGIONS
+                    if region in row.get("regions", {})
+                },
+            )
             for row in content["views"]
         )
         result = EvaluationResult(views, content.get("notes", {}), content.get("protocol", "8bit"))
@@ -157,6 +196,10 @@ def read_metrics_json(path: Path | str) -> RunMetrics:
         raise NerfroError(f"{path} cannot be read ({error}); run nerfro.evaluate on the run again") from error
     except (KeyError, TypeError, AttributeError) as error:
         raise NerfroError(f"{path} is not a metrics file ({error!r}); run nerfro.evaluate on the run again") from error
+
+
+def _scores(row: Mapping[str, Score]) -> dict[str, Score]:
+    return {metric.name: row.get(metric.name) for metric in METRICS}
 
 
 def _refuse_non_finite(value: object, name: str) -> None:

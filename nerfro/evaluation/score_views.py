@@ -35,6 +35,7 @@ def score_views(
         for view in range(len(views)):
             rgb = render_view(model, cameras, view, supersampling).rgb.reshape(height, width, 3).cpu()
             save_png(folder / "images" / f"{metrics.prefix}_{view:03d}.png", rgb)
-            metrics.update(rgb, views.images[view].cpu(), view)
+            coverage = None if views.masks is None else views.masks[view].cpu()
+            metrics.update(rgb, views.images[view].cpu(), view, coverage)
             progress.update(height * width)
     return metrics.result()

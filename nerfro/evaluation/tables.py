@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import html
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -18,7 +18,7 @@ import rich.text
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation.files import write_atomically
-from nerfro.evaluation.results import METRICS, EvaluationResult, Score
+from nerfro.evaluation.results import Score
 
 MISSING = "n/a"
 MEDALS = ("gold", "silver", "bronze")
@@ -119,37 +119,6 @@ class Table:
         present = [other.values[column] for other in self.rows]
         rivals = {round(other, decimals) for other in present if other is not None}
         return sorted(rivals, reverse=better == "higher").index(round(value, decimals))
-
-
-def views_table(result: EvaluationResult, title: str) -> Table:
-    """The scores of each view, and their means below.
-
-    Args:
-        result: what an evaluation found.
-        title: heading of the table.
-
-    Returns:
-        A row for each view, with a footnote for each metric that is missing.
-    """
-    names = [metric.name for metric in METRICS]
-    rows = tuple(Row(view.name, tuple(view.scores.get(name) for name in names)) for view in result.views)
-    mean = Row("mean", tuple(result.mean(name) for name in names))
-    return Table(title, "view", _metric_columns(), rows, summary=(mean,), notes=_notes({"": result}))
-
-
-def means_table(results: Mapping[str, EvaluationResult], title: str, label_title: str = "method") -> Table:
-    """The mean scores of several methods, the best of each metric marked.
-
-    Args:
-        results: what an evaluation found, by method.
-        title: heading of the table.
-        label_title: what the rows are, if not methods.
-
-    Returns:
-        A row for each method, with a footnote for each metric that is missing.
-    """
-    rows = tuple(Row(name, tuple(result.means.values())) for name, result in results.items())
-    return Table(title, label_title, _metric_columns(), rows, mark_best=len(rows) > 1, notes=_notes(results))
 
 
 def to_rich(table: Table) -> rich.console.Group:
@@ -336,24 +305,6 @@ def write_table(table: Table, stem: Path | str) -> list[Path]:
     for path, text in zip(paths, texts.values(), strict=True):
         write_atomically(path, text)
     return paths
-
-
-def _metric_columns() -> tuple[Column, ...]:
-    return tuple(Column(metric.title, metric.better, metric.decimals) for metric in METRICS)
-
-
-def _notes(results: Mapping[str, EvaluationResult]) -> tuple[str, ...]:
-    """One footnote for each reason, naming the methods it applies to unless that is all of them."""
-    methods_by_note: dict[str, list[str]] = {}
-    for name, result in results.items():
-        for metric in METRICS:
-            if metric.name in result.notes:
-                note = f"{metric.title} {MISSING}: {result.notes[metric.name]}"
-                methods_by_note.setdefault(note, []).append(name)
-    return tuple(
-        note if len(methods) == len(results) else f"{', '.join(methods)}: {note}"
-        for note, methods in methods_by_note.items()
-    )
 
 
 def _heading(column: Column) -> str:

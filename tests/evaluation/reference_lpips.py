@@ -1,11 +1,11 @@
-"""LPIPS as torchmetrics or lpips compute it, on a seeded random AlexNet; run as a program of its own.
+"""LPIPS as torchmetrics or lpips compute it, on a seeded random backbone; run as a program of its own.
 
     python reference_lpips.py {torchmetrics,lpips} INPUT.pt OUTPUT.pt
 
-Both packages take AlexNet from torchvision, which does not load beside a CPU build of torch. Here a module of that name
-that holds nothing but AlexNet stands in for it, which is why this cannot run inside the test process. INPUT holds
-`predictions` and `targets` [B, 3, H, W] in [0, 1]; OUTPUT the backbone's state dict, the distances and, of lpips, the
-distance maps.
+Both packages take the backbones from torchvision, which does not load beside a CPU build of torch. Here a module of
+that name that holds nothing but AlexNet and VGG-16 stands in for it, which is why this cannot run inside the test
+process. INPUT holds `predictions` and `targets` [B, 3, H, W] in [0, 1]; OUTPUT for `alex` and for `vgg` the backbone's state
+dict, the distances and, of lpips, the distance maps.
 """
 
 import importlib.machinery
@@ -37,10 +37,30 @@ class AlexNet(nn.Module):
             nn.ReLU(inplace=True),
             nn.MaxPool2d(kernel_size=3, stride=2),
         )
-        for module in self.features:
-            if isinstance(module, nn.Conv2d):
-                nn.init.kaiming_normal_(module.weight)
-                nn.init.normal_(module.bias, std=0.1)
+        initialise(self.features)
+
+
+class VGG16(nn.Module):
+    """The feature layers of torchvision's VGG-16, in its numbering, with seeded He initialisation."""
+
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed(8)
+        layers, channels = [], 3
+        for width, num_convolutions in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
+            for _ in range(num_convolutions):
+                layers += [nn.Conv2d(channels, width, kernel_size=3, padding=1), nn.ReLU(inplace=True)]
+                channels = width
+            layers.append(nn.MaxPool2d(kernel_size=2, stride=2))
+        self.features = nn.Sequential(*layers)
+        initialise(self.features)
+
+
+def initialise(layers):
+    for module in layers:
+        if isinstance(module, nn.Conv2d):
+            nn.init.kaiming_normal_(module.weight)
+            nn.init.normal_(module.bias, std=0.1)
 
 
 def stand_in_for_torchvision():
@@ -48,12 +68,13 @@ def stand_in_for_torchvision():
     torchvision.__spec__ = importlib.machinery.ModuleSpec("torchvision", None)
     torchvision.models = types.ModuleType("torchvision.models")
     torchvision.models.alexnet = lambda pretrained=True, weights=None: AlexNet()
-    torchvision.models.AlexNet_Weights = types.SimpleNamespace(DEFAULT="seeded")
+    torchvision.models.vgg16 = lambda pretrained=True, weights=None: VGG16()
+    torchvision.models.AlexNet_Weights = torchvision.models.VGG16_Weights = types.SimpleNamespace(DEFAULT="seeded")
     sys.modules["torchvision"] = torchvision
     sys.modules["torchvision.models"] = torchvision.models
 
 
-def by_torchmetrics(predictions, targets):
+def by_torchmetrics(backbone, predictions, targets):
     # The stand-in comes after the import: were it there before, torchmetrics would look for the rest of torchvision.
     import torchmetrics.functional.image.lpips
     import torchmetrics.image.lpip
@@ -62,30 +83,35 @@ def by_torchmetrics(predictions, targets):
     torchmetrics.functional.image.lpips._TORCHVISION_AVAILABLE = True
     torchmetrics.image.lpip._TORCHVISION_AVAILABLE = True
     metric = torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity(
-        net_type="alex", reduction="mean", normalize=True
+        net_type=backbone, reduction="mean", normalize=True
     )
     pairs = zip(predictions[:, None], targets[:, None], strict=True)
     distances = torch.stack([metric(prediction, target) for prediction, target in pairs])
     return {"distances": distances, "mean": metric.compute()}
 
 
-def by_lpips(predictions, targets):
+def by_lpips(backbone, predictions, targets):
     stand_in_for_torchvision()
     import lpips
 
-    distances = lpips.LPIPS(net="alex", version="0.1")(predictions, targets, normalize=True).flatten()
-    maps = lpips.LPIPS(net="alex", version="0.1", spatial=True)(predictions, targets, normalize=True)[:, 0]
+    distances = lpips.LPIPS(net=backbone, version="0.1")(predictions, targets, normalize=True).flatten()
+    maps = lpips.LPIPS(net=backbone, version="0.1", spatial=True)(predictions, targets, normalize=True)[:, 0]
     return {"distances": distances, "mean": distances.mean(), "maps": maps}
 
 
 def main():
     package, source, destination = sys.argv[1:]
     pictures = torch.load(source)
+    compute = {"torchmetrics": by_torchmetrics, "lpips": by_lpips}[package]
     with torch.no_grad():
-        results = {"torchmetrics": by_torchmetrics, "lpips": by_lpips}[package](
-            pictures["predictions"], pictures["targets"]
-        )
-    torch.save({"backbone": AlexNet().state_dict(), **results}, destination)
+        results = {
+            name: {
+                "backbone": backbone().state_dict(),
+                **compute(name, pictures["predictions"], pictures["targets"]),
+            }
+            for name, backbone in (("alex", AlexNet), ("vgg", VGG16))
+        }
+    torch.save(results, destination)
 
 
 if __name__ == "__main__":

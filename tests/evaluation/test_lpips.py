@@ -1,6 +1,8 @@
+import functools
 import importlib.util
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,8 +11,9 @@ import torch
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation import lpips as ours
-from nerfro.evaluation.lpips import LearnedPerceptualSimilarity, LpipsNetwork, find_lpips_network, load_lpips_network
+from nerfro.evaluation import pretrained
+from nerfro.evaluation.lpips import ALEX, VGG, Backbone, LpipsNetwork, find_lpips_networks, load_lpips_network
+from nerfro.evaluation.metrics import MeanOverPictures
 
 
 class Reference(NamedTuple):
@@ -20,10 +23,10 @@ class Reference(NamedTuple):
     results: dict[str, Tensor]
 
 
-def random_backbone() -> dict[str, Tensor]:
+def random_weights(backbone: Backbone) -> dict[str, Tensor]:
     generator = torch.Generator().manual_seed(3)
     weights = {}
-    for layer in ours.ALEXNET:
+    for layer in backbone.layers:
         fan_in = layer.channels_in * layer.kernel**2
         shape = (layer.channels, layer.channels_in, layer.kernel, layer.kernel)
         weights[f"{layer.key}.weight"] = torch.randn(shape, generator=generator) * (2 / fan_in) ** 0.5
@@ -34,39 +37,62 @@ def random_backbone() -> dict[str, Tensor]:
 @pytest.fixture(scope="module")
 def backbone_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("backbone") / "alexnet.pth"
-    torch.save(random_backbone(), path)
+    torch.save(random_weights(ALEX), path)
     return path
 
 
 @pytest.fixture(scope="module")
 def network(backbone_file: Path) -> LpipsNetwork:
-    return load_lpips_network(backbone_file)
+    return load_lpips_network(ALEX, backbone_file)
 
 
-@pytest.fixture(scope="module", params=["torchmetrics", "lpips"])
-def reference(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Reference:
-    """The other package's own values, and our network with the same backbone and the published heads."""
-    if importlib.util.find_spec(request.param) is None:
-        pytest.skip(f"{request.param} is not installed; pip install --no-deps {request.param}")
-    folder = tmp_path_factory.mktemp(request.param)
+@pytest.fixture(scope="module")
+def published(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict[str, dict]]:
+    """The values of another package with both backbones, computed once."""
+
+    @functools.lru_cache
+    def compute(package: str) -> dict[str, dict]:
+        folder = tmp_path_factory.mktemp(package)
+        predictions, targets = pictures()
+        torch.save({"predictions": predictions, "targets": targets}, folder / "pictures.pt")
+        program = [sys.executable, str(Path(__file__).with_name("reference_lpips.py")), package]
+        command = [*program, str(folder / "pictures.pt"), str(folder / "results.pt")]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        return torch.load(folder / "results.pt", weights_only=True)
+
+    return compute
+
+
+def pictures() -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(0)
     targets = torch.rand(3, 3, 67, 83, generator=generator)
     targets[0] = torch.linspace(0, 1, 83)  # a smooth picture too, not noise alone
     predictions = (targets + 0.2 * torch.randn(targets.shape, generator=generator)).clamp(0, 1)
     predictions[2] = targets[2].roll(5, dims=-1)
-    torch.save({"predictions": predictions, "targets": targets}, folder / "pictures.pt")
-    program = Path(__file__).with_name("reference_lpips.py")
-    command = [sys.executable, str(program), request.param, str(folder / "pictures.pt"), str(folder / "results.pt")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    results = torch.load(folder / "results.pt", weights_only=True)
-    torch.save(results.pop("backbone"), folder / "backbone.pth")
-    network = load_lpips_network(folder / "backbone.pth")
+    return predictions, targets
+
+
+@pytest.fixture(scope="module", params=["torchmetrics alex", "torchmetrics vgg", "lpips alex", "lpips vgg"])
+def reference(
+    request: pytest.FixtureRequest,
+    published: Callable[[str], dict[str, dict]],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Reference:
+    """The other package's own values, and our network with the same backbone and the published heads."""
+    package, backbone = request.param.split()
+    if importlib.util.find_spec(package) is None:
+        pytest.skip(f"{package} is not installed; pip install --no-deps {package}")
+    results = published(package)[backbone]
+    path = tmp_path_factory.mktemp("backbone") / "backbone.pth"
+    torch.save(results["backbone"], path)
+    network = load_lpips_network({"alex": ALEX, "vgg": VGG}[backbone], path)
+    predictions, targets = pictures()
     return Reference(network, predictions.movedim(1, -1), targets.movedim(1, -1), results)
 
 
 def test_distance_is_that_of_the_published_packages(reference: Reference) -> None:
-    metric = LearnedPerceptualSimilarity(reference.network)
+    metric = MeanOverPictures(reference.network)
     for prediction, target, expected in zip(
         reference.predictions, reference.targets, reference.results["distances"], strict=True
     ):
@@ -76,7 +102,7 @@ def test_distance_is_that_of_the_published_packages(reference: Reference) -> Non
     assert metric.compute().item() == pytest.approx(reference.results["mean"].item(), abs=1e-6)
 
 
-@pytest.mark.parametrize("reference", ["lpips"], indirect=True)  # the only one with a public metric that has maps
+@pytest.mark.parametrize("reference", ["lpips alex", "lpips vgg"], indirect=True)  # torchmetrics gives no maps
 def test_distance_map_is_that_of_lpips(reference: Reference) -> None:
     for prediction, target, expected in zip(
         reference.predictions, reference.targets, reference.results["maps"], strict=True
@@ -99,12 +125,23 @@ def test_distance_map_is_large_where_pictures_differ(network: LpipsNetwork) -> N
     assert distances[:32, :32].mean() > 10 * distances[96:, 96:].mean()
 
 
-def test_smallest_picture_is_the_smallest_that_alexnet_takes(network: LpipsNetwork, monkeypatch) -> None:
-    size = ours.MIN_PICTURE_SIZE
+def test_distance_on_a_mask_is_the_mean_of_the_map_there(network: LpipsNetwork) -> None:
+    prediction, target = torch.rand(2, 48, 40, 3, generator=torch.Generator().manual_seed(0))
+    inside = torch.zeros(48, 40, dtype=torch.bool)
+    inside[5:20, 7:30] = True
+    expected = network.distance_map(prediction, target)[5:20, 7:30].mean()
+    assert network(prediction, target, inside).item() == pytest.approx(expected.item(), abs=1e-7)
+
+
+@pytest.mark.parametrize("backbone", [ALEX, VGG])
+def test_smallest_picture_is_the_smallest_that_the_backbone_takes(backbone: Backbone, tmp_path: Path) -> None:
+    size = backbone.min_size
+    torch.save(random_weights(backbone), tmp_path / "weights.pth")
+    network = load_lpips_network(backbone, tmp_path / "weights.pth")
     assert torch.isfinite(network(torch.rand(size, size, 3), torch.rand(size, size, 3)))
-    with pytest.raises(NerfroError, match="at least 31 x 31 pixels"):
+    with pytest.raises(NerfroError, match=f"at least {size} x {size} pixels"):
         network(torch.rand(size - 1, 64, 3), torch.rand(size - 1, 64, 3))
-    monkeypatch.setattr(ours, "MIN_PICTURE_SIZE", 0)
+    network.backbone = backbone._replace(min_size=0)
     with pytest.raises(RuntimeError):  # the limit is not stricter than it must be
         network(torch.rand(size - 1, 64, 3), torch.rand(size - 1, 64, 3))
 
@@ -118,27 +155,46 @@ def test_distance_does_not_depend_on_mixed_precision(network: LpipsNetwork) -> N
 
 
 def test_model_that_holds_the_network_neither_trains_nor_stores_it(network: LpipsNetwork) -> None:
-    metric = LearnedPerceptualSimilarity(network)
+    metric = MeanOverPictures(network)
     assert list(metric.parameters()) == []
     assert metric.state_dict() == {}
 
 
-def test_missing_network_is_reported_with_the_reason(tmp_path: Path, monkeypatch) -> None:
+def test_missing_networks_are_reported_with_the_reason(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    network, reason = find_lpips_network(download=False)
-    assert network is None
-    assert str(tmp_path) in reason
-    assert "\n" not in reason
+    networks, reasons = find_lpips_networks(download=False)
+    assert networks == {}
+    assert reasons.keys() == {"lpips", "lpips_vgg"}
+    for name, title in (("lpips", "AlexNet"), ("lpips_vgg", "VGG-16")):
+        assert f"no {title} weights at {tmp_path}" in reasons[name]
+        assert "\n" not in reasons[name]
 
 
-def test_named_backbone_is_never_passed_over(tmp_path: Path, backbone_file: Path) -> None:
-    with pytest.raises(NerfroError, match="do not exist"):
-        find_lpips_network(tmp_path / "nothing.pth")
-    other = random_backbone()
+def test_vgg_is_taken_from_the_cache_but_never_fetched(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr(pretrained, "unreachable", lambda url: "asked" if "vgg" in url else "no cable")
+    networks, reasons = find_lpips_networks()
+    assert networks == {}
+    assert "no cable" in reasons["lpips"]
+    assert "asked" not in reasons["lpips_vgg"]
+    cache = tmp_path / "hub" / "checkpoints"
+    cache.mkdir(parents=True)
+    torch.save(random_weights(VGG), cache / "vgg16-397923af.pth")
+    networks, reasons = find_lpips_networks(download=False)
+    assert list(networks) == ["lpips_vgg"]
+    assert list(reasons) == ["lpips"]
+
+
+def test_named_weights_are_never_passed_over(tmp_path: Path, backbone_file: Path) -> None:
+    with pytest.raises(NerfroError, match=r"the AlexNet weights .* do not exist"):
+        find_lpips_networks(tmp_path / "nothing.pth")
+    with pytest.raises(NerfroError, match=r"the VGG-16 weights .* do not exist"):
+        find_lpips_networks(vgg=tmp_path / "nothing.pth", download=False)
+    other = random_weights(ALEX)
     other["features.3.weight"] = other["features.3.weight"][:, :3]
     torch.save(other, tmp_path / "other.pth")
     with pytest.raises(NerfroError, match=r"features\.3\.weight of shape \[192, 64, 5, 5\], found \[192, 3, 5, 5\]"):
-        find_lpips_network(tmp_path / "other.pth")
-    network, reason = find_lpips_network(backbone_file)
-    assert network is not None
-    assert reason == ""
+        find_lpips_networks(tmp_path / "other.pth")
+    with pytest.raises(NerfroError, match=r"use the file of VGG-16 itself"):
+        find_lpips_networks(backbone_file, vgg=backbone_file)
+    assert list(find_lpips_networks(backbone_file, download=False)[0]) == ["lpips"]

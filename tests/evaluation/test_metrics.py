@@ -1,15 +1,19 @@
 import math
+from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from skimage.metrics import peak_signal_noise_ratio
 from torch import Tensor
 
 from nerfro.errors import NerfroError
+from nerfro.evaluation.flip import flip
 from nerfro.evaluation.images import load_png, save_png
-from nerfro.evaluation.metrics import MAX_PSNR, ImageMetrics, psnr, ssim, ssim_map
+from nerfro.evaluation.lpips import ALEX
+from nerfro.evaluation.metrics import MAX_PSNR, ImageMetrics, MeanOverPictures, psnr
+from nerfro.evaluation.regions import mean_over
+from nerfro.evaluation.ssim import ms_ssim, ssim
 
 
 def pictures(seed: int = 0, height: int = 37, width: int = 45) -> tuple[Tensor, Tensor]:
@@ -22,19 +26,6 @@ def pictures(seed: int = 0, height: int = 37, width: int = 45) -> tuple[Tensor, 
     return prediction.clamp(0, 1), target
 
 
-def reference_ssim(prediction: Tensor, target: Tensor) -> tuple[float, np.ndarray]:
-    return structural_similarity(
-        prediction.double().numpy(),
-        target.double().numpy(),
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        data_range=1.0,
-        channel_axis=-1,
-        full=True,
-    )
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_psnr_is_that_of_scikit_image(seed: int) -> None:
     prediction, target = pictures(seed)
@@ -42,12 +33,12 @@ def test_psnr_is_that_of_scikit_image(seed: int) -> None:
     assert psnr(prediction, target).item() == pytest.approx(expected, abs=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_ssim_is_that_of_scikit_image_over_whole_windows(seed: int) -> None:
-    prediction, target = pictures(seed)
-    mean, full = reference_ssim(prediction, target)
-    assert ssim(prediction, target).item() == pytest.approx(mean, abs=1e-6)
-    assert np.abs(ssim_map(prediction, target).numpy() - full[5:-5, 5:-5]).max() < 1e-6
+def test_psnr_on_a_mask_is_that_of_its_pixels() -> None:
+    prediction, target = pictures()
+    inside = torch.zeros(target.shape[:2], dtype=torch.bool)
+    inside[4:20, 7:30] = True
+    expected = peak_signal_noise_ratio(target[inside].numpy(), prediction[inside].numpy(), data_range=1.0)
+    assert psnr(prediction, target, inside).item() == pytest.approx(expected, abs=1e-5)
 
 
 def test_uniform_error_has_the_psnr_of_its_square() -> None:
@@ -55,16 +46,9 @@ def test_uniform_error_has_the_psnr_of_its_square() -> None:
     assert psnr(target + 0.1, target).item() == pytest.approx(20.0, abs=1e-5)
 
 
-def test_flat_pictures_have_the_ssim_of_their_luminance() -> None:
-    a, b, stabiliser = 0.2, 0.7, 0.01**2
-    expected = (2 * a * b + stabiliser) / (a * a + b * b + stabiliser)
-    actual = ssim(torch.full((16, 16, 3), a, dtype=torch.float64), torch.full((16, 16, 3), b, dtype=torch.float64))
-    assert actual.item() == pytest.approx(expected, abs=1e-9)
-
-
 def test_equal_pictures_score_best_and_finite() -> None:
     _, target = pictures()
-    metrics = ImageMetrics(None, round_predictions=False)
+    metrics = ImageMetrics(round_predictions=False)
     metrics.update(target, target)
     assert metrics.result().mean("psnr") == MAX_PSNR
     assert metrics.result().mean("ssim") == pytest.approx(1.0)
@@ -72,14 +56,14 @@ def test_equal_pictures_score_best_and_finite() -> None:
 
 def test_mean_psnr_is_the_mean_over_views_and_not_over_pixels() -> None:
     target = torch.full((16, 16, 3), 0.4)
-    metrics = ImageMetrics(None, round_predictions=False)
+    metrics = ImageMetrics(round_predictions=False)
     metrics.update(target + 0.1, target)
     metrics.update(target + 0.001, target)
     assert metrics.result().mean("psnr") == pytest.approx((20 + 60) / 2, abs=1e-3)
 
 
 def test_numbers_can_be_computed_again_from_the_written_pictures(tmp_path: Path) -> None:
-    metrics, again = ImageMetrics(None), ImageMetrics(None, round_predictions=False)
+    metrics, again = ImageMetrics(), ImageMetrics(round_predictions=False)
     for view in range(3):
         prediction, target = pictures(view)
         prediction = prediction * 1.2 - 0.1  # parts that cannot be displayed are clipped
@@ -91,7 +75,7 @@ def test_numbers_can_be_computed_again_from_the_written_pictures(tmp_path: Path)
 
 def test_float_protocol_clips_but_does_not_round() -> None:
     target = torch.zeros(16, 16, 3)
-    metrics = ImageMetrics(None, round_predictions=False)
+    metrics = ImageMetrics(round_predictions=False)
     metrics.update(target + 0.001, target)  # a quarter of a level
     metrics.update(target - 0.5, target)
     first, second = (row.scores["psnr"] for row in metrics.result().views)
@@ -100,31 +84,115 @@ def test_float_protocol_clips_but_does_not_round() -> None:
     assert metrics.result().protocol == "float"
 
 
-def test_lpips_of_a_view_is_that_of_the_network() -> None:
-    class Halves(torch.nn.Module):
-        def forward(self, prediction: Tensor, target: Tensor) -> Tensor:
-            return (prediction - target).abs().mean() / 2
+class HalfOfTheDifference(torch.nn.Module):
+    """Stands in for a network of LPIPS."""
 
+    backbone = ALEX
+
+    def forward(self, prediction: Tensor, target: Tensor, inside: Tensor | None = None) -> Tensor:
+        return mean_over((prediction - target).abs().mean(-1), inside) / 2
+
+
+def test_lpips_of_a_view_is_that_of_its_network() -> None:
     target = torch.zeros(32, 32, 3)
-    metrics = ImageMetrics(Halves(), round_predictions=False)
+    metrics = ImageMetrics({"lpips_vgg": HalfOfTheDifference()}, {"lpips": "no AlexNet"}, round_predictions=False)
     metrics.update(target + 0.5, target)
-    assert metrics.result().mean("lpips") == pytest.approx(0.25)
-    assert metrics.result().notes == {}
+    result = metrics.result()
+    assert result.mean("lpips_vgg") == pytest.approx(0.25)
+    assert result.mean("lpips") is None
+    assert result.notes.keys() == {"lpips", "ms_ssim"}
+    assert result.notes["lpips"] == "no AlexNet"
+
+
+def test_every_region_has_the_scores_of_its_pixels() -> None:
+    prediction, target = pictures(height=190, width=200)
+    coverage = torch.zeros(190, 200)
+    coverage[60:100, 80:95] = 0.7
+    coverage[100:103, 80:95] = 0.3
+    inside = coverage > 0.5
+    network = HalfOfTheDifference()
+    metrics = ImageMetrics({"lpips": network}, {"lpips_vgg": "not asked for"}, round_predictions=False)
+    metrics.update(prediction, target, coverage=coverage)
+    result = metrics.result()
+    crop = slice(60 - 17, 100 + 17), slice(80 - 17, 95 + 17)
+    regions = {
+        "full": (prediction, target, None),
+        "mask": (prediction, target, inside),
+        "crop": (prediction[crop], target[crop], None),
+    }
+    assert result.regions == tuple(regions)
+    metric = {"psnr": psnr, "ssim": ssim, "ms_ssim": ms_ssim, "lpips": network, "flip": flip}
+    for region, compared in regions.items():
+        for name, function in metric.items():
+            if (name, region) == ("ms_ssim", "crop"):  # 74 x 49 pixels
+                assert result.mean(name, region) is None
+            else:
+                assert result.mean(name, region) == pytest.approx(function(*compared).item(), abs=1e-6), (name, region)
+    assert len({result.mean("psnr", region) for region in regions}) == 3
+    assert result.notes["crop.ms_ssim"] == "crops smaller than the 161 pixels that it needs"
+
+
+def test_views_without_the_object_have_the_full_image_only() -> None:
+    metrics = ImageMetrics()
+    prediction, target = pictures()
+    metrics.update(prediction, target, coverage=torch.ones(target.shape[:2]))
+    metrics.update(prediction, target, coverage=torch.zeros(target.shape[:2]))
+    metrics.update(prediction, target)
+    result = metrics.result()
+    assert [view.score("psnr", "mask") is None for view in result.views] == [False, True, True]
+    assert [view.score("psnr") is None for view in result.views] == [False, False, False]
+    assert result.mean("psnr", "mask") is None
+    assert result.notes["mask"] == "the mask is missing or empty in test_001, test_002"
+
+
+def test_views_without_masks_have_no_regions() -> None:
+    metrics = ImageMetrics()
+    metrics.update(*pictures())
+    assert metrics.result().regions == ("full",)
+    assert metrics.result().views[0].regions == {}
+    assert not any("." in key for key in metrics.result().notes)
+
+
+def test_names_are_those_that_are_given() -> None:
+    metrics = ImageMetrics()
+    metrics.update(*pictures(0))
+    metrics.update(*pictures(1))
+    assert [view.name for view in metrics.result(["glass", "pen"]).views] == ["glass", "pen"]
 
 
 def test_missing_metrics_are_none_with_a_reason() -> None:
-    metrics = ImageMetrics(None, "no network")
+    metrics = ImageMetrics(reasons={"lpips": "no cable", "lpips_vgg": "no file"})
     metrics.update(*pictures())
     metrics.update(*pictures(height=10))
     result = metrics.result()
     assert result.mean("psnr") is not None
+    assert result.mean("flip") is not None
     assert [row.scores["ssim"] is None for row in result.views] == [False, True]
     assert result.mean("ssim") is None
-    assert result.notes == {"ssim": "pictures smaller than its window of 11 pixels", "lpips": "no network"}
+    assert result.notes == {
+        "ssim": "pictures smaller than the 11 pixels that it needs",
+        "ms_ssim": "pictures smaller than the 161 pixels that it needs",
+        "lpips": "no cable",
+        "lpips_vgg": "no file",
+    }
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim])
+def test_metric_over_pictures_is_a_mean_that_processes_share(metric: Callable[..., Tensor]) -> None:
+    alone, here, there = (MeanOverPictures(metric) for _ in range(3))
+    for seed in range(3):
+        alone.update(*pictures(seed))
+        (here if seed == 1 else there).update(*pictures(seed))
+    expected = sum(metric(*pictures(seed)).item() for seed in range(3)) / 3
+    assert alone.compute().item() == pytest.approx(expected, abs=1e-9)
+    states = iter([there.total, there.count])
+    here.dist_sync_fn = lambda state, group: [state, next(states)]
+    here.distributed_available_fn = lambda: True
+    assert here.compute().item() == pytest.approx(expected, abs=1e-9)
 
 
 def test_views_are_ordered_by_number_and_repeated_ones_count_once() -> None:
-    metrics = ImageMetrics(None, prefix="val")
+    metrics = ImageMetrics(prefix="val")
     for view in (2, 0, 2):
         metrics.update(*pictures(view), view=view)
     result = metrics.result()
@@ -134,7 +202,7 @@ def test_views_are_ordered_by_number_and_repeated_ones_count_once() -> None:
 
 @pytest.mark.filterwarnings("ignore:The ``compute`` method")
 def test_reset_forgets_all_views() -> None:
-    metrics = ImageMetrics(None)
+    metrics = ImageMetrics()
     metrics.update(*pictures())
     metrics.reset()
     with pytest.raises(NerfroError, match="no view was scored"):
@@ -142,17 +210,17 @@ def test_reset_forgets_all_views() -> None:
 
 
 def test_pictures_that_cannot_be_compared_are_refused() -> None:
-    metrics = ImageMetrics(None)
+    metrics = ImageMetrics()
     with pytest.raises(NerfroError, match=r"\[16, 16, 3\] with a reference \[16, 17, 3\]"):
         metrics.update(torch.zeros(16, 16, 3), torch.zeros(16, 17, 3))
     with pytest.raises(NerfroError, match="NaN"):
         metrics.update(torch.full((16, 16, 3), math.nan), torch.zeros(16, 16, 3))
-    with pytest.raises(NerfroError, match="at least 11 x 11"):
-        ssim(torch.zeros(10, 40, 3), torch.zeros(10, 40, 3))
+    with pytest.raises(NerfroError, match=r"mask \[16, 17\] does not fit a picture \[16, 16, 3\]"):
+        metrics.update(torch.zeros(16, 16, 3), torch.zeros(16, 16, 3), coverage=torch.ones(16, 17))
 
 
 def test_views_scored_by_another_process_are_gathered() -> None:
-    alone, here, there = (ImageMetrics(None) for _ in range(3))
+    alone, here, there = (ImageMetrics() for _ in range(3))
     for view in range(3):
         alone.update(*pictures(view), view=view)
         (here if view == 1 else there).update(*pictures(view), view=view)

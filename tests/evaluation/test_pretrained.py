@@ -11,7 +11,7 @@ import torch
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation import pretrained
-from nerfro.evaluation.pretrained import load_alexnet, unreachable
+from nerfro.evaluation.pretrained import ALEXNET, Published, load_weights, unreachable
 
 WEIGHTS = {"features.0.weight": torch.arange(6.0)}
 
@@ -78,21 +78,21 @@ def assert_same(weights: dict[str, torch.Tensor]) -> None:
 
 def test_weights_are_fetched_once_and_then_read_from_the_cache(site: str, cache: Path) -> None:
     url = f"{site}/{right_name()}"
-    assert_same(load_alexnet(url=url))
+    assert_same(load_weights(Published("AlexNet", url)))
     assert (cache / right_name()).is_file()
-    assert_same(load_alexnet(url=url, download=False))
+    assert_same(load_weights(Published("AlexNet", url), download=False))
 
 
 def test_weights_with_another_hash_are_refused_and_not_kept(site: str, cache: Path) -> None:
     with pytest.raises(NerfroError, match="hash"):
-        load_alexnet(url=f"{site}/alexnet-00000000.pth")
+        load_weights(Published("AlexNet", f"{site}/alexnet-00000000.pth"))
     assert list(cache.iterdir()) == []
 
 
 def test_stalled_download_is_given_up_and_leaves_nothing(site: str, cache: Path, monkeypatch) -> None:
     monkeypatch.setattr(pretrained, "STALL_SECONDS", 0.3)
     with pytest.raises(NerfroError, match="timed out"):
-        load_alexnet(url=f"{site}/stalling/{right_name()}")
+        load_weights(Published("AlexNet", f"{site}/stalling/{right_name()}"))
     assert list(cache.iterdir()) == []
     assert socket.getdefaulttimeout() is None
 
@@ -107,13 +107,13 @@ def test_refused_connection_is_the_reason_in_one_line() -> None:
     with socket.create_server(("127.0.0.1", 0)) as closed:
         port = closed.getsockname()[1]
     with pytest.raises(NerfroError, match=r"no network \(Connection refused\)") as caught:
-        load_alexnet(url=f"http://127.0.0.1:{port}/alexnet-00000000.pth")
+        load_weights(Published("AlexNet", f"http://127.0.0.1:{port}/alexnet-00000000.pth"))
     assert "\n" not in str(caught.value)
 
 
 def test_nothing_is_fetched_when_downloads_are_off(site: str, cache: Path) -> None:
     with pytest.raises(NerfroError, match="no AlexNet weights at"):
-        load_alexnet(url=f"{site}/{right_name()}", download=False)
+        load_weights(Published("AlexNet", f"{site}/{right_name()}"), download=False)
     assert not cache.exists()
 
 
@@ -121,7 +121,7 @@ def test_damaged_file_is_named(tmp_path: Path) -> None:
     damaged = tmp_path / "damaged.pth"
     damaged.write_bytes(weights_file()[:200])
     with pytest.raises(NerfroError, match=r"damaged\.pth cannot be read") as caught:
-        load_alexnet(damaged)
+        load_weights(ALEXNET, damaged)
     assert "\n" not in str(caught.value)
 
 
@@ -135,5 +135,5 @@ class Code:
 def test_pickled_code_is_not_executed(tmp_path: Path, capsys) -> None:
     torch.save({"features.0.weight": Code()}, tmp_path / "evil.pth")
     with pytest.raises(NerfroError, match="cannot be read"):
-        load_alexnet(tmp_path / "evil.pth")
+        load_weights(ALEXNET, tmp_path / "evil.pth")
     assert "must never run" not in capsys.readouterr().out

@@ -5,15 +5,27 @@ from pathlib import Path
 import pytest
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.results import EvaluationResult, ViewScores, read_metrics_json, write_metrics_json
+from nerfro.evaluation.results import METRICS, EvaluationResult, ViewScores, read_metrics_json, write_metrics_json
+
+
+def scores(**given: float) -> dict[str, float | None]:
+    return {metric.name: given.get(metric.name) for metric in METRICS}
 
 
 def result() -> EvaluationResult:
     views = (
-        ViewScores("test_000", {"psnr": 25.123456789012345, "ssim": 0.8, "lpips": None}),
-        ViewScores("test_001", {"psnr": 27.0, "ssim": 0.9, "lpips": None}),
+        ViewScores(
+            "test_000",
+            scores(psnr=25.123456789012345, ssim=0.8, flip=0.25),
+            {"mask": scores(psnr=22.0, ssim=0.7), "crop": scores(psnr=23.0)},
+        ),
+        ViewScores(
+            "test_001",
+            scores(psnr=27.0, ssim=0.9, flip=0.125),
+            {"mask": scores(psnr=24.0), "crop": scores(psnr=26.0)},
+        ),
     )
-    return EvaluationResult(views, {"lpips": "no network"}, "float")
+    return EvaluationResult(views, {"lpips": "no network", "mask.ssim": "masks too small"}, "float")
 
 
 def refuse(constant: str) -> None:
@@ -23,8 +35,12 @@ def refuse(constant: str) -> None:
 def test_file_holds_means_rows_and_budget(tmp_path: Path) -> None:
     write_metrics_json(tmp_path / "metrics.json", result(), 1500, 312.5, 81000.0)
     content = json.loads((tmp_path / "metrics.json").read_text(), parse_constant=refuse)
-    assert content["test"] == {"psnr": (25.123456789012345 + 27.0) / 2, "ssim": pytest.approx(0.85), "lpips": None}
-    assert content["views"][0] == {"name": "test_000", "psnr": 25.123456789012345, "ssim": 0.8, "lpips": None}
+    means = scores(psnr=(25.123456789012345 + 27.0) / 2, ssim=pytest.approx(0.85), flip=0.1875)
+    assert content["test"] == means
+    assert content["regions"] == {"mask": scores(psnr=23.0), "crop": scores(psnr=24.5)}  # SSIM: of one view only
+    regions = {"mask": scores(psnr=22.0, ssim=0.7), "crop": scores(psnr=23.0)}
+    full = scores(psnr=25.123456789012345, ssim=0.8, flip=0.25)
+    assert content["views"][0] == {"name": "test_000", **full, "regions": regions}
     assert len(content["views"]) == 2
     assert (content["steps"], content["train_seconds"], content["rays_per_second"]) == (1500, 312.5, 81000.0)
 
@@ -36,10 +52,39 @@ def test_read_returns_what_was_written(tmp_path: Path) -> None:
     assert (run.steps, run.train_seconds, run.rays_per_second) == (1500, 312.5, None)
 
 
+def test_pictures_of_another_program_have_no_budget(tmp_path: Path) -> None:
+    write_metrics_json(tmp_path / "metrics.json", result(), None, None, None)
+    run = read_metrics_json(tmp_path / "metrics.json")
+    assert (run.steps, run.train_seconds, run.rays_per_second) == (None, None, None)
+
+
+def test_files_from_before_there_were_regions_are_read(tmp_path: Path) -> None:
+    old = {
+        "test": {"psnr": 25.0, "ssim": 0.8, "lpips": None},
+        "views": [{"name": "test_000", "psnr": 25.0, "ssim": 0.8, "lpips": None}],
+        "steps": 10,
+        "train_seconds": 1.0,
+        "rays_per_second": 2.0,
+        "notes": {"lpips": "no network"},
+        "protocol": "8bit",
+    }
+    (tmp_path / "metrics.json").write_text(json.dumps(old))
+    read = read_metrics_json(tmp_path / "metrics.json").result
+    assert read.means == scores(psnr=25.0, ssim=0.8)
+    assert read.regions == ("full",)
+    assert read.mean("psnr", "crop") is None
+
+
 def test_mean_over_some_of_the_views_is_not_given() -> None:
-    views = (ViewScores("a", {"psnr": 20.0, "ssim": None}), ViewScores("b", {"psnr": 30.0, "ssim": 0.9}))
-    assert EvaluationResult(views).means == {"psnr": 25.0, "ssim": None, "lpips": None}
+    views = (ViewScores("a", scores(psnr=20.0)), ViewScores("b", scores(psnr=30.0, ssim=0.9)))
+    assert EvaluationResult(views).means == scores(psnr=25.0)
     assert EvaluationResult(()).mean("psnr") is None
+
+
+def test_means_of_a_region_are_over_its_own_numbers() -> None:
+    assert result().regions == ("full", "mask", "crop")
+    assert result().mean("psnr", "mask") == 23.0
+    assert result().means_of("crop") == scores(psnr=24.5)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -56,7 +101,17 @@ def test_numbers_that_json_lacks_are_refused_and_the_old_file_stays(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    "content", ["", '{"test": {"ps', "[]", "{}", '{"views": [3]}', '{"views": [{"psnr": 3}]}', "\xff"]
+    "content",
+    [
+        "",
+        '{"test": {"ps',
+        "[]",
+        "{}",
+        '{"views": [3]}',
+        '{"views": [{"psnr": 3}]}',
+        '{"views": [{"name": "a", "regions": 3}]}',
+        "\xff",
+    ],
 )
 def test_damaged_files_are_an_error_of_one_line(tmp_path: Path, content: str) -> None:
     (tmp_path / "metrics.json").write_bytes(content.encode("latin-1"))

@@ -7,17 +7,14 @@ import pytest
 import rich.console
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.results import EvaluationResult, ViewScores
 from nerfro.evaluation.tables import (
     Column,
     Row,
     Table,
-    means_table,
     to_csv,
     to_latex,
     to_markdown,
     to_rich,
-    views_table,
     write_table,
 )
 
@@ -108,31 +105,6 @@ def test_console_shows_every_number_and_the_footnote_in_one_line() -> None:
 
 def test_console_prints_square_brackets_as_they_are() -> None:
     assert "[red]x" in on_console(Table("t", "view", (Column("PSNR"),), (Row("[red]x", (1.0,)),)))
-
-
-def evaluation(psnr: float, reason: str | None = None) -> EvaluationResult:
-    views = tuple(
-        ViewScores(f"test_{i:03d}", {"psnr": psnr + i, "ssim": 0.5, "lpips": None if reason else 0.1}) for i in range(2)
-    )
-    return EvaluationResult(views, {"lpips": reason} if reason else {})
-
-
-def test_views_table_has_a_row_for_each_view_and_their_mean() -> None:
-    table = views_table(evaluation(20.0, "no network"), "test views")
-    assert [row.label for row in table.rows] == ["test_000", "test_001"]
-    assert table.summary == (Row("mean", (20.5, 0.5, None)),)
-    assert table.notes == ("LPIPS n/a: no network",)
-    assert best_cells(table) == set()
-
-
-def test_means_table_marks_the_best_method_and_gives_each_reason_once() -> None:
-    table = means_table({"a": evaluation(20.0, "no network"), "b": evaluation(22.0, "no network")}, "all")
-    assert [row.values[0] for row in table.rows] == [20.5, 22.5]
-    assert (1, 0) in best_cells(table)
-    assert (0, 0) not in best_cells(table)
-    assert table.notes == ("LPIPS n/a: no network",)
-    mixed = means_table({"a": evaluation(20.0), "b": evaluation(22.0, "no network")}, "all")
-    assert mixed.notes == ("b: LPIPS n/a: no network",)
 
 
 def test_all_forms_are_written(tmp_path: Path) -> None:

@@ -1,0 +1,121 @@
+"""Folders of predictions and references, of any program, matched by the names of their files."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.data.image_files import Alpha, read_rgb
+from nerfro.data.masks import find_mask, read_masks
+from nerfro.errors import NerfroError
+from nerfro.evaluation.regions import object_pixels
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+
+
+@dataclass(frozen=True)
+class PicturePair:
+    """A prediction and what it is compared with.
+
+    Attributes:
+        name: what both files are called, without extension.
+        prediction, reference: the files.
+        mask: the file that says where the object is; None to take the reference's transparency, if it has any.
+    """
+
+    name: str
+    prediction: Path
+    reference: Path
+    mask: Path | None
+
+    def load(self, alpha: Alpha) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"], Float[Tensor, "H W"] | None]:
+        """Read the prediction, the reference, and the share of each pixel that the object covers, if it is known.
+
+        Args:
+            alpha: what becomes of transparency in both pictures, see `read_rgb`.
+
+        Raises:
+            NerfroError: a file cannot be read, sizes differ, or the mask is empty.
+        """
+        prediction, reference = (torch.tensor(read_rgb(path, alpha)) for path in (self.prediction, self.reference))
+        if prediction.shape != reference.shape:
+            raise NerfroError(
+                f"{self.prediction} has {_size(prediction)} pixels but its reference {self.reference} has "
+                f"{_size(reference)}; render it in the reference's size, or give references of the predictions' size"
+            )
+        coverage = self._coverage((reference.shape[1], reference.shape[0]))
+        if coverage is not None and not object_pixels(coverage).any():
+            raise NerfroError(
+                f"the mask {self.mask or f'(transparency) of {self.reference}'} is empty: no pixel is covered by half; "
+                "correct it, or leave the view out"
+            )
+        return prediction, reference, coverage
+
+    def _coverage(self, size: tuple[int, int]) -> Float[Tensor, "H W"] | None:
+        masks = read_masks([self.reference], [self.mask], 1, size)
+        return None if masks is None else masks[0]
+
+
+def match_folders(predictions: Path, references: Path, masks: Path | None) -> list[PicturePair]:
+    """Pair the pictures of two folders by their names without extension; none may be left over.
+
+    Args:
+        predictions: folder of pictures.
+        references: folder of pictures; masks among them (`mask_<name>.png`) are not references.
+        masks: folder of masks of the same names; by default they are looked for as `find_mask` does, beside the
+            references and in masks/ there.
+
+    Returns:
+        Pairs in the order of their names.
+
+    Raises:
+        NerfroError: a folder does not exist or has no pictures, a picture has no partner, or a name occurs twice.
+    """
+    predicted, truth = _pictures(predictions, "predictions"), _pictures(references, "references")
+    truth = {name: path for name, path in truth.items() if not _is_mask(name, truth)}
+    _require(predicted, truth, f"reference in references={references}")
+    _require(truth, predicted, f"prediction in predictions={predictions}")
+    if masks is None:
+        found = {name: find_mask(references, path) for name, path in truth.items()}
+        files = {name: path for name, path in found.items() if path is not None}
+        where = f"references={references}, where others have one"
+    else:
+        files = {name.removeprefix("mask_"): path for name, path in _pictures(masks, "masks").items()}
+        where = f"masks={masks}"
+    if files:
+        _require(truth, files, f"mask in {where}")
+    return [PicturePair(name, predicted[name], truth[name], files.get(name)) for name in sorted(predicted)]
+
+
+def _pictures(folder: Path, option: str) -> dict[str, Path]:
+    """The pictures of a folder by their names without extension."""
+    if not folder.is_dir():
+        raise NerfroError(f"{option}={folder} is not a folder; give one that holds pictures")
+    pictures: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() not in SUFFIXES or path.name.startswith("."):
+            continue
+        if path.stem in pictures:
+            raise NerfroError(f"{pictures[path.stem]} and {path} have one name; keep one of them in {option}={folder}")
+        pictures[path.stem] = path
+    if not pictures:
+        raise NerfroError(f"{option}={folder} holds no pictures; allowed are {', '.join(SUFFIXES)}")
+    return pictures
+
+
+def _is_mask(name: str, names: Collection[str]) -> bool:
+    return name.startswith("mask_") and name.removeprefix("mask_") in names
+
+
+def _require(pictures: Mapping[str, Path], partners: Collection[str], partner: str) -> None:
+    bare = [path for name, path in pictures.items() if name not in partners]
+    if bare:
+        raise NerfroError(
+            f"{len(bare)} of {len(pictures)} pictures have no {partner} ({bare[0]} is the first); "
+            "files are matched by their names without extension: add or rename what is missing, or take it out"
+        )

@@ -1,0 +1,48 @@
+from nerfro.evaluation.results import METRICS, EvaluationResult, ViewScores
+from nerfro.evaluation.score_tables import regions_table, views_table
+from nerfro.evaluation.tables import Row
+
+
+def scores(psnr: float | None) -> dict[str, float | None]:
+    """PSNR, a FLIP of half, and nothing else."""
+    return {metric.name: {"psnr": psnr, "flip": 0.5}.get(metric.name) for metric in METRICS}
+
+
+def line(label: str, psnr: float) -> Row:
+    return Row(label, tuple({"psnr": psnr, "flip": 0.5}.get(metric.name) for metric in METRICS))
+
+
+FULL_ONLY = EvaluationResult(
+    tuple(ViewScores(f"test_{i:03d}", scores(20.0 + i)) for i in range(2)), {"lpips": "no network"}
+)
+REGIONS = EvaluationResult(
+    tuple(ViewScores(f"r_{i}", scores(20.0 + i), {"mask": scores(10.0), "crop": scores(15.0 + i)}) for i in range(2)),
+    {"lpips": "no network", "mask.lpips": "no network", "crop.lpips": "no network", "crop.ms_ssim": "crops too small"},
+)
+
+
+def test_views_table_has_a_row_for_each_view_and_their_mean() -> None:
+    table = views_table(FULL_ONLY, "test views")
+    assert [column.title for column in table.columns] == ["PSNR", "SSIM", "MS-SSIM", "LPIPS", "LPIPS-VGG", "FLIP"]
+    assert table.rows == (line("test_000", 20.0), line("test_001", 21.0))
+    assert table.summary == (line("mean", 20.5),)
+    assert table.notes == ("LPIPS n/a: no network",)
+
+
+def test_views_table_of_a_region_has_its_numbers_and_reasons() -> None:
+    table = views_table(REGIONS, "test views", "crop")
+    assert table.rows == (line("r_0", 15.0), line("r_1", 16.0))
+    assert table.notes == ("MS-SSIM n/a: crops too small", "LPIPS n/a: no network")
+
+
+def test_regions_table_has_their_means_and_gives_each_reason_once() -> None:
+    table = regions_table(REGIONS, "means")
+    assert table.rows == (line("full", 20.5), line("mask", 10.0), line("crop", 15.5))
+    assert table.notes == ("LPIPS n/a: no network", "crop: MS-SSIM n/a: crops too small")
+
+
+def test_views_without_the_object_are_told_once_for_both_regions() -> None:
+    nothing = {"mask": scores(None), "crop": scores(None)}
+    result = EvaluationResult((ViewScores("r_0", scores(20.0), nothing),), {"mask": "the mask is empty in r_0"})
+    assert views_table(result, "t", "mask").rows[0].values[0] is None
+    assert regions_table(result, "t").notes == ("Mask and crop n/a: the mask is empty in r_0",)
