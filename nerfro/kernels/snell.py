@@ -162,7 +162,7 @@ def trace_snell(
                     nx, ny, nz, cosine = -nx, -ny, -nz, -cosine
                 ratio = n_before / n_after
                 squared = 1.0 - ratio * ratio * (1.0 - cosine * cosine)
-                if squared < 0.0:
+                if squared <= 0.0:
                     inside[hit] = not inside[hit]
                     hit_after = hit_before
                     scale, along = 1.0, 2.0 * cosine

@@ -30,8 +30,10 @@ def refract(
     cosine = cosine.abs()
     ratio = n_before / n_after
     squared = 1 - ratio**2 * (1 - cosine**2)
-    reflected = squared < 0
-    along = torch.where(reflected, 2 * cosine, ratio * cosine - squared.clamp(min=0).sqrt())
+    reflected = squared <= 0
+    # The root of 1 where it is not used: that of zero or less would make gradients nan.
+    root = torch.where(reflected, 1.0, squared).sqrt()
+    along = torch.where(reflected, 2 * cosine, ratio * cosine - root)
     scale = torch.where(reflected, 1.0, ratio)
     after = scale[..., None] * directions + along[..., None] * normals
     return after / torch.linalg.vector_norm(after, dim=-1, keepdim=True), reflected
