@@ -88,9 +88,8 @@ class HashGridField(Field):
         """Density and colour at positions within the box."""
         harmonics = spherical_harmonics(directions, self.direction_bands)
         features = self.encode(positions)
-        with torch.autocast(positions.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
-            geometry = self.density_mlp(features)
-            raw = self.colour_mlp(torch.cat([geometry, harmonics.to(geometry.dtype)], dim=-1))
+        geometry = self.apply_mlp(self.density_mlp, features)
+        raw = self.apply_mlp(self.colour_mlp, torch.cat([geometry, harmonics.to(geometry.dtype)], dim=-1))
         density = self.initial_density * torch.exp(geometry[:, 0].float().clamp(max=_MAX_EXPONENT))
         return density, padded_sigmoid(raw)
 
@@ -102,6 +101,16 @@ class HashGridField(Field):
         else:
             hash_encode = hash_encoding.hash_encode
         return hash_encode(unit, self.table, self.levels)
+
+    def apply_mlp(self, mlp: nn.Sequential, inputs: Float[Tensor, "P I"]) -> Float[Tensor, "P O"]:
+        """An MLP in the field's precision, with a gradient of our own on the CPU."""
+        if inputs.device.type == "cpu":
+            from nerfro.kernels.mlp import relu_mlp
+
+            weights = [layer.weight for layer in mlp if isinstance(layer, nn.Linear)]
+            return relu_mlp(inputs, weights, getattr(torch, self.precision))
+        with torch.autocast(inputs.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
+            return mlp(inputs)
 
 
 def _mlp(num_inputs: int, width: int, num_hidden: int, num_outputs: int) -> nn.Sequential:

@@ -2,7 +2,9 @@
 
 Forward, threads share the points; each thread takes them block by block and level by level, so that a block's output
 stays in the first-level cache and a level's table in the second. Backward, threads share the levels: no two threads
-write to the same entry, so there are no atomics, and the sums do not depend on the number of threads.
+write to the same entry, so there are no atomics, and the sums do not depend on the number of threads. What can be done
+for many points at once (cells, fractions, the part of the hash that y and z make) is done in loops of its own, because
+those become vector instructions, and the fetching of table entries does not.
 """
 
 from __future__ import annotations
@@ -20,25 +22,27 @@ from nerfro.fields.hash_encoding import HASH_Y, HASH_Z, NUM_FEATURES, GridLevels
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.threads import use_threads
 
-_BLOCK = 1024
+_BLOCK = 512
 _ONE = np.float32(1)
+# Hashes are of 32 bits.
+_UINT, _Y, _Z = np.uint32, np.uint32(HASH_Y), np.uint32(HASH_Z)
 
 
 def hash_encode(
     positions: Float[Tensor, "P 3"], table: Float[Tensor, "T 2"], levels: GridLevels
 ) -> Float[Tensor, "P 2*L"]:
     """The same as `nerfro.fields.hash_encoding.hash_encode`, on the CPU."""
-    return _HashEncode.apply(positions.detach().float().contiguous(), table, levels)
+    return _HashEncode.apply(positions.detach().float().t().contiguous(), table, levels)
 
 
 class _HashEncode(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, positions: Float[Tensor, "P 3"], table: Float[Tensor, "T 2"], levels: GridLevels
+        ctx: Any, positions: Float[Tensor, "3 P"], table: Float[Tensor, "T 2"], levels: GridLevels
     ) -> Float[Tensor, "P 2*L"]:
         ctx.save_for_backward(positions)
         ctx.levels, ctx.num_entries = levels, table.shape[0]
-        features = positions.new_empty(positions.shape[0], NUM_FEATURES * len(levels))
+        features = positions.new_empty(positions.shape[1], NUM_FEATURES * len(levels))
         use_threads()
         _forward(positions.numpy(), table.detach().contiguous().numpy(), *_layout(levels), features.numpy())
         return features
@@ -58,81 +62,110 @@ def _layout(levels: GridLevels) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
 
 
 @compiled
-def _vertices(x, y, z, resolution, size, dense):
-    """Offsets of the cell's eight vertices in its level, x fastest, and the position's fractions in the cell."""
-    scale = np.float32(resolution)
-    x = min(max(x, np.float32(0)), _ONE) * scale
-    y = min(max(y, np.float32(0)), _ONE) * scale
-    z = min(max(z, np.float32(0)), _ONE) * scale
-    # Bounded below as well, because a position that is not a number becomes the smallest integer.
-    i = max(min(np.int64(x), resolution - 1), 0)
-    j = max(min(np.int64(y), resolution - 1), 0)
-    k = max(min(np.int64(z), resolution - 1), 0)
+def _axis_cells(coordinates, resolution, cells, fractions):
+    """Cells that the unit cube's coordinates lie in along one axis, and where in them."""
+    scale, last = np.float32(resolution), _UINT(resolution - 1)
+    for p in range(coordinates.shape[0]):
+        scaled = min(max(coordinates[p], np.float32(0)), _ONE) * scale
+        # Bounded as an unsigned number, because a position that is not a number becomes the smallest signed integer.
+        cell = min(_UINT(np.int32(scaled)), last)
+        cells[p], fractions[p] = cell, scaled - np.float32(cell)
+
+
+@compiled
+def _edges(j, k, resolution, dense, low_low, high_low, low_high, high_high):
+    """What y and z contribute to the entries of the cells' four edges along x; _vertex adds x."""
     if dense:
-        stride = resolution + 1
-        a = i + stride * (j + stride * k)
-        b, c = a + stride, a + stride * stride
-        d = c + stride
-        e, f, g, h = a + 1, b + 1, c + 1, d + 1
+        row, plane = _UINT(resolution + 1), _UINT((resolution + 1) * (resolution + 1))
+        for p in range(j.shape[0]):
+            edge = j[p] * row + k[p] * plane
+            low_low[p], high_low[p] = edge, edge + row
+            low_high[p], high_high[p] = edge + plane, edge + plane + row
     else:
-        # Sizes of hashed levels are powers of two, so that the remainder is a mask.
-        mask, right = size - 1, i + 1
-        y0, z0 = j * HASH_Y, k * HASH_Z
-        y1, z1 = y0 + HASH_Y, z0 + HASH_Z
-        a, b, c, d = (i ^ y0 ^ z0) & mask, (i ^ y1 ^ z0) & mask, (i ^ y0 ^ z1) & mask, (i ^ y1 ^ z1) & mask
-        e, f, g, h = (
-            (right ^ y0 ^ z0) & mask,
-            (right ^ y1 ^ z0) & mask,
-            (right ^ y0 ^ z1) & mask,
-            (right ^ y1 ^ z1) & mask,
-        )
+        for p in range(j.shape[0]):
+            y, z = j[p] * _Y, k[p] * _Z
+            low_low[p], high_low[p] = y ^ z, (y + _Y) ^ z
+            low_high[p], high_high[p] = y ^ (z + _Z), (y + _Y) ^ (z + _Z)
+
+
+@compiled
+def _vertices(i, low_low, high_low, low_high, high_high, dense, mask):
+    """Entries of a cell's eight vertices in its level, x fastest.
+
+    Sizes of hashed levels are powers of two, so that the remainder is a mask.
+    """
     # Unsigned, because Numba counts signed ones from the end where they are negative, a test for each access.
-    index = np.uintp
-    vertices = (index(a), index(e), index(b), index(f), index(c), index(g), index(d), index(h))
-    return vertices, x - np.float32(i), y - np.float32(j), z - np.float32(k)
+    index, right = np.uintp, i + _UINT(1)
+    if dense:
+        a, b, c, d = index(low_low + i), index(high_low + i), index(low_high + i), index(high_high + i)
+        e, f, g, h = a + index(1), b + index(1), c + index(1), d + index(1)
+    else:
+        a, e = index((low_low ^ i) & mask), index((low_low ^ right) & mask)
+        b, f = index((high_low ^ i) & mask), index((high_low ^ right) & mask)
+        c, g = index((low_high ^ i) & mask), index((low_high ^ right) & mask)
+        d, h = index((high_high ^ i) & mask), index((high_high ^ right) & mask)
+    return a, e, b, f, c, g, d, h
+
+
+@compiled
+def _locate(positions, start, size, resolution, dense, cells, fractions, edges):
+    """Cells [3, B], fractions [3, B] and edges [4, B] of a block of the positions [3, P]."""
+    for axis in range(3):
+        # One row at a time: Numba takes a block of several for scattered in memory, and gives up vector instructions.
+        _axis_cells(positions[axis, start : start + size], resolution, cells[axis], fractions[axis])
+    _edges(cells[1], cells[2], resolution, dense, edges[0], edges[1], edges[2], edges[3])
 
 
 @compiled_parallel
 def _forward(positions, table, resolutions, sizes, offsets, dense, features):
-    num_points = positions.shape[0]
+    num_points = positions.shape[1]
     for block in prange((num_points + _BLOCK - 1) // _BLOCK):
+        start = block * _BLOCK
+        size = min(num_points - start, _BLOCK)
+        cells, fractions = np.empty((3, size), _UINT), np.empty((3, size), np.float32)
+        edges = np.empty((4, size), _UINT)
         for level in range(resolutions.shape[0]):
-            resolution, size, is_dense = resolutions[level], sizes[level], dense[level]
-            entries = table[offsets[level] : offsets[level] + size]
-            for p in range(block * _BLOCK, min(num_points, (block + 1) * _BLOCK)):
-                v, x, y, z = _vertices(positions[p, 0], positions[p, 1], positions[p, 2], resolution, size, is_dense)
+            is_dense, mask = dense[level], _UINT(sizes[level] - 1)
+            entries = table[offsets[level] : offsets[level] + sizes[level]]
+            _locate(positions, start, size, resolutions[level], is_dense, cells, fractions, edges)
+            for p in range(size):
+                i, x, y, z = cells[0, p], fractions[0, p], fractions[1, p], fractions[2, p]
                 w0, w1, w2, w3 = (_ONE - y) * (_ONE - z), y * (_ONE - z), (_ONE - y) * z, y * z
-                for f in range(2):
-                    left = w0 * entries[v[0], f] + w1 * entries[v[2], f]
-                    left += w2 * entries[v[4], f] + w3 * entries[v[6], f]
-                    right = w0 * entries[v[1], f] + w1 * entries[v[3], f]
-                    right += w2 * entries[v[5], f] + w3 * entries[v[7], f]
-                    features[p, 2 * level + f] = (_ONE - x) * left + x * right
+                low_low, high_low, low_high, high_high = edges[0, p], edges[1, p], edges[2, p], edges[3, p]
+                a, b, c, d, e, f, g, h = _vertices(i, low_low, high_low, low_high, high_high, is_dense, mask)
+                for n in range(2):
+                    left = w0 * entries[a, n] + w1 * entries[c, n] + w2 * entries[e, n] + w3 * entries[g, n]
+                    right = w0 * entries[b, n] + w1 * entries[d, n] + w2 * entries[f, n] + w3 * entries[h, n]
+                    features[start + p, 2 * level + n] = (_ONE - x) * left + x * right
 
 
 @compiled_parallel
 def _backward(positions, gradient, resolutions, sizes, offsets, dense, threads, table):
-    num_points = positions.shape[0]
+    num_points = positions.shape[1]
     # Levels are dealt out in turn, because fine ones cost more than coarse ones.
     for thread in prange(threads):
+        cells, fractions = np.empty((3, _BLOCK), _UINT), np.empty((3, _BLOCK), np.float32)
+        edges = np.empty((4, _BLOCK), _UINT)
         for start in range(0, num_points, _BLOCK):
+            size = min(num_points - start, _BLOCK)
             for level in range(thread, resolutions.shape[0], threads):
-                resolution, size, is_dense = resolutions[level], sizes[level], dense[level]
-                entries = table[offsets[level] : offsets[level] + size]
-                for p in range(start, min(num_points, start + _BLOCK)):
-                    v, x, y, z = _vertices(
-                        positions[p, 0], positions[p, 1], positions[p, 2], resolution, size, is_dense
-                    )
+                is_dense, mask = dense[level], _UINT(sizes[level] - 1)
+                entries = table[offsets[level] : offsets[level] + sizes[level]]
+                _locate(positions, start, size, resolutions[level], is_dense, cells, fractions, edges)
+                for p in range(size):
+                    i, x, y, z = cells[0, p], fractions[0, p], fractions[1, p], fractions[2, p]
                     w0, w1, w2, w3 = (_ONE - y) * (_ONE - z), y * (_ONE - z), (_ONE - y) * z, y * z
+                    low_low, high_low, low_high, high_high = edges[0, p], edges[1, p], edges[2, p], edges[3, p]
+                    a, b, c, d, e, f, g, h = _vertices(i, low_low, high_low, low_high, high_high, is_dense, mask)
                     # Both are read before any entry is written, which might overlap for all the compiler knows.
-                    both = (gradient[p, 2 * level], gradient[p, 2 * level + 1])
-                    for f in range(2):
-                        left, right = (_ONE - x) * both[f], x * both[f]
-                        entries[v[0], f] += w0 * left
-                        entries[v[1], f] += w0 * right
-                        entries[v[2], f] += w1 * left
-                        entries[v[3], f] += w1 * right
-                        entries[v[4], f] += w2 * left
-                        entries[v[5], f] += w2 * right
-                        entries[v[6], f] += w3 * left
-                        entries[v[7], f] += w3 * right
+                    both = (gradient[start + p, 2 * level], gradient[start + p, 2 * level + 1])
+                    for n in range(2):
+                        left, right = (_ONE - x) * both[n], x * both[n]
+                        entries[a, n] += w0 * left
+                        entries[b, n] += w0 * right
+                        entries[c, n] += w1 * left
+                        entries[d, n] += w1 * right
+                        entries[e, n] += w2 * left
+                        entries[f, n] += w2 * right
+                        entries[g, n] += w3 * left
+                        entries[h, n] += w3 * right

@@ -1,0 +1,54 @@
+"""The MLP with its gradient written out, against torch.nn.Sequential."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from nerfro.kernels.mlp import relu_mlp
+
+
+def layers(*widths: int) -> nn.Sequential:
+    linear = [nn.Linear(a, b, bias=False) for a, b in pairwise(widths)]
+    return nn.Sequential(*[part for layer in linear for part in (layer, nn.ReLU())][:-1])
+
+
+def weights(mlp: nn.Sequential) -> list[Tensor]:
+    return [part.weight for part in mlp if isinstance(part, nn.Linear)]
+
+
+@pytest.mark.parametrize("widths", [(5, 3), (24, 64, 16), (32, 64, 64, 3)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_equals_a_sequential_forward_and_backward(widths: tuple[int, ...], dtype: torch.dtype) -> None:
+    mlp = layers(*widths)
+    inputs = torch.randn(300, widths[0], requires_grad=True)
+    upstream = torch.randn(300, widths[-1]).to(dtype)
+    with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
+        expected = mlp(inputs)
+    result = relu_mlp(inputs, weights(mlp), dtype)
+    assert result.dtype == dtype
+    torch.testing.assert_close(result, expected)
+    for mine, theirs in zip(
+        torch.autograd.grad(result, [inputs, *weights(mlp)], upstream),
+        torch.autograd.grad(expected, [inputs, *weights(mlp)], upstream),
+        strict=True,
+    ):
+        assert mine.dtype == theirs.dtype
+        torch.testing.assert_close(mine, theirs, rtol=1e-2 if dtype == torch.bfloat16 else 1e-5, atol=1e-5)
+
+
+def test_gradient_against_differences() -> None:
+    mlp = layers(4, 6, 5, 2).double()
+    inputs = torch.randn(7, 4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x, *w: relu_mlp(x, list(w), torch.float64), (inputs, *weights(mlp)))
+
+
+def test_inputs_without_gradient_and_no_points() -> None:
+    mlp = layers(4, 6, 2)
+    result = relu_mlp(torch.zeros(0, 4), weights(mlp), torch.float32)
+    result.sum().backward()
+    assert result.shape == (0, 2)
+    assert all(torch.equal(w.grad, torch.zeros_like(w)) for w in weights(mlp))
