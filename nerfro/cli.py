@@ -61,20 +61,29 @@ def errors_in_one_line() -> Iterator[None]:
     """Tell a user's mistake in one line and exit with status 1; a bug keeps its traceback."""
     try:
         yield
-    except NerfroError as error:
-        _fail(str(error))
-    except (HydraException, OmegaConfBaseException) as error:
-        _fail(" ".join(_messages(error)))
-    except ValueError as error:
-        # Hydra's refusal of a group that is set to no option (field=null); any other ValueError is a bug.
-        if not str(error).startswith("Config group override"):
-            raise
-        _fail(f"{error}; give the name of an option, as in field=nerf")
-    except OSError as error:
-        _fail(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}")
     except KeyboardInterrupt:
         print("nerfro: interrupted", file=sys.stderr)
         sys.exit(EXIT_INTERRUPTED)
+    except Exception as error:
+        line = in_one_line(error)
+        if line is None:
+            raise
+        print(f"nerfro: error: {line}", file=sys.stderr)
+        sys.exit(1)
+
+
+def in_one_line(error: Exception) -> str | None:
+    """What to tell the user about a mistake of theirs; None for a bug."""
+    if isinstance(error, NerfroError):
+        return str(error)
+    if isinstance(error, (HydraException, OmegaConfBaseException)):
+        return " ".join(_messages(error))
+    # Hydra's refusal of a group that is set to no option (field=null); any other ValueError is a bug.
+    if isinstance(error, ValueError) and str(error).startswith("Config group override"):
+        return f"{error}; give the name of an option, as in field=nerf"
+    if isinstance(error, OSError):
+        return f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}"
+    return None
 
 
 def _messages(error: BaseException) -> list[str]:
@@ -86,8 +95,3 @@ def _messages(error: BaseException) -> list[str]:
     refused = re.search(r"not in '(\w+)'", " ".join(lines))
     fields = None if refused is None else fields_of_config(refused[1])
     return lines if fields is None else [*lines, f"fields: {', '.join(fields)}"]
-
-
-def _fail(message: str) -> None:
-    print(f"nerfro: error: {message}", file=sys.stderr)
-    sys.exit(1)

@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.errors import NerfroError
@@ -53,7 +55,7 @@ def record(folder: Path, config: DictConfig) -> None:
     write_atomically(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
     commit, diff = _git("rev-parse", "HEAD"), _git("diff", "HEAD")
     facts = {
-        "command": shlex.join([Path(sys.executable).name, "-m", _main_module(), *sys.argv[1:]]),
+        "command": _command(),
         "seed": config.seed,
         "commit": commit,
         "modified": bool(diff),
@@ -145,9 +147,14 @@ def _git(*command: str) -> str | None:
     return done.stdout.strip()
 
 
-def _main_module() -> str:
+def _command() -> str:
+    """The command line that repeats this run; for a cell of a sweep, the one that runs it alone."""
+    if HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
+        # In a launcher's worker this process has another main module and other arguments.
+        return shlex.join(["python", "-m", "nerfro.train", *HydraConfig.get().overrides.task])
     spec = getattr(sys.modules["__main__"], "__spec__", None)
-    return spec.name if spec is not None else sys.argv[0]
+    module = spec.name if spec is not None else sys.argv[0]
+    return shlex.join([Path(sys.executable).name, "-m", module, *sys.argv[1:]])
 
 
 def _version(package: str) -> str | None:

@@ -1,0 +1,232 @@
+"""The cells of a sweep, each one training run: which configuration a cell holds, how it ended, and how it is run.
+
+Everything is known from the cell's folder, so that a sweep can be stopped at any moment, by any means, and go on later.
+`hydra_plugins/nerfro_cells.py` plans and launches cells; a launcher's worker runs each of them through `CellTask`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from nerfro.cli import in_one_line
+from nerfro.errors import NerfroError
+from nerfro.evaluation.files import write_atomically
+from nerfro.paths import EMBEDDED_PREFIX, resolve_path
+from nerfro.registry import build, discover
+from nerfro.run_folder import LAST_CHECKPOINT, flatten
+from nerfro.synthesize import SCENES
+
+_RECORD, _LOCK = "cell.json", "cell.lock"
+
+# How a run is watched and stored is no part of what it computes.
+_NOT_HASHED = ("ckpt_path", "checkpoint", "logger")
+
+# Tell cells of a sweep apart in their folders' names without being written out as key=value.
+_NAMED_BY_THEMSELVES = ("+experiment", "data.root", "seed")
+
+
+class State(str, Enum):
+    """How far a cell has come."""
+
+    OPEN = "not finished"
+    RUNNING = "running in another process"
+    FINISHED = "finished"
+    FAILED = "failed"
+    REFUSED = "refused"
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What a cell computes: two cells with equal identities have equal results, up to the machine.
+
+    Attributes:
+        settings: the resolved configuration, without what does not matter for the result.
+        data: hash of the files in the data's folder.
+    """
+
+    settings: Mapping[str, Any]
+    data: str
+
+    @classmethod
+    def of(cls, config: DictConfig) -> Identity:
+        """Identity of a run of nerfro.train; reads no image, only the names and sizes of files."""
+        settings: Any = OmegaConf.to_container(config, resolve=True)
+        kept = {key: value for key, value in settings.items() if key not in _NOT_HASHED}
+        return cls(kept, _hash_of_files(resolve_path(config.data.root)))
+
+    @property
+    def hash(self) -> str:
+        text = json.dumps([self.settings, self.data], sort_keys=True, default=str)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    def difference(self, record: Mapping[str, Any]) -> str:
+        """The first thing in which a cell's record differs from this identity, in words."""
+        old, new = flatten(record["settings"], ""), flatten(dict(self.settings), "")
+        for key in sorted(old.keys() | new.keys()):
+            if old.get(key) != new.get(key):
+                return f"{key.lstrip('.')}={old.get(key)}, now {new.get(key)}"
+        return "other files in its data's folder"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training run of a sweep.
+
+    Attributes:
+        overrides: that make its configuration, its folder included.
+        folder: where it lies.
+        identity: of its configuration and data; None where it is refused.
+        refusal: why it cannot be run, else None.
+    """
+
+    overrides: list[str]
+    folder: Path
+    identity: Identity | None
+    refusal: str | None
+
+    def look(self) -> tuple[State, str]:
+        """How far it has come, and why it failed or is refused."""
+        return (State.REFUSED, self.refusal or "") if self.identity is None else _look(self.folder, self.identity)
+
+
+def refusal(config: DictConfig) -> str | None:
+    """Why a cell cannot be run at all, as far as that can be told without work; None if nothing speaks against it."""
+    try:
+        if "train" in build(config.data).splits:
+            return None
+        reason = f"data.root={config.data.root} has no training views"
+    except NerfroError as error:
+        reason = str(error)
+    scene = scene_name(config.data.root)
+    if scene in SCENES and not str(config.data.root).startswith(EMBEDDED_PREFIX):
+        out = Path(config.data.root)
+        small = "resolution=128 spp=256 test_spp=1024 views.val=10 views.test=20"
+        return f"{out} holds no data yet: python -m nerfro.synthesize scene={scene} out={out} {small}"
+    return reason
+
+
+def scene_name(root: str) -> str:
+    """Last part of a data folder's name."""
+    return Path(str(root).removeprefix(EMBEDDED_PREFIX)).name
+
+
+def folder_name(config: DictConfig, swept: Sequence[str]) -> str:
+    """Name of a cell's folder: experiment, scene and seed, and what else is swept over.
+
+    Args:
+        config: of the cell.
+        swept: overrides `key=value` that tell it from other cells.
+    """
+    others = [override for override in swept if override.split("=", 1)[0] not in _NAMED_BY_THEMSELVES]
+    short = [f"{key.lstrip('+').rpartition('.')[2]}={value}" for key, _, value in (o.partition("=") for o in others)]
+    name = "-".join([config.name, scene_name(config.data.root), f"seed{config.seed}", *short])
+    return re.sub(r"[^\w.=+-]+", "_", name).strip("_")
+
+
+class CellTask:
+    """Runs a cell where a launcher has put it, and records how it ended; a failure ends here and not the sweep.
+
+    A cell that was stopped before goes on from its checkpoint.
+
+    Args:
+        task: trains and evaluates a configuration.
+    """
+
+    def __init__(self, task: Callable[[DictConfig], None]) -> None:
+        self._task = task
+
+    def __call__(self, config: DictConfig) -> None:
+        discover()  # the worker may be a new process
+        folder = Path(HydraConfig.get().runtime.output_dir)
+        try:
+            with FileLock(folder / _LOCK, blocking=False):
+                self._run(config, folder)
+        except Timeout:
+            return  # a process that outlived an earlier start of the sweep is at it
+
+    def _run(self, config: DictConfig, folder: Path) -> None:
+        identity = Identity.of(config)
+        if _recorded(folder, identity)[0] is State.FINISHED:
+            return
+        if (folder / LAST_CHECKPOINT).is_file():
+            config.ckpt_path = str(folder / LAST_CHECKPOINT)
+        _record(folder, identity, State.OPEN)
+        try:
+            self._task(config)
+        except Exception as error:  # whatever it is, the other cells go on
+            reason = in_one_line(error)
+            if reason is None:
+                traceback.print_exc()
+                reason = f"{type(error).__name__}: {error}".splitlines()[0]
+            print(f"nerfro: {folder.name} failed: {reason}", file=sys.stderr, flush=True)
+            _record(folder, identity, State.FAILED, reason)
+        else:
+            _record(folder, identity, State.FINISHED)
+
+
+def _record(folder: Path, identity: Identity, state: State, reason: str = "") -> None:
+    record = {
+        "hash": identity.hash,
+        "state": state.value,
+        "reason": reason,
+        "data": identity.data,
+        "settings": identity.settings,
+    }
+    write_atomically(folder / _RECORD, json.dumps(record, indent=2, default=str) + "\n")
+
+
+def _look(folder: Path, identity: Identity) -> tuple[State, str]:
+    if not folder.is_dir():
+        return State.OPEN, ""
+    try:
+        with FileLock(folder / _LOCK, blocking=False):
+            pass
+    except Timeout:
+        return State.RUNNING, ""
+    return _recorded(folder, identity)
+
+
+def _recorded(folder: Path, identity: Identity) -> tuple[State, str]:
+    try:
+        record = json.loads((folder / _RECORD).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        record = None
+    holds_a_run = (folder / LAST_CHECKPOINT).is_file()
+    if record is None:
+        return (State.REFUSED, f"{folder} holds a run that is no cell of a sweep") if holds_a_run else (State.OPEN, "")
+    if record["hash"] != identity.hash:
+        if not holds_a_run:
+            return State.OPEN, ""
+        found = identity.difference(record)
+        return State.REFUSED, f"{folder} holds a run with {found}; choose another hydra.sweep.dir or remove it"
+    state = State(record["state"])
+    if state is State.FINISHED and not (folder / "metrics.json").is_file():
+        return State.OPEN, ""
+    return state, record["reason"]
+
+
+def _hash_of_files(root: Path) -> str:
+    """Hash of the names and sizes of all files below a folder, and of the content of those that describe it."""
+    digest = hashlib.sha256()
+    for file in sorted(_visible_files(root)):
+        digest.update(f"{file.relative_to(root).as_posix()}:{file.stat().st_size};".encode())
+        if file.suffix == ".json":
+            digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _visible_files(root: Path) -> Iterator[Path]:
+    return (path for path in root.rglob("*") if path.is_file() and not path.name.startswith("."))
