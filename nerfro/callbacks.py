@@ -1,4 +1,4 @@
-"""What happens around training: progress, throughput, pictures, interruption, and the record in the checkpoint."""
+"""What happens around training: progress, throughput, interruption, and the record in the checkpoint."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ import time
 from types import FrameType
 from typing import Any
 
-import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
-from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 from tqdm import tqdm
 
 from nerfro.models.optimizer import training_progress
@@ -157,29 +155,3 @@ class ConfigInCheckpoint(Callback):
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         checkpoint["nerfro_config"] = self._config
-
-
-class ValidationImages(Callback):
-    """Logs prediction, reference and squared error side by side, with depth and opacity, to TensorBoard and W&B."""
-
-    def on_validation_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
-    ) -> None:
-        if not outputs:
-            return
-        for name, picture in outputs.items():
-            for logger in trainer.loggers:
-                _log_image(logger, name, picture, trainer.global_step)
-
-
-def _log_image(logger: object, name: str, picture: torch.Tensor, step: int) -> None:
-    if isinstance(logger, TensorBoardLogger):
-        logger.experiment.add_image(name, picture.cpu().numpy(), step, dataformats="HWC")
-    elif isinstance(logger, WandbLogger):
-        logger.log_image(name, [picture.cpu().numpy()], step=step)

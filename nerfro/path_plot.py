@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerfro.media.base import Medium
@@ -14,6 +15,7 @@ from nerfro.types import Path
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 _RESOLUTION = 600
 # Share of the box's diagonal that is shown around it.
@@ -22,14 +24,24 @@ _MARGIN = 0.15
 
 def draw_paths(path: Path, medium: Medium, file: FilePath) -> None:
     """Write a picture of a few paths and the medium that they cross (see `plot_paths`)."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    _draw(path, medium).print_png(str(file))
+
+
+def picture_of_paths(path: Path, medium: Medium) -> UInt8[np.ndarray, "H W 3"]:
+    """What `draw_paths` writes, as a small picture in memory."""
+    return np.asarray(_draw(path, medium, dpi=70).buffer_rgba())[..., :3].copy()
+
+
+def _draw(path: Path, medium: Medium, dpi: int = 150) -> FigureCanvasAgg:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7, 7), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(7, 7), layout="constrained", dpi=dpi)
+    canvas = FigureCanvasAgg(figure)
     plot_paths(figure.add_subplot(), path, medium)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=150)
+    canvas.draw()
+    return canvas
 
 
 def plot_paths(axes: Axes, path: Path, medium: Medium, colour: str = "tab:red") -> None:
@@ -37,15 +49,16 @@ def plot_paths(axes: Axes, path: Path, medium: Medium, colour: str = "tab:red") 
 
     The plane goes through the centre of the medium's box. Rays outside it are drawn by their projection.
     """
-    centre = medium.box.mean(0).to(path.positions)
-    across, up = _plane(path.positions, centre)
+    vertices = path.positions.detach().cpu()
+    centre = medium.box.mean(0).to(vertices)
+    across, up = _plane(vertices, centre)
     half = (0.5 + _MARGIN) * float((medium.box[1] - medium.box[0]).max())
     steps = torch.linspace(-half, half, _RESOLUTION).to(centre)
     points = centre + steps[None, :, None] * across + steps[:, None, None] * up
-    n = torch.cat([medium(rows)[0] for rows in points.to(medium.box).split(50)])
+    n = torch.cat([medium(rows)[0].cpu() for rows in points.to(medium.box).split(50)])
     extent = (-half, half, -half, half)
     axes.imshow(n, cmap="Blues", vmin=1, vmax=2 * float(n.max()) - 1, extent=extent, origin="lower")
-    for positions in path.positions:
+    for positions in vertices:
         flat = positions - centre
         axes.plot(flat @ across, flat @ up, color=colour, linewidth=0.8)
     axes.set_xlim(-half, half)

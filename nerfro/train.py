@@ -14,7 +14,7 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.loggers import Logger, WandbLogger
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.callbacks import ConfigInCheckpoint, StopOnSignal, Throughput, TrainingProgress, ValidationImages
+from nerfro.callbacks import ConfigInCheckpoint, StopOnSignal, Throughput, TrainingProgress
 from nerfro.cli import EXIT_INTERRUPTED, entry_point
 from nerfro.config import TrainConfig, build_model
 from nerfro.data.module import RayDataModule
@@ -36,6 +36,7 @@ from nerfro.run_folder import (
     require_same_configuration,
 )
 from nerfro.samplers.path_cache import PathCache
+from nerfro.training_log import TrainingLog
 
 _SPARE_BYTES = 64 * 2**20  # pictures and logs, beside the checkpoints
 
@@ -99,7 +100,7 @@ def main(config: DictConfig) -> None:
     print("Look at:")
     print(f"  {folder}/images/  the pictures; metrics.json, .csv, .md and .tex beside them")
     print(f"  {folder}/checkpoints/last.ckpt  evaluate it with python -m nerfro.evaluate checkpoint=...")
-    print(f"  tensorboard --logdir {folder.parent}  losses and validation pictures")
+    print("  python -m nerfro.dashboard  losses and validation pictures")
 
 
 def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.Trainer:
@@ -122,7 +123,7 @@ def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.
     in_checkpoint = ConfigInCheckpoint(OmegaConf.to_yaml(config, resolve=True))
     ours = {
         "default_root_dir": str(folder),
-        "callbacks": [checkpoints, TrainingProgress(), in_checkpoint, ValidationImages(), *extra],
+        "callbacks": [checkpoints, TrainingProgress(), in_checkpoint, TrainingLog(), *extra],
         "logger": _loggers(config, folder),
         "max_epochs": -1,
         "val_check_interval": every if every > 0 else None,

@@ -1,0 +1,125 @@
+"""What a run shows while it trains, in TensorBoard and W&B: rates and memory, pictures, and where samples lie."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
+from torch import Tensor
+
+from nerfro.boundaries.lat_long import directions
+from nerfro.media.analytic import Vacuum
+from nerfro.models.base import NerfModel
+from nerfro.path_plot import picture_of_paths
+from nerfro.types import Batch, Rays, Rendering
+
+_SKY_HEIGHT = 128  # rows of the picture of the sky
+_NUM_RAYS = 128  # at most, for the histograms
+_NUM_PATHS = 12  # of these, in the picture of bent paths
+
+
+class TrainingLog(Callback):
+    """Logs learning rates and memory with the losses, and pictures at every look at a validation view.
+
+    The pictures are those of `NerfModel.validation_step`, the sky, and the paths of a few rays through the middle row
+    of the view; the histograms tell at which arc lengths the rays of that row are sampled, for each sampling level.
+    """
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
+    ) -> None:
+        for name, rate in learning_rates(trainer, pl_module).items():
+            pl_module.log(f"learning_rate/{name}", rate)
+        pl_module.log("train/peak_memory_gib", peak_memory(pl_module.device) / 2**30)
+
+    def on_validation_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: int,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        if not outputs:
+            return
+        assert isinstance(pl_module, NerfModel)
+        loggers = [logger for logger in trainer.loggers if isinstance(logger, (TensorBoardLogger, WandbLogger))]
+        if not loggers:
+            return
+        rays = _middle_row(trainer.datamodule.validation.cameras.to(pl_module.device), batch)  # type: ignore[attr-defined]
+        with torch.inference_mode():
+            renderings: list[Rendering] = pl_module(rays)
+        pictures = {name: _to_8bit(picture) for name, picture in outputs.items()}
+        pictures["val/sky"] = sky(pl_module)
+        if not isinstance(pl_module.medium, Vacuum):
+            shown = torch.linspace(0, len(rays) - 1, min(_NUM_PATHS, len(rays))).long().to(rays.origins.device)
+            pictures["val/paths"] = picture_of_paths(renderings[-1].path[shown], pl_module.medium)
+        for logger in loggers:
+            _log_pictures(logger, pictures, trainer.global_step)
+            for level, rendering in enumerate(renderings):
+                _log_histogram(logger, f"samples/arc_length_level_{level}", rendering.samples.s, trainer.global_step)
+
+
+def learning_rates(trainer: Trainer, model: LightningModule) -> dict[str, float]:
+    """Present learning rate of each part of the model that learns."""
+    parts = [name for name in ("fields", "boundary") if any(True for _ in getattr(model, name).parameters())]
+    return {name: group["lr"] for name, group in zip(parts, trainer.optimizers[0].param_groups, strict=True)}
+
+
+def peak_memory(device: torch.device) -> int:
+    """Most bytes that were used so far: by tensors on a GPU, by the whole process on a CPU; 0 where nobody counts."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024  # kilobytes everywhere but there
+
+
+@torch.inference_mode()
+def sky(model: NerfModel, height: int = _SKY_HEIGHT) -> UInt8[np.ndarray, "H 2*H 3"]:
+    """The model's boundary as a lat-long picture (see boundaries/lat_long.py)."""
+    was_training = model.boundary.training
+    model.boundary.eval()
+    try:
+        return _to_8bit(model.boundary(directions(height).to(model.device)))
+    finally:
+        model.boundary.train(was_training)
+
+
+def _middle_row(cameras: Any, view: int) -> Rays:
+    """Rays of at most `_NUM_RAYS` pixels of a view's middle row, evenly spread."""
+    rays = cameras.image_rays(view)
+    first = cameras.height // 2 * cameras.width
+    return rays[first : first + cameras.width : -(-cameras.width // _NUM_RAYS)]
+
+
+def _to_8bit(picture: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    return (picture.detach().float().clamp(0, 1) * 255).round().byte().cpu().numpy()
+
+
+def _log_pictures(logger: Logger, pictures: Mapping[str, UInt8[np.ndarray, "H W 3"]], step: int) -> None:
+    for name, picture in pictures.items():
+        if isinstance(logger, TensorBoardLogger):
+            logger.experiment.add_image(name, picture, step, dataformats="HWC")
+        elif isinstance(logger, WandbLogger):
+            logger.log_image(name, [picture], step=step)
+
+
+def _log_histogram(logger: Logger, name: str, values: Tensor, step: int) -> None:
+    flat = values.detach().float().flatten().cpu().numpy()
+    if isinstance(logger, TensorBoardLogger):
+        logger.experiment.add_histogram(name, flat, step)
+    elif isinstance(logger, WandbLogger):
+        from wandb import Histogram
+
+        logger.log_metrics({name: Histogram(flat)}, step)  # type: ignore[arg-type,dict-item]
