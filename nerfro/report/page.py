@@ -1,0 +1,165 @@
+"""One HTML page on many runs, with everything it needs inside: tables, curves, pictures and provenance."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jinja2
+import torch
+from markupsafe import Markup
+from omegaconf import OmegaConf
+
+from nerfro.errors import NerfroError
+from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, magma
+from nerfro.evaluation.results import Metric, Region
+from nerfro.evaluation.tables import Table, to_html
+from nerfro.paths import PACKAGE_DIR
+from nerfro.report import curves
+from nerfro.report.comparison import Comparison
+from nerfro.report.curves import Chart, draw_charts, read_curves
+from nerfro.report.runs import Run, device, duration, shown
+from nerfro.report.views import JPEG_QUALITY, PNG_SIDE, ScenePictures, Wanted, data_uri, scene_pictures
+
+_TEMPLATES = PACKAGE_DIR / "report"
+
+
+@dataclass(frozen=True)
+class SceneSection:
+    """What the page says about one scene of a comparison.
+
+    Attributes:
+        id: of the section, unique on the page.
+        title: of the scene.
+        charts: training curves.
+        pictures: views, or None if they cannot be shown.
+        reason: why they cannot.
+    """
+
+    id: str
+    title: str
+    charts: Sequence[Chart]
+    pictures: ScenePictures | None
+    reason: str
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """How one run came to be, as text."""
+
+    method: str
+    scene: str
+    seed: int
+    folder: str
+    facts: Mapping[str, str]
+    config: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """What the page says about the runs of one budget."""
+
+    id: str
+    title: str
+    methods: Sequence[str]
+    table: Markup
+    scenes: Sequence[SceneSection]
+    runs: Sequence[Provenance]
+
+
+def report_page(
+    compared: Sequence[tuple[Comparison, Table]],
+    unfinished: Sequence[str],
+    wanted: Wanted,
+    metric: Metric,
+    region: Region,
+) -> str:
+    """Write the page.
+
+    Args:
+        compared: the comparisons with their tables.
+        unfinished: a line on each run that is not in them.
+        wanted: which pictures.
+        metric: whose value stands below each picture.
+        region: that it was measured on.
+    """
+    sections = [
+        Section(
+            id=f"b{number}",
+            title=f"Trained for {comparison.budget.label}",
+            methods=comparison.methods,
+            table=Markup(to_html(table)),
+            scenes=_scenes(f"b{number}", comparison, wanted, metric, region),
+            runs=[_provenance(comparison, run) for run in comparison.runs],
+        )
+        for number, (comparison, table) in enumerate(compared)
+    ]
+    ramp = magma(torch.linspace(0, SQUARED_ERROR_LIMIT, 256)[None], SQUARED_ERROR_LIMIT)
+    return _render(
+        "page.html.jinja",
+        sections=sections,
+        unfinished=unfinished,
+        chart=curves,
+        error_limit=f"{SQUARED_ERROR_LIMIT:g}",
+        error_ramp=data_uri(ramp),
+        png_side=PNG_SIDE,
+        jpeg_quality=JPEG_QUALITY,
+    )
+
+
+def table_page(table: Table) -> str:
+    """A page with nothing but a table."""
+    return _render("table.html.jinja", title=table.title, table=Markup(to_html(table)))
+
+
+def _render(template: str, **context: object) -> str:
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_TEMPLATES),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(context)
+
+
+def _scenes(prefix: str, comparison: Comparison, wanted: Wanted, metric: Metric, region: Region) -> list[SceneSection]:
+    sections = []
+    for number, (scored, title) in enumerate(comparison.scenes.items()):
+        pictures, reason = None, ""
+        try:
+            pictures = scene_pictures(comparison, scored, wanted, metric, region)
+        except NerfroError as error:  # data that has moved away does not spoil the rest of the page
+            reason = str(error)
+        logged = [
+            (method, read_curves(run.folder))
+            for method, name in enumerate(comparison.methods)
+            for run in comparison.cells.get((name, scored), ())
+        ]
+        sections.append(SceneSection(f"{prefix}s{number}", title, draw_charts(logged), pictures, reason))
+    return sections
+
+
+def _provenance(comparison: Comparison, run: Run) -> Provenance:
+    place = next(place for place, runs in comparison.cells.items() if run in runs)
+    facts, metrics = run.facts, run.metrics
+    commit = facts.get("commit") or "not a git checkout"
+    texts: dict[str, Any] = {
+        "command": facts["command"],
+        "commit": f"{commit}, with changes kept in git.diff" if facts.get("modified") else commit,
+        "device": device(run.config, facts),
+        "spent": _spent(metrics.steps, metrics.train_seconds, metrics.rays_per_second),
+        "versions": ", ".join(f"{name} {version}" for name, version in facts["versions"].items() if version),
+        "python": facts["python"],
+    }
+    config = OmegaConf.to_yaml(OmegaConf.create(json.loads(json.dumps(run.config))))
+    method, scored = place
+    return Provenance(method, comparison.scenes[scored], run.seed, shown(run.folder), texts, config)
+
+
+def _spent(steps: int | None, seconds: float | None, rays_per_second: float | None) -> str:
+    parts = [f"{steps:,} steps" if steps is not None else "", duration(seconds) if seconds is not None else ""]
+    parts.append(f"{rays_per_second:,.0f} rays/s" if rays_per_second is not None else "")
+    return ", ".join(part for part in parts if part)

@@ -1,0 +1,220 @@
+"""Run folders as other tools see them: what was trained at which cost, and what it scored."""
+
+from __future__ import annotations
+
+import glob
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from PIL import Image
+
+from nerfro.errors import NerfroError
+from nerfro.evaluation.results import RunMetrics, read_metrics_json
+from nerfro.paths import EMBEDDED_PREFIX
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a training was allowed to spend; only runs of one budget can be compared.
+
+    Attributes:
+        seconds: wall-clock time, None if it was not limited.
+        steps: optimisation steps, None if they were not limited.
+        rays: of a step; None if only the time was limited.
+        device: on which the time was spent; None if only the steps were limited, which cost the same everywhere.
+    """
+
+    seconds: float | None
+    steps: int | None
+    rays: int | None
+    device: str | None
+
+    @property
+    def file_name(self) -> str:
+        """The label as a file name, without suffix."""
+        return re.sub(r"\W+", "_", self.label.replace(",", "")).strip("_")
+
+    @property
+    def label(self) -> str:
+        """As in "4 min on 1 CPU thread (x86_64)" or "200,000 steps of 1,024 rays"."""
+        steps = "" if self.steps is None else f"{self.steps:,} steps of {self.rays:,} rays"
+        if self.seconds is None:
+            return steps
+        return f"{duration(self.seconds)} on {self.device}" + (f", at most {steps}" if steps else "")
+
+
+@dataclass(frozen=True)
+class Scored:
+    """What a run was scored on; scores of different ones are different quantities.
+
+    Attributes:
+        root: folder of the data.
+        split: of the data.
+        num_views: pictures that were scored.
+        width, height: of the pictures, in pixels.
+        protocol: "8bit" or "float", see `EvaluationResult`.
+        reading: options of the data source, apart from the folder and the range of its rays.
+    """
+
+    root: str
+    split: str
+    num_views: int
+    width: int
+    height: int
+    protocol: str
+    reading: tuple[tuple[str, str], ...]
+
+    @property
+    def name(self) -> str:
+        """Last part of the folder's name."""
+        return Path(self.root.removeprefix(EMBEDDED_PREFIX)).name
+
+
+@dataclass(frozen=True)
+class Run:
+    """An evaluated run.
+
+    Attributes:
+        folder: where it lies.
+        config: its resolved configuration.
+        facts: its run.json: command, commit, versions and machine.
+        metrics: scores and what was spent.
+        budget: what it was allowed to spend.
+        scored: what it was scored on.
+        evaluated_at: when its scores were written, seconds since the epoch.
+    """
+
+    folder: Path
+    config: Mapping[str, Any]
+    facts: Mapping[str, Any]
+    metrics: RunMetrics
+    budget: Budget
+    scored: Scored
+    evaluated_at: float
+
+    @property
+    def name(self) -> str:
+        return str(self.config["name"])
+
+    @property
+    def seed(self) -> int:
+        return int(self.config["seed"])
+
+
+def find_runs(places: Sequence[str]) -> tuple[list[Run], list[str]]:
+    """Read all runs below some folders.
+
+    Args:
+        places: run folders, folders that hold some at any depth, or globs of either.
+
+    Returns:
+        The evaluated runs by folder, and a line on each run that has no scores.
+
+    Raises:
+        NerfroError: a place does not exist, none holds an evaluated run, or a run's files are damaged.
+    """
+    folders: set[Path] = set()
+    for place in places:
+        matches = [Path(match) for match in glob.glob(str(Path(place).expanduser()), recursive=True)]
+        if not matches:
+            raise NerfroError(f"runs: {place} does not exist; give run folders, folders that hold some, or globs")
+        folders |= {file.parent.resolve() for match in matches for file in match.rglob("run.json")}
+    runs, unfinished = [], []
+    for folder in sorted(folders):
+        if (folder / "metrics.json").is_file():
+            runs.append(read_run(folder))
+        else:
+            unfinished.append(f"{shown(folder)} is left out: it has no metrics.json, so it has not been evaluated")
+    if not runs:
+        reason = f"; {unfinished[0]}" if unfinished else "; nerfro.train writes one into every run folder"
+        raise NerfroError(f"runs: no metrics.json beside a run.json below {', '.join(places)}{reason}")
+    return runs, unfinished
+
+
+def read_run(folder: Path) -> Run:
+    """Read an evaluated run folder.
+
+    Raises:
+        NerfroError: a file is missing or damaged.
+    """
+    metrics = read_metrics_json(folder / "metrics.json")
+    try:
+        config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"), resolve=True)
+        facts = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+        data, trainer = config["data"], config["trainer"]
+        view = metrics.result.views[0].name
+        with Image.open(folder / "images" / f"{view}.png") as image:
+            width, height = image.size
+        reading = sorted((key, str(value)) for key, value in data.items() if key not in ("root", "near", "far"))
+        return Run(
+            folder=folder,
+            config=config,
+            facts=facts,
+            metrics=metrics,
+            budget=_budget(trainer, int(config["batches"]["size"]), facts),
+            scored=Scored(
+                root=_root(str(data["root"])),
+                split=str(config["evaluation"]["split"]),
+                num_views=len(metrics.result.views),
+                width=width,
+                height=height,
+                protocol=metrics.result.protocol,
+                reading=tuple(reading),
+            ),
+            evaluated_at=(folder / "metrics.json").stat().st_mtime,
+        )
+    except OSError as error:
+        reason = f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}"
+        raise NerfroError(f"the run {shown(folder)} cannot be read: {reason}; repair it or leave it out") from error
+    except (OmegaConfBaseException, KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+        reason = str(error).strip().split("\n", 1)[0]
+        raise NerfroError(
+            f"the run {shown(folder)} is not as nerfro.train writes it ({type(error).__name__}: {reason}); leave it out"
+        ) from error
+
+
+def duration(seconds: float) -> str:
+    """As in "1 h 30 min", "4 min" or "20 s"."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    parts = [f"{number} {unit}" for number, unit in ((hours, "h"), (minutes, "min"), (rest, "s")) if number]
+    return " ".join(parts) or "0 s"
+
+
+def shown(folder: Path) -> str:
+    """A folder as the user would type it: relative to the current one where it lies below it."""
+    return str(folder.relative_to(Path.cwd())) if folder.is_relative_to(Path.cwd()) else str(folder)
+
+
+def device(config: Mapping[str, Any], facts: Mapping[str, Any]) -> str:
+    """What a run was trained on, as in "NVIDIA H200" or "2 CPU threads (x86_64)"."""
+    trainer = config["trainer"]
+    if facts.get("gpu") and trainer["accelerator"] != "cpu":
+        number = trainer["devices"]
+        return facts["gpu"] if number == 1 else f"{number} x {facts['gpu']}"
+    threads = facts["threads"]
+    return f"{threads} CPU thread{'s' if threads != 1 else ''} ({facts['machine']})"
+
+
+def _budget(trainer: Mapping[str, Any], rays: int, facts: Mapping[str, Any]) -> Budget:
+    limit, steps = trainer.get("max_time"), trainer.get("max_steps", -1)
+    seconds = None
+    if isinstance(limit, str):  # DD:HH:MM:SS
+        days, hours, minutes, rest = map(float, limit.split(":"))
+        seconds = timedelta(days=days, hours=hours, minutes=minutes, seconds=rest).total_seconds()
+    elif limit is not None:
+        seconds = timedelta(**limit).total_seconds()
+    limited = steps is not None and steps >= 0
+    where = None if seconds is None else device({"trainer": trainer}, facts)
+    return Budget(seconds, steps if limited else None, rays if limited else None, where)
+
+
+def _root(root: str) -> str:
+    return root if root.startswith(EMBEDDED_PREFIX) else str(Path(root).expanduser().resolve())

@@ -1,0 +1,236 @@
+"""The pictures of a comparison's page: some views of a scene by every method, their errors, and insets."""
+
+from __future__ import annotations
+
+import base64
+import io
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from omegaconf import OmegaConf
+from PIL import Image
+from torch import Tensor
+
+from nerfro.data.base import Views
+from nerfro.errors import NerfroError
+from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, magma, squared_error_map
+from nerfro.evaluation.images import load_png, to_8bit
+from nerfro.evaluation.pictures import Crop, most_telling_crop
+from nerfro.evaluation.results import Metric, Region
+from nerfro.evaluation.tables import MISSING
+from nerfro.registry import build
+from nerfro.report.comparison import Comparison
+from nerfro.report.runs import Run, Scored
+
+NUM_CROPS = 2
+CROP_SHARE = 4  # an inset's side is this part of the picture's shorter one
+PNG_SIDE = 256  # pixels; larger pictures are embedded as JPEG, or a page of many would not load
+JPEG_QUALITY = 95
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Which pictures a page shows.
+
+    Attributes:
+        num_views: of each scene, evenly spread; 0 for all.
+        view: of the figure, by the scene's name.
+        crops: insets of the figure, by the scene's name.
+    """
+
+    num_views: int
+    view: Mapping[str, int]
+    crops: Mapping[str, tuple[Crop, ...]]
+
+    @classmethod
+    def of(cls, num_views: int, view: Any, crops: Any) -> Wanted:
+        """Check the form of what the user gave; `view` and `crops` may be None.
+
+        Raises:
+            NerfroError: a negative number of views, or `view` or `crops` is not what `SummaryConfig` says.
+        """
+        if num_views < 0:
+            raise NerfroError(f"views={num_views} is not a number of views; give 1 or more, or 0 for all")
+        try:
+            chosen = {str(scene): int(index) for scene, index in (view or {}).items()}
+        except (AttributeError, TypeError, ValueError) as error:
+            raise NerfroError(f"view={view} does not name views of scenes; give {{SCENE: INDEX}}") from error
+        try:
+            insets = {
+                str(scene): tuple(Crop(*map(int, square)) for square in squares)
+                for scene, squares in (crops or {}).items()
+            }
+        except (AttributeError, TypeError, ValueError) as error:
+            raise NerfroError(
+                f"crops={crops} does not name squares; give {{SCENE: [[TOP, LEFT, SIZE], ...]}} in pixels"
+            ) from error
+        return cls(num_views, chosen, insets)
+
+    def check(self, scenes: Sequence[Scored]) -> None:
+        """Refuse what fits no scene.
+
+        Raises:
+            NerfroError: a scene is not among those given, has no such view, or a crop lies outside of its pictures.
+        """
+        named = {scene.name: scene for scene in scenes}
+        for name in (*self.view, *self.crops):
+            if name not in named:
+                raise NerfroError(f"'{name}' is not a scene of these runs; choose from {', '.join(sorted(named))}")
+        for scene in scenes:
+            if not 0 <= self.view.get(scene.name, 0) < scene.num_views:
+                raise NerfroError(
+                    f"view.{scene.name}={self.view[scene.name]} is not a view; give 0 to {scene.num_views - 1}"
+                )
+            for crop in self.crops.get(scene.name, ()):
+                inside = crop.top + crop.size <= scene.height and crop.left + crop.size <= scene.width
+                if min(crop.top, crop.left) < 0 or crop.size < 1 or not inside:
+                    raise NerfroError(
+                        f"crops.{scene.name}: {crop} does not lie inside {scene.width} x {scene.height} pixels"
+                    )
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A picture on the page: what it shows in words, and its value of the metric; the picture itself as a data URI."""
+
+    label: str
+    score: str
+    uri: str
+
+
+@dataclass(frozen=True)
+class View:
+    """A view by all methods that rendered it.
+
+    Attributes:
+        index: of the view in its split.
+        reference: the ground truth.
+        predictions, errors: of the methods, by their number in the comparison.
+    """
+
+    index: int
+    reference: Shown
+    predictions: Mapping[int, Shown]
+    errors: Mapping[int, Shown]
+
+
+@dataclass(frozen=True)
+class ScenePictures:
+    """What a page shows of a scene.
+
+    Attributes:
+        width, height: of each picture, in pixels.
+        views: those that can be chosen.
+        figure: the view of the figure, one of them.
+        crops: its insets.
+        methods: titles by number; those that have not been trained on this scene are absent.
+        seeds: of the runs whose pictures these are.
+    """
+
+    width: int
+    height: int
+    views: tuple[View, ...]
+    figure: View
+    crops: tuple[Crop, ...]
+    methods: Mapping[int, str]
+    seeds: Sequence[int]
+
+
+def scene_pictures(
+    comparison: Comparison, scored: Scored, wanted: Wanted, metric: Metric, region: Region
+) -> ScenePictures:
+    """Gather the pictures of a scene.
+
+    Memory: all pictures of the split, as the loader returns them.
+
+    Args:
+        comparison: the runs; of each method the first seed is shown.
+        scored: the scene.
+        wanted: which views and insets.
+        metric: whose value is written below each picture.
+        region: that it was measured on.
+
+    Raises:
+        NerfroError: the references cannot be read, or a run's pictures are missing or of another size.
+    """
+    cells = [comparison.cells.get((method, scored)) for method in comparison.methods]
+    runs = {number: cell[0] for number, cell in enumerate(cells) if cell}
+    titles = {number: comparison.methods[number] for number in runs}
+    first = next(iter(runs.values()))
+    references: Views = build(OmegaConf.create(dict(first.config["data"]))).load(scored.split)
+    if tuple(references.images.shape[:3]) != (scored.num_views, scored.height, scored.width):
+        raise NerfroError(f"{scored.root} does not hold the views that were scored; has it been changed since?")
+    figure = wanted.view.get(scored.name, _median_view(list(runs.values()), metric, region))
+    count = min(wanted.num_views or scored.num_views, scored.num_views)
+    views = {
+        index: _view(index, references.images[index].cpu(), runs, titles, metric, region)
+        for index in sorted({round(i) for i in np.linspace(0, scored.num_views - 1, count)} | {figure})
+    }
+    crops = wanted.crops.get(scored.name)
+    if crops is None:
+        crops = _choose_crops(references.images[figure].cpu(), [_prediction(run, figure) for run in runs.values()])
+    return ScenePictures(
+        width=scored.width,
+        height=scored.height,
+        views=tuple(views.values()),
+        figure=views[figure],
+        crops=crops,
+        methods=titles,
+        seeds=sorted({run.seed for run in runs.values()}),
+    )
+
+
+def _median_view(runs: Sequence[Run], metric: Metric, region: Region) -> int:
+    """The view whose mean score over methods is the median: neither the best nor the worst that could be shown."""
+    scores = []
+    for index in range(len(runs[0].metrics.result.views)):
+        values = [run.metrics.result.views[index].score(metric.name, region) for run in runs]
+        scores.append(statistics.fmean([value for value in values if value is not None] or [0.0]))
+    return scores.index(statistics.median_low(scores))
+
+
+def _view(
+    index: int,
+    reference: Tensor,
+    runs: Mapping[int, Run],
+    titles: Mapping[int, str],
+    metric: Metric,
+    region: Region,
+) -> View:
+    predictions, errors = {}, {}
+    for number, run in runs.items():
+        picture, title = _prediction(run, index), titles[number]
+        value = run.metrics.result.views[index].score(metric.name, region)
+        score = f"{metric.title} {MISSING if value is None else f'{value:.{metric.decimals}f}'}"
+        error = magma(squared_error_map(picture, reference), SQUARED_ERROR_LIMIT)
+        predictions[number] = Shown(f"{title}, view {index}", score, data_uri(picture))
+        errors[number] = Shown(f"squared error of {title}, view {index}", score, data_uri(error))
+    return View(index, Shown(f"reference, view {index}", "", data_uri(reference)), predictions, errors)
+
+
+def _prediction(run: Run, index: int) -> Float[Tensor, "H W 3"]:
+    return load_png(run.folder / "images" / f"{run.metrics.result.views[index].name}.png")
+
+
+def _choose_crops(reference: Tensor, predictions: Sequence[Tensor]) -> tuple[Crop, ...]:
+    size = max(min(reference.shape[:2]) // CROP_SHARE, 1)
+    crops: list[Crop] = []
+    for _ in range(NUM_CROPS):
+        crops.append(most_telling_crop(reference, predictions, size, apart_from=crops))
+    return tuple(crops)
+
+
+def data_uri(picture: Float[Tensor, "H W 3"]) -> str:
+    """A picture as text: PNG up to `PNG_SIDE` pixels a side, JPEG beyond."""
+    exact = max(picture.shape[:2]) <= PNG_SIDE
+    encoded = io.BytesIO()
+    image = Image.fromarray(to_8bit(picture).numpy())
+    if exact:
+        image.save(encoded, format="PNG", optimize=True)
+    else:
+        image.save(encoded, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
+    return f"data:image/{'png' if exact else 'jpeg'};base64,{base64.b64encode(encoded.getvalue()).decode()}"

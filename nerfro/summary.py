@@ -1,0 +1,99 @@
+"""`python -m nerfro.summary runs=[outputs]`: many runs in one table, and on one page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Optional
+
+import rich
+from omegaconf import DictConfig, ListConfig
+
+from nerfro.cli import entry_point
+from nerfro.errors import NerfroError
+from nerfro.evaluation.files import write_atomically
+from nerfro.evaluation.results import FULL, OBJECT_REGIONS
+from nerfro.evaluation.tables import to_rich, write_table
+from nerfro.report.comparison import compare, find_metrics, to_table
+from nerfro.report.page import report_page, table_page
+from nerfro.report.runs import find_runs
+from nerfro.report.views import Wanted
+
+
+@dataclass
+class SummaryConfig:
+    """What `python -m nerfro.summary` is asked.
+
+    Attributes:
+        runs: run folders, folders that hold some at any depth, or globs of either.
+        out: folder for the tables, one for each budget, as .csv, .md, .tex and .html, and for the report;
+            none only prints.
+        report: whether to write the page `report.html`, to `outputs/summary` if `out` is none.
+        metrics: columns of each scene, see docs/metrics.md.
+        region: of the pictures: full, mask or crop.
+        methods: titles of experiments, in the order of the rows; others follow under their own names.
+        scenes: titles of scenes, by the last part of the data's folder, in the order of the columns.
+        views: number of views of each scene on the page, evenly spread; 0 for all.
+        view: views of the figures, as in {torus: 3}; otherwise those of the median score.
+        crops: insets of the figures, as in {torus: [[top, left, size], ...]}, pixels; otherwise those where methods
+            differ most.
+        overwrite: whether files in `out` may be replaced.
+    """
+
+    runs: Any = field(default_factory=lambda: ["outputs"])
+    out: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    report: bool = False
+    metrics: list[str] = field(default_factory=lambda: ["psnr", "ssim", "lpips"])
+    region: str = FULL
+    methods: dict[str, str] = field(default_factory=dict)
+    scenes: dict[str, str] = field(default_factory=dict)
+    views: int = 8
+    view: Any = None
+    crops: Any = None
+    overwrite: bool = False
+
+
+@entry_point("summary", SummaryConfig)
+def main(config: DictConfig) -> None:
+    """Read, compare, print, write."""
+    if config.region not in (FULL, *OBJECT_REGIONS):
+        raise NerfroError(f"region={config.region} is not a region; choose from {', '.join((FULL, *OBJECT_REGIONS))}")
+    wanted = Wanted.of(config.views, config.view, config.crops)
+    metrics = find_metrics(config.metrics)
+    places = list(config.runs) if isinstance(config.runs, ListConfig) else [str(config.runs)]
+    runs, unfinished = find_runs(places)
+    wanted.check([run.scored for run in runs])
+    comparisons = compare(runs, config.methods, config.scenes)
+    tables = {c.budget.file_name: to_table(c, metrics, config.region) for c in comparisons}
+
+    folder = "outputs/summary" if config.out is None and config.report else config.out
+    out = None if folder is None else Path(folder).expanduser()
+    if out is not None:
+        names = [name + suffix for name in tables for suffix in (".csv", ".md", ".tex", ".html")]
+        _refuse_overwriting(out, [*names, "report.html"] if config.report else names, config.overwrite)
+    for table in tables.values():
+        rich.print(to_rich(table))
+    for line in unfinished:
+        print(line)
+    if out is None:
+        return
+    for name, table in tables.items():
+        write_table(table, out / name)
+        write_atomically(out / f"{name}.html", table_page(table))
+    print(f"tables: {out}")
+    if config.report:
+        page = report_page(
+            list(zip(comparisons, tables.values(), strict=True)), unfinished, wanted, metrics[0], config.region
+        )
+        write_atomically(out / "report.html", page)
+        print(f"report: {out / 'report.html'}, {len(page) / 2**20:.1f} MiB")
+
+
+def _refuse_overwriting(folder: Path, names: list[str], overwrite: bool) -> None:
+    present = [name for name in names if (folder / name).exists()]
+    if present and not overwrite:
+        raise NerfroError(f"{folder / present[0]} exists; give another out=... or overwrite=true")
+
+
+if __name__ == "__main__":
+    main()
