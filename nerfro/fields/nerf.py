@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+from math import inf
+from operator import lt
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.fields.encoding import positional_encoding
 from nerfro.fields.mlp import RadianceMLP
+from nerfro.fields.selection import evaluate_selected, inside_box
 from nerfro.registry import register
 from nerfro.types import Radiance, Samples
 
@@ -18,7 +27,14 @@ class NerfField(Field):
         position_degree: octaves of the position's encoding; positions are raw world coordinates.
         direction_degree: octaves of the direction's encoding.
         normalise: length in world units that counts as one before encoding; 1 leaves positions as they are.
+        box_min, box_max: opposite corners of the content's bounds, world units. Samples outside are not evaluated;
+            nothing is there. Infinite ones have every sample evaluated, as the authors do.
+
+    Raises:
+        NerfroError: the box is empty.
     """
+
+    box: Float[Tensor, "2 3"]
 
     def __init__(
         self,
@@ -29,13 +45,30 @@ class NerfField(Field):
         position_degree: int = 10,
         direction_degree: int = 4,
         normalise: float = 1.0,
+        box_min: list[float] = (-inf, -inf, -inf),  # type: ignore[assignment]
+        box_max: list[float] = (inf, inf, inf),  # type: ignore[assignment]
     ) -> None:
         super().__init__()
+        if len(box_min) != 3 or len(box_max) != 3 or not all(map(lt, box_min, box_max)):
+            raise NerfroError(
+                f"field=nerf: box from {list(box_min)} to {list(box_max)} is empty; "
+                "give three numbers each, box_min below box_max"
+            )
+        self.register_buffer("box", torch.tensor([list(box_min), list(box_max)]), persistent=False)
+        self.everywhere = not self.box.isfinite().any()
         self.position_degree, self.direction_degree, self.normalise = position_degree, direction_degree, normalise
         num_position, num_direction = 3 * (1 + 2 * position_degree), 3 * (1 + 2 * direction_degree)
         self.mlp = RadianceMLP(num_position, num_direction, width, depth, skip, view_width)
 
     def forward(self, samples: Samples) -> Radiance:
-        position = positional_encoding(samples.positions / self.normalise, 0, self.position_degree)
-        direction = positional_encoding(samples.directions, 0, self.direction_degree)
-        return Radiance(*self.mlp(position, direction))
+        if self.everywhere:
+            return Radiance(*self.decode(samples.positions, samples.directions))
+        return evaluate_selected(self.decode, samples, inside_box(samples.positions, *self.box))
+
+    def decode(
+        self, positions: Float[Tensor, "*batch 3"], directions: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+        """Density and colour at positions, seen along unit directions."""
+        position = positional_encoding(positions / self.normalise, 0, self.position_degree)
+        direction = positional_encoding(directions, 0, self.direction_degree)
+        return self.mlp(position, direction)

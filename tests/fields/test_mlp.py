@@ -96,3 +96,21 @@ def test_mip_nerf_field_sees_the_size_of_the_cone() -> None:
 def test_empty_networks_are_refused(width: int, depth: int) -> None:
     with pytest.raises(NerfroError, match=f"width {width} and depth {depth} is empty; take 1 or more of each"):
         SkipMLP(3, width, depth, 1)
+
+
+def test_nerf_field_with_a_box_equals_one_without_inside_and_is_empty_outside() -> None:
+    everywhere = NerfField(width=16, depth=2, skip=1, view_width=8)
+    inside = NerfField(width=16, depth=2, skip=1, view_width=8, box_min=[-0.4, -0.5, -0.6], box_max=[0.6, 0.5, 0.4])
+    inside.load_state_dict(everywhere.state_dict())
+    samples = Stratified(32)(example_path(8), None)
+    kept = ((samples.positions > inside.box[0]) & (samples.positions < inside.box[1])).all(-1)
+    assert 0 < kept.sum() < kept.numel()
+    expected, radiance = everywhere(samples), inside(samples)
+    torch.testing.assert_close(radiance.density, expected.density * kept)
+    torch.testing.assert_close(radiance.rgb, expected.rgb * kept[..., None])
+
+
+@pytest.mark.parametrize("box_max", [[1.0, 0.0, 1.0], [1.0, 1.0]])
+def test_nerf_field_refuses_an_empty_box(box_max: list[float]) -> None:
+    with pytest.raises(NerfroError, match="is empty"):
+        NerfField(box_min=[0.0, 0.0, 0.0], box_max=box_max)

@@ -1,0 +1,299 @@
+"""How fast training and rendering are, and what a time budget buys. Each part prints Markdown; see docs/benchmarks.md.
+
+    python benchmarks/training.py step                        # a step of the paper's recipe, plain and fast
+    python benchmarks/training.py curve                       # their losses over 200 steps
+    python benchmarks/training.py profile refractive          # where a step's milliseconds go
+    python benchmarks/training.py budget 00:00:05:00          # default preset and paper's recipe, given the same time
+    python benchmarks/training.py view RUN/checkpoints/last.ckpt   # rendering a 400x400 view
+
+The embedded scene, all cores unless OMP_NUM_THREADS and NUMBA_NUM_THREADS say otherwise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from datetime import date
+from pathlib import Path
+
+import lightning.pytorch as pl
+import numpy as np
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig
+from torch.profiler import ProfilerActivity, profile, record_function
+from torch.utils.flop_counter import FlopCounterMode
+
+from nerfro.config import TrainConfig, build_model
+from nerfro.data.module import RayDataModule
+from nerfro.data.ray_batches import RayBatches
+from nerfro.evaluate import restore
+from nerfro.evaluation.render_view import Supersampling, render_view
+from nerfro.evaluation.results import read_metrics_json
+from nerfro.kernels.allocator import keep_freed_memory
+from nerfro.models.base import NerfModel
+from nerfro.paths import ASSETS_DIR, CONF_DIR
+from nerfro.registry import build, discover
+from nerfro.run_folder import load_checkpoint
+from nerfro.samplers.path_cache import PathCache
+from nerfro.types import Batch
+
+ROOT = Path(__file__).resolve().parent.parent
+EMBEDDED = ("+scene=torus", f"data.root={ASSETS_DIR / 'torus'}", "data.downscale=1")
+MESH = f"medium.mesh={ASSETS_DIR / 'torus' / 'mesh.ply'}"
+PLAIN, FAST = "paper_refractive", "paper_fast"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parts = parser.add_subparsers(dest="part", required=True)
+    step = parts.add_parser("step")
+    step.add_argument("--turns", type=int, default=3)
+    curve = parts.add_parser("curve")
+    curve.add_argument("--steps", type=int, default=200)
+    curve.add_argument("--rays", type=int, default=64)
+    profiled = parts.add_parser("profile")
+    profiled.add_argument("experiment")
+    profiled.add_argument("--steps", type=int, default=20)
+    budget = parts.add_parser("budget")
+    budget.add_argument("time")
+    view = parts.add_parser("view")
+    view.add_argument("checkpoint", type=Path)
+    arguments = parser.parse_args()
+    keep_freed_memory()
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    print(f"{platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__}, {date.today()}", end="")
+    print(f", load average {os.getloadavg()[0]:.1f}\n")
+    run: dict[str, Callable[[], None]] = {
+        "step": lambda: report_step(arguments.turns),
+        "curve": lambda: report_curve(arguments.steps, arguments.rays),
+        "profile": lambda: report_profile(arguments.experiment, arguments.steps),
+        "budget": lambda: report_budget(arguments.time),
+        "view": lambda: report_view(arguments.checkpoint),
+    }
+    run[arguments.part]()
+
+
+class Steps(pl.Callback):
+    """Wall-clock seconds and total loss of every training step, from one step's end to the next's."""
+
+    def __init__(self) -> None:
+        self.seconds: list[float] = []
+        self.losses: list[float] = []
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        self._last = time.perf_counter()
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object, batch: Batch, batch_idx: int
+    ) -> None:
+        now = time.perf_counter()
+        self.seconds.append(now - self._last)
+        self._last = now
+        self.losses.append(float(trainer.callback_metrics["loss/total"]))
+
+
+class Training:
+    """An experiment on the embedded scene that can be trained for a few steps at a time, as nerfro.train does it.
+
+    Args:
+        overrides: Hydra overrides of conf/train.yaml.
+    """
+
+    def __init__(self, *overrides: str) -> None:
+        ConfigStore.instance().store(name="train_schema", node=TrainConfig, provider="nerfro")
+        discover()
+        with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+            self.config: DictConfig = compose("train", [*overrides])
+        pl.seed_everything(self.config.seed, verbose=False)
+        wanted, views = self.config.batches, build(self.config.data).load("train")
+        self.model: NerfModel = build_model(self.config)
+        if wanted.cache_paths and not wanted.jitter and self.model.path_sampler.few_vertices:
+            self.model.path_cache = PathCache.build(self.model.path_sampler, self.model.medium, views.cameras)
+        self.batches = RayBatches(views, wanted.size, wanted.batching, self.config.seed, jitter=wanted.jitter)
+        self.num_rays = wanted.size
+
+    def run(self, num_steps: int) -> Steps:
+        """Train for some steps with a new optimiser."""
+        steps = Steps()
+        trainer = pl.Trainer(
+            max_steps=num_steps,
+            callbacks=[steps],
+            precision=self.config.trainer.precision,
+            logger=False,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            limit_val_batches=0,
+            num_sanity_val_steps=0,
+            use_distributed_sampler=False,
+        )
+        trainer.fit(self.model, datamodule=RayDataModule(self.batches, None, 0))
+        return steps
+
+
+def paper_recipe(experiment: str, *overrides: str) -> Training:
+    """The paper's recipe on the embedded scene; its index grid has 256 instead of 512 vertices a side."""
+    return Training(*EMBEDDED, f"+experiment={experiment}", MESH, "medium.resolution=256", *overrides)
+
+
+def report_step(turns: int) -> None:
+    """A step of 1024 rays in single precision with every sample evaluated, and what makes it faster."""
+    variants = {
+        "plain: float32, every sample evaluated (`paper_refractive`)": paper_recipe(PLAIN),
+        "bfloat16 products (`trainer.precision=bf16-mixed`)": paper_recipe(PLAIN, "trainer.precision=bf16-mixed"),
+        "bfloat16, only samples in the object's bounds (`paper_fast`)": paper_recipe(FAST),
+    }
+    fastest = dict.fromkeys(variants, float("inf"))
+    for _ in range(turns):
+        for name, training in variants.items():
+            fastest[name] = min(fastest[name], *training.run(3).seconds[1:])  # the first one allocates
+    plain, *_ = fastest.values()
+    print("| step of the paper's recipe, 1024 rays | ms | speed-up |\n|---|---|---|")
+    for name, seconds in fastest.items():
+        print(f"| {name} | {1e3 * seconds:.0f} | {plain / seconds:.1f}x |")
+
+
+def report_curve(num_steps: int, num_rays: int) -> None:
+    """Total losses of plain and fast training from the same weights and pixels, against other pixels."""
+    rate = ("optimizer.warmup_steps=0", f"batches.size={num_rays}")  # no warm-up, or nothing would be learned yet
+    bf16 = "trainer.precision=bf16-mixed"
+    runs = {
+        "plain": paper_recipe(PLAIN, *rate),
+        "bfloat16 products": paper_recipe(PLAIN, *rate, bf16),
+        "`paper_fast`": paper_recipe(FAST, *rate),
+        "plain, another seed": paper_recipe(PLAIN, *rate, "seed=1"),
+    }
+    losses = {name: np.array(training.run(num_steps).losses) for name, training in runs.items()}
+    print(f"Total loss, {num_rays} rays a step, mean of 50 steps:\n")
+    windows = range(0, num_steps, 50)
+    print(f"| run | {' | '.join(f'{w + 1} to {w + 50}' for w in windows)} | mean difference from plain, step by step |")
+    print("|---|" + "---|" * (len(windows) + 1))
+    for name, loss in losses.items():
+        means = " | ".join(f"{loss[w : w + 50].mean():.4f}" for w in windows)
+        print(f"| {name} | {means} | {np.abs(loss - losses['plain']).mean():.4f} |")
+
+
+def report_profile(experiment: str, num_steps: int) -> None:
+    """Share of a step's time by part, its matrix work, and the rate of that work against the machine's."""
+    paper = experiment.startswith("paper")
+    training = paper_recipe(experiment) if paper else Training(f"+experiment={experiment}")
+    model = training.model
+    training.run(3)
+    with FlopCounterMode(display=False) as counter:
+        training.run(1)
+    flops = counter.get_total_flops()
+    seconds = float(np.mean(training.run(num_steps).seconds[1:]))
+    parts = {
+        "point sampling": [(model.point_sampler, "forward")],
+        "fields, forward": [(field, "forward") for field in model.fields],
+        "boundary, forward": [(model.boundary, "forward")],
+        "losses, forward": [(loss, "forward") for loss in model.losses.values()],
+    }
+    if model.path_cache is None:
+        parts = {"tracing": [(model.path_sampler, "forward")], **parts}
+    else:
+        parts = {"cached paths": [(PathCache, "__call__")], **parts}
+    around = {
+        "batch of pixels and rays": [(RayBatches, "batch")],
+        "update of the density grid": [(model.point_sampler, "after_step")],
+        "backward pass": [(torch.Tensor, "backward")],
+    }
+    whole = {"training step": [(model, "training_step")], "Adam": [(torch.optim.Adam, "step")]}
+    with ExitStack() as stack:
+        for name, methods in (parts | around | whole).items():
+            for owner, method in methods:
+                label(stack, owner, method, name)
+        with profile(activities=[ProfilerActivity.CPU]) as measured:
+            training.run(num_steps)
+    events = {event.key: event.cpu_time_total / 1e3 / num_steps for event in measured.key_averages()}
+    ms = {name: events.get(name, 0.0) for name in (parts | around | whole)}
+    # Lightning runs the whole step inside the optimiser's.
+    ms["Adam"] -= ms["training step"] + ms["backward pass"]
+    ms["compositing, logging"] = ms.pop("training step") - sum(ms[name] for name in parts)
+    print(f"| {experiment}, {training.num_rays} rays | ms a step |\n|---|---|")
+    for name, value in ms.items():
+        print(f"| {name} | {value:.2f} |")
+    print(f"| all of a step, without the profiler | {1e3 * seconds:.2f} |\n")
+    print(
+        f"{flops / 1e9:.1f} GFLOP of matrix products a step: {flops / seconds / 1e12:.3f} TFLOP/s over the whole step."
+    )
+    for dtype in (torch.float32, torch.bfloat16):
+        rate = matrix_rate(dtype) / 1e12
+        print(f"A product of 65536x256 and 256x256 in {str(dtype)[6:]} runs at {rate:.2f} TFLOP/s.")
+
+
+def label(stack: ExitStack, owner: object, method: str, name: str) -> None:
+    """Have a method's calls counted under a name in a profile, until the stack unwinds."""
+    original = getattr(owner, method)
+
+    def labelled(*args: object, **kwargs: object) -> object:
+        with record_function(name):
+            return original(*args, **kwargs)
+
+    shadowed = method in vars(owner)
+    setattr(owner, method, labelled)
+    stack.callback(lambda: setattr(owner, method, original) if shadowed else delattr(owner, method))
+
+
+def matrix_rate(dtype: torch.dtype, turns: int = 10) -> float:
+    """Floating-point operations per second of a product with a layer of 256 units."""
+    a, b = torch.randn(65536, 256).to(dtype), torch.randn(256, 256).to(dtype)
+    return 2 * a.shape[0] * b.shape[0] * b.shape[1] / min(timed(lambda: a @ b) for _ in range(turns))
+
+
+def timed(task: Callable[[], object]) -> float:
+    """Seconds of one call."""
+    start = time.perf_counter()
+    task()
+    return time.perf_counter() - start
+
+
+def report_budget(budget: str) -> None:
+    """Test scores of the default preset and of the paper's recipe after the same time on the embedded scene."""
+    paper = [*EMBEDDED, MESH, "medium.resolution=256"]
+    commands = {"refractive": [], PLAIN: paper, FAST: paper}
+    print(
+        f"| experiment | steps in {budget} | rays/s | PSNR, 20 test views | SSIM |\n|---|---|---|---|---|", flush=True
+    )
+    for name, overrides in commands.items():
+        folder = ROOT / "outputs" / "training_benchmark" / f"{name}_{budget.replace(':', '')}"
+        if not (folder / "metrics.json").exists():
+            command = [sys.executable, "-m", "nerfro.train", *overrides, f"+experiment={name}"]
+            command += [f"trainer.max_time={budget}", "trainer.max_steps=-1", "evaluation.every=0"]
+            with (ROOT / "outputs" / f"{name}.log").open("w") as log:
+                subprocess.run([*command, f"hydra.run.dir={folder}"], check=True, cwd=ROOT, stdout=log, stderr=log)
+        run = read_metrics_json(folder / "metrics.json")
+        means = run.result.means
+        print(
+            f"| `{name}` | {run.steps} | {run.rays_per_second:.0f} | {means['psnr']:.2f} | {means['ssim']:.3f} |",
+            flush=True,
+        )
+
+
+def report_view(path: Path, side: int = 400, turns: int = 5) -> None:
+    """Seconds to render a view of the test camera at 400x400 with one ray a pixel, and supersampled as trained."""
+    checkpoint, config = load_checkpoint(path)
+    model = restore(checkpoint, config)
+    cameras = build(config.data).load("test").cameras
+    scale = side / cameras.width
+    intrinsics = {name: getattr(cameras, name) * scale for name in ("fx", "fy", "cx", "cy")}
+    cameras = replace(cameras, **intrinsics, width=side, height=side)
+    print(f"| 400x400 view of `{config.name}` | s |\n|---|---|")
+    supersampled = Supersampling(config.evaluation.supersample, config.evaluation.divergence)
+    for name, sampling in (("one ray a pixel", Supersampling(1, 0.0)), ("supersampled", supersampled)):
+        seconds = min(timed(lambda: render_view(model, cameras, 0, sampling)) for _ in range(turns))  # noqa: B023
+        print(f"| {name} | {seconds:.2f} |")
+
+
+if __name__ == "__main__":
+    main()
