@@ -119,3 +119,7 @@ def _require(pictures: Mapping[str, Path], partners: Collection[str], partner: s
             f"{len(bare)} of {len(pictures)} pictures have no {partner} ({bare[0]} is the first); "
             "files are matched by their names without extension: add or rename what is missing, or take it out"
         )
+
+
+def _size(picture: Tensor) -> str:
+    return f"{picture.shape[1]}x{picture.shape[0]}"

@@ -4,8 +4,8 @@
 
 Both packages take the backbones from torchvision, which does not load beside a CPU build of torch. Here a module of
 that name that holds nothing but AlexNet and VGG-16 stands in for it, which is why this cannot run inside the test
-process. INPUT holds `predictions` and `targets` [B, 3, H, W] in [0, 1]; OUTPUT for `alex` and for `vgg` the backbone's state
-dict, the distances and, of lpips, the distance maps.
+process. INPUT holds `predictions` and `targets` [B, 3, H, W] in [0, 1]; OUTPUT for `alex` and for `vgg` the state dict
+of the backbone, the distances and, of lpips, the distance maps.
 """
 
 import importlib.machinery

@@ -1,9 +1,15 @@
 import pytest
 import torch
+from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.error_maps import magma, squared_error_map
+from nerfro.evaluation.error_maps import ErrorMap, error_maps, magma, squared_error_map
+from nerfro.evaluation.error_sheets import error_sheet
+from nerfro.evaluation.flip import flip
+from nerfro.evaluation.images import round_to_8bit
+from nerfro.evaluation.lpips import ALEX
 from nerfro.evaluation.metrics import psnr
+from nerfro.evaluation.ssim import ssim
 
 
 def test_mean_of_the_error_map_is_what_psnr_measures() -> None:
@@ -33,3 +39,53 @@ def test_impossible_maps_are_refused() -> None:
         magma(torch.zeros(2, 2), 0)
     with pytest.raises(NerfroError, match="of one size"):
         squared_error_map(torch.zeros(2, 2, 3), torch.zeros(2, 1, 3))
+
+
+class Difference(torch.nn.Module):
+    """Stands in for a network of LPIPS."""
+
+    backbone = ALEX
+
+    def distance_map(self, prediction: Tensor, target: Tensor) -> Tensor:
+        return (prediction - target).abs().mean(-1)
+
+
+def test_means_of_the_maps_are_the_metrics() -> None:
+    prediction, target = torch.rand(2, 40, 36, 3, generator=torch.Generator().manual_seed(0))
+    maps = {error.name: error for error in error_maps(prediction, target, {"lpips": Difference()})}
+    assert list(maps) == ["squared_error", "ssim", "lpips", "flip"]
+    assert all(error.values.shape == (40, 36) for error in maps.values())
+    assert -10 * maps["squared_error"].values.mean().log10() == pytest.approx(psnr(prediction, target).item(), abs=1e-5)
+    assert 1 - maps["ssim"].values.nanmean().item() == pytest.approx(ssim(prediction, target).item(), abs=1e-9)
+    assert maps["lpips"].values.mean().item() == pytest.approx((prediction - target).abs().mean().item(), abs=1e-6)
+    assert maps["flip"].values.mean().item() == pytest.approx(flip(prediction, target).item(), abs=1e-6)
+
+
+def test_border_without_a_window_has_no_similarity_and_is_grey() -> None:
+    prediction, target = torch.rand(2, 16, 20, 3, generator=torch.Generator().manual_seed(0))
+    error = error_maps(prediction, target)[1]
+    assert error.values[5:-5, 5:-5].isfinite().all()
+    assert error.values.isnan().sum() == 16 * 20 - 6 * 10
+    colours = error.colours()
+    assert torch.equal(colours[0, 0], colours[4, 7])
+    assert (colours[0, 0] == colours[0, 0, 0]).all()
+
+
+def test_maps_that_a_picture_is_too_small_for_are_left_out() -> None:
+    prediction, target = torch.rand(2, 10, 30, 3, generator=torch.Generator().manual_seed(0))
+    maps = error_maps(prediction, target, {"lpips": Difference()})
+    assert [error.name for error in maps] == ["squared_error", "flip"]
+
+
+def test_sheet_shows_pictures_maps_and_the_ends_of_their_scales() -> None:
+    prediction, target = torch.rand(2, 64, 128, 3, generator=torch.Generator().manual_seed(0))
+    values = torch.rand(64, 128, generator=torch.Generator().manual_seed(1))
+    sheet = error_sheet(prediction, target, [ErrorMap("a", "error", values, 0.5)])
+    for column, shown in enumerate((prediction, target, magma(values, 0.5))):
+        enlarged = round_to_8bit(shown).repeat_interleave(2, 0).repeat_interleave(2, 1)
+        left = column * (256 + 6)
+        torch.testing.assert_close(sheet[22 : 22 + 128, left : left + 256], enlarged)
+    scale = sheet[22 + 128 :, 2 * 262 :].reshape(-1, 3)
+    for colour in round_to_8bit(magma(torch.tensor([[0.0, 0.5]]), 0.5))[0]:
+        assert (scale - colour).abs().sum(-1).min() < 1e-6
+    assert (sheet[22 + 128 :, :256] == 1).all()  # pictures have no scale

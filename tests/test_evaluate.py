@@ -1,0 +1,137 @@
+"""`python -m nerfro.evaluate predictions=... references=...`; scoring a checkpoint is tested in test_train.py."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from skimage.metrics import peak_signal_noise_ratio
+
+import nerfro.evaluate
+
+HEIGHT, WIDTH = 24, 40
+
+
+@pytest.fixture
+def evaluate_here(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str, str]]:
+    """The entry point in this process: exit code, standard output and standard error."""
+    monkeypatch.setattr(nerfro.evaluate, "find_lpips_networks", lambda *files: ({}, {"lpips": "no cable"}))
+
+    def evaluate(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr("sys.argv", ["nerfro.evaluate", "device=cpu", *arguments])
+        code = 0
+        try:
+            nerfro.evaluate.main()
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 1
+        printed = capsys.readouterr()
+        return code, printed.out, printed.err
+
+    return evaluate
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Predictions, references and masks of two views, written to folders of these names."""
+    generator = np.random.default_rng(0)
+    written = {}
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[20:22, 18:22] = 255
+    for name in ("glass", "pen"):
+        prediction, reference = generator.integers(0, 256, (2, HEIGHT, WIDTH, 3), dtype=np.uint8)
+        written[name] = prediction, reference
+        for folder, image in (("predictions", prediction), ("references", reference), ("masks", mask)):
+            (tmp_path / folder).mkdir(exist_ok=True)
+            Image.fromarray(image).save(tmp_path / folder / f"{name}.png")
+    return written
+
+
+def test_folder_of_pictures_is_scored_in_every_region(
+    tmp_path: Path, pictures: dict[str, tuple[np.ndarray, np.ndarray]], evaluate_here: Callable
+) -> None:
+    arguments = [f"{name}={tmp_path / name}" for name in ("predictions", "references", "masks")]
+    code, out, err = evaluate_here(*arguments, f"out={tmp_path / 'out'}")
+    assert code == 0, err
+    content = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert (content["steps"], content["train_seconds"], content["protocol"]) == (None, None, "8bit")
+    assert [view["name"] for view in content["views"]] == ["glass", "pen"]
+    for view in content["views"]:
+        prediction, reference = pictures[view["name"]]
+        assert view["psnr"] == pytest.approx(peak_signal_noise_ratio(reference, prediction), abs=1e-4)
+        expected = peak_signal_noise_ratio(reference[20:22, 18:22], prediction[20:22, 18:22])
+        assert view["regions"]["mask"]["psnr"] == pytest.approx(expected, abs=1e-4)
+        expected = peak_signal_noise_ratio(reference[3:, 1:39], prediction[3:, 1:39])
+        assert view["regions"]["crop"]["psnr"] == pytest.approx(expected, abs=1e-4)
+    mean = sum(view["regions"]["crop"]["psnr"] for view in content["views"]) / 2
+    assert content["regions"]["crop"]["psnr"] == pytest.approx(mean)
+    assert content["notes"]["crop.lpips"] == "no cable"
+    for name in ("metrics", "metrics_mask", "metrics_crop"):
+        assert f"{content['views'][1]['name']}," in (tmp_path / "out" / f"{name}.csv").read_text()
+    assert "pen" in out
+    assert f"{mean:.2f}" in out
+    for name in pictures:
+        with Image.open(tmp_path / "out" / "errors" / f"{name}.png") as sheet:
+            assert sheet.width > 5 * 256  # prediction, reference, squared error, SSIM, FLIP
+
+
+def test_sixteen_bits_count_in_the_float_protocol_only(tmp_path: Path, evaluate_here: Callable) -> None:
+    for name, level in (("predictions", 0), ("references", 30)):  # 30 / 65535 rounds to 0 / 255
+        (tmp_path / name).mkdir()
+        Image.fromarray(np.full((HEIGHT, WIDTH), level, np.uint16)).save(tmp_path / name / "a.png")
+    folders = [f"predictions={tmp_path / 'references'}", f"references={tmp_path / 'predictions'}"]
+    scores = {}
+    for protocol in ("8bit", "float"):
+        assert evaluate_here(*folders, f"protocol={protocol}", f"out={tmp_path / protocol}")[0] == 0
+        scores[protocol] = json.loads((tmp_path / protocol / "metrics.json").read_text())
+    assert scores["8bit"]["test"]["psnr"] == 100
+    assert scores["float"]["test"]["psnr"] == pytest.approx(-20 * np.log10(30 / 65535), abs=1e-3)
+    assert scores["float"]["protocol"] == "float"
+    assert scores["float"]["regions"] == {}
+
+
+def test_scores_stay_beside_the_predictions_and_are_not_replaced_unasked(
+    tmp_path: Path, pictures: dict, evaluate_here: Callable
+) -> None:
+    folders = [f"predictions={tmp_path / 'predictions'}", f"references={tmp_path / 'references'}"]
+    assert evaluate_here(*folders)[0] == 0
+    assert (tmp_path / "predictions" / "scores" / "metrics.json").is_file()
+    code, _, err = evaluate_here(*folders)
+    assert code == 1
+    assert "holds an evaluation already; give another out=... or overwrite=true" in err
+    assert evaluate_here(*folders, "overwrite=true")[0] == 0
+
+
+def test_damaged_picture_is_told_before_anything_is_scored(
+    tmp_path: Path, pictures: dict, evaluate_here: Callable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    last = tmp_path / "predictions" / "pen.png"
+    last.write_bytes(last.read_bytes()[:100])
+    code, _, err = evaluate_here(f"predictions={tmp_path / 'predictions'}", f"references={tmp_path / 'references'}")
+    assert code == 1
+    assert "pen.png cannot be read" in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "predictions" / "scores").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "what is to be scored? give checkpoint="),
+        (["checkpoint=a", "predictions=b"], "what is to be scored?"),
+        (["predictions=b"], "predictions=b are compared with what? give references=DIR"),
+        (["checkpoint=a", "references=b"], "references=b means nothing with checkpoint=...; leave it out"),
+        (["predictions=a", "references=b", "root=c"], "root=c means nothing with predictions=...; leave it out"),
+        (["predictions=a", "references=b", "protocol=9bit"], "protocol=9bit is not allowed; choose one of 8bit, float"),
+        (["predictions=a", "references=b", "alpha=red"], "alpha=red is not allowed; choose one of drop, white, black"),
+        (["predictions=/nowhere", "references=b"], "predictions=/nowhere is not a folder"),
+    ],
+)
+def test_contradictions_are_refused_in_one_line(arguments: list[str], message: str, evaluate_here: Callable) -> None:
+    code, _, err = evaluate_here(*arguments)
+    assert code == 1
+    assert message in err
+    assert err.count("\n") == 1
