@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Optional
 
+import numpy as np
 from omegaconf import MISSING, DictConfig
 
 from nerfro.errors import NerfroError
@@ -95,10 +97,12 @@ class ContentConfig:
 
     Attributes:
         box_min, box_max: its corners, world units; none takes the bounds of the object.
+        box_file: .npy of the box's centre and half sides [2, 3] instead, as Eikonal Fields stores it.
     """
 
     box_min: Optional[list[float]] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     box_max: Optional[list[float]] = None  # noqa: UP045
+    box_file: Optional[str] = None  # noqa: UP045
 
 
 @dataclass
@@ -184,7 +188,6 @@ def build_model(config: DictConfig) -> NerfModel:
         raise NerfroError(f"evaluation.chunk_size={config.evaluation.chunk_size} renders nothing; take 1 or more")
     losses = build_losses(config.loss)
     optimizer = OptimizerConfig(**config.optimizer)
-    boundary = build(config.boundary)
     path_sampler = build(config.sampler.path)
     medium = build(config.medium) if path_sampler.needs_medium else Vacuum()
     _settle_content(config, medium)
@@ -193,7 +196,7 @@ def build_model(config: DictConfig) -> NerfModel:
         path_sampler=path_sampler,
         point_sampler=build(config.sampler.points),
         make_field=lambda: build(config.field),
-        boundary=boundary,
+        boundary=build(config.boundary),
         losses=losses,
         optimizer=optimizer,
         seed=config.seed,
@@ -207,6 +210,10 @@ def _settle_content(config: DictConfig, medium: Medium) -> None:
         raise NerfroError("content: give both box_min and box_max, or neither for the bounds of the object")
     if config.content.box_min is not None:
         return
+    if config.content.box_file is not None:
+        centre, half = _read_box(resolve_path(config.content.box_file))
+        config.content.box_min, config.content.box_max = (centre - half).tolist(), (centre + half).tolist()
+        return
     if not isinstance(medium, Vacuum):
         box = medium.content_box.tolist()
     elif "mesh" in config.medium and resolve_path(config.medium.mesh).is_file():
@@ -215,3 +222,14 @@ def _settle_content(config: DictConfig, medium: Medium) -> None:
     else:
         return
     config.content.box_min, config.content.box_max = ([round(x, 6) for x in corner] for corner in box)
+
+
+def _read_box(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Centre and half sides of a box, from Eikonal Fields' bounding_box_vals.npy."""
+    try:
+        values = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise NerfroError(f"content.box_file={path} cannot be read ({error}); give a .npy of 2x3 numbers") from error
+    if values.shape != (2, 3) or not np.isfinite(values).all() or values[1].min() <= 0:
+        raise NerfroError(f"content.box_file={path} must hold a box's centre and positive half sides, 2x3 numbers")
+    return values[0], values[1]

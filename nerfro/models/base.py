@@ -107,6 +107,7 @@ class NerfModel(LightningModule, ABC):
         # Not at the end of the step before, which comes after its checkpoint: a resumed run would miss the update.
         if self.global_step > 0:
             self.point_sampler.after_step(self.global_step, list(self.fields))  # type: ignore[arg-type]
+            self.boundary.after_step(self.global_step)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         config = self.optimizer_config

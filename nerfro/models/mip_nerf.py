@@ -16,7 +16,7 @@ class MipNerfModel(NerfModel):
         super().__init__(parts, [parts.make_field()])
 
     def render_path(self, path: Path) -> list[Rendering]:
-        boundary_rgb = self.boundary(path.exit_directions)
+        boundary_rgb = self.boundary.along(path, path.exit_directions)
         (field,) = self.fields
         renderings: list[Rendering] = []
         for _ in range(self.point_sampler.num_levels):

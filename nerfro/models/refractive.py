@@ -26,7 +26,7 @@ class RefractiveModel(NerfModel):
     def render_path(self, path: Path) -> list[Rendering]:
         samples = self.point_sampler(path, None)
         leaving = path.exit_directions if self.boundary_direction == "exit" else samples.directions[:, -1]
-        boundary_rgb = self.boundary(leaving)
+        boundary_rgb = self.boundary.along(path, leaving)
         renderings = [composite(samples, self.fields[0](samples), boundary_rgb, path)]
         for field in self.fields[1:]:
             samples = self.point_sampler(path, renderings[-1])
