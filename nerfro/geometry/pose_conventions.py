@@ -1,0 +1,127 @@
+"""Whether poses and masks agree, and which misread convention would explain it if they do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.errors import NerfroError
+from nerfro.geometry.intersection import MeshIntersector
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.silhouettes import intersection_over_union, mesh_silhouette
+from nerfro.geometry.visual_hull import Silhouettes, carve_grid, extract_surface, find_box, remove_strays
+
+# The first look is at so many voxels a side and at most so many pixels a side.
+_COARSE_VOXELS, _COARSE_PIXELS = 48, 64
+# A hull meets the masks that it was carved from; below this overlap something is wrong.
+GOOD_OVERLAP = 0.9
+
+# What a file's poses could have been, as what has to be done to them as they were read; most frequent mistakes first.
+# `turn` is applied to the camera's axes (x right, y up, z back), `inverse` to the whole matrix before.
+_ALTERNATIVES: tuple[tuple[str, bool, tuple[tuple[int, int, int], ...]], ...] = (
+    (
+        "the camera's y and z axes flipped (OpenCV's axes, y down, z forward, in a file read as OpenGL's, or reversed)",
+        False,
+        ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+    ),
+    ("the matrices inverted (they are world-to-camera)", True, ((1, 0, 0), (0, 1, 0), (0, 0, 1))),
+    (
+        "the matrices inverted and the y and z axes flipped (world-to-camera matrices in OpenCV's axes)",
+        True,
+        ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+    ),
+    ("y flipped (images and masks are upside down, or y points down)", False, ((1, 0, 0), (0, -1, 0), (0, 0, 1))),
+    ("x flipped (images and masks are mirrored)", False, ((-1, 0, 0), (0, 1, 0), (0, 0, 1))),
+    ("x and y flipped (images turned by 180 degrees)", False, ((-1, 0, 0), (0, -1, 0), (0, 0, 1))),
+    ("x and y exchanged (LLFF's axes: down, right, back)", False, ((0, -1, 0), (1, 0, 0), (0, 0, 1))),
+    ("z flipped (cameras that look along +z, y up)", False, ((1, 0, 0), (0, 1, 0), (0, 0, -1))),
+)
+
+
+def overlap(mesh: TriangleMesh, silhouettes: Silhouettes, max_pixels: int) -> Float[np.ndarray, "V"]:
+    """Intersection over union of a mesh's silhouette with each mask.
+
+    Args:
+        mesh: world units.
+        silhouettes: the masks.
+        max_pixels: larger images are looked at in every second, third, ... pixel only.
+    """
+    cameras, masks = silhouettes.cameras, silhouettes.masks
+    intersector = MeshIntersector([mesh], crease_degrees=30.0)
+    stride = pixel_stride(silhouettes, max_pixels)
+    return np.array(
+        [
+            intersection_over_union(
+                mesh_silhouette(intersector, cameras, view, stride), masks[view, ::stride, ::stride] > 0.5
+            )
+            for view in range(len(masks))
+        ]
+    )
+
+
+def pixel_stride(silhouettes: Silhouettes, max_pixels: int) -> int:
+    """Every how many pixels an image is looked at, so that there are at most `max_pixels` a side."""
+    return -(-max(silhouettes.cameras.width, silhouettes.cameras.height) // max_pixels)
+
+
+def coarse_overlap(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np.ndarray, "V"]:
+    """Overlap of each mask with the silhouettes' coarse hull; 0 where the hull is empty."""
+    distances, corner, spacing = carve_grid(
+        silhouettes, find_box(silhouettes, wrong_masks), _COARSE_VOXELS, wrong_masks
+    )
+    remove_strays(distances)
+    if not (distances < 0).any():
+        return np.zeros(len(silhouettes))
+    return overlap(extract_surface(distances, corner, spacing), silhouettes, _COARSE_PIXELS)
+
+
+def require_consistent_poses(silhouettes: Silhouettes, names: list[str], wrong_masks: int) -> None:
+    """Check that the masks' common hull looks like the masks.
+
+    Raises:
+        NerfroError: it does not; the misread convention or the views that disagree with the others are named.
+    """
+    found = float(np.median(coarse_overlap(silhouettes, wrong_masks)))
+    if found >= GOOD_OVERLAP:
+        return
+    state = (
+        "the visual hull is empty: no point lies inside all masks"
+        if found == 0
+        else f"the visual hull covers the masks badly (median overlap {found:.2f})"
+    )
+    scores = [float(np.median(coarse_overlap(_changed(silhouettes, i, t), wrong_masks))) for _, i, t in _ALTERNATIVES]
+    # Of equally good ones (a ball is a ball upside down) the most frequent mistake.
+    best = next(i for i, score in enumerate(scores) if score >= max(scores) - 0.01)
+    if scores[best] > max(GOOD_OVERLAP, found):
+        raise NerfroError(
+            f"{state}; the poses are in another convention: with {_ALTERNATIVES[best][0]} the overlap is "
+            f"{scores[best]:.2f}; correct transform_matrix, or choose the data= format that fits"
+        )
+    for allowed in (1, 2, 4, 8):
+        if wrong_masks < allowed <= len(names) // 3:
+            each = coarse_overlap(silhouettes, allowed)
+            if np.median(each) >= GOOD_OVERLAP:
+                odd = [names[view] for view in np.argsort(each, kind="stable")[:allowed]]
+                raise NerfroError(
+                    f"{state}, but not if {allowed} views may be wrong; look at the masks and poses of "
+                    f"{', '.join(odd)}, and correct them or set wrong_masks={allowed}"
+                )
+    raise NerfroError(
+        f"{state}, and no usual misreading of the poses explains it; check that masks, images and poses belong "
+        "together and that the object did not move between the views"
+    )
+
+
+def _changed(silhouettes: Silhouettes, inverse: bool, turn: tuple[tuple[int, int, int], ...]) -> Silhouettes:
+    """The same masks with the poses read differently."""
+    poses: Tensor = silhouettes.cameras.camera_to_world
+    rotation, centre = poses[:, :, :3], poses[:, :, 3:]
+    if inverse:
+        rotation = rotation.transpose(1, 2)
+        centre = -rotation @ centre
+    poses = torch.cat([rotation @ torch.tensor(turn, dtype=rotation.dtype), centre], -1)
+    return silhouettes.seen_from(replace(silhouettes.cameras, camera_to_world=poses))
