@@ -1,7 +1,7 @@
 """Several processes that train one model, each on its share of a batch.
 
-They shall learn what one process would learn from the whole batch. So every process draws the random numbers of all rays
-and keeps those of its own, and what is normalised over a batch is normalised over all of it.
+They shall learn what one process would learn from the whole batch. So every process draws the random numbers of all
+rays and keeps those of its own, and what is normalised over a batch is normalised over all of it.
 """
 
 from __future__ import annotations

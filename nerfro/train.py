@@ -10,8 +10,10 @@ from pathlib import Path
 
 import lightning.pytorch as pl
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.loggers import Logger, WandbLogger
+from lightning.pytorch.strategies import DDPStrategy
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.callbacks import ConfigInCheckpoint, StopOnSignal, Throughput, TrainingProgress
@@ -19,6 +21,7 @@ from nerfro.cli import EXIT_INTERRUPTED, entry_point
 from nerfro.config import TrainConfig, build_model
 from nerfro.data.module import RayDataModule
 from nerfro.data.ray_batches import RayBatches
+from nerfro.distributed import leave
 from nerfro.errors import NerfroError
 from nerfro.evaluate import report
 from nerfro.evaluation.lpips import find_lpips_networks
@@ -70,13 +73,15 @@ def main(config: DictConfig) -> None:
     model = build_model(config)
     if checkpoint is not None:
         require_same_configuration(checkpoint, load_checkpoint(checkpoint)[1], config)
-    # Weights and Adam's two moments, in an old checkpoint that goes when the new one is whole.
-    num_bytes = sum(p.numel() * p.element_size() for p in model.parameters())
-    claim(folder, checkpoint is not None, 2 * 3 * num_bytes + _SPARE_BYTES)
     throughput, interruption = Throughput(), StopOnSignal()
     trainer = make_trainer(config, folder, [throughput, interruption])
-    record(folder, config)
-    print(f"nerfro: {config.name} on {config.data.root} -> {folder}", flush=True)
+    batches = batches.share(trainer.global_rank, trainer.world_size)
+    # Weights and Adam's two moments, in an old checkpoint that goes when the new one is whole.
+    num_bytes = sum(p.numel() * p.element_size() for p in model.parameters())
+    if trainer.is_global_zero:
+        claim(folder, checkpoint is not None, 2 * 3 * num_bytes + _SPARE_BYTES)
+        record(folder, config)
+        print(f"nerfro: {config.name} on {config.data.root} -> {folder}", flush=True)
     if wanted.cache_paths and not wanted.jitter and model.path_sampler.few_vertices:
         model.path_cache = PathCache.build(model.path_sampler, model.medium, training.cameras)
 
@@ -86,6 +91,9 @@ def main(config: DictConfig) -> None:
     for logger in trainer.loggers:
         if isinstance(logger, WandbLogger):  # or the next job of a sweep would go on with this one's log
             logger.experiment.finish()
+    leave()
+    if not trainer.is_global_zero:
+        return
     if interruption.received:
         command = f"hydra.run.dir={folder} ckpt_path=last"
         print(f"nerfro: interrupted after step {trainer.global_step} and saved; to go on, repeat it with {command}")
@@ -135,7 +143,12 @@ def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.
     taken = sorted(ours.keys() & config.trainer.keys())
     if taken:
         raise NerfroError(f"trainer.{taken[0]} is set by nerfro.train itself; see evaluation, checkpoint and logger")
+    if config.trainer.get("strategy") == "ddp":
+        # The index grid is a buffer and would be sent around in every step, though all processes have the same one.
+        ours["strategy"] = DDPStrategy(broadcast_buffers=False)
     trainer = build(config.trainer, **ours)
+    if trainer.world_size > 1 and HydraConfig.get().mode == RunMode.MULTIRUN:
+        raise NerfroError("a sweep (-m) cannot use several devices; start its runs one by one")
     if config.trainer.get("max_time") is None and trainer.max_steps < 0:
         raise NerfroError("the run would never end; set trainer.max_time (DD:HH:MM:SS), trainer.max_steps, or both")
     return trainer
@@ -147,8 +160,16 @@ def _loggers(config: DictConfig, folder: Path) -> list[Logger]:
 
 def _quieten_lightning() -> None:
     """Keep Lightning's hints about loaders and hardware from the user: batches are made on the device here."""
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    for message in (".*does not have many workers.*", ".*You are using .* devices.*", ".*Starting from v1.9.*"):
+    for package in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(package).setLevel(logging.WARNING)
+    for message in (
+        ".*does not have many workers.*",
+        ".*You are using .* devices.*",
+        ".*Starting from v1.9.*",
+        ".*sync_dist=True.*",  # one process looks at validation views
+        ".*broadcast_buffers.* is deprecated.*",  # its successor is not in all versions of torch that are supported
+        ".*LeafSpec.* is deprecated.*",
+    ):
         warnings.filterwarnings("ignore", message)
 
 

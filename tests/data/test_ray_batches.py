@@ -55,6 +55,26 @@ def test_batch_depends_on_seed_and_step_alone(views, batching):
     assert not torch.equal(in_order[0].index, in_order[1].index)
 
 
+@pytest.mark.parametrize("batching", ["single_image", "all_images"])
+def test_shares_of_several_processes_make_up_the_batch(views, batching):
+    whole = RayBatches(views, 30, batching, seed=3, precrop_steps=5, jitter=True)
+    shares = [whole.share(rank, 3).batch(4) for rank in range(3)]
+    assert [len(share.rays) for share in shares] == [10, 10, 10]
+    expected = whole.batch(4)
+    for name in ("index", "rgb"):
+        assert torch.equal(torch.cat([getattr(share, name) for share in shares]), getattr(expected, name))
+    for name in ("origins", "directions"):
+        parts = [getattr(share.rays, name) for share in shares]
+        assert torch.equal(torch.cat(parts), getattr(expected.rays, name))
+    assert torch.equal(whole.share(0, 1).batch(4).index, expected.index)
+
+
+def test_batch_without_equal_shares_is_refused(views):
+    message = "batches.size=30 cannot be shared evenly by 4 processes; take a multiple of 4"
+    with pytest.raises(NerfroError, match=message):
+        RayBatches(views, 30).share(0, 4)
+
+
 def test_iteration_resumed_at_a_step_goes_on_with_the_same_batches(views):
     whole = list(islice(RayBatches(views, 30, seed=1), 8))
     rest = list(islice(RayBatches(views, 30, seed=1, first_step=5), 3))

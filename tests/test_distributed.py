@@ -1,0 +1,222 @@
+"""Several processes that train one model: what one process would learn, stopped and resumed together."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+import nerfro.distributed
+from nerfro.callbacks import StopOnSignal
+from nerfro.distributed import rand_rays
+from nerfro.run_folder import LAST_CHECKPOINT, load_checkpoint
+
+# Gradients are sums in another order, so they differ in their last bits. Adam divides them by their size, and would
+# make whole steps of what rounding has left of zero.
+SCHEDULE = ["trainer.max_steps=8", "checkpoint.every_steps=3", "checkpoint.every_seconds=null", "evaluation.every=4"]
+PRESETS = {
+    "paper": ["batches.jitter=true", "loss.boundary.start=2", "loss.smoothness.start=3"],
+    "default": [
+        "field.precision=float32",
+        "optimizer.adam_epsilon=1e-8",
+        "evaluation.supersample=1",
+        "+loss.total_variation.weight=0.01",
+        "+loss.distortion.weight=0.01",
+    ],
+}
+TWO_PROCESSES = ["trainer.devices=2", "trainer.strategy=ddp"]
+
+# Compares the processes' models in every step, which takes the second one longer, and says which step it is at.
+WATCHING_LOSS = '''
+"""Watches."""
+import time
+import torch
+import torch.distributed as dist
+from nerfro.losses.base import Loss
+from nerfro.registry import register
+
+@register("loss", "watching")
+class Watching(Loss):
+    """Fails if the models of two processes differ."""
+
+    def forward(self, renderings, batch, model):
+        time.sleep(0.05 * (1 + dist.get_rank()))
+        mine = torch.cat([tensor.detach().double().flatten() for tensor in model.state_dict().values()])
+        both = [torch.empty_like(mine) for _ in range(2)]
+        dist.all_gather(both, mine)
+        assert torch.equal(*both), "the models of the two processes differ"
+        print(f"rank {dist.get_rank()} at step {model.global_step}", flush=True)
+        return renderings[-1].rgb.sum() * 0
+'''
+
+
+@pytest.fixture
+def small(tiny_run: list[str], tiny_default_run: list[str]) -> dict[str, list[str]]:
+    """Overrides of short runs that use every random draw."""
+    return {
+        "paper": [*tiny_run, *SCHEDULE, *PRESETS["paper"]],
+        "default": [*tiny_default_run, *SCHEDULE, *PRESETS["default"]],
+    }
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
+    """Start `python -m nerfro.train` on two processes, which compare their models; its folder is tmp_path/<name>."""
+    plugins = tmp_path / "watching_plugins"
+    plugins.mkdir()
+    (plugins / "watching.py").write_text(WATCHING_LOSS)
+    environment = {
+        **os.environ,
+        "NERFRO_PLUGINS": str(plugins),
+        "OMP_NUM_THREADS": "1",
+        # Nobody listens there: the search for LPIPS weights ends at once.
+        "https_proxy": "http://127.0.0.1:9",
+        "TORCH_HOME": str(tmp_path / "torch"),
+    }
+
+    def start(name: str, *overrides: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "nerfro.train", *overrides, *TWO_PROCESSES, "+loss.watching.weight=1"]
+        command += [f"hydra.run.dir={tmp_path / name}"]
+        return subprocess.Popen(
+            command, env=environment, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+
+    return start
+
+
+def finish(process: subprocess.Popen[str], code: int = 0) -> str:
+    """What a run prints until it ends with the given exit code."""
+    out, errors = process.communicate(timeout=300)
+    assert process.returncode == code, errors
+    assert "Traceback" not in errors
+    return out
+
+
+def weights(folder: Path) -> dict[str, torch.Tensor]:
+    checkpoint = load_checkpoint(folder / LAST_CHECKPOINT)[0]
+    assert checkpoint["callbacks"]["Throughput"]["num_rays"] == 32 * checkpoint["global_step"]
+    return checkpoint["state_dict"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["paper", "default"])
+def test_two_processes_learn_what_one_learns(
+    preset: str,
+    small: dict[str, list[str]],
+    train_here: Callable[..., Any],
+    start: Callable[..., subprocess.Popen[str]],
+    tmp_path: Path,
+) -> None:
+    together = start("two", *small[preset])
+    alone = train_here(*small[preset], f"hydra.run.dir={tmp_path / 'one'}")
+    assert alone.code == 0, alone.err
+    out = finish(together)
+    for line in ("nerfro: refractive on", "8 steps in"):
+        assert out.count(line) == 1, "one process alone speaks"
+    expected, got = weights(tmp_path / "one"), weights(tmp_path / "two")
+    assert expected.keys() == got.keys()
+    for name in expected:
+        torch.testing.assert_close(got[name], expected[name], rtol=0, atol=1e-5, msg=lambda m, n=name: f"{n}: {m}")
+    scores = [json.loads((tmp_path / name / "metrics.json").read_text())["test"]["psnr"] for name in ("one", "two")]
+    assert scores[0] == pytest.approx(scores[1], abs=0.05)
+    command = json.loads((tmp_path / "two" / "run.json").read_text())["command"]
+    assert "train_ddp_process" not in command, "the first process records the run"
+
+
+@pytest.mark.slow
+def test_signal_to_one_process_stops_both_and_both_resume(
+    small: dict[str, list[str]],
+    train_here: Callable[..., Any],
+    start: Callable[..., subprocess.Popen[str]],
+    tmp_path: Path,
+) -> None:
+    stopped = start("two", *small["default"])
+    assert stopped.stdout is not None
+    lines = []
+    for line in stopped.stdout:
+        lines.append(line)
+        if "at step 2" in line:
+            break
+    stopped.send_signal(signal.SIGTERM)  # reaches the process that was started, not the one that it has started
+    out = finish(stopped, code=130)
+    steps = load_checkpoint(tmp_path / "two" / LAST_CHECKPOINT)[0]["global_step"]
+    assert 3 <= steps <= 7, lines
+    assert f"nerfro: interrupted after step {steps} and saved" in out
+    out = finish(start("two", *small["default"], "ckpt_path=last"))
+    for rank in range(2):
+        assert f"rank {rank} at step {steps}\n" in out
+        assert f"rank {rank} at step {steps - 1}\n" not in out
+    alone = train_here(*small["default"], f"hydra.run.dir={tmp_path / 'one'}")
+    assert alone.code == 0, alone.err
+    expected, got = weights(tmp_path / "one"), weights(tmp_path / "two")
+    for name in expected:
+        torch.testing.assert_close(got[name], expected[name], rtol=0, atol=1e-5, msg=lambda m, n=name: f"{n}: {m}")
+
+
+@pytest.mark.slow
+def test_time_ends_both_processes_at_one_step(
+    small: dict[str, list[str]], start: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    out = finish(start("two", *small["paper"], "trainer.max_steps=-1", "trainer.max_time=00:00:00:02"))
+    steps = load_checkpoint(tmp_path / "two" / LAST_CHECKPOINT)[0]["global_step"]
+    last = {rank: max(int(line.split()[-1]) for line in out.splitlines() if f"rank {rank} at" in line) for rank in "01"}
+    assert last == {"0": steps - 1, "1": steps - 1}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["batches.size=33"], "batches.size=33 cannot be shared evenly by 2 processes; take a multiple of 2"),
+        (["hydra.mode=MULTIRUN"], "a sweep (-m) cannot use several devices; start its runs one by one"),
+    ],
+)
+def test_what_two_processes_cannot_do_is_refused_in_one_line(
+    overrides: list[str], message: str, tiny_run: list[str], train_here: Callable[..., Any], tmp_path: Path
+) -> None:
+    folders = [f"hydra.run.dir={tmp_path / 'run'}", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
+    finished = train_here(*tiny_run, "trainer.max_steps=2", *TWO_PROCESSES, *folders, *overrides)
+    assert finished.code == 1
+    assert finished.err.splitlines()[-1].endswith(message)
+    assert not list(tmp_path.rglob("config.yaml"))
+
+
+def test_processes_draw_the_rows_that_one_would_draw(monkeypatch: pytest.MonkeyPatch) -> None:
+    like = torch.zeros((), dtype=torch.float64)
+
+    def draw(num_rays: int, rank: int, size: int) -> tuple[torch.Tensor, torch.Tensor]:
+        monkeypatch.setattr(nerfro.distributed, "rank_and_size", lambda: (rank, size))
+        torch.manual_seed(5)
+        return rand_rays(num_rays, 3, like), torch.rand(4)
+
+    whole, following = draw(12, 0, 1)
+    torch.manual_seed(5)
+    assert torch.equal(whole, torch.rand(12, 3, dtype=torch.float64))
+    shares = [draw(3, rank, 4) for rank in range(4)]
+    assert torch.equal(torch.cat([rows for rows, _ in shares]), whole)
+    assert all(torch.equal(after, following) for _, after in shares)
+
+
+def test_a_signal_is_not_lost_while_the_processes_agree() -> None:
+    """It arrives after this process has said that there was none."""
+    callback = StopOnSignal()
+
+    def agree(decision: bool, all: bool) -> bool:
+        callback._signalled = True
+        return decision
+
+    trainer: Any = SimpleNamespace(strategy=SimpleNamespace(reduce_boolean_decision=agree), should_stop=False)
+    arguments: Any = (trainer, None, None, None, 0)
+    callback.on_train_batch_end(*arguments)
+    assert not callback.received
+    callback.on_train_batch_end(*arguments)
+    assert callback.received
+    assert trainer.should_stop
