@@ -8,14 +8,17 @@ import pytest
 import torch
 
 from nerfro.media.analytic import Luneburg, Vacuum
+from nerfro.media.shapes import Ball
 from nerfro.rendering import composite, volume_weights
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.hierarchical import Hierarchical
 from nerfro.samplers.integrators import INTEGRATORS
+from nerfro.samplers.snell import Snell
 from nerfro.samplers.straight import Straight, straight_path
 from nerfro.samplers.stratified import Stratified, point_samples
 from nerfro.testing import NUM_RAYS, example_path, example_rays, example_rendering, example_samples
 from nerfro.types import Path, Radiance, Rays, Samples
+from tests.closed_forms import beam
 
 
 def smooth_radiance(samples: Samples) -> Radiance:
@@ -45,6 +48,20 @@ def test_constant_density_attenuates_exponentially() -> None:
     deltas = torch.rand(3, 20, dtype=torch.float64)
     _, transmittance = volume_weights(torch.full_like(deltas, 0.7), deltas)
     torch.testing.assert_close(transmittance, torch.exp(-0.7 * deltas.sum(-1)))
+
+
+def test_a_dense_ball_of_glass_absorbs_along_its_chords() -> None:
+    # Beer-Lambert along a refracted ray: exp(-a l) with the chord l = 2 R cos t, sin t = b / (n R).
+    radius, n, absorption = 0.8, 1.5, 1.7
+    heights = torch.linspace(-0.75, 0.75, 11, dtype=torch.float64)
+    path = Snell()(beam(heights, far=6.0), Ball(radius, n).double())
+    samples = Stratified(8192).eval()(path, None)
+    density = torch.where(samples.positions.norm(dim=-1) < radius, absorption, 0.0)
+    _, transmittance = volume_weights(density, samples.deltas)
+    chord = 2 * radius * (1 - (heights / (n * radius)) ** 2).sqrt()
+    # The surface lies within a sample's interval at either end.
+    step = float(samples.deltas[:, 0].max())
+    torch.testing.assert_close(transmittance, torch.exp(-absorption * chord), atol=absorption * step, rtol=0)
 
 
 def test_compositing_equals_a_slow_loop() -> None:

@@ -110,6 +110,41 @@ def test_paraxial_rays_meet_at_the_back_focus() -> None:
     x, d = path.exit_positions[0], path.exit_directions[0]
     focus = x[0] - x[1] * d[0] / d[1]
     assert float(focus) - 0.8 == pytest.approx(0.8 * (2 - 1.5) / (2 * (1.5 - 1)), rel=1e-5)
+    # From the principal plane, which is the ball's middle: n R / (2 (n - 1)).
+    assert float(-heights[0] * d[0] / d[1]) == pytest.approx(1.5 * 0.8 / (2 * (1.5 - 1)), rel=1e-5)
+
+
+@pytest.mark.parametrize("bounces", [1, 2, 5])
+def test_each_total_reflection_within_a_ball_turns_by_pi_less_twice_its_angle(bounces: int) -> None:
+    # From inside, at an angle t to the surface beyond the critical one: every bounce turns by pi - 2 t.
+    t = math.radians(50)
+    start = 0.8 * math.sin(t)
+    trace = Snell(max_events=bounces).trace(_rays([[0, start, 0]], [[1, 0, 0]], 0, 30), Ball(0.8, 1.5).double())
+    assert trace.num_events[0] == bounces
+    turn = bounces * (math.pi - 2 * t)
+    expected = torch.tensor([[math.cos(turn), -math.sin(turn), 0]], dtype=torch.float64)
+    assert angle(trace.path.exit_directions, expected).max() < 1e-7
+    chords = trace.path.s[0, 2 : bounces + 1] - trace.path.s[0, 1:bounces]
+    torch.testing.assert_close(chords, torch.full_like(chords, 1.6 * math.cos(t)))
+
+
+def test_the_rainbow_stands_where_its_closed_form_says() -> None:
+    # One reflection inside: deviation 2 (i - t) + pi - 2 t, least where cos i = sqrt((n^2 - 1) / 3).
+    n = 1.333
+    i = torch.linspace(0.9, 1.2, 30001, dtype=torch.float64)
+    ones = torch.ones_like(i)
+    x = torch.stack([-i.cos(), i.sin(), 0 * i], -1)
+    d, _ = refract(torch.tensor([1.0, 0, 0]).double().expand_as(x), x, ones, n * ones)
+    x = x - 2 * (x * d).sum(-1, keepdim=True) * d
+    d = d - 2 * (d * x).sum(-1, keepdim=True) * x
+    x = x - 2 * (x * d).sum(-1, keepdim=True) * d
+    d, reflected = refract(d, x, n * ones, ones)
+    assert not reflected.any()
+    deviation = torch.atan2(-d[:, 1], d[:, 0]) % (2 * math.pi)
+    torch.testing.assert_close(deviation, 2 * i - 4 * torch.asin(i.sin() / n) + math.pi)
+    least = int(deviation.argmin())
+    assert float(i[least].cos()) == pytest.approx(math.sqrt((n * n - 1) / 3), abs=1e-4)
+    assert math.degrees(deviation[least]) == pytest.approx(137.9, abs=0.05)
 
 
 def test_slab_shifts_and_does_not_turn() -> None:
@@ -159,8 +194,27 @@ def test_prism_deviates_as_its_formula(tmp_path: FilePath) -> None:
     s = np.sin(angles)
     expected = angles + np.arcsin(math.sin(apex) * np.sqrt(n**2 - s**2) - math.cos(apex) * s) - apex
     np.testing.assert_allclose(measured, expected, atol=1e-9)
+
+
+def test_least_deviation_of_a_prism_tells_its_index(tmp_path: FilePath) -> None:
+    apex, n = math.radians(50), 1.5
+    medium = _mesh_medium(_prism(apex, 0.9), tmp_path, n)
+    least = 2 * math.asin(n * math.sin(apex / 2)) - apex
+    angles = 0.5 * (apex + least) + np.radians([-1.0, 0.0, 1.0])
+    directions = np.stack([np.cos(angles - apex / 2), np.sin(angles - apex / 2), 0 * angles], -1)
+    target = np.array([-0.225 * math.tan(apex / 2) * 2, 0.0, 0.1])
+    path = Snell("mesh")(_rays(target - 2 * directions, directions), medium)
+    before, middle, after = torch.deg2rad(angle(path.exit_directions, torch.tensor(directions))).tolist()
     # Fraunhofer: n = sin((A + Dmin) / 2) / sin(A / 2).
-    assert measured.min() >= 2 * math.asin(n * math.sin(apex / 2)) - apex
+    assert math.sin(0.5 * (apex + middle)) / math.sin(apex / 2) == pytest.approx(n, abs=1e-7)
+    assert before > middle < after
+    # Steeper than this the ray meets the second face beyond the critical angle and does not leave through it.
+    limit = math.asin(n * math.sin(apex - math.asin(1 / n)))
+    for offset, leaves in ((0.01, True), (-0.01, False)):
+        tilt = limit + offset - apex / 2
+        direction = np.array([[math.cos(tilt), math.sin(tilt), 0.0]])
+        trace = Snell("mesh").trace(_rays(target - 2 * direction, direction), medium)
+        assert (int(trace.num_events[0]) == 2) == leaves
 
 
 @pytest.mark.parametrize(("n", "total"), [(1.40, False), (1.43, True)])
