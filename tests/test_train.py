@@ -210,7 +210,7 @@ def test_evaluation_refuses_in_one_line(
 def test_evaluation_without_a_checkpoint_asks_for_one(evaluate_here: Callable[..., tuple[int, str]]) -> None:
     code, errors = evaluate_here()
     assert code == 1
-    assert "which model? give checkpoint=RUN/checkpoints/last.ckpt" in errors
+    assert "what is to be scored? give checkpoint=RUN/checkpoints/last.ckpt, or predictions=DIR" in errors
 
 
 @pytest.mark.parametrize("chunk_size", [1, 37, 256])
