@@ -138,6 +138,8 @@ class TrainConfig:
         content, authors, optimizer, batches, evaluation, checkpoint: see there.
         trainer, logger: Lightning objects.
         ckpt_path: checkpoint to go on from, or `last` for the newest of this experiment.
+        compile: backend of torch.compile for the networks, such as inductor or cudagraphs on a GPU; none runs them as
+            they are. Compiling takes a minute or more at the start.
     """
 
     name: str = "refractive"
@@ -158,6 +160,7 @@ class TrainConfig:
     trainer: Any = MISSING
     logger: Any = None
     ckpt_path: Optional[str] = None  # noqa: UP045
+    compile: Optional[str] = None  # noqa: UP045
 
 
 def build_losses(nodes: DictConfig) -> dict[str, Loss]:

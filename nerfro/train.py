@@ -28,6 +28,7 @@ from nerfro.evaluation.lpips import find_lpips_networks
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.render_view import Supersampling
 from nerfro.evaluation.score_views import score_views
+from nerfro.fields.mlp import compile_networks
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.registry import build
 from nerfro.run_folder import (
@@ -84,6 +85,8 @@ def main(config: DictConfig) -> None:
         print(f"nerfro: {config.name} on {config.data.root} -> {folder}", flush=True)
     if wanted.cache_paths and not wanted.jitter and model.path_sampler.few_vertices:
         model.path_cache = PathCache.build(model.path_sampler, model.medium, training.cameras)
+    if config.compile is not None:
+        compile_networks(model, config.compile)
 
     datamodule = RayDataModule(batches, validation, config.evaluation.every)
     trainer.fit(model, datamodule=datamodule, ckpt_path=checkpoint, weights_only=True)

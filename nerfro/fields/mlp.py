@@ -65,6 +65,24 @@ class RadianceMLP(nn.Module):
         return density, padded_sigmoid(self.rgb(view))
 
 
+def compile_networks(model: nn.Module, backend: str) -> None:
+    """Have torch.compile compile a model's networks in place, for any number of points.
+
+    Args:
+        model: holds the networks; its weights and their names stay as they are.
+        backend: of torch.compile, such as `inductor`.
+
+    Raises:
+        NerfroError: there is no such backend.
+    """
+    known = torch.compiler.list_backends(exclude_tags=())
+    if backend not in known:
+        raise NerfroError(f"compile={backend} is no backend of torch.compile here; there are {', '.join(known)}")
+    for module in model.modules():
+        if isinstance(module, (RadianceMLP, nn.Sequential)):
+            module.compile(backend=backend, dynamic=True)
+
+
 def glorot_linear(num_inputs: int, num_outputs: int) -> nn.Linear:
     """Linear layer with Glorot-uniform weights and zero bias."""
     layer = nn.Linear(num_inputs, num_outputs)

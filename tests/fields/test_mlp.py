@@ -9,7 +9,7 @@ import torch
 
 from nerfro.errors import NerfroError
 from nerfro.fields.mip_nerf import MipNerfField
-from nerfro.fields.mlp import RGB_PADDING, RadianceMLP, SkipMLP, glorot_linear, padded_sigmoid
+from nerfro.fields.mlp import RGB_PADDING, RadianceMLP, SkipMLP, compile_networks, glorot_linear, padded_sigmoid
 from nerfro.fields.nerf import NerfField
 from nerfro.samplers.stratified import Stratified
 from nerfro.testing import example_path, example_samples
@@ -114,3 +114,30 @@ def test_nerf_field_with_a_box_equals_one_without_inside_and_is_empty_outside() 
 def test_nerf_field_refuses_an_empty_box(box_max: list[float]) -> None:
     with pytest.raises(NerfroError, match="is empty"):
         NerfField(box_min=[0.0, 0.0, 0.0], box_max=box_max)
+
+
+def test_compiled_networks_equal_plain_ones_and_keep_their_weights_names() -> None:
+    plain, compiled = (
+        NerfField(width=16, depth=2, skip=1, view_width=8),
+        NerfField(width=16, depth=2, skip=1, view_width=8),
+    )
+    compiled.load_state_dict(plain.state_dict())
+    calls = []
+
+    def counting(graph: torch.fx.GraphModule, inputs: list) -> torch.fx.GraphModule:
+        calls.append(graph)
+        return graph
+
+    torch._dynamo.register_backend(counting, name="counting")
+    compile_networks(compiled, "counting")
+    samples = example_samples()
+    expected, radiance = plain(samples), compiled(samples)
+    assert calls
+    torch.testing.assert_close(radiance.rgb, expected.rgb)
+    torch.testing.assert_close(radiance.density, expected.density)
+    assert compiled.state_dict().keys() == plain.state_dict().keys()
+
+
+def test_unknown_backend_of_the_compiler_is_refused() -> None:
+    with pytest.raises(NerfroError, match=r"compile=cuda is no backend of torch.compile here; there are .*inductor"):
+        compile_networks(NerfField(width=4, depth=1, skip=1, view_width=4), "cuda")
