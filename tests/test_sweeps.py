@@ -1,0 +1,258 @@
+"""Sweeps that are stopped, continued, changed, and that fail in part; and the launchers that run them."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf
+
+from nerfro.config import TrainConfig
+from nerfro.paths import CONF_DIR
+from nerfro.registry import discover
+from nerfro.sweeps import Identity, folder_name, scene_name
+
+SWEEPS = sorted(path.stem for path in (CONF_DIR / "sweep").glob("*.yaml"))
+
+WAITING_LOSS = '''
+"""Waits, and says which step it is at."""
+import time
+from nerfro.losses.base import Loss
+from nerfro.registry import register
+
+@register("loss", "waiting")
+class Waiting(Loss):
+    """Waits a little in every step."""
+
+    def forward(self, renderings, batch, model):
+        print(f"at step {model.global_step}", flush=True)
+        time.sleep(0.1)
+        return renderings[-1].rgb.sum() * 0
+'''
+
+
+@pytest.fixture
+def sweep(train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path) -> Callable[..., Any]:
+    """`python -m nerfro.train -m` in this process, with tiny cells in tmp_path/sweep."""
+    steps = ["trainer.max_steps=2", "evaluation.every=0", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
+    return lambda *overrides: train_here("-m", *tiny_run, *steps, *overrides)
+
+
+@pytest.fixture
+def start(tmp_path: Path, tiny_run: list[str]) -> Callable[..., subprocess.Popen[str]]:
+    """Start a real sweep in tmp_path/sweep, whose output goes to tmp_path/log."""
+    plugins = tmp_path / "waiting_plugins"
+    plugins.mkdir()
+    (plugins / "waiting.py").write_text(WAITING_LOSS)
+    environment = {
+        **os.environ,
+        "NERFRO_PLUGINS": str(plugins),
+        "OMP_NUM_THREADS": "1",
+        # Nobody listens there: the search for LPIPS weights ends at once.
+        "https_proxy": "http://127.0.0.1:9",
+        "TORCH_HOME": str(tmp_path),
+        "RAY_USAGE_STATS_ENABLED": "0",
+    }
+
+    def run(*overrides: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "nerfro.train", "-m", *tiny_run, "evaluation.every=0", *overrides]
+        command.append(f"hydra.sweep.dir={tmp_path / 'sweep'}")
+        log = (tmp_path / "log").open("w")
+        return subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=log, stderr=subprocess.STDOUT, text=True)
+
+    return run
+
+
+def composed(*overrides: str) -> DictConfig:
+    discover()
+    ConfigStore.instance().store(name="train_schema", node=TrainConfig, provider="nerfro")
+    with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+        return compose("train", list(overrides))
+
+
+def written(folder: Path) -> dict[str, int]:
+    """When the scores of each cell were written."""
+    return {path.parent.name: path.stat().st_mtime_ns for path in folder.glob("*/metrics.json")}
+
+
+def test_finished_cells_are_skipped_and_new_ones_added(sweep: Callable[..., Any], tmp_path: Path) -> None:
+    first = sweep("seed=0,1")
+    assert first.code == 0, first.err
+    before = written(tmp_path / "sweep")
+    scene = scene_name(OmegaConf.load(next((tmp_path / "sweep").glob("*/config.yaml"))).data.root)
+    assert set(before) == {f"refractive-{scene}-seed{seed}" for seed in (0, 1)}
+
+    second = sweep("seed=1,2")
+    assert second.code == 0, second.err
+    assert "2 cells, 1 to run" in second.out
+    assert "2 of 2 cells finished" in second.out
+    assert f"python -m nerfro.summary 'runs={tmp_path / 'sweep'}'" in second.out
+    after = written(tmp_path / "sweep")
+    assert after.keys() - before.keys() == {f"refractive-{scene}-seed2"}
+    assert {name: after[name] for name in before} == before
+
+
+def test_failing_cell_stops_no_other_and_is_retried_on_request_alone(
+    sweep: Callable[..., Any], tiny_scene: Path, tmp_path: Path
+) -> None:
+    late = tmp_path / "late.ply"
+    swept = f"medium.mesh={late},{tiny_scene / 'mesh.ply'}"
+    first = sweep(swept)
+    assert first.code == 1
+    assert "1 of 2 cells finished" in first.out
+    (reason,) = [line for line in first.out.splitlines() if ": failed: " in line]
+    assert str(late) in reason
+    before = written(tmp_path / "sweep")
+    assert len(before) == 1
+
+    shutil.copy(tiny_scene / "mesh.ply", late)
+    second = sweep(swept)
+    assert second.code == 1
+    assert "2 cells, 0 to run" in second.out
+    assert reason in second.out.splitlines()
+
+    third = sweep(swept, "hydra.sweeper.retry_failed=true")
+    assert third.code == 0, third.err
+    assert "2 cells, 1 to run" in third.out
+    assert len(written(tmp_path / "sweep")) == 2
+    assert before.items() <= written(tmp_path / "sweep").items()
+
+
+def test_cell_of_another_configuration_or_other_data_is_never_replaced(
+    sweep: Callable[..., Any], tiny_scene: Path, tmp_path: Path
+) -> None:
+    scene = tmp_path / "scene"
+    shutil.copytree(tiny_scene, scene)
+    data = [f"data.root={scene}", "seed=0"]
+    assert sweep(*data).code == 0
+    before = written(tmp_path / "sweep")
+
+    changed = sweep(*data, "trainer.max_steps=3")
+    assert changed.code == 1
+    assert "holds a run with trainer.max_steps=2, now 3; choose another hydra.sweep.dir" in changed.out
+    (scene / "test" / "r_9.png").write_bytes(b"more")
+    changed = sweep(*data)
+    assert changed.code == 1
+    assert "holds a run with other files in its data's folder" in changed.out
+    assert written(tmp_path / "sweep") == before
+
+
+def test_missing_data_is_told_before_anything_runs(sweep: Callable[..., Any], tiny_scene: Path, tmp_path: Path) -> None:
+    finished = sweep(f"data.root={tmp_path / 'ship'},{tiny_scene}")
+    assert finished.code == 1
+    told = finished.out.index(f"python -m nerfro.synthesize scene=ship out={tmp_path / 'ship'}")
+    assert told < finished.out.index("nerfro: refractive on"), "before the other cell begins"
+    assert "1 of 2 cells finished" in finished.out
+    assert not (tmp_path / "sweep" / "refractive-ship-seed0").exists()
+
+
+def test_cells_that_would_share_a_folder_are_refused(sweep: Callable[..., Any], tmp_path: Path) -> None:
+    finished = sweep(f"data.root={tmp_path / 'a' / 'x'},{tmp_path / 'b' / 'x'}")
+    assert finished.code == 1
+    assert "two cells would share the folder refractive-x-seed0" in finished.err
+    assert not list((tmp_path).glob("sweep/*"))
+
+
+@pytest.mark.parametrize("name", SWEEPS)
+def test_sweep_file_composes_its_cells(name: str, train_here: Callable[..., Any], tmp_path: Path) -> None:
+    finished = train_here(
+        "-m",
+        f"+sweep={name}",
+        f"data.root={tmp_path / 'torus'},{tmp_path / 'ship'}",
+        f"hydra.sweep.dir={tmp_path}/sweep",
+    )
+    hydra: Any = OmegaConf.to_container(OmegaConf.load(CONF_DIR / "sweep" / f"{name}.yaml"), resolve=False)["hydra"]
+    num_cells = 2
+    for key, value in hydra["sweeper"]["params"].items():
+        num_cells *= 1 if key == "data.root" else len(value.split(","))
+    assert finished.code == 1
+    assert f"{num_cells} cells, 0 to run" in finished.out, finished.err
+    refused = [line for line in finished.out.splitlines() if ": refused: " in line]
+    assert len(refused) == 2 * num_cells, "at the beginning and at the end"
+    assert hydra["sweep"]["dir"] == f"outputs/sweeps/{name}"
+
+
+def test_identity_is_what_is_computed_and_not_how_it_is_watched() -> None:
+    plain = Identity.of(composed()).hash
+    assert Identity.of(composed("logger=none", "checkpoint.every_seconds=5", "ckpt_path=last")).hash == plain
+    for override in ("seed=1", "trainer.max_steps=7", "medium.ior=1.4", "evaluation.split=val"):
+        assert Identity.of(composed(override)).hash != plain
+
+
+def test_folders_are_named_by_experiment_scene_seed_and_what_else_is_swept() -> None:
+    config = composed("+experiment=ablation_noH", "seed=3")
+    swept = ["+experiment=ablation_noH", "data.root=embedded:torus", "trainer.max_time=00:00:04:00", "seed=3"]
+    assert folder_name(config, swept) == "ablation_noH-torus-seed3-max_time=00_00_04_00"
+
+
+@pytest.mark.slow
+def test_killed_sweep_goes_on_where_it_was(start: Callable[..., subprocess.Popen[str]], tmp_path: Path) -> None:
+    overrides = ["seed=0,1,2", "+loss.waiting.weight=1", "trainer.max_steps=20"]
+    overrides += ["checkpoint.every_steps=4", "checkpoint.every_seconds=null"]
+    first = start(*overrides)
+    cells = [tmp_path / "sweep" / f"refractive-{name}-seed{seed}" for seed in range(3) for name in [tiny_name(first)]]
+    deadline = time.monotonic() + 300
+    while not (state(cells[0]) == "finished" and (cells[1] / "checkpoints" / "last.ckpt").is_file()):
+        assert first.poll() is None, (tmp_path / "log").read_text()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    assert not (cells[1] / "metrics.json").exists()
+    assert not cells[2].exists()
+    before = written(tmp_path / "sweep")
+
+    assert start(*overrides).wait(300) == 0
+    log = (tmp_path / "log").read_text()
+    assert "3 cells, 2 to run" in log
+    assert "3 of 3 cells finished" in log
+    assert before.items() <= written(tmp_path / "sweep").items(), "the finished cell was left alone"
+    steps = [int(line.rpartition("at step ")[2]) for line in log.splitlines() if "at step " in line]
+    assert steps[0] >= 4, "the second cell went on from its checkpoint"
+    assert steps == [*range(steps[0], 20), *range(20)], "and the third began at the beginning"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local", "ray"])
+def test_launchers_run_cells_in_other_processes(
+    launcher: str, start: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    pytest.importorskip(f"hydra_plugins.hydra_{launcher.split('_')[0]}_launcher")
+    wrong = f"medium.mesh={tmp_path / 'nowhere.ply'},{'${data.root}/mesh.ply'}"
+    finished = start(wrong, "seed=0,1", "trainer.max_steps=2", f"hydra/launcher={launcher}")
+    assert finished.wait(600) == 1
+    log = (tmp_path / "log").read_text()
+    assert "4 cells, 4 to run" in log
+    assert "2 of 4 cells finished" in log
+    assert len([line for line in log.splitlines() if line.startswith("  ") and ": failed: " in line]) == 2
+    commands = [json.loads(path.read_text())["command"] for path in (tmp_path / "sweep").glob("*/run.json")]
+    assert len(commands) == 2
+    assert all(command.startswith("python -m nerfro.train data.root=") for command in commands)
+    assert sorted("seed=0" in command for command in commands) == [False, True]
+
+    assert start(wrong, "seed=0,1", "trainer.max_steps=2", f"hydra/launcher={launcher}").wait(600) == 1
+    assert "4 cells, 0 to run" in (tmp_path / "log").read_text()
+
+
+def tiny_name(process: subprocess.Popen[str]) -> str:
+    """Name of the scene that a sweep's command is about."""
+    (root,) = [str(a).partition("=")[2] for a in process.args if str(a).startswith("data.root=")]  # type: ignore[union-attr]
+    return scene_name(root)
+
+
+def state(cell: Path) -> str | None:
+    try:
+        return json.loads((cell / "cell.json").read_text())["state"]
+    except FileNotFoundError:
+        return None
