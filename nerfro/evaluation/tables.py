@@ -266,7 +266,8 @@ def to_html(table: Table) -> str:
 
     grouped = any(column.group for column in table.columns)
     lines = ["<table>", f"<caption>{html.escape(table.title)}</caption>", "<thead>", "<tr>"]
-    lines.append(f'<th scope="col"{" rowspan=2" if grouped else ""}>{html.escape(table.label_title)}</th>')
+    rows = 2 if grouped else 1
+    lines.append(f'<th scope="col" rowspan="{rows}">{html.escape(table.label_title)}</th>')
     if grouped:
         lines += [f'<th scope="colgroup" colspan="{n}">{html.escape(name)}</th>' for name, n in table.groups()]
         lines.append("</tr><tr>")

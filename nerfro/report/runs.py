@@ -11,6 +11,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
+import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from PIL import Image
@@ -173,7 +174,15 @@ def read_run(folder: Path) -> Run:
     except OSError as error:
         reason = f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}"
         raise NerfroError(f"the run {shown(folder)} cannot be read: {reason}; repair it or leave it out") from error
-    except (OmegaConfBaseException, KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+    except (
+        OmegaConfBaseException,
+        yaml.YAMLError,
+        KeyError,
+        IndexError,
+        TypeError,
+        ValueError,
+        AttributeError,
+    ) as error:
         reason = str(error).strip().split("\n", 1)[0]
         raise NerfroError(
             f"the run {shown(folder)} is not as nerfro.train writes it ({type(error).__name__}: {reason}); leave it out"

@@ -1,0 +1,227 @@
+import base64
+import io
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from PIL import Image
+
+from nerfro.errors import NerfroError
+from nerfro.evaluation.images import load_png, save_png
+from nerfro.evaluation.metrics import ImageMetrics
+from nerfro.evaluation.results import write_metrics_json
+from nerfro.registry import discover
+from nerfro.report.comparison import compare, find_metrics, to_table
+from nerfro.report.curves import HEIGHT, MAX_POINTS, WIDTH, draw_charts, read_curves
+from nerfro.report.page import report_page
+from nerfro.report.runs import find_runs
+from nerfro.report.views import Wanted, data_uri, scene_pictures
+from nerfro.run_folder import record
+
+PSNR = find_metrics(["psnr"])[0]
+CSV = """epoch,loss/photometric,loss/total,step,train/psnr,val/psnr
+0,0.1,0.2,9,10.0,
+0,0.01,0.02,19,20.0,
+0,,,19,,18.5
+0,0.001,nan,29,30.0,
+0,0.0
+"""
+
+
+def write_run(folder: Path, name: str, scene: Path, noise: float) -> None:
+    """A run folder as nerfro.train leaves it: pictures are the references of a scene with noise, scored."""
+    config = {
+        "name": name,
+        "seed": 0,
+        "data": {"_target_": "nerfro.data.blender.BlenderData", "root": str(scene), "near": 2.0, "far": 6.0},
+        "batches": {"size": 512},
+        "evaluation": {"split": "test"},
+        "trainer": {"max_time": "00:00:00:20", "max_steps": -1, "accelerator": "cpu", "devices": 1},
+    }
+    record(folder, OmegaConf.create(config))
+    metrics = ImageMetrics({}, prefix="test")
+    for view in range(2):
+        reference = load_png(scene / "test" / f"r_{view}.png")
+        prediction = (reference + noise * (1 + view) * torch.randn_like(reference)).clamp(0, 1)
+        save_png(folder / "images" / f"test_{view:03d}.png", prediction)
+        metrics.update(prediction, reference, view)
+    write_metrics_json(folder / "metrics.json", metrics.result(), 30, 20.0, 1000.0)
+    (folder / "csv").mkdir()
+    (folder / "csv" / "metrics.csv").write_text(CSV)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory, tiny_scene: Path) -> Path:
+    discover()
+    root = tmp_path_factory.mktemp("runs")
+    write_run(root / "good", "good <b>", tiny_scene, 0.01)
+    write_run(root / "bad", "bad", tiny_scene, 0.2)
+    return root
+
+
+def page(runs: Path, wanted: Wanted | None = None, unfinished: tuple[str, ...] = ()) -> str:
+    comparisons = compare(find_runs([str(runs)])[0], {}, {})
+    compared = [(comparison, to_table(comparison, [PSNR], "full")) for comparison in comparisons]
+    return report_page(compared, unfinished, wanted or Wanted.of(8, None, None), PSNR, "full")
+
+
+def test_curves_are_read_by_name_without_empty_broken_or_endless_values(tmp_path: Path) -> None:
+    (tmp_path / "csv").mkdir()
+    (tmp_path / "csv" / "metrics.csv").write_text(CSV)
+    curves = read_curves(tmp_path)
+    assert curves.keys() == {"loss/photometric", "loss/total", "train/psnr", "val/psnr"}
+    assert [list(part) for part in curves["train/psnr"]] == [[9, 19, 29], [10, 20, 30]]
+    assert [list(part) for part in curves["loss/total"]] == [[9, 19], [0.2, 0.02]]
+    assert [list(part) for part in curves["val/psnr"]] == [[19], [18.5]]
+    assert read_curves(tmp_path / "nowhere") == {}
+
+
+def test_charts_put_psnr_first_draw_losses_in_decades_and_keep_inside() -> None:
+    steps = np.arange(1, 4) * 10
+    run = {"loss/a": (steps, np.array([1.0, 0.1, 0.01])), "val/psnr": (steps[:1], np.array([20.0]))}
+    charts = draw_charts([(3, run)])
+    assert [chart.name for chart in charts] == ["val/psnr", "loss/a"]
+    assert charts[0].lines[0].single
+    assert charts[1].lines[0].method == 3
+    points = [tuple(map(float, point.split(","))) for point in charts[1].lines[0].points.split()]
+    assert points[0][1] < points[1][1] < points[2][1]  # SVG counts downwards
+    assert points[1][1] - points[0][1] == pytest.approx(points[2][1] - points[1][1], abs=0.2)
+    assert all(0 <= x <= WIDTH and 0 <= y <= HEIGHT for x, y in points)
+    assert [tick.text for tick in charts[1].y_ticks] == ["0.01", "0.1", "1"]
+
+
+def test_long_logs_are_averaged_and_losses_of_zero_are_not_drawn() -> None:
+    steps = np.arange(10 * MAX_POINTS)
+    (psnr,) = draw_charts([(0, {"train/psnr": (steps, np.tile([0.0, 10.0], 5 * MAX_POINTS))})])
+    points = psnr.lines[0].points.split()
+    assert len(points) == MAX_POINTS
+    assert len({point.split(",")[1] for point in points}) == 1  # every mean is 5
+    assert draw_charts([(0, {"loss/a": (steps, np.zeros(len(steps)))})]) == []
+
+
+def test_figure_shows_the_view_of_the_median_score_and_insets_that_lie_apart(runs: Path) -> None:
+    (comparison,) = compare(find_runs([str(runs)])[0], {}, {})
+    (scored,) = comparison.scenes
+    pictures = scene_pictures(comparison, scored, Wanted.of(1, None, None), PSNR, "full")
+    # View 1 has twice the noise; of two views the lower score is the lower median.
+    assert pictures.figure.index == 1
+    assert [view.index for view in pictures.views] == [0, 1]
+    first, second = pictures.crops
+    assert first.size == second.size == 4
+    assert abs(first.top - second.top) >= 4 or abs(first.left - second.left) >= 4
+    assert pictures.methods == dict(enumerate(comparison.methods))
+    wanted = Wanted.of(8, {scored.name: 0}, {scored.name: [[1, 2, 5]]})
+    chosen = scene_pictures(comparison, scored, wanted, PSNR, "full")
+    assert chosen.figure.index == 0
+    assert [(crop.top, crop.left, crop.size) for crop in chosen.crops] == [(1, 2, 5)]
+
+
+def test_small_pictures_are_embedded_bit_for_bit_and_large_ones_as_jpeg(runs: Path) -> None:
+    file = runs / "bad" / "images" / "test_000.png"
+    kind, encoded = data_uri(load_png(file)).split(",")
+    assert kind == "data:image/png;base64"
+    assert np.array_equal(np.array(Image.open(io.BytesIO(base64.b64decode(encoded)))), np.array(Image.open(file)))
+    assert data_uri(torch.zeros(8, 300, 3)).startswith("data:image/jpeg;base64,")
+
+
+def test_page_needs_nothing_from_outside_and_its_parts_find_each_other(runs: Path) -> None:
+    html = page(runs, unfinished=("x has not been evaluated",))
+    loaded = re.findall(r"\b(?:src|href|data)=\"([^\"]*)\"", html)
+    assert loaded
+    assert all(link.startswith(("data:image/", "#")) for link in loaded)
+    assert "@import" not in html
+    assert "url(" not in html
+    ids = re.findall(r"\bid=\"([^\"]*)\"", html)
+    assert len(ids) == len(set(ids))
+    assert {link[1:] for link in loaded if link.startswith("#")} <= set(ids)
+    assert "good &lt;b&gt;" in html
+    assert "good <b>" not in html
+    assert "x has not been evaluated" in html
+    assert "python -m" in html
+    assert "max_time: 00:00:00:20" in html
+
+
+def test_page_without_its_data_keeps_the_rest(runs: Path, tmp_path: Path) -> None:
+    moved = tmp_path / "runs"
+    shutil.copytree(runs, moved)
+    for config in moved.glob("*/config.yaml"):
+        config.write_text(re.sub(r"root: .*", "root: /nowhere/scene", config.read_text()))
+    html = page(moved)
+    assert "The pictures cannot be shown" in html
+    assert "/nowhere/scene" in html
+    assert "<image" not in html
+    assert "train/psnr" in html
+    assert "max_time" in html
+
+
+def test_pictures_of_another_data_set_are_refused(runs: Path, tmp_path: Path, tiny_scene: Path) -> None:
+    (comparison,) = compare(find_runs([str(runs)])[0], {}, {})
+    (scored,) = comparison.scenes
+    changed = tmp_path / "scene"
+    shutil.copytree(tiny_scene, changed)
+    manifest = json.loads((changed / "transforms_test.json").read_text())
+    manifest["frames"].pop()
+    (changed / "transforms_test.json").write_text(json.dumps(manifest))
+    for run in comparison.runs:
+        run.config["data"]["root"] = str(changed)  # type: ignore[index]
+    with pytest.raises(NerfroError, match="has it been changed since"):
+        scene_pictures(comparison, scored, Wanted.of(8, None, None), PSNR, "full")
+
+
+# Does what a reader does, and writes down what is seen.
+PROBE = """<script>
+const stage = document.querySelector(".slider"), form = stage.querySelector("form").elements, seen = [];
+const box = element => element.getBoundingClientRect();
+const look = () => seen.push({
+  left: stage.querySelector("svg.left use").getAttribute("href"),
+  right: stage.querySelector("svg.right use").getAttribute("href"),
+  named: stage.querySelector("svg.right").getAttribute("aria-label"),
+  written: stage.querySelector("output.right").value,
+  clip: getComputedStyle(stage.querySelector("svg.left")).clipPath,
+  border: box(stage.querySelector(".border")).x - box(stage.querySelector(".stage")).x,
+});
+const set = (control, value) => { control.value = value; control.dispatchEvent(new Event("input", {bubbles: true})); };
+look();
+set(form.border, 80); look();
+set(form.view, 0); set(form.left, "p0"); set(form.right, "e1"); look();
+form.border.focus();
+document.body.dataset.seen = JSON.stringify({
+  states: seen,
+  width: box(stage.querySelector(".stage")).width,
+  focus: document.activeElement.name,
+  overflow: document.documentElement.scrollWidth - document.documentElement.clientWidth,
+  drawn: [...document.querySelectorAll("svg[role=img]")].every(svg => box(svg).width > 0 && box(svg).height > 0),
+  unnamed: [...document.querySelectorAll("svg[role=img], img, select, input, .wide")].filter(
+    e => !(e.ariaLabel || e.alt || e.labels?.length)).length,
+});
+</script></body>"""
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="Chromium is not installed")
+def test_slider_in_a_browser(runs: Path, tmp_path: Path) -> None:
+    file = tmp_path / "page.html"
+    file.write_text(page(runs).replace("</body>", PROBE), encoding="utf-8")
+    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
+    command = ["chromium", *options, "--window-size=500,900", "--dump-dom", file.as_uri()]
+    dom = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout
+    found = re.search(r"data-seen=\"([^\"]*)\"", dom)
+    assert found, dom[-2000:]
+    seen = json.loads(found[1].replace("&quot;", '"').replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&"))
+    start, moved, other = seen["states"]
+    assert (start["left"], start["right"]) == ("#b0s0v1r", "#b0s0v1p1")
+    assert start["named"] == start["written"]
+    assert start["border"] == pytest.approx(0.5 * seen["width"], abs=2)
+    assert moved["border"] == pytest.approx(0.8 * seen["width"], abs=2)
+    assert start["clip"] != moved["clip"]
+    assert (other["left"], other["right"]) == ("#b0s0v0p0", "#b0s0v0e1")
+    assert other["named"].startswith("squared error of good <b>, view 0, PSNR ")
+    assert seen["focus"] == "border"
+    assert seen["overflow"] == 0
+    assert seen["drawn"]
+    assert seen["unnamed"] == 0

@@ -1,0 +1,359 @@
+import csv
+import io
+import json
+import os
+import re
+import statistics
+import sys
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import rich.console
+import torch
+from omegaconf import OmegaConf
+
+import nerfro.summary
+from nerfro.errors import NerfroError
+from nerfro.evaluation.images import save_png
+from nerfro.evaluation.results import METRICS, EvaluationResult, ViewScores, write_metrics_json
+from nerfro.evaluation.tables import Column, Row, Table, to_csv, to_html, to_latex, to_markdown, to_rich
+from nerfro.report.comparison import compare, differing, find_metrics, to_table
+from nerfro.report.runs import duration, find_runs
+from nerfro.run_folder import record
+
+PAPER = find_metrics(["psnr", "ssim", "lpips"])
+FIELD = {"_target_": "nerfro.fields.nerf.NerfField", "width": 64, "scale": 1.0}
+
+
+def write_run(
+    folder: Path,
+    name: str,
+    psnr: float,
+    seed: int = 0,
+    root: str = "scenes/torus",
+    size: int = 16,
+    max_time: str | None = "00:00:04:00",
+    max_steps: int = -1,
+    field: dict | None = None,
+    lpips: float | None = 0.1,
+    views: int = 2,
+) -> Path:
+    """A run folder as nerfro.train leaves it, with grey pictures."""
+    config = {
+        "name": name,
+        "seed": seed,
+        "data": {"_target_": "nerfro.data.blender.BlenderData", "root": root, "near": 2.0, "far": 6.0, "alpha": "drop"},
+        "medium": {"mesh": f"{root}/mesh.ply", "cache": seed == 0},
+        "field": field or FIELD,
+        "batches": {"size": 512},
+        "evaluation": {"split": "test", "every": 10 + seed},
+        "trainer": {"max_time": max_time, "max_steps": max_steps, "accelerator": "cpu", "devices": 1},
+    }
+    record(folder, OmegaConf.create(config))
+    others = {metric.name: 0.5 for metric in METRICS}
+    rows = tuple(
+        ViewScores(f"test_{i:03d}", {**others, "psnr": psnr + i - (views - 1) / 2, "ssim": psnr / 40, "lpips": lpips})
+        for i in range(views)
+    )
+    result = EvaluationResult(rows, {} if lpips is not None else {"lpips": "no network"})
+    write_metrics_json(folder / "metrics.json", result, 1500, 240.0, 81000.0)
+    for row in rows:
+        save_png(folder / "images" / f"{row.name}.png", torch.full((size, size, 3), 0.5))
+    return folder
+
+
+def tables(place: Path) -> list[Table]:
+    runs, _ = find_runs([str(place)])
+    return [to_table(comparison, PAPER, "full") for comparison in compare(runs, {"b": "B"}, {"ship": "Ship"})]
+
+
+def cell(table: Table, label: str, group: str, title: str = "PSNR") -> tuple[float | None, float | None]:
+    column = next(i for i, c in enumerate(table.columns) if (c.group, c.title) == (group, title))
+    row = next(row for row in table.rows if row.label == label)
+    return row.values[column], row.spread(column)
+
+
+def test_seeds_become_a_mean_and_a_sample_deviation_and_titles_give_the_order(tmp_path: Path) -> None:
+    for seed, psnr in enumerate((20.0, 21.0, 23.0)):
+        write_run(tmp_path / f"deep/er/{seed}", "a", psnr, seed)
+        write_run(tmp_path / f"b{seed}", "b", 30.0 + seed, seed)
+        write_run(tmp_path / f"ship{seed}", "b", 25.0, seed, root="scenes/ship")
+    (table,) = tables(tmp_path)
+    assert [row.label for row in table.rows] == ["B", "a"]
+    assert [group for group, _ in table.groups()] == ["Ship", "torus"]
+    mean, spread = cell(table, "a", "torus")
+    assert mean == pytest.approx(64 / 3)
+    assert spread == pytest.approx(statistics.stdev([20, 21, 23]))
+    assert cell(table, "a", "Ship") == (None, None)
+    assert "over 3 seeds" in table.title
+    assert "2 test views; 16 x 16 pixels" in table.title
+
+
+def test_runs_of_different_budgets_never_share_a_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_run(tmp_path / "0", "a", 20.0)
+    write_run(tmp_path / "1", "a", 21.0, max_time="00:00:08:00")
+    write_run(tmp_path / "2", "a", 22.0, max_time=None, max_steps=100)
+    torch_threads = torch.get_num_threads()
+    monkeypatch.setattr(torch, "get_num_threads", lambda: torch_threads + 7)
+    write_run(tmp_path / "3", "a", 23.0)  # as long, on another device
+    write_run(tmp_path / "4", "b", 24.0, max_time=None, max_steps=100)  # as many steps cost the same there
+    found = tables(tmp_path)
+    assert [[row.values[0] for row in table.rows] for table in found] == [[24.0, 22.0], [20.0], [23.0], [21.0]]
+    assert found[0].title.startswith("Trained for 100 steps of 512 rays;")
+    assert found[3].title.startswith("Trained for 8 min on ")
+    assert len({re.split(";", table.title)[0] for table in found}) == 4
+
+
+def test_what_was_scored_differently_stands_in_columns_of_its_own(tmp_path: Path) -> None:
+    write_run(tmp_path / "0", "a", 20.0)
+    write_run(tmp_path / "1", "b", 21.0, size=8)
+    write_run(tmp_path / "2", "b", 22.0, root="elsewhere/torus")
+    (table,) = tables(tmp_path)
+    assert [group for group, _ in table.groups()] == [
+        f"torus, 16 x 16 pixels, {Path('elsewhere/torus').resolve()}",
+        f"torus, 8 x 8 pixels, {Path('scenes/torus').resolve()}",
+        f"torus, 16 x 16 pixels, {Path('scenes/torus').resolve()}",
+    ]
+    assert [row.values[::3] for row in table.rows] == [(22.0, 21.0, None), (None, None, 20.0)]
+    assert "pixels" not in table.title
+
+
+def test_runs_of_one_name_that_differ_in_a_field_are_different_methods(tmp_path: Path) -> None:
+    write_run(tmp_path / "0", "a", 20.0)
+    write_run(tmp_path / "1", "a", 22.0, field={**FIELD, "width": 32}, seed=1)
+    write_run(tmp_path / "2", "a", 24.0, field={"_target_": "nerfro.fields.hash_grid.HashGridField", "levels": 4})
+    write_run(tmp_path / "3", "a", 25.0, root="scenes/ship")  # another mesh, and the same method
+    (table,) = tables(tmp_path)
+    labels = {row.label: row.values for row in table.rows}
+    assert labels.keys() == {
+        "a (field=HashGridField)",
+        "a (field=NerfField, field.width=32)",
+        "a (field=NerfField, field.width=64)",
+    }
+    assert labels["a (field=NerfField, field.width=64)"][::3] == (25.0, 20.0)
+
+
+def test_fields_of_a_part_count_only_among_parts_of_one_class() -> None:
+    base = {"s._target_": "A", "s.n": 1, "t": 0}
+    assert differing([base, dict(base)]) == set()
+    assert differing([base, {"s._target_": "B", "s.m": 1, "t": 0}]) == {"s._target_"}
+    assert differing([base, {**base, "s.n": 2}, {**base, "t": 1}]) == {"s.n", "t"}
+
+
+def test_of_repeated_runs_the_newest_counts_and_the_others_are_named(tmp_path: Path) -> None:
+    for name, psnr, age in (("old", 20.0, 100), ("new", 25.0, 0), ("older", 22.0, 200)):
+        folder = write_run(tmp_path / name, "a", psnr)
+        stamp = os.stat(folder).st_mtime - age
+        os.utime(folder / "metrics.json", (stamp, stamp))
+    (table,) = tables(tmp_path)
+    assert cell(table, "a", "torus") == (25.0, None)
+    left_out = [note for note in table.notes if "left out" in note]
+    assert len(left_out) == 2
+    assert all(f"{tmp_path / 'new'} repeats it" in note for note in left_out)
+
+
+def test_missing_scores_are_missing_in_the_mean_too_and_have_their_reason(tmp_path: Path) -> None:
+    write_run(tmp_path / "0", "a", 20.0, seed=0)
+    write_run(tmp_path / "1", "a", 20.0, seed=1, lpips=None)
+    (table,) = tables(tmp_path)
+    assert cell(table, "a", "torus", "LPIPS") == (None, None)
+    assert cell(table, "a", "torus") == (20.0, 0.0)
+    assert "LPIPS n/a: no network" in table.notes
+
+
+def test_scores_of_a_region_come_from_the_region(tmp_path: Path) -> None:
+    write_run(tmp_path / "0", "a", 20.0)
+    file = tmp_path / "0" / "metrics.json"
+    content = json.loads(file.read_text())
+    for view in content["views"]:
+        view["regions"] = {"crop": {"psnr": 11.0, "ssim": 0.1, "lpips": 0.9}}
+    file.write_text(json.dumps(content))
+    (comparison,) = compare(find_runs([str(tmp_path)])[0], {}, {})
+    table = to_table(comparison, PAPER, "crop")
+    assert table.rows[0].values == (11.0, pytest.approx(0.1), pytest.approx(0.9))
+    assert "scores of the crop" in table.title
+    assert to_table(comparison, PAPER, "mask").rows[0].values == (None, None, None)
+
+
+def test_a_difference_of_commits_is_told(tmp_path: Path) -> None:
+    for name, commit in (("a", "1" * 40), ("b", "2" * 40)):
+        file = write_run(tmp_path / name, name, 20.0) / "run.json"
+        file.write_text(json.dumps({**json.loads(file.read_text()), "commit": commit}))
+    (table,) = tables(tmp_path)
+    assert "The runs are of different versions of the code: 1111111, 2222222" in table.notes
+
+
+def test_places_are_folders_and_globs_and_runs_without_scores_are_named(tmp_path: Path) -> None:
+    for name in ("a", "b", "c"):
+        write_run(tmp_path / name, name, 20.0)
+    (tmp_path / "c" / "metrics.json").unlink()
+    runs, unfinished = find_runs([str(tmp_path / "[ab]"), str(tmp_path / "a"), str(tmp_path / "c")])
+    assert [run.folder.name for run in runs] == ["a", "b"]
+    assert len(unfinished) == 1
+    assert str(tmp_path / "c") in unfinished[0]
+    with pytest.raises(NerfroError, match="has not been evaluated"):
+        find_runs([str(tmp_path / "c")])
+    with pytest.raises(NerfroError, match="nowhere does not exist"):
+        find_runs([str(tmp_path / "nowhere")])
+
+
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [
+        ("config.yaml", "name: a"),
+        ("config.yaml", "{[: not yaml"),
+        ("run.json", "{"),
+        ("metrics.json", "{}"),
+        ("images/test_000.png", ""),
+    ],
+)
+def test_a_damaged_run_is_named_in_one_line(tmp_path: Path, file: str, content: str) -> None:
+    folder = write_run(tmp_path / "a", "a", 20.0)
+    (folder / file).write_text(content)
+    with pytest.raises(NerfroError) as error:
+        find_runs([str(tmp_path)])
+    assert str(folder) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_durations_in_words() -> None:
+    assert [duration(s) for s in (20, 240, 5400, 0.2)] == ["20 s", "4 min", "1 h 30 min", "0 s"]
+
+
+MEDALS = Table(
+    "t",
+    "method",
+    tuple(
+        Column(title, better, decimals, group)
+        for group in ("A & co", "B")
+        for title, better, decimals in (("PSNR", "higher", 2), ("LPIPS", "lower", 3))
+    ),
+    (
+        Row("a", (22.08, 0.1, 1.0, None), (0.5, None, None, None)),
+        Row("b", (22.081, 0.2, 2.0, None)),
+        Row("c", (22.04, 0.3, 3.0, None)),
+        Row("d", (21.83, 0.4, 4.0, 0.5)),
+    ),
+    medals=True,
+)
+
+
+def test_medals_follow_the_papers_rule() -> None:
+    assert [[MEDALS.medal(i, j) for i in range(4)] for j in range(4)] == [
+        ["gold", "gold", "silver", "bronze"],
+        ["gold", "silver", "bronze", None],
+        [None, "bronze", "silver", "gold"],
+        [None, None, None, "gold"],
+    ]
+
+
+def test_markdown_and_csv_with_groups_medals_and_spreads() -> None:
+    lines = to_markdown(MEDALS).splitlines()
+    assert lines[2] == "| method | A & co PSNR ↑ | A & co LPIPS ↓ | B PSNR ↑ | B LPIPS ↓ |"
+    assert lines[4] == "| a | 22.08 ± 0.50 🥇 | 0.100 🥇 | 1.00 | n/a |"
+    heading, first, *_ = csv.reader(io.StringIO(to_csv(MEDALS)))
+    assert heading[:5] == ["method", "A & co PSNR", "A & co PSNR std", "A & co LPIPS", "A & co LPIPS std"]
+    assert first[:5] == ["a", "22.08", "0.5", "0.1", "n/a"]
+    assert len(heading) == len(first) == 9
+
+
+def test_latex_with_groups_medals_and_spreads() -> None:
+    latex = to_latex(MEDALS)
+    assert r" & \multicolumn{2}{c}{A \& co} & \multicolumn{2}{c}{B} \\" in latex
+    assert r"\cmidrule(lr){2-3} \cmidrule(lr){4-5}" in latex
+    assert r"a & \cellcolor[HTML]{F7DC8A}22.08 $\pm$ 0.50 & \cellcolor[HTML]{F7DC8A}0.100 & 1.00 & n/a \\" in latex
+    assert latex.count("{") == latex.count("}")
+    assert "±" not in latex
+
+
+def test_html_is_well_formed_and_tells_medals_without_colours() -> None:
+    root = ElementTree.fromstring(f"<div>{to_html(MEDALS)}</div>")
+    assert [(th.text, th.get("colspan")) for th in root.findall(".//th[@scope='colgroup']")] == [
+        ("A & co", "2"),
+        ("B", "2"),
+    ]
+    cells = root.findall(".//tbody/tr")[0].findall("td")
+    assert ["".join(td.itertext()) for td in cells] == ["22.08 ± 0.50 gold", "0.100 gold", "1.00", "n/a"]
+    assert [td.get("class") for td in cells] == ["gold", "gold", None, None]
+
+
+@pytest.mark.parametrize(("width", "blocks"), [(400, 1), (45, 2)])
+def test_console_stacks_groups_that_do_not_fit_side_by_side(width: int, blocks: int) -> None:
+    console = rich.console.Console(file=io.StringIO(), width=width)
+    console.print(to_rich(MEDALS))
+    text = console.file.getvalue()
+    assert text.count("method") == blocks
+    assert all(number in text for number in ("22.08 ± 0.50 🥇", "0.400", "4.00 🥇", "0.500 🥇"))
+    assert "…" not in text
+
+
+def test_spreads_that_do_not_fit_the_columns_are_refused() -> None:
+    with pytest.raises(NerfroError, match="1 values of 'a' for 2 columns"):
+        Table("t", "m", (Column("x"), Column("y")), (Row("a", (1.0, 2.0), (0.1,)),))
+
+
+@pytest.fixture
+def summarise(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
+    """`python -m nerfro.summary`'s main in this process: exit code, and all that it printed."""
+
+    def run(*overrides: str) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["nerfro.summary", *overrides])
+        monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+        capsys.readouterr()
+        code = 0
+        try:
+            nerfro.summary.main()
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 1
+        printed = capsys.readouterr()
+        return code, printed.out + printed.err
+
+    return run
+
+
+def test_command_prints_writes_all_forms_and_refuses_to_overwrite(
+    tmp_path: Path, summarise: Callable[..., tuple[int, str]]
+) -> None:
+    write_run(tmp_path / "runs" / "a", "refractive", 25.0)
+    write_run(tmp_path / "runs" / "b", "mine", 22.0, max_time=None, max_steps=100)
+    runs, out = f"runs={tmp_path / 'runs'}", tmp_path / "out"
+    code, printed = summarise(runs, "methods.refractive=Ours", "+methods.mine=My own")
+    assert code == 0
+    assert "Ours" in printed
+    assert "My own" in printed
+    assert not out.exists()
+    code, printed = summarise(runs, f"out={out}")
+    assert code == 0, printed
+    assert {path.suffix for path in out.iterdir()} == {".csv", ".md", ".tex", ".html"}
+    assert len(list(out.iterdir())) == 8
+    assert "22.00" in (out / "100_steps_of_512_rays.md").read_text()
+    code, printed = summarise(runs, f"out={out}")
+    assert code == 1
+    assert "overwrite=true" in printed
+    assert len(printed.strip().splitlines()) == 1
+    assert summarise(runs, f"out={out}", "overwrite=true")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("metrics=[psnr,foo]", "'foo' is not a metric; choose from psnr"),
+        ("region=x", "choose from full, mask, crop"),
+        ("views=-1", "views=-1"),
+        ("view={ship: 0}", "'ship' is not a scene of these runs; choose from torus"),
+        ("view={torus: 2}", "give 0 to 1"),
+        ("crops={torus: 5}", "does not name squares"),
+        ("crops={torus: [[8,8,9]]}", "does not lie inside 16 x 16 pixels"),
+        ("runz=[x]", "runz"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(
+    tmp_path: Path, summarise: Callable[..., tuple[int, str]], override: str, said: str
+) -> None:
+    write_run(tmp_path / "a", "refractive", 25.0)
+    code, printed = summarise(f"runs=[{tmp_path}]", override)
+    assert code == 1
+    assert said in printed
+    assert len(printed.strip().splitlines()) == 1
