@@ -174,6 +174,7 @@ def test_evaluation_of_the_checkpoint_repeats_the_runs_own(
     assert first["rays_per_second"] == pytest.approx(second["rays_per_second"])
     for name in ("test_000.png", "test_001.png"):
         assert np.array_equal(read(run / "images" / name), read(tmp_path / "again" / "images" / name))
+        assert (tmp_path / "again" / "errors" / name).is_file()
 
 
 def test_evaluation_never_replaces_an_earlier_one_unasked(

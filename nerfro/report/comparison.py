@@ -28,6 +28,7 @@ _NOT_THE_METHOD = (
     "evaluation.every",
     "evaluation.chunk_size",
     "evaluation.lpips_backbone",
+    "evaluation.lpips_vgg_backbone",
     "batches.cache_paths",
     "trainer.max_time",
     "trainer.max_steps",
