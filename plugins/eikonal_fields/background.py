@@ -1,0 +1,98 @@
+"""What is seen around the box, as grids that are blurred first and sharpened level by level."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.boundaries.base import Boundary
+from nerfro.fields.base import Field
+from nerfro.fields.selection import inside_box
+from nerfro.geometry.interpolation import trilinear
+from nerfro.geometry.smoothing import smooth
+from nerfro.types import Radiance, Samples
+
+# Directions are looked up on the unit sphere in a grid over this cube.
+_SKY_SIDE = 1.1
+_POINTS_AT_ONCE = 65536
+
+
+@dataclass(frozen=True)
+class Background:
+    """Radiance outside a box and the boundary, on grids; lookups are differentiable in position and direction.
+
+    Attributes:
+        radiance: rgb and density at the vertices over `box`.
+        box: corners, world units.
+        sky: rgb of the boundary in the direction of each vertex of a cube around the origin.
+    """
+
+    radiance: Float[Tensor, "X Y Z 4"]
+    box: Float[Tensor, "2 3"]
+    sky: Float[Tensor, "X Y Z 3"]
+
+    @classmethod
+    @torch.no_grad()
+    def fit(
+        cls,
+        field: Field,
+        boundary: Boundary,
+        box: Float[Tensor, "2 3"],
+        hidden: Float[Tensor, "2 3"],
+        resolution: int,
+    ) -> Background:
+        """Ask a field and a boundary at the vertices of grids.
+
+        The field's colour is the mean over the six axis directions.
+
+        Args:
+            field, boundary: what is seen.
+            box: where the field is asked, world units.
+            hidden: box in which nothing of it is kept.
+            resolution: vertices a side.
+        """
+        vertices = _vertices(box, resolution)
+        radiance = vertices.new_zeros(len(vertices), 4)
+        outside = (~inside_box(vertices, *hidden)).nonzero().squeeze(1)
+        for index in outside.split(_POINTS_AT_ONCE):
+            radiance[index] = _mean_radiance(field, vertices[index])
+        cube = torch.tensor([[-_SKY_SIDE] * 3, [_SKY_SIDE] * 3], device=box.device)
+        directions = torch.nn.functional.normalize(_vertices(cube, resolution), dim=-1)
+        sky = torch.cat([boundary(chunk).float() for chunk in directions.split(_POINTS_AT_ONCE)])
+        sides = (resolution,) * 3
+        return cls(radiance.view(*sides, 4), box, sky.view(*sides, 3))
+
+    def blurred(self, sigma: float) -> Background:
+        """Both grids convolved with a Gaussian of this standard deviation, in voxels."""
+        size = 2 * math.ceil(3 * sigma) + 1
+        return Background(smooth(self.radiance, size, sigma), self.box, smooth(self.sky, size, sigma))
+
+    def radiance_at(self, samples: Samples) -> Radiance:
+        """Density and colour at samples."""
+        values = trilinear(self.radiance, self.box, samples.positions)
+        return Radiance(values[..., 3], values[..., :3])
+
+    def sky_towards(self, directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
+        """Colour of the boundary in unit directions."""
+        cube = torch.tensor([[-_SKY_SIDE] * 3, [_SKY_SIDE] * 3], device=directions.device)
+        return trilinear(self.sky, cube, directions)
+
+
+def _vertices(box: Float[Tensor, "2 3"], resolution: int) -> Float[Tensor, "P 3"]:
+    ticks = torch.linspace(0, 1, resolution, device=box.device)
+    return box[0] + torch.cartesian_prod(ticks, ticks, ticks) * (box[1] - box[0])
+
+
+def _mean_radiance(field: Field, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P 4"]:
+    total = positions.new_zeros(len(positions), 4)
+    axes = torch.cat([torch.eye(3), -torch.eye(3)]).to(positions.device)
+    s = positions.new_zeros(len(positions), 1)
+    for axis in axes:
+        directions = axis.expand(len(positions), 1, 3)
+        found = field(Samples(positions[:, None], directions, s, torch.cat([s, s], 1), s[:, 0]))
+        total += torch.cat([found.rgb[:, 0], found.density], -1).float() / len(axes)
+    return total

@@ -1,0 +1,158 @@
+"""The refractive index as a network that is learned inside a box."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerfro.errors import NerfroError
+from nerfro.fields.selection import inside_box
+from nerfro.geometry.mesh import load_mesh
+from nerfro.media.base import Medium
+from nerfro.paths import resolve_path
+from nerfro.registry import register
+
+# Sharpness of the activation (authors' code): the Eikonal equation needs a smooth one, not ReLU.
+_BETA = 5.0
+
+
+@register("medium", "index_field")
+class IndexField(Medium):
+    """A refractive index that is learned: an MLP of encoded positions inside a box, n = 1 at the start.
+
+    A window W, 1 within the content's bounds and falling to 0 in a margin around them, weights the network's gradient,
+    as in the authors' code: the box itself does not refract, whatever the network says at its faces. Images then tell
+    the index up to a constant, which is chosen so that n = 1 on average over 26 points of the box's faces.
+
+    The gradient is pushed forward through the layers beside the value, so that one ordinary backward pass trains both.
+    """
+
+    box: Float[Tensor, "2 3"]
+    bounds: Float[Tensor, "2 3"]
+    frame: Float[Tensor, "26 3"]
+    frequencies: Float[Tensor, "K"]
+
+    def __init__(
+        self,
+        mesh: str | None = None,
+        box_min: list[float] = (-1.0, -1.0, -1.0),  # type: ignore[assignment]
+        box_max: list[float] = (1.0, 1.0, 1.0),  # type: ignore[assignment]
+        margin: float = 0.1,
+        width: int = 64,
+        depth: int = 6,
+        skip: int = 4,
+        octaves: int = 5,
+        ior: float | None = None,
+    ) -> None:
+        """Make an untrained field.
+
+        Args:
+            mesh: surface of which the bounds alone are taken; none for `box_min` and `box_max`.
+            box_min, box_max: corners of the content's bounds, world units.
+            margin: width of the window around the bounds, as a share of their longest side.
+            width, depth: of the MLP.
+            skip: layer, counted from 1, to whose output the encoding is concatenated again.
+            octaves: of the positional encoding; half the bounds' longest side counts as one.
+            ior: not used, for it is learned; scene files set it for the media that are told it.
+
+        Raises:
+            NerfroError: the box is empty, or a number is out of range.
+        """
+        super().__init__()
+        if mesh is not None:
+            bounds = torch.from_numpy(load_mesh(resolve_path(mesh), accept_open_mesh=True).bounds).float()
+        elif len(box_min) == len(box_max) == 3:
+            bounds = torch.tensor([list(box_min), list(box_max)])
+        else:
+            bounds = torch.zeros(2, 3)
+        if not bool((bounds[0] < bounds[1]).all()):
+            raise NerfroError(
+                f"medium=index_field: no box from {list(box_min)} to {list(box_max)}; give three numbers each, "
+                "box_min below box_max"
+            )
+        if margin <= 0 or width < 1 or depth < 1 or octaves < 0:
+            raise NerfroError(
+                f"medium=index_field: margin={margin} width={width} depth={depth} octaves={octaves}; "
+                "take a positive margin, at least 1 for width and depth, and 0 or more octaves"
+            )
+        side = float((bounds[1] - bounds[0]).max())
+        self.fade, self.scale, self.skip = margin * side, 0.5 * side, skip
+        self.register_buffer("bounds", bounds, persistent=False)
+        self.register_buffer("box", bounds + self.fade * torch.tensor([[-1.0], [1.0]]), persistent=False)
+        ticks = torch.tensor([-1.0, 0.0, 1.0])
+        signs = torch.cartesian_prod(ticks, ticks, ticks)
+        frame = self.box.mean(0) + 0.5 * signs[signs.any(-1)] * (self.box[1] - self.box[0])
+        self.register_buffer("frame", frame, persistent=False)
+        self.register_buffer("frequencies", 2.0 ** torch.arange(octaves), persistent=False)
+        encoded = 3 * (1 + 2 * octaves)
+        inputs = [encoded] + [width + encoded * (i == skip) for i in range(1, depth + 1)]
+        self.layers = nn.ModuleList(_Dual(n, width) for n in inputs[:-1])
+        self.last = _Dual(inputs[-1], 1)
+        nn.init.zeros_(self.last.weight)
+
+    @property
+    def content_box(self) -> Float[Tensor, "2 3"]:
+        """The content's bounds, without the margin."""
+        return self.bounds
+
+    def forward(
+        self, positions: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+        """Refractive index and its gradient; the network is asked only inside the box."""
+        flat = positions.reshape(-1, 3)
+        index = inside_box(flat, *self.box).nonzero().squeeze(1)
+        chosen = flat[index]
+        network, slope = self._network(chosen)
+        window = self._window(chosen)
+        excess = network - self._network(self.frame)[0].mean()
+        n = torch.ones_like(flat[:, 0]).index_copy(0, index, (1 + window * excess).to(flat))
+        gradients = torch.zeros_like(flat).index_copy(0, index, (window[:, None] * slope).to(flat))
+        return n.view(positions.shape[:-1]), gradients.view(positions.shape)
+
+    def _network(self, positions: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P"], Float[Tensor, "P 3"]]:
+        """Index up to a constant, and its gradient."""
+        encoded = self._encode(positions)
+        state = encoded
+        for i, layer in enumerate(self.layers, start=1):
+            state = _softplus(layer(state))
+            if i == self.skip:
+                state = torch.cat([state, encoded], -1)
+        state = _softplus(self.last(state))[..., 0]
+        return state[:, 0], state[:, 1:] / self.scale
+
+    def _encode(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P 4 F"]:
+        """Positional encoding, and its derivative along each axis of the unit frame."""
+        unit = ((positions - self.bounds.mean(0)) / self.scale).to(self.frequencies)
+        angles = (unit[:, None] * self.frequencies[:, None]).flatten(1)
+        rates = self.frequencies.repeat_interleave(3)
+        sines, cosines = torch.sin(angles), torch.cos(angles)
+        value = torch.cat([unit, sines, cosines], -1)
+        slope = torch.cat([torch.ones_like(unit), rates * cosines, -rates * sines], -1)
+        axes = torch.eye(3, device=unit.device).repeat(1, value.shape[1] // 3)
+        return torch.cat([value[:, None], slope[:, None] * axes], 1)
+
+    def _window(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
+        """Product of a cubic step for each axis."""
+        depth = 0.5 * (self.box[1] - self.box[0]) - (positions - self.bounds.mean(0)).abs()
+        t = (depth / self.fade).clamp(0, 1)
+        return (t * t * (3 - 2 * t)).prod(-1)
+
+
+class _Dual(nn.Linear):
+    """A layer for a value and its three derivatives, to which the bias adds nothing; Glorot-uniform, bias zero."""
+
+    def reset_parameters(self) -> None:
+        nn.init.xavier_uniform_(self.weight)
+        nn.init.zeros_(self.bias)
+
+    def forward(self, state: Float[Tensor, "P 4 I"]) -> Float[Tensor, "P 4 O"]:
+        product = state @ self.weight.T
+        return torch.cat([product[:, :1] + self.bias, product[:, 1:]], 1)
+
+
+def _softplus(state: Float[Tensor, "P 4 O"]) -> Float[Tensor, "P 4 O"]:
+    """The activation for a value and its three derivatives."""
+    value, slopes = state[:, :1], state[:, 1:]
+    return torch.cat([F.softplus(value, _BETA), torch.sigmoid(_BETA * value) * slopes], 1)

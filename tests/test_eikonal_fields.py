@@ -1,0 +1,273 @@
+"""The plugin that holds Eikonal Fields: its medium, its paths and its stages."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from nerfro.boundaries.constant import ConstantBoundary
+from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.errors import NerfroError
+from nerfro.fields.base import Field
+from nerfro.fields.nerf import NerfField
+from nerfro.media.analytic import Luneburg
+from nerfro.media.base import Medium
+from nerfro.models.base import NerfModel, Parts
+from nerfro.models.optimizer import OptimizerConfig
+from nerfro.registry import discover, find
+from nerfro.run_folder import load_checkpoint
+from nerfro.samplers.straight import straight_path
+from nerfro.samplers.stratified import Stratified
+from nerfro.testing import example_rays
+from nerfro.types import Radiance, Samples
+
+discover()
+IndexField = find("medium", "index_field").cls
+BoxMarch = find("sampler/path", "box_march").cls
+EikonalFields = find("model", "eikonal_fields").cls
+
+SCENE, INDEX, INTERIOR = 0, 1, 2
+
+
+def random_index_field(**fields: Any) -> Medium:
+    """An index field as it may be in the middle of training, in double precision."""
+    medium = IndexField(**{"width": 16, "depth": 3, "skip": 2, "octaves": 3, **fields})
+    torch.nn.init.normal_(medium.last.weight, std=0.2)
+    return medium.double()
+
+
+# The medium.
+
+
+def test_untrained_index_is_one_everywhere() -> None:
+    n, gradient = IndexField()(torch.rand(100, 3) * 3 - 1.5)
+    assert torch.equal(n, torch.ones(100))
+    assert torch.equal(gradient, torch.zeros(100, 3))
+
+
+def test_gradient_is_the_derivative_of_the_index_within_the_bounds() -> None:
+    medium = random_index_field()
+    positions = (torch.rand(50, 3, dtype=torch.float64) * 2 - 1).requires_grad_()
+    n, gradient = medium(positions)
+    (expected,) = torch.autograd.grad(n.sum(), positions)
+    assert gradient.abs().max() > 0.05
+    torch.testing.assert_close(gradient, expected)
+
+
+def test_index_and_gradient_vanish_continuously_at_the_box() -> None:
+    medium = random_index_field()
+    face = medium.box[1, 0] * torch.tensor([1 - 1e-6, 0.2, 0.3], dtype=torch.float64)
+    n, gradient = medium(torch.stack([face, face * torch.tensor([1 + 2e-6, 1, 1], dtype=torch.float64)]))
+    torch.testing.assert_close(n, torch.ones_like(n), atol=1e-6, rtol=0)
+    torch.testing.assert_close(gradient, torch.zeros_like(gradient), atol=1e-6, rtol=0)
+
+
+def test_bounds_are_those_of_the_mesh(tiny_scene: Path) -> None:
+    medium = IndexField(mesh=str(tiny_scene / "mesh.ply"), margin=0.25)
+    torch.testing.assert_close(medium.content_box, torch.tensor([[-0.6] * 3, [0.6] * 3]), atol=1e-2, rtol=0)
+    assert float(medium.box[1, 0] - medium.content_box[1, 0]) == pytest.approx(0.3, abs=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"box_min": [0.0, 0.0, 1.0], "box_max": [1.0, 1.0, 0.0]}, "no box from"),
+        ({"margin": 0.0}, "take a positive margin"),
+    ],
+)
+def test_impossible_index_fields_are_refused(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(NerfroError, match=message):
+        IndexField(**fields)
+
+
+# Paths.
+
+
+def test_paths_through_nothing_are_the_straight_ones() -> None:
+    rays = example_rays()
+    path = BoxMarch(16)(rays, IndexField())
+    straight = straight_path(rays)
+    s = path.near[:, None] + torch.linspace(0, 1, 20) * (path.far - path.near)[:, None]
+    torch.testing.assert_close(path.at(s)[0], straight.at(s)[0])
+    torch.testing.assert_close(path.exit_directions, rays.directions)
+    assert not path.refracted.any()
+
+
+def test_parallel_rays_through_a_luneburg_lens_meet_in_its_focus() -> None:
+    height = torch.linspace(-0.8, 0.8, 9, dtype=torch.float64)
+    origins = torch.stack([torch.full_like(height, -3), height, 0 * height], -1)
+    directions = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64).expand(9, 3)
+    rays = replace(example_rays(9), origins=origins, directions=directions, near=height * 0 + 1, far=height * 0 + 5)
+    errors = []
+    for num_steps in (256, 512):
+        path = BoxMarch(num_steps)(rays, Luneburg().double())
+        to_focus = path.positions - torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+        errors.append(float(to_focus.norm(dim=-1).amin(-1).max()))
+    assert errors[1] < 0.02
+    assert errors[1] < 0.7 * errors[0]  # of first order, up to where the vertices happen to lie
+
+
+def test_gradients_of_exit_directions_are_those_of_finite_differences() -> None:
+    rays = example_rays(6)
+    rays = replace(rays, **{name: getattr(rays, name).double() for name in ("origins", "directions", "near", "far")})
+    medium = random_index_field()
+    weight = medium.layers[0].weight
+    toward = torch.randn(6, 3, dtype=torch.float64)
+
+    def value() -> Tensor:
+        return (BoxMarch(24)(rays, medium).exit_directions * toward).sum()
+
+    value().backward()
+    step = 1e-6
+    for row, column in ((0, 1), (3, 4), (7, 0)):
+        with torch.no_grad():
+            weight[row, column] += step
+            above = value()
+            weight[row, column] -= 2 * step
+            below = value()
+            weight[row, column] += step
+        assert float(weight.grad[row, column]) == pytest.approx(float(above - below) / (2 * step), rel=1e-4, abs=1e-9)
+
+
+# The model.
+
+
+class Slanted(Field):
+    """Density 1 and a colour that grows with x, everywhere."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.scale = torch.nn.Parameter(torch.tensor(0.1))
+
+    def forward(self, samples: Samples) -> Radiance:
+        return Radiance(torch.ones_like(samples.s), 0.5 + self.scale * samples.positions)
+
+
+def make_model(make_field: Callable[[], Field] = Slanted, **fields: Any) -> NerfModel:
+    parts = Parts(
+        medium=IndexField(width=8, depth=2, skip=0),
+        path_sampler=BoxMarch(16),
+        point_sampler=Stratified(64),
+        make_field=make_field,
+        boundary=ConstantBoundary([0.2, 0.3, 0.4]),
+        losses={},
+        optimizer=OptimizerConfig(),
+    )
+    return EikonalFields(parts, **{"resolution": 16, "box_min": [-5.0] * 3, "box_max": [5.0] * 3, **fields})
+
+
+def test_stages_have_their_shares_of_the_budget() -> None:
+    model = make_model(scene_share=0.5, index_share=0.3)
+    stages = [model.stage_at(progress) for progress in (0.0, 0.25, 0.5, 0.65, 0.9, 1.0)]
+    assert [int(stage) for stage, _ in stages] == [SCENE, SCENE, INDEX, INDEX, INTERIOR, INTERIOR]
+    assert [done for _, done in stages] == pytest.approx([0, 0.5, 0, 0.5, 0.5, 1])
+
+
+def test_each_stage_trains_its_own_part() -> None:
+    model = make_model(lambda: NerfField(width=8, depth=2, skip=1, view_width=8))
+    torch.nn.init.normal_(model.medium.last.weight, std=0.2)
+    model.train()
+    trained = {}
+    for stage in (SCENE, INDEX, INTERIOR):
+        model.stage.fill_(stage)
+        model.sharpen(0)
+        model.zero_grad(set_to_none=True)
+        model(example_rays())[-1].rgb.sum().backward()
+        parts = {"scene": model.fields, "index": model.medium, "interior": model.interior}
+        trained[stage] = {name for name, part in parts.items() if any(p.grad is not None for p in part.parameters())}
+    assert trained == {SCENE: {"scene"}, INDEX: {"index"}, INTERIOR: {"interior"}}
+
+
+def test_what_the_first_stage_saw_inside_the_box_is_dropped() -> None:
+    rays = example_rays()
+    model = make_model().eval()
+    first = model(rays)[-1]
+    model.stage.fill_(INDEX)
+    second = model(rays)[-1]
+    inside = (first.samples.positions.abs() <= model.medium.box[1]).all(-1)
+    assert inside.any()
+    assert bool((second.weights[inside] == 0).all())
+    # Before the box nothing has changed.
+    before = (inside.cumsum(-1) == 0) & inside.any(-1, keepdim=True)
+    torch.testing.assert_close(first.weights[before], second.weights[before])
+
+
+def test_sharp_grids_show_what_the_field_and_the_boundary_show() -> None:
+    model = make_model(blur=1e-2, resolution=24)
+    model.stage.fill_(INDEX)
+    model.point_sampler.eval()
+    model.sharpen(0)
+    # Past the box: next to it the grid blurs what was dropped over a cell.
+    rays = replace(example_rays(), origins=example_rays().origins + torch.tensor([2.5, 0, 0]))
+    from_grids = model(rays)[-1].rgb
+    from_fields = model.eval()(rays)[-1].rgb
+    past = (model(rays)[-1].samples.positions.abs().amax(-1) > model.medium.box[1, 0] + 0.5).all(-1)
+    assert past.sum() > 5
+    torch.testing.assert_close(from_grids[past], from_fields[past], atol=1e-4, rtol=0)
+
+
+def test_grids_get_sharper_level_by_level() -> None:
+    model = make_model(blur=2.0, num_levels=3)
+    model.boundary = EnvironmentMap([16])
+    torch.nn.init.normal_(model.boundary.texels)
+    directions = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
+    errors = []
+    for level in range(3):
+        model.sharpen(level)
+        with torch.no_grad():
+            error = model._blurred.sky_towards(directions) - model.boundary(directions)
+        errors.append(float(error.square().mean()))
+    assert errors[0] > errors[1] > errors[2]
+
+
+def test_impossible_shares_are_refused() -> None:
+    with pytest.raises(NerfroError, match="leave the rest of 1 to the interior"):
+        make_model(scene_share=0.8, index_share=0.4)
+
+
+# All of it, from the command line.
+
+
+def test_the_three_stages_train_from_the_command_line(
+    tiny_scene: Path, train_here: Callable[..., Any], tmp_path: Path
+) -> None:
+    finished = train_here("+experiment=eikonal_fields", *tiny(tiny_scene), f"hydra.run.dir={tmp_path}")
+    assert finished.code == 0, finished.err
+    checkpoint, _ = load_checkpoint(tmp_path / "checkpoints" / "last.ckpt")
+    assert int(checkpoint["state_dict"]["stage"]) == INTERIOR
+    assert checkpoint["state_dict"]["medium.last.weight"].abs().max() > 0  # zero before training
+    assert json.loads((tmp_path / "metrics.json").read_text())["steps"] == 9
+
+
+def test_scene_files_compose_with_the_experiment(tiny_scene: Path, train_here: Callable[..., Any]) -> None:
+    finished = train_here("+scene=torus", "+experiment=eikonal_fields", *tiny(tiny_scene), "--cfg", "job")
+    assert finished.code == 0, finished.err
+    assert "mesh: ${data.root}/mesh.ply" in finished.out
+
+
+def tiny(root: Path) -> list[str]:
+    """Overrides that make a step take milliseconds."""
+    return [
+        f"data.root={root}",
+        "medium.width=8",
+        "sampler.path.num_steps=16",
+        "sampler.points.num_samples=16",
+        "field.num_levels=4",
+        "field.log2_table_size=10",
+        "boundary.resolutions=[4,8]",
+        "model.resolution=16",
+        "batches.size=64",
+        "evaluation.supersample=1",
+        "evaluation.every=0",
+        "trainer.accelerator=cpu",
+        "trainer.max_time=null",
+        "trainer.max_steps=9",
+        "logger=none",
+    ]
