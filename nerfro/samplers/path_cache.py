@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from tqdm import tqdm
 
 import nerfro
 from nerfro.data.cameras import Cameras
@@ -25,6 +26,8 @@ from nerfro.types import Path, Rays
 _COLUMNS = 7
 _BYTES_PER_VERTEX = 4 * _COLUMNS
 _RAYS_AT_ONCE = 8192
+# Shorter work shows no progress bar.
+_SILENT_SECONDS = 2.0
 # Largest difference of a component that rounding makes.
 _SAME_DIRECTION = 1e-5
 
@@ -114,9 +117,18 @@ def _trace_to_disk(
 ) -> None:
     counts = []
     temporary = ""
+    progress = tqdm(
+        total=len(cameras) * cameras.height * cameras.width,
+        unit="ray",
+        unit_scale=True,
+        desc="trace",
+        dynamic_ncols=True,
+        delay=_SILENT_SECONDS,
+        disable=None,
+    )
     try:
         index_file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=vertex_file.parent, suffix=".tmp", delete=False) as file:
+        with tempfile.NamedTemporaryFile(dir=vertex_file.parent, suffix=".tmp", delete=False) as file, progress:
             temporary = file.name
             for view in range(len(cameras)):
                 for rays in _chunks(cameras.image_rays(view)):
@@ -128,6 +140,7 @@ def _trace_to_disk(
                     rows = torch.cat([path.positions, path.directions, path.s[..., None]], -1)[used]
                     rows.float().cpu().numpy().tofile(file)
                     counts.append(lengths.cpu())
+                    progress.update(len(rays))
         os.replace(temporary, vertex_file)
     except OSError as error:
         if temporary:
@@ -160,6 +173,7 @@ def _describe(part: nn.Module) -> list[np.ndarray | str]:
 
 
 def _camera_parts(cameras: Cameras) -> list[np.ndarray | str]:
-    tensors = (cameras.camera_to_world, cameras.fx, cameras.fy, cameras.cx, cameras.cy)
+    tensors = [cameras.camera_to_world, cameras.fx, cameras.fy, cameras.cx, cameras.cy]
+    tensors += [] if cameras.distortion is None else [cameras.distortion]
     numbers = (cameras.width, cameras.height, cameras.near, cameras.far)
     return [*(tensor.cpu().numpy() for tensor in tensors), repr(numbers)]

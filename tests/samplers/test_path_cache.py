@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import io
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,7 @@ import torch
 from nerfro.data.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.media.sdf_grid import SdfGrid
+from nerfro.samplers import path_cache
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.path_cache import PathCache
 from nerfro.samplers.snell import Snell
@@ -120,3 +123,31 @@ def test_a_truncated_file_is_not_used(tmp_path: Path) -> None:
     with pytest.raises(NerfroError, match="truncated"):
         PathCache.build(Snell(), _medium(), _cameras())
     PathCache.build(Snell(), _medium(), _cameras())
+
+
+class _Console(io.StringIO):
+    """Text that says whether it is a terminal."""
+
+    def __init__(self, terminal: bool) -> None:
+        super().__init__()
+        self.terminal = terminal
+
+    def isatty(self) -> bool:
+        return self.terminal
+
+
+@pytest.mark.parametrize(
+    ("terminal", "silent_seconds", "shown"), [(True, 0.0, True), (True, 60.0, False), (False, 0.0, False)]
+)
+def test_long_tracing_shows_its_progress_on_a_terminal(
+    monkeypatch: pytest.MonkeyPatch, terminal: bool, silent_seconds: float, shown: bool
+) -> None:
+    console = _Console(terminal)
+    monkeypatch.setattr(path_cache, "_SILENT_SECONDS", silent_seconds)
+    monkeypatch.setattr(sys, "stderr", console)
+    PathCache.build(Snell(), _medium(), _cameras())
+    PathCache.build(Snell(), _medium(), _cameras())  # read from disk: nothing to show
+    text = console.getvalue()
+    assert ("trace: 100%" in text and "ray/s" in text) == shown
+    assert shown or not text
+    assert text.count("\n") == (1 if shown else 0)
