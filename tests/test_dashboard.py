@@ -1,0 +1,97 @@
+"""`python -m nerfro.dashboard`: names of runs, and a real server that shows them."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import pytest
+from torch.utils.tensorboard import SummaryWriter
+
+import nerfro.dashboard
+from nerfro.dashboard import link_runs, run_name
+
+
+def make_run(folder: Path, name: str, root: str) -> None:
+    """A run folder with one logged value."""
+    with SummaryWriter(str(folder / "tensorboard")) as writer:
+        writer.add_scalar("loss/total", 1.0, 3)
+    (folder / "config.yaml").write_text(f"name: {name}\ndata: {{root: {root}}}\n")
+
+
+@pytest.fixture
+def outputs(tmp_path: Path) -> Path:
+    make_run(tmp_path / "outputs" / "refractive" / "2026-01-02_03-04-05", "refractive", "embedded:torus")
+    make_run(tmp_path / "outputs" / "sweeps" / "seeds" / "mipnerf-ship-seed1", "mipnerf", "outputs/scenes/ship")
+    return tmp_path / "outputs"
+
+
+NAMES = ["mipnerf/ship/seeds/seed1", "refractive/torus/2026-01-02_03-04-05"]
+
+
+def test_runs_are_named_by_experiment_and_scene(outputs: Path, tmp_path: Path) -> None:
+    names = tmp_path / "names"
+    assert link_runs(outputs, names) == 2
+    assert sorted(path.relative_to(names).as_posix() for path in names.rglob("*") if path.is_symlink()) == NAMES
+    make_run(outputs / "late", "nerf", "/data/star")
+    assert link_runs(outputs, names) == 3, "what is there stays, and new runs are added"
+    assert list((names / "nerf" / "star" / "late").glob("events.*"))
+
+
+def test_logs_of_other_programs_keep_their_folder(tmp_path: Path) -> None:
+    (tmp_path / "theirs" / "tensorboard").mkdir(parents=True)
+    assert run_name(tmp_path / "theirs", tmp_path) == "theirs"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["outputs=nowhere"], "outputs=nowhere is not a folder"), (["prot=1"], "Key 'prot' not in 'DashboardConfig'")],
+)
+def test_refuses_in_one_line(
+    arguments: list[str], message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["nerfro.dashboard", "open=false", *arguments])
+    with pytest.raises(SystemExit) as end:
+        nerfro.dashboard.main()
+    assert end.value.code == 1
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_server_shows_the_runs_and_leaves_nothing_behind(outputs: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "nerfro.dashboard", f"outputs={outputs}", "port=0", "open=false"]
+    links = tmp_path / "tmp"
+    links.mkdir()
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "TMPDIR": str(links)})
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        found = re.search(r"2 runs below .* on (http://\S+/)", line)
+        assert found, line
+        shown: list[str] = []
+        for _ in range(60):
+            with urllib.request.urlopen(f"{found[1]}data/runs", timeout=60) as answer:
+                shown = json.load(answer)
+            if len(shown) == 2:
+                break
+            time.sleep(0.5)
+        assert sorted(shown) == NAMES
+
+        port = re.search(r":(\d+)/", found[1])[1]  # type: ignore[index]
+        taken = subprocess.run(
+            [*command[:-2], f"port={port}", "open=false"], capture_output=True, text=True, check=False, timeout=120
+        )
+        assert taken.returncode == 1
+        assert "give another port, or port=0" in taken.stderr.strip().splitlines()[-1]
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.wait(60)
+    assert process.returncode == 130
+    assert not list(links.glob("nerfro_dashboard_*"))
