@@ -160,7 +160,7 @@ def test_papers_recipe_is_the_authors() -> None:
 
 
 @pytest.mark.slow
-def test_multirun_sweeps_over_the_ablations(tmp_path: Path, tiny_run: list[str]) -> None:
+def test_multirun_sweeps_over_the_ablations(tmp_path: Path, tiny_run: list[str], tiny_scene: Path) -> None:
     small = [override for override in tiny_run if not override.startswith(("sampler.points", "sampler/points"))]
     command = [sys.executable, "-m", "nerfro.train", "-m", "+experiment=glob(ablation_*)", "trainer.max_steps=2"]
     command += [*small, f"hydra.sweep.dir={tmp_path / 'sweep'}", "evaluation.every=0"]
@@ -175,4 +175,4 @@ def test_multirun_sweeps_over_the_ablations(tmp_path: Path, tiny_run: list[str])
     assert done.returncode == 0, done.stderr
     ablations = [name for name in EXPERIMENTS if name.startswith("ablation_")]
     runs = sorted(path.parent.name for path in (tmp_path / "sweep").glob("*/metrics.json"))
-    assert runs == [f"{i}_{name}" for i, name in enumerate(ablations)]
+    assert runs == sorted(f"{name}-{tiny_scene.name}-seed0" for name in ablations)
