@@ -179,8 +179,14 @@ def require_root(root: Path) -> None:
         raise NerfroError(f"data.root={root} is not a folder; give the one that holds the data set")
 
 
-def check_pose(matrix: Float[np.ndarray, "rows 4"], where: str) -> Float[np.ndarray, "3 4"]:
+def check_pose(
+    matrix: Float[np.ndarray, "rows 4"], where: str, name: str = "transform_matrix"
+) -> Float[np.ndarray, "3 4"]:
     """The first three rows of a camera-to-world matrix.
+
+    Args:
+        matrix: of three or four rows.
+        where, name: the frame, and what the data set calls its matrix, for errors.
 
     Raises:
         NerfroError: it is no rotation and shift.
@@ -190,11 +196,11 @@ def check_pose(matrix: Float[np.ndarray, "rows 4"], where: str) -> Float[np.ndar
     if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
         cause = "mirrors" if error <= _ROTATION_TOLERANCE else f"is off by {error:.2g}"
         raise NerfroError(
-            f"{where}: the 3x3 part of transform_matrix is no rotation (it {cause}); "
+            f"{where}: the 3x3 part of {name} is no rotation (it {cause}); "
             "give camera-to-world matrices without scale or reflection"
         )
     if len(matrix) == 4 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > _ROTATION_TOLERANCE:
-        raise NerfroError(f"{where}: the last row of transform_matrix is {matrix[3].tolist()}; it must be 0, 0, 0, 1")
+        raise NerfroError(f"{where}: the last row of {name} is {matrix[3].tolist()}; it must be 0, 0, 0, 1")
     return matrix[:3]
 
 

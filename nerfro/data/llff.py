@@ -149,7 +149,7 @@ def read_poses_bounds(
         raise NerfroError(f"{path}: depths must ascend from above 0, and height, width and focal length be positive")
     poses = np.stack([right, -down, back, centre], -1)
     for i, pose in enumerate(poses):
-        check_pose(pose, f"{path}: row {i}")
+        check_pose(pose, f"{path}: row {i}", "the pose")
     return poses, depths, size
 
 

@@ -135,4 +135,4 @@ def _read_meta(path: Path, captured: bool) -> tuple[Float[np.ndarray, "3 4"], fl
     focal = document["f"] if captured else 1.0
     if not is_number(focal) or focal <= 0:
         raise NerfroError(f"{path}: f={focal!r} must be a focal length in pixels")
-    return check_pose(pose, str(path)), float(focal)
+    return check_pose(pose, str(path), "cam_world_pose"), float(focal)

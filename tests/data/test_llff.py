@@ -141,7 +141,7 @@ def test_wrong_files_are_refused(write):
         (rows[:, :15], r"has shape \(6, 15\); it must be \[images, 17\]"),
         (np.where(np.arange(17) == 16, 0.1, rows), "depths must ascend from above 0"),
         (np.where(np.arange(17) == 3, np.nan, rows), "holds NaN or infinite numbers in row 0"),
-        (turned, "row 2: the 3x3 part of transform_matrix is no rotation"),
+        (turned, "row 2: the 3x3 part of the pose is no rotation"),
     ):
         np.save(path, content)
         with pytest.raises(NerfroError, match=message):
