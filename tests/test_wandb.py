@@ -1,27 +1,98 @@
-"""Weights & Biases without an account: a run is logged into its own folder."""
+"""Weights & Biases without an account: a run's own file holds what TensorBoard and the CSV show."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import csv
+import json
+import struct
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
+
+PICTURES = {"val/prediction_reference_error", "val/depth_opacity", "val/sky", "val/paths"}
+_BLOCK = 32768  # records are split at multiples of it, as in LevelDB's logs
+
+
+def records(file: Path) -> Iterator[bytes]:
+    """Payloads of a .wandb file: a header of 7 bytes, then chunks of checksum, length and kind (1 whole, 4 last)."""
+    content = file.read_bytes()
+    assert content[:4] == b":W&B"
+    at, whole = 7, b""
+    while at + 7 <= len(content):
+        if _BLOCK - at % _BLOCK < 7:
+            at += _BLOCK - at % _BLOCK
+            continue
+        _, length, kind = struct.unpack_from("<IHB", content, at)
+        whole += content[at + 7 : at + 7 + length]
+        at += 7 + length
+        if kind in (1, 4):
+            yield whole
+            whole = b""
+
+
+def history(file: Path) -> dict[str, dict[int, Any]]:
+    """Logged values by key and by step of the trainer."""
+    from wandb.proto import wandb_internal_pb2
+
+    found: dict[str, dict[int, Any]] = defaultdict(dict)
+    for payload in records(file):
+        record = wandb_internal_pb2.Record()
+        record.ParseFromString(payload)
+        if record.WhichOneof("record_type") == "history":
+            row = {item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in record.history.item}
+            for key, value in row.items():
+                found[key][row["trainer/global_step"]] = value
+    return found
 
 
 @pytest.mark.slow
-def test_offline_run_needs_no_account(
+def test_offline_run_needs_no_account_and_holds_what_tensorboard_and_the_csv_hold(
     train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
     monkeypatch.setenv("WANDB_SILENT", "true")
     monkeypatch.delenv("WANDB_API_KEY", raising=False)
     folder = tmp_path / "run"
     finished = train_here(
         *tiny_run, "logger=wandb", "logger.wandb.offline=true", "trainer.max_steps=4", "evaluation.every=2",
-        "trainer.log_every_n_steps=1", f"hydra.run.dir={folder}",
+        "trainer.log_every_n_steps=1", "loss.boundary.start=0", "loss.smoothness.start=0", f"hydra.run.dir={folder}",
     )  # fmt: skip
     assert finished.code == 0, finished.err
     (log,) = folder.glob("wandb/offline-run-*/run-*.wandb")
-    content = log.read_bytes()
-    for key in (b"loss/photometric", b"weight/boundary", b"val/psnr"):
-        assert key in content
+    logged = history(log)
+    events = EventAccumulator(str(folder / "tensorboard"), {"images": 0, "scalars": 0}).Reload()
+    tags = events.Tags()
+
+    scalars = set(tags["scalars"]) - {"epoch"}
+    assert {
+        "loss/total", "loss/photometric", "loss/boundary", "loss/smoothness", "weight/boundary", "train/psnr",
+        "val/psnr", "train/rays_per_second", "train/peak_memory_gib", "learning_rate/fields", "learning_rate/boundary",
+    } <= scalars  # fmt: skip
+    with (folder / "csv" / "metrics.csv").open() as stream:
+        assert scalars <= set(next(csv.reader(stream)))
+    for name in scalars:
+        assert logged[name] == pytest.approx({event.step: event.value for event in events.Scalars(name)}), name
+
+    assert set(tags["images"]) == PICTURES
+    for name in PICTURES:
+        assert len(events.Images(name)) == 2
+        for event in events.Images(name):
+            file = log.parent / "files" / logged[f"{name}/filenames"][event.step][0]
+            with Image.open(file) as ours, Image.open(BytesIO(event.encoded_image_string)) as theirs:
+                assert np.array_equal(np.asarray(ours.convert("RGB")), np.asarray(theirs.convert("RGB"))), name
+
+    assert set(tags["histograms"]) == {"samples/arc_length_level_0", "samples/arc_length_level_1"}
+    for name in tags["histograms"]:
+        for event in events.Histograms(name):
+            assert sum(logged[f"{name}/values"][event.step]) == event.histogram_value.num > 0
+            bins = logged[f"{name}/bins"][event.step]
+            assert (bins[0], bins[-1]) == pytest.approx(
+                (event.histogram_value.min, event.histogram_value.max), rel=1e-4
+            )
