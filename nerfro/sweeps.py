@@ -29,7 +29,7 @@ from nerfro.registry import build, discover
 from nerfro.run_folder import LAST_CHECKPOINT, flatten
 from nerfro.synthesize import SCENES
 
-_RECORD, _LOCK = "cell.json", "cell.lock"
+CELL_FILE, _LOCK = "cell.json", "cell.lock"
 
 # How a run is watched and stored is no part of what it computes.
 _NOT_HASHED = ("ckpt_path", "checkpoint", "logger")
@@ -185,7 +185,7 @@ def _record(folder: Path, identity: Identity, state: State, reason: str = "") ->
         "data": identity.data,
         "settings": identity.settings,
     }
-    write_atomically(folder / _RECORD, json.dumps(record, indent=2, default=str) + "\n")
+    write_atomically(folder / CELL_FILE, json.dumps(record, indent=2, default=str) + "\n")
 
 
 def _look(folder: Path, identity: Identity) -> tuple[State, str]:
@@ -201,7 +201,7 @@ def _look(folder: Path, identity: Identity) -> tuple[State, str]:
 
 def _recorded(folder: Path, identity: Identity) -> tuple[State, str]:
     try:
-        record = json.loads((folder / _RECORD).read_text(encoding="utf-8"))
+        record = json.loads((folder / CELL_FILE).read_text(encoding="utf-8"))
     except FileNotFoundError:
         record = None
     holds_a_run = (folder / LAST_CHECKPOINT).is_file()

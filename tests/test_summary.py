@@ -195,6 +195,9 @@ def test_places_are_folders_and_globs_and_runs_without_scores_are_named(tmp_path
     assert str(tmp_path / "c") in unfinished[0]
     with pytest.raises(NerfroError, match="has not been evaluated"):
         find_runs([str(tmp_path / "c")])
+    (tmp_path / "d").mkdir()
+    (tmp_path / "d" / "cell.json").write_text(json.dumps({"state": "failed", "reason": "no space left"}))
+    assert find_runs([str(tmp_path)])[1][1] == f"{tmp_path / 'd'} is left out: it failed: no space left"
     with pytest.raises(NerfroError, match="nowhere does not exist"):
         find_runs([str(tmp_path / "nowhere")])
 

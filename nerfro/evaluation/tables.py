@@ -232,7 +232,7 @@ def to_latex(table: Table) -> str:
         return rf"\textbf{{{cell}}}" if table.is_best(i, j) else cell
 
     def cells(row: Row) -> list[str]:
-        return [cell.replace("±", r"$\pm$") for cell in _cells(row, table)]
+        return [_latex(cell) for cell in _cells(row, table)]
 
     arrows = {"higher": r" $\uparrow$", "lower": r" $\downarrow$", None: ""}
     headings = [_latex(table.label_title), *(_latex(c.title) + arrows[c.better] for c in table.columns)]
@@ -342,6 +342,7 @@ def _latex(text: str) -> str:
         "\\": r"\textbackslash{}",
         "~": r"\textasciitilde{}",
         "^": r"\textasciicircum{}",
+        "±": r"$\pm$",
         **{character: "\\" + character for character in "&%$#_{}"},
     }
     return "".join(special.get(character, character) for character in text)

@@ -29,6 +29,7 @@ _NOT_THE_METHOD = (
     "evaluation.chunk_size",
     "evaluation.lpips_backbone",
     "evaluation.lpips_vgg_backbone",
+    "evaluation.lpips_vgg_backbone",
     "batches.cache_paths",
     "trainer.max_time",
     "trainer.max_steps",

@@ -19,6 +19,7 @@ from PIL import Image
 from nerfro.errors import NerfroError
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
 from nerfro.paths import EMBEDDED_PREFIX
+from nerfro.sweeps import CELL_FILE, scene_name
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Scored:
     @property
     def name(self) -> str:
         """Last part of the folder's name."""
-        return Path(self.root.removeprefix(EMBEDDED_PREFIX)).name
+        return scene_name(self.root)
 
 
 @dataclass(frozen=True)
@@ -126,17 +127,28 @@ def find_runs(places: Sequence[str]) -> tuple[list[Run], list[str]]:
         matches = [Path(match) for match in glob.glob(str(Path(place).expanduser()), recursive=True)]
         if not matches:
             raise NerfroError(f"runs: {place} does not exist; give run folders, folders that hold some, or globs")
-        folders |= {file.parent.resolve() for match in matches for file in match.rglob("run.json")}
+        # A cell of a sweep that failed early has nothing but the record of its failure.
+        found = (file for match in matches for name in ("run.json", CELL_FILE) for file in match.rglob(name))
+        folders |= {file.parent.resolve() for file in found}
     runs, unfinished = [], []
     for folder in sorted(folders):
         if (folder / "metrics.json").is_file():
             runs.append(read_run(folder))
         else:
-            unfinished.append(f"{shown(folder)} is left out: it has no metrics.json, so it has not been evaluated")
+            unfinished.append(f"{shown(folder)} is left out: {_why_unfinished(folder)}")
     if not runs:
         reason = f"; {unfinished[0]}" if unfinished else "; nerfro.train writes one into every run folder"
         raise NerfroError(f"runs: no metrics.json beside a run.json below {', '.join(places)}{reason}")
     return runs, unfinished
+
+
+def _why_unfinished(folder: Path) -> str:
+    """The reason that a sweep recorded for a run without scores, if one did."""
+    try:
+        reason = json.loads((folder / CELL_FILE).read_text(encoding="utf-8"))["reason"]
+    except (OSError, ValueError, KeyError):
+        reason = ""
+    return f"it failed: {reason}" if reason else "it has no metrics.json, so it has not been evaluated"
 
 
 def read_run(folder: Path) -> Run:
