@@ -1,8 +1,9 @@
-"""The plugin that holds Eikonal Fields: its medium, its paths and its stages."""
+"""The plugin that holds Eikonal Fields: its medium, paths and stages, and the index of a ball learned from images."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,19 +11,26 @@ from typing import Any
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from torch import Tensor
 
+from nerfro.boundaries import lat_long
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.config import build_model
+from nerfro.data.cameras import Cameras
 from nerfro.errors import NerfroError
+from nerfro.evaluation.images import save_png
 from nerfro.fields.base import Field
 from nerfro.fields.nerf import NerfField
 from nerfro.media.analytic import Luneburg
 from nerfro.media.base import Medium
+from nerfro.media.shapes import Ball
 from nerfro.models.base import NerfModel, Parts
 from nerfro.models.optimizer import OptimizerConfig
 from nerfro.registry import discover, find
 from nerfro.run_folder import load_checkpoint
+from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.straight import straight_path
 from nerfro.samplers.stratified import Stratified
 from nerfro.testing import example_rays
@@ -271,3 +279,74 @@ def tiny(root: Path) -> list[str]:
         "trainer.max_steps=9",
         "logger=none",
     ]
+
+
+# The index of a ball.
+
+RADIUS, SHELL, IOR = 0.6, 0.2, 1.33
+
+
+@pytest.mark.slow
+def test_the_index_of_a_homogeneous_ball_is_recovered(train_here: Callable[..., Any], tmp_path: Path) -> None:
+    """From twelve images of 20x20 pixels before a known sky, from n = 1 on, within 2 %.
+
+    The ball's surface is a shell in which the index rises smoothly, because a smooth field cannot be sharp.
+    """
+    write_ball_scene(tmp_path / "ball")
+    side = RADIUS + SHELL
+    finished = train_here(
+        "+experiment=eikonal_fields",
+        *tiny(tmp_path / "ball"),
+        "medium={mesh: null, width: 24, depth: 3, octaves: 3}",
+        f"medium.box_min=[-{side},-{side},-{side}]",
+        f"medium.box_max=[{side},{side},{side}]",
+        "sampler.path.num_steps=24",
+        "boundary.resolutions=[64]",
+        f"boundary.image={tmp_path / 'sky.png'}",
+        "optimizer={learning_rate: 1e-2, final_learning_rate: 1e-3, boundary_learning_rate: 1e-9}",
+        "model={resolution: 64, blur: 1.5, num_levels: 3, scene_share: 0.003, index_share: 0.997}",
+        "batches.size=200",
+        "trainer.max_steps=300",
+        f"hydra.run.dir={tmp_path / 'run'}",
+    )
+    assert finished.code == 0, finished.err
+    checkpoint, config = load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")
+    model = build_model(OmegaConf.create(config))
+    assert float(model.medium.last.weight.detach().abs().max()) == 0  # it begins without a ball
+    model.load_state_dict(checkpoint["state_dict"])
+    directions = torch.nn.functional.normalize(torch.randn(1000, 3), dim=-1)
+    inside = directions * (RADIUS - SHELL) * torch.rand(1000, 1) ** (1 / 3)
+    with torch.no_grad():
+        n, _ = model.medium(inside)
+    assert float(n.mean()) == pytest.approx(IOR, rel=0.02)
+    assert float(n.std()) < 0.02 * IOR
+
+
+def ball_sky(directions: Tensor) -> Tensor:
+    """A sky of a few waves of different lengths, as a function of direction."""
+    waves = torch.tensor([[2.0, 1.0, 0.4], [-0.6, 2.0, 1.2], [0.8, -1.2, 2.0]])
+    colour = 0.5 + 0.16 * torch.sin(directions @ waves.T)
+    colour += 0.12 * torch.cos(2.3 * directions @ waves.flip(0).T)
+    return colour + 0.1 * torch.sin(5 * directions @ waves.roll(1, 0).T)
+
+
+def write_ball_scene(root: Path) -> None:
+    """A Blender-format folder of a ball before `ball_sky`, and that sky as a picture beside the folder."""
+    size, num_views, half_width = 20, 12, 0.2
+    save_png(root.parent / "sky.png", ball_sky(lat_long.directions(128)))
+    origins = 3 * torch.nn.functional.normalize(torch.randn(num_views, 3), dim=-1)
+    back = torch.nn.functional.normalize(origins, dim=-1)
+    right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([[0.1, 0.3, 1.0]]), back), dim=-1)
+    poses = torch.stack([right, torch.linalg.cross(back, right), back, origins], -1)
+    focal = torch.full((num_views,), 0.5 * size / half_width)
+    centre = torch.full((num_views,), 0.5 * size)
+    cameras = Cameras(poses, focal, focal, centre, centre, size, size, near=2.0, far=6.0)
+    for split, views in (("train", range(num_views)), ("test", range(1))):
+        frames = []
+        for view in views:
+            path = Eikonal()(cameras.image_rays(view), Ball(RADIUS, IOR, SHELL))
+            save_png(root / split / f"r_{view}.png", ball_sky(path.exit_directions).view(size, size, 3))
+            pose = [*poses[view].tolist(), [0, 0, 0, 1]]
+            frames.append({"file_path": f"./{split}/r_{view}", "transform_matrix": pose})
+        document = {"camera_angle_x": 2 * math.atan(half_width), "frames": frames}
+        (root / f"transforms_{split}.json").write_text(json.dumps(document))
