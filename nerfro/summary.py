@@ -37,6 +37,7 @@ class SummaryConfig:
         view: views of the figures, as in {torus: 3}; otherwise those of the median score.
         crops: insets of the figures, as in {torus: [[top, left, size], ...]}, pixels; otherwise those where methods
             differ most.
+        error_map: what the error maps show: squared_error, ssim, lpips, lpips_vgg or flip.
         overwrite: whether files in `out` may be replaced.
     """
 
@@ -50,6 +51,7 @@ class SummaryConfig:
     views: int = 8
     view: Any = None
     crops: Any = None
+    error_map: str = "squared_error"
     overwrite: bool = False
 
 
@@ -58,7 +60,7 @@ def main(config: DictConfig) -> None:
     """Read, compare, print, write."""
     if config.region not in (FULL, *OBJECT_REGIONS):
         raise NerfroError(f"region={config.region} is not a region; choose from {', '.join((FULL, *OBJECT_REGIONS))}")
-    wanted = Wanted.of(config.views, config.view, config.crops)
+    wanted = Wanted.of(config.views, config.view, config.crops, config.error_map)
     metrics = find_metrics(config.metrics)
     places = list(config.runs) if isinstance(config.runs, ListConfig) else [str(config.runs)]
     runs, unfinished = find_runs(places)

@@ -130,6 +130,15 @@ def test_small_pictures_are_embedded_bit_for_bit_and_large_ones_as_jpeg(runs: Pa
     assert data_uri(torch.zeros(8, 300, 3)).startswith("data:image/jpeg;base64,")
 
 
+def test_error_maps_of_another_kind_have_their_own_scale_and_name(runs: Path) -> None:
+    html = page(runs, Wanted.of(8, None, None, "flip"))
+    assert "FLIP of bad, view 1" in html
+    assert "≥ 1<" in html
+    assert "≥ 0.05" in page(runs)
+    with pytest.raises(NerfroError, match="choose from squared_error, ssim, lpips, lpips_vgg, flip"):
+        Wanted.of(8, None, None, "foo")
+
+
 def test_page_needs_nothing_from_outside_and_its_parts_find_each_other(runs: Path) -> None:
     html = page(runs, unfinished=("x has not been evaluated",))
     loaded = re.findall(r"\b(?:src|href|data)=\"([^\"]*)\"", html)

@@ -13,7 +13,7 @@ from markupsafe import Markup
 from omegaconf import OmegaConf
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, magma
+from nerfro.evaluation.error_maps import magma
 from nerfro.evaluation.results import Metric, Region
 from nerfro.evaluation.tables import Table, to_html
 from nerfro.paths import PACKAGE_DIR
@@ -96,13 +96,12 @@ def report_page(
         )
         for number, (comparison, table) in enumerate(compared)
     ]
-    ramp = magma(torch.linspace(0, SQUARED_ERROR_LIMIT, 256)[None], SQUARED_ERROR_LIMIT)
+    ramp = magma(torch.linspace(0, 1, 256)[None], 1)
     return _render(
         "page.html.jinja",
         sections=sections,
         unfinished=unfinished,
         chart=curves,
-        error_limit=f"{SQUARED_ERROR_LIMIT:g}",
         error_ramp=data_uri(ramp),
         png_side=PNG_SIDE,
         jpeg_quality=JPEG_QUALITY,

@@ -17,8 +17,9 @@ from torch import Tensor
 
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
-from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, magma, squared_error_map
+from nerfro.evaluation.error_maps import ErrorMap, error_maps
 from nerfro.evaluation.images import load_png, to_8bit
+from nerfro.evaluation.lpips import LpipsNetwork, find_lpips_networks
 from nerfro.evaluation.pictures import Crop, most_telling_crop
 from nerfro.evaluation.results import Metric, Region
 from nerfro.evaluation.tables import MISSING
@@ -26,6 +27,7 @@ from nerfro.registry import build
 from nerfro.report.comparison import Comparison
 from nerfro.report.runs import Run, Scored
 
+ERROR_MAPS = ("squared_error", "ssim", "lpips", "lpips_vgg", "flip")
 NUM_CROPS = 2
 CROP_SHARE = 4  # an inset's side is this part of the picture's shorter one
 PNG_SIDE = 256  # pixels; larger pictures are embedded as JPEG, or a page of many would not load
@@ -40,19 +42,29 @@ class Wanted:
         num_views: of each scene, evenly spread; 0 for all.
         view: of the figure, by the scene's name.
         crops: insets of the figure, by the scene's name.
+        error_map: one of `ERROR_MAPS`.
+        lpips_networks: those that it needs.
     """
 
     num_views: int
     view: Mapping[str, int]
     crops: Mapping[str, tuple[Crop, ...]]
+    error_map: str
+    lpips_networks: Mapping[str, LpipsNetwork]
 
     @classmethod
-    def of(cls, num_views: int, view: Any, crops: Any) -> Wanted:
+    def of(cls, num_views: int, view: Any, crops: Any, error_map: str = "squared_error") -> Wanted:
         """Check the form of what the user gave; `view` and `crops` may be None.
 
         Raises:
-            NerfroError: a negative number of views, or `view` or `crops` is not what `SummaryConfig` says.
+            NerfroError: a negative number of views, `view` or `crops` is not what `SummaryConfig` says, there is no
+                such error map, or the network that it needs cannot be had.
         """
+        if error_map not in ERROR_MAPS:
+            raise NerfroError(f"error_map={error_map} is not an error map; choose from {', '.join(ERROR_MAPS)}")
+        networks, reasons = find_lpips_networks() if error_map.startswith("lpips") else ({}, {})
+        if error_map in reasons:
+            raise NerfroError(f"error_map={error_map}: {reasons[error_map]}")
         if num_views < 0:
             raise NerfroError(f"views={num_views} is not a number of views; give 1 or more, or 0 for all")
         try:
@@ -68,7 +80,7 @@ class Wanted:
             raise NerfroError(
                 f"crops={crops} does not name squares; give {{SCENE: [[TOP, LEFT, SIZE], ...]}} in pixels"
             ) from error
-        return cls(num_views, chosen, insets)
+        return cls(num_views, chosen, insets, error_map, networks)
 
     def check(self, scenes: Sequence[Scored]) -> None:
         """Refuse what fits no scene.
@@ -127,6 +139,8 @@ class ScenePictures:
         views: those that can be chosen.
         figure: the view of the figure, one of them.
         crops: its insets.
+        error_title: what the error maps show.
+        error_limit: error at the last colour of their scale.
         methods: titles by number; those that have not been trained on this scene are absent.
         seeds: of the runs whose pictures these are.
     """
@@ -136,6 +150,8 @@ class ScenePictures:
     views: tuple[View, ...]
     figure: View
     crops: tuple[Crop, ...]
+    error_title: str
+    error_limit: float
     methods: Mapping[int, str]
     seeds: Sequence[int]
 
@@ -167,18 +183,22 @@ def scene_pictures(
     figure = wanted.view.get(scored.name, _median_view(list(runs.values()), metric, region))
     count = min(wanted.num_views or scored.num_views, scored.num_views)
     views = {
-        index: _view(index, references.images[index].cpu(), runs, titles, metric, region)
+        index: _view(index, references.images[index].cpu(), runs, titles, metric, region, wanted)
         for index in sorted({round(i) for i in np.linspace(0, scored.num_views - 1, count)} | {figure})
     }
+    reference, predictions = references.images[figure].cpu(), [_prediction(run, figure) for run in runs.values()]
+    error = _error_map(predictions[0], reference, wanted)
     crops = wanted.crops.get(scored.name)
     if crops is None:
-        crops = _choose_crops(references.images[figure].cpu(), [_prediction(run, figure) for run in runs.values()])
+        crops = _choose_crops(reference, predictions)
     return ScenePictures(
         width=scored.width,
         height=scored.height,
         views=tuple(views.values()),
         figure=views[figure],
         crops=crops,
+        error_title=error.title,
+        error_limit=error.limit,
         methods=titles,
         seeds=sorted({run.seed for run in runs.values()}),
     )
@@ -200,16 +220,24 @@ def _view(
     titles: Mapping[int, str],
     metric: Metric,
     region: Region,
+    wanted: Wanted,
 ) -> View:
     predictions, errors = {}, {}
     for number, run in runs.items():
         picture, title = _prediction(run, index), titles[number]
         value = run.metrics.result.views[index].score(metric.name, region)
         score = f"{metric.title} {MISSING if value is None else f'{value:.{metric.decimals}f}'}"
-        error = magma(squared_error_map(picture, reference), SQUARED_ERROR_LIMIT)
+        error = _error_map(picture, reference, wanted)
         predictions[number] = Shown(f"{title}, view {index}", score, data_uri(picture))
-        errors[number] = Shown(f"squared error of {title}, view {index}", score, data_uri(error))
+        errors[number] = Shown(f"{error.title} of {title}, view {index}", score, data_uri(error.colours()))
     return View(index, Shown(f"reference, view {index}", "", data_uri(reference)), predictions, errors)
+
+
+def _error_map(prediction: Tensor, reference: Tensor, wanted: Wanted) -> ErrorMap:
+    for found in error_maps(prediction, reference, wanted.lpips_networks):
+        if found.name == wanted.error_map:
+            return found
+    raise NerfroError(f"pictures of {list(reference.shape[:2])} pixels are too small for error_map={wanted.error_map}")
 
 
 def _prediction(run: Run, index: int) -> Float[Tensor, "H W 3"]:
