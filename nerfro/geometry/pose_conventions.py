@@ -17,8 +17,10 @@ from nerfro.geometry.visual_hull import Silhouettes, carve_grid, extract_surface
 
 # The first look is at so many voxels a side and at most so many pixels a side.
 _COARSE_VOXELS, _COARSE_PIXELS = 48, 64
-# A hull meets the masks that it was carved from; below this overlap something is wrong.
+# A hull meets the masks that it was carved from; below this overlap, or this agreement, something is wrong.
 GOOD_OVERLAP = 0.9
+# A coarse hull may miss a mask's outline by this many of the pixels that it is looked at in.
+_SLACK = 1.5
 
 # What a file's poses could have been, as what has to be done to them as they were read; most frequent mistakes first.
 # `turn` is applied to the camera's axes (x right, y up, z back), `inverse` to the whole matrix before.
@@ -68,15 +70,26 @@ def pixel_stride(silhouettes: Silhouettes, max_pixels: int) -> int:
     return -(-max(silhouettes.cameras.width, silhouettes.cameras.height) // max_pixels)
 
 
-def coarse_overlap(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np.ndarray, "V"]:
-    """Overlap of each mask with the silhouettes' coarse hull; 0 where the hull is empty."""
+def coarse_agreement(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np.ndarray, "V"]:
+    """How well a coarse hull explains each mask: 1, less the pixels that differ and are not near the mask's outline.
+
+    Counted in pixels of the mask; not below 0, and 0 where the hull is empty.
+    """
     distances, corner, spacing = carve_grid(
         silhouettes, find_box(silhouettes, wrong_masks), _COARSE_VOXELS, wrong_masks
     )
     remove_strays(distances)
     if not (distances < 0).any():
         return np.zeros(len(silhouettes))
-    return overlap(extract_surface(distances, corner, spacing), silhouettes, _COARSE_PIXELS)
+    intersector = MeshIntersector([extract_surface(distances, corner, spacing)], crease_degrees=30.0)
+    stride = pixel_stride(silhouettes, _COARSE_PIXELS)
+    agreement = np.empty(len(silhouettes))
+    for view in range(len(silhouettes)):
+        ours = mesh_silhouette(intersector, silhouettes.cameras, view, stride)
+        outline = silhouettes.distances[view, ::stride, ::stride]
+        differs = (ours != (outline > 0)) & (outline.abs() > _SLACK * stride)
+        agreement[view] = max(0.0, 1 - int(differs.sum()) / max(int((outline > 0).sum()), 1))
+    return agreement
 
 
 def require_consistent_poses(silhouettes: Silhouettes, names: list[str], wrong_masks: int) -> None:
@@ -85,25 +98,25 @@ def require_consistent_poses(silhouettes: Silhouettes, names: list[str], wrong_m
     Raises:
         NerfroError: it does not; the misread convention or the views that disagree with the others are named.
     """
-    found = float(np.median(coarse_overlap(silhouettes, wrong_masks)))
+    found = float(np.median(coarse_agreement(silhouettes, wrong_masks)))
     if found >= GOOD_OVERLAP:
         return
     state = (
         "the visual hull is empty: no point lies inside all masks"
         if found == 0
-        else f"the visual hull covers the masks badly (median overlap {found:.2f})"
+        else f"the visual hull covers the masks badly (to {found:.0%})"
     )
-    scores = [float(np.median(coarse_overlap(_changed(silhouettes, i, t), wrong_masks))) for _, i, t in _ALTERNATIVES]
+    scores = [float(np.median(coarse_agreement(_changed(silhouettes, i, t), wrong_masks))) for _, i, t in _ALTERNATIVES]
     # Of equally good ones (a ball is a ball upside down) the most frequent mistake.
-    best = next(i for i, score in enumerate(scores) if score >= max(scores) - 0.01)
+    best = next(i for i, score in enumerate(scores) if score >= max(scores) - 0.002)
     if scores[best] > max(GOOD_OVERLAP, found):
         raise NerfroError(
-            f"{state}; the poses are in another convention: with {_ALTERNATIVES[best][0]} the overlap is "
-            f"{scores[best]:.2f}; correct transform_matrix, or choose the data= format that fits"
+            f"{state}; the poses are in another convention: with {_ALTERNATIVES[best][0]} they agree to "
+            f"{scores[best]:.0%}; correct transform_matrix, or choose the data= format that fits"
         )
     for allowed in (1, 2, 4, 8):
-        if wrong_masks < allowed <= len(names) // 3:
-            each = coarse_overlap(silhouettes, allowed)
+        if wrong_masks < allowed <= max(1, len(names) // 8):
+            each = coarse_agreement(silhouettes, allowed)
             if np.median(each) >= GOOD_OVERLAP:
                 odd = [names[view] for view in np.argsort(each, kind="stable")[:allowed]]
                 raise NerfroError(

@@ -1,0 +1,204 @@
+"""From silhouettes to a surface: outlines, carving, the fit, and what explains silhouettes that do not agree."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from nerfro.data.cameras import Cameras
+from nerfro.errors import NerfroError
+from nerfro.geometry.intersection import MeshIntersector
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.normals import face_normals
+from nerfro.geometry.pose_conventions import overlap, require_consistent_poses
+from nerfro.geometry.silhouette_fit import fit_surface
+from nerfro.geometry.silhouettes import mesh_silhouette, outline_distance
+from nerfro.geometry.visual_hull import (
+    Silhouettes,
+    carve_grid,
+    extract_surface,
+    find_box,
+    reached_sides,
+    remove_strays,
+)
+
+
+def cameras_around(count: int, size: int, distance: float = 4.0, focal: float = 1.4, spread: float = 1.0) -> Cameras:
+    """Cameras on a spiral over a sphere (the part of it around +z that `spread` says) that look at the origin."""
+    z = 1 - spread * (2 * np.arange(count) + 1) / count
+    turn = 2.4 * np.arange(count)
+    back = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], -1)
+    right = np.cross([0.3, 0.9, 0.1], back)
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    poses = np.stack([right, np.cross(back, right), back, distance * back], -1)
+    ones = torch.ones(count)
+    pixels = focal * size * ones
+    return Cameras(torch.from_numpy(poses).float(), pixels, pixels, size / 2 * ones, size / 2 * ones, size, size, 1, 9)
+
+
+def photographed(mesh: trimesh.Trimesh, cameras: Cameras) -> Silhouettes:
+    """Binary masks: pixels whose central ray meets the mesh."""
+    body = TriangleMesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
+    intersector = MeshIntersector([body], 30.0)
+    masks = torch.stack([mesh_silhouette(intersector, cameras, view, 1) for view in range(len(cameras))])
+    return Silhouettes.of(cameras, masks.float())
+
+
+def hull(silhouettes: Silhouettes, resolution: int, wrong_masks: int = 0) -> TriangleMesh:
+    distances, corner, spacing = carve_grid(silhouettes, find_box(silhouettes, wrong_masks), resolution, wrong_masks)
+    remove_strays(distances)
+    return extract_surface(distances, corner, spacing)
+
+
+def volume(mesh: TriangleMesh) -> float:
+    return float(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).volume)
+
+
+@pytest.fixture(scope="module")
+def odd_shape() -> trimesh.Trimesh:
+    """A body that no mirroring or turning leaves alone."""
+    boxes = [trimesh.creation.box((1.2, 0.45, 0.45)), trimesh.creation.box((0.4, 0.8, 0.35))]
+    boxes.append(trimesh.creation.box((0.35, 0.35, 1.0)))
+    for box, place in zip(boxes, ([0.1, 0, 0], [-0.4, 0.3, 0], [0.6, 0, 0.4]), strict=True):
+        box.apply_translation(place)
+    return trimesh.util.concatenate(boxes)
+
+
+def test_outline_of_a_binary_mask_is_found_between_the_pixels() -> None:
+    column, row = np.meshgrid(np.arange(32) + 0.5, np.arange(32) + 0.5)
+    errors = []
+    for angle in np.linspace(0.1, 6, 23):
+        exact = np.cos(angle) * (column - 16.3) + np.sin(angle) * (row - 15.8)
+        found = outline_distance((exact > 0).astype(np.float32))
+        assert ((found > 0) == (exact > 0)).all()
+        near = (np.abs(exact) < 1) & (np.hypot(column - 16, row - 16) < 12)
+        errors.append((found - exact)[near])
+    # A mask that is only counted pixel by pixel is off by 0.29 (uniform between two of them).
+    assert np.std(np.concatenate(errors)) < 0.18
+
+
+def test_hull_of_a_ball_is_the_ball_between_the_voxels() -> None:
+    silhouettes = photographed(trimesh.creation.icosphere(4, 0.7), cameras_around(30, 64))
+    mesh = hull(silhouettes, 32)
+    radii = np.linalg.norm(mesh.vertices, axis=1)
+    assert mesh.is_closed
+    # A pixel is 0.045 wide here and a voxel 0.05.
+    assert abs(radii.mean() - 0.7) < 0.01
+    assert radii.std() < 0.015
+    assert volume(mesh) == pytest.approx(4 / 3 * np.pi * 0.7**3, rel=0.05)
+
+
+def test_nothing_is_known_behind_a_camera_and_beyond_a_frame_that_cuts() -> None:
+    cameras = cameras_around(1, 16)
+    back = cameras.camera_to_world[0, :, 2]
+    masks = torch.zeros(1, 16, 16)
+    masks[:, 4:12, 4:12] = 1
+    points = torch.stack([8 * back, 0 * back, 3 * cameras.camera_to_world[0, :, 0]])  # behind, centre, beside
+    whole = Silhouettes.of(cameras, masks).depth_inside(0, points)[0]
+    assert whole[0] == torch.inf
+    assert whole[1] > 2
+    assert whole[2] < -5
+    masks[:, 4:12, 4:] = 1
+    assert Silhouettes.of(cameras, masks).depth_inside(0, points)[0][2] == torch.inf
+
+
+def test_wrong_masks_are_tolerated_when_told(odd_shape: trimesh.Trimesh) -> None:
+    right = photographed(odd_shape, cameras_around(20, 48))
+    masks = right.masks.clone()
+    masks[3] = masks[3].roll(20, 1)
+    wrong = Silhouettes.of(right.cameras, masks)
+    box, expected = find_box(right), volume(hull(right, 40))
+    assert (carve_grid(wrong, box, 40)[0] < 0).sum() < 0.3 * (carve_grid(right, box, 40)[0] < 0).sum()
+    assert volume(hull(wrong, 40, wrong_masks=1)) == pytest.approx(expected, rel=0.25)
+
+
+def test_strays_go_and_voids_are_filled() -> None:
+    x, y, z = np.meshgrid(*[np.arange(20.0)] * 3, indexing="ij")
+
+    def ball(cx: float, radius: float) -> np.ndarray:
+        return np.sqrt((x - cx) ** 2 + (y - 8) ** 2 + (z - 8) ** 2) - radius
+
+    shell = np.maximum(ball(6, 5), -ball(6, 2))
+    distances = np.minimum(np.minimum(shell, ball(14.5, 2)), np.where((x == 18) & (y == 17) & (z == 1), -0.1, 9))
+    assert remove_strays(distances.copy(), keep=1) == (3, 1)
+    assert remove_strays(distances) == (3, 2)  # one voxel is a stray, the small ball is not
+    assert distances[6, 8, 8] < 0
+    assert distances[18, 17, 1] > 0
+    assert len(trimesh.Trimesh(*_arrays(extract_surface(distances, np.zeros(3), 1.0))).split()) == 2
+
+
+def _arrays(mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
+    return mesh.vertices, mesh.faces
+
+
+def test_body_that_reaches_the_box_is_closed_there() -> None:
+    distances = np.full((6, 6, 6), 0.5)
+    distances[3:, 2:4, 2:4] = -0.5
+    assert reached_sides(distances) == [(0, 1)]
+    mesh = extract_surface(distances, np.array([1.0, 2, 3]), 0.5)
+    assert mesh.is_closed
+    assert volume(mesh) > 0
+    assert mesh.bounds[0] == pytest.approx([2.25, 2.75, 3.75])
+
+
+def test_fit_flattens_what_no_camera_looked_along() -> None:
+    box = trimesh.creation.box((1.2, 1.2, 1.2))
+    silhouettes = photographed(box, cameras_around(20, 48))
+    carved = hull(silhouettes, 32)
+    fitted = fit_surface(carved, silhouettes)
+    assert fitted.is_closed
+
+    def tilt(mesh: TriangleMesh) -> float:
+        """Mean angle of the middle of the sides to the axes, degrees."""
+        centre = mesh.triangles.mean(1)
+        middle = np.sort(np.abs(centre), axis=1)[:, 1] < 0.4
+        return float(np.degrees(np.arccos(np.abs(face_normals(mesh)[middle]).max(1).clip(max=1))).mean())
+
+    assert tilt(fitted) < 0.35 * tilt(carved)
+    assert overlap(fitted, silhouettes, 64).min() > 0.95
+    assert volume(fitted) == pytest.approx(1.2**3, rel=0.03)
+
+
+def test_hull_meets_its_masks(odd_shape: trimesh.Trimesh) -> None:
+    silhouettes = photographed(odd_shape, cameras_around(16, 64))
+    require_consistent_poses(silhouettes, [f"r_{view}" for view in range(16)], wrong_masks=0)
+    assert overlap(hull(silhouettes, 48), silhouettes, 64).mean() > 0.93
+
+
+MISREAD = {
+    "y and z axes flipped": lambda pose: pose * torch.tensor([1.0, -1, -1, 1]),
+    "the matrices inverted": lambda pose: torch.cat([pose[:, :, :3].mT, -pose[:, :, :3].mT @ pose[:, :, 3:]], -1),
+    "with y flipped": lambda pose: pose * torch.tensor([1.0, -1, 1, 1]),
+    "with x flipped": lambda pose: pose * torch.tensor([-1.0, 1, 1, 1]),
+    "LLFF's axes": lambda pose: torch.cat([-pose[:, :, 1:2], pose[:, :, :1], pose[:, :, 2:]], -1),
+}
+
+
+@pytest.mark.parametrize("convention", MISREAD)
+def test_misread_poses_are_named(odd_shape: trimesh.Trimesh, convention: str) -> None:
+    silhouettes = photographed(odd_shape, cameras_around(16, 32))
+    poses = MISREAD[convention](silhouettes.cameras.camera_to_world)
+    misread = silhouettes.seen_from(replace(silhouettes.cameras, camera_to_world=poses))
+    with pytest.raises(NerfroError, match=rf"poses are in another convention: .*{convention}"):
+        require_consistent_poses(misread, [str(view) for view in range(16)], wrong_masks=0)
+
+
+def test_view_that_contradicts_the_others_is_named(odd_shape: trimesh.Trimesh) -> None:
+    silhouettes = photographed(odd_shape, cameras_around(16, 32))
+    masks = silhouettes.masks.clone()
+    masks[5] = masks[5].roll(16, 0)
+    with pytest.raises(NerfroError, match=r"look at the masks and poses of view_5, and .* wrong_masks=1"):
+        require_consistent_poses(
+            Silhouettes.of(silhouettes.cameras, masks), [f"view_{view}" for view in range(16)], wrong_masks=0
+        )
+
+
+def test_shuffled_masks_are_refused(odd_shape: trimesh.Trimesh) -> None:
+    silhouettes = photographed(odd_shape, cameras_around(16, 32))
+    shuffled = Silhouettes.of(silhouettes.cameras, silhouettes.masks.roll(5, 0))
+    with pytest.raises(NerfroError, match="no usual misreading of the poses explains it"):
+        require_consistent_poses(shuffled, [str(view) for view in range(16)], wrong_masks=0)

@@ -1,0 +1,189 @@
+"""`python -m nerfro.preprocess`: what it writes, the command that it prints, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+import nerfro.preprocess
+from nerfro.geometry.mesh import load_mesh
+
+NUM_VIEWS, SIZE, FOCAL, RADIUS, CENTRE = 24, 40, 50.0, 0.7, np.array([0.3, 0.1, -0.2])
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    """A Blender-format folder of views of a ball off the origin, with masks in masks/train/."""
+    root = tmp_path / "capture"
+    (root / "train").mkdir(parents=True)
+    (root / "masks" / "train").mkdir(parents=True)
+    frames = []
+    for view in range(NUM_VIEWS):
+        z = 1 - (2 * view + 1) / NUM_VIEWS
+        back = np.array([math.sqrt(1 - z * z) * math.cos(2.4 * view), math.sqrt(1 - z * z) * math.sin(2.4 * view), z])
+        right = np.cross([0.3, 0.9, 0.1], back)
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3] = np.stack([right, np.cross(back, right), back, 4 * back], 1)
+        column, row = np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5)
+        directions = np.stack([(column - SIZE / 2) / FOCAL, (SIZE / 2 - row) / FOCAL, -np.ones_like(row)], -1)
+        directions = directions @ pose[:3, :3].T
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        to_centre = CENTRE - pose[:3, 3]
+        along = directions @ to_centre
+        mask = np.linalg.norm(to_centre - along[..., None] * directions, axis=-1) < RADIUS
+        Image.fromarray(np.full((SIZE, SIZE, 3), 128, np.uint8)).save(root / "train" / f"r_{view}.png")
+        Image.fromarray(np.uint8(255 * mask)).save(root / "masks" / "train" / f"r_{view}.png")
+        frames.append({"file_path": f"train/r_{view}", "transform_matrix": pose.tolist()})
+    document = {"camera_angle_x": 2 * math.atan(0.5 * SIZE / FOCAL), "frames": frames}
+    (root / "transforms_train.json").write_text(json.dumps(document))
+    return root
+
+
+@pytest.fixture
+def preprocess(
+    capture: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., str]:
+    """Run the entry point in this process on the capture; returns what it printed, or its one line of error."""
+
+    def run(*overrides: str) -> str:
+        common = [f"data.root={capture}", "resolution=24", "medium.resolution=32", "medium.cache=false"]
+        monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", *common, *overrides])
+        try:
+            nerfro.preprocess.main()
+        except SystemExit:
+            return capsys.readouterr().err
+        return capsys.readouterr().out
+
+    return run
+
+
+def _change_masks(capture: Path, change: Callable[[np.ndarray], np.ndarray], count: int = NUM_VIEWS) -> None:
+    for view in range(count):
+        path = capture / "masks" / "train" / f"r_{view}.png"
+        Image.fromarray(change(np.array(Image.open(path)))).save(path)
+
+
+def test_ball_from_its_silhouettes(preprocess: Callable[..., str], capture: Path) -> None:
+    printed = preprocess("medium.ior=1.33")
+    mesh = load_mesh(capture / "mesh.ply")
+    assert mesh.is_closed
+    radii = np.linalg.norm(mesh.vertices - CENTRE, axis=1)
+    # A pixel is 0.08 wide at the ball, and binary masks leave a quarter of one open.
+    assert abs(radii.mean() - RADIUS) < 0.04
+    overlaps = json.loads((capture / "overlaps.json").read_text())
+    assert overlaps["mean"] > 0.93
+    assert list(overlaps["views"]) == [f"train/r_{view}" for view in range(NUM_VIEWS)]
+    assert all(f"train/r_{view}\n" in printed for view in range(NUM_VIEWS))
+    with Image.open(capture / "overlays.png") as sheet:
+        assert np.array(sheet).std() > 10
+    command = shlex.split(printed.split("train on it: ")[1])
+    assert command[:3] == ["python", "-m", "nerfro.train"]
+    assert {f"data.root={capture}", "medium.ior=1.33"} <= set(command)
+    box = [
+        json.loads(next(a for a in command if a.startswith(f"medium.{n}=")).split("=")[1])
+        for n in ("box_min", "box_max")
+    ]
+    assert (np.array(box[0]) < mesh.bounds[0]).all()
+    assert (np.array(box[1]) > mesh.bounds[1]).all()
+
+
+def test_printed_command_trains(
+    preprocess: Callable[..., str], train_here: Callable, tiny_default_run: list[str]
+) -> None:
+    command = shlex.split(preprocess().split("train on it: ")[1])[3:]
+    small = [text for text in tiny_default_run if not text.startswith(("data.root=", "medium."))]
+    finished = train_here(*small, *command, "trainer.max_steps=1", "evaluation.split=train", "evaluation.every=0")
+    assert finished.code == 0, finished.err
+
+
+def test_nothing_is_overwritten_unasked(preprocess: Callable[..., str], capture: Path) -> None:
+    (capture / "mesh.ply").write_text("mine")
+    assert "mesh.ply exists; set overwrite=true" in preprocess()
+    assert (capture / "mesh.ply").read_text() == "mine"
+    assert "train on it" in preprocess("overwrite=true", "smoothing=0")
+    assert load_mesh(capture / "mesh.ply").is_closed
+
+
+def test_supplied_mesh_is_compared_and_kept(preprocess: Callable[..., str], capture: Path, tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(3, RADIUS)
+    ball.apply_translation(CENTRE)
+    ball.export(tmp_path / "ball.ply")
+    printed = preprocess(f"mesh={tmp_path / 'ball.ply'}")
+    assert f"medium.mesh={tmp_path / 'ball.ply'}" in printed
+    assert not (capture / "mesh.ply").exists()
+    assert json.loads((capture / "overlaps.json").read_text())["mean"] > 0.97
+
+
+def test_data_without_masks_is_refused(preprocess: Callable[..., str], tiny_scene: Path) -> None:
+    assert "the data has no masks" in preprocess(f"data.root={tiny_scene}", "overwrite=true")
+
+
+@pytest.mark.parametrize(
+    ("change", "count", "message"),
+    [
+        (lambda mask: 0 * mask, 1, "train/r_0: the mask is empty"),
+        (lambda mask: 0 * mask + 255, 1, "train/r_0: the mask is all object"),
+        (lambda mask: 255 - mask, NUM_VIEWS, "24 of 24 masks cover the frame .* they are inverted"),
+        (lambda mask: mask[:12], 1, r"r_0\.png has 40x12 pixels but its image has 40x40"),
+        (
+            lambda mask: np.maximum(mask, 255 * (np.arange(SIZE) < 15)).astype(np.uint8),
+            NUM_VIEWS,
+            "cut by the frame in all 24",
+        ),
+        (lambda mask: np.roll(mask, 20, 1), 1, "look at the masks and poses of train/r_0, and .* wrong_masks=1"),
+    ],
+    ids=["empty", "full", "inverted", "size", "cut", "wrong"],
+)
+def test_wrong_masks_give_one_line(
+    preprocess: Callable[..., str], capture: Path, change: Callable, count: int, message: str
+) -> None:
+    _change_masks(capture, change, count)
+    printed = preprocess()
+    assert re.search(message, printed)
+    assert printed.count("\n") == 1
+    assert not (capture / "mesh.ply").exists()
+
+
+def test_flipped_axes_are_named(preprocess: Callable[..., str], capture: Path) -> None:
+    document = json.loads((capture / "transforms_train.json").read_text())
+    for frame in document["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([1.0, -1, -1, 1])).tolist()
+    (capture / "transforms_train.json").write_text(json.dumps(document))
+    assert "the poses are in another convention: with the camera's y and z axes flipped" in preprocess()
+
+
+def test_views_from_one_side_are_bounded_by_the_box(preprocess: Callable[..., str], capture: Path) -> None:
+    document = json.loads((capture / "transforms_train.json").read_text())
+    document["frames"] = document["frames"][:3]
+    (capture / "transforms_train.json").write_text(json.dumps(document))
+    printed = preprocess("box_min=[-0.6,-0.8,-0.6]", "box_max=[1.2,1,0.3]", "smoothing=0")
+    assert "3 views make a coarse hull" in printed
+    assert "the hull is cut off by the box" in printed
+    assert "no silhouette shows where the object ends in depth" in printed
+    assert load_mesh(capture / "mesh.ply").bounds[1, 2] < 0.4
+
+
+def test_two_views_are_too_few(preprocess: Callable[..., str], capture: Path) -> None:
+    document = json.loads((capture / "transforms_train.json").read_text())
+    document["frames"] = document["frames"][:2]
+    (capture / "transforms_train.json").write_text(json.dumps(document))
+    assert "2 views do not bound a shape" in preprocess()
+
+
+def test_options_out_of_range(preprocess: Callable[..., str]) -> None:
+    assert "resolution=8 is not allowed" in preprocess("resolution=8")
+    assert "keep=0" in preprocess("keep=0")
+    assert "give both box_min and box_max" in preprocess("box_min=[0,0,0]")
+    assert "is no box" in preprocess("box_min=[0,0,0]", "box_max=[1,1,0]")
+    assert "add out=FOLDER" in preprocess("data.root=embedded:torus")
