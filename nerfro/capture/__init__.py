@@ -1,0 +1,1 @@
+"""From photographs to posed views: calibration targets, poses, masks."""
