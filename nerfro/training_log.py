@@ -64,7 +64,10 @@ class TrainingLog(Callback):
         for logger in loggers:
             _log_pictures(logger, pictures, trainer.global_step)
             for level, rendering in enumerate(renderings):
-                _log_histogram(logger, f"samples/arc_length_level_{level}", rendering.samples.s, trainer.global_step)
+                # Rays that miss the object have their samples in a span of no length at far.
+                s = rendering.samples.s[rendering.samples.deltas > 0]
+                if len(s) > 0:
+                    _log_histogram(logger, f"samples/arc_length_level_{level}", s, trainer.global_step)
 
 
 def learning_rates(trainer: Trainer, model: LightningModule) -> dict[str, float]:
