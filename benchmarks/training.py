@@ -259,9 +259,11 @@ def timed(task: Callable[[], object]) -> float:
 
 
 def report_budget(budget: str) -> None:
-    """Test scores of the default preset and of the paper's recipe after the same time on the embedded scene."""
-    paper = [*EMBEDDED, MESH, "medium.resolution=256"]
-    commands = {"refractive": [], PLAIN: paper, FAST: paper}
+    """Test scores of the default preset and of the paper's recipe after the same time on the embedded scene.
+
+    The recipe in its fast form, which gets several times as many steps as the plain one.
+    """
+    commands = {"refractive": [], FAST: [*EMBEDDED, MESH, "medium.resolution=256"]}
     print(
         f"| experiment | steps in {budget} | rays/s | PSNR, 20 test views | SSIM |\n|---|---|---|---|---|", flush=True
     )
