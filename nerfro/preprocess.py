@@ -284,7 +284,7 @@ def train_command(
     medium |= {name.removeprefix("medium."): value for name, value in settings.items() if name.startswith("medium.")}
     build(medium | {"mesh": location})
     kept = [text for text in overrides if text.lstrip("+").startswith(("data=", "data.", "medium=", "medium."))]
-    kept = [text for text in kept if text.lstrip("+").split("=")[0] not in settings]
+    kept = [text for text in kept if text.lstrip("+").split("=")[0] not in {*settings, "medium.mesh"}]
     written = [f"{name}={str(value).replace(' ', '')}" for name, value in settings.items()]
     return ["python", "-m", "nerfro.train", *kept, *written]
 
