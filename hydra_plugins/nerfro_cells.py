@@ -144,6 +144,9 @@ class CellSweeper(BasicSweeper):
         assert self.launcher is not None
         try:
             self.launcher.launch([cell.overrides for cell in cells], initial_job_idx=0)
+        except (KeyboardInterrupt, SystemExit):
+            print("nerfro: the sweep was interrupted; the same command goes on with it", file=sys.stderr, flush=True)
+            raise
         except Exception as error:  # a worker died, or the launcher could not start any: the cells tell what is done
             reason = in_one_line(error) or f"{type(error).__name__}: {error}".splitlines()[0]
             print(f"nerfro: the launcher gave up: {reason}", file=sys.stderr, flush=True)

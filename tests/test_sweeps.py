@@ -197,7 +197,10 @@ def test_folders_are_named_by_experiment_scene_seed_and_what_else_is_swept() -> 
 
 
 @pytest.mark.slow
-def test_killed_sweep_goes_on_where_it_was(start: Callable[..., subprocess.Popen[str]], tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_stopped_sweep_goes_on_where_it_was(
+    how: signal.Signals, start: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
     overrides = ["seed=0,1,2", "+loss.waiting.weight=1", "trainer.max_steps=20"]
     overrides += ["checkpoint.every_steps=4", "checkpoint.every_seconds=null"]
     first = start(*overrides)
@@ -207,8 +210,10 @@ def test_killed_sweep_goes_on_where_it_was(start: Callable[..., subprocess.Popen
         assert first.poll() is None, (tmp_path / "log").read_text()
         assert time.monotonic() < deadline
         time.sleep(0.05)
-    first.send_signal(signal.SIGKILL)
-    first.wait()
+    first.send_signal(how)
+    assert first.wait(60) == (-signal.SIGKILL if how is signal.SIGKILL else 130)
+    if how is signal.SIGINT:
+        assert "the same command goes on with it" in (tmp_path / "log").read_text()
     assert not (cells[1] / "metrics.json").exists()
     assert not cells[2].exists()
     before = written(tmp_path / "sweep")
