@@ -98,15 +98,19 @@ class TagBoard:
         return np.kron(sheet, np.ones((module_pixels, module_pixels), np.uint8))
 
 
-def twelve_faces() -> TagBoard:
+def twelve_faces(tag: float = 0.05) -> TagBoard:
     """The board of the paper's authors: a block of 0.27 units on the middle of a square of 0.81, 108 tags.
 
     The square lies in the plane z = 0 with a corner at the origin; its eight outer cells are faces 0 to 7, 0.27 wide.
     The walls of the block over the cell in the middle are faces 8 to 11 (towards +x, +y, -x, -y), and the object
     stands on top of it at z = 0.27. The positions are those of calib_camera_with_apriltag.py in
     https://github.com/alexkeroro86/SampleNeRFRO; a module is 0.01 units, and a face has 3x3 tags of tagStandard41h12.
+
+    Args:
+        tag: side of a tag between the corners that are detected; all lengths go with it, and 0.05 is the authors'.
     """
-    side, columnwise = 0.27, np.arange(9).reshape(3, 3).T
+    module = tag / 5
+    side, columnwise = 27 * module, np.arange(9).reshape(3, 3).T
     cells = [(0, 0), (1, 0), (2, 0), (2, 1), (2, 2), (1, 2), (0, 2), (0, 1)]
     faces = [
         Face((side * x, side * y, 0), (0, 1, 0), (1, 0, 0), columnwise + 9 * number)
@@ -122,7 +126,7 @@ def twelve_faces() -> TagBoard:
         Face((side * x, side * y, side), right, (0, 0, -1), columnwise + 9 * number)
         for number, ((x, y), right) in enumerate(walls, len(cells))
     ]
-    return TagBoard("tagStandard41h12", 0.01, tuple(faces))
+    return TagBoard("tagStandard41h12", module, tuple(faces))
 
 
 def tag_grid(family: Family, rows: int, columns: int, tag: float) -> TagBoard:
