@@ -54,8 +54,7 @@ class BlenderData(DataSource):
             )
 
         def lenses(width: int, height: int) -> list[Lens]:
-            focal = 0.5 * width / math.tan(0.5 * angle)
-            return [Lens(focal, focal, 0.5 * width, 0.5 * height)] * len(manifest.frames)
+            return [Lens.of_angle(angle, width, height)] * len(manifest.frames)
 
         bounds = self.near, self.far
         return load_views(manifest.frames, lenses, "opengl", bounds, self.downscale, self.alpha, manifest.size)

@@ -52,7 +52,7 @@ class ColmapData(DataSource):
         model: str | None = None,
         test_every: int = 8,
     ) -> None:
-        check_options(near or 0.0, far or 1e30, downscale)
+        check_options(near, far, downscale)
         self.root = resolve_path(root)
         self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
         self.images, self.model, self.test_every = images, model, test_every

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,6 +56,12 @@ class Lens:
     cx: float
     cy: float
     distortion: tuple[float, ...] | None = None
+
+    @classmethod
+    def of_angle(cls, angle: float, width: int, height: int) -> Lens:
+        """The ideal lens with a horizontal field of view in radians and its principal point in the image's centre."""
+        focal = 0.5 * width / math.tan(0.5 * angle)
+        return cls(focal, focal, 0.5 * width, 0.5 * height)
 
     def resized(self, made_for: tuple[float, float], size: tuple[int, int], where: str) -> Lens:
         """The lens for images that were resized after calibration.
@@ -118,13 +125,18 @@ def load_views(
     return Views(cameras, images, masks, [frame.name for frame in frames])
 
 
-def check_options(near: float, far: float, downscale: int) -> None:
+def check_options(near: float | None, far: float | None, downscale: int) -> None:
     """Check the options that all loaders share.
+
+    Args:
+        near, far: arc lengths at which rays begin and end; None where the data will tell.
+        downscale: side of the blocks of pixels that are averaged.
 
     Raises:
         NerfroError: one is out of range.
     """
-    if not 0 <= near < far < math.inf:  # also false for NaN
+    known = (0.0 if near is None else near), (sys.float_info.max if far is None else far)
+    if not 0 <= known[0] < known[1] < math.inf:  # also false for NaN
         raise NerfroError(f"data.near={near} and data.far={far} are no interval; take 0 <= near < far")
     if downscale < 1:
         raise NerfroError(f"data.downscale={downscale} is not allowed; take 1 for full size, 2 for half, and so on")

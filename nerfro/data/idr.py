@@ -53,7 +53,7 @@ class IdrData(DataSource):
         world: Literal["sphere", "file"] = "sphere",
         test_every: int = 8,
     ) -> None:
-        check_options(near or 0.0, far or 1e30, downscale)
+        check_options(near, far, downscale)
         if world == "file" and (near is None or far is None):
             raise NerfroError("data.world=file needs data.near and data.far, in units of that world")
         self.root = resolve_path(root)

@@ -68,7 +68,7 @@ class LlffData(DataSource):
         video: str | None = None,
         test_every: int = 8,
     ) -> None:
-        check_options(near or 0.0, far or 1e30, downscale)
+        check_options(near, far, downscale)
         self.root = resolve_path(root)
         self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
         self.images, self.frame, self.video, self.test_every = images, frame, video, test_every

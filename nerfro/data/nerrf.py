@@ -60,7 +60,7 @@ class NerrfData(DataSource):
         downscale: int = 1,
         alpha: Literal["drop", "white", "black"] = "drop",
     ) -> None:
-        check_options(near, far or 80.0, downscale)
+        check_options(near, far, downscale)
         self.root = resolve_path(root)
         self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
 
@@ -84,8 +84,7 @@ class NerrfData(DataSource):
                 w, h = _EIKONAL_SIZE
                 full = [Lens(focal, focal, 0.5 * w, 0.5 * h) for focal in focals]
                 return [lens.resized((w, h), (width, height), f"{self.root / 'meta'}") for lens in full]
-            focal = 0.5 * width / math.tan(0.5 * _FIELD_OF_VIEW)
-            return [Lens(focal, focal, 0.5 * width, 0.5 * height)] * len(frames)
+            return [Lens.of_angle(_FIELD_OF_VIEW, width, height)] * len(frames)
 
         far = self.far if self.far is not None else 3.0 if captured else 80.0
         return load_views(frames, lenses, "opengl", (self.near, far), self.downscale, self.alpha)

@@ -49,7 +49,7 @@ class RefRefData(DataSource):
         downscale: int = 1,
         alpha: Literal["drop", "white", "black"] = "drop",
     ) -> None:
-        check_options(near, far or 1e30, downscale)
+        check_options(near, far, downscale)
         self.root, self.scene = resolve_path(root), scene
         self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
 
@@ -65,8 +65,7 @@ class RefRefData(DataSource):
             frames = [_unpack(row, number, Path(folder), files[0]) for number, row in rows]
 
             def lenses(width: int, height: int) -> list[Lens]:
-                focal = 0.5 * width / math.tan(0.5 * _CAMERA_ANGLE_X)
-                return [Lens(focal, focal, 0.5 * width, 0.5 * height)] * len(frames)
+                return [Lens.of_angle(_CAMERA_ANGLE_X, width, height)] * len(frames)
 
             far = self.far
             if far is None:

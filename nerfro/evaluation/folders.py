@@ -10,12 +10,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.data.frames import IMAGE_SUFFIXES
 from nerfro.data.image_files import Alpha, read_rgb
 from nerfro.data.masks import find_mask, read_masks
 from nerfro.errors import NerfroError
 from nerfro.evaluation.regions import object_pixels
-
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
 
 @dataclass(frozen=True)
@@ -98,13 +97,13 @@ def _pictures(folder: Path, option: str) -> dict[str, Path]:
         raise NerfroError(f"{option}={folder} is not a folder; give one that holds pictures")
     pictures: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
-        if path.suffix.lower() not in SUFFIXES or path.name.startswith("."):
+        if path.suffix.lower() not in IMAGE_SUFFIXES or path.name.startswith("."):
             continue
         if path.stem in pictures:
             raise NerfroError(f"{pictures[path.stem]} and {path} have one name; keep one of them in {option}={folder}")
         pictures[path.stem] = path
     if not pictures:
-        raise NerfroError(f"{option}={folder} holds no pictures; allowed are {', '.join(SUFFIXES)}")
+        raise NerfroError(f"{option}={folder} holds no pictures; allowed are {', '.join(IMAGE_SUFFIXES)}")
     return pictures
 
 

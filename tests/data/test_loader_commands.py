@@ -8,6 +8,9 @@ import pytest
 import trimesh
 from omegaconf import OmegaConf
 
+from nerfro.errors import NerfroError
+from nerfro.registry import discover, find
+
 from .photographs import POINTS, save_picture, world_to_camera
 from .test_colmap import OPENCV, write_binary
 
@@ -71,3 +74,10 @@ def test_a_folder_that_is_not_there_is_one_line(train_here, tmp_path, options):
     assert finished.code == 1
     (line,) = finished.err.strip().splitlines()
     assert f"data.root={tmp_path / 'gone'}" in line
+
+
+@pytest.mark.parametrize("data", ["colmap", "llff", "idr", "nerrf", "refref"])
+def test_zero_is_no_far_bound_and_not_an_unknown_one(data):
+    discover()
+    with pytest.raises(NerfroError, match=r"data.far=0.0 are no interval"):
+        find("data", data).cls(root="anywhere", far=0.0)
