@@ -29,12 +29,12 @@ _NOT_THE_METHOD = (
     "evaluation.chunk_size",
     "evaluation.lpips_backbone",
     "evaluation.lpips_vgg_backbone",
-    "evaluation.lpips_vgg_backbone",
     "batches.cache_paths",
     "trainer.max_time",
     "trainer.max_steps",
     "trainer.accelerator",
     "trainer.devices",
+    "trainer.strategy",
     "trainer.log_every_n_steps",
     "trainer.enable_model_summary",
 )
