@@ -122,7 +122,7 @@ def load_views(
     distortion = torch.tensor([lens.distortion or (0.0,) * 9 for lens in full]) if distorted else None
     cameras = Cameras(torch.from_numpy(poses).float(), fx, fy, cx, cy, width, height, *bounds, distortion)
     _check_distortion(cameras, frames)
-    return Views(cameras, images, masks, [frame.name for frame in frames])
+    return Views(cameras, images, masks, [frame.name for frame in frames], frames=frames)
 
 
 def check_options(near: float | None, far: float | None, downscale: int) -> None:

@@ -82,7 +82,7 @@ class OpenCVData(DataSource):
             return views
         window = central_window(views.cameras.height, views.cameras.width, self.eval_crop)
         masks = None if views.masks is None else window.cut(views.masks)
-        return Views(views.cameras.crop(window), window.cut(views.images), masks, views.names)
+        return Views(views.cameras.crop(window), window.cut(views.images), masks, views.names, frames=views.frames)
 
 
 def _distortion(manifest: Manifest) -> tuple[float, ...] | None:

@@ -112,7 +112,7 @@ def find_box(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np.ndarray
     count = inside.sum((1, 2))
     row, column = (inside.sum(2) * rows).sum(1) / count, (inside.sum(1) * columns).sum(1) / count
     rays = cameras.rays(torch.arange(len(cameras)), row - 0.5, column - 0.5)
-    centre = _nearest_point(rays.origins.double().numpy(), rays.directions.double().numpy())
+    centre = nearest_point(rays.origins.double().numpy(), rays.directions.double().numpy())
     pixels, depth = cameras.project(torch.from_numpy(centre[None]).float())
     radii = []
     for view in range(len(cameras)):
@@ -126,7 +126,7 @@ def find_box(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np.ndarray
     return np.stack([centre - half_side, centre + half_side])
 
 
-def _nearest_point(origins: Float[np.ndarray, "V 3"], directions: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "3"]:
+def nearest_point(origins: Float[np.ndarray, "V 3"], directions: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "3"]:
     """The point of the least sum of distances to lines, by reweighted least squares: a few stray lines do not count."""
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     weights = np.ones(len(origins))
