@@ -138,10 +138,12 @@ def _require_one_task(config: DictConfig) -> None:
         )
     if config.predictions is not None and config.references is None:
         raise NerfroError(f"predictions={config.predictions} are compared with what? give references=DIR")
-    other = ("root", "chunk_size", "supersample", "divergence") if config.predictions else ("references", "masks")
-    for name in other:
-        if config[name] is not None:
-            task = "predictions" if config.predictions else "checkpoint"
+    if config.checkpoint is None:
+        task, others = "predictions", ("split", "root", "chunk_size", "supersample", "divergence")
+    else:
+        task, others = "checkpoint", ("references", "masks", "alpha")
+    for name in others:
+        if config[name] != getattr(EvaluateConfig, name):
             raise NerfroError(f"{name}={config[name]} means nothing with {task}=...; leave it out")
     for name, allowed in (("protocol", ("8bit", "float")), ("alpha", ("drop", "white", "black"))):
         if config[name] not in allowed:
