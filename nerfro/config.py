@@ -12,6 +12,7 @@ import numpy as np
 from omegaconf import MISSING, DictConfig
 
 from nerfro.errors import NerfroError
+from nerfro.geometry.cache import load_array
 from nerfro.geometry.mesh import load_mesh
 from nerfro.losses.base import Loss
 from nerfro.media.analytic import Vacuum
@@ -229,10 +230,7 @@ def _settle_content(config: DictConfig, medium: Medium) -> None:
 
 def _read_box(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Centre and half sides of a box, from Eikonal Fields' bounding_box_vals.npy."""
-    try:
-        values = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise NerfroError(f"content.box_file={path} cannot be read ({error}); give a .npy of 2x3 numbers") from error
+    values = load_array(path)
     if values.shape != (2, 3) or not np.isfinite(values).all() or values[1].min() <= 0:
         raise NerfroError(f"content.box_file={path} must hold a box's centre and positive half sides, 2x3 numbers")
     return values[0], values[1]

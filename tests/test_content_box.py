@@ -34,7 +34,8 @@ def test_box_is_centre_and_half_sides(tmp_path: Path) -> None:
         ([[0, 0, 0], [1, -1, 1]], "positive half sides"),
         ([[0, 0], [1, 1]], "2x3 numbers"),
         ([[0, 0, np.nan], [1, 1, 1]], "2x3 numbers"),
-        (None, "cannot be read"),
+        (None, "does not exist"),
+        ([["a"] * 3] * 2, "not a .npy of numbers"),
     ],
 )
 def test_wrong_files_are_refused(tmp_path: Path, values: list | None, message: str) -> None:

@@ -24,6 +24,7 @@ from nerfro.data.frames import (
 )
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
+from nerfro.geometry.cache import load_array
 from nerfro.paths import resolve_path
 from nerfro.registry import register
 
@@ -134,15 +135,11 @@ def read_poses_bounds(
     """
     if not path.is_file():
         raise NerfroError(f"{path} does not exist; make it with LLFF's imgs2poses.py, or use data=colmap directly")
-    try:
-        rows = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        raise NerfroError(f"{path} cannot be read ({error}); copy or export it again") from error
-    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0:
-        raise NerfroError(f"{path} has shape {getattr(rows, 'shape', None)}; it must be [images, 17]")
+    rows = load_array(path)
+    if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0:
+        raise NerfroError(f"{path} has shape {rows.shape}; it must be [images, 17]")
     if not np.isfinite(rows).all():
         raise NerfroError(f"{path} holds NaN or infinite numbers in row {int(np.isfinite(rows).all(1).argmin())}")
-    rows = rows.astype(np.float64)
     matrices, depths = rows[:, :15].reshape(-1, 3, 5), rows[:, 15:]
     down, right, back, centre, size = (matrices[:, :, i] for i in range(5))
     if depths.min() <= 0 or (depths[:, 0] >= depths[:, 1]).any() or size.min() <= 0:

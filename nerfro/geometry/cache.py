@@ -65,6 +65,23 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
         raise NerfroError(f"{path} is not a readable .npz of plain arrays ({error}); make it again") from error
 
 
+def load_array(path: Path) -> np.ndarray:
+    """Read the numbers of a .npy without executing pickled code, in double precision.
+
+    Raises:
+        NerfroError: the file is missing, truncated or holds anything but an array of numbers.
+    """
+    try:
+        array = np.load(path, allow_pickle=False)
+    except FileNotFoundError as error:
+        raise NerfroError(f"{path} does not exist; check the path") from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise NerfroError(f"{path} cannot be read ({error}); copy or export it again") from error
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+        raise NerfroError(f"{path} is not a .npy of numbers; copy or export it again")
+    return array.astype(np.float64)
+
+
 Arrays = dict[str, np.ndarray]
 
 
