@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.data.cameras import Cameras
+
+if TYPE_CHECKING:
+    from nerfro.data.frames import Frame
 
 
 @dataclass(frozen=True)
@@ -21,12 +26,14 @@ class Views:
         images: colours, sRGB in [0, 1].
         masks: share of each pixel that the refractive object covers, or None where the data has no masks.
         names: of the images, as the data set calls them.
+        frames: files of the images and their masks, where the loader knows them.
     """
 
     cameras: Cameras
     images: Float[Tensor, "V H W 3"]
     masks: Float[Tensor, "V H W"] | None
     names: list[str]
+    frames: Sequence[Frame] = ()
 
     def __len__(self) -> int:
         return len(self.names)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
+from contextvars import ContextVar
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,18 @@ from nerfro.errors import NerfroError
 
 MASKS_FOLDER = "masks"
 _SPLIT_FOLDERS = ("train", "val", "test")
+
+_left_out: ContextVar[bool] = ContextVar("left_out", default=False)
+
+
+@contextlib.contextmanager
+def masks_left_out() -> Iterator[None]:
+    """Data that are loaded within it have no masks, for the tool that makes the missing ones: loaders refuse a part."""
+    token = _left_out.set(True)
+    try:
+        yield
+    finally:
+        _left_out.reset(token)
 
 
 def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None:
@@ -66,6 +80,8 @@ def read_masks(
     Raises:
         NerfroError: some images have a silhouette and others none, or one is corrupt or of another size.
     """
+    if _left_out.get():
+        return None
     files = [mask for mask in masks if mask is not None]
     if not files:
         return read_stack(images, _read_alpha, downscale, size) if _is_transparent(images[0]) else None

@@ -9,6 +9,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -25,6 +26,11 @@ NEAR, FAR = 2.0, 6.0
 BOX = ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))
 SPLITS = ("train", "val", "test")
 META = "meta.json"
+_FILES = (
+    *(f"transforms_{split}.json" for split in SPLITS),
+    *(f"{folder}{split}/r_*.png" for split in SPLITS for folder in ("", "masks/")),
+    *("mesh.ply", "interior.ply", "sky.png", "sky.exr", META),
+)
 
 
 @dataclass(frozen=True)
@@ -80,13 +86,16 @@ class View:
 
 
 def fingerprint(scene: Scene) -> str:
-    """Return a short hash of a scene's geometry, colours, index, tint and sky."""
+    """Return a short hash of a scene's geometry, colours, index, tint and surroundings."""
     digest = hashlib.sha256(repr((scene.ior, scene.tint)).encode())
     for surface in (scene.glass, scene.interior):
         for array in (surface.vertices, surface.faces, surface.normals, surface.colours):
             if array is not None:
                 digest.update(array.tobytes())
-    digest.update(scene.sky(lat_long_directions(64, 128)).astype(np.float32).tobytes())
+    if scene.sky is not None:
+        digest.update(scene.sky(lat_long_directions(64, 128)).astype(np.float32).tobytes())
+    for panel in scene.panels:
+        digest.update(repr((panel.to_world.tolist(), panel.glows, panel.smooth)).encode() + panel.picture.tobytes())
     return digest.hexdigest()[:16]
 
 
@@ -102,13 +111,20 @@ def views(settings: Settings) -> list[View]:
     return planned
 
 
-def prepare(folder: Path, settings: Settings, overwrite: bool) -> None:
+def prepare(folder: Path, settings: Any, overwrite: bool, meta: str = META, files: tuple[str, ...] = _FILES) -> None:
     """Make `folder` ready for pictures of `settings`: new, continued, or cleared.
+
+    Args:
+        folder: of the data set.
+        settings: dataclass of everything that decides the contents.
+        overwrite: whether another data set may be replaced.
+        meta: file in the folder in which a data set's settings stand.
+        files: patterns of the files that a data set consists of.
 
     Raises:
         NerfroError: the folder holds another data set, or other files, and `overwrite` is not set.
     """
-    stored = _stored_settings(folder / META)
+    stored = _stored_settings(folder / meta)
     if stored is not None:
         if stored == asdict(settings):
             return
@@ -117,7 +133,9 @@ def prepare(folder: Path, settings: Settings, overwrite: bool) -> None:
                 f"'{folder}' holds a data set with other settings; choose another folder with out=DIR, "
                 "or replace it with overwrite=true"
             )
-        _remove_data_set(folder)
+        # Nothing else, that somebody may have put beside them.
+        for path in [path for pattern in files for path in folder.glob(pattern)]:
+            path.unlink()
     elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise NerfroError(f"'{folder}' exists and is no data set of ours; choose another folder with out=DIR")
     folder.mkdir(parents=True, exist_ok=True)
@@ -195,14 +213,3 @@ def _stored_settings(meta: Path) -> dict | None:
         return json.loads(meta.read_text()).get("settings")
     except (FileNotFoundError, NotADirectoryError, ValueError, AttributeError):
         return None
-
-
-def _remove_data_set(folder: Path) -> None:
-    """Delete the files that a data set consists of, and nothing else that somebody may have put beside them."""
-    for split in SPLITS:
-        (folder / f"transforms_{split}.json").unlink(missing_ok=True)
-        for pictures in (folder / split, folder / "masks" / split):
-            for picture in pictures.glob("r_*.png"):
-                picture.unlink()
-    for name in ("mesh.ply", "interior.ply", "sky.png", "sky.exr", META):
-        (folder / name).unlink(missing_ok=True)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import functools
 import warnings
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from types import ModuleType
 
 import numpy as np
 
 from nerfro.errors import NerfroError
 from nerfro.scenes.glass import PLUGIN, register_transmitting_glass
+from nerfro.scenes.panels import Panel
 from nerfro.scenes.patterns import to_linear
 from nerfro.scenes.scene import Scene
 from nerfro.scenes.skies import Sky
@@ -67,6 +69,33 @@ def _register_materials(variant: str) -> None:
     register_transmitting_glass(mitsuba)
 
 
+@dataclass(frozen=True)
+class Pinhole:
+    """A camera without distortion, square pixels; pixel (row i, column j) covers the square (j, i) to (j + 1, i + 1).
+
+    Attributes:
+        width, height: resolution, pixels.
+        focal: focal length, pixels.
+        cx, cy: principal point, pixels from the picture's left and upper edge.
+    """
+
+    width: int
+    height: int
+    focal: float
+    cx: float
+    cy: float
+
+    @classmethod
+    def square(cls, angle_x: float, size: int) -> Pinhole:
+        """A camera of square pictures with a field of view of `angle_x` radians."""
+        return cls(size, size, 0.5 * size / np.tan(0.5 * angle_x), 0.5 * size, 0.5 * size)
+
+    @property
+    def angle_x(self) -> float:
+        """Angle, radians, under which the picture's width is seen from in front of its middle."""
+        return float(2 * np.arctan(0.5 * self.width / self.focal))
+
+
 class PathTracer:
     """Renders one scene from many cameras.
 
@@ -74,8 +103,7 @@ class PathTracer:
         scene: what to render.
         fresnel: False for transmission and total reflection only (the paper's image formation), True for a physical
             dielectric with partial reflection.
-        camera_angle_x: horizontal field of view, radians.
-        resolution: picture side in pixels; pictures are square.
+        camera: that takes the pictures.
         texels_per_pixel: sky texels per pixel of the background.
         variant: Mitsuba variant, see `load_mitsuba`.
     """
@@ -84,17 +112,13 @@ class PathTracer:
         self,
         scene: Scene,
         fresnel: bool,
-        camera_angle_x: float,
-        resolution: int,
+        camera: Pinhole,
         texels_per_pixel: float = 2.0,
         variant: str = "auto",
     ) -> None:
         self.mitsuba = load_mitsuba(variant)
-        self.camera_angle_x, self.resolution = camera_angle_x, resolution
+        self.camera = camera
         mi = self.mitsuba
-        height = int(np.clip(np.pi / camera_angle_x * resolution * texels_per_pixel, 256, 2048))
-        # The sky stands on its edge in Mitsuba's frame (y up); this turns y to our z.
-        upright = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
         glass = (
             {"type": "dielectric", "int_ior": scene.ior, "ext_ior": 1.0}
             if fresnel
@@ -103,13 +127,19 @@ class PathTracer:
         if fresnel:
             glass["specular_transmittance"] = {"type": "rgb", "value": list(scene.tint)}
         paint = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
-        texture = mi.Bitmap(envmap_texture(scene.sky, height, np.asarray(upright.matrix)[:3, :3]))
+        surroundings = {f"panel_{number}": _panel(mi, panel) for number, panel in enumerate(scene.panels)}
+        if scene.sky is not None:
+            height = int(np.clip(np.pi / camera.angle_x * camera.width * texels_per_pixel, 256, 2048))
+            # The sky stands on its edge in Mitsuba's frame (y up); this turns y to our z.
+            upright = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+            texture = mi.Bitmap(envmap_texture(scene.sky, height, np.asarray(upright.matrix)[:3, :3]))
+            surroundings["sky"] = {"type": "envmap", "bitmap": texture, "to_world": upright}
         self.glass = mi.load_dict({"type": "scene", "glass": _mesh(mi, "glass", scene.glass, glass)})
         self.scene = mi.load_dict(
             {
                 "type": "scene",
                 "integrator": {"type": "path", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH},
-                "sky": {"type": "envmap", "bitmap": texture, "to_world": upright},
+                **surroundings,
                 "glass": _mesh(mi, "glass", scene.glass, glass),
                 "interior": _mesh(mi, "interior", scene.interior, paint),
             }
@@ -123,10 +153,26 @@ class PathTracer:
             spp: samples per pixel; rendered in passes of at most `SAMPLES_PER_PASS` samples.
             seed: seed of the sampler; equal seeds give equal pictures.
         """
+        return self._render(self._sensor(pose), spp, seed)
+
+    def render_flat(self, to_world: np.ndarray, above: float, spp: int, seed: int) -> np.ndarray:
+        """Return the linear radiance [H, W, 3] that a rectangle sends straight up, averaged over its pixels.
+
+        Args:
+            to_world: matrix [4, 4] from the square [-1, 1]^2 of x (to the right) and y (upwards); z points up from it.
+            above: distance from the rectangle at which rays begin, world units.
+            spp: samples per pixel.
+            seed: seed of the sampler.
+        """
+        pose = to_world @ np.diag([-1.0, 1.0, -1.0, 1.0])
+        pose[:3, 3] += above * to_world[:3, 2]
+        kind = {"type": "orthographic", "near_clip": 0.1 * above, "far_clip": 10.0 * above}
+        return self._render(self._film(kind, pose), spp, seed)
+
+    def _render(self, sensor, spp: int, seed: int) -> np.ndarray:
         mi = self.mitsuba
-        per_pass = max(1, min(spp, SAMPLES_PER_PASS // self.resolution**2))
-        sensor = self._sensor(pose)
-        total = np.zeros((self.resolution, self.resolution, 3))
+        per_pass = max(1, min(spp, SAMPLES_PER_PASS // (self.camera.width * self.camera.height)))
+        total = np.zeros((self.camera.height, self.camera.width, 3))
         for number, first in enumerate(range(0, spp, per_pass)):
             count = min(per_pass, spp - first)
             # Mitsuba hashes the seed, so neighbouring seeds are independent; 4096 passes is 24 G samples per view.
@@ -135,36 +181,43 @@ class PathTracer:
         return total / spp
 
     def silhouette(self, pose: np.ndarray) -> np.ndarray:
-        """Return bool [H, W]: whether the ray through each pixel's centre meets the glass."""
-        mi = self.mitsuba
-        size = self.resolution
-        focal = 0.5 * size / np.tan(0.5 * self.camera_angle_x)
-        u, v = np.meshgrid(np.arange(size) + 0.5 - 0.5 * size, 0.5 * size - np.arange(size) - 0.5)
-        directions = np.stack([u / focal, v / focal, -np.ones_like(u)], -1).reshape(-1, 3) @ pose[:3, :3].T
+        """Return bool [H, W]: whether the ray through each pixel's centre meets the glass, which nothing may hide."""
+        mi, camera = self.mitsuba, self.camera
+        u, v = np.meshgrid(np.arange(camera.width) + 0.5 - camera.cx, camera.cy - np.arange(camera.height) - 0.5)
+        directions = np.stack([u, v, np.full_like(u, -camera.focal)], -1).reshape(-1, 3) @ pose[:3, :3].T
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         if mi.variant().startswith("scalar"):
             hits = [self.glass.ray_test(mi.Ray3f(list(pose[:3, 3]), list(direction))) for direction in directions]
         else:
-            origins = mi.Point3f(*(mi.Float(np.full(size * size, x, np.float32)) for x in pose[:3, 3]))
+            origins = mi.Point3f(*(mi.Float(np.full(len(directions), x, np.float32)) for x in pose[:3, 3]))
             rays = mi.Ray3f(origins, mi.Vector3f(*(mi.Float(x.astype(np.float32)) for x in directions.T)))
             hits = self.glass.ray_test(rays)
-        return np.asarray(hits, bool).reshape(size, size)
+        return np.asarray(hits, bool).reshape(camera.height, camera.width)
 
     def _sensor(self, pose: np.ndarray):
-        mi = self.mitsuba
+        camera = self.camera
+        kind = {
+            "type": "perspective",
+            "fov": float(np.degrees(camera.angle_x)),
+            "fov_axis": "x",
+            "principal_point_offset_x": 0.5 - camera.cx / camera.width,
+            "principal_point_offset_y": 0.5 - camera.cy / camera.height,
+            "near_clip": 0.01,
+            "far_clip": 100.0,
+        }
         # Mitsuba's camera looks along +z with x to the left; ours looks along -z with x to the right.
+        return self._film(kind, pose @ np.diag([-1.0, 1.0, -1.0, 1.0]))
+
+    def _film(self, kind: dict, to_world: np.ndarray):
+        mi, camera = self.mitsuba, self.camera
         return mi.load_dict(
             {
-                "type": "perspective",
-                "fov": float(np.degrees(self.camera_angle_x)),
-                "fov_axis": "x",
-                "near_clip": 0.01,
-                "far_clip": 100.0,
-                "to_world": mi.ScalarTransform4f((pose @ np.diag([-1.0, 1.0, -1.0, 1.0])).tolist()),
+                **kind,
+                "to_world": mi.ScalarTransform4f(to_world.tolist()),
                 "film": {
                     "type": "hdrfilm",
-                    "width": self.resolution,
-                    "height": self.resolution,
+                    "width": camera.width,
+                    "height": camera.height,
                     "rfilter": {"type": "box"},
                     "pixel_format": "rgb",
                     "component_format": "float32",
@@ -213,6 +266,23 @@ def _contrast(texture: np.ndarray) -> np.ndarray:
     contrast = np.maximum(np.maximum(right, np.roll(right, 1, 1)), below)
     contrast[1:] = np.maximum(contrast[1:], below[:-1])
     return contrast
+
+
+def _panel(mi: ModuleType, panel: Panel) -> dict:
+    """Return a Mitsuba rectangle with the panel's picture, decoded to linear, as light or as albedo."""
+    linear = {
+        "type": "bitmap",
+        # Mitsuba's v runs upwards along a rectangle, and its rows of pixels run with v.
+        "bitmap": mi.Bitmap(np.ascontiguousarray(to_linear(panel.picture[::-1]), np.float32)),
+        "raw": True,
+        "filter_type": "bilinear" if panel.smooth else "nearest",
+        "wrap_mode": "clamp",
+    }
+    shape = {"type": "rectangle", "to_world": mi.ScalarTransform4f(panel.to_world.tolist())}
+    if panel.glows:
+        black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
+        return shape | {"bsdf": black, "light": {"type": "area", "radiance": linear}}
+    return shape | {"bsdf": {"type": "diffuse", "reflectance": linear}}
 
 
 def _mesh(mi: ModuleType, name: str, surface: Surface, material: dict):

@@ -73,13 +73,15 @@ def sky(directions: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore"):
         reach = np.where(directions > 0, ROOM_HIGH / directions, ROOM_LOW / directions)
     reach = np.where(directions == 0, np.inf, reach)
-    wall = reach.argmin(-1)
-    x, y, z = np.moveaxis(directions * reach.min(-1)[..., None], -1, 0)
-    colour = np.where((directions[..., 0] > 0)[..., None], _bookcase(y, z), _panelling(y, z))
-    colour = np.where((wall == 1)[..., None], _windows(x, z, directions[..., 1] > 0), colour)
-    return to_linear(
-        np.clip(np.where((wall == 2)[..., None], _floor_and_ceiling(x, y, directions[..., 2] > 0), colour), 0, 0.98)
-    )
+    return to_linear(room(directions * reach.min(-1)[..., None], reach.argmin(-1)))
+
+
+def room(points: np.ndarray, wall: np.ndarray) -> np.ndarray:
+    """Return sRGB [..., 3] of points [..., 3] on the room's sides; `wall` [...] is the axis that each side faces."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    colour = np.where((x > 0)[..., None], _bookcase(y, z), _panelling(y, z))
+    colour = np.where((wall == 1)[..., None], _windows(x, z, y > 0), colour)
+    return np.clip(np.where((wall == 2)[..., None], _floor_and_ceiling(x, y, z > 0), colour), 0, 0.98)
 
 
 def _bookcase(y: np.ndarray, z: np.ndarray) -> np.ndarray:
