@@ -211,6 +211,7 @@ def _check_data(plugin: Plugin, fields: dict[str, object]) -> None:
         _require(views.images.shape == (*size, 3), "images are [V, H, W, 3]")
         _require(len(views.cameras) == len(views), "there is a camera for each image")
         _require(views.masks is None or views.masks.shape == size, "masks are [V, H, W]")
+        _require(views.usable is None or views.usable.shape == size, "usable pixels are [V, H, W]")
 
 
 _CONTRACTS: dict[str, Callable[[Plugin, dict[str, object]], None]] = {

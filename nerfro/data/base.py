@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfro.data.cameras import Cameras
@@ -26,6 +26,7 @@ class Views:
         images: colours, sRGB in [0, 1].
         masks: share of each pixel that the refractive object covers, or None where the data has no masks.
         names: of the images, as the data set calls them.
+        usable: pixels that may be trained on, or None for all of them.
         frames: files of the images and their masks, where the loader knows them.
     """
 
@@ -33,6 +34,7 @@ class Views:
     images: Float[Tensor, "V H W 3"]
     masks: Float[Tensor, "V H W"] | None
     names: list[str]
+    usable: Bool[Tensor, "V H W"] | None = None
     frames: Sequence[Frame] = ()
 
     def __len__(self) -> int:

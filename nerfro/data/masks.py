@@ -1,4 +1,4 @@
-"""Silhouettes of the refractive object: where their files lie, and how they are read."""
+"""Masks, silhouettes of the refractive object and pixels to ignore: where their files lie, and how they are read."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from contextvars import ContextVar
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor
 
-from nerfro.data.image_files import read_levels, read_mask, read_stack
+from nerfro.data.image_files import Read, read_levels, read_mask, read_stack
 from nerfro.errors import NerfroError
 
 MASKS_FOLDER = "masks"
@@ -82,9 +82,41 @@ def read_masks(
     """
     if _left_out.get():
         return None
+    if any(masks):
+        return _read_files(images, masks, read_mask, downscale, size)
+    return read_stack(images, _read_alpha, downscale, size) if _is_transparent(images[0]) else None
+
+
+def read_usable(
+    images: Sequence[Path], masks: Sequence[Path | None], downscale: int, size: tuple[int, int]
+) -> Bool[Tensor, "V H W"]:
+    """Read masks that rule pixels out: black ones are ignored, white ones are used, grey ones by the nearer of the two.
+
+    Args:
+        images: the images' files.
+        masks: the masks' files, of all images.
+        downscale: side of the blocks of pixels that are averaged; a block is used if all of it is.
+        size: width and height of the images in pixels before downscaling.
+
+    Raises:
+        NerfroError: an image has no mask, or one that is corrupt, of another size, or leaves no pixel.
+    """
+    share = _read_files(images, masks, lambda path: (read_mask(path) >= 0.5).astype(np.float32), downscale, size)
+    usable = share == 1
+    for image, mask, pixels in zip(images, masks, usable, strict=True):
+        if not pixels.any():
+            blocks = f" in blocks of {downscale}x{downscale}" if downscale > 1 else ""
+            raise NerfroError(
+                f"mask {mask} rules out all pixels of {image}{blocks}: black is ignored, white is used; "
+                "is it inverted? Correct it or take the frame out"
+            )
+    return usable
+
+
+def _read_files(
+    images: Sequence[Path], masks: Sequence[Path | None], read_one: Read, downscale: int, size: tuple[int, int]
+) -> Float[Tensor, "V H W"]:
     files = [mask for mask in masks if mask is not None]
-    if not files:
-        return read_stack(images, _read_alpha, downscale, size) if _is_transparent(images[0]) else None
     if len(files) < len(images):
         bare = [str(image) for image, mask in zip(images, masks, strict=True) if mask is None]
         raise NerfroError(
@@ -93,7 +125,7 @@ def read_masks(
         )
 
     def read(path: Path) -> Float[np.ndarray, "H W"]:
-        share = read_mask(path)
+        share = read_one(path)
         if share.shape != (size[1], size[0]):
             raise NerfroError(
                 f"mask {path} has {share.shape[1]}x{share.shape[0]} pixels but its image has {size[0]}x{size[1]}; "

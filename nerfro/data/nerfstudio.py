@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping
-from pathlib import PurePosixPath
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from nerfro.data.base import DataSource, Views
 from nerfro.data.distortion import coefficients
-from nerfro.data.frames import SPLITS, Lens, check_options, check_split, held_out, load_views, require_root
+from nerfro.data.frames import SPLITS, Frame, Lens, check_options, check_split, held_out, load_views, require_root
+from nerfro.data.masks import find_mask, read_usable
 from nerfro.data.transforms import Manifest, find_splits, is_number, parse_manifest
 from nerfro.errors import NerfroError
 from nerfro.paths import resolve_path
@@ -25,8 +26,8 @@ class NerfstudioData(DataSource):
     """Folder with transforms.json (or transforms_{train,val,test}.json): OpenGL axes, intrinsics with distortion.
 
     Poses are taken as they are: the world is that of the file, not turned, centred and scaled as nerfstudio does when
-    it trains, so that a mesh fits. `mask_path` in these files marks pixels to ignore and is not read; a frame's
-    silhouette of the refractive object is its `object_mask_path`.
+    it trains, so that a mesh fits. `mask_path` in these files marks pixels to ignore (black), which are not
+    trained on; a frame's silhouette of the refractive object is its `object_mask_path`.
 
     Args:
         root: the folder.
@@ -74,12 +75,6 @@ class NerfstudioData(DataSource):
             manifest = parse_manifest(files[split], "object_mask_path")
             chosen = list(range(len(manifest.frames)))
         entries: list[Mapping[str, object]] = manifest.document["frames"]  # type: ignore[assignment]
-        if any("mask_path" in entries[i] for i in chosen):
-            warnings.warn(
-                f"{manifest.path}: 'mask_path' marks pixels to ignore, which nerfro does not; they are trained on. "
-                "Name silhouettes of the object 'object_mask_path'",
-                stacklevel=2,
-            )
         names = [f"{manifest.path}: '{manifest.frames[i].name}'" for i in chosen]
 
         def lenses(width: int, height: int) -> list[Lens]:
@@ -87,7 +82,19 @@ class NerfstudioData(DataSource):
             return [_read_lens(v, width, height, name) for v, name in zip(values, names, strict=True)]
 
         frames = [manifest.frames[i] for i in chosen]
-        return load_views(frames, lenses, "opengl", (self.near, self.far), self.downscale, self.alpha)
+        ignoring = [self._find_ignoring(manifest.frames[i], entries[i], n) for i, n in zip(chosen, names, strict=True)]
+        views = load_views(frames, lenses, "opengl", (self.near, self.far), self.downscale, self.alpha)
+        if not any(ignoring):
+            return views
+        stored = views.cameras.width * self.downscale, views.cameras.height * self.downscale
+        return replace(views, usable=read_usable([frame.image for frame in frames], ignoring, self.downscale, stored))
+
+    def _find_ignoring(self, frame: Frame, entry: Mapping[str, object], where: str) -> Path | None:
+        """The file of a frame's mask of pixels to ignore, if it states one."""
+        stated = entry.get("mask_path")
+        if stated is not None and not isinstance(stated, str):
+            raise NerfroError(f"{where}: 'mask_path' must be text")
+        return None if stated is None else find_mask(self.root, frame.image, stated)
 
     def _choose(self, manifest: Manifest, split: str) -> list[int]:
         """Numbers of the frames of a split."""

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
 
 from nerfro.data.base import Views
-from nerfro.data.cameras import central_window
+from nerfro.data.cameras import Window, central_window
 from nerfro.distributed import share_of
 from nerfro.errors import NerfroError
 from nerfro.types import Batch
@@ -24,7 +26,8 @@ class RayBatches:
     A run that stops and resumes with `first_step` set therefore sees the batches that it would have seen.
 
     Args:
-        views: posed images; their tensors' device is where batches are made, see `to`.
+        views: posed images, of which the usable pixels are drawn; their tensors' device is where batches are made, see
+            `to`.
         batch_size: number of pixels in a batch.
         batching: `single_image` draws different pixels of one random image, `all_images` draws each pixel anew from
             all images.
@@ -35,7 +38,7 @@ class RayBatches:
         first_step: step at which iteration begins.
 
     Raises:
-        NerfroError: an option is out of range, or an image (or its middle) has fewer pixels than a batch.
+        NerfroError: an option is out of range, or an image (or its middle) has fewer usable pixels than a batch.
     """
 
     def __init__(
@@ -73,6 +76,11 @@ class RayBatches:
                 f"batch_size={batch_size} exceeds the {self._crop.width}x{self._crop.height} pixels that one image"
                 f"{' offers while precropped' if precrop_steps > 0 else ' has'}; take a smaller one, or all_images"
             )
+        self._usable: dict[Window, _Usable] | None = None
+        if views.usable is not None:
+            windows = {self._crop, central_window(cameras.height, cameras.width, 1.0)}
+            self._usable = {window: _Usable.of(views.usable, window) for window in windows}
+            self._check_usable(np.diff(self._usable[self._crop].starts), views.names)
 
     def to(self, device: torch.device | str) -> RayBatches:
         """The same sequence with cameras and pixels on another device."""
@@ -106,7 +114,7 @@ class RayBatches:
         height, width = cameras.height, cameras.width
         window = central_window(height, width, 1.0) if step >= self.precrop_steps else self._crop
         generator = np.random.default_rng([self.seed, step])
-        view, pixel = self._draw(generator, window.height * window.width)
+        view, pixel = self._draw(generator, window)
         row, column = window.top + pixel // window.width, window.left + pixel % window.width
         drawn = ((view * height + row) * width + column)[self._share]
         # One small copy to the device; the rest is computed there.
@@ -122,11 +130,48 @@ class RayBatches:
             cameras=cameras.crop(window),
         )
 
-    def _draw(self, generator: np.random.Generator, num_pixels: int) -> tuple[np.ndarray | np.int64, np.ndarray]:
+    def _draw(self, generator: np.random.Generator, window: Window) -> tuple[np.ndarray | np.int64, np.ndarray]:
         """Views and pixels of the window, numbered row by row."""
+        usable = None if self._usable is None else self._usable[window]
+        num_pixels = window.height * window.width
         if self.batching == "single_image":
             view = generator.integers(len(self._cameras))
+            allowed = None if usable is None else usable.pixels[usable.starts[view] : usable.starts[view + 1]]
+            num_allowed = num_pixels if allowed is None else len(allowed)
             # Floyd's algorithm or a partial shuffle inside: far cheaper than a permutation of all pixels.
-            return view, generator.choice(num_pixels, self.batch_size, replace=False, shuffle=False)
+            drawn = generator.choice(num_allowed, self.batch_size, replace=False, shuffle=False)
+            return view, drawn if allowed is None else allowed[drawn].astype(np.int64)
+        if usable is not None:
+            drawn = generator.integers(len(usable.pixels), size=self.batch_size)
+            return np.searchsorted(usable.starts, drawn, side="right") - 1, usable.pixels[drawn].astype(np.int64)
         views = generator.integers(len(self._cameras), size=self.batch_size)
         return views, generator.integers(num_pixels, size=self.batch_size)
+
+    def _check_usable(self, counts: Int[np.ndarray, "V"], names: list[str]) -> None:
+        """Refuse masks that leave too few pixels to draw a batch from."""
+        precropped = " while precropped" if self.precrop_steps > 0 else ""
+        fewest = int(counts.argmin())
+        if self.batching == "single_image" and self.batch_size > counts[fewest]:
+            raise NerfroError(
+                f"batch_size={self.batch_size} exceeds the {counts[fewest]} pixels that the mask of {names[fewest]} "
+                f"leaves{precropped}; take a smaller one, or all_images"
+            )
+        if counts.sum() == 0:
+            raise NerfroError(f"the masks leave no pixel to train on{precropped}; black is ignored, white is used")
+
+
+class _Usable(NamedTuple):
+    """The pixels of a window that may be drawn, one view's after another's.
+
+    Attributes:
+        pixels: their numbers in the window, row by row; of 32 bits, for there is one for each pixel of all images.
+        starts: where those of each view begin, and the end.
+    """
+
+    pixels: Int[np.ndarray, "U"]
+    starts: Int[np.ndarray, "V+1"]
+
+    @classmethod
+    def of(cls, usable: Bool[Tensor, "V H W"], window: Window) -> _Usable:
+        by_view = [np.flatnonzero(view).astype(np.int32) for view in window.cut(usable).cpu().numpy()]
+        return cls(np.concatenate(by_view), np.cumsum([0, *map(len, by_view)]))

@@ -5,13 +5,29 @@ from __future__ import annotations
 import json
 import math
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from nerfro.data.nerfstudio import NerfstudioData
+from nerfro.data.ray_batches import RayBatches
 from nerfro.errors import NerfroError
 
-from .photographs import CX, CY, FX, FY, HEIGHT, POINTS, WIDTH, camera_to_world, check_views, save_mask, save_picture
+from .photographs import (
+    CX,
+    CY,
+    FX,
+    FY,
+    HEIGHT,
+    POINTS,
+    WIDTH,
+    camera_to_world,
+    check_views,
+    picture,
+    save_mask,
+    save_picture,
+)
 
 K, P = (-0.12, 0.03, 0.004, -0.001), (0.002, -0.003)
 SHARED = {"camera_model": "OPENCV", "fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY, "w": WIDTH, "h": HEIGHT}
@@ -88,11 +104,65 @@ def test_downscaled_images_keep_the_directions(write):
     torch.testing.assert_close(half.project(points)[0], full.project(points)[0] / 2)
 
 
-def test_masks_of_nerfstudio_mean_ignore_and_are_no_silhouettes(write):
-    root = write(2, frame=lambda i: {"mask_path": "masks/f.png"})
-    save_mask(root / "masks/f_1.png", 1)  # where a silhouette would be found in other formats
-    with pytest.warns(UserWarning, match="'mask_path' marks pixels to ignore"):
-        assert load(root).masks is None
+def test_black_of_mask_path_is_not_usable_and_no_silhouette(write):
+    root = write(3, frame=lambda i: {"mask_path": f"masks/f_{i}.png"})
+    for i in range(3):
+        save_mask(root / f"masks/f_{i}.png", i)  # where a silhouette would be found in other formats
+    views = load(root)
+    assert views.masks is None
+    white = np.stack([picture(i)[..., 0] > 127 for i in (1, 2)])
+    np.testing.assert_array_equal(views.usable.numpy(), white)
+    whole = white.reshape(2, HEIGHT // 2, 2, WIDTH // 2, 2).all((2, 4))
+    np.testing.assert_array_equal(load(root, downscale=2).usable.numpy(), whole)
+    assert 0 < whole.sum() < whole.size
+    for batching in ("single_image", "all_images"):
+        batches = RayBatches(views, 20, batching)
+        drawn = torch.cat([batches.batch(step).index for step in range(300)])
+        # Of about 430 pixels, each is drawn 14 times: all that may be, and no other.
+        assert drawn.unique().tolist() == np.flatnonzero(white).tolist()
+
+
+def test_grey_of_mask_path_is_what_it_is_nearer_to_and_labels_are_0_and_1(write):
+    root = write(2, frame=lambda i: {"mask_path": "mask.png"})
+    levels = np.full((HEIGHT, WIDTH), 127, np.uint8)
+    levels[3, 5] = 128
+    Image.fromarray(levels).save(root / "mask.png")
+    assert load(root).usable.nonzero().tolist() == [[0, 3, 5]]
+    Image.fromarray(levels - 127).save(root / "mask.png")
+    assert load(root).usable.nonzero().tolist() == [[0, 3, 5]]
+
+
+def test_frames_without_mask_path_are_usable_throughout(write):
+    assert load(write(2)).usable is None
+    assert load(write(2, frame=lambda i: {"mask_path": None})).usable is None
+
+
+@pytest.mark.parametrize(
+    ("draw", "message"),
+    [
+        (lambda path: None, r"mask .*ignore\.png of .*f_1\.png does not exist"),
+        (lambda path: path.write_bytes(b"no picture"), r"ignore\.png cannot be read"),
+        (lambda path: save_mask(path, 1, WIDTH, HEIGHT - 1), "24x17 pixels but its image has 24x18"),
+        (
+            lambda path: Image.new("L", (WIDTH, HEIGHT)).save(path),
+            r"mask .*ignore\.png rules out all pixels of .*f_1\.png: black is ignored, white is used",
+        ),
+    ],
+)
+def test_mask_path_that_cannot_be_obeyed_is_named(write, draw, message):
+    root = write(2, frame=lambda i: {"mask_path": "ignore.png"})
+    draw(root / "ignore.png")
+    with pytest.raises(NerfroError, match=message):
+        load(root)
+
+
+def test_mask_path_of_some_frames_and_of_other_types_is_named(write):
+    root = write(3, frame=lambda i: {"mask_path": "ignore.png"} if i == 1 else {})
+    save_mask(root / "ignore.png", 1)
+    with pytest.raises(NerfroError, match=r"1 of 2 images have no mask .*f_2\.png is the first"):
+        load(root)
+    with pytest.raises(NerfroError, match="'mask_path' must be text"):
+        load(write(3, frame=lambda i: {"mask_path": 3}))
 
 
 @pytest.mark.parametrize(

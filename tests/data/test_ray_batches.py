@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -26,6 +27,16 @@ def views() -> Views:
     cameras = Cameras(poses, 20 * full, 20 * full, 8 * full, 6 * full, WIDTH, HEIGHT, 2.0, 6.0)
     index = torch.meshgrid(*(torch.arange(n) for n in (NUM_VIEWS, HEIGHT, WIDTH)), indexing="ij")
     return Views(cameras, torch.stack(index, -1).float() / 16, None, [f"r_{i}" for i in range(NUM_VIEWS)])
+
+
+@pytest.fixture
+def masked(views) -> Views:
+    """The same views, of whose pixels a half, a tenth, and in the third one but one, may not be trained on."""
+    share = torch.tensor([0.5, 0.1, 0, 0.5, 0.1])[:, None, None]
+    usable = torch.rand(NUM_VIEWS, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(1)) >= share
+    usable[2] = False
+    usable[2, 5, 7] = True
+    return replace(views, usable=usable)
 
 
 def place(index: torch.Tensor) -> torch.Tensor:
@@ -67,6 +78,88 @@ def test_shares_of_several_processes_make_up_the_batch(views, batching):
         parts = [getattr(share.rays, name) for share in shares]
         assert torch.equal(torch.cat(parts), getattr(expected.rays, name))
     assert torch.equal(whole.share(0, 1).batch(4).index, expected.index)
+
+
+@pytest.mark.parametrize("jitter", [False, True])
+@pytest.mark.parametrize("precrop_steps", [0, 10])
+def test_without_masks_pixels_are_drawn_as_ever(views, precrop_steps, jitter):
+    """Measured results depend on which pixels a seed draws; here they are drawn as the method is written down."""
+    size = HEIGHT * WIDTH if precrop_steps == 0 else HEIGHT * WIDTH // 4
+    for batching in ("single_image", "all_images"):
+        generator = np.random.default_rng([3, 7])
+        if batching == "single_image":
+            view, pixel = generator.integers(NUM_VIEWS), generator.choice(size, 30, replace=False, shuffle=False)
+        else:
+            view, pixel = generator.integers(NUM_VIEWS, size=30), generator.integers(size, size=30)
+        row, column = (pixel // WIDTH, pixel % WIDTH) if precrop_steps == 0 else (3 + pixel // 8, 4 + pixel % 8)
+        expected = (view * HEIGHT + row) * WIDTH + column
+        batch = RayBatches(views, 30, batching, seed=3, precrop_steps=precrop_steps, jitter=jitter).batch(7)
+        assert batch.index.tolist() == expected.tolist()
+        offsets = torch.from_numpy(generator.random((30, 2), dtype=np.float32)) if jitter else None
+        rays = views.cameras.rays(*place(batch.index).unbind(-1), offsets)
+        assert torch.equal(batch.rays.directions, rays.directions)
+
+
+def test_masks_that_rule_nothing_out_change_no_batch_of_one_image(views):
+    allowed = replace(views, usable=torch.ones(NUM_VIEWS, HEIGHT, WIDTH, dtype=torch.bool))
+    for step in range(5):
+        batches = [RayBatches(v, 30, seed=3, precrop_steps=2, jitter=True).batch(step) for v in (views, allowed)]
+        assert torch.equal(batches[0].index, batches[1].index)
+        assert torch.equal(batches[0].rays.directions, batches[1].rays.directions)
+
+
+def test_masked_pixels_are_never_drawn_and_all_others_equally_often(masked):
+    batches = RayBatches(masked, 96, "all_images", seed=0)
+    counts = torch.zeros(NUM_VIEWS * HEIGHT * WIDTH)
+    for step in range(1500):
+        counts += torch.bincount(batches.batch(step).index, minlength=len(counts))
+    usable = masked.usable.flatten()
+    mean = 1500 * 96 / int(usable.sum())
+    assert counts[~usable].sum() == 0
+    assert (counts[usable] - mean).abs().max() < 6 * mean**0.5
+
+
+def test_masked_batch_of_one_image_is_different_usable_pixels_of_it(masked):
+    seen = set()
+    for step in range(200):
+        index = RayBatches(masked, 1, seed=0).batch(step).index
+        assert masked.usable.flatten()[index].all()
+        seen.add(int(index) // (HEIGHT * WIDTH))
+    assert seen == set(range(NUM_VIEWS))  # views are drawn alike, whatever their masks leave
+    two = Views(masked.cameras, masked.images, None, masked.names, masked.usable.clone())
+    two.usable[2, 4:6] = True
+    smallest = int(two.usable.sum((1, 2)).min())
+    for step in range(20):
+        batch = RayBatches(two, smallest, seed=0).batch(step)
+        assert two.usable.flatten()[batch.index].all()
+        assert len(batch.index.unique()) == smallest
+        assert len((batch.index // (HEIGHT * WIDTH)).unique()) == 1
+
+
+@pytest.mark.parametrize(("batching", "size"), [("single_image", 1), ("all_images", 30)])
+def test_masks_hold_while_precropped_and_in_every_share(masked, batching, size):
+    whole = RayBatches(masked, size, batching, seed=3, precrop_steps=20, jitter=True)
+    for step in (*range(5), *range(20, 25)):
+        batch = whole.batch(step)
+        shares = [whole.share(rank, size).batch(step) for rank in range(size)]
+        assert torch.equal(torch.cat([share.index for share in shares]), batch.index)
+        assert torch.equal(torch.cat([share.rays.directions for share in shares]), batch.rays.directions)
+        assert masked.usable.flatten()[batch.index].all()
+        _, row, column = place(batch.index).unbind(-1)
+        inside = (row >= 3) & (row < 9) & (column >= 4) & (column < 12)
+        assert bool(inside.all()) or step >= 20
+
+
+def test_masks_that_leave_too_few_pixels_are_refused(masked):
+    with pytest.raises(NerfroError, match="batch_size=2 exceeds the 1 pixels that the mask of r_2 leaves; take a smal"):
+        RayBatches(masked, 2)
+    RayBatches(masked, 500, "all_images")
+    border = torch.ones(NUM_VIEWS, HEIGHT, WIDTH, dtype=torch.bool)
+    border[:, 2:10, 2:14] = False
+    with pytest.raises(NerfroError, match="exceeds the 0 pixels that the mask of r_0 leaves while precropped"):
+        RayBatches(replace(masked, usable=border), 2, precrop_steps=1)
+    with pytest.raises(NerfroError, match="the masks leave no pixel to train on while precropped"):
+        RayBatches(replace(masked, usable=border), 2, "all_images", precrop_steps=1)
 
 
 def test_batch_without_equal_shares_is_refused(views):
