@@ -5,9 +5,11 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import platform
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from omegaconf import MISSING, DictConfig
@@ -16,13 +18,16 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
 from nerfro.paths import CONF_DIR
-from nerfro.scenes import dataset
-from nerfro.scenes.path_tracer import PathTracer, load_mitsuba
+from nerfro.scenes import dataset, photographs
+from nerfro.scenes.baking import bake
+from nerfro.scenes.path_tracer import PathTracer, Pinhole, load_mitsuba
 from nerfro.scenes.patterns import to_srgb
 from nerfro.scenes.scene import Scene
 from nerfro.scenes.skies import lat_long_texture
 
 SCENES = ("torus", "ship", "deerglobe", "starlamp")
+CAPTURES = ("dolphin_capture",)
+_BAKING_SPP = 512
 
 
 @dataclass
@@ -44,6 +49,8 @@ class SynthesizeConfig:
     spp: int = MISSING
     test_spp: int = MISSING
     views: ViewCounts = field(default_factory=ViewCounts)
+    photographs: int = MISSING
+    noise: float = MISSING
     fresnel: bool = MISSING
     seed: int = MISSING
     sky_height: int = MISSING
@@ -56,15 +63,18 @@ def build_scene(name: str, resolution: int) -> Scene:
     """Model a scene, with colours as fine as half a pixel of the picture that it is meant for.
 
     Args:
-        name: one of `SCENES`.
-        resolution: side of the square picture, pixels.
+        name: one of `SCENES` or `CAPTURES`.
+        resolution: width of the pictures, pixels.
 
     Raises:
         NerfroError: no such scene.
     """
-    if name not in SCENES:
-        raise NerfroError(f"unknown scene '{name}'; choose one of {', '.join(SCENES)}")
-    pixel = dataset.CAMERA_DISTANCE * dataset.CAMERA_ANGLE_X / resolution
+    if name not in SCENES + CAPTURES:
+        raise NerfroError(f"unknown scene '{name}'; choose one of {', '.join(SCENES + CAPTURES)}")
+    if name in CAPTURES:
+        pixel = photographs.DISTANCE / photographs.camera(resolution).focal
+    else:
+        pixel = dataset.CAMERA_DISTANCE * dataset.CAMERA_ANGLE_X / resolution
     return importlib.import_module(f"nerfro.scenes.{name}").build(spacing=max(0.5 * pixel, 0.0025))
 
 
@@ -79,6 +89,14 @@ def synthesize(config: DictConfig) -> tuple[Scene, Path]:
     """
     _check(config)
     scene = build_scene(config.scene, config.resolution)
+    folder = Path(config.out).expanduser()
+    mitsuba = load_mitsuba(config.variant)  # before anything is cleared that could not be rendered again
+    write = _photograph if config.scene in CAPTURES else _render_views
+    write(config, scene, folder, mitsuba)
+    return scene, folder
+
+
+def _render_views(config: DictConfig, scene: Scene, folder: Path, mitsuba: ModuleType) -> None:
     settings = dataset.Settings(
         scene=config.scene,
         fingerprint=dataset.fingerprint(scene),
@@ -89,8 +107,6 @@ def synthesize(config: DictConfig) -> tuple[Scene, Path]:
         fresnel=config.fresnel,
         seed=config.seed,
     )
-    folder = Path(config.out).expanduser()
-    mitsuba = load_mitsuba(config.variant)  # before anything is cleared that could not be rendered again
     dataset.prepare(folder, settings, config.overwrite)
     if not (folder / dataset.META).is_file():
         dataset.write_meta(folder, settings, scene, _versions(mitsuba))
@@ -98,20 +114,49 @@ def synthesize(config: DictConfig) -> tuple[Scene, Path]:
     waiting = list(dataset.missing(folder, planned))
     print(f"{config.scene}: {len(planned)} views, {len(planned) - len(waiting)} of them already in {folder}")
     if waiting:
-        tracer = PathTracer(scene, config.fresnel, dataset.CAMERA_ANGLE_X, config.resolution, variant=config.variant)
-        _render(tracer, folder, waiting)
+        camera = Pinhole.square(dataset.CAMERA_ANGLE_X, config.resolution)
+        tracer = PathTracer(scene, config.fresnel, camera, variant=config.variant)
+        _render(tracer, waiting, lambda view, *pictures: dataset.write_view(folder, view, *pictures))
     scene.glass.save(folder / "mesh.ply")
+    assert scene.sky is not None
     sky = lat_long_texture(scene.sky, config.sky_height)
     dataset.write_image(folder / "sky.png", to_srgb(sky))
     if config.extras:
         scene.interior.save(folder / "interior.ply")
         _write_exr(mitsuba, folder / "sky.exr", sky)
     dataset.write_transforms(folder, planned)
-    return scene, folder
+
+
+def _photograph(config: DictConfig, scene: Scene, folder: Path, mitsuba: ModuleType) -> None:
+    settings = photographs.Settings(
+        scene=config.scene,
+        fingerprint=dataset.fingerprint(scene),
+        resolution=config.resolution,
+        photographs=config.photographs,
+        spp=config.spp,
+        noise=config.noise,
+        fresnel=config.fresnel,
+        seed=config.seed,
+    )
+    dataset.prepare(folder, settings, config.overwrite, photographs.META, photographs.FILES)
+    if not (folder / photographs.META).is_file():
+        photographs.write_meta(folder, settings, scene, _versions(mitsuba))
+    planned = photographs.photographs(settings, importlib.import_module(f"nerfro.scenes.{config.scene}").AIM)
+    waiting = list(photographs.missing(folder, planned))
+    print(f"{config.scene}: {len(planned)} photographs, {len(planned) - len(waiting)} of them already in {folder}")
+    if waiting:
+        lit = bake(scene, _BAKING_SPP, config.variant)
+        tracer = PathTracer(lit, config.fresnel, photographs.camera(config.resolution), variant=config.variant)
+        _render(
+            tracer,
+            waiting,
+            lambda taken, radiance, mask: photographs.write_photograph(folder, taken, radiance, mask, config.noise),
+        )
+    photographs.write_truth(folder, planned, settings, scene)
 
 
 def _check(config: DictConfig) -> None:
-    lowest = {"resolution": 8, "spp": 1, "test_spp": 1, "seed": 0, "sky_height": 16}
+    lowest = {"resolution": 8, "spp": 1, "test_spp": 1, "seed": 0, "sky_height": 16, "photographs": 1, "noise": 0}
     for name, least in lowest.items():
         if config[name] < least:
             raise NerfroError(f"{name}={config[name]} is too small; give {least} or more")
@@ -120,7 +165,8 @@ def _check(config: DictConfig) -> None:
             raise NerfroError(f"views.{split}={config.views[split]} is too small; give 1 or more")
 
 
-def _render(tracer: PathTracer, folder: Path, waiting: list[dataset.View]) -> None:
+def _render(tracer: PathTracer, waiting: Sequence[Any], write: Callable[..., None]) -> None:
+    """Take pictures from poses; `write` is given each view, its radiance and its silhouette."""
     columns = (
         TextColumn("rendering"),
         BarColumn(),
@@ -134,7 +180,7 @@ def _render(tracer: PathTracer, folder: Path, waiting: list[dataset.View]) -> No
         task = progress.add_task("rendering", total=sum(view.spp for view in waiting))
         for view in waiting:
             radiance = tracer.render(view.pose, view.spp, view.seed)
-            dataset.write_view(folder, view, radiance, tracer.silhouette(view.pose))
+            write(view, radiance, tracer.silhouette(view.pose))
             progress.advance(task, view.spp)
 
 
@@ -154,6 +200,10 @@ def main(config: DictConfig) -> None:
     """Render, then say how to train on the result."""
     scene, folder = synthesize(config)
     print(f"done: {folder}")
+    if config.scene in CAPTURES:
+        images = folder / photographs.IMAGES
+        print(f"calibrate it: python -m nerfro.calibrate images={images} target=apriltag out={folder}")
+        return
     mesh = folder / "mesh.ply"
     print(f"train on it: python -m nerfro.train data.root={folder} medium.mesh={mesh} medium.ior={scene.ior}")
 

@@ -280,7 +280,8 @@ def _panel(mi: ModuleType, panel: Panel) -> dict:
     }
     shape = {"type": "rectangle", "to_world": mi.ScalarTransform4f(panel.to_world.tolist())}
     if panel.glows:
-        black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
+        # A black mirror and not a black diffuser, which would send out shadow rays for nothing.
+        black = {"type": "conductor", "material": "none", "specular_reflectance": {"type": "rgb", "value": 0.0}}
         return shape | {"bsdf": black, "light": {"type": "area", "radiance": linear}}
     return shape | {"bsdf": {"type": "diffuse", "reflectance": linear}}
 

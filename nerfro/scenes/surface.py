@@ -26,7 +26,7 @@ class Surface:
     normals: np.ndarray
     colours: np.ndarray | None = None
 
-    def moved(self, offset: Sequence[float]) -> Surface:
+    def moved(self, offset: Sequence[float] | np.ndarray) -> Surface:
         """Return the surface translated by `offset` (world units)."""
         return replace(self, vertices=(self.vertices + np.asarray(offset)).astype(np.float32))
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerfro.scenes import torus
-from nerfro.scenes.path_tracer import PathTracer, load_mitsuba
+from nerfro.scenes.path_tracer import PathTracer, Pinhole, load_mitsuba
 from nerfro.scenes.surface import rounded_box, torus_angles
 from nerfro.scenes.viewpoints import look_at_origin
 
@@ -28,7 +28,7 @@ def glass(n):
     if mi.variant().startswith("scalar"):
         pytest.skip("samples many angles at once, which needs LLVM or CUDA")
     box = rounded_box((1.0, 1.0, 0.1), 0.02, edge_steps=2)
-    tracer = PathTracer(replace(torus.build(0.1), glass=box, ior=n, tint=(1.0, 1.0, 1.0)), True, 0.5, 8)
+    tracer = PathTracer(replace(torus.build(0.1), glass=box, ior=n, tint=(1.0, 1.0, 1.0)), True, Pinhole.square(0.5, 8))
     shapes = [shape for shape in tracer.scene.shapes() if shape.id() == "glass"]
     return mi, (shapes or tracer.scene.shapes())[0].bsdf()
 
@@ -95,7 +95,7 @@ def test_a_slab_transmits_what_infinitely_many_reflections_leave():
         tint=(1.0, 1.0, 1.0),
         sky=lambda directions: np.repeat((directions[..., 2:] < 0).astype(float), 3, -1),
     )
-    tracer = PathTracer(scene, True, 0.05, 8)
+    tracer = PathTracer(scene, True, Pinhole.square(0.05, 8))
     picture = tracer.render(look_at_origin(np.array([0.0, 1e-3, 4.0])), spp=1024, seed=0)
     # 65536 paths, each black or white: a standard deviation of 0.001.
     assert picture.mean() == pytest.approx(2 * n / (n * n + 1), abs=4e-3)

@@ -12,7 +12,7 @@ import pytest
 from nerfro.errors import NerfroError
 from nerfro.scenes import path_tracer, torus
 from nerfro.scenes.dataset import CAMERA_ANGLE_X, CAMERA_DISTANCE
-from nerfro.scenes.path_tracer import PathTracer, load_mitsuba
+from nerfro.scenes.path_tracer import PathTracer, Pinhole, load_mitsuba
 from nerfro.scenes.surface import rounded_box, sphere, torus_angles
 from nerfro.scenes.viewpoints import directions_on_sphere, look_at_origin
 
@@ -103,7 +103,7 @@ def test_a_ray_that_meets_a_side_of_a_cube_is_reflected_totally():
 def test_white_furnace_is_white(white_torus, poses, fresnel, monkeypatch):
     pytest.importorskip("mitsuba")
     monkeypatch.setattr(path_tracer, "SAMPLES_PER_PASS", 24 * 24 * 20)  # 32 samples are then two uneven passes
-    tracer = PathTracer(white_torus, fresnel, CAMERA_ANGLE_X, 24)
+    tracer = PathTracer(white_torus, fresnel, Pinhole.square(CAMERA_ANGLE_X, 24))
     for seed, pose in enumerate(poses):
         picture = tracer.render(pose, spp=32, seed=seed)
         assert picture.mean() == pytest.approx(1.0, abs=1e-3)
@@ -112,7 +112,7 @@ def test_white_furnace_is_white(white_torus, poses, fresnel, monkeypatch):
 def test_tint_counts_on_entry_and_on_exit(white_torus, poses):
     pytest.importorskip("mitsuba")
     tint = np.array([0.5, 0.9, 0.7])
-    tracer = PathTracer(replace(white_torus, tint=tuple(tint)), False, CAMERA_ANGLE_X, 24)
+    tracer = PathTracer(replace(white_torus, tint=tuple(tint)), False, Pinhole.square(CAMERA_ANGLE_X, 24))
     picture, mask = tracer.render(poses[0], spp=16, seed=0), tracer.silhouette(poses[0])
     inner = mask & np.roll(mask, 1, 0) & np.roll(mask, -1, 0) & np.roll(mask, 1, 1) & np.roll(mask, -1, 1)
     assert np.median(picture[inner], 0) == pytest.approx(tint**2, abs=1e-3)
@@ -127,7 +127,7 @@ def test_background_pixels_show_the_sky_in_the_direction_of_the_pixel(poses):
     scene = replace(
         torus.build(0.1), glass=sphere(0.1, 3), interior=tiny, sky=lambda directions: 0.5 + 0.5 * directions
     )
-    tracer = PathTracer(scene, False, CAMERA_ANGLE_X, 16)
+    tracer = PathTracer(scene, False, Pinhole.square(CAMERA_ANGLE_X, 16))
     for pose in poses:
         picture, background = tracer.render(pose, spp=256, seed=0), np.ones((16, 16), bool)
         background[6:10, 6:10] = False
@@ -139,7 +139,7 @@ def test_background_pixels_show_the_sky_in_the_direction_of_the_pixel(poses):
 def test_equal_seeds_give_equal_pictures(white_torus, poses):
     pytest.importorskip("mitsuba")
     scene = replace(white_torus, sky=torus.sky)
-    tracer = PathTracer(scene, False, CAMERA_ANGLE_X, 16)
+    tracer = PathTracer(scene, False, Pinhole.square(CAMERA_ANGLE_X, 16))
     first, again, other = (tracer.render(poses[0], spp=8, seed=seed) for seed in (3, 3, 4))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
