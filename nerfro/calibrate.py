@@ -95,7 +95,8 @@ def main(config: DictConfig) -> None:
         if config.images is None:
             return
     images, size = _list_photographs(Path(config.images).expanduser())
-    masks = [find_mask(images[0].parent, image) for image in images]
+    # Where the loader of the data set will look for them.
+    masks = [find_mask(out.resolve(), image.resolve()) for image in images]
     _claim(out, [*(f"transforms_{split}.json" for split in _SPLITS), _REPORT, _PLOT], config.overwrite)
     quads: list[Float[np.ndarray, "4 3"]] = []
     if target is None:
@@ -110,7 +111,7 @@ def main(config: DictConfig) -> None:
         points = np.empty((0, 3))
     splits = split_views([image.name for image in images if image.name in calibration.poses], config.test_every)
     _report(calibration, config, "points" if target is None else target.feature)
-    _write(out, images, masks, size, calibration, splits, config.target, quads, points)
+    _write(out, images, size, calibration, splits, config.target, quads, points)
     seen = points if target is None else np.concatenate(quads)
     print("next: " + shlex.join(_next_command(out, calibration, seen, any(masks))))
 
@@ -267,7 +268,6 @@ def _report(calibration: Calibration, config: DictConfig, feature: str) -> None:
 def _write(
     out: Path,
     images: list[Path],
-    masks: list[Path | None],
     size: tuple[int, int],
     calibration: Calibration,
     splits: dict[str, list[str]],
@@ -276,7 +276,7 @@ def _write(
     points: Float[np.ndarray, "P 3"],
 ) -> None:
     """The data set (see docs/data.md), the report and the plot."""
-    files = {image.name: (image, mask) for image, mask in zip(images, masks, strict=True)}
+    files = {image.name: image for image in images}
     lens = calibration.intrinsics
     document: dict[str, object] = {"cam_mat": lens.matrix.tolist(), "w": size[0], "h": size[1]}
     if lens.distortion:
@@ -289,10 +289,8 @@ def _write(
             continue
         frames = []
         for name in names:
-            image, mask = files[name]
             matrix = [*calibration.poses[name].camera_to_world.tolist(), [0.0, 0.0, 0.0, 1.0]]
-            frame = {"file_path": _relative(image, out), "transform_matrix": matrix}
-            frames.append(frame if mask is None else frame | {"mask_path": _relative(mask, out)})
+            frames.append({"file_path": _relative(files[name], out), "transform_matrix": matrix})
         write_atomically(path, json.dumps(document | {"frames": frames}, indent=1) + "\n")
         written.append(f"{path} ({len(names)} views)")
     report = {
