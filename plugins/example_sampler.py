@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import torch
 
+from nerfro.distributed import rand_rays
 from nerfro.errors import NerfroError
 from nerfro.registry import register
 from nerfro.samplers.base import PointSampler
@@ -35,6 +36,7 @@ class LogarithmicSampler(PointSampler):
         num_rays, like = len(path.s), path.s
         bins = torch.arange(self.num_samples, device=like.device, dtype=like.dtype).expand(num_rays, -1)
         # Random in training, central in evaluation: the contract of every sampler.
-        u = (bins + (torch.rand_like(bins) if self.training else 0.5)) / self.num_samples
+        offsets = rand_rays(num_rays, self.num_samples, like) if self.training else 0.5
+        u = (bins + offsets) / self.num_samples
         fraction = (self.growth**u - 1) / (self.growth - 1)
         return point_samples(path, path.near[:, None] + fraction * (path.far - path.near)[:, None])
