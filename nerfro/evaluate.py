@@ -138,6 +138,7 @@ def _require_one_task(config: DictConfig) -> None:
         )
     if config.predictions is not None and config.references is None:
         raise NerfroError(f"predictions={config.predictions} are compared with what? give references=DIR")
+    others: tuple[str, ...]
     if config.checkpoint is None:
         task, others = "predictions", ("split", "root", "chunk_size", "supersample", "divergence")
     else:
