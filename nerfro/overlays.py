@@ -5,19 +5,18 @@ from __future__ import annotations
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from nerfro.data.base import Views
+from nerfro.evaluation.drawing import GAP, LINE_HEIGHT, fit, paper, write
 from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.geometry.silhouettes import mesh_silhouette
+from nerfro.geometry.silhouettes import mesh_silhouette, pixel_stride
 
 MAX_VIEWS = 48
 _COLUMNS = 8
 _WIDTH = 192  # pixels across each picture
-_GAP, _LINE = 6, 20  # pixels
-_PAPER, _INK = (255, 255, 255), (25, 25, 25)
+_NAME_LENGTH = 16  # characters, the last ones, that fit below a picture
 MASK_ONLY, SURFACE_ONLY = (235, 60, 45), (40, 110, 240)
 _BOTH = (60, 190, 90)
 
@@ -37,31 +36,24 @@ def contact_sheet(
         sRGB in [0, 1].
     """
     assert views.masks is not None
-    stride = -(-max(views.cameras.width, views.cameras.height) // max_pixels)
+    stride = pixel_stride(views.cameras, max_pixels)
     intersector = MeshIntersector([mesh], crease_degrees=30.0)
     chosen = np.argsort(overlaps, kind="stable")[:MAX_VIEWS]
     height = round(_WIDTH * views.cameras.height / views.cameras.width)
     columns = min(_COLUMNS, len(chosen))
     rows = -(-len(chosen) // columns)
-    sheet = Image.new(
-        "RGB", (columns * (_WIDTH + _GAP) + _GAP, (rows * (height + _LINE + _GAP)) + _LINE + _GAP), _PAPER
-    )
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(13)
-    legend = (
-        f"green: mask and surface, red: mask only, blue: surface only; {len(chosen)} of {len(views)} views, worst first"
-    )
-    draw.text((_GAP, 4), legend, _INK, font)
+    sheet = paper(columns * (_WIDTH + GAP) - GAP, LINE_HEIGHT + rows * (height + LINE_HEIGHT + GAP))
+    legend = f"green: both, red: mask only, blue: surface only; worst {len(chosen)} of {len(views)} views"
+    write(sheet, legend, sheet.width // 2, LINE_HEIGHT // 2)
     for place, view in enumerate(chosen.tolist()):
         ours = mesh_silhouette(intersector, views.cameras, view, stride)
         theirs = views.masks[view, ::stride, ::stride] > 0.5
         picture = _tinted(views.images[view, ::stride, ::stride], ours, theirs)
-        tile = Image.fromarray(np.uint8(np.rint(255 * picture.numpy()))).resize(
-            (_WIDTH, height), Image.Resampling.NEAREST
-        )
-        left = _GAP + place % columns * (_WIDTH + _GAP)
-        top = _LINE + _GAP + place // columns * (height + _LINE + _GAP)
-        sheet.paste(tile, (left, top))
-        draw.text((left, top + height + 2), f"{overlaps[view]:.3f}  {views.names[view][-20:]}", _INK, font)
+        left = place % columns * (_WIDTH + GAP)
+        top = LINE_HEIGHT + place // columns * (height + LINE_HEIGHT + GAP)
+        sheet.paste(fit(picture, _WIDTH, height), (left, top))
+        caption = f"{overlaps[view]:.3f}  {views.names[view][-_NAME_LENGTH:]}"
+        write(sheet, caption, left + _WIDTH // 2, top + height + LINE_HEIGHT // 2)
     return torch.from_numpy(np.array(sheet)).float() / 255
 
 

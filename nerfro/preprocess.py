@@ -19,7 +19,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from nerfro.cli import entry_point
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, first_of
 from nerfro.evaluation.files import write_atomically
 from nerfro.evaluation.images import save_png
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
@@ -80,9 +80,9 @@ class PreprocessConfig:
 
 
 @entry_point("preprocess", PreprocessConfig)
+@torch.no_grad()
 def main(config: DictConfig) -> None:
     """Carve, fit, compare with the masks, and say how to train; whatever can be refused is refused before that."""
-    torch.set_grad_enabled(False)
     supplied = None if config.mesh is None else load_mesh(resolve_path(config.mesh))
     folder = _claim(config)
     source = build(config.data)
@@ -246,8 +246,7 @@ def _report(overlaps: Float[np.ndarray, "V"], names: list[str]) -> None:
     print(f"  {overlaps.mean():.4f}  mean; {overlaps[worst]:.4f} lowest, {names[worst]}")
     bad = [names[view] for view in np.argsort(overlaps, kind="stable") if overlaps[view] < GOOD_OVERLAP]
     if bad:
-        shown = ", ".join(bad[:3]) + (f" and {len(bad) - 3} more" if len(bad) > 3 else "")
-        _warn(f"overlaps below {GOOD_OVERLAP}: {shown}; look at {_SHEET}, and correct their masks or poses")
+        _warn(f"overlaps below {GOOD_OVERLAP}: {first_of(bad)}; look at {_SHEET}, and correct their masks or poses")
 
 
 def train_command(
@@ -276,9 +275,9 @@ def train_command(
             settings[f"medium.{name}"] = [round(float(x), digits) for x in corner]
     offsets = silhouettes.cameras.camera_to_world[:, None, :, 3].double().numpy() - mesh.vertices[::16]
     distance = np.linalg.norm(offsets, axis=-1)
-    if "near" in config.data and config.data.near >= distance.min():
+    if silhouettes.cameras.near >= distance.min():
         settings["data.near"] = float(f"{0.8 * distance.min():.3g}")
-    if "far" in config.data and config.data.far <= distance.max():
+    if silhouettes.cameras.far <= distance.max():
         settings["data.far"] = float(f"{1.2 * distance.max():.3g}")
     medium = typing.cast(dict[str, object], OmegaConf.to_container(config.medium, resolve=True))
     medium |= {name.removeprefix("medium."): value for name, value in settings.items() if name.startswith("medium.")}
@@ -294,8 +293,7 @@ def _ply(mesh: TriangleMesh) -> bytes:
 
 
 def _names(views: Views, chosen: torch.Tensor) -> str:
-    names = [name for name, wanted in zip(views.names, chosen.tolist(), strict=True) if wanted]
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    return first_of([name for name, wanted in zip(views.names, chosen.tolist(), strict=True) if wanted])
 
 
 def _warn(message: str) -> None:

@@ -107,6 +107,20 @@ def test_printed_command_trains(
     assert finished.code == 0, finished.err
 
 
+def test_bounds_that_the_loader_finds_are_left_to_it(preprocess: Callable[..., str], capture: Path) -> None:
+    frames = json.loads((capture / "transforms_train.json").read_text())["frames"]
+    rows = []
+    for frame in sorted(frames, key=lambda frame: f"{frame['file_path']}.png"):
+        right, up, back, centre = np.array(frame["transform_matrix"])[:3].T
+        matrix = np.stack([-up, right, back, centre, [SIZE, SIZE, FOCAL]], 1)
+        rows.append([*matrix.ravel(), 2.5, 5.5])
+    np.save(capture / "poses_bounds.npy", rows)
+    command = preprocess("data=llff", "data.frame=file", "data.images=train").split("train on it: ")[1]
+    assert "data.frame=file" in command
+    assert "data.near" not in command
+    assert "data.far" not in command
+
+
 def test_nothing_is_overwritten_unasked(preprocess: Callable[..., str], capture: Path) -> None:
     (capture / "mesh.ply").write_text("mine")
     assert "mesh.ply exists; set overwrite=true" in preprocess()

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from nerfro.data.frames import IMAGE_SUFFIXES, SPLITS, Frame, check_pose
 from nerfro.data.masks import find_mask
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, first_of
 
 
 @dataclass(frozen=True)
@@ -171,9 +171,5 @@ def _check_names(manifest: Manifest) -> None:
     counts = Counter(frame.image for frame in manifest.frames)
     repeated = list(dict.fromkeys(frame.name for frame in manifest.frames if counts[frame.image] > 1))
     if repeated:
-        raise NerfroError(f"{manifest.path}: {_listing(repeated)} occurs in several frames; keep one of each")
-
-
-def _listing(names: list[str]) -> str:
-    shown = ", ".join(f"'{name}'" for name in names[:3])
-    return shown if len(names) <= 3 else f"{shown} and {len(names) - 3} more"
+        quoted = first_of([f"'{name}'" for name in repeated])
+        raise NerfroError(f"{manifest.path}: {quoted} occurs in several frames; keep one of each")

@@ -12,7 +12,7 @@ from torch import Tensor
 from nerfro.errors import NerfroError
 from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.geometry.silhouettes import intersection_over_union, mesh_silhouette
+from nerfro.geometry.silhouettes import intersection_over_union, mesh_silhouette, pixel_stride
 from nerfro.geometry.visual_hull import Silhouettes, carve_grid, extract_surface, find_box, remove_strays
 
 # The first look is at so many voxels a side and at most so many pixels a side.
@@ -54,7 +54,7 @@ def overlap(mesh: TriangleMesh, silhouettes: Silhouettes, max_pixels: int) -> Fl
     """
     cameras, masks = silhouettes.cameras, silhouettes.masks
     intersector = MeshIntersector([mesh], crease_degrees=30.0)
-    stride = pixel_stride(silhouettes, max_pixels)
+    stride = pixel_stride(cameras, max_pixels)
     return np.array(
         [
             intersection_over_union(
@@ -63,11 +63,6 @@ def overlap(mesh: TriangleMesh, silhouettes: Silhouettes, max_pixels: int) -> Fl
             for view in range(len(masks))
         ]
     )
-
-
-def pixel_stride(silhouettes: Silhouettes, max_pixels: int) -> int:
-    """Every how many pixels an image is looked at, so that there are at most `max_pixels` a side."""
-    return -(-max(silhouettes.cameras.width, silhouettes.cameras.height) // max_pixels)
 
 
 def coarse_agreement(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np.ndarray, "V"]:
@@ -82,7 +77,7 @@ def coarse_agreement(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np
     if not (distances < 0).any():
         return np.zeros(len(silhouettes))
     intersector = MeshIntersector([extract_surface(distances, corner, spacing)], crease_degrees=30.0)
-    stride = pixel_stride(silhouettes, _COARSE_PIXELS)
+    stride = pixel_stride(silhouettes.cameras, _COARSE_PIXELS)
     agreement = np.empty(len(silhouettes))
     for view in range(len(silhouettes)):
         ours = mesh_silhouette(intersector, silhouettes.cameras, view, stride)

@@ -63,6 +63,11 @@ def single_view(cameras: Cameras, view: int) -> Cameras:
     )
 
 
+def pixel_stride(cameras: Cameras, max_pixels: int) -> int:
+    """Every how many pixels an image is looked at, so that there are at most `max_pixels` a side."""
+    return -(-max(cameras.width, cameras.height) // max_pixels)
+
+
 def mesh_silhouette(intersector: MeshIntersector, cameras: Cameras, view: int, stride: int) -> Bool[Tensor, "h w"]:
     """Where the rays through the centres of every stride-th pixel, from the first on, meet a mesh."""
     row, column = torch.meshgrid(
