@@ -14,6 +14,7 @@ from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from torch import Tensor
 
 from nerfro.boundaries.lat_long import directions
+from nerfro.data.cameras import Cameras
 from nerfro.media.analytic import Vacuum
 from nerfro.models.base import NerfModel
 from nerfro.path_plot import picture_of_paths
@@ -99,7 +100,7 @@ def sky(model: NerfModel, height: int = _SKY_HEIGHT) -> UInt8[np.ndarray, "H 2*H
         model.boundary.train(was_training)
 
 
-def _middle_row(cameras: Any, view: int) -> Rays:
+def _middle_row(cameras: Cameras, view: int) -> Rays:
     """Rays of at most `_NUM_RAYS` pixels of a view's middle row, evenly spread."""
     rays = cameras.image_rays(view)
     first = cameras.height // 2 * cameras.width
