@@ -34,8 +34,8 @@ from nerfro.registry import build
 
 _SHEET = "masks.png"
 _TILE, _COLUMNS, _GAP, _LINE = 220, 6, 6, 18  # pixels
-# A mask that overlaps less than this with the hull of the others is pointed out.
-_GOOD_OVERLAP = 0.85
+# The hull is coarse and a little too large; a mask that overlaps this much less with it than is usual is pointed out.
+_DOUBTFUL = 0.9
 
 
 @dataclass
@@ -242,7 +242,7 @@ def _draw_sheet(
     sheet = Image.new("RGB", (columns * (_TILE + _GAP) + _GAP, rows * (height + _LINE + _GAP) + _GAP), "white")
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(12)
     for place, view in enumerate(order):
-        shown = np.where(masks[view][..., None], images[view], images[view] // 4 + np.array([70, 0, 0], np.uint8))
+        shown = np.where(masks[view][..., None], images[view], images[view] // 4 + np.array([0, 0, 90], np.uint8))
         left, top = _GAP + place % columns * (_TILE + _GAP), _GAP + place // columns * (height + _LINE + _GAP)
         sheet.paste(Image.fromarray(shown).resize((_TILE, height)), (left, top))
         label = f"{overlaps[view]:.3f}" if view in overlaps else "given"
@@ -256,9 +256,11 @@ def _report(frames: list[Frame], overlaps: Mapping[int, float], made: list[int],
     print("overlap (intersection over union) of each mask with the hull of the others:")
     for view in sorted(overlaps, key=lambda view: overlaps[view]):
         print(f"  {overlaps[view]:.4f}  {frames[view].name}")
-    bad = [frames[view].name for view in overlaps if overlaps[view] < _GOOD_OVERLAP]
+    limit = _DOUBTFUL * float(np.median(list(overlaps.values()) or [0.0]))
+    bad = [frames[view].name for view in sorted(overlaps, key=lambda view: overlaps[view]) if overlaps[view] < limit]
     if bad:
-        print(f"nerfro: warning: {len(bad)} masks overlap less than {_GOOD_OVERLAP}: {', '.join(bad[:5])}")
+        shown = ", ".join(bad[:3]) + (f" and {len(bad) - 3} more" if len(bad) > 3 else "")
+        print(f"nerfro: warning: overlap much less than is usual: {shown}; look at them first")
     print(f"wrote {len(made)} masks beside their images (mask_*.png), and {sheet}: look at it")
     print("correct wrong masks in any paint program, or delete them, outline one of them, and run this again")
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from numpy.typing import ArrayLike
-from scipy.ndimage import binary_closing, binary_dilation, binary_erosion, binary_fill_holes, label
+from scipy.ndimage import binary_closing, binary_fill_holes, label
 
 from nerfro.capture.targets import opencv
 from nerfro.data.cameras import Cameras
@@ -143,7 +143,7 @@ def propagate(
         region = hull.seen_from(view)
         if not region.any():  # the others contradict each other here; what was found stays
             region = masks[view]
-        core = binary_erosion(region, iterations=max(1, round(_CORE * _diameter(region))))
+        core = _distance(region) > _CORE * _diameter(region)
         found = grab(images[view], region, _grown(region, _REACH), core)
         refined[view] = found if found.sum() >= _LEAST_KEPT * region.sum() else region
         overlaps[view] = float((found & region).sum() / max(1, (found | region).sum()))
@@ -162,19 +162,22 @@ class _Hull:
         self.points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
         self.voxel = float(axes[0][1] - axes[0][0])
         self.outside: dict[int, Bool[np.ndarray, "P"]] = {}
+        self.count = np.zeros(len(self.points), np.int32)
         for view, mask in masks.items():
             self.add(view, mask)
 
     def add(self, view: int, mask: Bool[np.ndarray, "H W"]) -> None:
         silhouettes = Silhouettes.of(_some(self.cameras, [view]), torch.from_numpy(mask[None]).float())
         inside, width, _ = silhouettes.depth_inside(0, self.points)
-        # Half a voxel's diagonal: points whose voxel reaches inside count.
-        self.outside[view] = (inside * width < -0.87 * self.voxel).numpy()
+        # A little generous, for thin parts lie between the grid's points.
+        self.outside[view] = (inside * width < -0.3 * self.voxel).numpy()
+        self.count += self.outside[view]
 
     def seen_from(self, view: int) -> Bool[np.ndarray, "H W"]:
         """The silhouette of what the other views leave over."""
-        others = [outside for other, outside in self.outside.items() if other != view]
-        inside = np.sum(others, axis=0) <= int(_WRONG_SHARE * len(others))
+        own = self.outside.get(view)
+        num_others = len(self.outside) - (own is not None)
+        inside = (self.count if own is None else self.count - own) <= int(_WRONG_SHARE * num_others)
         camera = _some(self.cameras, [view])
         region = np.zeros((camera.height, camera.width), bool)
         points = self.points[torch.from_numpy(inside)]
@@ -227,7 +230,13 @@ def _diameter(region: Bool[np.ndarray, "H W"]) -> float:
 
 
 def _grown(region: Bool[np.ndarray, "H W"], share: float) -> Bool[np.ndarray, "H W"]:
-    return binary_dilation(region, iterations=max(2, round(share * _diameter(region))))
+    return _distance(~region) <= max(2.0, share * _diameter(region))
+
+
+def _distance(region: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    """To the nearest pixel outside, pixels."""
+    cv2 = opencv()
+    return cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5)
 
 
 def _largest_part(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:

@@ -138,7 +138,8 @@ def test_tags_inside_the_objects_mask_do_not_count(tmp_path: Path, command: Call
     command("calibrate", f"images={tmp_path / 'photos'}", f"out={tmp_path}", *board)
     images = json.loads((tmp_path / "calibration.json").read_text())["images"]
     assert set(images) == set(truth)
-    assert images["p_0.png"]["features"] < 20 == images["p_2.png"]["features"]
+    counts = {name: image["features"] for name, image in images.items()}
+    assert counts.pop("p_0.png") <= 15 < min(counts.values())
 
 
 def test_boards_are_printed_in_their_size(tmp_path: Path, command: Callable[..., str]) -> None:

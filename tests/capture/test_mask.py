@@ -1,0 +1,140 @@
+"""`python -m nerfro.mask` on a coloured ball before a textured floor."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+pytest.importorskip("cv2")
+
+from nerfro.capture.masking import grab, outline_region
+from nerfro.data.opencv import OpenCVData
+from tests.capture.photographs import look_at
+
+WIDTH, HEIGHT, FOCAL, NUM_VIEWS = 96, 72, 115.0, 14
+CENTRE, RADIUS = np.array([0.05, -0.03, 0.3]), 0.28
+
+
+@pytest.fixture(scope="module")
+def photographs() -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Picture, silhouette and pose of each view."""
+    generator = np.random.default_rng(0)
+    noise = np.stack([gaussian_filter(generator.normal(size=(64, 64)), 1.2) for _ in range(3)], -1)
+    texture = np.clip(110 + 160 * noise, 0, 255)
+    column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    local = np.stack([(column - WIDTH / 2) / FOCAL, (row - HEIGHT / 2) / FOCAL, np.ones_like(row)], -1)
+    local /= np.linalg.norm(local, axis=-1, keepdims=True)
+    views = []
+    for view in range(NUM_VIEWS):
+        azimuth, up = 2 * np.pi * view / NUM_VIEWS, generator.uniform(0.35, 1.0)
+        towards = np.array([np.cos(azimuth) * np.cos(up), np.sin(azimuth) * np.cos(up), np.sin(up)])
+        pose = look_at(CENTRE + 2.2 * towards, CENTRE + generator.normal(0, 0.06, 3))
+        directions, offset = local @ pose[:, :3].T, pose[:, 3] - CENTRE
+        along = directions @ offset
+        inside = along**2 - offset @ offset + RADIUS**2
+        mask = inside > 0
+        floor = pose[:2, 3] - directions[..., :2] * (pose[2, 3] / np.minimum(directions[..., 2:], -1e-3))
+        place = np.clip((floor + 4) * 63 / 8, 0, 63).astype(int)
+        picture = texture[place[..., 0], place[..., 1]].copy()
+        normal = (offset + directions * (-along - np.sqrt(np.maximum(inside, 0)))[..., None]) / RADIUS
+        shade = 0.45 + 0.55 * np.clip(normal @ np.array([0.4, 0.3, 0.85]), 0, 1)
+        picture[mask] = (np.array([200, 60, 40]) * shade[..., None])[mask]
+        picture += generator.normal(0, 3, picture.shape)
+        views.append((np.uint8(np.clip(picture, 0, 255)), mask, pose))
+    return views
+
+
+@pytest.fixture
+def capture(tmp_path: Path, photographs: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Path:
+    """The photographs as a data set in OpenCV's format, without masks."""
+    splits: dict[str, list[dict]] = {"train": [], "val": [], "test": []}
+    (tmp_path / "photos").mkdir()
+    for view, (picture, _, pose) in enumerate(photographs):
+        Image.fromarray(picture).save(tmp_path / "photos" / f"p_{view}.png")
+        frame = {"file_path": f"photos/p_{view}.png", "transform_matrix": [*pose.tolist(), [0, 0, 0, 1]]}
+        splits["test" if view % 7 == 0 else "val" if view % 7 == 3 else "train"].append(frame)
+    matrix = [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
+    for split, frames in splits.items():
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps({"cam_mat": matrix, "frames": frames}))
+    return tmp_path
+
+
+def box_around(mask: np.ndarray, margin: int) -> list[int]:
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    numbers = columns[0] - margin, rows[0] - margin, columns[-1] + 1 + margin, rows[-1] + 1 + margin
+    return [int(number) for number in numbers]
+
+
+def overlap(one: np.ndarray, other: np.ndarray) -> float:
+    return float((one & other).sum() / (one | other).sum())
+
+
+def read(root: Path, view: int) -> np.ndarray:
+    with Image.open(root / "photos" / f"mask_p_{view}.png") as image:
+        levels = np.asarray(image)
+    assert set(np.unique(levels)) == {0, 255}
+    return levels > 127
+
+
+def test_one_box_leads_to_all_masks(capture: Path, photographs: list, command: Callable[..., str]) -> None:
+    box = str(box_around(photographs[1][1], 3)).replace(" ", "")
+    printed = command("mask", f"data.root={capture}", f"outlines={{p_1:{box}}}")
+    overlaps = [overlap(read(capture, view), mask) for view, (_, mask, _) in enumerate(photographs)]
+    assert min(overlaps) > 0.9, overlaps
+    assert np.mean(overlaps) > 0.95
+    assert "next: python -m nerfro.preprocess data=opencv" in printed
+    # The loader finds them, for all splits.
+    for split in ("train", "val", "test"):
+        assert OpenCVData(str(capture)).load(split).masks is not None
+    with Image.open(capture / "masks.png") as sheet:
+        assert sheet.size[0] > 6 * 220
+
+
+def test_masks_that_exist_are_kept_and_show_the_way(
+    capture: Path, photographs: list, command: Callable[..., str]
+) -> None:
+    drawn = {view: photographs[view][1].copy() for view in (0, 3, 5, 8, 11)}
+    drawn[3][:2, :2] = True  # known again
+    for view, mask in drawn.items():
+        Image.fromarray(np.uint8(200 * mask)).save(capture / "photos" / f"mask_p_{view}.png")
+    before = {view: (capture / "photos" / f"mask_p_{view}.png").read_bytes() for view in drawn}
+    assert "delete it, or set overwrite=true" in command("mask", f"data.root={capture}", "outlines={p_0:[1,1,9,9]}")
+    assert "5 masks exist" in command("mask", f"data.root={capture}")
+    for view, (_, mask, _) in enumerate(photographs):
+        if view in drawn:
+            assert (capture / "photos" / f"mask_p_{view}.png").read_bytes() == before[view]
+        else:
+            assert overlap(read(capture, view), mask) > 0.9
+    assert "all images have masks" in command("mask", f"data.root={capture}")
+
+
+def test_a_rough_polygon_from_a_file(tmp_path: Path, photographs: list) -> None:
+    from nerfro.mask import read_outlines
+
+    picture, mask, _ = photographs[4]
+    rows, columns = np.nonzero(mask)
+    angles = np.linspace(0, 2 * np.pi, 9)[:-1]
+    corners = np.stack([columns.mean() + 2 + 19 * np.cos(angles), rows.mean() - 1 + 19 * np.sin(angles)], 1)
+    (tmp_path / "outlines.json").write_text(json.dumps({"p_4": corners.tolist()}))
+    outlines = read_outlines(str(tmp_path / "outlines.json"))
+    likely, possible = outline_region(outlines["p_4"], (WIDTH, HEIGHT))
+    assert overlap(likely, mask) < 0.8
+    assert overlap(grab(picture, likely, possible), mask) > 0.95
+
+
+def test_mistakes_are_told_in_one_line(capture: Path, command: Callable[..., str]) -> None:
+    root = f"data.root={capture}"
+    assert "no mask to start from" in command("mask", root)
+    assert "q_1 is no image of the data; its names are like photos/p_" in command(
+        "mask", root, "outlines={q_1:[1,1,9,9]}"
+    )
+    assert "give a box [left,top,right,bottom]" in command("mask", root, "outlines={p_1:[9,9,1,1]}")
+    assert "cannot be read" in command("mask", root, "outlines=nothing.json")
+    assert "ships with nerfro" in command("mask", "data=blender", "data.root=embedded:torus")
+    assert not list((capture / "photos").glob("mask_*"))
