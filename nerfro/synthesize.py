@@ -27,7 +27,7 @@ from nerfro.scenes.skies import lat_long_texture
 
 SCENES = ("torus", "ship", "deerglobe", "starlamp")
 CAPTURES = ("dolphin_capture",)
-_BAKING_SPP = 512
+_BAKING_SPP = 256
 
 
 @dataclass

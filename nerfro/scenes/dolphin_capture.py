@@ -26,7 +26,6 @@ BLOCK_TOP = BOARD_SCALE * 0.27 + BOARD_HEIGHT
 CENTRE = np.array([0.0, 0.0, BLOCK_TOP + GLOBE_FOOT + 0.01])  # of the globe; air below it, for it must not touch
 TABLE_HALF_SIDE = 2.7
 ROOM_SCALE, ROOM_CENTRE = 4.4, np.array([0.0, 0.0, 1.7])
-ROOM_SPACING = 0.015
 AIM = np.array([0.0, 0.0, 1.15])  # of the photographer
 
 ARC_RADIUS, ARC_CENTRE = 0.40, np.array([0.02, 0.0, -0.24])  # the back's curve, in the plane y = 0
@@ -153,8 +152,8 @@ def wood(points: np.ndarray, tone: Vector, seed: int) -> np.ndarray:
     return np.where(seam[..., None], 0.4 * colour, colour)
 
 
-def room_panels() -> list[Panel]:
-    """The six sides of the room, which light it."""
+def room_panels(spacing: float) -> list[Panel]:
+    """The six sides of the room, which light it, with a pixel every `spacing` world units."""
     low, high = (ROOM_CENTRE + ROOM_SCALE * corner for corner in (starlamp.ROOM_LOW, starlamp.ROOM_HIGH))
     extent = high - low
     x, y, z = np.diag(extent)
@@ -164,7 +163,7 @@ def room_panels() -> list[Panel]:
             places = (points - ROOM_CENTRE) / ROOM_SCALE
             return starlamp.room(places, np.full(points.shape[:-1], axis))
 
-        return painted_panel(corner, right, down, colour, ROOM_SPACING, glows=True)
+        return painted_panel(corner, right, down, colour, spacing, glows=True)
 
     return [
         side(0, low + z, y, -z),
@@ -178,7 +177,7 @@ def room_panels() -> list[Panel]:
 
 def build(spacing: float) -> Scene:
     """Return the scene; `spacing` is the distance between neighbouring coloured vertices, world units."""
-    fine = min(max(spacing, 0.004), 0.008)
+    fine, coarse = min(max(spacing, 0.004), 0.012), max(3 * spacing, 0.015)
     parts = [
         painted(dolphin, dolphin_colours, (-0.55, -0.3, -0.4), (0.55, 0.3, 0.45), fine),
         painted(sea, sea_colours, (-0.56, -0.56, -0.56), (0.56, 0.56, -0.2), fine),
@@ -206,5 +205,5 @@ def build(spacing: float) -> Scene:
         glass=glass.moved(CENTRE),
         interior=join(parts).moved(CENTRE),
         sky=None,
-        panels=(*room_panels(), table, top, *board_panels(twelve_faces())),
+        panels=(*room_panels(coarse), table, top, *board_panels(twelve_faces())),
     )

@@ -1,0 +1,125 @@
+"""How well a simulated capture was calibrated and carved: `python benchmarks/capture.py DIR`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from nerfro.data.transforms import find_splits, parse_matrix, read_manifest
+from nerfro.errors import NerfroError
+from nerfro.geometry.mesh import TriangleMesh, load_mesh
+from nerfro.geometry.occupancy import occupancy_fraction
+
+_RESOLUTION = 160
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path, help="written by nerfro.synthesize, nerfro.calibrate, nerfro.preprocess")
+    parser.add_argument("--data", type=Path, help="what nerfro.calibrate wrote, if that is another folder")
+    given = parser.parse_args()
+    for name, value in measure(given.folder, given.data or given.folder).items():
+        print(f"{name:<52} {value:.4g}")
+
+
+def measure(folder: Path, data: Path) -> dict[str, float]:
+    """Compare estimated cameras and surface with the true ones.
+
+    Args:
+        folder: holds `truth/`.
+        data: holds the estimated cameras in the format `opencv`, and perhaps mesh.ply and calibration.json.
+
+    Raises:
+        NerfroError: there are no cameras, or fewer than three.
+    """
+    lens, true_poses = read_cameras(folder / "truth")
+    found_lens, found_poses = read_cameras(data)
+    names = sorted(found_poses)
+    if len(names) < 3:
+        raise NerfroError(f"{data} has {len(names)} cameras; three or more can be aligned")
+    true, found = (np.stack([poses[name] for name in names]) for poses in (true_poses, found_poses))
+    scale, turn, shift = similarity(found[:, :, 3], true[:, :, 3])
+    moved = np.concatenate([turn @ found[:, :, :3], (scale * found[:, :, 3] @ turn.T + shift)[..., None]], -1)
+    angles = _angle(true[:, :, :3].transpose(0, 2, 1) @ moved[:, :, :3])
+    surface = load_mesh(folder / "truth" / "mesh.ply")
+    distance = np.linalg.norm(true[:, :, 3] - surface.bounds.mean(0), axis=1)
+    offsets = np.linalg.norm(moved[:, :, 3] - true[:, :, 3], axis=1) / distance
+    pixels = np.linalg.norm(
+        _project(surface.vertices[::50], found_lens, moved) - _project(surface.vertices[::50], lens, true), axis=-1
+    )
+    figures = {
+        "photographs with a pose": len(names),
+        "photographs": len(true_poses),
+        "focal length, error in %": 100 * abs(found_lens[0, 0] / lens[0, 0] - 1),
+        "principal point, error in pixels": float(np.linalg.norm(found_lens[:2, 2] - lens[:2, 2])),
+        "rotation, median error in degrees": float(np.median(angles)),
+        "rotation, largest error in degrees": float(angles.max()),
+        "position, median error in % of the distance": 100 * float(np.median(offsets)),
+        "position, largest error in % of the distance": 100 * float(offsets.max()),
+        "object's surface in the pictures, median error in pixels": float(np.median(pixels)),
+    }
+    if (data / "calibration.json").is_file():
+        report = json.loads((data / "calibration.json").read_text())
+        figures["reprojection, mean over photographs in pixels"] = float(
+            np.mean([image["error"] for image in report["images"].values()])
+        )
+    if (data / "mesh.ply").is_file():
+        hull = load_mesh(data / "mesh.ply")
+        hull = TriangleMesh((scale * hull.vertices @ turn.T + shift).astype(hull.vertices.dtype), hull.faces)
+        figures["hull, intersection over union with the object"] = volume_overlap(hull, surface)
+    return figures
+
+
+def read_cameras(root: Path) -> tuple[Float[np.ndarray, "3 3"], dict[Path, Float[np.ndarray, "3 4"]]]:
+    """The camera matrix of a data set in the format `opencv`, and the poses of all its splits by image."""
+    poses: dict[Path, Float[np.ndarray, "3 4"]] = {}
+    matrix = np.eye(3)
+    for split in find_splits(root):
+        manifest = read_manifest(root, split)
+        matrix = parse_matrix(manifest.require("cam_mat", "the camera matrix"), ((3, 3),), str(manifest.path))
+        poses |= {frame.image.resolve(): np.asarray(frame.camera_to_world) for frame in manifest.frames}
+    return matrix, poses
+
+
+def similarity(
+    points: Float[np.ndarray, "N 3"], targets: Float[np.ndarray, "N 3"]
+) -> tuple[float, Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+    """Scale, rotation and shift that map points to targets with the least squared error (Umeyama, PAMI 1991)."""
+    centre, aim = points.mean(0), targets.mean(0)
+    left, spread, right = np.linalg.svd((targets - aim).T @ (points - centre))
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    turn = left @ sign @ right
+    scale = float((spread * np.diag(sign)).sum() / ((points - centre) ** 2).sum())
+    return scale, turn, aim - scale * turn @ centre
+
+
+def volume_overlap(first: TriangleMesh, second: TriangleMesh) -> float:
+    """Intersection over union of two closed bodies."""
+    both = np.concatenate([first.bounds, second.bounds])
+    margin = 0.02 * np.ptp(both, axis=0).max()
+    box = np.stack([both.min(0) - margin, both.max(0) + margin])
+    one, other = (occupancy_fraction(mesh, box, _RESOLUTION) > 0.5 for mesh in (first, second))
+    return float((one & other).sum() / (one | other).sum())
+
+
+def _angle(rotations: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N"]:
+    """Angle of each rotation in degrees, accurate for small ones."""
+    axis = np.stack([rotations[:, i, j] - rotations[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], -1)
+    return np.degrees(np.arctan2(np.linalg.norm(axis, axis=1), np.trace(rotations, axis1=1, axis2=2) - 1))
+
+
+def _project(
+    points: Float[np.ndarray, "P 3"], lens: Float[np.ndarray, "3 3"], poses: Float[np.ndarray, "N 3 4"]
+) -> Float[np.ndarray, "N P 2"]:
+    """Pixels at which cameras with OpenCV's axes see points."""
+    seen = np.einsum("npi,nij->npj", points - poses[:, None, :, 3], poses[:, :, :3]) @ lens.T
+    return seen[..., :2] / seen[..., 2:]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,162 @@
+"""The simulated capture: photographs fit the truth that is kept apart, and the commands lead back to it."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import shutil
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.path import Path as Polygon
+from omegaconf import OmegaConf
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+import nerfro.synthesize
+from benchmarks.capture import measure, similarity
+from nerfro.capture.boards import tag_detector, twelve_faces
+from nerfro.data.opencv import OpenCVData
+from nerfro.geometry.mesh import load_mesh
+from nerfro.paths import CONF_DIR
+from nerfro.scenes.dolphin_capture import AIM, board_to_world
+from nerfro.scenes.photographs import Settings, missing, photographs
+from nerfro.synthesize import SynthesizeConfig, synthesize
+
+
+def photograph(folder: Path, **options: object) -> Path:
+    """Render a capture into a folder."""
+    file = OmegaConf.load(CONF_DIR / "synthesize" / "synthesize.yaml")
+    plain = {key: file[key] for key in file if key not in ("defaults", "hydra")}
+    asked = {"scene": "dolphin_capture", "out": str(folder), **options}
+    return synthesize(OmegaConf.merge(OmegaConf.structured(SynthesizeConfig), plain, asked))[1]
+
+
+def outline_of(points: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Pixels whose centres lie in the convex hull of points of the picture."""
+    centres = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
+    outline = Polygon(points[ConvexHull(points).vertices])
+    return outline.contains_points(centres.reshape(-1, 2)).reshape(height, width)
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two photographs, large enough to find tags in."""
+    pytest.importorskip("mitsuba")
+    pytest.importorskip("pupil_apriltags")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(nerfro.synthesize, "_BAKING_SPP", 8)
+        return photograph(tmp_path_factory.mktemp("few"), resolution=320, photographs=2, spp=4)
+
+
+def test_poses_are_only_in_the_truth(few: Path) -> None:
+    beside = [path.relative_to(few).parts[0] for path in few.rglob("*") if path.is_file()]
+    assert set(beside) == {"images", "masks", "truth"}
+    assert len(list((few / "images").iterdir())) == len(list((few / "masks").iterdir())) == 2
+
+
+def test_masks_are_the_true_surface_in_the_true_cameras(few: Path) -> None:
+    views = OpenCVData(str(few / "truth")).load("train")
+    vertices = torch.from_numpy(load_mesh(few / "truth" / "mesh.ply").vertices).float()
+    pixels, depth = views.cameras.project(vertices)
+    assert (depth > 0).all()
+    assert views.masks is not None
+    for place, mask in zip(pixels.numpy(), views.masks.numpy() > 0.5, strict=True):
+        expected = outline_of(place, *mask.shape)  # the globe is convex
+        assert mask.any()
+        assert (mask & expected).sum() / (mask | expected).sum() > 0.99
+
+
+def test_tags_are_photographed_where_the_true_cameras_see_them(few: Path) -> None:
+    views = OpenCVData(str(few / "truth")).load("train")
+    board = twelve_faces()
+    corners = board.tag_corners()
+    for view, image in enumerate(views.images.numpy()):
+        grey = np.uint8(np.rint(255 * image.mean(-1)))
+        found = tag_detector(board.family).detect(grey)
+        assert len(found) > 5
+        places = np.stack([board_to_world(corners[tag.tag_id]).mean(0) for tag in found])
+        pixels, _ = views.cameras.project(torch.from_numpy(places).float())
+        error = np.linalg.norm(pixels[view].numpy() - [tag.corners.mean(0) for tag in found], axis=1)
+        assert np.median(error) < 0.3
+
+
+def test_only_what_is_not_on_disk_is_rendered_again(few: Path, tmp_path: Path) -> None:
+    settings = Settings(**json.loads((few / "truth" / "meta.json").read_text())["settings"])
+    planned = photographs(settings, AIM)
+    assert list(missing(few, planned)) == []
+    shutil.copytree(few, tmp_path / "copy")
+    (tmp_path / "copy" / planned[1].mask_path).unlink()
+    assert [one.index for one in missing(tmp_path / "copy", planned)] == [1]
+
+
+def test_similarity_undoes_scale_turn_and_shift() -> None:
+    generator = np.random.default_rng(0)
+    points = generator.normal(size=(20, 3))
+    turn = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()
+    scale, found, shift = similarity(points, 0.3 * points @ turn.T + [1.0, 2.0, -3.0])
+    assert scale == pytest.approx(0.3)
+    assert found == pytest.approx(turn)
+    assert shift == pytest.approx([1.0, 2.0, -3.0])
+
+
+@pytest.mark.slow
+def test_from_photographs_to_a_table(
+    request: pytest.FixtureRequest,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    train_here: Callable,
+) -> None:
+    """The four commands of docs/capture.md, on fewer and smaller photographs, which are kept for the next time."""
+    pytest.importorskip("mitsuba")
+    pytest.importorskip("pupil_apriltags")
+    kept = request.config.cache.mkdir("dolphin_capture") / "photographs"
+    photograph(kept, resolution=400, photographs=24, spp=4, overwrite=True)
+    data = tmp_path / "data"
+
+    def run(command: str, *overrides: str) -> str:
+        monkeypatch.setattr(sys, "argv", [f"nerfro.{command}", *overrides])
+        capsys.readouterr()
+        import_module(f"nerfro.{command}").main()
+        return capsys.readouterr().out
+
+    data.mkdir()
+    for name in ("images", "masks"):
+        (data / name).symlink_to(kept / name, target_is_directory=True)
+    run("calibrate", f"images={data / 'images'}", "target=apriltag", f"out={data}")
+    common = ["data=opencv", f"data.root={data}", "data.near=0.05", "data.far=4", "medium.ior=1.33"]
+    printed = run("preprocess", *common, "resolution=48", "medium.resolution=48", "medium.cache=false")
+    figures = measure(kept, data)
+    assert figures["photographs with a pose"] == 24
+    assert figures["rotation, median error in degrees"] <= 0.1
+    assert figures["position, median error in % of the distance"] <= 0.3
+    assert figures["reprojection, mean over photographs in pixels"] <= 0.5
+    assert figures["hull, intersection over union with the object"] >= 0.93
+    command = shlex.split(re.findall("train on it: (.*)", printed)[0])[3:]
+    tiny = [
+        "trainer.max_steps=3",
+        "trainer.max_time=null",
+        "trainer.accelerator=cpu",
+        "logger=none",
+        "data.downscale=10",
+    ]
+    small = ["field.num_levels=4", "field.log2_table_size=10", "sampler.points.resolution=16", "batches.size=64"]
+    run_folder = tmp_path / "run"
+    finished = train_here(
+        "+experiment=refractive_room",
+        *command,
+        *tiny,
+        *small,
+        f"hydra.run.dir={run_folder}",
+        "evaluation.supersample=1",
+    )
+    assert finished.code == 0, finished.err
+    crop = json.loads((run_folder / "metrics.json").read_text())["regions"]["crop"]
+    assert crop["psnr"] > 5
