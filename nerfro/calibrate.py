@@ -208,12 +208,12 @@ def _grey(image: Path) -> UInt8[np.ndarray, "H W"]:
 
 
 def _outside(sighting: Sighting, mask: Path | None) -> Sighting:
-    """The points that are not seen through the object."""
+    """The features that are not seen through the object, or cut by it."""
     if mask is None or len(sighting.points) == 0:
         return sighting
     inside = read_mask(mask) > 0.5
     columns, rows = np.clip(sighting.pixels.astype(int), 0, np.array(inside.shape[::-1]) - 1).T
-    return sighting.only(~inside[rows, columns])
+    return sighting.only(~np.isin(sighting.features, sighting.features[inside[rows, columns]]))
 
 
 def _find_model(
