@@ -132,7 +132,7 @@ def test_from_photographs_to_a_table(
         (data / name).symlink_to(kept / name, target_is_directory=True)
     run("calibrate", f"images={data / 'images'}", "target=apriltag", f"out={data}")
     common = ["data=opencv", f"data.root={data}", "data.near=0.05", "data.far=4", "medium.ior=1.33"]
-    printed = run("preprocess", *common, "resolution=48", "medium.resolution=48", "medium.cache=false")
+    printed = run("preprocess", *common, "smoothing=0", "resolution=48", "medium.resolution=48", "medium.cache=false")
     figures = measure(kept, data)
     assert figures["photographs with a pose"] == 24
     assert figures["rotation, median error in degrees"] <= 0.1
