@@ -22,6 +22,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.cli import in_one_line
+from nerfro.data.frames import IMAGE_SUFFIXES
 from nerfro.errors import NerfroError
 from nerfro.evaluation.files import write_atomically
 from nerfro.paths import EMBEDDED_PREFIX, resolve_path
@@ -33,6 +34,9 @@ CELL_FILE, _LOCK = "cell.json", "cell.lock"
 
 # How a run is watched and stored is no part of what it computes.
 _NOT_HASHED = ("ckpt_path", "checkpoint", "logger")
+
+# Larger files of a data folder are told apart by name and size, so that no sweep begins with reading for minutes.
+_MAX_HASHED = 64 * 2**20  # bytes
 
 # Tell cells of a sweep apart in their folders' names without being written out as key=value.
 _NAMED_BY_THEMSELVES = ("+experiment", "data.root", "seed")
@@ -62,7 +66,7 @@ class Identity:
 
     @classmethod
     def of(cls, config: DictConfig) -> Identity:
-        """Identity of a run of nerfro.train; reads no image, only the names and sizes of files."""
+        """Identity of a run of nerfro.train; of images it reads the names and sizes only."""
         settings: Any = OmegaConf.to_container(config, resolve=True)
         kept = {key: value for key, value in settings.items() if key not in _NOT_HASHED}
         return cls(kept, _hash_of_files(resolve_path(config.data.root)))
@@ -219,11 +223,12 @@ def _recorded(folder: Path, identity: Identity) -> tuple[State, str]:
 
 
 def _hash_of_files(root: Path) -> str:
-    """Hash of the names and sizes of all files below a folder, and of the content of those that describe it."""
+    """Hash of the names and sizes of all files below a folder, and of the content of those that are no pictures."""
     digest = hashlib.sha256()
     for file in sorted(_visible_files(root)):
-        digest.update(f"{file.relative_to(root).as_posix()}:{file.stat().st_size};".encode())
-        if file.suffix == ".json":
+        num_bytes = file.stat().st_size
+        digest.update(f"{file.relative_to(root).as_posix()}:{num_bytes};".encode())
+        if file.suffix.lower() not in IMAGE_SUFFIXES and num_bytes <= _MAX_HASHED:
             digest.update(file.read_bytes())
     return digest.hexdigest()[:16]
 

@@ -190,6 +190,21 @@ def test_identity_is_what_is_computed_and_not_how_it_is_watched() -> None:
         assert Identity.of(composed(override)).hash != plain
 
 
+@pytest.mark.parametrize("name", ["cameras.bin", "poses_bounds.npy", "arrays.npz", "mesh.ply", "transforms.json"])
+def test_data_that_are_calibrated_anew_are_other_data(name: str, tmp_path: Path) -> None:
+    def identity() -> str:
+        return Identity.of(composed(f"data.root={tmp_path}")).data
+
+    (tmp_path / "sparse").mkdir()
+    (tmp_path / "sparse" / name).write_bytes(b"before")
+    (tmp_path / "r_0.PNG").write_bytes(b"before")
+    before = identity()
+    (tmp_path / "r_0.PNG").write_bytes(b"after!")
+    assert identity() == before, "pictures are known by name and size"
+    (tmp_path / "sparse" / name).write_bytes(b"after!")
+    assert identity() != before
+
+
 def test_folders_are_named_by_experiment_scene_seed_and_what_else_is_swept() -> None:
     config = composed("+experiment=ablation_noH", "seed=3")
     swept = ["+experiment=ablation_noH", "data.root=embedded:torus", "trainer.max_time=00:00:04:00", "seed=3"]
