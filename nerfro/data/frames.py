@@ -167,7 +167,7 @@ def held_out(num_views: int, every: int, split: str, root: Path) -> list[int]:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The images of a folder by name, masks (`mask_*`) left out.
+    """The images of a folder by name, masks (`mask_*`) and hidden files left out.
 
     Raises:
         NerfroError: there is no such folder, or no image in it.
@@ -175,7 +175,7 @@ def list_images(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise NerfroError(f"{folder} is not a folder; it should hold the images, see docs/data.md")
     images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
-    images = [path for path in images if not path.name.startswith("mask_")]
+    images = [path for path in images if not path.name.startswith(("mask_", "."))]
     if not images:
         raise NerfroError(f"{folder} holds no image; see docs/data.md")
     return sorted(images)
