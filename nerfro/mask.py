@@ -55,9 +55,9 @@ class MaskConfig:
 
 
 @entry_point("mask", MaskConfig)
+@torch.no_grad()
 def main(config: DictConfig) -> None:
     """Cut the object out where an outline is given, then in all other views, and write what was missing."""
-    torch.set_grad_enabled(False)
     if str(config.data.root).startswith(EMBEDDED_PREFIX):
         raise NerfroError(f"data.root={config.data.root} ships with nerfro and has its masks; give a folder of yours")
     outlines = read_outlines(config.outlines)

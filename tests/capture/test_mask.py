@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
@@ -94,6 +95,11 @@ def test_one_box_leads_to_all_masks(capture: Path, photographs: list, command: C
         assert OpenCVData(str(capture)).load(split).masks is not None
     with Image.open(capture / "masks.png") as sheet:
         assert sheet.size[0] > 6 * 220
+
+
+def test_gradients_are_on_after_the_command(capture: Path, command: Callable[..., str]) -> None:
+    assert "no mask to start from" in command("mask", f"data.root={capture}")
+    assert torch.is_grad_enabled()
 
 
 def test_masks_that_exist_are_kept_and_show_the_way(
