@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -238,6 +240,15 @@ def test_grids_get_sharper_level_by_level() -> None:
 def test_impossible_shares_are_refused() -> None:
     with pytest.raises(NerfroError, match="leave the rest of 1 to the interior"):
         make_model(scene_share=0.8, index_share=0.4)
+
+
+def test_several_processes_are_refused_before_training() -> None:
+    model = make_model()
+    for num_processes in (1, 2):
+        model.trainer = SimpleNamespace(world_size=num_processes)  # type: ignore[assignment]
+        refused = pytest.raises(NerfroError, match="trains in one process") if num_processes > 1 else nullcontext()
+        with refused:
+            model.setup("fit")
 
 
 # All of it, from the command line.

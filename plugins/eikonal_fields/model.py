@@ -106,6 +106,11 @@ class EikonalFields(NerfModel):
         rest = 1 - self.scene_share - self.index_share
         return Stage.INTERIOR, min((progress - self.index_share) / rest, 1.0) if rest > 0 else 1.0
 
+    def setup(self, stage: str) -> None:
+        if self.trainer.world_size > 1:
+            # A stage leaves out parameters, whose gradients the other processes would wait for.
+            raise NerfroError("model=eikonal_fields trains in one process; set trainer.devices=1")
+
     def on_train_batch_start(self, batch: Batch, batch_index: int) -> None:
         super().on_train_batch_start(batch, batch_index)
         stage, done = self.stage_at(training_progress(self.trainer))
