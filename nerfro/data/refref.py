@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from nerfro.data.base import DataSource, Views
 from nerfro.data.frames import SPLITS, Frame, Lens, check_options, check_pose, check_split, load_views
@@ -32,7 +34,8 @@ class RefRefData(DataSource):
         root: folder with the scene's .parquet files, at any depth.
         scene: its name, such as cube_smcvx_ampoule; none where the folder holds one scene alone.
         near: arc length at which rays begin, world units.
-        far: arc length at which rays end; none takes the farthest corner of RefRef's box of side 14.6.
+        far: arc length at which rays end; none takes, from the farthest camera of all splits, the
+            farthest corner of RefRef's box of side 14.6.
         downscale: side of the blocks of pixels that are averaged into one.
         alpha: `drop` ignores the images' transparency, `white` and `black` composite them over that colour.
 
@@ -60,18 +63,17 @@ class RefRefData(DataSource):
     def load(self, split: str) -> Views:
         check_split(split, self.root)
         files = self._files()
-        rows = _read_rows(files, SPLITS.index(split) * _VIEWS_PER_SPLIT)
+        first = SPLITS.index(split) * _VIEWS_PER_SPLIT
+        rows = _read_rows(files, range(first, first + _VIEWS_PER_SPLIT), _COLUMNS)
+        far = _find_far(files) if self.far is None else self.far
         with tempfile.TemporaryDirectory() as folder:
             frames = [_unpack(row, number, Path(folder), files[0]) for number, row in rows]
 
             def lenses(width: int, height: int) -> list[Lens]:
                 return [Lens.of_angle(_CAMERA_ANGLE_X, width, height)] * len(frames)
 
-            far = self.far
-            if far is None:
-                corner = max(float(np.linalg.norm(frame.camera_to_world[:, 3])) for frame in frames)
-                far = corner + math.sqrt(3) * _HALF_SIDE
-            return load_views(frames, lenses, "opengl", (self.near, far), self.downscale, self.alpha)
+            views = load_views(frames, lenses, "opengl", (self.near, far), self.downscale, self.alpha)
+        return replace(views, frames=())  # their files are gone
 
     def _files(self) -> list[Path]:
         """The scene's files in order."""
@@ -86,8 +88,15 @@ class RefRefData(DataSource):
         return files
 
 
-def _read_rows(files: list[Path], first: int) -> list[tuple[int, dict[str, Any]]]:
-    """Number and content of the rows of a split."""
+def _find_far(files: list[Path]) -> float:
+    """The default far bound, one for all splits."""
+    rows = _read_rows(files, range(len(SPLITS) * _VIEWS_PER_SPLIT), ["transform_matrix"])
+    distance = max(float(np.linalg.norm(_pose(row, f"{files[0].name}: row {number}")[:, 3])) for number, row in rows)
+    return distance + math.sqrt(3) * _HALF_SIDE
+
+
+def _read_rows(files: list[Path], numbers: range, columns: list[str]) -> list[tuple[int, dict[str, Any]]]:
+    """Number and content of the rows of a range, as far as there are any."""
     try:
         import pyarrow
         import pyarrow.parquet
@@ -101,12 +110,12 @@ def _read_rows(files: list[Path], first: int) -> list[tuple[int, dict[str, Any]]
         try:
             table = pyarrow.parquet.ParquetFile(path)
             num_rows = table.metadata.num_rows
-            wanted = range(max(first, offset), min(first + _VIEWS_PER_SPLIT, offset + num_rows))
+            wanted = range(max(numbers.start, offset), min(numbers.stop, offset + num_rows))
             if len(wanted):
-                missing = [name for name in _COLUMNS if name not in table.schema_arrow.names]
+                missing = [name for name in columns if name not in table.schema_arrow.names]
                 if missing:
                     raise NerfroError(f"{path} has no column '{missing[0]}'; is it a file of RefRef?")
-                part = table.read(_COLUMNS).slice(wanted.start - offset, len(wanted))
+                part = table.read(columns).slice(wanted.start - offset, len(wanted))
                 rows += zip(wanted, part.to_pylist(), strict=True)
         except (pyarrow.ArrowException, OSError) as error:
             reason = str(error).split("\n")[0]
@@ -114,7 +123,7 @@ def _read_rows(files: list[Path], first: int) -> list[tuple[int, dict[str, Any]]
         offset += num_rows
     if not rows:
         raise NerfroError(
-            f"{files[0].parent} holds {offset} rows, none from {first} on; is a file of the scene missing?"
+            f"{files[0].parent} holds {offset} rows, none from {numbers.start} on; is a file of the scene missing?"
         )
     return rows
 
@@ -129,5 +138,8 @@ def _unpack(row: dict[str, Any], number: int, folder: Path, source: Path) -> Fra
             raise NerfroError(f"{where}: '{column}' holds no picture; download the file again")
         paths.append(folder / f"{column}_{number:04d}.png")
         paths[-1].write_bytes(content)
-    pose = check_pose(parse_matrix(row["transform_matrix"], ((4, 4), (3, 4)), f"{where}: transform_matrix"), where)
-    return Frame(paths[0].name, paths[0], paths[1], pose)
+    return Frame(paths[0].name, paths[0], paths[1], _pose(row, where))
+
+
+def _pose(row: dict[str, Any], where: str) -> Float[np.ndarray, "3 4"]:
+    return check_pose(parse_matrix(row["transform_matrix"], ((4, 4), (3, 4)), f"{where}: transform_matrix"), where)

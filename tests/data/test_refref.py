@@ -28,12 +28,18 @@ def png(levels: np.ndarray) -> dict:
     return {"bytes": stream.getvalue(), "path": None}
 
 
+def pose(view: int, farther: float) -> np.ndarray:
+    matrix = camera_to_world(view, "opengl").copy()
+    matrix[:3, 3] *= farther
+    return matrix
+
+
 @pytest.fixture
 def write(tmp_path, monkeypatch):
     """Write six views in two files; a split has two instead of a hundred."""
     monkeypatch.setattr(refref, "_VIEWS_PER_SPLIT", 2)
 
-    def write(scene="cube_smcvx_ampoule", parts=((0, 1, 2), (3, 4, 5)), drop=None):
+    def write(scene="cube_smcvx_ampoule", parts=((0, 1, 2), (3, 4, 5)), drop=None, far_away=None):
         folder = tmp_path / "cubebg_single-convex"
         folder.mkdir(exist_ok=True)
         for part, seeds in enumerate(parts):
@@ -42,7 +48,7 @@ def write(tmp_path, monkeypatch):
                     "image": png(picture(i)),
                     "depth": png(picture(i)[..., 0]),
                     "mask": png(np.uint8(255 * (picture(i)[..., 0] > 127))),
-                    "transform_matrix": camera_to_world(i, "opengl").tolist(),
+                    "transform_matrix": pose(i, 2 if i == far_away else 1).tolist(),
                 }
                 for i in seeds
             ]
@@ -61,6 +67,14 @@ def test_splits_are_the_rows_in_turn_across_files(write):
         check_views(views, seeds, **lens)
         assert views.cameras.far == pytest.approx(3 + math.sqrt(3) * 7.3)
     assert views.names == ["image_0004.png", "image_0005.png"]
+
+
+def test_bounds_are_those_of_all_splits_and_no_file_is_named_that_is_gone(write):
+    source = RefRefData(str(write(far_away=4)))
+    for split in ("train", "val", "test"):
+        views = source.load(split)
+        assert views.cameras.far == pytest.approx(6 + math.sqrt(3) * 7.3)
+        assert not views.frames
 
 
 def test_one_of_several_scenes(write):
