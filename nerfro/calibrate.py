@@ -26,7 +26,7 @@ from nerfro.data.frames import list_images
 from nerfro.data.image_files import read_mask, read_rgb
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
-from nerfro.evaluation.files import write_atomically
+from nerfro.evaluation.files import refuse_existing, write_atomically
 
 _TARGETS, _BOARDS, _LENSES = (
     ("apriltag", "charuco", "colmap"),
@@ -97,7 +97,8 @@ def main(config: DictConfig) -> None:
     images, size = _list_photographs(Path(config.images).expanduser())
     # Where the loader of the data set will look for them.
     masks = [find_mask(out.resolve(), image.resolve()) for image in images]
-    _claim(out, [*(f"transforms_{split}.json" for split in _SPLITS), _REPORT, _PLOT], config.overwrite)
+    names = [*(f"transforms_{split}.json" for split in _SPLITS), _REPORT, _PLOT]
+    refuse_existing([out / name for name in names], config.overwrite)
     quads: list[Float[np.ndarray, "4 3"]] = []
     if target is None:
         calibration, points = import_model(_find_model(config, images, masks, out, given), images, size)
@@ -171,7 +172,7 @@ def make_target(config: DictConfig) -> Target:
 def _write_board(config: DictConfig, target: Target | None, out: Path) -> None:
     if target is None:
         raise NerfroError("target=colmap has no board to write; choose target=apriltag or target=charuco")
-    _claim(out, ["board.pdf"], config.overwrite)
+    refuse_existing([out / "board.pdf"], config.overwrite)
     files = print_sheets(target.sheets(), out)
     print(f"wrote {files[0]} ({len(files) - 1} pages, in true size if the unit is a metre) and the pages as PNG")
 
@@ -195,12 +196,6 @@ def _list_photographs(folder: Path) -> tuple[list[Path], tuple[int, int]]:
             "of one lens and size: turn or remove it"
         )
     return images, size
-
-
-def _claim(folder: Path, names: list[str], overwrite: bool) -> None:
-    taken = [folder / name for name in names if (folder / name).exists()]
-    if taken and not overwrite:
-        raise NerfroError(f"{taken[0]} exists; set overwrite=true to replace it, or choose another folder with out=")
 
 
 def _grey(image: Path) -> UInt8[np.ndarray, "H W"]:
@@ -227,7 +222,7 @@ def _find_model(
         if any((candidate / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
             print(f"taking the model {candidate}")
             return candidate
-    _claim(out, ["sparse"], config.overwrite)
+    refuse_existing([out / "sparse"], config.overwrite)
     num_masks = sum(mask is not None for mask in masks)
     print(f"no COLMAP model: making one from {len(images)} images, {num_masks} of them with masks of the object")
     return reconstruct(images, masks, out / "sparse", config.lens, given)

@@ -19,6 +19,7 @@ from nerfro.config import build_model
 from nerfro.errors import NerfroError
 from nerfro.evaluation.error_maps import error_maps
 from nerfro.evaluation.error_sheets import error_sheet
+from nerfro.evaluation.files import refuse_existing
 from nerfro.evaluation.folders import match_folders
 from nerfro.evaluation.images import load_png, save_png
 from nerfro.evaluation.lpips import LpipsNetwork, find_lpips_networks
@@ -153,8 +154,7 @@ def _require_one_task(config: DictConfig) -> None:
 
 def _free_folder(config: DictConfig, default: Path) -> Path:
     folder = default if config.out is None else Path(config.out).expanduser()
-    if (folder / "metrics.json").exists() and not config.overwrite:
-        raise NerfroError(f"{folder} holds an evaluation already; give another out=... or overwrite=true")
+    refuse_existing([folder / "metrics.json"], config.overwrite)
     return folder
 
 

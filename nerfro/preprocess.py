@@ -20,7 +20,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from nerfro.cli import entry_point
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError, first_of
-from nerfro.evaluation.files import write_atomically
+from nerfro.evaluation.files import refuse_existing, write_atomically
 from nerfro.evaluation.images import save_png
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.pose_conventions import GOOD_OVERLAP, overlap, require_consistent_poses
@@ -131,9 +131,7 @@ def _claim(config: DictConfig) -> Path:
         raise NerfroError(f"data.root={config.data.root} ships with nerfro and is not written to; add out=FOLDER")
     folder = resolve_path(config.data.root) if config.out is None else Path(config.out).expanduser()
     names = [_SHEET, _REPORT] if config.mesh is not None else [_MESH, _SHEET, _REPORT]
-    taken = [str(folder / name) for name in names if (folder / name).exists()]
-    if taken and not config.overwrite:
-        raise NerfroError(f"{taken[0]} exists; set overwrite=true to replace it, or choose another folder with out=")
+    refuse_existing([folder / name for name in names], config.overwrite)
     return folder
 
 

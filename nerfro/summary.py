@@ -11,7 +11,7 @@ from omegaconf import DictConfig, ListConfig
 
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
-from nerfro.evaluation.files import write_atomically
+from nerfro.evaluation.files import refuse_existing, write_atomically
 from nerfro.evaluation.results import FULL, OBJECT_REGIONS
 from nerfro.evaluation.tables import to_rich, write_table
 from nerfro.report.comparison import compare, find_metrics, to_table
@@ -72,7 +72,8 @@ def main(config: DictConfig) -> None:
     out = None if folder is None else Path(folder).expanduser()
     if out is not None:
         names = [name + suffix for name in tables for suffix in (".csv", ".md", ".tex", ".html")]
-        _refuse_overwriting(out, [*names, "report.html"] if config.report else names, config.overwrite)
+        written = [*names, "report.html"] if config.report else names
+        refuse_existing([out / name for name in written], config.overwrite)
     for table in tables.values():
         rich.print(to_rich(table))
     for line in unfinished:
@@ -89,12 +90,6 @@ def main(config: DictConfig) -> None:
         )
         write_atomically(out / "report.html", page)
         print(f"report: {out / 'report.html'}, {len(page) / 2**20:.1f} MiB")
-
-
-def _refuse_overwriting(folder: Path, names: list[str], overwrite: bool) -> None:
-    present = [name for name in names if (folder / name).exists()]
-    if present and not overwrite:
-        raise NerfroError(f"{folder / present[0]} exists; give another out=... or overwrite=true")
 
 
 if __name__ == "__main__":

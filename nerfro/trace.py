@@ -16,6 +16,7 @@ from torch import Tensor
 
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
+from nerfro.evaluation.files import refuse_existing
 from nerfro.geometry.cache import load_arrays, save_arrays
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
@@ -48,7 +49,7 @@ class TraceConfig:
         near: arc length at which paths begin.
         far: arc length at which paths end; by default they end where they leave the medium's box.
         plot: whether to draw some of the paths and the object beside `out`, as .png.
-        overwrite: whether `out` may be replaced.
+        overwrite: whether `out`, and the drawing, may be replaced.
     """
 
     medium: Any = MISSING
@@ -58,7 +59,7 @@ class TraceConfig:
     near: float = 0.0
     far: Optional[float] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     plot: bool = False
-    overwrite: bool = True
+    overwrite: bool = False
 
 
 @entry_point("trace", TraceConfig)
@@ -67,8 +68,7 @@ def main(config: DictConfig) -> None:
     out = Path(config.out).expanduser()
     if out.suffix != ".npz":
         raise NerfroError(f"out={out} must end in .npz, for that is what is written")
-    if out.exists() and not config.overwrite:
-        raise NerfroError(f"{out} exists; choose another out=, or set overwrite=true")
+    refuse_existing([out, out.with_suffix(".png")] if config.plot else [out], config.overwrite)
     origins, directions = _read_rays(Path(config.rays).expanduser())
     sampler = build(config.sampler.path)
     medium = build(config.medium)

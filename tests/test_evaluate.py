@@ -101,7 +101,7 @@ def test_scores_stay_beside_the_predictions_and_are_not_replaced_unasked(
     assert (tmp_path / "predictions" / "scores" / "metrics.json").is_file()
     code, _, err = evaluate_here(*folders)
     assert code == 1
-    assert "holds an evaluation already; give another out=... or overwrite=true" in err
+    assert "metrics.json exists; give another out=... or overwrite=true" in err
     assert evaluate_here(*folders, "overwrite=true")[0] == 0
 
 

@@ -123,7 +123,7 @@ def test_bounds_that_the_loader_finds_are_left_to_it(preprocess: Callable[..., s
 
 def test_nothing_is_overwritten_unasked(preprocess: Callable[..., str], capture: Path) -> None:
     (capture / "mesh.ply").write_text("mine")
-    assert "mesh.ply exists; set overwrite=true" in preprocess()
+    assert "mesh.ply exists; give another out=... or overwrite=true" in preprocess()
     assert (capture / "mesh.ply").read_text() == "mine"
     assert "train on it" in preprocess("overwrite=true", "smoothing=0")
     assert load_mesh(capture / "mesh.ply").is_closed

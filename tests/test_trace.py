@@ -126,8 +126,11 @@ def test_bad_options_are_one_clear_line(
     assert message in trace(*options)
 
 
-def test_an_existing_result_may_be_protected(trace: Callable[..., str], tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["out.npz", "out.png"])
+def test_existing_results_are_replaced_on_request_alone(trace: Callable[..., str], tmp_path: Path, name: str) -> None:
     _write_rays(tmp_path / "rays.npz")
-    (tmp_path / "out.npz").write_text("precious")
-    assert "overwrite=true" in trace("overwrite=false")
-    assert (tmp_path / "out.npz").read_text() == "precious"
+    (tmp_path / name).write_text("precious")
+    assert f"{name} exists; give another out=... or overwrite=true" in trace("plot=true")
+    assert (tmp_path / name).read_text() == "precious"
+    assert "40 rays traced" in trace("plot=true", "overwrite=true")
+    assert (tmp_path / name).read_bytes() != b"precious"

@@ -185,7 +185,7 @@ def test_evaluation_never_replaces_an_earlier_one_unasked(
     assert (run / "evaluate_val" / "images" / "val_001.png").exists()
     code, errors = evaluate_here(checkpoint, "split=val")
     assert code == 1
-    assert "holds an evaluation already; give another out=... or overwrite=true" in errors
+    assert "metrics.json exists; give another out=... or overwrite=true" in errors
     assert evaluate_here(checkpoint, "split=val", "overwrite=true")[0] == 0
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 from nerfro.errors import NerfroError
@@ -44,6 +45,21 @@ def write_atomically(path: Path | str, content: bytes | str) -> None:
             f"cannot write {path}: {error.strerror or error}; what was there before is unchanged; "
             "free some space or choose another folder"
         ) from error
+
+
+def refuse_existing(files: Iterable[Path], overwrite: bool) -> None:
+    """Check that nothing would be replaced that should stay.
+
+    Args:
+        files: that are going to be written, or folders.
+        overwrite: whether they may be replaced.
+
+    Raises:
+        NerfroError: one exists, and `overwrite` is not set.
+    """
+    taken = [path for path in files if path.exists()]
+    if taken and not overwrite:
+        raise NerfroError(f"{taken[0]} exists; give another out=... or overwrite=true")
 
 
 def _umask() -> int:

@@ -155,7 +155,7 @@ def test_boards_are_printed_in_their_size(tmp_path: Path, command: Callable[...,
     assert sorted(set(sighting.features)) == list(range(72, 81))
     sides = np.linalg.norm(sighting.pixels[0::4] - sighting.pixels[1::4], axis=1) / per_metre
     np.testing.assert_allclose(sides, 0.03, rtol=0.005)
-    assert "exists; set overwrite=true" in command("calibrate", "write_board=true", f"out={tmp_path}")
+    assert "board.pdf exists; give another out=" in command("calibrate", "write_board=true", f"out={tmp_path}")
 
 
 def test_mistakes_are_told_in_one_line(tmp_path: Path, command: Callable[..., str]) -> None:
@@ -173,7 +173,7 @@ def test_mistakes_are_told_in_one_line(tmp_path: Path, command: Callable[..., st
     assert "no lens" in command("calibrate", *common, "intrinsics=[700,700,32]")
     assert "no tag 587" in command("calibrate", *common, "write_board=true", "board=grid", "columns=30", "rows=30")
     (tmp_path / "cameras.png").write_bytes(b"mine")
-    assert "cameras.png exists; set overwrite=true" in command("calibrate", *common)
+    assert "cameras.png exists; give another out=... or overwrite=true" in command("calibrate", *common)
     Image.fromarray(np.full((64, 48), 90, np.uint8)).save(photos / "b.png")
     assert "b.png has 48x64 pixels but most have 64x48" in command("calibrate", *common)
     Image.fromarray(np.full((48, 64), 90, np.uint8)).save(photos / "a.jpg")
