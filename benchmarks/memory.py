@@ -12,13 +12,11 @@ import os
 import subprocess
 import sys
 import tempfile
-from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
 import torch
 
-from nerfro.data.cameras import Cameras
 from nerfro.evaluate import restore
 from nerfro.evaluation.render_view import Supersampling, render_view
 from nerfro.registry import build, discover
@@ -72,14 +70,7 @@ def render(checkpoint: Path, chunk_size: int, side: int) -> None:
     model = restore(trained, config)
     if chunk_size > 0:
         # The preset's own supersampling, which the run was told to leave out.
-        render_view(model, enlarged(cameras, side), 0, Supersampling(3, config.evaluation.divergence))
-
-
-def enlarged(cameras: Cameras, side: int) -> Cameras:
-    """The same cameras with another number of pixels."""
-    x, y = side / cameras.width, side / cameras.height
-    pixels = {"fx": cameras.fx * x, "cx": cameras.cx * x, "fy": cameras.fy * y, "cy": cameras.cy * y}
-    return replace(cameras, width=side, height=side, **pixels)
+        render_view(model, cameras.resized(side, side), 0, Supersampling(3, config.evaluation.divergence))
 
 
 if __name__ == "__main__":

@@ -20,7 +20,6 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
@@ -286,10 +285,7 @@ def report_view(path: Path, side: int = 400, turns: int = 5) -> None:
     """Seconds to render a view of the test camera at 400x400 with one ray a pixel, and supersampled as trained."""
     checkpoint, config = load_checkpoint(path)
     model = restore(checkpoint, config)
-    cameras = build(config.data).load("test").cameras
-    scale = side / cameras.width
-    intrinsics = {name: getattr(cameras, name) * scale for name in ("fx", "fy", "cx", "cy")}
-    cameras = replace(cameras, **intrinsics, width=side, height=side)
+    cameras = build(config.data).load("test").cameras.resized(side, side)
     print(f"| 400x400 view of `{config.name}` | s |\n|---|---|")
     supersampled = Supersampling(config.evaluation.supersample, config.evaluation.divergence)
     for name, sampling in (("one ray a pixel", Supersampling(1, 0.0)), ("supersampled", supersampled)):

@@ -91,6 +91,11 @@ class Cameras:
             self, cx=self.cx - window.left, cy=self.cy - window.top, width=window.width, height=window.height
         )
 
+    def resized(self, width: int, height: int) -> Cameras:
+        """The cameras of the same images in another resolution, in pixels."""
+        x, y = width / self.width, height / self.height
+        return replace(self, width=width, height=height, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y)
+
     def rays(
         self,
         view: Int[Tensor, "R"],

@@ -121,6 +121,15 @@ def test_cropped_cameras_see_the_same_rays_as_the_window_of_the_image(cameras):
     assert torch.equal(window.cut(images), images[:, 3:9, 5:14])
 
 
+def test_resized_cameras_see_a_point_at_the_same_share_of_the_image(cameras):
+    resized = cameras.resized(60, 7)
+    assert (resized.width, resized.height) == (60, 7)
+    points = torch.randn(8, 3)
+    (before, depth), (after, same_depth) = cameras.project(points), resized.project(points)
+    torch.testing.assert_close(after / torch.tensor([60, 7]), before / torch.tensor([20, 14]))
+    assert torch.equal(depth, same_depth)
+
+
 @pytest.mark.parametrize(
     ("size", "fraction", "window"),
     [((960, 1280), 0.5, (240, 320, 480, 640)), ((15, 11), 0.6, (3, 2, 8, 6)), ((15, 11), 1.0, (0, 0, 15, 11))],
