@@ -148,7 +148,7 @@ def load_all(source: DataSource) -> tuple[Cameras, list[UInt8[np.ndarray, "H W 3
         fresh = [i for i, frame in enumerate(views.frames) if frame.image not in known]
         if not fresh:
             continue
-        parts.append(_chosen(views.cameras, fresh))
+        parts.append(views.cameras.select(fresh))
         images += [np.uint8(np.rint(255 * views.images[i].numpy())) for i in fresh]
         frames += [views.frames[i] for i in fresh]
         known |= {views.frames[i].image for i in fresh}
@@ -158,16 +158,11 @@ def load_all(source: DataSource) -> tuple[Cameras, list[UInt8[np.ndarray, "H W 3
     return _joined(parts), images, frames
 
 
-def _chosen(cameras: Cameras, views: list[int]) -> Cameras:
-    lens = cameras.distortion if cameras.distortion is not None else torch.zeros(len(cameras), 9)
-    tensors = {name: getattr(cameras, name)[views] for name in ("camera_to_world", "fx", "fy", "cx", "cy")}
-    return replace(cameras, **tensors, distortion=lens[views])
-
-
 def _joined(parts: Sequence[Cameras]) -> Cameras:
-    names = ("camera_to_world", "fx", "fy", "cx", "cy", "distortion")
+    names = ("camera_to_world", "fx", "fy", "cx", "cy")
     tensors: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-    return replace(parts[0], **tensors)
+    lenses = [torch.zeros(len(part), 9) if part.distortion is None else part.distortion for part in parts]
+    return replace(parts[0], **tensors, distortion=torch.cat(lenses))
 
 
 def _find_frame(name: str, frames: list[Frame]) -> int:

@@ -85,6 +85,11 @@ class Cameras:
         distortion = None if self.distortion is None else self.distortion.to(device)
         return replace(self, **tensors, distortion=distortion)
 
+    def select(self, views: list[int]) -> Cameras:
+        """Some of the cameras, in the order that is asked for."""
+        tensors = {name: getattr(self, name)[views] for name in ("camera_to_world", "fx", "fy", "cx", "cy")}
+        return replace(self, **tensors, distortion=None if self.distortion is None else self.distortion[views])
+
     def crop(self, window: Window) -> Cameras:
         """The cameras of a window of each image: its pixel (0, 0) is pixel (top, left) of these cameras."""
         return replace(

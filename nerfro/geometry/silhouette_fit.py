@@ -14,7 +14,6 @@ from scipy.sparse.linalg import splu
 
 from nerfro.data.cameras import Cameras
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.geometry.silhouettes import single_view
 from nerfro.geometry.visual_hull import Silhouettes
 
 _ITERATIONS = 10
@@ -132,7 +131,7 @@ def _find_rims(
         places = torch.from_numpy(points).float()
         inside, width = (values.double().numpy() for values in silhouettes.depth_inside(view, places)[:2])
         near = np.flatnonzero(np.abs(inside) < _GATE)
-        cell = _look_up(outline, single_view(cameras, view), places[near])
+        cell = _look_up(outline, cameras.select([view]), places[near])
         order = np.lexsort((inside[near], cell))
         outermost = near[order[np.diff(cell[order], prepend=-1) != 0]]
         misfit = inside[outermost]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -47,20 +45,6 @@ def is_cut_by_frame(masks: Float[Tensor, "V H W"]) -> Bool[Tensor, "V"]:
     """Which masks touch the frame of their image, so that the object may go on beyond it."""
     inside = masks > 0.5
     return inside[:, [0, -1]].flatten(1).any(1) | inside[:, :, [0, -1]].flatten(1).any(1)
-
-
-def single_view(cameras: Cameras, view: int) -> Cameras:
-    """One camera of several."""
-    one = slice(view, view + 1)
-    return replace(
-        cameras,
-        camera_to_world=cameras.camera_to_world[one],
-        fx=cameras.fx[one],
-        fy=cameras.fy[one],
-        cx=cameras.cx[one],
-        cy=cameras.cy[one],
-        distortion=None if cameras.distortion is None else cameras.distortion[one],
-    )
 
 
 def pixel_stride(cameras: Cameras, max_pixels: int) -> int:

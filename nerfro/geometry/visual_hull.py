@@ -16,7 +16,7 @@ from torch import Tensor
 from nerfro.data.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh, merge_vertices
-from nerfro.geometry.silhouettes import is_cut_by_frame, outline_distance, single_view
+from nerfro.geometry.silhouettes import is_cut_by_frame, outline_distance
 
 # Each level halves the voxels and looks only at those near the surface of the level before.
 _LEVELS = 2
@@ -67,7 +67,7 @@ class Silhouettes:
             camera, or outside the frame where that cuts the object. The width of a pixel at the point, world units.
             How far outside the frame the point is seen, pixels.
         """
-        cameras = single_view(self.cameras, view)
+        cameras = self.cameras.select([view])
         pixels, depth = (values[0] for values in cameras.project(points))
         size = torch.tensor([cameras.width, cameras.height])
         outside = torch.linalg.vector_norm(pixels - pixels.clamp(torch.zeros(2), size), dim=-1)

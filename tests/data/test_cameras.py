@@ -121,6 +121,21 @@ def test_cropped_cameras_see_the_same_rays_as_the_window_of_the_image(cameras):
     assert torch.equal(window.cut(images), images[:, 3:9, 5:14])
 
 
+@pytest.mark.parametrize("distorted", [False, True])
+def test_selected_cameras_are_those_of_the_views_in_order(cameras, distorted):
+    scales = torch.arange(1.0, 6.0)
+    lens = torch.zeros(5, 9)
+    lens[:, 0] = 0.01 * scales
+    cameras = replace(cameras, fx=15 * scales, cy=7 + scales, distortion=lens if distorted else None)
+    for views in ([3], [4, 0, 2]):
+        selected = cameras.select(views)
+        assert len(selected) == len(views)
+        for place, view in enumerate(views):
+            ours, theirs = selected.image_rays(place), cameras.image_rays(view)
+            assert torch.equal(ours.origins, theirs.origins)
+            assert torch.equal(ours.directions, theirs.directions)
+
+
 def test_resized_cameras_see_a_point_at_the_same_share_of_the_image(cameras):
     resized = cameras.resized(60, 7)
     assert (resized.width, resized.height) == (60, 7)
