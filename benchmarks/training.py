@@ -283,6 +283,7 @@ def report_budget(budget: str) -> None:
 
 def report_view(path: Path, side: int = 400, turns: int = 5) -> None:
     """Seconds to render a view of the test camera at 400x400 with one ray a pixel, and supersampled as trained."""
+    discover()
     checkpoint, config = load_checkpoint(path)
     model = restore(checkpoint, config)
     cameras = build(config.data).load("test").cameras.resized(side, side)

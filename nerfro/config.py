@@ -47,6 +47,8 @@ class BatchesConfig:
         precrop_steps: number of first steps that see only the central window of the images.
         precrop_fraction: side of that window.
         cache_paths: trace all training rays once and keep their paths, where they do not change (no jitter).
+        max_divergence: leave out pixels whose exit direction differs from a neighbour's by this many pixels or more,
+            where paths are kept; none trains on all of them.
     """
 
     size: int = 1024
@@ -55,6 +57,7 @@ class BatchesConfig:
     precrop_steps: int = 0
     precrop_fraction: float = 0.5
     cache_paths: bool = True
+    max_divergence: Optional[float] = None  # noqa: UP045
 
 
 @dataclass

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 import warnings
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from nerfro.callbacks import ConfigInCheckpoint, StopOnSignal, Throughput, TrainingProgress
 from nerfro.cli import EXIT_INTERRUPTED, entry_point
 from nerfro.config import TrainConfig, build_model
+from nerfro.data.base import Views
 from nerfro.data.module import RayDataModule
 from nerfro.data.ray_batches import RayBatches
 from nerfro.distributed import leave
@@ -39,6 +41,7 @@ from nerfro.run_folder import (
     record,
     require_same_configuration,
 )
+from nerfro.samplers.divergence import steady_pixels
 from nerfro.samplers.path_cache import PathCache
 from nerfro.training_log import TrainingLog
 
@@ -60,15 +63,7 @@ def main(config: DictConfig) -> None:
     test = source.load(config.evaluation.split)
     validation = source.load("val") if config.evaluation.every > 0 and "val" in source.splits else None
     wanted, training = config.batches, source.load("train")
-    batches = RayBatches(
-        training,
-        wanted.size,
-        wanted.batching,
-        config.seed,
-        wanted.precrop_steps,
-        wanted.precrop_fraction,
-        wanted.jitter,
-    )
+    batches = _batches(config, training)
     supersampling = Supersampling(config.evaluation.supersample, config.evaluation.divergence)
     lpips = find_lpips_networks(config.evaluation.lpips_backbone, config.evaluation.lpips_vgg_backbone)
     model = build_model(config)
@@ -85,6 +80,9 @@ def main(config: DictConfig) -> None:
         print(f"nerfro: {config.name} on {config.data.root} -> {folder}", flush=True)
     if wanted.cache_paths and not wanted.jitter and model.path_sampler.few_vertices:
         model.path_cache = PathCache.build(model.path_sampler, model.medium, training.cameras)
+        if wanted.max_divergence is not None:
+            steady = only_steady(training, model.path_cache, wanted.max_divergence)
+            batches = _batches(config, steady).share(trainer.global_rank, trainer.world_size)
     if config.compile is not None:
         compile_networks(model, config.compile)
 
@@ -112,6 +110,25 @@ def main(config: DictConfig) -> None:
     print(f"  {folder}/images/  the pictures; metrics.json, .csv, .md and .tex beside them")
     print(f"  {folder}/checkpoints/last.ckpt  evaluate it with python -m nerfro.evaluate checkpoint=...")
     print("  python -m nerfro.dashboard  losses and validation pictures")
+
+
+def _batches(config: DictConfig, training: Views) -> RayBatches:
+    wanted = config.batches
+    return RayBatches(
+        training,
+        wanted.size,
+        wanted.batching,
+        config.seed,
+        wanted.precrop_steps,
+        wanted.precrop_fraction,
+        wanted.jitter,
+    )
+
+
+def only_steady(views: Views, paths: PathCache, max_divergence: float) -> Views:
+    """The same views, in which only those pixels are usable that one ray stands for (see `steady_pixels`)."""
+    steady = steady_pixels(paths, views.cameras, max_divergence)
+    return replace(views, usable=steady if views.usable is None else steady & views.usable)
 
 
 def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.Trainer:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -13,6 +12,7 @@ from nerfro.colour import to_linear, to_srgb
 from nerfro.data.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.models.base import NerfModel, RenderedRays
+from nerfro.samplers.divergence import exit_divergence
 
 
 @dataclass(frozen=True)
@@ -60,14 +60,6 @@ def render_view(model: NerfModel, cameras: Cameras, view: int, supersampling: Su
     rgb = rendered.rgb.clone()
     rgb[chosen] = to_srgb(total / supersampling.side**2)
     return RenderedRays(rgb, rendered.depth, rendered.opacity, rendered.exit_directions)
-
-
-def exit_divergence(directions: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
-    """Largest angle in radians between a pixel's exit direction and those of its four neighbours."""
-    padded = F.pad(directions.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="replicate")[0].permute(1, 2, 0)
-    neighbours = (padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:])
-    chords = torch.stack([(directions - other).norm(dim=-1) for other in neighbours]).amax(0)
-    return 2 * torch.asin((0.5 * chords).clamp(max=1))
 
 
 def grid_offsets(side: int) -> Float[Tensor, "K 2"]:
