@@ -18,6 +18,7 @@ from nerfro.data.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.geometry.cache import cache_dir, content_hash, load_arrays, save_arrays
 from nerfro.geometry.mesh import TriangleMesh
+from nerfro.kernels.threads import use_threads
 from nerfro.media.base import Medium
 from nerfro.samplers.base import PathSampler
 from nerfro.types import Path, Rays
@@ -91,20 +92,14 @@ class PathCache:
         Raises:
             NerfroError: a stored path does not begin at its ray, as when rays are jittered within their pixels.
         """
-        # In NumPy: PyTorch would start its threads for work of a tenth of a millisecond.
-        rows = index.cpu().numpy()
-        starts, vertices = self.starts.numpy(), self.vertices.numpy()
-        first, counts = starts[rows], starts[rows + 1] - starts[rows]
-        bent = np.nonzero(counts)[0]
-        width = max(int(counts.max(initial=2)), 2)
-        origins, directions = rays.origins.cpu().numpy(), rays.directions.cpu().numpy()
-        path = np.empty((len(rows), width, _COLUMNS), np.float32)
-        path[:, 0, 6], path[:, 1:, 6] = rays.near.cpu().numpy(), rays.far.cpu().numpy()[:, None]
-        path[..., 3:6] = directions[:, None]
-        path[..., :3] = origins[:, None] + path[..., 6:] * directions[:, None]
-        slots = first[bent, None] + np.minimum(np.arange(width), counts[bent, None] - 1)
-        path[bent] = vertices[slots]
-        if (np.abs(path[bent, 0, 3:6] - directions[bent]) > _SAME_DIRECTION).any():
+        from nerfro.kernels.stored_paths import gather_paths  # compiled code, so only where it is used
+
+        use_threads()
+        rows, starts = index.cpu().numpy(), self.starts.numpy()
+        counts = starts[rows + 1] - starts[rows]
+        path = np.empty((len(rows), max(int(counts.max(initial=2)), 2), _COLUMNS), np.float32)
+        own = [t.cpu().float().contiguous().numpy() for t in (rays.origins, rays.directions, rays.near, rays.far)]
+        if gather_paths(starts, self.vertices.numpy(), rows, *own, _SAME_DIRECTION, path) > 0:
             raise NerfroError("cached paths are of other rays; they hold for pixel centres only, so switch jitter off")
         all_vertices = torch.from_numpy(path).to(rays.origins.device)
         positions, along, s = all_vertices[..., :3], all_vertices[..., 3:6], all_vertices[..., 6]
