@@ -69,7 +69,14 @@ def test_server_shows_the_runs_and_leaves_nothing_behind(outputs: Path, tmp_path
     command = [sys.executable, "-m", "nerfro.dashboard", f"outputs={outputs}", "port=0", "open=false"]
     links = tmp_path / "tmp"
     links.mkdir()
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "TMPDIR": str(links)})
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "TMPDIR": str(links)},
+        # A shell's background jobs, the tests among them, ignore what is sent below.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     try:
         assert process.stdout is not None
         line = process.stdout.readline()

@@ -152,7 +152,7 @@ def test_page_needs_nothing_from_outside_and_its_parts_find_each_other(runs: Pat
     assert "good &lt;b&gt;" in html
     assert "good <b>" not in html
     assert "x has not been evaluated" in html
-    assert "python -m" in html
+    assert "<dt>command</dt>" in html
     assert "max_time: 00:00:00:20" in html
 
 

@@ -122,7 +122,9 @@ class NerfModel(LightningModule, ABC):
             return None  # one process looks, the others wait
         views = self.trainer.datamodule.validation  # type: ignore[attr-defined]
         target = views.images[view].to(self.device)
-        rendered = self.render(views.cameras.to(self.device).image_rays(view))
+        with torch.autocast(self.device.type, enabled=False):  # directions in half precision would miss their pixels
+            rays = views.cameras.to(self.device).image_rays(view)
+        rendered = self.render(rays)
         prediction = rendered.rgb.reshape(target.shape)
         psnr = -10 * torch.log10((prediction - target).square().mean())
         self.log("val/psnr", psnr, prog_bar=True, batch_size=1, rank_zero_only=True)
