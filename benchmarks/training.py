@@ -3,6 +3,7 @@
     python benchmarks/training.py step                        # a step of the paper's recipe, plain and fast
     python benchmarks/training.py curve                       # their losses over 200 steps
     python benchmarks/training.py profile refractive          # where a step's milliseconds go
+    python benchmarks/training.py paths                       # what fetching cached paths takes of a step
     python benchmarks/training.py budget 00:00:05:00          # default preset and paper's recipe, given the same time
     python benchmarks/training.py view RUN/checkpoints/last.ckpt   # rendering a 400x400 view
 
@@ -63,6 +64,7 @@ def main() -> None:
     profiled = parts.add_parser("profile")
     profiled.add_argument("experiment")
     profiled.add_argument("--steps", type=int, default=20)
+    parts.add_parser("paths")
     budget = parts.add_parser("budget")
     budget.add_argument("time")
     view = parts.add_parser("view")
@@ -76,6 +78,7 @@ def main() -> None:
         "step": lambda: report_step(arguments.turns),
         "curve": lambda: report_curve(arguments.steps, arguments.rays),
         "profile": lambda: report_profile(arguments.experiment, arguments.steps),
+        "paths": report_paths,
         "budget": lambda: report_budget(arguments.time),
         "view": lambda: report_view(arguments.checkpoint),
     }
@@ -229,6 +232,26 @@ def report_profile(experiment: str, num_steps: int) -> None:
     for dtype in (torch.float32, torch.bfloat16):
         rate = matrix_rate(dtype) / 1e12
         print(f"A product of 65536x256 and 256x256 in {str(dtype)[6:]} runs at {rate:.2f} TFLOP/s.")
+
+
+def report_paths(num_steps: int = 200) -> None:
+    """Share of a step of the default preset that fetching the cached paths takes, without a profiler's own time."""
+    training = Training("+experiment=refractive")
+    training.run(5)
+    cached = training.model.path_cache
+    assert cached is not None
+    seconds: list[float] = []
+
+    def fetch(*batch: object) -> object:
+        start = time.perf_counter()
+        path = cached(*batch)  # type: ignore[arg-type]
+        seconds.append(time.perf_counter() - start)
+        return path
+
+    training.model.path_cache = fetch  # type: ignore[assignment]
+    steps = training.run(num_steps).seconds[1:]
+    share = np.median(seconds) / np.median(steps)
+    print(f"cached paths {1e3 * np.median(seconds):.2f} ms of {1e3 * np.median(steps):.1f} ms a step: {share:.2%}")
 
 
 def label(stack: ExitStack, owner: object, method: str, name: str) -> None:

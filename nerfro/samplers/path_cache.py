@@ -98,8 +98,10 @@ class PathCache:
         rows, starts = index.cpu().numpy(), self.starts.numpy()
         counts = starts[rows + 1] - starts[rows]
         path = np.empty((len(rows), max(int(counts.max(initial=2)), 2), _COLUMNS), np.float32)
-        own = [t.cpu().float().contiguous().numpy() for t in (rays.origins, rays.directions, rays.near, rays.far)]
-        if gather_paths(starts, self.vertices.numpy(), rows, *own, _SAME_DIRECTION, path) > 0:
+        own = (rays.origins, rays.directions, rays.near, rays.far)
+        origins, directions, near, far = (tensor.cpu().float().contiguous().numpy() for tensor in own)
+        vertices = self.vertices.numpy()
+        if gather_paths(starts, vertices, rows, origins, directions, near, far, _SAME_DIRECTION, path) > 0:
             raise NerfroError("cached paths are of other rays; they hold for pixel centres only, so switch jitter off")
         all_vertices = torch.from_numpy(path).to(rays.origins.device)
         positions, along, s = all_vertices[..., :3], all_vertices[..., 3:6], all_vertices[..., 6]
