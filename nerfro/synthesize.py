@@ -142,7 +142,7 @@ def _photograph(config: DictConfig, scene: Scene, folder: Path, mitsuba: ModuleT
     if not (folder / photographs.META).is_file():
         photographs.write_meta(folder, settings, scene, _versions(mitsuba))
     planned = photographs.photographs(settings, importlib.import_module(f"nerfro.scenes.{config.scene}").AIM)
-    waiting = list(photographs.missing(folder, planned))
+    waiting = list(dataset.missing(folder, planned))
     print(f"{config.scene}: {len(planned)} photographs, {len(planned) - len(waiting)} of them already in {folder}")
     if waiting:
         lit = bake(scene, _BAKING_SPP, config.variant)

@@ -25,8 +25,9 @@ from nerfro.capture.boards import tag_detector, twelve_faces
 from nerfro.data.opencv import OpenCVData
 from nerfro.geometry.mesh import load_mesh
 from nerfro.paths import CONF_DIR
+from nerfro.scenes.dataset import missing
 from nerfro.scenes.dolphin_capture import AIM, board_to_world
-from nerfro.scenes.photographs import Settings, missing, photographs
+from nerfro.scenes.photographs import Settings, photographs
 from nerfro.synthesize import SynthesizeConfig, synthesize
 
 

@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from PIL import Image
@@ -141,11 +141,24 @@ def prepare(folder: Path, settings: Any, overwrite: bool, meta: str = META, file
     folder.mkdir(parents=True, exist_ok=True)
 
 
-def missing(folder: Path, planned: list[View]) -> Iterator[View]:
-    """Yield the views whose picture or mask is not on disk yet."""
-    for view in planned:
-        if not ((folder / view.image_path).is_file() and (folder / view.mask_path).is_file()):
-            yield view
+class Planned(Protocol):
+    """A picture that is to be rendered, and where it and its mask go within the folder."""
+
+    @property
+    def image_path(self) -> str: ...
+
+    @property
+    def mask_path(self) -> str: ...
+
+
+AnyPlanned = TypeVar("AnyPlanned", bound=Planned)
+
+
+def missing(folder: Path, planned: list[AnyPlanned]) -> Iterator[AnyPlanned]:
+    """Yield those whose picture or mask is not on disk yet."""
+    for picture in planned:
+        if not ((folder / picture.image_path).is_file() and (folder / picture.mask_path).is_file()):
+            yield picture
 
 
 def write_view(folder: Path, view: View, radiance: np.ndarray, silhouette: np.ndarray) -> None:

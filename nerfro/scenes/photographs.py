@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -88,13 +87,6 @@ def photographs(settings: Settings, target: np.ndarray) -> list[Photograph]:
     """Return all photographs of a capture around `target`, in the order in which they are taken."""
     poses = hand_held(settings.photographs, settings.seed, target, DISTANCE, ELEVATIONS, LAPS)
     return [Photograph(index, pose, settings.spp, settings.seed * 100_000 + index) for index, pose in enumerate(poses)]
-
-
-def missing(folder: Path, planned: list[Photograph]) -> Iterator[Photograph]:
-    """Yield the photographs that are not on disk yet, or whose masks are not."""
-    for photograph in planned:
-        if not ((folder / photograph.image_path).is_file() and (folder / photograph.mask_path).is_file()):
-            yield photograph
 
 
 def write_photograph(
