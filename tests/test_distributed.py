@@ -38,6 +38,7 @@ TWO_PROCESSES = ["trainer.devices=2", "trainer.strategy=ddp"]
 # Compares the processes' models in every step, which takes the second one longer, and says which step it is at.
 WATCHING_LOSS = '''
 """Watches."""
+import os
 import time
 import torch
 import torch.distributed as dist
@@ -54,7 +55,8 @@ class Watching(Loss):
         both = [torch.empty_like(mine) for _ in range(2)]
         dist.all_gather(both, mine)
         assert torch.equal(*both), "the models of the two processes differ"
-        print(f"rank {dist.get_rank()} at step {model.global_step}", flush=True)
+        # One write: print would write the end of the line by itself, after what the other process writes meanwhile.
+        os.write(1, f"rank {dist.get_rank()} at step {model.global_step}\\n".encode())
         return renderings[-1].rgb.sum() * 0
 '''
 
