@@ -15,12 +15,13 @@ from collections.abc import Callable
 from datetime import date
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from nerfro.boundaries import cube_map
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.fields import hash_encoding
 from nerfro.fields.hash_grid import HashGridField
+from nerfro.fields.spherical_harmonics import spherical_harmonics
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.types import Samples
 
@@ -67,10 +68,16 @@ def random_samples(num_rays: int, num_samples: int) -> Samples:
 
 
 class TwinField(HashGridField):
-    """The field with the plain-PyTorch encoding on the CPU, too."""
+    """The field in plain PyTorch on the CPU, too: its encodings, and MLPs differentiated by autograd."""
 
     def encode(self, positions: Tensor) -> Tensor:
         return hash_encoding.hash_encode((positions - self.box_min) / self.side, self.table, self.levels)
+
+    def encode_directions(self, directions: Tensor) -> Tensor:
+        return spherical_harmonics(directions, self.direction_bands)
+
+    def apply_mlp(self, mlp: nn.Sequential, *inputs: Tensor) -> Tensor:
+        return mlp(torch.cat(inputs, dim=-1))
 
 
 def hash_grid_tasks(samples: Samples, num_levels: int, log2_table_size: int) -> list[tuple[str, Task, Task]]:

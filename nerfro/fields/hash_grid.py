@@ -11,10 +11,10 @@ from torch import Tensor, nn
 
 from nerfro.errors import NerfroError
 from nerfro.fields import hash_encoding
+from nerfro.fields import spherical_harmonics as harmonics
 from nerfro.fields.base import Field
 from nerfro.fields.mlp import padded_sigmoid
 from nerfro.fields.selection import evaluate_selected, inside_box
-from nerfro.fields.spherical_harmonics import spherical_harmonics
 from nerfro.registry import register
 from nerfro.types import Radiance, Samples
 
@@ -75,7 +75,7 @@ class HashGridField(Field):
         self.levels = hash_encoding.grid_levels(num_levels, base_resolution, finest_resolution, log2_table_size)
         self.table = nn.Parameter(torch.empty(self.levels.num_entries, hash_encoding.NUM_FEATURES))
         nn.init.uniform_(self.table, -1e-4, 1e-4)
-        num_harmonics = spherical_harmonics(torch.zeros(1, 3), direction_bands).shape[-1]
+        num_harmonics = harmonics.spherical_harmonics(torch.zeros(1, 3), direction_bands).shape[-1]
         self.density_mlp = _mlp(hash_encoding.NUM_FEATURES * num_levels, width, 1, _GEOMETRY_FEATURES)
         self.colour_mlp = _mlp(_GEOMETRY_FEATURES + num_harmonics, width, 2, 3)
 
@@ -86,10 +86,8 @@ class HashGridField(Field):
         self, positions: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]
     ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P 3"]]:
         """Density and colour at positions within the box."""
-        harmonics = spherical_harmonics(directions, self.direction_bands)
-        features = self.encode(positions)
-        geometry = self.apply_mlp(self.density_mlp, features)
-        raw = self.apply_mlp(self.colour_mlp, torch.cat([geometry, harmonics.to(geometry.dtype)], dim=-1))
+        geometry = self.apply_mlp(self.density_mlp, self.encode(positions))
+        raw = self.apply_mlp(self.colour_mlp, geometry, self.encode_directions(directions))
         density = self.initial_density * torch.exp(geometry[:, 0].float().clamp(max=_MAX_EXPONENT))
         return density, padded_sigmoid(raw)
 
@@ -102,15 +100,23 @@ class HashGridField(Field):
             hash_encode = hash_encoding.hash_encode
         return hash_encode(unit, self.table, self.levels)
 
-    def apply_mlp(self, mlp: nn.Sequential, inputs: Float[Tensor, "P I"]) -> Float[Tensor, "P O"]:
-        """An MLP in the field's precision, with a gradient of our own on the CPU."""
-        if inputs.device.type == "cpu":
+    def encode_directions(self, directions: Float[Tensor, "P 3"]) -> Float[Tensor, "P K"]:
+        """Spherical harmonics, compiled on the CPU."""
+        if directions.device.type == "cpu":
+            from nerfro.kernels.spherical_harmonics import spherical_harmonics
+        else:
+            spherical_harmonics = harmonics.spherical_harmonics
+        return spherical_harmonics(directions, self.direction_bands)
+
+    def apply_mlp(self, mlp: nn.Sequential, *inputs: Float[Tensor, "P _"]) -> Float[Tensor, "P O"]:
+        """An MLP of inputs side by side in the field's precision, with a gradient of our own on the CPU."""
+        if inputs[0].device.type == "cpu":
             from nerfro.kernels.mlp import relu_mlp
 
             weights = [layer.weight for layer in mlp if isinstance(layer, nn.Linear)]
-            return relu_mlp(inputs, weights, getattr(torch, self.precision))
-        with torch.autocast(inputs.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
-            return mlp(inputs)
+            return relu_mlp(list(inputs), weights, getattr(torch, self.precision))
+        with torch.autocast(inputs[0].device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
+            return mlp(torch.cat([part.to(inputs[0].dtype) for part in inputs], dim=-1))
 
 
 def _mlp(num_inputs: int, width: int, num_hidden: int, num_outputs: int) -> nn.Sequential:

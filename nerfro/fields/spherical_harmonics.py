@@ -21,8 +21,7 @@ def spherical_harmonics(directions: Float[Tensor, "*batch 3"], num_bands: int) -
     Raises:
         NerfroError: a number of bands that is not implemented.
     """
-    if not 1 <= num_bands <= MAX_BANDS:
-        raise NerfroError(f"{num_bands} bands of spherical harmonics: allowed are 1 to {MAX_BANDS}")
+    check_bands(num_bands)
     x, y, z = directions.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
     harmonics = [torch.full_like(x, 0.28209479177387814)]
@@ -47,3 +46,9 @@ def spherical_harmonics(directions: Float[Tensor, "*batch 3"], num_bands: int) -
             0.5900435899266435 * x * (xx - 3 * yy),
         ]
     return torch.stack(harmonics, dim=-1)
+
+
+def check_bands(num_bands: int) -> None:
+    """Refuse a number of bands that is not implemented."""
+    if not 1 <= num_bands <= MAX_BANDS:
+        raise NerfroError(f"{num_bands} bands of spherical harmonics: allowed are 1 to {MAX_BANDS}")

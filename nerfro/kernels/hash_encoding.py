@@ -116,6 +116,20 @@ def _locate(positions, start, size, resolution, dense, cells, fractions, edges):
     _edges(cells[1], cells[2], resolution, dense, edges[0], edges[1], edges[2], edges[3])
 
 
+@compiled
+def _interpolate(cells, fractions, edges, entries, dense, mask, features, first):
+    """A block's features of one level into two columns of `features`."""
+    for p in range(features.shape[0]):
+        i, x, y, z = cells[0, p], fractions[0, p], fractions[1, p], fractions[2, p]
+        w0, w1, w2, w3 = (_ONE - y) * (_ONE - z), y * (_ONE - z), (_ONE - y) * z, y * z
+        low_low, high_low, low_high, high_high = edges[0, p], edges[1, p], edges[2, p], edges[3, p]
+        a, b, c, d, e, f, g, h = _vertices(i, low_low, high_low, low_high, high_high, dense, mask)
+        for n in range(2):
+            left = w0 * entries[a, n] + w1 * entries[c, n] + w2 * entries[e, n] + w3 * entries[g, n]
+            right = w0 * entries[b, n] + w1 * entries[d, n] + w2 * entries[f, n] + w3 * entries[h, n]
+            features[p, first + n] = (_ONE - x) * left + x * right
+
+
 @compiled_parallel
 def _forward(positions, table, resolutions, sizes, offsets, dense, features):
     num_points = positions.shape[1]
@@ -128,15 +142,11 @@ def _forward(positions, table, resolutions, sizes, offsets, dense, features):
             is_dense, mask = dense[level], _UINT(sizes[level] - 1)
             entries = table[offsets[level] : offsets[level] + sizes[level]]
             _locate(positions, start, size, resolutions[level], is_dense, cells, fractions, edges)
-            for p in range(size):
-                i, x, y, z = cells[0, p], fractions[0, p], fractions[1, p], fractions[2, p]
-                w0, w1, w2, w3 = (_ONE - y) * (_ONE - z), y * (_ONE - z), (_ONE - y) * z, y * z
-                low_low, high_low, low_high, high_high = edges[0, p], edges[1, p], edges[2, p], edges[3, p]
-                a, b, c, d, e, f, g, h = _vertices(i, low_low, high_low, low_high, high_high, is_dense, mask)
-                for n in range(2):
-                    left = w0 * entries[a, n] + w1 * entries[c, n] + w2 * entries[e, n] + w3 * entries[g, n]
-                    right = w0 * entries[b, n] + w1 * entries[d, n] + w2 * entries[f, n] + w3 * entries[h, n]
-                    features[start + p, 2 * level + n] = (_ONE - x) * left + x * right
+            # Two calls, because a constant is compiled in: the loop over the points is left without a branch.
+            if is_dense:
+                _interpolate(cells, fractions, edges, entries, True, mask, features[start : start + size], 2 * level)
+            else:
+                _interpolate(cells, fractions, edges, entries, False, mask, features[start : start + size], 2 * level)
 
 
 @compiled_parallel

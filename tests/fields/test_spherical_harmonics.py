@@ -9,6 +9,7 @@ import torch
 
 from nerfro.errors import NerfroError
 from nerfro.fields.spherical_harmonics import spherical_harmonics
+from nerfro.kernels import spherical_harmonics as kernel
 
 
 def quadrature() -> tuple[torch.Tensor, torch.Tensor]:
@@ -45,3 +46,10 @@ def test_each_degree_is_closed_under_rotation() -> None:
 def test_too_many_bands_are_refused() -> None:
     with pytest.raises(NerfroError, match="1 to 4"):
         spherical_harmonics(torch.zeros(1, 3), 5)
+
+
+@pytest.mark.parametrize("num_bands", [1, 2, 3, 4])
+def test_kernel_equals_the_reference(num_bands: int) -> None:
+    directions = torch.nn.functional.normalize(torch.randn(70, 3), dim=-1)
+    expected = spherical_harmonics(directions, num_bands)
+    torch.testing.assert_close(kernel.spherical_harmonics(directions, num_bands), expected, rtol=0, atol=1e-6)

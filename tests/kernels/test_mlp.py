@@ -40,6 +40,16 @@ def test_equals_a_sequential_forward_and_backward(widths: tuple[int, ...], dtype
         torch.testing.assert_close(mine, theirs, rtol=1e-2 if dtype == torch.bfloat16 else 1e-5, atol=1e-5)
 
 
+def test_inputs_side_by_side_of_which_one_learns() -> None:
+    mlp = layers(9, 8, 3)
+    first, second = torch.randn(20, 5, requires_grad=True), torch.randn(20, 4)
+    result = relu_mlp([first, second], weights(mlp), torch.float32)
+    expected = mlp(torch.cat([first, second], dim=-1))
+    torch.testing.assert_close(result, expected)
+    (mine,), (theirs,) = (torch.autograd.grad(x.square().sum(), first) for x in (result, expected))
+    torch.testing.assert_close(mine, theirs)
+
+
 def test_gradient_against_differences() -> None:
     mlp = layers(4, 6, 5, 2).double()
     inputs = torch.randn(7, 4, dtype=torch.float64, requires_grad=True)
