@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from nerfro.capture.targets import Sheet
+from nerfro.scenes.patterns import to_linear, to_srgb
 
 _SAMPLES = 3  # per pixel and side
 _TO_CENTRES = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])  # OpenCV's pixel coordinates
@@ -45,8 +46,8 @@ def photograph(
     size: tuple[int, int],
     generator: np.random.Generator,
 ) -> np.ndarray:
-    """Sheets before a grey wall, the far ones first, with noise; grey levels [H, W]."""
-    picture = np.full((size[1] * _SAMPLES, size[0] * _SAMPLES), 150, np.float32)
+    """Sheets before a grey wall, the far ones first, with noise; grey levels [H, W] of the light on each pixel."""
+    picture = np.full((size[1] * _SAMPLES, size[0] * _SAMPLES), to_linear(np.array(150 / 255)), np.float32)
     # The walls of the twelve faces stand on the others.
     for sheet in sorted(sheets, key=lambda one: (np.ptp(one.corners[:, 2]) > 0, -_distance(one, pose))):
         normal = np.cross(sheet.corners[1] - sheet.corners[0], sheet.corners[0] - sheet.corners[3])
@@ -58,11 +59,12 @@ def photograph(
         corners = np.float32([[0, 0], [width, 0], [width, height], [0, height]])
         warp = cv2.getPerspectiveTransform(corners, np.float32(seen[:, :2] / seen[:, 2:]))
         warp = _TO_CENTRES @ np.diag([_SAMPLES, _SAMPLES, 1.0]) @ warp @ np.linalg.inv(_TO_CENTRES)
-        drawn = cv2.warpPerspective(levels, warp, picture.shape[::-1])
+        printed = np.float32(to_linear((20 + 0.85 * levels) / 255))
+        drawn = cv2.warpPerspective(printed, warp, picture.shape[::-1])
         covered = cv2.warpPerspective(np.full_like(levels, 255), warp, picture.shape[::-1]) == 255
-        picture[covered] = 20 + 0.85 * drawn[covered]
-    picture = picture.reshape(size[1], _SAMPLES, size[0], _SAMPLES).mean((1, 3))
-    return np.uint8(np.rint(np.clip(picture + generator.normal(0, 2, picture.shape), 0, 255)))
+        picture[covered] = drawn[covered]
+    levels = 255 * to_srgb(picture.reshape(size[1], _SAMPLES, size[0], _SAMPLES).mean((1, 3)))
+    return np.uint8(np.rint(np.clip(levels + generator.normal(0, 2, levels.shape), 0, 255)))
 
 
 def angle(one: np.ndarray, other: np.ndarray) -> float:

@@ -14,6 +14,7 @@ from PIL import Image
 pytest.importorskip("cv2")
 pytest.importorskip("pupil_apriltags")
 
+from nerfro.calibrate import luminance
 from nerfro.capture.boards import tag_grid, twelve_faces
 from nerfro.capture.calibration import Intrinsics, calibrate
 from nerfro.capture.targets import CharucoTarget, Sighting, TagTarget, Target
@@ -79,6 +80,22 @@ def test_lens_and_poses_are_recovered(kind: str, tmp_path: Path, command: Callab
         np.testing.assert_allclose(pixels[view, 0].numpy(), expected[:2] / expected[2], atol=0.5)
     with Image.open(out / "cameras.png") as plot:
         assert np.ptp(np.asarray(plot.convert("L"))) > 100
+
+
+def test_tags_look_no_larger_than_they_are(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    target = TagTarget(twelve_faces())
+    outward = []
+    for pose in around(target.sheets(), 3, 1.7, generator):
+        Image.fromarray(photograph(target.sheets(), MATRIX, pose, SIZE, generator)).save(tmp_path / "p.png")
+        sighting = target.find(luminance(tmp_path / "p.png"))
+        seen = (sighting.points - pose[:, 3]) @ pose[:, :3] @ MATRIX.T
+        true = (seen[:, :2] / seen[:, 2:]).reshape(-1, 4, 2)
+        away = true - true.mean(1, keepdims=True)
+        away /= np.linalg.norm(away, axis=-1, keepdims=True)
+        outward.append(((sighting.pixels.reshape(-1, 4, 2) - true) * away).sum(-1).ravel())
+    # A median, for some tags are seen in part; 0.2 where edges are looked for in sRGB values.
+    assert abs(np.median(np.concatenate(outward))) < 0.05
 
 
 def sightings_of(target: TagTarget, distortion: tuple[float, ...] = ()) -> tuple[dict[str, Sighting], list[np.ndarray]]:
