@@ -20,6 +20,7 @@ from rounded_cube import trace_rounded_cube
 from torch import Tensor
 
 from nerfro.data.cameras import Cameras
+from nerfro.data.pixel_parts import PixelParts
 from nerfro.geometry.cache import cache_dir
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball, RoundedBox
@@ -194,7 +195,7 @@ def cached_paths(solid: SdfGrid) -> None:
     print(f"\n### Paths of {batch} random rays of that view (sphere)\n")
     print("| sampler | live, ms | cached, ms | bytes of cache per ray of the view |\n|---|---|---|---|")
     for name, sampler in (("snell", Snell()), ("eikonal", Eikonal())):
-        cache = PathCache.build(sampler, solid, camera)
+        cache = PathCache.build(sampler, solid, PixelParts(camera))
         live = best_time(lambda s=sampler: s(chosen, solid))
         warm = best_time(lambda c=cache: c(index, chosen))
         size = (cache.vertices.numel() * 4 + cache.starts.numel() * 8) / (SIDE * SIDE)

@@ -44,7 +44,8 @@ from nerfro.models.base import NerfModel
 from nerfro.paths import ASSETS_DIR, CONF_DIR
 from nerfro.registry import build, discover
 from nerfro.run_folder import load_checkpoint
-from nerfro.samplers.path_cache import PathCache
+from nerfro.samplers.training_paths import TrainingPaths
+from nerfro.train import trace_training_rays
 from nerfro.types import Batch
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -119,9 +120,10 @@ class Training:
         pl.seed_everything(self.config.seed, verbose=False)
         wanted, views = self.config.batches, build(self.config.data).load("train")
         self.model: NerfModel = build_model(self.config)
-        if wanted.cache_paths and not wanted.jitter and self.model.path_sampler.few_vertices:
-            self.model.path_cache = PathCache.build(self.model.path_sampler, self.model.medium, views.cameras)
         self.batches = RayBatches(views, wanted.size, wanted.batching, self.config.seed, jitter=wanted.jitter)
+        paths = self.model.training_paths = trace_training_rays(self.config, self.model, views.cameras)
+        if paths is not None and paths.parts is not None:
+            self.batches = self.batches.dividing(paths.parts)
         self.num_rays = wanted.size
 
     def run(self, num_steps: int) -> Steps:
@@ -201,10 +203,10 @@ def report_profile(experiment: str, num_steps: int) -> None:
         "boundary, forward": [(model.boundary, "forward")],
         "losses, forward": [(loss, "forward") for loss in model.losses.values()],
     }
-    if model.path_cache is None:
+    if model.training_paths is None:
         parts = {"tracing": [(model.path_sampler, "forward")], **parts}
     else:
-        parts = {"cached paths": [(PathCache, "__call__")], **parts}
+        parts = {"cached paths": [(TrainingPaths, "__call__")], **parts}
     around = {
         "batch of pixels and rays": [(RayBatches, "batch")],
         "update of the density grid": [(model.point_sampler, "after_step")],
@@ -238,7 +240,7 @@ def report_paths(num_steps: int = 200) -> None:
     """Share of a step of the default preset that fetching the cached paths takes, without a profiler's own time."""
     training = Training("+experiment=refractive")
     training.run(5)
-    cached = training.model.path_cache
+    cached = training.model.training_paths
     assert cached is not None
     seconds: list[float] = []
 
@@ -248,7 +250,7 @@ def report_paths(num_steps: int = 200) -> None:
         seconds.append(time.perf_counter() - start)
         return path
 
-    training.model.path_cache = fetch  # type: ignore[assignment]
+    training.model.training_paths = fetch  # type: ignore[assignment]
     steps = training.run(num_steps).seconds[1:]
     share = np.median(seconds) / np.median(steps)
     print(f"cached paths {1e3 * np.median(seconds):.2f} ms of {1e3 * np.median(steps):.1f} ms a step: {share:.2%}")

@@ -41,7 +41,7 @@ class Throughput(Callback):
         if self._last is not None:
             self.seconds += now - self._last
         self._last = now
-        self.num_rays += len(batch.rays) * trainer.world_size
+        self.num_rays += batch.num_rows or len(batch.rays) * trainer.world_size
         pl_module.log("train/rays_per_second", self.num_rays / self.seconds)
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -47,8 +47,9 @@ class BatchesConfig:
         precrop_steps: number of first steps that see only the central window of the images.
         precrop_fraction: side of that window.
         cache_paths: trace all training rays once and keep their paths, where they do not change (no jitter).
-        max_divergence: leave out pixels whose exit direction differs from a neighbour's by this many pixels or more,
-            where paths are kept; none trains on all of them.
+        supersample: rays in each direction of a pixel whose exit direction differs from a neighbour's by more than
+            `divergence` pixels, where paths are kept; 1 gives all pixels one ray.
+        divergence: see there.
     """
 
     size: int = 1024
@@ -57,7 +58,8 @@ class BatchesConfig:
     precrop_steps: int = 0
     precrop_fraction: float = 0.5
     cache_paths: bool = True
-    max_divergence: Optional[float] = None  # noqa: UP045
+    supersample: int = 1
+    divergence: float = 8.0
 
 
 @dataclass

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import sys
 import warnings
-from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from nerfro.callbacks import ConfigInCheckpoint, StopOnSignal, Throughput, TrainingProgress
 from nerfro.cli import EXIT_INTERRUPTED, entry_point
 from nerfro.config import TrainConfig, build_model
-from nerfro.data.base import Views
+from nerfro.data.cameras import Cameras
 from nerfro.data.module import RayDataModule
 from nerfro.data.ray_batches import RayBatches
 from nerfro.distributed import leave
@@ -32,6 +31,7 @@ from nerfro.evaluation.render_view import Supersampling
 from nerfro.evaluation.score_views import score_views
 from nerfro.fields.mlp import compile_networks
 from nerfro.kernels.allocator import keep_freed_memory
+from nerfro.models.base import NerfModel
 from nerfro.registry import build
 from nerfro.run_folder import (
     LAST_CHECKPOINT,
@@ -41,8 +41,7 @@ from nerfro.run_folder import (
     record,
     require_same_configuration,
 )
-from nerfro.samplers.divergence import steady_pixels
-from nerfro.samplers.path_cache import PathCache
+from nerfro.samplers.training_paths import TrainingPaths
 from nerfro.training_log import TrainingLog
 
 _SPARE_BYTES = 64 * 2**20  # pictures and logs, beside the checkpoints
@@ -63,7 +62,16 @@ def main(config: DictConfig) -> None:
     test = source.load(config.evaluation.split)
     validation = source.load("val") if config.evaluation.every > 0 and "val" in source.splits else None
     wanted, training = config.batches, source.load("train")
-    batches = _batches(config, training)
+    batches = RayBatches(
+        training,
+        wanted.size,
+        wanted.batching,
+        config.seed,
+        wanted.precrop_steps,
+        wanted.precrop_fraction,
+        wanted.jitter,
+    )
+    Supersampling(wanted.supersample, wanted.divergence)  # refuses what is out of range
     supersampling = Supersampling(config.evaluation.supersample, config.evaluation.divergence)
     lpips = find_lpips_networks(config.evaluation.lpips_backbone, config.evaluation.lpips_vgg_backbone)
     model = build_model(config)
@@ -78,11 +86,9 @@ def main(config: DictConfig) -> None:
         claim(folder, checkpoint is not None, 2 * 3 * num_bytes + _SPARE_BYTES)
         record(folder, config)
         print(f"nerfro: {config.name} on {config.data.root} -> {folder}", flush=True)
-    if wanted.cache_paths and not wanted.jitter and model.path_sampler.few_vertices:
-        model.path_cache = PathCache.build(model.path_sampler, model.medium, training.cameras)
-        if wanted.max_divergence is not None:
-            steady = only_steady(training, model.path_cache, wanted.max_divergence)
-            batches = _batches(config, steady).share(trainer.global_rank, trainer.world_size)
+    model.training_paths = trace_training_rays(config, model, training.cameras)
+    if model.training_paths is not None and model.training_paths.parts is not None:
+        batches = batches.dividing(model.training_paths.parts)
     if config.compile is not None:
         compile_networks(model, config.compile)
 
@@ -112,23 +118,12 @@ def main(config: DictConfig) -> None:
     print("  python -m nerfro.dashboard  losses and validation pictures")
 
 
-def _batches(config: DictConfig, training: Views) -> RayBatches:
+def trace_training_rays(config: DictConfig, model: NerfModel, cameras: Cameras) -> TrainingPaths | None:
+    """Paths of all training rays, if they stay the same and are short enough to be kept."""
     wanted = config.batches
-    return RayBatches(
-        training,
-        wanted.size,
-        wanted.batching,
-        config.seed,
-        wanted.precrop_steps,
-        wanted.precrop_fraction,
-        wanted.jitter,
-    )
-
-
-def only_steady(views: Views, paths: PathCache, max_divergence: float) -> Views:
-    """The same views, in which only those pixels are usable that one ray stands for (see `steady_pixels`)."""
-    steady = steady_pixels(paths, views.cameras, max_divergence)
-    return replace(views, usable=steady if views.usable is None else steady & views.usable)
+    if not wanted.cache_paths or wanted.jitter or not model.path_sampler.few_vertices:
+        return None
+    return TrainingPaths.build(model.path_sampler, model.medium, cameras, wanted.supersample, wanted.divergence)
 
 
 def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.Trainer:

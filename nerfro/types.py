@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from nerfro.colour import to_linear, to_srgb
+
 if TYPE_CHECKING:
     from nerfro.data.cameras import Cameras
 
@@ -38,6 +40,11 @@ class Rays:
 
     def __getitem__(self, index: slice | Tensor) -> Rays:
         return Rays(self.origins[index], self.directions[index], self.radii[index], self.near[index], self.far[index])
+
+    def followed_by(self, other: Rays) -> Rays:
+        """These rays and after them others."""
+        names = ("origins", "directions", "radii", "near", "far")
+        return Rays(*(torch.cat([getattr(self, name), getattr(other, name)]) for name in names))
 
     def to(self, device: torch.device | str) -> Rays:
         return Rays(*(getattr(self, name).to(device) for name in ("origins", "directions", "radii", "near", "far")))
@@ -80,6 +87,25 @@ class Path:
     def __getitem__(self, index: slice | Tensor) -> Path:
         fields = ("positions", "directions", "s", "exit_directions", "refracted", "radii")
         return Path(*(getattr(self, name)[index] for name in fields))
+
+    def followed_by(self, other: Path) -> Path:
+        """These paths and after them those of another."""
+        num_vertices = max(self.s.shape[1], other.s.shape[1])
+
+        def longer(vertices: Tensor) -> Tensor:
+            missing = num_vertices - vertices.shape[1]
+            return torch.cat([vertices, vertices[:, -1:].expand(-1, missing, *vertices.shape[2:])], dim=1)
+
+        return Path(
+            *(
+                torch.cat([longer(getattr(part, name)) for part in (self, other)])
+                for name in ("positions", "directions", "s")
+            ),
+            *(
+                torch.cat([getattr(part, name) for part in (self, other)])
+                for name in ("exit_directions", "refracted", "radii")
+            ),
+        )
 
     def span(self, box: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
         """Arc lengths between which the path runs inside a box, from its first entry to its last exit.
@@ -181,16 +207,32 @@ class Rendering:
 
 @dataclass(frozen=True)
 class Batch:
-    """Training pixels.
+    """Training pixels: first those that have one ray, then those that are divided, all rays of each together.
 
     Attributes:
-        rays: one ray for each pixel.
-        rgb: the pixels' colours (sRGB in [0, 1]).
-        index: identity of each training ray, `view * H * W + row * W + column`.
+        rays: of the pixels.
+        rgb: colour of the pixel that each ray belongs to (sRGB in [0, 1]).
+        index: identity of each training ray: `view * H * W + row * W + column`; of divided pixels the ray's number in
+            their `PixelParts`.
         cameras: all training cameras, for losses that ask for further directions.
+        num_whole: number of pixels that have one ray; all by default.
+        rays_per_pixel: of the divided ones.
+        rows: which rows of the whole batch these are, where several processes share it.
+        num_rows: of the whole batch.
     """
 
     rays: Rays
     rgb: Float[Tensor, "R 3"]
     index: Int[Tensor, "R"]
     cameras: Cameras
+    num_whole: int | None = None
+    rays_per_pixel: int = 1
+    rows: Int[Tensor, "R"] | None = None
+    num_rows: int | None = None
+
+    def pixel_colours(self, rgb: Float[Tensor, "R 3"]) -> Float[Tensor, "P 3"]:
+        """Colours of pixels from those of their rays: means of linear radiance, in sRGB."""
+        if self.num_whole is None:
+            return rgb
+        divided = to_linear(rgb[self.num_whole :]).view(-1, self.rays_per_pixel, 3)
+        return torch.cat([rgb[: self.num_whole], to_srgb(divided.mean(1))])

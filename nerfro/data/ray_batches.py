@@ -12,7 +12,8 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from nerfro.data.base import Views
-from nerfro.data.cameras import Window, central_window
+from nerfro.data.cameras import Cameras, Window, central_window
+from nerfro.data.pixel_parts import PixelParts
 from nerfro.distributed import share_of
 from nerfro.errors import NerfroError
 from nerfro.types import Batch
@@ -67,6 +68,8 @@ class RayBatches:
         self.batch_size, self.batching, self.seed = batch_size, batching, seed
         self.precrop_steps, self.jitter, self.first_step = precrop_steps, jitter, first_step
         self._share = slice(batch_size)
+        self._parts: PixelParts | None = None
+        self._place: Int[np.ndarray, "V*H*W"] = np.empty(0, np.int32)  # of each pixel among the divided ones, or -1
         cameras = views.cameras
         self._cameras = cameras
         self._pixels = views.images.reshape(-1, 3)
@@ -86,7 +89,17 @@ class RayBatches:
         """The same sequence with cameras and pixels on another device."""
         moved = copy.copy(self)
         moved._cameras, moved._pixels = self._cameras.to(device), self._pixels.to(device)
+        moved._parts = None if self._parts is None else self._parts.to(device)
         return moved
+
+    def dividing(self, parts: PixelParts) -> RayBatches:
+        """The sequence with all rays of `parts` where it has one of the pixels that they divide."""
+        assert parts.pixels is not None
+        divided = copy.copy(self)
+        divided._parts = parts
+        divided._place = np.full(self._pixels.shape[0], -1, np.int32)
+        divided._place[parts.pixels.cpu().numpy()] = np.arange(len(parts.pixels))
+        return divided
 
     def share(self, rank: int, size: int) -> RayBatches:
         """The sequence of process `rank` of `size`: an equal part of every batch, in its order.
@@ -116,7 +129,10 @@ class RayBatches:
         generator = np.random.default_rng([self.seed, step])
         view, pixel = self._draw(generator, window)
         row, column = window.top + pixel // window.width, window.left + pixel % window.width
-        drawn = ((view * height + row) * width + column)[self._share]
+        drawn = (view * height + row) * width + column
+        if self._parts is not None:
+            return self._divided_batch(drawn, cameras.crop(window))
+        drawn = drawn[self._share]
         # One small copy to the device; the rest is computed there.
         index = torch.from_numpy(drawn).to(cameras.device, non_blocking=True)
         jitter = None
@@ -128,6 +144,35 @@ class RayBatches:
             rgb=self._pixels[index],
             index=index,
             cameras=cameras.crop(window),
+        )
+
+    def _divided_batch(self, drawn: Int[np.ndarray, "P"], cameras: Cameras) -> Batch:
+        """A batch of pixels of which some have several rays: the others first, then those."""
+        assert self._parts is not None
+        device, several = self._cameras.device, self._parts.rays_per_pixel
+        is_divided = self._place[drawn] >= 0
+        # Each pixel's first row in the whole batch.
+        sizes = np.where(is_divided, several, 1)
+        order = np.argsort(is_divided, kind="stable")
+        first = np.empty(len(drawn), np.int64)
+        first[order] = np.cumsum(sizes[order]) - sizes[order]
+        own, divided = drawn[self._share], is_divided[self._share]
+        parts = np.arange(several)
+        whole, numbers = own[~divided], self._place[own[divided]].astype(np.int64)[:, None] * several + parts
+        rows = np.concatenate([first[self._share][~divided], (first[self._share][divided][:, None] + parts).ravel()])
+        pixels = np.concatenate([whole, own[divided].repeat(several)])
+        index = np.concatenate([whole, numbers.ravel()])
+        pixel, number, row = torch.from_numpy(np.stack([pixels, index, rows])).to(device, non_blocking=True)
+        centres = PixelParts(self._cameras).rays(number[: len(whole)])
+        return Batch(
+            rays=centres.followed_by(self._parts.rays(number[len(whole) :])),
+            rgb=self._pixels[pixel],
+            index=number,
+            cameras=cameras,
+            num_whole=len(whole),
+            rays_per_pixel=several,
+            rows=row,
+            num_rows=int(sizes.sum()),
         )
 
     def _draw(self, generator: np.random.Generator, window: Window) -> tuple[np.ndarray | np.int64, np.ndarray]:

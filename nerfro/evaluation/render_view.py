@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from nerfro.colour import to_linear, to_srgb
 from nerfro.data.cameras import Cameras
+from nerfro.data.pixel_parts import PixelParts
 from nerfro.errors import NerfroError
 from nerfro.models.base import NerfModel, RenderedRays
 from nerfro.samplers.divergence import exit_divergence
@@ -52,17 +51,11 @@ def render_view(model: NerfModel, cameras: Cameras, view: int, supersampling: Su
     chosen = (diverging >= supersampling.divergence * pixel_angle).flatten().nonzero()[:, 0]
     if len(chosen) == 0:
         return rendered
-    row, column = chosen // cameras.width, chosen % cameras.width
+    parts = PixelParts(cameras, supersampling.side, view * cameras.height * cameras.width + chosen)
     total = torch.zeros_like(rendered.rgb[chosen])
-    for offset in grid_offsets(supersampling.side).to(cameras.device):
-        rays = cameras.rays(torch.full_like(row, view), row, column, offset.expand(len(chosen), 2))
+    for part in range(parts.rays_per_pixel):
+        rays = parts.rays(torch.arange(part, len(parts), parts.rays_per_pixel, device=cameras.device))
         total += to_linear(model.render(rays).rgb)
     rgb = rendered.rgb.clone()
-    rgb[chosen] = to_srgb(total / supersampling.side**2)
+    rgb[chosen] = to_srgb(total / parts.rays_per_pixel)
     return RenderedRays(rgb, rendered.depth, rendered.opacity, rendered.exit_directions)
-
-
-def grid_offsets(side: int) -> Float[Tensor, "K 2"]:
-    """Centres of side x side equal parts of a pixel, as (x, y) in [0, 1)."""
-    ticks = (torch.arange(side) + 0.5) / side
-    return torch.cartesian_prod(ticks, ticks).view(-1, 2)

@@ -44,6 +44,8 @@ class BoundaryRegulariser(Loss):
         counts = fine.transmittance.detach() > self.threshold
         if self.refracted_only:
             counts = counts & fine.path.refracted
+        if batch.num_whole is not None:
+            counts[batch.num_whole :] = False  # a part of a pixel need not have the pixel's colour
         error = (fine.transmittance[:, None] * fine.boundary_rgb.detach() - batch.rgb).abs().sum(-1)
         # Processes average their gradients: each brings its sum as often as there are processes.
         return (error * counts).sum() * rank_and_size()[1] / (sum_over_processes(counts.sum()) + 1)

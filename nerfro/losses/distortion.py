@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.distributed import mean_over_rays
 from nerfro.losses.base import Loss
 from nerfro.registry import register
 from nerfro.types import Batch, Rendering
@@ -31,7 +32,7 @@ class Distortion(Loss):
         near, far = rendering.path.near[:, None], rendering.path.far[:, None]
         # A path of no length has no weights either; the clamp only keeps the quotient a number.
         edges = (rendering.samples.edges - near) / (far - near).clamp(min=1e-6)
-        return distortion(rendering.weights, edges).mean()
+        return mean_over_rays(distortion(rendering.weights, edges), batch.num_rows)
 
 
 def distortion(weights: Float[Tensor, "R N"], edges: Float[Tensor, "R N+1"]) -> Float[Tensor, "R"]:

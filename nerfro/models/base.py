@@ -12,13 +12,14 @@ from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 
 from nerfro.boundaries.base import Boundary
+from nerfro.distributed import drawing_for
 from nerfro.evaluation.pictures import triptych
 from nerfro.fields.base import Field
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.models.optimizer import OptimizerConfig, learning_rate_factor, training_progress
 from nerfro.samplers.base import PathSampler, PointSampler
-from nerfro.samplers.path_cache import PathCache
+from nerfro.samplers.training_paths import TrainingPaths
 from nerfro.types import Batch, Path, Rays, Rendering
 
 
@@ -56,10 +57,10 @@ class NerfModel(LightningModule, ABC):
         fields: radiance field of each sampling level, or one for all.
 
     Attributes:
-        path_cache: training paths that are known already; nerfro.train sets it where rays do not change.
+        training_paths: training paths that are known already; nerfro.train sets it where rays do not change.
     """
 
-    path_cache: PathCache | None
+    training_paths: TrainingPaths | None
 
     def __init__(self, parts: Parts, fields: list[Field]) -> None:
         super().__init__()
@@ -68,7 +69,7 @@ class NerfModel(LightningModule, ABC):
         self.fields = nn.ModuleList(fields)
         self.boundary = parts.boundary
         self.losses = nn.ModuleDict(dict(parts.losses))
-        self.path_cache = None
+        self.training_paths = None
         self.optimizer_config, self.chunk_size, self.seed = parts.optimizer, parts.chunk_size, parts.seed
 
     @abstractmethod
@@ -80,8 +81,9 @@ class NerfModel(LightningModule, ABC):
         return self.render_path(self.path_sampler(rays, self.medium))
 
     def training_step(self, batch: Batch, batch_index: int) -> Float[Tensor, ""]:
-        cached = None if self.path_cache is None else self.path_cache(batch.index, batch.rays)
-        renderings: list[Rendering] = self(batch.rays) if cached is None else self.render_path(cached)
+        known = None if self.training_paths is None else self.training_paths(batch)
+        with drawing_for(batch.rows, batch.num_rows):
+            renderings: list[Rendering] = self(batch.rays) if known is None else self.render_path(known)
         total = torch.zeros((), device=self.device)
         for name, loss in self.losses.items():
             weight = loss.weight_at(self.global_step)  # type: ignore[operator]
@@ -90,7 +92,7 @@ class NerfModel(LightningModule, ABC):
                 value = loss(renderings, batch, self)
                 self.log(f"loss/{name}", value)
                 total = total + weight * value
-        error = (renderings[-1].rgb.detach() - batch.rgb).square().mean()
+        error = (batch.pixel_colours(renderings[-1].rgb.detach()) - batch.pixel_colours(batch.rgb)).square().mean()
         self.log("train/psnr", -10 * torch.log10(error), prog_bar=True)
         self.log("loss/total", total)
         return total

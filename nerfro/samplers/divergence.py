@@ -1,4 +1,4 @@
-"""Pixels for which the ray through their centre does not stand: where neighbouring rays leave in other directions."""
+"""Pixels for which the ray through their centre does not stand: neighbouring rays leave in other directions."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerfro.data.cameras import Cameras
-from nerfro.errors import NerfroError
 from nerfro.types import Path, Rays
 
 
@@ -22,29 +21,24 @@ def exit_divergence(directions: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
     return 2 * torch.asin((0.5 * chords).clamp(max=1))
 
 
-def steady_pixels(
-    trace: Callable[[Int[Tensor, "R"], Rays], Path], cameras: Cameras, max_divergence: float
-) -> Bool[Tensor, "V H W"]:
-    """Pixels whose exit direction differs from every neighbour's by less than a limit.
+def divergent_pixels(
+    trace: Callable[[Int[Tensor, "R"], Rays], Path], cameras: Cameras, divergence: float
+) -> Int[Tensor, "U"]:
+    """Pixels, as `view * H * W + row * W + column`, whose exit direction differs much from a neighbour's.
 
-    The others lie on the object's rim and edges. Their colour is an average over directions far apart, which a ray
-    through the centre would teach to one of them, as speckle.
+    They lie on the object's rim and edges. Their colour is a mean over directions far apart, which a ray through the
+    centre would teach to one of them, as speckle.
 
     Args:
-        trace: paths of rays, given the rays' identity `view * H * W + row * W + column`.
+        trace: paths of the rays through pixel centres, given the pixels and the rays.
         cameras: of the images.
-        max_divergence: limit in pixel angles, 1 / fx.
-
-    Raises:
-        NerfroError: the limit is not positive.
+        divergence: least difference, in pixel angles 1 / fx.
     """
-    if not max_divergence > 0:
-        raise NerfroError(f"batches.max_divergence={max_divergence} leaves no pixel; take more than 1, or null for all")
     size = cameras.height * cameras.width
-    steady = []
+    divergent = []
     for view in range(len(cameras)):
-        index = torch.arange(view * size, (view + 1) * size, device=cameras.device)
-        directions = trace(index, cameras.image_rays(view)).exit_directions
-        limit = max_divergence / float(cameras.fx[view])
-        steady.append(exit_divergence(directions.view(cameras.height, cameras.width, 3)) < limit)
-    return torch.stack(steady)
+        pixels = torch.arange(view * size, (view + 1) * size, device=cameras.device)
+        directions = trace(pixels, cameras.image_rays(view)).exit_directions
+        angles = exit_divergence(directions.view(cameras.height, cameras.width, 3))
+        divergent.append(pixels[angles.flatten() >= divergence / float(cameras.fx[view])])
+    return torch.cat(divergent)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -15,6 +14,7 @@ from tqdm import tqdm
 
 import nerfro
 from nerfro.data.cameras import Cameras
+from nerfro.data.pixel_parts import PixelParts
 from nerfro.errors import NerfroError
 from nerfro.geometry.cache import cache_dir, content_hash, load_arrays, save_arrays
 from nerfro.geometry.mesh import TriangleMesh
@@ -34,13 +34,13 @@ _SAME_DIRECTION = 1e-5
 
 
 class PathCache:
-    """The bent paths through all pixel centres of a set of cameras, one row of vertices after another.
+    """The bent paths through pixels, or parts of pixels, of a set of cameras, one row of vertices after another.
 
     Poses and medium do not change in training, so neither do the paths. Rays that miss the medium are not stored: they
     are straight. A bent path takes 28 bytes a vertex and usually four to ten vertices.
 
     Attributes:
-        starts: where each ray's vertices begin, and the end; a ray is its view * H * W + row * W + column.
+        starts: where each ray's vertices begin, and the end.
         vertices: position, direction and arc length; in memory, or mapped from disk.
     """
 
@@ -49,24 +49,26 @@ class PathCache:
         self.vertices = vertices
 
     @classmethod
-    def build(cls, path_sampler: PathSampler, medium: Medium, cameras: Cameras, memory_limit: float = 2.0) -> PathCache:
-        """Trace the rays through all pixel centres, or load them when the same was traced before.
+    def build(
+        cls, path_sampler: PathSampler, medium: Medium, parts: PixelParts, memory_limit: float = 2.0
+    ) -> PathCache:
+        """Trace rays, or load their paths when the same was traced before.
 
-        The file's name is a hash of cameras, medium, sampler and nerfro's version, so paths of anything else are never
+        The file's name is a hash of rays, medium, sampler and nerfro's version, so paths of anything else are never
         found. The trace itself needs the memory of one chunk of rays.
 
         Args:
             path_sampler, medium: how rays bend.
-            cameras: of the training images.
+            parts: the rays.
             memory_limit: gigabytes of vertices that are kept in memory; more are mapped from disk.
 
         Raises:
             NerfroError: the cache folder cannot be written.
         """
-        key = content_hash(nerfro.__version__, *_describe(path_sampler), *_describe(medium), *_camera_parts(cameras))
+        key = content_hash(nerfro.__version__, *_describe(path_sampler), *_describe(medium), *_describe_rays(parts))
         index_file, vertex_file = cache_dir() / f"paths_{key}.npz", cache_dir() / f"paths_{key}.f32"
         if not (index_file.is_file() and vertex_file.is_file()):
-            _trace_to_disk(path_sampler, medium, cameras, index_file, vertex_file)
+            _trace_to_disk(path_sampler, medium, parts, index_file, vertex_file)
         starts = load_arrays(index_file)["starts"]
         if vertex_file.stat().st_size != starts[-1] * _BYTES_PER_VERTEX:
             index_file.unlink()
@@ -83,10 +85,10 @@ class PathCache:
         return cls(torch.from_numpy(starts), torch.from_numpy(vertices))
 
     def __call__(self, index: Int[Tensor, "R"], rays: Rays) -> Path:
-        """Paths of rays through pixel centres.
+        """Paths of some of the rays.
 
         Args:
-            index: identity of each ray, `view * H * W + row * W + column`.
+            index: number of each ray in the `PixelParts`.
             rays: the same rays; those that are not stored go straight.
 
         Raises:
@@ -102,7 +104,9 @@ class PathCache:
         origins, directions, near, far = (tensor.cpu().float().contiguous().numpy() for tensor in own)
         vertices = self.vertices.numpy()
         if gather_paths(starts, vertices, rows, origins, directions, near, far, _SAME_DIRECTION, path) > 0:
-            raise NerfroError("cached paths are of other rays; they hold for pixel centres only, so switch jitter off")
+            raise NerfroError(
+                "cached paths are of other rays; they hold for rays through fixed places, so switch jitter off"
+            )
         all_vertices = torch.from_numpy(path).to(rays.origins.device)
         positions, along, s = all_vertices[..., :3], all_vertices[..., 3:6], all_vertices[..., 6]
         refracted = torch.from_numpy(counts > 0).to(s.device)
@@ -110,12 +114,12 @@ class PathCache:
 
 
 def _trace_to_disk(
-    path_sampler: PathSampler, medium: Medium, cameras: Cameras, index_file: FilePath, vertex_file: FilePath
+    path_sampler: PathSampler, medium: Medium, parts: PixelParts, index_file: FilePath, vertex_file: FilePath
 ) -> None:
     counts = []
     temporary = ""
     progress = tqdm(
-        total=len(cameras) * cameras.height * cameras.width,
+        total=len(parts),
         unit="ray",
         unit_scale=True,
         desc="trace",
@@ -127,17 +131,17 @@ def _trace_to_disk(
         index_file.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=vertex_file.parent, suffix=".tmp", delete=False) as file, progress:
             temporary = file.name
-            for view in range(len(cameras)):
-                for rays in _chunks(cameras.image_rays(view)):
-                    path = path_sampler(rays, medium)
-                    ends = (path.s[:, 1:] > path.s[:, :-1]).long()
-                    # Rows end where s stops growing; what follows repeats the last vertex.
-                    lengths = torch.where(path.refracted, path.s.shape[1] - ends.flip(1).cumsum(1).eq(0).sum(1), 0)
-                    used = torch.arange(path.s.shape[1], device=path.s.device) < lengths[:, None]
-                    rows = torch.cat([path.positions, path.directions, path.s[..., None]], -1)[used]
-                    rows.float().cpu().numpy().tofile(file)
-                    counts.append(lengths.cpu())
-                    progress.update(len(rays))
+            for start in range(0, len(parts), _RAYS_AT_ONCE):
+                stop = min(start + _RAYS_AT_ONCE, len(parts))
+                path = path_sampler(parts.rays(torch.arange(start, stop, device=parts.cameras.device)), medium)
+                ends = (path.s[:, 1:] > path.s[:, :-1]).long()
+                # Rows end where s stops growing; what follows repeats the last vertex.
+                lengths = torch.where(path.refracted, path.s.shape[1] - ends.flip(1).cumsum(1).eq(0).sum(1), 0)
+                used = torch.arange(path.s.shape[1], device=path.s.device) < lengths[:, None]
+                rows = torch.cat([path.positions, path.directions, path.s[..., None]], -1)[used]
+                rows.float().cpu().numpy().tofile(file)
+                counts.append(lengths.cpu())
+                progress.update(stop - start)
         os.replace(temporary, vertex_file)
     except OSError as error:
         if temporary:
@@ -147,11 +151,6 @@ def _trace_to_disk(
         ) from error
     starts = torch.cat([torch.zeros(1, dtype=torch.long), torch.cat(counts).cumsum(0)])
     save_arrays(index_file, {"starts": starts.numpy()})
-
-
-def _chunks(rays: Rays) -> Iterator[Rays]:
-    for start in range(0, len(rays), _RAYS_AT_ONCE):
-        yield rays[start : start + _RAYS_AT_ONCE]
 
 
 def _describe(part: nn.Module) -> list[np.ndarray | str]:
@@ -169,7 +168,12 @@ def _describe(part: nn.Module) -> list[np.ndarray | str]:
     return description
 
 
-def _camera_parts(cameras: Cameras) -> list[np.ndarray | str]:
+def _describe_rays(parts: PixelParts) -> list[np.ndarray | str]:
+    pixels = [] if parts.pixels is None else [parts.pixels.cpu().numpy()]
+    return [*_describe_cameras(parts.cameras), f"{parts.side}", *pixels]
+
+
+def _describe_cameras(cameras: Cameras) -> list[np.ndarray | str]:
     tensors = [cameras.camera_to_world, cameras.fx, cameras.fy, cameras.cx, cameras.cy]
     tensors += [] if cameras.distortion is None else [cameras.distortion]
     numbers = (cameras.width, cameras.height, cameras.near, cameras.far)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from nerfro.data.cameras import Cameras
 from nerfro.data.distortion import coefficients, distort, opencv_coefficients, undistort
 from nerfro.geometry.cache import content_hash
-from nerfro.samplers.path_cache import _camera_parts
+from nerfro.samplers.path_cache import _describe_cameras
 
 LENSES = {
     "barrel": coefficients([-0.18, 0.03]),
@@ -122,5 +122,5 @@ def test_projection_by_hand_and_behind_the_camera():
 
 def test_paths_that_were_kept_for_one_lens_are_not_taken_for_another(cameras):
     other = replace(cameras, distortion=cameras.distortion * 0.5)
-    keys = [content_hash(*_camera_parts(c)) for c in (cameras, other, replace(cameras, distortion=None))]
+    keys = [content_hash(*_describe_cameras(c)) for c in (cameras, other, replace(cameras, distortion=None))]
     assert len(set(keys)) == 3

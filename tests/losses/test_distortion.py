@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nerfro.losses.distortion import Distortion, distortion
-from nerfro.types import Path, Rendering, Samples
+from nerfro.types import Batch, Path, Rendering, Samples
 
 
 def random_intervals(num_rays: int, num_samples: int, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
@@ -65,7 +65,8 @@ def test_loss_does_not_depend_on_the_scenes_scale_or_place() -> None:
         samples = Samples(positions, positions, s[:, :-1], s, torch.ones(5))
         colour = torch.zeros(5, 3)
         rendering = Rendering(colour, weights, torch.zeros(5), colour, samples, path)
-        return Distortion()([rendering], None, None)  # type: ignore[arg-type]  # neither batch nor model is asked
+        batch = Batch(None, colour, None, None)  # type: ignore[arg-type]  # nor is the model asked
+        return Distortion()([rendering], batch, None)  # type: ignore[arg-type]
 
     torch.testing.assert_close(loss(1.0, 0.0), loss(30.0, 2.0), rtol=1e-4, atol=0)
 

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from nerfro.data.cameras import Cameras
+from nerfro.data.pixel_parts import PixelParts
 from nerfro.errors import NerfroError
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers import path_cache
@@ -55,7 +56,7 @@ def _batch(cameras: Cameras, jitter: bool = False) -> tuple[torch.Tensor, Rays]:
 @pytest.mark.parametrize("memory_limit", [2.0, 0.0], ids=["memory", "disk"])
 def test_cached_paths_are_the_traced_ones(sampler: Snell | Eikonal, memory_limit: float) -> None:
     cameras, medium = _cameras(), _medium()
-    cache = PathCache.build(sampler, medium, cameras, memory_limit)
+    cache = PathCache.build(sampler, medium, PixelParts(cameras), memory_limit)
     index, rays = _batch(cameras)
     cached, traced = cache(index, rays), sampler(rays, medium)
     assert 0.1 < float(traced.refracted.float().mean()) < 0.9
@@ -67,10 +68,10 @@ def test_cached_paths_are_the_traced_ones(sampler: Snell | Eikonal, memory_limit
 
 
 def test_straight_rays_are_not_stored() -> None:
-    cache = PathCache.build(Snell(), _medium(), _cameras())
+    cache = PathCache.build(Snell(), _medium(), PixelParts(_cameras()))
     bent = cache.starts.diff() > 0
     assert len(cache.vertices) == 4 * int(bent.sum())
-    nothing = PathCache.build(Snell(), _medium(), _cameras(-40.0))
+    nothing = PathCache.build(Snell(), _medium(), PixelParts(_cameras(-40.0)))
     assert nothing.vertices.shape == (0, 7)
     index, rays = _batch(_cameras(-40.0))
     assert not nothing(index, rays).refracted.any()
@@ -84,9 +85,9 @@ def test_the_second_build_reads_what_the_first_wrote(tmp_path: Path) -> None:
             Counting.calls += 1
             return super().forward(rays, medium)
 
-    first = PathCache.build(Counting(), _medium(), _cameras())
+    first = PathCache.build(Counting(), _medium(), PixelParts(_cameras()))
     calls = Counting.calls
-    second = PathCache.build(Counting(), _medium(), _cameras())
+    second = PathCache.build(Counting(), _medium(), PixelParts(_cameras()))
     assert Counting.calls == calls > 0
     torch.testing.assert_close(first.vertices, second.vertices, rtol=0, atol=0)
 
@@ -104,25 +105,25 @@ def test_any_change_is_another_entry(tmp_path: Path) -> None:
         (Snell(), medium, dataclasses.replace(cameras, far=6.5)),
     ]
     for sampler, body, views in variants:
-        PathCache.build(sampler, body, views)
+        PathCache.build(sampler, body, PixelParts(views))
     assert len(list((tmp_path / "cache").glob("paths_*.f32"))) == len(variants)
 
 
 def test_jittered_rays_are_refused() -> None:
     cameras = _cameras()
-    cache = PathCache.build(Snell(), _medium(), cameras)
+    cache = PathCache.build(Snell(), _medium(), PixelParts(cameras))
     index, rays = _batch(cameras, jitter=True)
     with pytest.raises(NerfroError, match="jitter"):
         cache(index, rays)
 
 
 def test_a_truncated_file_is_not_used(tmp_path: Path) -> None:
-    PathCache.build(Snell(), _medium(), _cameras())
+    PathCache.build(Snell(), _medium(), PixelParts(_cameras()))
     file = next((tmp_path / "cache").glob("paths_*.f32"))
     file.write_bytes(file.read_bytes()[:-28])
     with pytest.raises(NerfroError, match="truncated"):
-        PathCache.build(Snell(), _medium(), _cameras())
-    PathCache.build(Snell(), _medium(), _cameras())
+        PathCache.build(Snell(), _medium(), PixelParts(_cameras()))
+    PathCache.build(Snell(), _medium(), PixelParts(_cameras()))
 
 
 class _Console(io.StringIO):
@@ -145,8 +146,8 @@ def test_long_tracing_shows_its_progress_on_a_terminal(
     console = _Console(terminal)
     monkeypatch.setattr(path_cache, "_SILENT_SECONDS", silent_seconds)
     monkeypatch.setattr(sys, "stderr", console)
-    PathCache.build(Snell(), _medium(), _cameras())
-    PathCache.build(Snell(), _medium(), _cameras())  # read from disk: nothing to show
+    PathCache.build(Snell(), _medium(), PixelParts(_cameras()))
+    PathCache.build(Snell(), _medium(), PixelParts(_cameras()))  # read from disk: nothing to show
     text = console.getvalue()
     assert ("trace: 100%" in text and "ray/s" in text) == shown
     assert shown or not text

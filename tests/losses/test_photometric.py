@@ -1,0 +1,55 @@
+"""The re-rendering error of pixels that have one ray, and of those that have several."""
+
+from __future__ import annotations
+
+import torch
+
+from nerfro.colour import to_linear, to_srgb
+from nerfro.losses.boundary import BoundaryRegulariser
+from nerfro.losses.photometric import Photometric
+from nerfro.types import Batch, Path, Rendering, Samples
+
+NUM_WHOLE, NUM_DIVIDED, PARTS = 3, 2, 4
+NUM_RAYS = NUM_WHOLE + NUM_DIVIDED * PARTS
+
+
+def rendering(colour: torch.Tensor, boundary: torch.Tensor, passed: torch.Tensor) -> Rendering:
+    vectors = torch.zeros(NUM_RAYS, 2, 3)
+    ends = torch.tensor([[2.0, 6.0]]).expand(NUM_RAYS, 2)
+    path = Path(vectors, vectors, ends, vectors[:, 0], torch.ones(NUM_RAYS, dtype=torch.bool), torch.ones(NUM_RAYS))
+    samples = Samples(vectors[:, :1], vectors[:, :1], ends[:, :1], ends, torch.ones(NUM_RAYS))
+    rgb = (1 - passed)[:, None] * colour + passed[:, None] * boundary
+    return Rendering(rgb, (1 - passed)[:, None], passed, boundary, samples, path)
+
+
+def batch() -> Batch:
+    pixels = torch.rand(NUM_WHOLE + NUM_DIVIDED, 3)
+    rgb = torch.cat([pixels[:NUM_WHOLE], pixels[NUM_WHOLE:].repeat_interleave(PARTS, 0)])
+    return Batch(None, rgb, None, None, num_whole=NUM_WHOLE, rays_per_pixel=PARTS)  # type: ignore[arg-type]
+
+
+def test_a_divided_pixel_is_compared_as_a_whole_and_teaches_the_field_alone() -> None:
+    colour, boundary = (torch.rand(NUM_RAYS, 3, requires_grad=True) for _ in range(2))
+    given, passed = batch(), torch.rand(NUM_RAYS)
+    rendered = rendering(colour, boundary, passed)
+    loss = Photometric()([rendered], given, None)  # type: ignore[arg-type]  # the model is not asked
+    parts = to_linear(rendered.rgb[NUM_WHOLE:]).view(NUM_DIVIDED, PARTS, 3)
+    pixels = torch.cat([rendered.rgb[:NUM_WHOLE], to_srgb(parts.mean(1))])
+    target = torch.cat([given.rgb[:NUM_WHOLE], given.rgb[NUM_WHOLE::PARTS]])
+    expected = (pixels - target).square().mean()
+    torch.testing.assert_close(loss, expected)
+    of_colour, of_boundary = torch.autograd.grad(loss, [colour, boundary], retain_graph=True)
+    whole_colour, whole_boundary = torch.autograd.grad(expected, [colour, boundary])
+    torch.testing.assert_close(of_colour, whole_colour)
+    torch.testing.assert_close(of_boundary[:NUM_WHOLE], whole_boundary[:NUM_WHOLE])
+    assert whole_boundary[NUM_WHOLE:].abs().min() > 0
+    torch.testing.assert_close(of_boundary[NUM_WHOLE:], torch.zeros(NUM_DIVIDED * PARTS, 3), rtol=0, atol=1e-7)
+
+
+def test_parts_of_a_pixel_need_not_have_its_colour_for_the_regulariser() -> None:
+    given, passed = batch(), torch.full((NUM_RAYS,), 0.9, requires_grad=True)
+    rendered = rendering(torch.rand(NUM_RAYS, 3), torch.rand(NUM_RAYS, 3), passed)
+    value = BoundaryRegulariser()([rendered], given, None)  # type: ignore[arg-type]
+    (gradient,) = torch.autograd.grad(value, passed)
+    assert (gradient[:NUM_WHOLE] != 0).all()
+    assert (gradient[NUM_WHOLE:] == 0).all()
