@@ -99,7 +99,7 @@ def main(config: DictConfig) -> None:
             return
     images, size = _list_photographs(Path(config.images).expanduser())
     # Where the loader of the data set will look for them.
-    masks = [find_mask(out.resolve(), image.resolve()) for image in images]
+    masks = [find_mask(out, out / _relative(image, out)) for image in images]
     names = [*(f"transforms_{split}.json" for split in _SPLITS), _REPORT, _PLOT]
     refuse_existing([out / name for name in names], config.overwrite)
     quads: list[Float[np.ndarray, "4 3"]] = []
@@ -325,7 +325,11 @@ def _write(
 
 
 def _relative(file: Path, folder: Path) -> str:
-    return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
+    """A file's path from a folder; through a link within the folder, whose place in it says where masks are."""
+    file, folder = Path(os.path.abspath(file)), Path(os.path.abspath(folder))
+    if not file.is_relative_to(folder):
+        file, folder = file.resolve(), folder.resolve()
+    return Path(os.path.relpath(file, folder)).as_posix()
 
 
 def _next_command(out: Path, calibration: Calibration, seen: Float[np.ndarray, "P 3"], has_masks: bool) -> list[str]:

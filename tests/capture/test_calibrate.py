@@ -159,6 +159,19 @@ def test_tags_inside_the_objects_mask_do_not_count(tmp_path: Path, command: Call
     assert counts.pop("p_0.png") <= 15 < min(counts.values())
 
 
+def test_masks_of_photographs_behind_a_link_are_found(tmp_path: Path, command: Callable[..., str]) -> None:
+    options, make, distance = TARGETS["grid"]
+    names = take(tmp_path / "elsewhere", make(), distance)
+    data = tmp_path / "data"
+    (data / "masks").mkdir(parents=True)
+    (data / "images").symlink_to(tmp_path / "elsewhere")
+    for name in names:
+        Image.fromarray(np.uint8(255 * (np.indices(SIZE[::-1]).sum(0) < 40))).save(data / "masks" / name)
+    printed = command("calibrate", f"images={data / 'images'}", f"out={data}", *options)
+    assert "nerfro.preprocess" in printed
+    assert OpenCVData(str(data)).load("train").masks is not None
+
+
 def test_boards_are_printed_in_their_size(tmp_path: Path, command: Callable[..., str]) -> None:
     command("calibrate", "write_board=true", f"out={tmp_path}", "size=0.03")
     assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
