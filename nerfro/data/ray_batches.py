@@ -147,32 +147,39 @@ class RayBatches:
         )
 
     def _divided_batch(self, drawn: Int[np.ndarray, "P"], cameras: Cameras) -> Batch:
-        """A batch of pixels of which some have several rays: the others first, then those."""
+        """The batch of the drawn pixels: first those that have one ray, then the divided ones with all of theirs."""
         assert self._parts is not None
-        device, several = self._cameras.device, self._parts.rays_per_pixel
+        several = self._parts.rays_per_pixel
         is_divided = self._place[drawn] >= 0
         # Each pixel's first row in the whole batch.
-        sizes = np.where(is_divided, several, 1)
+        num_rays = np.where(is_divided, several, 1)
         order = np.argsort(is_divided, kind="stable")
-        first = np.empty(len(drawn), np.int64)
-        first[order] = np.cumsum(sizes[order]) - sizes[order]
-        own, divided = drawn[self._share], is_divided[self._share]
-        parts = np.arange(several)
-        whole, numbers = own[~divided], self._place[own[divided]].astype(np.int64)[:, None] * several + parts
-        rows = np.concatenate([first[self._share][~divided], (first[self._share][divided][:, None] + parts).ravel()])
-        pixels = np.concatenate([whole, own[divided].repeat(several)])
-        index = np.concatenate([whole, numbers.ravel()])
-        pixel, number, row = torch.from_numpy(np.stack([pixels, index, rows])).to(device, non_blocking=True)
-        centres = PixelParts(self._cameras).rays(number[: len(whole)])
+        first_row = np.empty(len(drawn), np.int64)
+        first_row[order] = np.cumsum(num_rays[order]) - num_rays[order]
+
+        pixel, row, divided = drawn[self._share], first_row[self._share], is_divided[self._share]
+        first_part = several * self._place[pixel[divided]].astype(np.int64)
+
+        def for_each_ray(of_whole: np.ndarray, of_divided: np.ndarray, step: int) -> np.ndarray:
+            return np.concatenate([of_whole, (of_divided[:, None] + step * np.arange(several)).ravel()])
+
+        of_each_ray = (
+            for_each_ray(pixel[~divided], pixel[divided], 0),
+            for_each_ray(pixel[~divided], first_part, 1),
+            for_each_ray(row[~divided], row[divided], 1),
+        )
+        # One small copy to the device; the rest is computed there.
+        pixels, index, rows = torch.from_numpy(np.stack(of_each_ray)).to(self._cameras.device, non_blocking=True)
+        num_whole = int((~divided).sum())
         return Batch(
-            rays=centres.followed_by(self._parts.rays(number[len(whole) :])),
-            rgb=self._pixels[pixel],
-            index=number,
+            rays=PixelParts(self._cameras).rays(index[:num_whole]).followed_by(self._parts.rays(index[num_whole:])),
+            rgb=self._pixels[pixels],
+            index=index,
             cameras=cameras,
-            num_whole=len(whole),
+            num_whole=num_whole,
             rays_per_pixel=several,
-            rows=row,
-            num_rows=int(sizes.sum()),
+            rows=rows,
+            num_rows=int(num_rays.sum()),
         )
 
     def _draw(self, generator: np.random.Generator, window: Window) -> tuple[np.ndarray | np.int64, np.ndarray]:
