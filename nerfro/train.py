@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import sys
 import warnings
 from datetime import timedelta
@@ -114,7 +115,8 @@ def main(config: DictConfig) -> None:
     print(f"{trainer.global_step} steps in {throughput.seconds:.0f} s, {throughput.rays_per_second or 0:,.0f} rays/s.")
     print("Look at:")
     print(f"  {folder}/images/  the pictures; metrics.json, .csv, .md and .tex beside them")
-    print(f"  {folder}/checkpoints/last.ckpt  evaluate it with python -m nerfro.evaluate checkpoint=...")
+    checkpoint = shlex.quote(f"checkpoint={folder}/checkpoints/last.ckpt")
+    print(f"  python -m nerfro.evaluate {checkpoint}  scores it again, or other views")
     print("  python -m nerfro.dashboard  losses and validation pictures")
 
 
