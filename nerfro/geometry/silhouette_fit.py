@@ -11,24 +11,26 @@ from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.ndimage import binary_erosion, distance_transform_edt
 from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
 
 from nerfro.data.cameras import Cameras
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.visual_hull import Silhouettes
 
 _ITERATIONS = 10
-# Weights of area and of bending for each observation of the outline; found on silhouettes of a rounded cube.
-_AREA, _BENDING = 1.1e-5, 4.4e-8
-# The area's weight falls from this many times its last value: a surface that is a little too small is pulled out at the
-# edges, where the object is, whereas one that fills the hull touches all masks everywhere and would stay.
-_FIRST_AREA = 30.0
-# Outlines farther than this from a mask's belong to folds of the surface in front of itself, pixels.
-_GATE = 3.0
-# Misfits below this are no news, pixels: where a line along the pixels' rows lies between two rows, a binary mask does
-# not tell, and the surface may lie as it is smoothest.
-_TOLERANCE_BINARY, _TOLERANCE_GREY = 0.25, 0.05
-# Weight of observations within the tolerance, and misfit at which the weight of those beyond it is halved, pixels.
-_WITHIN, _HALVED = 0.05, 0.7
+# Weights of area and of bending for each observation of the outline, in units of the object's size.
+_AREA, _BENDING = 3.0e-5, 1.0e-7
+# A normal that is turned by a radian counts as far away as this share of the object's size. Curvature is usual around a
+# vertex if this share of the vertices there have at least as much: 0 on flat sides and low roofs, the ball's on a ball.
+_TURN, _LEAST_SHARE = 0.08, 0.7
+# Around a vertex are so many of these, spread over the whole surface.
+_NUM_AROUND, _NUM_SPREAD = 31, 1000
+# A binary mask's outline is known to about this, pixels. The misfits' median over it, where that is more than 1, is how
+# far the surface still is from the masks: the two limits below widen with it, so that it never loses them all.
+_TYPICAL = 0.35
+# Outlines farther than this from a mask's belong to folds of the surface in front of itself; where the weight of an
+# observation is halved, pixels.
+_GATE, _HALVED = 3.0, 0.7
 
 
 @dataclass(frozen=True)
@@ -58,13 +60,16 @@ def fit_surface(
     """Move a hull's vertices along their normals so that its outlines meet the masks' and the rest is smooth.
 
     The hull is the largest body with the given silhouettes: its flat sides carry low roofs, where no camera looked
-    along them, and every error of a mask cuts a groove. This is the smallest smooth one instead. Each step finds the
-    rims (where the surface turns away from a camera), takes the outermost rim at each pixel of a mask's outline as an
-    observation of the distance to it, and solves the linear least squares of observations, area and bending
+    along them, and every error of a mask cuts a groove. This is a smooth one instead. Each step finds the rims (where
+    the surface turns away from a camera), takes the outermost rim at each pixel of a mask's outline as an observation
+    of the distance to it, and solves the linear least squares of observations, area and bending
 
-        sum_k w_k (d_k - misfit_k)^2 + a sum_edges |x_i - x_j|^2 + b sum_i (h H_i)^2
+        sum_k w_k (d_k - misfit_k)^2 + a (sum_edges |x_i - x_j|^2 - sum_i p_i d_i) + b sum_i (h (H_i - C_i))^2
 
     for the displacements d along the normals, x the displaced vertices, H their mean curvature, h the edges' length.
+    C is the curvature that is usual around a vertex, and p the pressure at which area bends a film that much: flat
+    sides become flat, and a ball is left alone, where least area alone would draw it in between its rims. All of it is
+    relative to the object's size and to the number of observations.
 
     Args:
         mesh: a closed surface around the object with triangles of about one size, such as marching cubes give.
@@ -79,15 +84,15 @@ def fit_surface(
     edges = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
     size = float(np.ptp(vertices, axis=0).max())
     outlines = [_nearest_outline_pixel(mask) for mask in (silhouettes.masks > 0.5).numpy()]
-    tolerance = _TOLERANCE_BINARY if _is_binary(silhouettes) else _TOLERANCE_GREY
     mean = _neighbour_mean(edges, len(vertices))
     across = _differences(edges, len(vertices))
+    degree = np.bincount(edges.ravel())
     for iteration in range(_ITERATIONS):
         normals = _vertex_normals(vertices, faces)
-        rims = _find_rims(vertices, normals, edges, silhouettes, outlines, tolerance)
+        rims = _find_rims(vertices, normals, edges, silhouettes, outlines)
         num_rims = len(rims.share)
-        area = smoothing * num_rims * _AREA * _FIRST_AREA ** (1 - iteration / (_ITERATIONS - 1))
-        bending = area * _BENDING / _AREA * size**2
+        area = smoothing * num_rims * _AREA
+        bending = smoothing * num_rims * _BENDING * size**2
         observed = sparse.csr_matrix(
             (
                 np.concatenate([1 - rims.share, rims.share]),
@@ -95,13 +100,16 @@ def fit_surface(
             ),
             (num_rims, len(vertices)),
         )
-        curvature, curved = _mean_curvature(vertices, normals, edges, mean)
+        curvature, curved, around = _mean_curvature(vertices, normals, edges, mean)
+        usual = _usual_curvature(curved, vertices, normals, _TURN * size)
         along = [sparse.diags(normals[:, axis]) for axis in range(3)]
         stretch = sum(n @ across.T @ across @ n for n in along)
         stretched = sum(normals[:, a] * (across.T @ (across @ vertices[:, a])) for a in range(3))
+        pressure = -degree * around / np.sqrt(around.mean()) * usual
         weights = sparse.diags(rims.weight)
         system = observed.T @ weights @ observed + area * stretch + bending * (curvature.T @ curvature)
-        right = observed.T @ (rims.weight * rims.misfit) - area * stretched - bending * (curvature.T @ curved)
+        right = observed.T @ (rims.weight * rims.misfit) - area * (stretched - pressure)
+        right -= bending * (curvature.T @ (curved - usual))
         # Symmetric and positive definite: no pivoting needed, and an ordering that keeps the factors sparse.
         factors = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0, options={"SymmetricMode": True})
         longest = 2 * np.sqrt(((vertices[edges[:, 0]] - vertices[edges[:, 1]]) ** 2).sum(1).mean())
@@ -116,10 +124,10 @@ def _find_rims(
     edges: Int[np.ndarray, "E 2"],
     silhouettes: Silhouettes,
     outlines: list[Int[np.ndarray, "H W"]],
-    tolerance: float,
 ) -> _Rims:
     """The outermost rims that every view sees near each pixel of its mask's outline."""
     cameras = silhouettes.cameras
+    spacing = float(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1).mean())
     parts = []
     for view, outline in enumerate(outlines):
         facing = (normals * (vertices - cameras.camera_to_world[view, :, 3].double().numpy())).sum(1)
@@ -130,22 +138,31 @@ def _find_rims(
         points = vertices[first] + share[:, None] * (vertices[second] - vertices[first])
         places = torch.from_numpy(points).float()
         inside, width = (values.double().numpy() for values in silhouettes.depth_inside(view, places)[:2])
-        near = np.flatnonzero(np.abs(inside) < _GATE)
-        cell = _look_up(outline, cameras.select([view]), places[near])
-        order = np.lexsort((inside[near], cell))
-        outermost = near[order[np.diff(cell[order], prepend=-1) != 0]]
-        misfit = inside[outermost]
-        news = misfit - misfit.clip(-tolerance, tolerance)
-        weight = np.where(news == 0, _WITHIN, 1 / (1 + (misfit / _HALVED) ** 2))
-        parts.append((first[outermost], second[outermost], share[outermost], news * width[outermost], weight))
-    return _Rims(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+        known = np.flatnonzero(np.isfinite(inside))
+        if not len(known):
+            continue
+        # Pixels narrower than an edge may be met by no rim but one of a fold, so they are taken together.
+        pixels = max(1, int(np.ceil(spacing / width[known].mean())))
+        cell = _look_up(outline, cameras.select([view]), places[known], pixels)
+        order = np.lexsort((inside[known], cell))
+        outermost = known[order[np.diff(cell[order], prepend=-1) != 0]]
+        parts.append((first[outermost], second[outermost], share[outermost], inside[outermost], width[outermost]))
+    first, second, share, misfit, width = (np.concatenate(values) for values in zip(*parts, strict=True))
+    spread = max(1.0, float(np.median(np.abs(misfit))) / _TYPICAL)
+    near = np.abs(misfit) < _GATE * spread
+    weight = 1 / (1 + (misfit / (_HALVED * spread)) ** 2)
+    return _Rims(first[near], second[near], share[near], (misfit * width)[near], weight[near])
 
 
-def _look_up(outline: Int[np.ndarray, "H W"], camera: Cameras, points: torch.Tensor) -> Int[np.ndarray, "P"]:
-    pixels = camera.project(points)[0][0].numpy()
-    row = pixels[:, 1].astype(np.int64).clip(0, camera.height - 1)
-    column = pixels[:, 0].astype(np.int64).clip(0, camera.width - 1)
-    return outline[row, column]
+def _look_up(
+    outline: Int[np.ndarray, "H W"], camera: Cameras, points: torch.Tensor, pixels: int
+) -> Int[np.ndarray, "P"]:
+    """Number of the square of pixels x pixels that holds the part of the outline nearest to each point."""
+    place = camera.project(points)[0][0].numpy()
+    row = place[:, 1].astype(np.int64).clip(0, camera.height - 1)
+    column = place[:, 0].astype(np.int64).clip(0, camera.width - 1)
+    nearest = outline[row, column]
+    return nearest // camera.width // pixels * camera.width + nearest % camera.width // pixels
 
 
 def _nearest_outline_pixel(inside: np.ndarray) -> Int[np.ndarray, "H W"]:
@@ -153,14 +170,6 @@ def _nearest_outline_pixel(inside: np.ndarray) -> Int[np.ndarray, "H W"]:
     outline = inside & ~binary_erosion(inside, border_value=1)
     rows, columns = distance_transform_edt(~outline, return_distances=False, return_indices=True)
     return rows.astype(np.int64) * inside.shape[1] + columns
-
-
-def _is_binary(silhouettes: Silhouettes) -> bool:
-    """Whether the masks' pixels are covered or not, without shares in between."""
-    masks = silhouettes.masks
-    partial = ((masks > 0.02) & (masks < 0.98)).sum()
-    changes = ((masks[:, 1:] > 0.5) != (masks[:, :-1] > 0.5)).sum()
-    return int(partial) < 0.2 * int(changes)
 
 
 def _vertex_normals(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "V 3"]:
@@ -191,8 +200,11 @@ def _mean_curvature(
     normals: Float[np.ndarray, "V 3"],
     edges: Int[np.ndarray, "E 2"],
     mean: sparse.csr_matrix,
-) -> tuple[sparse.csr_matrix, Float[np.ndarray, "V"]]:
-    """Half the mean curvature at vertices times the edges' length: how displacements change it, and what it is now.
+) -> tuple[sparse.csr_matrix, Float[np.ndarray, "V"], Float[np.ndarray, "V"]]:
+    """Half the mean curvature at vertices times the edges' length, negative on a ball.
+
+    Returns:
+        How displacements change it, what it is now, and the mean square of the lengths of each vertex' edges.
 
     The neighbours' mean lies off a vertex by r^2 H / 2 along the normal, r^2 the mean square of the edges' lengths.
     """
@@ -205,4 +217,22 @@ def _mean_curvature(
     umbrella = mean - sparse.identity(len(vertices))
     along = [sparse.diags(normals[:, axis]) for axis in range(3)]
     change = scale @ sum(n @ umbrella @ n for n in along)
-    return change.tocsr(), scale @ (normals * (umbrella @ vertices)).sum(1)
+    return change.tocsr(), scale @ (normals * (umbrella @ vertices)).sum(1), around
+
+
+def _usual_curvature(
+    curved: Float[np.ndarray, "V"], vertices: Float[np.ndarray, "V 3"], normals: Float[np.ndarray, "V 3"], turn: float
+) -> Float[np.ndarray, "V"]:
+    """The curvature that most vertices around each one reach, with the sign of their median.
+
+    Args:
+        curved: negative on a ball.
+        vertices, normals: of the mesh.
+        turn: how far away a normal turned by a radian is: the other side of a thin wall is not near.
+    """
+    points = np.concatenate([vertices, turn * normals], 1)
+    chosen = np.linspace(0, len(points) - 1, min(len(points), _NUM_SPREAD)).astype(np.int64)
+    _, index = cKDTree(points[chosen]).query(points, k=min(_NUM_AROUND, len(chosen)))
+    near = curved[chosen][index]
+    sign = np.sign(np.median(near, axis=1))
+    return sign * np.quantile((near * sign[:, None]).clip(min=0), 1 - _LEAST_SHARE, axis=1)

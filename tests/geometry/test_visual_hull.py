@@ -163,6 +163,25 @@ def test_fit_flattens_what_no_camera_looked_along() -> None:
     assert volume(fitted) == pytest.approx(1.2**3, rel=0.03)
 
 
+@pytest.mark.parametrize("pixels", [64, 256])
+def test_fit_leaves_a_ball_in_its_outlines_however_many_pixels_it_fills(pixels: int) -> None:
+    silhouettes = photographed(trimesh.creation.icosphere(5, 0.7), cameras_around(20, pixels))
+    fitted = fit_surface(hull(silhouettes, 32), silhouettes)
+    radii = np.linalg.norm(fitted.vertices, axis=1)
+    assert radii.mean() == pytest.approx(0.7, rel=0.006)
+    assert radii.std() < 0.008
+    assert overlap(fitted, silhouettes, 64).min() > 0.97
+
+
+def test_fit_is_the_same_in_any_unit_of_length() -> None:
+    silhouettes = photographed(trimesh.creation.box((1.2, 0.9, 0.7)), cameras_around(12, 48))
+    carved = hull(silhouettes, 24)
+    poses = silhouettes.cameras.camera_to_world * torch.tensor([1.0, 1, 1, 8])
+    larger = silhouettes.seen_from(replace(silhouettes.cameras, camera_to_world=poses))
+    scaled = fit_surface(TriangleMesh(8 * carved.vertices, carved.faces), larger)
+    np.testing.assert_allclose(scaled.vertices / 8, fit_surface(carved, silhouettes).vertices, atol=2e-3)
+
+
 def test_hull_meets_its_masks(odd_shape: trimesh.Trimesh) -> None:
     silhouettes = photographed(odd_shape, cameras_around(16, 64))
     require_consistent_poses(silhouettes, [f"r_{view}" for view in range(16)], wrong_masks=0)

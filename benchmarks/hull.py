@@ -1,0 +1,113 @@
+"""How well a hull stands for the true surface: `python benchmarks/hull.py DATA MESH`, a minute on one core."""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from capture import read_cameras, similarity, volume_overlap
+from jaxtyping import Float
+
+from nerfro.data.base import Views
+from nerfro.geometry.mesh import TriangleMesh, load_mesh
+from nerfro.geometry.normals import face_normals
+from nerfro.geometry.silhouettes import pixel_stride
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.paths import resolve_path
+from nerfro.registry import discover, find
+from nerfro.samplers.snell import Snell
+
+_MARGIN_SHARE = 0.15
+_MAX_PIXELS = 160
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("data", help="folder of posed images; its test split is looked at")
+    parser.add_argument("mesh", type=Path, help="written by nerfro.preprocess")
+    parser.add_argument("--truth", type=Path, help="true surface; DATA/truth/mesh.ply, or DATA/mesh.ply, if not given")
+    parser.add_argument("--format", default="blender", help="of the data, as in data=")
+    parser.add_argument("--ior", type=float, default=1.5)
+    given = parser.parse_args()
+    discover()
+    views = find("data", given.format).cls(given.data).load("test")
+    root = resolve_path(given.data)
+    true = load_mesh(given.truth) if given.truth else true_surface(root)
+    for name, value in measure(load_mesh(given.mesh), true, views, given.ior).items():
+        print(f"{name:<60} {value:.4g}")
+
+
+def true_surface(root: Path) -> TriangleMesh:
+    """The true surface in the frame of a data set's cameras, which for a capture are not the true ones."""
+    if not (root / "truth").is_dir():
+        return load_mesh(root / "mesh.ply")
+    true_poses, poses = (read_cameras(folder)[1] for folder in (root / "truth", root))
+    names = sorted(poses)
+    scale, turn, shift = similarity(*(np.stack([p[name][:, 3] for name in names]) for p in (true_poses, poses)))
+    mesh = load_mesh(root / "truth" / "mesh.ply")
+    return TriangleMesh(scale * mesh.vertices @ turn.T + shift, mesh.faces)
+
+
+def measure(mesh: TriangleMesh, true: TriangleMesh, views: Views, ior: float) -> dict[str, float]:
+    """Compare a surface with the true one.
+
+    Args:
+        mesh: the surface.
+        true: the true one, in the same frame.
+        views: whose rays are traced through both.
+        ior: refractive index inside.
+    """
+    both = np.concatenate([mesh.bounds, true.bounds])
+    margin = _MARGIN_SHARE * np.ptp(both, axis=0).max()
+    box = np.stack([both.min(0) - margin, both.max(0) + margin])
+    ours, exact = (_medium(body, box, ior) for body in (mesh, true))
+    stride = pixel_stride(views.cameras, _MAX_PIXELS)
+    cameras = views.cameras.resized(views.cameras.width // stride, views.cameras.height // stride)
+    errors = []
+    for view in range(len(cameras)):
+        rays = cameras.image_rays(view)
+        seen, expected = (Snell()(rays, medium) for medium in (ours, exact))
+        hit = expected.refracted
+        errors.append(_degrees(seen.exit_directions[hit].numpy(), expected.exit_directions[hit].numpy()))
+    error = np.concatenate(errors)
+    tilt, area = normal_errors(mesh, exact)
+    return {
+        "volume, intersection over union": volume_overlap(mesh, true),
+        "volume, ratio": _volume(mesh) / _volume(true),
+        "normals, mean error in degrees": float((tilt * area).sum() / area.sum()),
+        "exit directions, median error in degrees": float(np.median(error)),
+        "exit directions, mean error in degrees": float(error.mean()),
+    }
+
+
+def normal_errors(mesh: TriangleMesh, exact: SdfGrid) -> tuple[Float[np.ndarray, "F"], Float[np.ndarray, "F"]]:
+    """Angle of each triangle to the true surface beside it, degrees, and its area."""
+    a, b, c = mesh.triangles.swapaxes(0, 1)
+    gradient = exact.signed_distances(torch.from_numpy(mesh.triangles.mean(1)).float())[1][:, 0].double().numpy()
+    return _degrees(face_normals(mesh), gradient), 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def _medium(mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], ior: float) -> SdfGrid:
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "mesh.ply"
+        trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file)
+        return SdfGrid(str(file), ior, box_min=box[0].tolist(), box_max=box[1].tolist(), cache=False)
+
+
+def _volume(mesh: TriangleMesh) -> float:
+    return float(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).volume)
+
+
+def _degrees(first: Float[np.ndarray, "N 3"], second: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"]:
+    """Angles between vectors, accurate for small ones."""
+    across = np.linalg.norm(np.cross(first, second), axis=1)
+    return np.degrees(np.arctan2(across, (first * second).sum(1)))
+
+
+if __name__ == "__main__":
+    main()
