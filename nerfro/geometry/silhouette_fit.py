@@ -1,4 +1,4 @@
-"""From the visual hull to the smallest smooth surface whose silhouettes are still the masks."""
+"""From the visual hull to a smooth surface whose silhouettes are still the masks."""
 
 from __future__ import annotations
 
