@@ -105,9 +105,7 @@ def main(config: DictConfig) -> None:
         f"wrote {', '.join(str(folder / name) for name in ([_MESH] if supplied is None else []) + [_SHEET, _REPORT])}"
     )
     command = train_command(config, silhouettes, mesh, location, list(HydraConfig.get().overrides.task))
-    print(
-        "add +experiment=refractive_room to what follows where the surroundings are near; +experiment=mipnerf compares"
-    )
+    print("where the surroundings are near, add +experiment=refractive_room; the baseline is +experiment=mipnerf")
     print(f"train on it: {shlex.join(command)}")
 
 
