@@ -162,13 +162,13 @@ def missing(folder: Path, planned: list[AnyPlanned]) -> Iterator[AnyPlanned]:
 
 
 def write_view(folder: Path, view: View, radiance: np.ndarray, silhouette: np.ndarray) -> None:
-    """Write one view: 8-bit sRGB picture from linear radiance [H, W, 3], binary mask from bool [H, W]."""
+    """Write one view: 8-bit pictures of linear radiance [H, W, 3], in sRGB, and of the share of pixels [H, W]."""
     write_image(folder / view.mask_path, silhouette)
     write_image(folder / view.image_path, to_srgb(radiance))
 
 
 def write_image(path: Path, image: np.ndarray) -> None:
-    """Write sRGB [H, W, 3] in [0, 1] as an 8-bit PNG, or bool [H, W] as a 1-bit PNG."""
+    """Write sRGB [H, W, 3] or shares [H, W] in [0, 1] as an 8-bit PNG, or bool [H, W] as a 1-bit PNG."""
     picture = Image.fromarray(image if image.dtype == bool else np.rint(image * 255).astype(np.uint8))
     buffer = io.BytesIO()
     picture.save(buffer, format="PNG", optimize=True)
@@ -197,7 +197,7 @@ def write_meta(folder: Path, settings: Settings, scene: Scene, versions: dict[st
         "far": FAR,
         "camera_distance": CAMERA_DISTANCE,
         "sky": "lat-long, z up: column u = 0.5 - atan2(y, x) / (2 pi), row v = acos(z) / pi, pixel centres + 0.5",
-        "masks": "white where the ray through the pixel's centre meets the glass",
+        "masks": "share of the pixel that the glass covers",
         "settings": asdict(settings),
         "versions": versions,
     }

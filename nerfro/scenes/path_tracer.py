@@ -1,4 +1,4 @@
-"""Rendering a scene with Mitsuba 3: pictures by path tracing, silhouettes by one ray per pixel centre."""
+"""Rendering a scene with Mitsuba 3: pictures by path tracing, silhouettes by rays through parts of each pixel."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from nerfro.scenes.skies import Sky
 from nerfro.scenes.surface import Surface
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "scalar_rgb")
+# Hammersley's points: no two of them in one row or column, along which an edge might run.
+SILHOUETTE_PLACES = [((k + 0.5) / 32, int(f"{k:05b}"[::-1], 2) / 32 + 1 / 64) for k in range(32)]
 SAMPLES_PER_PASS = 6_000_000  # a wavefront of paths is held in memory at once: about 1 GB per 10 M paths
 _TEXELS_PER_TASK, _EDGE_CONTRAST = 1 << 17, 0.1
 _GET_LLVM = "llvm_ad_rgb needs the LLVM library, 16 or newer (Debian: apt-get install libllvm19)"
@@ -181,9 +183,17 @@ class PathTracer:
         return total / spp
 
     def silhouette(self, pose: np.ndarray) -> np.ndarray:
-        """Return bool [H, W]: whether the ray through each pixel's centre meets the glass, which nothing may hide."""
+        """Return the share [H, W] of each pixel that the glass, which nothing may hide, covers, to about 1 / 32."""
+        camera = self.camera
+        total = np.zeros((camera.height, camera.width))
+        for x, y in SILHOUETTE_PLACES:
+            u, v = np.meshgrid(np.arange(camera.width) + x - camera.cx, camera.cy - np.arange(camera.height) - y)
+            total += self._meets_glass(pose, u, v).reshape(total.shape)
+        return total / len(SILHOUETTE_PLACES)
+
+    def _meets_glass(self, pose: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Whether rays meet the glass, given where they cross the image plane, pixels from its principal point."""
         mi, camera = self.mitsuba, self.camera
-        u, v = np.meshgrid(np.arange(camera.width) + 0.5 - camera.cx, camera.cy - np.arange(camera.height) - 0.5)
         directions = np.stack([u, v, np.full_like(u, -camera.focal)], -1).reshape(-1, 3) @ pose[:3, :3].T
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         if mi.variant().startswith("scalar"):
@@ -192,7 +202,7 @@ class PathTracer:
             origins = mi.Point3f(*(mi.Float(np.full(len(directions), x, np.float32)) for x in pose[:3, 3]))
             rays = mi.Ray3f(origins, mi.Vector3f(*(mi.Float(x.astype(np.float32)) for x in directions.T)))
             hits = self.glass.ray_test(rays)
-        return np.asarray(hits, bool).reshape(camera.height, camera.width)
+        return np.asarray(hits, bool)
 
     def _sensor(self, pose: np.ndarray):
         camera = self.camera

@@ -92,12 +92,12 @@ def photographs(settings: Settings, target: np.ndarray) -> list[Photograph]:
 def write_photograph(
     folder: Path, photograph: Photograph, radiance: np.ndarray, silhouette: np.ndarray, noise: float
 ) -> None:
-    """Write one photograph: linear radiance [H, W, 3] as 8-bit sRGB with noise, and the mask bool [H, W].
+    """Write one photograph: linear radiance [H, W, 3] as 8-bit sRGB with noise, and a mask in black and white.
 
     Noise of equal strength on sRGB values is about what the noise of counted photons becomes under sRGB's curve.
     """
     grain = np.random.default_rng(photograph.seed).normal(scale=noise, size=radiance.shape)
-    write_image(folder / photograph.mask_path, silhouette)
+    write_image(folder / photograph.mask_path, silhouette >= 0.5)
     write_image(folder / photograph.image_path, np.clip(to_srgb(radiance) + grain, 0.0, 1.0))
 
 
