@@ -115,8 +115,8 @@ def main(config: DictConfig) -> None:
     print(f"{trainer.global_step} steps in {throughput.seconds:.0f} s, {throughput.rays_per_second or 0:,.0f} rays/s.")
     print("Look at:")
     print(f"  {folder}/images/  the pictures; metrics.json, .csv, .md and .tex beside them")
-    checkpoint = shlex.quote(f"checkpoint={folder}/checkpoints/last.ckpt")
-    print(f"  python -m nerfro.evaluate {checkpoint}  scores it again, or other views")
+    written = shlex.quote(f"checkpoint={folder}/checkpoints/last.ckpt")
+    print(f"  python -m nerfro.evaluate {written}  scores it again, or other views")
     print("  python -m nerfro.dashboard  losses and validation pictures")
 
 

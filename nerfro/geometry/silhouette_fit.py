@@ -17,9 +17,31 @@ from nerfro.data.cameras import Cameras
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.visual_hull import Silhouettes
 
-_ITERATIONS = 10
-# Weights of area and of bending for each observation of the outline, in units of the object's size.
-_AREA, _BENDING = 3.0e-5, 1.0e-7
+
+@dataclass(frozen=True)
+class _Prior:
+    """What is taken for likely where no outline tells.
+
+    Attributes:
+        area, bending: their last weights for each observation of the outline, in units of the object's size.
+        first: the weights fall from this many times the last ones. A surface that is too small is pulled out at the
+            edges, where the object is, whereas one that fills the hull touches all masks everywhere and would stay.
+        usual: whether the curvature that is usual around a vertex is likely, or none.
+        iterations: steps.
+    """
+
+    area: float
+    bending: float
+    first: float
+    usual: bool
+    iterations: int
+
+
+_ROUND = _Prior(area=3e-5, bending=1e-7, first=1, usual=True, iterations=10)
+_FLAT = _Prior(area=3e-6, bending=1e-8, first=100, usual=False, iterations=20)
+# Flat sides and sharp edges are believed in if they bring the outlines so much nearer to the masks'. Over five scenes
+# it was 0.26 and 0.64 times as near where they are true, and 0.94 to 1.2 where the object is round or masks are coarse.
+_CONVINCING = 0.8
 # A normal that is turned by a radian counts as far away as this share of the object's size. Curvature is usual around a
 # vertex if this share of the vertices there have at least as much: 0 on flat sides and low roofs, the ball's on a ball.
 _TURN, _LEAST_SHARE = 0.08, 0.7
@@ -67,9 +89,12 @@ def fit_surface(
         sum_k w_k (d_k - misfit_k)^2 + a (sum_edges |x_i - x_j|^2 - sum_i p_i d_i) + b sum_i (h (H_i - C_i))^2
 
     for the displacements d along the normals, x the displaced vertices, H their mean curvature, h the edges' length.
-    C is the curvature that is usual around a vertex, and p the pressure at which area bends a film that much: flat
-    sides become flat, and a ball is left alone, where least area alone would draw it in between its rims. All of it is
-    relative to the object's size and to the number of observations.
+    C is the curvature that is usual around a vertex, and p the pressure at which area bends a film that much: a ball
+    is left alone, where least area alone would draw it in between its rims. All of it is relative to the object's size
+    and to the number of observations.
+
+    That draws in sharp edges. So a second surface is fitted without C and p, with much area first and hardly any at
+    last; it is taken where its outlines are clearly nearer to the masks'.
 
     Args:
         mesh: a closed surface around the object with triangles of about one size, such as marching cubes give.
@@ -80,6 +105,22 @@ def fit_surface(
     Returns:
         The same triangles with other vertices.
     """
+    done = 0
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        progress(done / (_ROUND.iterations + _FLAT.iterations))
+
+    curved, rounded_misfit = _fit(mesh, silhouettes, smoothing, _ROUND, step)
+    flat, flat_misfit = _fit(mesh, silhouettes, smoothing, _FLAT, step)
+    return flat if flat_misfit < _CONVINCING * rounded_misfit else curved
+
+
+def _fit(
+    mesh: TriangleMesh, silhouettes: Silhouettes, smoothing: float, prior: _Prior, step: Callable[[], None]
+) -> tuple[TriangleMesh, float]:
+    """The surface that is likeliest by a prior, and its outlines' mean distance from the masks', world units."""
     faces, vertices = mesh.faces, mesh.vertices.copy()
     edges = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
     size = float(np.ptp(vertices, axis=0).max())
@@ -87,12 +128,14 @@ def fit_surface(
     mean = _neighbour_mean(edges, len(vertices))
     across = _differences(edges, len(vertices))
     degree = np.bincount(edges.ravel())
-    for iteration in range(_ITERATIONS):
+    for iteration in range(prior.iterations):
         normals = _vertex_normals(vertices, faces)
         rims = _find_rims(vertices, normals, edges, silhouettes, outlines)
         num_rims = len(rims.share)
-        area = smoothing * num_rims * _AREA
-        bending = smoothing * num_rims * _BENDING * size**2
+        # The last three steps have the last weights.
+        more = prior.first ** max(0.0, 1 - iteration / (prior.iterations - 3))
+        area = smoothing * num_rims * prior.area * more
+        bending = smoothing * num_rims * prior.bending * more * size**2
         observed = sparse.csr_matrix(
             (
                 np.concatenate([1 - rims.share, rims.share]),
@@ -101,7 +144,7 @@ def fit_surface(
             (num_rims, len(vertices)),
         )
         curvature, curved, around = _mean_curvature(vertices, normals, edges, mean)
-        usual = _usual_curvature(curved, vertices, normals, _TURN * size)
+        usual = _usual_curvature(curved, vertices, normals, _TURN * size) if prior.usual else np.zeros_like(curved)
         along = [sparse.diags(normals[:, axis]) for axis in range(3)]
         stretch = sum(n @ across.T @ across @ n for n in along)
         stretched = sum(normals[:, a] * (across.T @ (across @ vertices[:, a])) for a in range(3))
@@ -114,8 +157,9 @@ def fit_surface(
         factors = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0, options={"SymmetricMode": True})
         longest = 2 * np.sqrt(((vertices[edges[:, 0]] - vertices[edges[:, 1]]) ** 2).sum(1).mean())
         vertices += factors.solve(right).clip(-longest, longest)[:, None] * normals
-        progress((iteration + 1) / _ITERATIONS)
-    return TriangleMesh(vertices, faces)
+        step()
+    rims = _find_rims(vertices, _vertex_normals(vertices, faces), edges, silhouettes, outlines)
+    return TriangleMesh(vertices, faces), float(np.abs(rims.misfit).mean())
 
 
 def _find_rims(
