@@ -20,7 +20,7 @@ from nerfro.scenes.surface import Surface
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "scalar_rgb")
 # Hammersley's points: no two of them in one row or column, along which an edge might run.
-SILHOUETTE_PLACES = [((k + 0.5) / 32, int(f"{k:05b}"[::-1], 2) / 32 + 1 / 64) for k in range(32)]
+SILHOUETTE_PLACES = [((k + 0.5) / 128, (int(f"{k:07b}"[::-1], 2) + 0.5) / 128) for k in range(128)]
 SAMPLES_PER_PASS = 6_000_000  # a wavefront of paths is held in memory at once: about 1 GB per 10 M paths
 _TEXELS_PER_TASK, _EDGE_CONTRAST = 1 << 17, 0.1
 _GET_LLVM = "llvm_ad_rgb needs the LLVM library, 16 or newer (Debian: apt-get install libllvm19)"
@@ -183,7 +183,7 @@ class PathTracer:
         return total / spp
 
     def silhouette(self, pose: np.ndarray) -> np.ndarray:
-        """Return the share [H, W] of each pixel that the glass, which nothing may hide, covers, to about 1 / 32."""
+        """Return the share [H, W] of each pixel that the glass, which nothing may hide, covers, to about 1 / 128."""
         camera = self.camera
         total = np.zeros((camera.height, camera.width))
         for x, y in SILHOUETTE_PLACES:
