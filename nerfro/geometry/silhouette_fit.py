@@ -112,9 +112,9 @@ def fit_surface(
         done += 1
         progress(done / (_ROUND.iterations + _FLAT.iterations))
 
-    curved, rounded_misfit = _fit(mesh, silhouettes, smoothing, _ROUND, step)
+    rounded, rounded_misfit = _fit(mesh, silhouettes, smoothing, _ROUND, step)
     flat, flat_misfit = _fit(mesh, silhouettes, smoothing, _FLAT, step)
-    return flat if flat_misfit < _CONVINCING * rounded_misfit else curved
+    return flat if flat_misfit < _CONVINCING * rounded_misfit else rounded
 
 
 def _fit(
