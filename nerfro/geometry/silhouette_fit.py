@@ -112,19 +112,24 @@ def fit_surface(
         done += 1
         progress(done / (_ROUND.iterations + _FLAT.iterations))
 
-    rounded, rounded_misfit = _fit(mesh, silhouettes, smoothing, _ROUND, step)
-    flat, flat_misfit = _fit(mesh, silhouettes, smoothing, _FLAT, step)
+    outlines = [_nearest_outline_pixel(mask) for mask in (silhouettes.masks > 0.5).numpy()]
+    rounded, rounded_misfit = _fit(mesh, silhouettes, outlines, smoothing, _ROUND, step)
+    flat, flat_misfit = _fit(mesh, silhouettes, outlines, smoothing, _FLAT, step)
     return flat if flat_misfit < _CONVINCING * rounded_misfit else rounded
 
 
 def _fit(
-    mesh: TriangleMesh, silhouettes: Silhouettes, smoothing: float, prior: _Prior, step: Callable[[], None]
+    mesh: TriangleMesh,
+    silhouettes: Silhouettes,
+    outlines: list[Int[np.ndarray, "H W"]],
+    smoothing: float,
+    prior: _Prior,
+    step: Callable[[], None],
 ) -> tuple[TriangleMesh, float]:
     """The surface that is likeliest by a prior, and its outlines' mean distance from the masks', world units."""
     faces, vertices = mesh.faces, mesh.vertices.copy()
     edges = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
     size = float(np.ptp(vertices, axis=0).max())
-    outlines = [_nearest_outline_pixel(mask) for mask in (silhouettes.masks > 0.5).numpy()]
     mean = _neighbour_mean(edges, len(vertices))
     across = _differences(edges, len(vertices))
     degree = np.bincount(edges.ravel())
