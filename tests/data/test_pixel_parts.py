@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -19,10 +21,8 @@ NUM_VIEWS, HEIGHT, WIDTH = 3, 8, 10
 
 
 @pytest.fixture
-def cameras() -> Cameras:
-    generator = torch.Generator().manual_seed(0)
-    poses = torch.linalg.qr(torch.randn(NUM_VIEWS, 3, 3, generator=generator)).Q
-    poses = torch.cat([poses, torch.randn(NUM_VIEWS, 3, 1, generator=generator)], -1)
+def cameras(random_pose: Callable[[int], np.ndarray]) -> Cameras:
+    poses = torch.from_numpy(np.stack([random_pose(view)[:3] for view in range(NUM_VIEWS)])).float()
     full = torch.ones(NUM_VIEWS)
     return Cameras(poses, 20 * full, 22 * full, 5 * full, 4 * full, WIDTH, HEIGHT, 2.0, 6.0)
 
