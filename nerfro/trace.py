@@ -47,7 +47,8 @@ class TraceConfig:
         rays: .npz with `origins` and `directions` [R, 3], world units and unit directions.
         out: .npz that is written, with `exit_positions` and `exit_directions` [R, 3], `path_lengths` and `hit` [R].
         near: arc length at which paths begin.
-        far: arc length at which paths end; by default they end where they leave the medium's box.
+        far: arc length at which paths end, or where they have left the medium's box if that is later; by default all end
+            where they leave it.
         plot: whether to draw some of the paths and the object beside `out`, as .png.
         overwrite: whether `out`, and the drawing, may be replaced.
     """

@@ -26,7 +26,7 @@ class Rays:
         origins: camera centres.
         directions: unit viewing directions.
         radii: radius of the pixel's cone at unit distance (mip-NeRF, section 3.1).
-        near, far: arc length from the origin at which the path begins and ends.
+        near, far: arc length from the origin at which the path begins and ends; a bent path never ends in the object.
     """
 
     origins: Float[Tensor, "R 3"]
@@ -59,7 +59,8 @@ class Path:
     Attributes:
         positions: vertices.
         directions: unit direction in which each vertex is left.
-        s: arc length from the camera at each vertex, non-decreasing; s[:, 0] is near, s[:, -1] far.
+        s: arc length from the camera at each vertex, non-decreasing. s[:, 0] is near; s[:, -1] is far, or more where
+            the object is left later.
         exit_directions: unit direction in which the ray leaves the bounded volume.
         refracted: whether the ray met the medium (n not 1) at all.
         radii: pixel cone radius at unit distance, carried along from the rays.

@@ -62,11 +62,15 @@ def test_rays_leave_a_ball_as_in_closed_form(trace: Callable[..., str], tmp_path
         assert (out["path_lengths"][out["hit"]] > 5.3).all()
 
 
-def test_with_far_paths_end_at_far(trace: Callable[..., str], tmp_path: Path) -> None:
+def test_with_far_straight_paths_end_there_and_bent_ones_outside_the_box(trace: Callable[..., str], tmp_path: Path) -> None:
     _write_rays(tmp_path / "rays.npz")
     trace("sampler/path=eikonal", "near=2", "far=6")
     with np.load(tmp_path / "out.npz") as out:
-        np.testing.assert_allclose(out["path_lengths"], 6, atol=1e-5)
+        np.testing.assert_allclose(out["path_lengths"][~out["hit"]], 6, atol=1e-5)
+        lengths, ends = out["path_lengths"][out["hit"]], out["exit_positions"][out["hit"]]
+        assert ((np.abs(lengths - 6) < 1e-5) | (np.abs(ends).max(-1) > 1.5)).all()
+        assert lengths.min() > 6 - 1e-5
+        assert (np.abs(ends).max(-1) > 1.5).all()
 
 
 def test_the_papers_tracker_is_an_option(trace: Callable[..., str], tmp_path: Path) -> None:

@@ -19,3 +19,5 @@ REACHED = 1e-3
 
 # The search for a surface takes steps of at least this share of the box's shortest side: thinner sheets are overlooked.
 MIN_SEARCH_STEP = 2e-4
+# A bent path that is longer than far ends this share of the box's shortest side beyond the box.
+BEYOND_BOX = 1e-3

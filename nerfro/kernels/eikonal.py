@@ -15,6 +15,7 @@ from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.lookup import (
     block_clearance,
     box_span,
+    distance_out,
     put_vertex,
     repeat_last,
     solid_clearance,
@@ -185,8 +186,7 @@ def march_adaptive(
                     if (dx - kdx) ** 2 + (dy - kdy) ** 2 + (dz - kdz) ** 2 > MIN_TURN:
                         count = put_vertex(*row, count, x, y, z, dx, dy, dz, s)
                         kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
-                    ds = min(free, end - s)
-                    x, y, z, s = x + ds * dx, y + ds * dy, z + ds * dz, s + ds
+                    x, y, z, s = x + free * dx, y + free * dy, z + free * dz, s + free
                     known = False
                 else:
                     slope = math.sqrt(gx * gx + gy * gy + gz * gz)
@@ -194,7 +194,6 @@ def march_adaptive(
                     if coefficients.shape[0] > 0 and slope > 0.0:
                         cosine = abs(dx * gx + dy * gy + dz * gz) / slope
                         ds = step / max(cosine, MIN_COSINE)
-                    ds = min(ds, end - s)
                     h = ds / max(n + 0.5 * ds * (gx * vx + gy * vy + gz * vz) / n, 0.5 * n)
                     kick = 0.5 * h * n
                     px, py, pz = vx + kick * gx, vy + kick * gy, vz + kick * gz
@@ -218,13 +217,16 @@ def march_adaptive(
                         count = put_vertex(*row, count, x, y, z, dx, dy, dz, s)
                         kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
                 outside = x < low[0] or x > high[0] or y < low[1] or y > high[1] or z < low[2] or z > high[2]
-                if outside or s >= end:
+                if outside:
                     exceeded[ray] = False
                     break
             if (dx - kdx) ** 2 + (dy - kdy) ** 2 + (dz - kdz) ** 2 > MIN_TURN:
                 count = put_vertex(*row, count, x, y, z, dx, dy, dz, s)
+        # A bent path ends outside the box, however long it is; far bounds what lies beyond.
         jump = end - s
-        count = put_vertex(*row, count, x + jump * dx, y + jump * dy, z + jump * dz, dx, dy, dz, end)
+        if refracted[ray]:
+            jump = max(jump, distance_out(low, high, x, y, z, dx, dy, dz))
+        count = put_vertex(*row, count, x + jump * dx, y + jump * dy, z + jump * dz, dx, dy, dz, s + jump)
         counts[ray] = count
         repeat_last(*row, min(count, capacity))
     return out_positions, out_directions, out_s, counts, refracted, exceeded

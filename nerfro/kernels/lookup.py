@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from nerfro.geometry.tolerances import SAFE_SHARE
+from nerfro.geometry.tolerances import BEYOND_BOX, SAFE_SHARE
 from nerfro.kernels.compilation import compiled
 
 
@@ -153,6 +153,13 @@ def box_span(low, high, x, y, z, dx, dy, dz):
         enter = max(enter, min(first, second))
         leave = min(leave, max(first, second))
     return enter, leave
+
+
+@compiled
+def distance_out(low, high, x, y, z, dx, dy, dz):
+    """Distance after which a ray from inside a box, or from just outside it, is surely out of it."""
+    shortest = min(high[0] - low[0], high[1] - low[1], high[2] - low[2])
+    return max(box_span(low, high, x, y, z, dx, dy, dz)[1], 0.0) + BEYOND_BOX * shortest
 
 
 @compiled

@@ -14,6 +14,7 @@ from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.lookup import (
     block_clearance,
     box_span,
+    distance_out,
     put_vertex,
     repeat_last,
     spline_value,
@@ -110,14 +111,13 @@ def trace_snell(
                 inside[body] = spline_value(coefficients[body], low, inverse_spacing, x, y, z) < 0.0
             while True:
                 _, leave = box_span(low, high, x, y, z, dx, dy, dz)
-                limit = min(leave, end - s)
                 t, before, crossed = 0.0, 0.0, False
                 while not crossed:
                     free = block_clearance(clearance, low, inverse_block, x + t * dx, y + t * dy, z + t * dz)
                     if free > 2.0 * min_step:
                         before = t
                         t += free
-                        if t >= limit:
+                        if t >= leave:
                             break
                         continue
                     distance = math.inf
@@ -127,10 +127,10 @@ def trace_snell(
                         )
                         crossed = crossed or (value < 0.0) != inside[body]
                         distance = min(distance, abs(value))
-                    if crossed or t >= limit:
+                    if crossed or t >= leave:
                         break
                     before = t
-                    t = min(t + max(distance, min_step), limit)
+                    t = min(t + max(distance, min_step), leave)
                 if not crossed:
                     break
                 # The first of the surfaces that were crossed in this step.
@@ -173,8 +173,11 @@ def trace_snell(
                 norm = math.sqrt(dx * dx + dy * dy + dz * dz)
                 dx, dy, dz = dx / norm, dy / norm, dz / norm
                 count = put_vertex(*row, count, x, y, z, dx, dy, dz, s)
+        # A bent path ends outside the box, however long it is; far bounds what lies beyond.
         jump = end - s
-        count = put_vertex(*row, count, x + jump * dx, y + jump * dy, z + jump * dz, dx, dy, dz, end)
+        if events[ray] > 0:
+            jump = max(jump, distance_out(low, high, x, y, z, dx, dy, dz))
+        count = put_vertex(*row, count, x + jump * dx, y + jump * dy, z + jump * dz, dx, dy, dz, s + jump)
         counts[ray] = count
         repeat_last(*row, min(count, capacity))
     return out_positions, out_directions, out_s, counts, events, exceeded

@@ -25,7 +25,7 @@ class PathSampler(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, rays: Rays, medium: Medium) -> Path:
-        """Trace every ray from near to far through the medium."""
+        """Trace every ray from near to far through the medium; a bent path ends outside it, if need be beyond far."""
 
 
 class PointSampler(nn.Module, ABC):

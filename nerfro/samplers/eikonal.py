@@ -62,7 +62,7 @@ class Eikonal(PathSampler):
 
     @torch.no_grad()
     def forward(self, rays: Rays, medium: Medium) -> Path:
-        """Trace every ray from near to far."""
+        """Trace every ray from near to far; adaptive paths do not end before they have left the medium's box."""
         on_cpu = rays.origins.device.type == "cpu"
         if self.integrator != "adaptive":
             if on_cpu and isinstance(medium, VoxelGrid):
@@ -141,19 +141,18 @@ def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int)
         if not len(active):
             break
         step = medium.step_length(d[active], g[active])
-        remaining = rays.far[active] - s[active]
         free = medium.clearance(x[active])
         jumps = free > REACHED * step
         jumping, stepping = active[jumps], active[~jumps]
         keep(turned(jumping))
-        length = torch.minimum(free, remaining)[jumps]
+        length = free[jumps]
         x[jumping] += length[:, None] * d[jumping]
         s[jumping] += length
         n[jumping], g[jumping] = medium(x[jumping])
         v[jumping] = n[jumping, None] * d[jumping]
         varies = (g[stepping] != 0).any(-1)
         refracted[stepping] |= varies
-        ds = torch.minimum(step, remaining)[~jumps]
+        ds = step[~jumps]
         state = leapfrog(RayState(x[stepping], v[stepping], n[stepping], g[stepping]), ds, medium)
         s[stepping] += torch.linalg.vector_norm(state.positions - x[stepping], dim=-1)
         x[stepping], v[stepping], n[stepping], g[stepping] = state
@@ -163,9 +162,9 @@ def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int)
         tangent = kept_x[stepping] + (s - kept_s)[stepping, None] * kept_d[stepping]
         keep(stepping[(x[stepping] - tangent).square().sum(-1) > tolerance**2])
         outside = ((x[active] < medium.box[0]) | (x[active] > medium.box[1])).any(-1)
-        active = active[~outside & (s[active] < rays.far[active])]
+        active = active[~outside]
     exceeded = torch.zeros_like(refracted)
     exceeded[active] = True
     keep(turned(rows))
-    lines.append(rows, x + (rays.far - s)[:, None] * d, d, rays.far)
+    lines.append_ends(rays.far, medium.box, refracted, x, d, s)
     return lines.path(rays, refracted), exceeded

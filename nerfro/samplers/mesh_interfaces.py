@@ -55,7 +55,7 @@ def snell_on_mesh(rays: Rays, medium: SdfGrid, max_events: int) -> tuple[Path, I
         # A straight line meets a plane once: the triangle that the ray comes from is found again only by rounding.
         again = face == last_face[active]
         start[active[again]] += offset
-        retry, ahead = active[again], ~again & (length < far[active] - s[active])
+        retry, ahead = active[again], ~again
         active, face, length = active[ahead], face[ahead], length[ahead].clamp(min=0)
         flipped = inside[active]
         body = scene.body[face][:, None]
@@ -78,7 +78,7 @@ def snell_on_mesh(rays: Rays, medium: SdfGrid, max_events: int) -> tuple[Path, I
         bent = active[visible]
         lines.append(bent, x[bent], d[bent], s[bent])
         active = torch.cat([active, retry])
-    lines.append(rows, x + (far - s)[:, None] * d, d, far)
+    lines.append_ends(far, box, num_events > 0, x, d, s)
     path = lines.path(rays, num_events > 0)
     like = rays.origins
     path = Path(

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from nerfro.geometry.interpolation import intersect_box
+from nerfro.geometry.tolerances import BEYOND_BOX
 from nerfro.types import Path, Rays
 
 
@@ -28,6 +30,22 @@ class Polylines:
             self._vertices = torch.cat([self._vertices, torch.zeros_like(self._vertices)], 1)
         self._vertices[rows, self.counts[rows]] = torch.cat([positions, directions, s[:, None]], -1)
         self.counts[rows] += 1
+
+    def append_ends(
+        self,
+        far: Float[Tensor, "R"],
+        box: Float[Tensor, "2 3"],
+        refracted: Bool[Tensor, "R"],
+        positions: Float[Tensor, "R 3"],
+        directions: Float[Tensor, "R 3"],
+        s: Float[Tensor, "R"],
+    ) -> None:
+        """Add the last vertex of every row: at far, but for a bent path never before it has left the medium's box."""
+        _, leave = intersect_box(box, positions, directions)
+        out = leave.clamp(min=0) + BEYOND_BOX * (box[1] - box[0]).min()
+        ahead = torch.where(refracted, torch.maximum(far - s, out), far - s)
+        rows = torch.arange(len(s), device=s.device)
+        self.append(rows, positions + ahead[:, None] * directions, directions, s + ahead)
 
     def path(self, rays: Rays, refracted: Bool[Tensor, "R"]) -> Path:
         """The finished paths; shorter rows repeat their last vertex."""

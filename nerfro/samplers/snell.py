@@ -65,7 +65,7 @@ class Snell(PathSampler):
 
     @torch.no_grad()
     def forward(self, rays: Rays, medium: Medium) -> Path:
-        """Trace every ray from near to far; straight runs are two vertices."""
+        """Trace every ray from near to far, or until it has left the medium's box; straight runs are two vertices."""
         return self.trace(rays, medium).path
 
     @torch.no_grad()
@@ -112,8 +112,7 @@ def trace_interfaces(rays: Rays, medium: Solid, max_events: int) -> tuple[Path, 
     min_step = MIN_SEARCH_STEP * float((medium.box[1] - medium.box[0]).min())
     while len(active):
         _, leave = intersect_box(medium.box, x[active], d[active])
-        limit = torch.minimum(leave, rays.far[active] - s[active])
-        before, after, crossed = _search(medium, x[active], d[active], inside[active], limit, min_step)
+        before, after, crossed = _search(medium, x[active], d[active], inside[active], leave, min_step)
         active, before, after = active[crossed], before[crossed], after[crossed]
         if not len(active):
             break
@@ -141,8 +140,9 @@ def trace_interfaces(rays: Rays, medium: Solid, max_events: int) -> tuple[Path, 
         num_events[active] += visible
         bent = active[visible]
         lines.append(bent, x[bent], d[bent], s[bent])
-    lines.append(rows, x + (rays.far - s)[:, None] * d, d, rays.far)
-    return lines.path(rays, num_events > 0), num_events, exceeded
+    refracted = num_events > 0
+    lines.append_ends(rays.far, medium.box, refracted, x, d, s)
+    return lines.path(rays, refracted), num_events, exceeded
 
 
 def _search(

@@ -1,0 +1,72 @@
+"""A bent path ends where it has left the object for good, however short `far` is."""
+
+from __future__ import annotations
+
+from pathlib import Path as FilePath
+
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+from nerfro.geometry.interpolation import intersect_box
+from nerfro.media.base import Medium
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.shapes import RoundedBox
+from nerfro.samplers.base import PathSampler
+from nerfro.samplers.eikonal import Eikonal
+from nerfro.samplers.snell import Snell
+from nerfro.types import Path, Rays
+from tests.closed_forms import make_rays
+
+# From the camera at distance 3 the near face of the cube is reached, its far one is not.
+SHORT, LONG = 3.2, 60.0
+
+
+def _rays(far: float) -> Rays:
+    generator = torch.Generator().manual_seed(4)
+    directions = torch.nn.functional.normalize(torch.randn(200, 3, generator=generator), dim=-1)
+    targets = 1.2 * torch.rand(200, 3, generator=generator) - 0.6
+    return make_rays(targets - 3 * directions, directions, 0.5, far)
+
+
+def _medium(folder: FilePath, kind: str) -> Medium:
+    if kind == "analytic":
+        return RoundedBox(0.7, 0.1, 1.5)
+    trimesh.creation.box(extents=[1.4, 1.4, 1.4]).export(folder / "cube.ply")
+    return SdfGrid(str(folder / "cube.ply"), 1.5, resolution=48, cache=False)
+
+
+CASES = [
+    (Snell("sdf"), "grid"), (Snell("mesh"), "grid"), (Snell(), "analytic"),
+    (Eikonal(), "grid"), (Eikonal(), "analytic"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("sampler", "kind"), CASES)
+def test_far_does_not_cut_a_path_inside_the_object(tmp_path: FilePath, sampler: PathSampler, kind: str) -> None:
+    medium = _medium(tmp_path, kind)
+    short, long = sampler(_rays(SHORT), medium), sampler(_rays(LONG), medium)
+    bent = long.refracted
+    assert bent.sum() > 50
+    torch.testing.assert_close(short.exit_directions, long.exit_directions)
+    assert (short.far >= SHORT).all()
+    torch.testing.assert_close(short.far[~bent], torch.full_like(short.far[~bent], SHORT))
+    assert _outside(short, medium)[bent].all()
+    # The end lies on the line along which the longer path goes on.
+    at_short_end, _ = long.at(short.far[:, None])
+    torch.testing.assert_close(at_short_end[:, 0], short.exit_positions, atol=2e-5, rtol=0)
+
+
+@pytest.mark.parametrize(("sampler", "kind"), [(Snell("sdf", 2), "grid"), (Snell("mesh", 2), "grid")])
+def test_rays_that_meet_the_limit_of_events_end_outside_too(tmp_path: FilePath, sampler: Snell, kind: str) -> None:
+    medium = _medium(tmp_path, kind)
+    trace = sampler.trace(_rays(SHORT), medium)
+    assert trace.exceeded.any()
+    assert _outside(trace.path, medium)[trace.path.refracted].all()
+
+
+def _outside(path: Path, medium: Medium) -> Tensor:
+    """Whether paths end where nothing of the medium's box lies ahead."""
+    _, leave = intersect_box(medium.box, path.exit_positions, path.exit_directions)
+    return leave <= 0
