@@ -12,10 +12,10 @@ import trimesh
 from capture import read_cameras, similarity, volume_overlap
 from jaxtyping import Float
 
+from nerfro.capture.silhouettes import pixel_stride
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.normals import face_normals
-from nerfro.geometry.silhouettes import pixel_stride
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.paths import resolve_path
 from nerfro.registry import discover, find

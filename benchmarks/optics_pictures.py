@@ -13,11 +13,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from tracing import BOX, N_BALL, RADIUS, angles, euler, exits, grid_distances, make_rays
 
+from nerfro.evaluation.path_plot import plot_paths
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball, RoundedBox
 from nerfro.media.voxel_grid import VoxelGrid
-from nerfro.path_plot import plot_paths
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.snell import Snell
 from nerfro.types import Path as RayPath

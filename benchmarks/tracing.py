@@ -19,12 +19,12 @@ import trimesh
 from rounded_cube import trace_rounded_cube
 from torch import Tensor
 
-from nerfro.data.cameras import Cameras
-from nerfro.data.pixel_parts import PixelParts
-from nerfro.geometry.cache import cache_dir
+from nerfro.cameras import Cameras
+from nerfro.files.cache import cache_dir
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball, RoundedBox
 from nerfro.media.voxel_grid import VoxelGrid
+from nerfro.pixel_parts import PixelParts
 from nerfro.samplers.compiled import uniform_exit_on_grid
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.path_cache import PathCache

@@ -20,7 +20,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, open_dict
 
 if TYPE_CHECKING:
-    from nerfro.sweeps import Cell
+    from nerfro.training.sweeps import Cell
 
 
 @dataclass
@@ -59,7 +59,7 @@ class CellSweeper(BasicSweeper):
         self._retry_failed = retry_failed
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        from nerfro.sweeps import CellTask
+        from nerfro.training.sweeps import CellTask
 
         task = CellTask(inspect.unwrap(task_function))
         super().setup(hydra_context=hydra_context, task_function=task, config=config)
@@ -70,7 +70,7 @@ class CellSweeper(BasicSweeper):
         Raises:
             NerfroError: two cells would share a folder.
         """
-        from nerfro.sweeps import State
+        from nerfro.training.sweeps import State
 
         assert self.config is not None
         assert self.launcher is not None
@@ -123,7 +123,7 @@ class CellSweeper(BasicSweeper):
         return cells
 
     def _cell(self, number: int, overrides: Sequence[str], swept: Sequence[str]) -> "Cell":
-        from nerfro.sweeps import Cell, Identity, folder_name, refusal
+        from nerfro.training.sweeps import Cell, Identity, folder_name, refusal
 
         assert self.config is not None
         assert self.hydra_context is not None

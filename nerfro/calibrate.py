@@ -23,12 +23,12 @@ from nerfro.capture.printing import print_sheets
 from nerfro.capture.reconstruction import import_model, reconstruct
 from nerfro.capture.targets import CharucoTarget, Sighting, TagTarget, Target
 from nerfro.cli import entry_point
-from nerfro.colour import to_linear
 from nerfro.data.frames import list_images
 from nerfro.data.image_files import read_mask, read_rgb
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
-from nerfro.evaluation.files import refuse_existing, write_atomically
+from nerfro.files.atomic import refuse_existing, write_atomically
+from nerfro.light import to_linear
 
 _TARGETS, _BOARDS, _LENSES = (
     ("apriltag", "charuco", "colmap"),

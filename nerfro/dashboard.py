@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
-from nerfro.sweeps import scene_name
+from nerfro.training.sweeps import scene_name
 
 _LOGS = "tensorboard"  # the folder in a run folder, see conf/logger/tensorboard.yaml
 _LOOK_AGAIN = 5.0  # seconds between two searches for new runs

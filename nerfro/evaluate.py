@@ -13,13 +13,10 @@ from omegaconf import DictConfig
 from torch import Tensor
 from tqdm import tqdm
 
-from nerfro.callbacks import Throughput
 from nerfro.cli import entry_point
-from nerfro.config import build_model
 from nerfro.errors import NerfroError
 from nerfro.evaluation.error_maps import error_maps
 from nerfro.evaluation.error_sheets import error_sheet
-from nerfro.evaluation.files import refuse_existing
 from nerfro.evaluation.folders import match_folders
 from nerfro.evaluation.images import load_png, save_png
 from nerfro.evaluation.lpips import LpipsNetwork, find_lpips_networks
@@ -29,9 +26,12 @@ from nerfro.evaluation.results import FULL, EvaluationResult, write_metrics_json
 from nerfro.evaluation.score_tables import regions_table, views_table
 from nerfro.evaluation.score_views import score_views
 from nerfro.evaluation.tables import to_rich, write_table
+from nerfro.files.atomic import refuse_existing
 from nerfro.models.base import NerfModel
 from nerfro.registry import build
-from nerfro.run_folder import load_checkpoint
+from nerfro.training.callbacks import Throughput
+from nerfro.training.config import build_model
+from nerfro.training.run_folder import load_checkpoint
 
 
 @dataclass

@@ -19,16 +19,16 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from PIL import Image, ImageDraw, ImageFont
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from nerfro.cameras import Cameras
 from nerfro.capture.masking import grab, outline_region, propagate
 from nerfro.capture.targets import opencv
 from nerfro.cli import entry_point
 from nerfro.data.base import DataSource
-from nerfro.data.cameras import Cameras
 from nerfro.data.frames import Frame
 from nerfro.data.image_files import read_mask
 from nerfro.data.masks import masks_left_out
 from nerfro.errors import NerfroError
-from nerfro.evaluation.files import write_atomically
+from nerfro.files.atomic import write_atomically
 from nerfro.paths import EMBEDDED_PREFIX
 from nerfro.registry import build
 

@@ -17,15 +17,10 @@ from jaxtyping import Float
 from omegaconf import MISSING, DictConfig, OmegaConf
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from nerfro.cli import entry_point
-from nerfro.data.base import Views
-from nerfro.errors import NerfroError, first_of
-from nerfro.evaluation.files import refuse_existing, write_atomically
-from nerfro.evaluation.images import save_png
-from nerfro.geometry.mesh import TriangleMesh, load_mesh
-from nerfro.geometry.pose_conventions import GOOD_OVERLAP, overlap, require_consistent_poses
-from nerfro.geometry.silhouette_fit import fit_surface
-from nerfro.geometry.visual_hull import (
+from nerfro.capture.overlays import contact_sheet
+from nerfro.capture.pose_conventions import GOOD_OVERLAP, overlap, require_consistent_poses
+from nerfro.capture.silhouette_fit import fit_surface
+from nerfro.capture.visual_hull import (
     Silhouettes,
     carve_grid,
     extract_surface,
@@ -33,7 +28,12 @@ from nerfro.geometry.visual_hull import (
     reached_sides,
     remove_strays,
 )
-from nerfro.overlays import contact_sheet
+from nerfro.cli import entry_point
+from nerfro.data.base import Views
+from nerfro.errors import NerfroError, first_of
+from nerfro.evaluation.images import save_png
+from nerfro.files.atomic import refuse_existing, write_atomically
+from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.paths import EMBEDDED_PREFIX, resolve_path
 from nerfro.registry import build
 

@@ -11,9 +11,9 @@ from omegaconf import DictConfig, ListConfig
 
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
-from nerfro.evaluation.files import refuse_existing, write_atomically
 from nerfro.evaluation.results import FULL, OBJECT_REGIONS
 from nerfro.evaluation.tables import to_rich, write_table
+from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.report.comparison import compare, find_metrics, to_table
 from nerfro.report.page import report_page, table_page
 from nerfro.report.runs import find_runs

@@ -13,7 +13,7 @@ import torch
 
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.constant import ConstantBoundary
-from nerfro.data.cameras import Cameras
+from nerfro.cameras import Cameras
 from nerfro.fields.base import Field
 from nerfro.fields.nerf import NerfField
 from nerfro.losses.base import Loss

@@ -16,11 +16,11 @@ from torch import Tensor
 
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
-from nerfro.evaluation.files import refuse_existing
-from nerfro.geometry.cache import load_arrays, save_arrays
+from nerfro.evaluation.path_plot import draw_paths
+from nerfro.files.atomic import refuse_existing
+from nerfro.files.cache import load_arrays, save_arrays
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
-from nerfro.path_plot import draw_paths
 from nerfro.registry import build
 from nerfro.samplers.snell import Snell
 from nerfro.types import Path as RayPath
@@ -47,8 +47,8 @@ class TraceConfig:
         rays: .npz with `origins` and `directions` [R, 3], world units and unit directions.
         out: .npz that is written, with `exit_positions` and `exit_directions` [R, 3], `path_lengths` and `hit` [R].
         near: arc length at which paths begin.
-        far: arc length at which paths end, or where they have left the medium's box if that is later; by default all end
-            where they leave it.
+        far: arc length at which paths end, or where they have left the medium's box if that is later; by default all
+            end where they leave it.
         plot: whether to draw some of the paths and the object beside `out`, as .png.
         overwrite: whether `out`, and the drawing, may be replaced.
     """

@@ -17,12 +17,8 @@ from lightning.pytorch.loggers import Logger, WandbLogger
 from lightning.pytorch.strategies import DDPStrategy
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.callbacks import ConfigInCheckpoint, StopOnSignal, Throughput, TrainingProgress
+from nerfro.cameras import Cameras
 from nerfro.cli import EXIT_INTERRUPTED, entry_point
-from nerfro.config import TrainConfig, build_model
-from nerfro.data.cameras import Cameras
-from nerfro.data.module import RayDataModule
-from nerfro.data.ray_batches import RayBatches
 from nerfro.distributed import leave
 from nerfro.errors import NerfroError
 from nerfro.evaluate import report
@@ -34,7 +30,13 @@ from nerfro.fields.mlp import compile_networks
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.models.base import NerfModel
 from nerfro.registry import build
-from nerfro.run_folder import (
+from nerfro.samplers.training_paths import TrainingPaths
+from nerfro.training.callbacks import ConfigInCheckpoint, StopOnSignal, Throughput, TrainingProgress
+from nerfro.training.config import TrainConfig, build_model
+from nerfro.training.data_module import RayDataModule
+from nerfro.training.log import TrainingLog
+from nerfro.training.ray_batches import RayBatches
+from nerfro.training.run_folder import (
     LAST_CHECKPOINT,
     claim,
     find_checkpoint,
@@ -42,8 +44,6 @@ from nerfro.run_folder import (
     record,
     require_same_configuration,
 )
-from nerfro.samplers.training_paths import TrainingPaths
-from nerfro.training_log import TrainingLog
 
 _SPARE_BYTES = 64 * 2**20  # pictures and logs, beside the checkpoints
 

@@ -6,48 +6,16 @@ R rays, S path vertices, N samples, V views, H and W pixels, L sampling levels.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from nerfro.colour import to_linear, to_srgb
+from nerfro.cameras import Cameras
+from nerfro.light import to_linear, to_srgb
+from nerfro.rays import Rays
 
-if TYPE_CHECKING:
-    from nerfro.data.cameras import Cameras
-
-
-@dataclass(frozen=True)
-class Rays:
-    """Camera rays in world space.
-
-    Attributes:
-        origins: camera centres.
-        directions: unit viewing directions.
-        radii: radius of the pixel's cone at unit distance (mip-NeRF, section 3.1).
-        near, far: arc length from the origin at which the path begins and ends; a bent path never ends in the object.
-    """
-
-    origins: Float[Tensor, "R 3"]
-    directions: Float[Tensor, "R 3"]
-    radii: Float[Tensor, "R"]
-    near: Float[Tensor, "R"]
-    far: Float[Tensor, "R"]
-
-    def __len__(self) -> int:
-        return self.origins.shape[0]
-
-    def __getitem__(self, index: slice | Tensor) -> Rays:
-        return Rays(self.origins[index], self.directions[index], self.radii[index], self.near[index], self.far[index])
-
-    def followed_by(self, other: Rays) -> Rays:
-        """These rays and after them others."""
-        names = ("origins", "directions", "radii", "near", "far")
-        return Rays(*(torch.cat([getattr(self, name), getattr(other, name)]) for name in names))
-
-    def to(self, device: torch.device | str) -> Rays:
-        return Rays(*(getattr(self, name).to(device) for name in ("origins", "directions", "radii", "near", "far")))
+__all__ = ["Batch", "Path", "Radiance", "Rays", "Rendering", "Samples"]
 
 
 @dataclass(frozen=True)

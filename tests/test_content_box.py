@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.config import TrainConfig, _settle_content
 from nerfro.errors import NerfroError
 from nerfro.media.analytic import Vacuum
+from nerfro.training.config import TrainConfig, _settle_content
 
 
 def settled(path: Path) -> DictConfig:

@@ -16,9 +16,9 @@ import pytest
 import torch
 
 import nerfro.distributed
-from nerfro.callbacks import StopOnSignal
 from nerfro.distributed import rand_rays
-from nerfro.run_folder import LAST_CHECKPOINT, load_checkpoint
+from nerfro.training.callbacks import StopOnSignal
+from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 
 # Gradients are sums in another order, so they differ in their last bits. Adam divides them by their size, and would
 # make whole steps of what rounding has left of zero.

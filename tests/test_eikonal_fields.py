@@ -18,8 +18,7 @@ from torch import Tensor
 from nerfro.boundaries import lat_long
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.boundaries.envmap import EnvironmentMap
-from nerfro.config import build_model
-from nerfro.data.cameras import Cameras
+from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.evaluation.images import save_png
 from nerfro.fields.base import Field
@@ -30,11 +29,12 @@ from nerfro.media.shapes import Ball
 from nerfro.models.base import NerfModel, Parts
 from nerfro.models.optimizer import OptimizerConfig
 from nerfro.registry import discover, find
-from nerfro.run_folder import load_checkpoint
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.straight import straight_path
 from nerfro.samplers.stratified import Stratified
 from nerfro.testing import example_rays
+from nerfro.training.config import build_model
+from nerfro.training.run_folder import load_checkpoint
 from nerfro.types import Radiance, Samples
 
 discover()

@@ -15,9 +15,9 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.config import TrainConfig
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover
+from nerfro.training.config import TrainConfig
 
 discover()
 

@@ -11,7 +11,7 @@ RENDER = """
 import resource, sys
 import torch
 from nerfro.boundaries.constant import ConstantBoundary
-from nerfro.data.cameras import Cameras
+from nerfro.cameras import Cameras
 from nerfro.evaluation.render_view import Supersampling, render_view
 from nerfro.fields.nerf import NerfField
 from nerfro.media.analytic import Vacuum

@@ -15,11 +15,11 @@ from torch import nn
 import nerfro.registry
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.cli import entry_point
-from nerfro.config import TrainConfig, build_losses
 from nerfro.errors import NerfroError
 from nerfro.paths import CONF_DIR
 from nerfro.registry import KINDS, build, configure, discover, find, plugins, register
 from nerfro.samplers.eikonal import Eikonal
+from nerfro.training.config import TrainConfig, build_losses
 
 discover()
 

@@ -22,7 +22,7 @@ from nerfro.report.curves import HEIGHT, MAX_POINTS, WIDTH, draw_charts, read_cu
 from nerfro.report.page import report_page
 from nerfro.report.runs import find_runs
 from nerfro.report.views import Wanted, data_uri, scene_pictures
-from nerfro.run_folder import record
+from nerfro.training.run_folder import record
 
 PSNR = find_metrics(["psnr"])[0]
 CSV = """epoch,loss/photometric,loss/total,step,train/psnr,val/psnr

@@ -18,7 +18,7 @@ import torch
 from omegaconf import OmegaConf
 
 from nerfro.errors import NerfroError
-from nerfro.run_folder import (
+from nerfro.training.run_folder import (
     LAST_CHECKPOINT,
     claim,
     find_checkpoint,

@@ -21,7 +21,7 @@ from nerfro.evaluation.results import METRICS, EvaluationResult, ViewScores, wri
 from nerfro.evaluation.tables import Column, Row, Table, to_csv, to_html, to_latex, to_markdown, to_rich
 from nerfro.report.comparison import compare, differing, find_metrics, to_table
 from nerfro.report.runs import duration, find_runs
-from nerfro.run_folder import record
+from nerfro.training.run_folder import record
 
 PAPER = find_metrics(["psnr", "ssim", "lpips"])
 FIELD = {"_target_": "nerfro.fields.nerf.NerfField", "width": 64, "scale": 1.0}

@@ -18,10 +18,10 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.config import TrainConfig
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover
-from nerfro.sweeps import Identity, folder_name, scene_name
+from nerfro.training.config import TrainConfig
+from nerfro.training.sweeps import Identity, folder_name, scene_name
 
 SWEEPS = sorted(path.stem for path in (CONF_DIR / "sweep").glob("*.yaml"))
 

@@ -62,7 +62,7 @@ def test_rays_leave_a_ball_as_in_closed_form(trace: Callable[..., str], tmp_path
         assert (out["path_lengths"][out["hit"]] > 5.3).all()
 
 
-def test_with_far_straight_paths_end_there_and_bent_ones_outside_the_box(trace: Callable[..., str], tmp_path: Path) -> None:
+def test_far_ends_straight_paths_and_bent_ones_outside_the_box(trace: Callable[..., str], tmp_path: Path) -> None:
     _write_rays(tmp_path / "rays.npz")
     trace("sampler/path=eikonal", "near=2", "far=6")
     with np.load(tmp_path / "out.npz") as out:

@@ -16,7 +16,7 @@ from PIL import Image
 import nerfro.evaluate
 from nerfro.data.blender import BlenderData
 from nerfro.evaluate import restore
-from nerfro.run_folder import LAST_CHECKPOINT, load_checkpoint
+from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 
 
 @pytest.fixture(scope="module")

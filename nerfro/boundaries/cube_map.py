@@ -4,7 +4,7 @@ Face 2 a + b is the side of the cube that the axis a pierces, on the positive en
 b = 1. Its first texture coordinate is the angle towards the axis a + 1 (modulo 3), its second towards a + 2; texels are
 equally wide in angle, which keeps their solid angles within a factor of 1.4.
 
-The compiled kernels in `nerfro.kernels.cube_map` are tested against `lookup`, which is also the path on a GPU.
+The compiled kernels in `nerfro.boundaries.cube_map_cpu` are tested against `lookup`, which is also the path on a GPU.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ class EnvironmentMap(Boundary):
     def forward(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         face, coordinates = cube_map.project(directions.detach().float().reshape(-1, 3))
         if face.device.type == "cpu":
-            from nerfro.kernels.cube_map import lookup  # compiled code, so only where it is used
+            from nerfro.boundaries.cube_map_cpu import lookup  # compiled code, so only where it is used
         else:
             lookup = cube_map.lookup
         return padded_sigmoid(lookup(face, coordinates, self.texels, self.padded, self.levels)).view(directions.shape)

@@ -15,10 +15,10 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from nerfro.boundaries import radiance_hdr
 from nerfro.errors import NerfroError
-from nerfro.evaluation.files import write_atomically
 from nerfro.evaluation.images import save_png
+from nerfro.files import radiance_hdr
+from nerfro.files.atomic import write_atomically
 from nerfro.scenes.patterns import to_linear, to_srgb
 
 _FORMATS = (".png", ".jpg", ".jpeg", ".hdr", ".exr")

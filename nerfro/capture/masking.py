@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float, UInt8
 from numpy.typing import ArrayLike
 from scipy.ndimage import binary_closing, binary_fill_holes, label
 
+from nerfro.cameras import Cameras
 from nerfro.capture.targets import opencv
-from nerfro.data.cameras import Cameras
-from nerfro.geometry.visual_hull import Silhouettes, find_box, nearest_point
+from nerfro.capture.visual_hull import Silhouettes, find_box, nearest_point
 
 _ITERATIONS = 5
 # GrabCut sees the object and its surroundings in at most so many pixels along the longer side.

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from nerfro.capture.targets import Sheet
-from nerfro.evaluation.files import write_atomically
+from nerfro.files.atomic import write_atomically
 
 _DOTS_PER_METRE = 300 / 0.0254
 _MARGIN = 0.008  # metres

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerfro.data.cameras import Cameras
+from nerfro.cameras import Cameras
 
 if TYPE_CHECKING:
     from nerfro.data.frames import Frame

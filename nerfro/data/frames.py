@@ -14,12 +14,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.cameras import Cameras
 from nerfro.data.base import Views
-from nerfro.data.cameras import Cameras
-from nerfro.data.distortion import distort, undistort
 from nerfro.data.image_files import Alpha, read_rgb, read_stack
 from nerfro.data.masks import read_masks
 from nerfro.errors import NerfroError
+from nerfro.lens import distort, undistort
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 SPLITS = ["train", "val", "test"]
@@ -49,7 +49,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Lens:
-    """Focal lengths and principal point in pixels, and distortion (see `nerfro.data.distortion.coefficients`)."""
+    """Focal lengths and principal point in pixels, and distortion (see `nerfro.lens.coefficients`)."""
 
     fx: float
     fy: float

@@ -13,7 +13,7 @@ from nerfro.data.base import DataSource, Views
 from nerfro.data.frames import SPLITS, Frame, Lens, check_options, held_out, list_images, load_views, require_root
 from nerfro.data.transforms import parse_matrix
 from nerfro.errors import NerfroError
-from nerfro.geometry.cache import load_arrays
+from nerfro.files.cache import load_arrays
 from nerfro.paths import resolve_path
 from nerfro.registry import register
 

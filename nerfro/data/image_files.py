@@ -15,8 +15,8 @@ from jaxtyping import Float
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
-from nerfro.data.png16 import decode_png16, is_png16
 from nerfro.errors import NerfroError
+from nerfro.files.png16 import decode_png16, is_png16
 
 Alpha = Literal["drop", "white", "black"]
 Read = Callable[[Path], Float[np.ndarray, "H W *C"]]

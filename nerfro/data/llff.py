@@ -24,7 +24,7 @@ from nerfro.data.frames import (
 )
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
-from nerfro.geometry.cache import load_array
+from nerfro.files.cache import load_array
 from nerfro.paths import resolve_path
 from nerfro.registry import register
 

@@ -9,11 +9,11 @@ from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from nerfro.data.base import DataSource, Views
-from nerfro.data.distortion import coefficients
 from nerfro.data.frames import SPLITS, Frame, Lens, check_options, check_split, held_out, load_views, require_root
 from nerfro.data.masks import find_mask, read_usable
 from nerfro.data.transforms import Manifest, find_splits, is_number, parse_manifest
 from nerfro.errors import NerfroError
+from nerfro.lens import coefficients
 from nerfro.paths import resolve_path
 from nerfro.registry import register
 

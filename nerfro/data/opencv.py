@@ -7,12 +7,12 @@ from typing import Literal
 
 import numpy as np
 
+from nerfro.cameras import central_window
 from nerfro.data.base import DataSource, Views
-from nerfro.data.cameras import central_window
-from nerfro.data.distortion import opencv_coefficients
 from nerfro.data.frames import Lens, check_options, load_views
 from nerfro.data.transforms import Manifest, find_splits, is_number, parse_matrix, read_manifest
 from nerfro.errors import NerfroError
+from nerfro.lens import opencv_coefficients
 from nerfro.paths import resolve_path
 from nerfro.registry import register
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import torch
 
-from nerfro.colour import to_linear, to_srgb
-from nerfro.data.cameras import Cameras
-from nerfro.data.pixel_parts import PixelParts
+from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
+from nerfro.light import to_linear, to_srgb
 from nerfro.models.base import NerfModel, RenderedRays
+from nerfro.pixel_parts import PixelParts
 from nerfro.samplers.divergence import exit_divergence
 
 

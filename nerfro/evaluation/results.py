@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.files import write_atomically
+from nerfro.files.atomic import write_atomically
 
 Score = float | None  # None: not available, the reason stands in the notes
 

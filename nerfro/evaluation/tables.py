@@ -17,8 +17,8 @@ import rich.table
 import rich.text
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.files import write_atomically
 from nerfro.evaluation.results import Score
+from nerfro.files.atomic import write_atomically
 
 MISSING = "n/a"
 MEDALS = ("gold", "silver", "bronze")

@@ -95,7 +95,7 @@ class HashGridField(Field):
         """Hash encoding in single precision, compiled on the CPU."""
         unit = (positions - self.box_min) / self.side
         if unit.device.type == "cpu":
-            from nerfro.kernels.hash_encoding import hash_encode  # compiled code, so only where it is used
+            from nerfro.fields.hash_encoding_cpu import hash_encode  # compiled code, so only where it is used
         else:
             hash_encode = hash_encoding.hash_encode
         return hash_encode(unit, self.table, self.levels)
@@ -103,7 +103,7 @@ class HashGridField(Field):
     def encode_directions(self, directions: Float[Tensor, "P 3"]) -> Float[Tensor, "P K"]:
         """Spherical harmonics, compiled on the CPU."""
         if directions.device.type == "cpu":
-            from nerfro.kernels.spherical_harmonics import spherical_harmonics
+            from nerfro.fields.spherical_harmonics_cpu import spherical_harmonics
         else:
             spherical_harmonics = harmonics.spherical_harmonics
         return spherical_harmonics(directions, self.direction_bands)
@@ -111,7 +111,7 @@ class HashGridField(Field):
     def apply_mlp(self, mlp: nn.Sequential, *inputs: Float[Tensor, "P _"]) -> Float[Tensor, "P O"]:
         """An MLP of inputs side by side in the field's precision, with a gradient of our own on the CPU."""
         if inputs[0].device.type == "cpu":
-            from nerfro.kernels.mlp import relu_mlp
+            from nerfro.fields.relu_mlp import relu_mlp
 
             weights = [layer.weight for layer in mlp if isinstance(layer, nn.Linear)]
             return relu_mlp(list(inputs), weights, getattr(torch, self.precision))

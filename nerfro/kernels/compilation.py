@@ -10,11 +10,11 @@ from typing import Any, TypeVar
 
 import numba
 
-from nerfro.geometry.cache import cache_dir
+from nerfro.files.cache import cache_dir
 from nerfro.paths import PACKAGE_DIR
 
-# Kernels, and the constants that are compiled into them, live in these folders.
-_SOURCES = ("kernels", "geometry")
+# Files that hold kernels, or the constants that are compiled into them; a kernel lies beside its plain twin.
+_SOURCES = ("kernels/*.py", "geometry/*.py", "*/*_cpu.py")
 
 Function = TypeVar("Function", bound=Callable)
 
@@ -58,7 +58,7 @@ def _fingerprint() -> str:
     calls has: it would go on running old machine code.
     """
     digest = hashlib.sha256()
-    for folder in _SOURCES:
-        for file in sorted((PACKAGE_DIR / folder).glob("*.py")):
+    for pattern in _SOURCES:
+        for file in sorted(PACKAGE_DIR.glob(pattern)):
             digest.update(file.read_bytes())
     return digest.hexdigest()[:16]

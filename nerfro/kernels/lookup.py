@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import math
 
-from nerfro.geometry.tolerances import BEYOND_BOX, SAFE_SHARE
 from nerfro.kernels.compilation import compiled
+from nerfro.kernels.tolerances import BEYOND_BOX, SAFE_SHARE
 
 
 @compiled

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.geometry.cache import cached_arrays, content_hash
+from nerfro.files.cache import cached_arrays, content_hash
 from nerfro.geometry.interpolation import quadratic_spline, spline_coefficients
 from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh, load_mesh

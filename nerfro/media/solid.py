@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.geometry.tolerances import MIN_COSINE, SAFE_SHARE, STEPS_PER_SHELL
+from nerfro.kernels.tolerances import MIN_COSINE, SAFE_SHARE, STEPS_PER_SHELL
 from nerfro.media.base import Medium
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.geometry.cache import cached_arrays, content_hash, load_arrays, save_arrays
+from nerfro.files.cache import cached_arrays, content_hash, load_arrays, save_arrays
 from nerfro.geometry.interpolation import trilinear
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.occupancy import occupancy_fraction

@@ -11,7 +11,7 @@ from nerfro.errors import NerfroError
 from nerfro.evaluation.results import FULL, METRICS, Metric, Region
 from nerfro.evaluation.tables import MISSING, Column, Row, Table
 from nerfro.report.runs import Budget, Run, Scored, shown
-from nerfro.run_folder import flatten
+from nerfro.training.run_folder import flatten
 
 # What may differ between the seeds of one method: where things are, how they are watched, and the budget, which has
 # a table of its own.

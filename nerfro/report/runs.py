@@ -19,7 +19,7 @@ from PIL import Image
 from nerfro.errors import NerfroError
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
 from nerfro.paths import EMBEDDED_PREFIX
-from nerfro.sweeps import CELL_FILE, scene_name
+from nerfro.training.sweeps import CELL_FILE, scene_name
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,8 @@ def snell_on_grid(
         min_step: shortest step of the search, as a share of the box's shortest side.
         max_events: refractions and reflections, at most.
     """
-    from nerfro.kernels.snell import trace_snell
     from nerfro.media.sdf_grid import BLOCK
+    from nerfro.samplers.snell_cpu import trace_snell
 
     low, high, inverse_spacing = _frame(medium.box, medium.coefficients.shape[1:])
     settings = (
@@ -56,8 +56,8 @@ def eikonal_on_grid(
         tolerance: distance from its last tangent at which a path gets a vertex, world units.
         max_steps: steps of a ray, at most.
     """
-    from nerfro.kernels.eikonal import march_adaptive
     from nerfro.media.sdf_grid import BLOCK, SdfGrid
+    from nerfro.samplers.eikonal_cpu import march_adaptive
 
     if isinstance(medium, SdfGrid):
         low, high, inverse_spacing = _frame(medium.box, medium.coefficients.shape[1:])
@@ -91,7 +91,7 @@ def uniform_exit_on_grid(rays: Rays, medium: VoxelGrid, integrator: str, num_ste
 def _march_uniform(
     rays: Rays, medium: VoxelGrid, integrator: str, num_steps: int, keep_all: bool
 ) -> tuple[np.ndarray, ...]:
-    from nerfro.kernels import eikonal
+    from nerfro.samplers import eikonal_cpu as eikonal
 
     code = {"euler": eikonal.EULER, "leapfrog": eikonal.LEAPFROG, "rk4": eikonal.RK4}[integrator]
     use_threads()

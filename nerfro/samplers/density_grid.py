@@ -84,8 +84,8 @@ class DensityGridSampler(PointSampler):
 
     def draw_compiled(self, path: Path, u: Float[Tensor, "R N+1"]) -> Samples:
         """The same as `draw`, on the CPU."""
-        from nerfro.kernels.density_grid import draw  # compiled code, so only where it is used
         from nerfro.kernels.threads import use_threads
+        from nerfro.samplers.density_grid_cpu import draw  # compiled code, so only where it is used
 
         use_threads()
         drawn = draw(

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerfro.data.cameras import Cameras
+from nerfro.cameras import Cameras
 from nerfro.types import Path, Rays
 
 

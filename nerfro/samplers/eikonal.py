@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import intersect_box
-from nerfro.geometry.tolerances import MIN_TURN, REACHED, STEPS_PER_SHELL
+from nerfro.kernels.tolerances import MIN_TURN, REACHED, STEPS_PER_SHELL
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.voxel_grid import VoxelGrid

@@ -13,13 +13,13 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 import nerfro
-from nerfro.data.cameras import Cameras
-from nerfro.data.pixel_parts import PixelParts
+from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
-from nerfro.geometry.cache import cache_dir, content_hash, load_arrays, save_arrays
+from nerfro.files.cache import cache_dir, content_hash, load_arrays, save_arrays
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.kernels.threads import use_threads
 from nerfro.media.base import Medium
+from nerfro.pixel_parts import PixelParts
 from nerfro.samplers.base import PathSampler
 from nerfro.types import Path, Rays
 

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerfro.geometry.interpolation import intersect_box
-from nerfro.geometry.tolerances import BEYOND_BOX
+from nerfro.kernels.tolerances import BEYOND_BOX
 from nerfro.types import Path, Rays
 
 

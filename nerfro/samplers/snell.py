@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import intersect_box
-from nerfro.geometry.tolerances import MIN_SEARCH_STEP
+from nerfro.kernels.tolerances import MIN_SEARCH_STEP
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid

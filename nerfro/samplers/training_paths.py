@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from nerfro.data.cameras import Cameras
-from nerfro.data.pixel_parts import PixelParts
+from nerfro.cameras import Cameras
 from nerfro.media.base import Medium
+from nerfro.pixel_parts import PixelParts
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.divergence import divergent_pixels
 from nerfro.samplers.path_cache import PathCache

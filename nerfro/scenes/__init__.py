@@ -1,1 +1,3 @@
 """Synthetic scenes of refractive objects: modelled procedurally, rendered by a path tracer."""
+
+SCENES = ("torus", "ship", "deerglobe", "starlamp")

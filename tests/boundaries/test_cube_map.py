@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from nerfro.boundaries import cube_map
-from nerfro.kernels import cube_map as kernels
+from nerfro.boundaries import cube_map_cpu as kernels
 
 LEVELS = cube_map.CubeLevels((1, 3, 8))
 PADDED = torch.cat([cube_map.padded_texels(n).flatten() for n in LEVELS.resolutions])

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from nerfro.boundaries import cube_map, lat_long, radiance_hdr
+from nerfro.boundaries import cube_map, lat_long
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.errors import NerfroError
 from nerfro.evaluation.images import save_png
+from nerfro.files import radiance_hdr
 
 
 def random_directions(num: int, seed: int = 0) -> torch.Tensor:

@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.boundaries.near_field import NearField, _share, contract, contracted_lines, curve
-from nerfro.data.cameras import Cameras
+from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.media.shapes import Ball
 from nerfro.samplers.snell import Snell

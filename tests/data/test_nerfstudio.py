@@ -11,8 +11,8 @@ import torch
 from PIL import Image
 
 from nerfro.data.nerfstudio import NerfstudioData
-from nerfro.data.ray_batches import RayBatches
 from nerfro.errors import NerfroError
+from nerfro.training.ray_batches import RayBatches
 
 from .photographs import (
     CX,

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.files import write_atomically
+from nerfro.files.atomic import write_atomically
 
 
 @pytest.mark.parametrize("step", ["fsync", "replace"])

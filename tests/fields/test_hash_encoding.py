@@ -7,7 +7,7 @@ import torch
 
 from nerfro.errors import NerfroError
 from nerfro.fields import hash_encoding
-from nerfro.kernels import hash_encoding as kernels
+from nerfro.fields import hash_encoding_cpu as kernels
 
 # Two dense levels and three hashed ones, the last of them much finer than its table.
 LEVELS = hash_encoding.grid_levels(num_levels=5, base_resolution=4, finest_resolution=64, log2_table_size=10)

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from nerfro.errors import NerfroError
+from nerfro.fields import spherical_harmonics_cpu as kernel
 from nerfro.fields.spherical_harmonics import spherical_harmonics
-from nerfro.kernels import spherical_harmonics as kernel
 
 
 def quadrature() -> tuple[torch.Tensor, torch.Tensor]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from nerfro.colour import to_linear, to_srgb
+from nerfro.light import to_linear, to_srgb
 from nerfro.losses.boundary import BoundaryRegulariser
 from nerfro.losses.photometric import Photometric
 from nerfro.types import Batch, Path, Rendering, Samples

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerfro.data.cameras import Cameras
+from nerfro.cameras import Cameras
 from nerfro.media.analytic import Vacuum
 from nerfro.media.shapes import RoundedBox
 from nerfro.samplers.divergence import divergent_pixels, exit_divergence

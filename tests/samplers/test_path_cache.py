@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerfro.data.cameras import Cameras
-from nerfro.data.pixel_parts import PixelParts
+from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.media.sdf_grid import SdfGrid
+from nerfro.pixel_parts import PixelParts
 from nerfro.samplers import path_cache
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.path_cache import PathCache

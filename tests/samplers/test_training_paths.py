@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from nerfro.cameras import Cameras
 from nerfro.data.base import Views
-from nerfro.data.cameras import Cameras
-from nerfro.data.ray_batches import RayBatches
 from nerfro.media.analytic import Vacuum
 from nerfro.media.shapes import RoundedBox
 from nerfro.samplers.snell import Snell
 from nerfro.samplers.training_paths import TrainingPaths
+from nerfro.training.ray_batches import RayBatches
 
 SIDE = 24
 

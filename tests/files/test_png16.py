@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerfro.data.png16 import PngError, decode_png16, is_png16
+from nerfro.files.png16 import PngError, decode_png16, is_png16
 
 COLOUR_TYPE = {1: 0, 2: 4, 3: 2, 4: 6}
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from nerfro.kernels.mlp import relu_mlp
+from nerfro.fields.relu_mlp import relu_mlp
 
 
 def layers(*widths: int) -> nn.Sequential:

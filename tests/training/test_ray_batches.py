@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
+from nerfro.cameras import Cameras
 from nerfro.data.base import Views
-from nerfro.data.cameras import Cameras
-from nerfro.data.ray_batches import RayBatches
 from nerfro.errors import NerfroError
+from nerfro.training.ray_batches import RayBatches
 
 NUM_VIEWS, HEIGHT, WIDTH = 5, 12, 16
 

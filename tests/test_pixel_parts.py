@@ -10,12 +10,12 @@ import pytest
 import torch
 
 import nerfro.distributed
-from nerfro.colour import to_linear
+from nerfro.cameras import Cameras
 from nerfro.data.base import Views
-from nerfro.data.cameras import Cameras
-from nerfro.data.pixel_parts import PixelParts
-from nerfro.data.ray_batches import RayBatches
 from nerfro.distributed import drawing_for, rand_rays
+from nerfro.light import to_linear
+from nerfro.pixel_parts import PixelParts
+from nerfro.training.ray_batches import RayBatches
 
 NUM_VIEWS, HEIGHT, WIDTH = 3, 8, 10
 

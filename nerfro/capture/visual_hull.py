@@ -13,10 +13,10 @@ from scipy.ndimage import binary_fill_holes, label
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from nerfro.data.cameras import Cameras
+from nerfro.cameras import Cameras
+from nerfro.capture.silhouettes import is_cut_by_frame, outline_distance
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh, merge_vertices
-from nerfro.geometry.silhouettes import is_cut_by_frame, outline_distance
 
 # Each level halves the voxels and looks only at those near the surface of the level before.
 _LEVELS = 2

@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.capture.silhouettes import mesh_silhouette, pixel_stride
 from nerfro.data.base import Views
 from nerfro.evaluation.drawing import GAP, LINE_HEIGHT, fit, paper, write
 from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.geometry.silhouettes import mesh_silhouette, pixel_stride
 
 MAX_VIEWS = 48
 _COLUMNS = 8

@@ -24,11 +24,11 @@ from omegaconf import DictConfig, OmegaConf
 from nerfro.cli import in_one_line
 from nerfro.data.frames import IMAGE_SUFFIXES
 from nerfro.errors import NerfroError
-from nerfro.evaluation.files import write_atomically
+from nerfro.files.atomic import write_atomically
 from nerfro.paths import EMBEDDED_PREFIX, resolve_path
 from nerfro.registry import build, discover
-from nerfro.run_folder import LAST_CHECKPOINT, flatten
-from nerfro.synthesize import SCENES
+from nerfro.scenes import SCENES
+from nerfro.training.run_folder import LAST_CHECKPOINT, flatten
 
 CELL_FILE, _LOCK = "cell.json", "cell.lock"
 

@@ -9,7 +9,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.special import ndtri
 from torch import Tensor
 
-from nerfro.data.cameras import Cameras
+from nerfro.cameras import Cameras
 from nerfro.geometry.intersection import MeshIntersector
 
 # Standard deviation of the blur in which the outline is found, pixels: enough to see between a binary mask's steps (an

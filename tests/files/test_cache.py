@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerfro.errors import NerfroError
-from nerfro.geometry.cache import cached_arrays, content_hash, load_arrays, save_arrays
+from nerfro.files.cache import cached_arrays, content_hash, load_arrays, save_arrays
 
 
 class _Counter:

@@ -13,9 +13,9 @@ from scipy.ndimage import binary_erosion, distance_transform_edt
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from nerfro.data.cameras import Cameras
+from nerfro.cameras import Cameras
+from nerfro.capture.visual_hull import Silhouettes
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.geometry.visual_hull import Silhouettes
 
 
 @dataclass(frozen=True)

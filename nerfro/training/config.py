@@ -12,7 +12,7 @@ import numpy as np
 from omegaconf import MISSING, DictConfig
 
 from nerfro.errors import NerfroError
-from nerfro.geometry.cache import load_array
+from nerfro.files.cache import load_array
 from nerfro.geometry.mesh import load_mesh
 from nerfro.losses.base import Loss
 from nerfro.media.analytic import Vacuum

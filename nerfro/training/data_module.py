@@ -8,7 +8,7 @@ import torch
 from lightning.pytorch import LightningDataModule
 
 from nerfro.data.base import Views
-from nerfro.data.ray_batches import RayBatches
+from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Batch
 
 

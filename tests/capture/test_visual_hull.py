@@ -9,15 +9,11 @@ import pytest
 import torch
 import trimesh
 
-from nerfro.data.cameras import Cameras
-from nerfro.errors import NerfroError
-from nerfro.geometry.intersection import MeshIntersector
-from nerfro.geometry.mesh import TriangleMesh
-from nerfro.geometry.normals import face_normals
-from nerfro.geometry.pose_conventions import overlap, require_consistent_poses
-from nerfro.geometry.silhouette_fit import fit_surface
-from nerfro.geometry.silhouettes import mesh_silhouette, outline_distance
-from nerfro.geometry.visual_hull import (
+from nerfro.cameras import Cameras
+from nerfro.capture.pose_conventions import overlap, require_consistent_poses
+from nerfro.capture.silhouette_fit import fit_surface
+from nerfro.capture.silhouettes import mesh_silhouette, outline_distance
+from nerfro.capture.visual_hull import (
     Silhouettes,
     carve_grid,
     extract_surface,
@@ -25,6 +21,10 @@ from nerfro.geometry.visual_hull import (
     reached_sides,
     remove_strays,
 )
+from nerfro.errors import NerfroError
+from nerfro.geometry.intersection import MeshIntersector
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.normals import face_normals
 
 
 def cameras_around(count: int, size: int, distance: float = 4.0, focal: float = 1.4, spread: float = 1.0) -> Cameras:

@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.capture.silhouettes import intersection_over_union, mesh_silhouette, pixel_stride
+from nerfro.capture.visual_hull import Silhouettes, carve_grid, extract_surface, find_box, remove_strays
 from nerfro.errors import NerfroError
 from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.geometry.silhouettes import intersection_over_union, mesh_silhouette, pixel_stride
-from nerfro.geometry.visual_hull import Silhouettes, carve_grid, extract_surface, find_box, remove_strays
 
 # The first look is at so many voxels a side and at most so many pixels a side.
 _COARSE_VOXELS, _COARSE_PIXELS = 48, 64

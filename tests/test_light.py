@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from nerfro.colour import to_linear, to_srgb
+from nerfro.light import to_linear, to_srgb
 
 
 def test_middle_grey_and_the_ends_are_the_standards() -> None:

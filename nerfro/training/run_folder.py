@@ -18,7 +18,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.files import write_atomically
+from nerfro.files.atomic import write_atomically
 from nerfro.paths import PACKAGE_DIR
 
 LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")

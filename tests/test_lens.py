@@ -9,9 +9,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from nerfro.data.cameras import Cameras
-from nerfro.data.distortion import coefficients, distort, opencv_coefficients, undistort
-from nerfro.geometry.cache import content_hash
+from nerfro.cameras import Cameras
+from nerfro.files.cache import content_hash
+from nerfro.lens import coefficients, distort, opencv_coefficients, undistort
 from nerfro.samplers.path_cache import _describe_cameras
 
 LENSES = {

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from nerfro.data.distortion import distort, undistort
 from nerfro.errors import NerfroError
-from nerfro.types import Rays
+from nerfro.lens import distort, undistort
+from nerfro.rays import Rays
 
 
 class Window(NamedTuple):
@@ -59,7 +59,7 @@ class Cameras:
         cx, cy: principal point, pixels from the image's left and top edge.
         width, height: resolution, pixels.
         near, far: arc length from the camera's centre at which rays begin and end, world units.
-        distortion: of the lens, see `nerfro.data.distortion.coefficients`; None for an ideal one.
+        distortion: of the lens, see `nerfro.lens.coefficients`; None for an ideal one.
     """
 
     camera_to_world: Float[Tensor, "V 3 4"]

@@ -14,10 +14,10 @@ from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from torch import Tensor
 
 from nerfro.boundaries.lat_long import directions
-from nerfro.data.cameras import Cameras
+from nerfro.cameras import Cameras
+from nerfro.evaluation.path_plot import picture_of_paths
 from nerfro.media.analytic import Vacuum
 from nerfro.models.base import NerfModel
-from nerfro.path_plot import picture_of_paths
 from nerfro.types import Batch, Rays, Rendering
 
 _SKY_HEIGHT = 128  # rows of the picture of the sky

@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from nerfro.data.cameras import Cameras, Window, central_window
+from nerfro.cameras import Cameras, Window, central_window
 from nerfro.errors import NerfroError
 
 

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerfro.data.cameras import Cameras
-from nerfro.types import Rays
+from nerfro.cameras import Cameras
+from nerfro.rays import Rays
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from nerfro.cameras import Cameras, Window, central_window
 from nerfro.data.base import Views
-from nerfro.data.cameras import Cameras, Window, central_window
-from nerfro.data.pixel_parts import PixelParts
 from nerfro.distributed import share_of
 from nerfro.errors import NerfroError
+from nerfro.pixel_parts import PixelParts
 from nerfro.types import Batch
 
 Batching = Literal["single_image", "all_images"]

@@ -10,7 +10,6 @@ import math
 import numpy as np
 from numba import prange
 
-from nerfro.geometry.tolerances import MIN_COSINE, MIN_NORMAL_PART, MIN_TURN, REACHED, RESOLVED
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.lookup import (
     block_clearance,
@@ -22,6 +21,7 @@ from nerfro.kernels.lookup import (
     solid_index,
     voxel_index,
 )
+from nerfro.kernels.tolerances import MIN_COSINE, MIN_NORMAL_PART, MIN_TURN, REACHED, RESOLVED
 
 EULER, LEAPFROG, RK4 = 0, 1, 2
 

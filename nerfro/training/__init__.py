@@ -1,0 +1,1 @@
+"""What happens around a model while it trains: batches, callbacks, logs, and the run's folder."""
