@@ -30,10 +30,10 @@ from torch import nn
 from nerfro.errors import NerfroError
 from nerfro.paths import PLUGINS_DIR
 
-KINDS = ("model", "medium", "sampler/path", "sampler/points", "field", "boundary", "loss", "data")
+KINDS = ("model", "camera", "medium", "sampler/path", "sampler/points", "field", "boundary", "loss", "data")
 
 # Packages whose modules register the built-in parts, imported by `discover`.
-_BUILT_IN = ("media", "samplers", "fields", "boundaries", "losses", "models", "data")
+_BUILT_IN = ("camera", "media", "samplers", "fields", "boundaries", "losses", "models", "data")
 _LOCAL_PACKAGE = "nerfro_plugins"
 _ENTRY_POINTS = "nerfro.plugins"
 

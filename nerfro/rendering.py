@@ -28,10 +28,10 @@ def volume_weights(
     return weights, transmittance[:, -1]
 
 
-def composite(samples: Samples, radiance: Radiance, boundary_rgb: Float[Tensor, "R 3"], path: Path) -> Rendering:
-    """Render one level: C = sum_i w_i c_i + T_{N+1} C'(d_N) (paper, Eqn. volrendBd)."""
+def composite(samples: Samples, radiance: Radiance, boundary_rgb: Float[Tensor, "P 3"], path: Path) -> Rendering:
+    """Render one level: C = sum_i w_i c_i + T_{N+1} C'(d_N) (paper, Eqn. volrendBd), summed over a ray's polylines."""
     density, rgb = radiance.density.float(), radiance.rgb.float()  # sums over a ray stay in single precision
     weights, transmittance = volume_weights(density, samples.deltas)
     boundary_rgb = boundary_rgb.float()
     colour = (weights[..., None] * rgb).sum(-2) + transmittance[:, None] * boundary_rgb
-    return Rendering(colour, weights, transmittance, boundary_rgb, samples, path)
+    return Rendering(path.per_ray(colour), weights, transmittance, boundary_rgb, samples, path)

@@ -13,6 +13,7 @@ import torch
 
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.constant import ConstantBoundary
+from nerfro.camera.base import Camera
 from nerfro.cameras import Cameras
 from nerfro.fields.base import Field
 from nerfro.fields.nerf import NerfField
@@ -29,7 +30,7 @@ from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.snell import Snell
 from nerfro.samplers.straight import Straight
 from nerfro.samplers.stratified import Stratified, point_samples
-from nerfro.types import Batch, Path, Radiance, Rays, Rendering, Samples
+from nerfro.types import Batch, Exits, Path, Radiance, Rays, Rendering, Samples
 
 NUM_RAYS = 24
 
@@ -88,7 +89,8 @@ def example_batch() -> Batch:
     pose[:, 2, 3] = 4
     two = torch.full((2,), 8.0)
     cameras = Cameras(pose, two, two, two, two, width=16, height=16, near=2.0, far=6.0)
-    return Batch(example_rays(), torch.full((NUM_RAYS, 3), 0.5), torch.arange(NUM_RAYS), cameras)
+    view = torch.arange(NUM_RAYS) % 2
+    return Batch(example_rays(), view, torch.full((NUM_RAYS, 3), 0.5), cameras)
 
 
 def _make(plugin: Plugin, fields: dict[str, object], **parts: object) -> Any:
@@ -105,6 +107,13 @@ def _check_medium(plugin: Plugin, fields: dict[str, object]) -> None:
     _require(bool((ior > 0).all()) and bool(gradient.isfinite().all()), "n is positive and grad n finite")
     ior, gradient = medium(high + (high - low) * (1 + torch.rand(50, 3)))
     _require(bool((ior == 1).all()) and bool((gradient == 0).all()), "outside the box n = 1 and grad n = 0")
+
+
+def _check_camera(plugin: Plugin, fields: dict[str, object]) -> None:
+    camera = _make(plugin, fields)
+    _require(isinstance(camera, Camera), "a camera part derives from nerfro.camera.base.Camera")
+    rays = camera(example_rays(), torch.arange(NUM_RAYS) % 2)
+    _require(rays.origins.shape == (NUM_RAYS, 3) and _unit(rays.directions), "forward returns unit rays")
 
 
 def _check_path_sampler(plugin: Plugin, fields: dict[str, object]) -> None:
@@ -167,7 +176,7 @@ def _check_field(plugin: Plugin, fields: dict[str, object]) -> None:
     _require(radiance.density.shape == samples.s.shape, "density is [R, N]")
     _require(radiance.rgb.shape == samples.positions.shape, "rgb is [R, N, 3]")
     _require(bool((radiance.density >= 0).all()), "density is not negative")
-    _require(bool(((radiance.rgb > -0.01) & (radiance.rgb < 1.01)).all()), "rgb lies in [0, 1]")
+    _require(bool((radiance.rgb > -0.01).all()), "radiance is not negative")
     (radiance.density.sum() + radiance.rgb.sum()).backward()
     _require_gradients(field)
 
@@ -176,9 +185,11 @@ def _check_boundary(plugin: Plugin, fields: dict[str, object]) -> None:
     boundary = _make(plugin, fields)
     _require(isinstance(boundary, Boundary), "a boundary derives from nerfro.boundaries.base.Boundary")
     directions = torch.nn.functional.normalize(torch.randn(4, 5, 3), dim=-1)
-    rgb = boundary(directions)
+    rgb = boundary(Exits(directions))
     _require(rgb.shape == directions.shape, "forward keeps all leading axes: [..., 3] -> [..., 3]")
-    _require(bool(((rgb > -0.01) & (rgb < 1.01)).all()), "rgb lies in [0, 1]")
+    _require(bool((rgb > -0.01).all()), "radiance is not negative")
+    exits = example_path().exits()
+    _require(boundary(exits).shape == exits.directions.shape, "forward takes the exits of paths")
     if any(parameter.requires_grad for parameter in boundary.parameters()):
         rgb.sum().backward()
         _require_gradients(boundary)
@@ -215,6 +226,7 @@ def _check_data(plugin: Plugin, fields: dict[str, object]) -> None:
 
 
 _CONTRACTS: dict[str, Callable[[Plugin, dict[str, object]], None]] = {
+    "camera": _check_camera,
     "medium": _check_medium,
     "sampler/path": _check_path_sampler,
     "sampler/points": _check_point_sampler,

@@ -1,45 +1,127 @@
 """The values that pass between the parts. Shapes use the axis letters below, lengths are in world units.
 
-R rays, S path vertices, N samples, V views, H and W pixels, L sampling levels.
+R rays, P polylines, S path vertices, N samples, V views, H and W pixels, L sampling levels. There are as many polylines
+as rays where no ray splits; what is documented with R then has P rows.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from nerfro.cameras import Cameras
-from nerfro.light import to_linear, to_srgb
+from nerfro.distributed import rand_rays
 from nerfro.rays import Rays
 
-__all__ = ["Batch", "Path", "Radiance", "Rays", "Rendering", "Samples"]
+__all__ = ["Batch", "Exits", "Path", "Radiance", "Rays", "Rendering", "Samples"]
 
 
 @dataclass(frozen=True)
 class Path:
     """Rays as polylines in arc length: vertex i is left along directions[i] until s[i + 1].
 
-    A straight ray is a path of two vertices. Rows with fewer vertices than others repeat their last one (s and all).
+    Light that splits takes several polylines of one ray, each complete from the camera on; rendering adds up what they
+    bring. A straight ray is a path of two vertices. Rows with fewer vertices than others repeat their last one (s and
+    all).
 
     Attributes:
         positions: vertices.
         directions: unit direction in which each vertex is left.
         s: arc length from the camera at each vertex, non-decreasing. s[:, 0] is near; s[:, -1] is far, or more where
             the object is left later.
-        exit_directions: unit direction in which the ray leaves the bounded volume.
-        refracted: whether the ray met the medium (n not 1) at all.
+        exit_directions: unit direction in which the polyline leaves the bounded volume.
+        refracted: whether the polyline met the medium (n not 1) at all.
         radii: pixel cone radius at unit distance, carried along from the rays.
+        ray: the ray that each polyline belongs to, non-decreasing, every ray with one polyline at least; by default
+            each ray has one.
+        throughput: linear factor of the light that the polyline brings; 1 by default. Those of a ray sum to at most 1.
+        body: innermost body of the medium in which each vertex is left, numbered from 1; 0 in air, or where the index
+            varies continuously.
     """
 
-    positions: Float[Tensor, "R S 3"]
-    directions: Float[Tensor, "R S 3"]
-    s: Float[Tensor, "R S"]
-    exit_directions: Float[Tensor, "R 3"]
-    refracted: Bool[Tensor, "R"]
-    radii: Float[Tensor, "R"]
+    positions: Float[Tensor, "P S 3"]
+    directions: Float[Tensor, "P S 3"]
+    s: Float[Tensor, "P S"]
+    exit_directions: Float[Tensor, "P 3"]
+    refracted: Bool[Tensor, "P"]
+    radii: Float[Tensor, "P"]
+    ray: Int[Tensor, "P"] = None  # type: ignore[assignment]  # filled in below
+    throughput: Float[Tensor, "P 3"] = None  # type: ignore[assignment]
+    body: Int[Tensor, "P S"] = None  # type: ignore[assignment]
+    _splits: bool = field(init=False, repr=False)
+    _dims: bool = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        def fill(name: str, value: object) -> None:
+            object.__setattr__(self, name, value)
+
+        # Known here, so that the ordinary path is neither summed up nor weighted, bit for bit.
+        fill("_splits", self.ray is not None)
+        fill("_dims", self.throughput is not None)
+        if self.ray is None:
+            fill("ray", torch.arange(len(self.s), device=self.s.device))
+        if self.throughput is None:
+            fill("throughput", self.s.new_ones(()).expand(len(self.s), 3))
+        if self.body is None:
+            fill("body", torch.zeros((), dtype=torch.int8, device=self.s.device).expand(self.s.shape))
+
+    @property
+    def num_rays(self) -> int:
+        """Number of rays; of as many polylines where none splits."""
+        return int(self.ray[-1]) + 1 if self._splits and len(self.ray) else len(self.ray)
+
+    def per_ray(self, values: Float[Tensor, "P *C"]) -> Float[Tensor, "R *C"]:
+        """What the polylines of each ray bring together: the sum of their values, each times its throughput."""
+        if self._dims:
+            values = values * (self.throughput if values.ndim > 1 else self.throughput.mean(-1))
+        if not self._splits:
+            return values
+        return values.new_zeros(self.num_rays, *values.shape[1:]).index_add(0, self.ray, values)
+
+    def of_ray(self, values: Shaped[Tensor, "R *C"]) -> Shaped[Tensor, "P *C"]:
+        """The value of its ray for each polyline."""
+        return values[self.ray] if self._splits else values
+
+    def first_of_ray(self, values: Shaped[Tensor, "P *C"]) -> Shaped[Tensor, "R *C"]:
+        """The value of its first polyline, the main one, for each ray."""
+        if not self._splits:
+            return values
+        return values[torch.searchsorted(self.ray, torch.arange(self.num_rays, device=self.ray.device))]
+
+    def rand(self, num: int) -> Float[Tensor, "P num"]:
+        """Uniform numbers in [0, 1): drawn for each ray (see `distributed.rand_rays`), the same for its polylines."""
+        return self.of_ray(rand_rays(self.num_rays, num, self.s))
+
+    def moved(
+        self,
+        positions: Float[Tensor, "P S 3"],
+        directions: Float[Tensor, "P S 3"],
+        s: Float[Tensor, "P S"],
+        exit_directions: Float[Tensor, "P 3"],
+        throughput: Float[Tensor, "P 3"] | None = None,
+    ) -> Path:
+        """The same polylines through other vertices, as a refinement makes them."""
+        ray = self.ray if self._splits else None
+        if throughput is None and self._dims:
+            throughput = self.throughput
+        return Path(
+            positions, directions, s, exit_directions, self.refracted, self.radii,
+            ray, throughput, self.body,  # type: ignore[arg-type]
+        )  # fmt: skip
+
+    def exits(self, directions: Float[Tensor, "P 3"] | None = None) -> Exits:
+        """Where light comes from beyond all vertices: the last straight run of each polyline.
+
+        Args:
+            directions: in which it is looked for instead of the exit directions.
+        """
+        turns = (self.directions[:, 1:] != self.directions[:, :-1]).any(-1)
+        last = (turns * torch.arange(1, self.s.shape[1], device=self.s.device)).amax(-1)
+        start = self.positions.gather(1, last[:, None, None].expand(-1, 1, 3))[:, 0]
+        return Exits(self.exit_directions if directions is None else directions, start, self.radii)
 
     @property
     def near(self) -> Float[Tensor, "R"]:
@@ -54,27 +136,35 @@ class Path:
         return self.positions[:, -1]
 
     def __getitem__(self, index: slice | Tensor) -> Path:
-        fields = ("positions", "directions", "s", "exit_directions", "refracted", "radii")
-        return Path(*(getattr(self, name)[index] for name in fields))
+        """Some of the polylines, each as that of a ray of its own."""
 
-    def followed_by(self, other: Path) -> Path:
-        """These paths and after them those of another."""
-        num_vertices = max(self.s.shape[1], other.s.shape[1])
-
-        def longer(vertices: Tensor) -> Tensor:
-            missing = num_vertices - vertices.shape[1]
-            return torch.cat([vertices, vertices[:, -1:].expand(-1, missing, *vertices.shape[2:])], dim=1)
+        def of(name: str) -> Tensor:
+            chosen: Tensor = getattr(self, name)[index]
+            return chosen
 
         return Path(
-            *(
-                torch.cat([longer(getattr(part, name)) for part in (self, other)])
-                for name in ("positions", "directions", "s")
-            ),
-            *(
-                torch.cat([getattr(part, name) for part in (self, other)])
-                for name in ("exit_directions", "refracted", "radii")
-            ),
-        )
+            of("positions"), of("directions"), of("s"), of("exit_directions"), of("refracted"), of("radii"),
+            throughput=of("throughput") if self._dims else None, body=of("body"),  # type: ignore[arg-type]
+        )  # fmt: skip
+
+    def followed_by(self, other: Path) -> Path:
+        """These paths and after them those of another; of rays that do not split."""
+        num_vertices = max(self.s.shape[1], other.s.shape[1])
+
+        def joined(name: str) -> Tensor:
+            parts: list[Tensor] = [getattr(part, name) for part in (self, other)]
+            if name in ("positions", "directions", "s", "body"):
+                missing = [num_vertices - p.shape[1] for p in parts]
+                parts = [
+                    torch.cat([p, p[:, -1:].expand(-1, m, *p.shape[2:])], 1)
+                    for p, m in zip(parts, missing, strict=True)
+                ]
+            return torch.cat(parts)
+
+        return Path(
+            joined("positions"), joined("directions"), joined("s"), joined("exit_directions"), joined("refracted"),
+            joined("radii"), body=joined("body"),
+        )  # fmt: skip
 
     def span(self, box: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
         """Arc lengths between which the path runs inside a box, from its first entry to its last exit.
@@ -109,6 +199,22 @@ class Path:
 
 
 @dataclass(frozen=True)
+class Exits:
+    """What a boundary is asked: lines on which light arrives from far away. Leading axes may have any form.
+
+    Attributes:
+        directions: unit directions in which light is looked for, pointing away from the volume.
+        positions: where these lines begin: at the last event of a path, or at the camera where there is none; None
+            asks for what is seen from the middle of all.
+        radii: of the pixel's cone at unit distance along the line; 0 where nothing is known of it.
+    """
+
+    directions: Float[Tensor, "*batch 3"]
+    positions: Float[Tensor, "*batch 3"] | None = None
+    radii: Float[Tensor, "*batch"] | float = 0.0
+
+
+@dataclass(frozen=True)
 class Samples:
     """Samples of the radiance field along a path; sample i stands for the interval from edges[i] to edges[i + 1].
 
@@ -128,6 +234,13 @@ class Samples:
     edges: Float[Tensor, "R N+1"]
     radii: Float[Tensor, "R"]
 
+    @classmethod
+    def along(cls, path: Path, s: Float[Tensor, "R N"], edges: Float[Tensor, "R N+1"]) -> Samples:
+        """Samples at chosen arc lengths of a path, which gives positions and directions, with its gradients."""
+        s, edges = s.detach(), edges.detach()
+        positions, directions = path.at(s)
+        return cls(positions, directions, s, edges, path.radii)
+
     @property
     def deltas(self) -> Float[Tensor, "R N"]:
         return self.edges[:, 1:] - self.edges[:, :-1]
@@ -135,7 +248,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Radiance:
-    """What a field returns: volume density (per world unit, non-negative) and colour (sRGB)."""
+    """What a field returns: volume density (per world unit, not negative) and linear radiance."""
 
     density: Float[Tensor, "R N"]
     rgb: Float[Tensor, "R N 3"]
@@ -146,32 +259,38 @@ class Rendering:
     """One sampling level of rendered rays (paper, Eqn. volrendBd).
 
     Attributes:
-        rgb: pixel colour, boundary term included.
-        weights: contribution of each sample.
-        transmittance: what is left at the end of the path, T_{N+1}.
-        boundary_rgb: colour of the boundary in the leaving direction, C'(d_N).
+        rgb: radiance of each ray, boundary term included, of all its polylines together. Linear, and unbounded above;
+            sRGB where the model adds up sRGB (`NerfModel.colour`).
+        weights: contribution of each sample to its polyline.
+        transmittance: what is left at the end of the polyline, T_{N+1}.
+        boundary_rgb: radiance of the boundary in the leaving direction, C'(d_N).
         samples: the samples that were rendered.
-        path: the path they lie on.
+        path: the polylines that they lie on.
     """
 
     rgb: Float[Tensor, "R 3"]
-    weights: Float[Tensor, "R N"]
-    transmittance: Float[Tensor, "R"]
-    boundary_rgb: Float[Tensor, "R 3"]
+    weights: Float[Tensor, "P N"]
+    transmittance: Float[Tensor, "P"]
+    boundary_rgb: Float[Tensor, "P 3"]
     samples: Samples
     path: Path
 
     @property
     def opacity(self) -> Float[Tensor, "R"]:
-        return self.weights.sum(-1)
+        return self.path.per_ray(self.weights.sum(-1))
 
     @property
     def depth(self) -> Float[Tensor, "R"]:
-        """Expected arc length of the samples that were hit; far where nothing was."""
-        weight = self.weights.sum(-1)
+        """Expected arc length of the samples that were hit; the main polyline's end where nothing was."""
+        weight = self.opacity
         centres = 0.5 * (self.samples.edges[:, 1:] + self.samples.edges[:, :-1])
-        depth = (self.weights * centres).sum(-1) / weight.clamp(min=1e-6)
-        return torch.where(weight > 1e-6, depth, self.path.far)
+        depth = self.path.per_ray((self.weights * centres).sum(-1)) / weight.clamp(min=1e-6)
+        return torch.where(weight > 1e-6, depth, self.path.first_of_ray(self.path.far))
+
+    @property
+    def exit_directions(self) -> Float[Tensor, "R 3"]:
+        """Unit direction in which the main polyline of each ray leaves."""
+        return self.path.first_of_ray(self.path.exit_directions)
 
 
 @dataclass(frozen=True)
@@ -179,29 +298,31 @@ class Batch:
     """Training pixels: first those that have one ray, then those that are divided, all rays of each together.
 
     Attributes:
-        rays: of the pixels.
+        rays: of the pixels, as the data's cameras give them.
+        view: number of the training view that each ray belongs to.
         rgb: colour of the pixel that each ray belongs to (sRGB in [0, 1]).
-        index: identity of each training ray: `view * H * W + row * W + column`; of divided pixels the ray's number in
-            their `PixelParts`.
         cameras: all training cameras, for losses that ask for further directions.
         num_whole: number of pixels that have one ray; all by default.
         rays_per_pixel: of the divided ones.
         rows: which rows of the whole batch these are, where several processes share it.
         num_rows: of the whole batch.
+        path: of the rays, where it was traced ahead of the step.
     """
 
     rays: Rays
+    view: Int[Tensor, "R"]
     rgb: Float[Tensor, "R 3"]
-    index: Int[Tensor, "R"]
     cameras: Cameras
     num_whole: int | None = None
     rays_per_pixel: int = 1
     rows: Int[Tensor, "R"] | None = None
     num_rows: int | None = None
+    path: Path | None = None
+    index: Int[Tensor, "R"] | None = None
 
-    def pixel_colours(self, rgb: Float[Tensor, "R 3"]) -> Float[Tensor, "P 3"]:
-        """Colours of pixels from those of their rays: means of linear radiance, in sRGB."""
+    def of_pixels(self, rgb: Float[Tensor, "R 3"]) -> Float[Tensor, "P 3"]:
+        """Radiance (or colour) of pixels from that of their rays: its mean."""
         if self.num_whole is None:
             return rgb
-        divided = to_linear(rgb[self.num_whole :]).view(-1, self.rays_per_pixel, 3)
-        return torch.cat([rgb[: self.num_whole], to_srgb(divided.mean(1))])
+        divided = rgb[self.num_whole :].view(-1, self.rays_per_pixel, 3)
+        return torch.cat([rgb[: self.num_whole], divided.mean(1)])

@@ -9,11 +9,12 @@ from torch import Tensor, nn
 from nerfro.boundaries.base import Boundary
 from nerfro.errors import NerfroError
 from nerfro.registry import register
+from nerfro.types import Exits
 
 
 @register("boundary", "gradient_sky")
 class GradientSky(Boundary):
-    """Two learned colours, blended by the height of the direction.
+    """Two learned radiances, blended by the height of the direction.
 
     Args:
         up: axis that points up, 0, 1 or 2.
@@ -24,9 +25,9 @@ class GradientSky(Boundary):
         if up not in (0, 1, 2):
             raise NerfroError(f"gradient_sky: up={up} is no axis; choose 0, 1 or 2")
         self.up = up
-        self.raw = nn.Parameter(torch.zeros(2, 3))  # ground and zenith, before the sigmoid
+        self.raw = nn.Parameter(torch.zeros(2, 3))  # ground and zenith, before the exponential
 
-    def forward(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        height = 0.5 * (1 + directions[..., self.up, None])
-        ground, zenith = torch.sigmoid(self.raw)
+    def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
+        height = 0.5 * (1 + exits.directions[..., self.up, None])
+        ground, zenith = torch.exp(self.raw)
         return ground + height * (zenith - ground)

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.losses.base import Loss
+from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
 from nerfro.types import Batch, Rendering
-
-if TYPE_CHECKING:
-    from nerfro.models.base import NerfModel
 
 
 @register("loss", "opacity_entropy")
 class OpacityEntropy(Loss):
     """Entropy of the finest level's opacity: rays shall either pass or be stopped, not be dimmed by fog."""
 
-    def forward(self, renderings: list[Rendering], batch: Batch, model: NerfModel) -> Float[Tensor, ""]:
+    def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
         passed = renderings[-1].transmittance.clamp(1e-5, 1 - 1e-5)
         return -(passed * torch.log(passed) + (1 - passed) * torch.log(1 - passed)).mean()

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import torch
 
-from nerfro.distributed import rand_rays
 from nerfro.errors import NerfroError
 from nerfro.registry import register
 from nerfro.samplers.base import PointSampler
@@ -33,10 +32,9 @@ class LogarithmicSampler(PointSampler):
         self.num_samples, self.growth = num_samples, growth
 
     def forward(self, path: Path, previous: Rendering | None) -> Samples:
-        num_rays, like = len(path.s), path.s
-        bins = torch.arange(self.num_samples, device=like.device, dtype=like.dtype).expand(num_rays, -1)
+        bins = torch.arange(self.num_samples, device=path.s.device, dtype=path.s.dtype).expand(len(path.s), -1)
         # Random in training, central in evaluation: the contract of every sampler.
-        offsets = rand_rays(num_rays, self.num_samples, like) if self.training else 0.5
+        offsets = path.rand(self.num_samples) if self.training else 0.5
         u = (bins + offsets) / self.num_samples
         fraction = (self.growth**u - 1) / (self.growth - 1)
         return point_samples(path, path.near[:, None] + fraction * (path.far - path.near)[:, None])

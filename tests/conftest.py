@@ -28,6 +28,19 @@ def _seed() -> None:
     torch.manual_seed(0)
 
 
+def _random_pose(seed: int) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.random(random_state=seed).as_matrix()
+    pose[:3, 3] = np.random.default_rng(seed).normal(size=3)
+    return pose
+
+
+@pytest.fixture
+def random_pose() -> Callable[[int], np.ndarray]:
+    """Camera-to-world matrix [4, 4] of a seed, with any orientation."""
+    return _random_pose
+
+
 @dataclass(frozen=True)
 class Finished:
     """How an entry point ended: its exit code and what it printed."""

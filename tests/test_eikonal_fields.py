@@ -35,7 +35,7 @@ from nerfro.samplers.stratified import Stratified
 from nerfro.testing import example_rays
 from nerfro.training.config import build_model
 from nerfro.training.run_folder import load_checkpoint
-from nerfro.types import Radiance, Samples
+from nerfro.types import Exits, Radiance, Samples
 
 discover()
 IndexField = find("medium", "index_field").cls
@@ -231,7 +231,7 @@ def test_grids_get_sharper_level_by_level() -> None:
     for level in range(3):
         model.sharpen(level)
         with torch.no_grad():
-            error = model._blurred.sky_towards(directions) - model.boundary(directions)
+            error = model._blurred.sky_towards(directions) - model.boundary(Exits(directions))
         errors.append(float(error.square().mean()))
     assert errors[0] > errors[1] > errors[2]
 

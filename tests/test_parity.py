@@ -61,7 +61,7 @@ def batch(recorded: dict[str, Tensor]) -> Batch:
     near, far = (recorded[key].expand(num_rays) for key in ("near", "far"))
     rays = Rays(recorded["origins"], recorded["directions"], torch.zeros(num_rays), near, far)
     tile = RecordedTile(recorded["sky_patch_directions"])
-    return Batch(rays, recorded["target_rgb"], torch.arange(num_rays), tile)  # type: ignore[arg-type]
+    return Batch(rays, torch.zeros(num_rays).long(), recorded["target_rgb"], tile)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +83,7 @@ def model(recorded: dict[str, Tensor], medium: VoxelGrid) -> RefractiveModel:
         losses=losses,
         optimizer=OptimizerConfig(),
     )
-    model = RefractiveModel(parts, boundary_direction="last_coarse").eval()
+    model = RefractiveModel(parts, boundary_direction="last_coarse", colour="srgb").eval()
     for name, layer in layers(model).items():
         layer.weight.data.copy_(recorded[f"weight/{name}/kernel"].T)
         layer.bias.data.copy_(recorded[f"weight/{name}/bias"])

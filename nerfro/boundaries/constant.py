@@ -9,14 +9,15 @@ from torch import Tensor
 from nerfro.boundaries.base import Boundary
 from nerfro.errors import NerfroError
 from nerfro.registry import register
+from nerfro.types import Exits
 
 
 @register("boundary", "constant")
 class ConstantBoundary(Boundary):
-    """The same colour in every direction, black by default: what stock NeRF and mip-NeRF assume.
+    """The same radiance in every direction, black by default: what stock NeRF and mip-NeRF assume.
 
     Args:
-        rgb: the colour, sRGB.
+        rgb: linear radiance.
     """
 
     rgb: Float[Tensor, "3"]
@@ -27,5 +28,5 @@ class ConstantBoundary(Boundary):
             raise NerfroError(f"boundary=constant: rgb={list(rgb)} needs three numbers")
         self.register_buffer("rgb", torch.tensor(list(rgb)), persistent=False)
 
-    def forward(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        return self.rgb.expand(directions.shape)
+    def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
+        return self.rgb.expand(exits.directions.shape)

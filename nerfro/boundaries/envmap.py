@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from nerfro.boundaries import cube_map, lat_long
 from nerfro.boundaries.base import Boundary
 from nerfro.errors import NerfroError
-from nerfro.fields.mlp import RGB_PADDING, padded_sigmoid
 from nerfro.registry import register
+from nerfro.types import Exits
+
+# Softplus of 0 is log 2.
+_GREY = 0.5 / math.log(2)
+_BLACK = 1e-4
 
 
 @register("boundary", "envmap")
 class EnvironmentMap(Boundary):
-    """Sigmoid of a sum of cube maps, coarse to fine, so that coarse ones fill in where no ray has looked.
+    """Softplus of a sum of cube maps, coarse to fine, so that coarse ones fill in where no ray has looked.
 
     It starts as an even grey, or as the given picture. There is no preferred axis; lat-long pictures have z up.
 
@@ -43,28 +49,39 @@ class EnvironmentMap(Boundary):
         if image is not None:
             self.set_lat_long(lat_long.load_lat_long(image))
 
-    def forward(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        face, coordinates = cube_map.project(directions.detach().float().reshape(-1, 3))
+    def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
+        face, coordinates = cube_map.project(exits.directions.detach().float().reshape(-1, 3))
         if face.device.type == "cpu":
             from nerfro.boundaries.cube_map_cpu import lookup  # compiled code, so only where it is used
         else:
             lookup = cube_map.lookup
-        return padded_sigmoid(lookup(face, coordinates, self.texels, self.padded, self.levels)).view(directions.shape)
+        raw = lookup(face, coordinates, self.texels, self.padded, self.levels)
+        return _radiance(raw).view(exits.directions.shape)
 
     @torch.no_grad()
     def to_lat_long(self, height: int) -> Float[Tensor, "H 2*H 3"]:
-        """The sky as a lat-long picture, z up, +x in the middle (see `lat_long.directions`); sRGB in [0, 1]."""
-        return self(lat_long.directions(height).to(self.texels.device)).clamp(0, 1)
+        """The sky as a lat-long picture of linear radiance, z up, +x in the middle (see `lat_long.directions`)."""
+        return self(Exits(lat_long.directions(height).to(self.texels.device)))
 
     def save_lat_long(self, path: Path | str, height: int = 512) -> None:
-        """Write the sky as a lat-long picture: sRGB for .png, linear radiance for .hdr and .exr."""
+        """Write the sky as a lat-long picture: clipped sRGB for .png, all of its linear radiance for .hdr and .exr."""
         lat_long.save_lat_long(path, self.to_lat_long(height).cpu())
 
     @torch.no_grad()
-    def set_lat_long(self, rgb: Float[Tensor, "H 2*H 3"]) -> None:
-        """Start from a picture: the finest level takes its colours, the coarser ones become zero."""
+    def set_lat_long(self, radiance: Float[Tensor, "H 2*H 3"]) -> None:
+        """Start from a picture: the finest level takes its linear radiance, the coarser ones become zero."""
         n = self.levels.resolutions[-1]
-        colour = lat_long.sample(rgb, cube_map.texel_directions(n), width=4 * n)
+        radiance = lat_long.sample(radiance, cube_map.texel_directions(n), width=4 * n)
         self.texels.zero_()
-        raw = torch.logit((colour.clamp(0, 1) + RGB_PADDING) / (1 + 2 * RGB_PADDING))
-        self.texels[self.levels.offsets[-1] :] = raw.to(self.texels)
+        self.texels[self.levels.offsets[-1] :] = _raw(radiance).to(self.texels)
+
+
+def _radiance(raw: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
+    """Linear radiance: softplus, scaled to 0.5 at 0. Like a sigmoid where it is dark, without end above."""
+    return F.softplus(raw.float()) * _GREY
+
+
+def _raw(radiance: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
+    """The inverse of `_radiance`; black is not quite reached."""
+    y = (radiance / _GREY).clamp(min=_BLACK)
+    return y + torch.log(-torch.expm1(-y))

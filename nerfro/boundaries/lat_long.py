@@ -19,7 +19,7 @@ from nerfro.errors import NerfroError
 from nerfro.evaluation.images import save_png
 from nerfro.files import radiance_hdr
 from nerfro.files.atomic import write_atomically
-from nerfro.scenes.patterns import to_linear, to_srgb
+from nerfro.light import to_linear, to_srgb
 
 _FORMATS = (".png", ".jpg", ".jpeg", ".hdr", ".exr")
 
@@ -48,7 +48,7 @@ def sample(rgb: Float[Tensor, "H W 3"], where: Float[Tensor, "P 3"], width: int)
 
 
 def load_lat_long(path: Path | str) -> Float[Tensor, "H 2*H 3"]:
-    """Read a lat-long picture as sRGB in [0, 1]; what is brighter than 1 in a .hdr or .exr is clipped.
+    """Read a lat-long picture as linear radiance; lamps of a .hdr or .exr are as bright as they are.
 
     Raises:
         NerfroError: the file is missing, not readable, of another format, or not twice as wide as high.
@@ -59,26 +59,28 @@ def load_lat_long(path: Path | str) -> Float[Tensor, "H 2*H 3"]:
         raise NerfroError(f"the sky {path} does not exist; correct boundary.image")
     try:
         if suffix == ".hdr":
-            rgb = to_srgb(np.clip(radiance_hdr.decode(path.read_bytes()), 0, 1))
+            rgb = radiance_hdr.decode(path.read_bytes())
         elif suffix == ".exr":
-            rgb = to_srgb(np.clip(_mitsuba_bitmap()(str(path)), 0, 1)[..., :3])
+            rgb = np.array(_mitsuba_bitmap()(str(path)), np.float32)[..., :3]
         else:
             with Image.open(path) as image:
-                rgb = np.array(image.convert("RGB")) / 255
+                rgb = to_linear(torch.from_numpy(np.array(image.convert("RGB")) / 255)).numpy()
     except (OSError, ValueError, RuntimeError, SyntaxError) as error:
         raise NerfroError(f"the sky {path} cannot be read ({error}); write or copy it again") from error
     height, width = rgb.shape[:2]
     if width != 2 * height:
         raise NerfroError(f"the sky {path} has {width}x{height} pixels; a lat-long picture is twice as wide as high")
+    if not (np.isfinite(rgb).all() and (rgb >= 0).all()):
+        raise NerfroError(f"the sky {path} has radiance that is negative or not finite; write or copy it again")
     return torch.from_numpy(np.ascontiguousarray(rgb)).float()
 
 
-def save_lat_long(path: Path | str, rgb: Float[Tensor, "H 2*H 3"]) -> None:
-    """Write a lat-long picture: 8-bit sRGB for .png, linear radiance for .hdr and .exr.
+def save_lat_long(path: Path | str, radiance: Float[Tensor, "H 2*H 3"]) -> None:
+    """Write a lat-long picture: 8-bit sRGB for .png, clipped; radiance as it is for .hdr and .exr.
 
     Args:
         path: its ending chooses the format.
-        rgb: sRGB in [0, 1].
+        radiance: linear.
 
     Raises:
         NerfroError: another format, or the file cannot be written.
@@ -86,9 +88,9 @@ def save_lat_long(path: Path | str, rgb: Float[Tensor, "H 2*H 3"]) -> None:
     path = Path(path)
     suffix = _format(path)
     if suffix == ".png":
-        save_png(path, rgb)
+        save_png(path, to_srgb(radiance).clamp(0, 1))
         return
-    linear = to_linear(rgb.double().numpy()).astype(np.float32)
+    linear = radiance.float().numpy()
     if suffix == ".hdr":
         write_atomically(path, radiance_hdr.encode(linear))
     elif suffix == ".exr":

@@ -12,10 +12,11 @@ from torch import Tensor
 from nerfro.boundaries.base import Boundary
 from nerfro.errors import NerfroError
 from nerfro.fields.hash_grid import HashGridField
+from nerfro.geometry.interpolation import intersect_box
 from nerfro.registry import register
 from nerfro.rendering import volume_weights
 from nerfro.samplers.density_grid import DensityGridSampler
-from nerfro.types import Path
+from nerfro.types import Exits, Path
 
 # Of the polyline by which the curve that a line becomes in contracted space is measured.
 _NUM_CHORDS = 64
@@ -83,14 +84,16 @@ class NearField(Boundary):
         )  # fmt: skip
         self.sampler = DensityGridSampler(num_samples, num_bins, low, high, grid_resolution)
 
-    def forward(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        flat = directions.reshape(-1, 3)
-        return self._render(self.box.mean(0).expand_as(flat), flat).view(directions.shape)
-
-    def along(self, path: Path, directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
-        first, last = path.span(self.box)
-        starts, _ = path.at(torch.where(first < last, last, path.near)[:, None])
-        return self._render(starts[:, 0], directions)
+    def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
+        directions = exits.directions.reshape(-1, 3)
+        if exits.positions is None:
+            starts = self.box.mean(0).expand_as(directions)
+        else:
+            starts = exits.positions.reshape(-1, 3)
+            enter, leave = intersect_box(self.box, starts, directions)
+            through = (enter < leave) & (leave > 0)
+            starts = starts + torch.where(through, leave, 0.0)[:, None] * directions
+        return self._render(starts, directions).view(exits.directions.shape)
 
     def after_step(self, step: int) -> None:
         self.sampler.after_step(step, [self.field])

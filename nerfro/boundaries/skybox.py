@@ -9,11 +9,14 @@ from nerfro.boundaries.base import Boundary
 from nerfro.fields.encoding import positional_encoding
 from nerfro.fields.mlp import SkipMLP, glorot_linear, padded_sigmoid
 from nerfro.registry import register
+from nerfro.types import Exits
 
 
 @register("boundary", "skybox")
 class Skybox(Boundary):
     """4x128 MLP of the encoded direction, after NeRFactor's normal field (paper, Eqn. volrendBd, F_psi).
+
+    Its sigmoid ends at 1, as the authors' does: no lamp is brighter.
 
     Args:
         width, depth, skip: of the MLP.
@@ -26,5 +29,5 @@ class Skybox(Boundary):
         self.trunk = SkipMLP(3 * (1 + 2 * direction_degree), width, depth, skip)
         self.rgb = glorot_linear(self.trunk.num_outputs, 3)
 
-    def forward(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        return padded_sigmoid(self.rgb(self.trunk(positional_encoding(directions, 0, self.direction_degree))))
+    def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
+        return padded_sigmoid(self.rgb(self.trunk(positional_encoding(exits.directions, 0, self.direction_degree))))

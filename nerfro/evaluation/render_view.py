@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
-from nerfro.light import to_linear, to_srgb
 from nerfro.models.base import NerfModel, RenderedRays
 from nerfro.pixel_parts import PixelParts
 from nerfro.samplers.divergence import exit_divergence
@@ -35,7 +34,7 @@ class Supersampling:
 
 
 def render_view(model: NerfModel, cameras: Cameras, view: int, supersampling: Supersampling) -> RenderedRays:
-    """Render all pixels of one view, row by row, as averages (of linear radiance) over supersampled pixels.
+    """Render all pixels of one view, row by row; radiance is the mean over the rays of supersampled pixels.
 
     Args:
         model: the trained model.
@@ -52,10 +51,10 @@ def render_view(model: NerfModel, cameras: Cameras, view: int, supersampling: Su
     if len(chosen) == 0:
         return rendered
     parts = PixelParts(cameras, supersampling.side, view * cameras.height * cameras.width + chosen)
-    total = torch.zeros_like(rendered.rgb[chosen])
+    total = torch.zeros_like(rendered.radiance[chosen])
     for part in range(parts.rays_per_pixel):
         rays = parts.rays(torch.arange(part, len(parts), parts.rays_per_pixel, device=cameras.device))
-        total += to_linear(model.render(rays).rgb)
-    rgb = rendered.rgb.clone()
-    rgb[chosen] = to_srgb(total / parts.rays_per_pixel)
-    return RenderedRays(rgb, rendered.depth, rendered.opacity, rendered.exit_directions)
+        total += model.render(rays).radiance
+    radiance = rendered.radiance.clone()
+    radiance[chosen] = total / parts.rays_per_pixel
+    return replace(rendered, radiance=radiance)

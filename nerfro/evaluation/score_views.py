@@ -33,7 +33,8 @@ def score_views(
     progress = tqdm(total=len(views) * height * width, unit="ray", unit_scale=True, desc="evaluate", dynamic_ncols=True)
     with progress:
         for view in range(len(views)):
-            rgb = render_view(model, cameras, view, supersampling).rgb.reshape(height, width, 3).cpu()
+            rendered = render_view(model, cameras, view, supersampling)
+            rgb = model.encode(rendered.radiance).clamp(0, 1).reshape(height, width, 3).cpu()
             save_png(folder / "images" / f"{metrics.prefix}_{view:03d}.png", rgb)
             coverage = None if views.masks is None else views.masks[view].cpu()
             metrics.update(rgb, views.images[view].cpu(), view, coverage)

@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nerfro.boundaries.base import Boundary
 from nerfro.errors import NerfroError
 from nerfro.types import Batch, Rendering
 
-if TYPE_CHECKING:
-    from nerfro.models.base import NerfModel
+
+class Model(Protocol):
+    """What losses know of the model (`nerfro.models.base.NerfModel`)."""
+
+    boundary: Boundary
+
+    def encode(self, radiance: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]: ...
+
+    def difference(
+        self, radiance: Float[Tensor, "*batch 3"], rgb: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]: ...
 
 
 class Loss(nn.Module, ABC):
@@ -40,5 +50,5 @@ class Loss(nn.Module, ABC):
         return self.weight * min(1.0, (step - self.start + 1) / (self.ramp + 1))
 
     @abstractmethod
-    def forward(self, renderings: list[Rendering], batch: Batch, model: NerfModel) -> Float[Tensor, ""]:
+    def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
         """Unweighted value, averaged over the batch."""

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.distributed import rank_and_size, sum_over_processes
-from nerfro.losses.base import Loss
+from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
 from nerfro.types import Batch, Rendering
-
-if TYPE_CHECKING:
-    from nerfro.models.base import NerfModel
 
 
 @register("loss", "boundary")
@@ -39,13 +34,15 @@ class BoundaryRegulariser(Loss):
         super().__init__(weight, start, ramp)
         self.threshold, self.refracted_only = threshold, refracted_only
 
-    def forward(self, renderings: list[Rendering], batch: Batch, model: NerfModel) -> Float[Tensor, ""]:
+    def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
         fine = renderings[-1]
-        counts = fine.transmittance.detach() > self.threshold
+        path = fine.path
+        counts = path.per_ray(fine.transmittance.detach()) > self.threshold
         if self.refracted_only:
-            counts = counts & fine.path.refracted
+            counts = counts & path.first_of_ray(path.refracted)
         if batch.num_whole is not None:
             counts[batch.num_whole :] = False  # a part of a pixel need not have the pixel's colour
-        error = (fine.transmittance[:, None] * fine.boundary_rgb.detach() - batch.rgb).abs().sum(-1)
+        shown = model.encode(path.per_ray(fine.transmittance[:, None] * fine.boundary_rgb.detach()))
+        error = (shown - batch.rgb).abs().sum(-1)
         # Processes average their gradients: each brings its sum as often as there are processes.
         return (error * counts).sum() * rank_and_size()[1] / (sum_over_processes(counts.sum()) + 1)

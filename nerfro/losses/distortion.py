@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.distributed import mean_over_rays
-from nerfro.losses.base import Loss
+from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
 from nerfro.types import Batch, Rendering
-
-if TYPE_CHECKING:
-    from nerfro.models.base import NerfModel
 
 
 @register("loss", "distortion")
@@ -27,12 +22,12 @@ class Distortion(Loss):
     def __init__(self, weight: float = 1e-2, start: int = 0, ramp: int = 0) -> None:
         super().__init__(weight, start, ramp)
 
-    def forward(self, renderings: list[Rendering], batch: Batch, model: NerfModel) -> Float[Tensor, ""]:
+    def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
         rendering = renderings[-1]
         near, far = rendering.path.near[:, None], rendering.path.far[:, None]
         # A path of no length has no weights either; the clamp only keeps the quotient a number.
         edges = (rendering.samples.edges - near) / (far - near).clamp(min=1e-6)
-        return mean_over_rays(distortion(rendering.weights, edges), batch.num_rows)
+        return mean_over_rays(rendering.path.per_ray(distortion(rendering.weights, edges)), batch.num_rows)
 
 
 def distortion(weights: Float[Tensor, "R N"], edges: Float[Tensor, "R N+1"]) -> Float[Tensor, "R"]:

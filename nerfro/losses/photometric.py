@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import mse_loss
 
-from nerfro.losses.base import Loss
+from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
 from nerfro.types import Batch, Rendering
-
-if TYPE_CHECKING:
-    from nerfro.models.base import NerfModel
 
 
 @register("loss", "photometric")
@@ -32,20 +27,18 @@ class Photometric(Loss):
         super().__init__(weight, start, ramp)
         self.coarse = coarse
 
-    def forward(self, renderings: list[Rendering], batch: Batch, model: NerfModel) -> Float[Tensor, ""]:
-        *coarse, fine = (batch.pixel_colours(_teaching(rendering, batch)) for rendering in renderings)
-        target = batch.pixel_colours(batch.rgb)
-        value = mse_loss(fine, target)
-        for rgb in coarse:
-            value = value + self.coarse * mse_loss(rgb, target)
+    def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
+        value = torch.zeros((), device=batch.rgb.device)
+        for rendering, factor in zip(renderings, [self.coarse] * (len(renderings) - 1) + [1.0], strict=True):
+            radiance = batch.of_pixels(_teaching(rendering, batch))
+            value = value + factor * mse_loss(*model.difference(radiance, batch.of_pixels(batch.rgb)))
         return value
 
 
 def _teaching(rendering: Rendering, batch: Batch) -> Float[Tensor, "R 3"]:
-    """The rendered colours, of which those of divided pixels have no gradient in the boundary."""
+    """The rays' radiance, of which that of divided pixels has no gradient in the boundary."""
     if batch.num_whole is None:
         return rendering.rgb
-    whole, divided = rendering.rgb[: batch.num_whole], rendering.rgb[batch.num_whole :]
-    boundary = rendering.boundary_rgb[batch.num_whole :]
-    passed = rendering.transmittance[batch.num_whole :, None]
-    return torch.cat([whole, divided - passed * (boundary - boundary.detach())])
+    boundary = rendering.boundary_rgb
+    from_boundary = rendering.path.per_ray(rendering.transmittance[:, None] * (boundary - boundary.detach()))
+    return torch.cat([rendering.rgb[: batch.num_whole], (rendering.rgb - from_boundary)[batch.num_whole :]])

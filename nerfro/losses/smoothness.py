@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.losses.base import Loss
+from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
-from nerfro.types import Batch, Rendering
-
-if TYPE_CHECKING:
-    from nerfro.models.base import NerfModel
+from nerfro.types import Batch, Exits, Rendering
 
 
 @register("loss", "smoothness")
@@ -30,8 +25,8 @@ class Smoothness(Loss):
             raise NerfroError(f"loss.smoothness.tile_size={tile_size} has no neighbours; take 2 or more")
         self.tile_size = tile_size
 
-    def forward(self, renderings: list[Rendering], batch: Batch, model: NerfModel) -> Float[Tensor, ""]:
-        return tile_roughness(model.boundary(batch.cameras.tile(self.tile_size)))
+    def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
+        return tile_roughness(model.encode(model.boundary(Exits(batch.cameras.tile(self.tile_size)))))
 
 
 def tile_roughness(rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
@@ -11,12 +10,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerfro.errors import NerfroError
-from nerfro.losses.base import Loss
+from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
-from nerfro.types import Batch, Rendering
-
-if TYPE_CHECKING:
-    from nerfro.models.base import NerfModel
+from nerfro.types import Batch, Exits, Rendering
 
 
 @register("loss", "total_variation")
@@ -42,9 +38,9 @@ class TotalVariation(Loss):
             )
         self.num_directions, self.angle = num_directions, angle
 
-    def forward(self, renderings: list[Rendering], batch: Batch, model: NerfModel) -> Float[Tensor, ""]:
+    def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
         first, second = direction_pairs(self.num_directions, math.radians(self.angle), batch.rgb.device)
-        rgb = model.boundary(torch.cat([first, second]))
+        rgb = model.encode(model.boundary(Exits(torch.cat([first, second]))))
         return (rgb[self.num_directions :] - rgb[: self.num_directions]).abs().mean()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerfro.errors import NerfroError
@@ -44,6 +44,12 @@ class Solid(Medium):
         self, positions: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
         """Signed distance to each body's surface, negative inside, and its gradient; a lower bound far away will do."""
+
+    @staticmethod
+    def innermost(inside: Bool[Tensor, "*batch K"]) -> Int[Tensor, "*batch"]:
+        """Number of the last body that a point is in, from 1 on; 0 in none."""
+        numbers = torch.arange(1, inside.shape[-1] + 1, device=inside.device)
+        return torch.where(inside, numbers, 0).amax(-1)
 
     def index_inside(self, inside: Bool[Tensor, "*batch K"]) -> Float[Tensor, "*batch"]:
         """Index of the last body that a point is in, 1 in none."""

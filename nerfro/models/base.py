@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -12,14 +14,16 @@ from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 
 from nerfro.boundaries.base import Boundary
+from nerfro.camera.base import Camera
+from nerfro.camera.given import GivenCamera
 from nerfro.distributed import drawing_for
-from nerfro.evaluation.pictures import triptych
+from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
+from nerfro.light import clipped_alike, to_srgb
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.models.optimizer import OptimizerConfig, learning_rate_factor, training_progress
 from nerfro.samplers.base import PathSampler, PointSampler
-from nerfro.samplers.training_paths import TrainingPaths
 from nerfro.types import Batch, Path, Rays, Rendering
 
 
@@ -34,6 +38,7 @@ class Parts:
         boundary: what lies beyond the volume.
         losses: training losses by name.
         optimizer: settings of Adam.
+        camera: what is believed of the training cameras.
         seed: of all random draws in training.
         chunk_size: rays rendered at once in evaluation, which bounds its memory.
     """
@@ -45,6 +50,7 @@ class Parts:
     boundary: Boundary
     losses: Mapping[str, Loss]
     optimizer: OptimizerConfig
+    camera: Camera = dataclasses.field(default_factory=GivenCamera)
     seed: int = 0
     chunk_size: int = 8192
 
@@ -55,21 +61,22 @@ class NerfModel(LightningModule, ABC):
     Args:
         parts: what the model is composed of.
         fields: radiance field of each sampling level, or one for all.
+        colour: what fields and boundary return and rays add up: `linear` radiance, or `srgb` as in the authors' code.
 
-    Attributes:
-        training_paths: training paths that are known already; nerfro.train sets it where rays do not change.
+    Raises:
+        NerfroError: another `colour`.
     """
 
-    training_paths: TrainingPaths | None
-
-    def __init__(self, parts: Parts, fields: list[Field]) -> None:
+    def __init__(self, parts: Parts, fields: list[Field], colour: Literal["linear", "srgb"] = "linear") -> None:
         super().__init__()
-        self.medium = parts.medium
+        if colour not in ("linear", "srgb"):
+            raise NerfroError(f"model.colour={colour} is unknown; choose linear, or srgb as in the authors' code")
+        self.colour = colour
+        self.camera, self.medium = parts.camera, parts.medium
         self.path_sampler, self.point_sampler = parts.path_sampler, parts.point_sampler
         self.fields = nn.ModuleList(fields)
         self.boundary = parts.boundary
         self.losses = nn.ModuleDict(dict(parts.losses))
-        self.training_paths = None
         self.optimizer_config, self.chunk_size, self.seed = parts.optimizer, parts.chunk_size, parts.seed
 
     @abstractmethod
@@ -78,12 +85,53 @@ class NerfModel(LightningModule, ABC):
 
     def forward(self, rays: Rays) -> list[Rendering]:
         """Bend rays and render their paths."""
-        return self.render_path(self.path_sampler(rays, self.medium))
+        return self.render_path(self.trace(rays))
+
+    def trace(self, rays: Rays) -> Path:
+        """Paths of rays; with gradients by what bends them where that learns."""
+        path = self.path_sampler(rays, self.medium)
+        return self.path_sampler.refine(path, rays, self.medium) if self.paths_learn else path
+
+    @property
+    def paths_learn(self) -> bool:
+        """Whether paths change while training: then none may be traced before the step that needs it."""
+        bending = (self.camera, self.medium, self.path_sampler)
+        return torch.is_grad_enabled() and any(p.requires_grad for part in bending for p in part.parameters())
+
+    def parameter_groups(self) -> dict[str, tuple[list[nn.Parameter], float]]:
+        """All that learns: parameters and initial learning rate by name. A model that adds parameters adds a group."""
+        config = self.optimizer_config
+        groups = {
+            "fields": (list(self.fields.parameters()), config.learning_rate),
+            "boundary": (list(self.boundary.parameters()), config.rate("boundary")),
+            "medium": ([*self.medium.parameters(), *self.path_sampler.parameters()], config.rate("medium")),
+            "camera": (list(self.camera.parameters()), config.rate("camera")),
+        }
+        return {name: group for name, group in groups.items() if group[0]}
+
+    def encode(self, radiance: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """What rays add up to, as sRGB; not clipped, so that what is too bright keeps its gradient."""
+        return radiance if self.colour == "srgb" else to_srgb(radiance)
+
+    def difference(self, radiance: Float[Tensor, "*batch 3"], rgb: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor]:
+        """Prediction and target, both sRGB, for a loss to compare.
+
+        Args:
+            radiance: of pixels, as rendered.
+            rgb: of the same pixels in the photograph, sRGB in [0, 1].
+
+        Returns:
+            The prediction encoded, and the target; equal where both are brighter than a photograph can tell.
+        """
+        prediction = self.encode(radiance)
+        return prediction, rgb if self.colour == "srgb" else clipped_alike(rgb, prediction)
 
     def training_step(self, batch: Batch, batch_index: int) -> Float[Tensor, ""]:
-        known = None if self.training_paths is None else self.training_paths(batch)
         with drawing_for(batch.rows, batch.num_rows):
-            renderings: list[Rendering] = self(batch.rays) if known is None else self.render_path(known)
+            if batch.path is None:
+                renderings = self(self.camera(batch.rays, batch.view))
+            else:
+                renderings = self.render_path(batch.path)
         total = torch.zeros((), device=self.device)
         for name, loss in self.losses.items():
             weight = loss.weight_at(self.global_step)  # type: ignore[operator]
@@ -92,8 +140,8 @@ class NerfModel(LightningModule, ABC):
                 value = loss(renderings, batch, self)
                 self.log(f"loss/{name}", value)
                 total = total + weight * value
-        error = (batch.pixel_colours(renderings[-1].rgb.detach()) - batch.pixel_colours(batch.rgb)).square().mean()
-        self.log("train/psnr", -10 * torch.log10(error), prog_bar=True)
+        shown = self.encode(batch.of_pixels(renderings[-1].rgb.detach())).clamp(0, 1)
+        self.log("train/psnr", psnr(shown, batch.of_pixels(batch.rgb)), prog_bar=True)
         self.log("loss/total", total)
         return total
 
@@ -112,12 +160,13 @@ class NerfModel(LightningModule, ABC):
             self.boundary.after_step(self.global_step)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        config = self.optimizer_config
-        rates = {self.fields: config.learning_rate, self.boundary: config.boundary_rate}
-        groups = [{"params": list(part.parameters()), "lr": rate, "initial_lr": rate} for part, rate in rates.items()]
+        groups = [
+            {"params": parameters, "lr": rate, "initial_lr": rate, "name": name}
+            for name, (parameters, rate) in self.parameter_groups().items()
+        ]
         # Lightning cannot clip the gradients of a fused optimiser under mixed precision.
         fused = self._trainer is None or not self._trainer.gradient_clip_val
-        return torch.optim.Adam([g for g in groups if g["params"]], eps=config.adam_epsilon, fused=fused)
+        return torch.optim.Adam(groups, eps=self.optimizer_config.adam_epsilon, fused=fused)
 
     def validation_step(self, view: int, batch_index: int) -> dict[str, Tensor] | None:
         if not self.trainer.is_global_zero:
@@ -127,15 +176,10 @@ class NerfModel(LightningModule, ABC):
         with torch.autocast(self.device.type, enabled=False):  # directions in half precision would miss their pixels
             rays = views.cameras.to(self.device).image_rays(view)
         rendered = self.render(rays)
-        prediction = rendered.rgb.reshape(target.shape)
-        psnr = -10 * torch.log10((prediction - target).square().mean())
-        self.log("val/psnr", psnr, prog_bar=True, batch_size=1, rank_zero_only=True)
-        far = views.cameras.far
-        maps = [m.reshape(*target.shape[:2], 1).expand_as(target) for m in (rendered.depth / far, rendered.opacity)]
-        return {
-            "val/prediction_reference_error": triptych(prediction, target),
-            "val/depth_opacity": torch.cat(maps, dim=1).clamp(0, 1),
-        }
+        prediction = self.encode(rendered.radiance).clamp(0, 1).reshape(target.shape)
+        self.log("val/psnr", psnr(prediction, target), prog_bar=True, batch_size=1, rank_zero_only=True)
+        depth, opacity = (m.reshape(target.shape[:2]) for m in (rendered.depth / views.cameras.far, rendered.opacity))
+        return {"prediction": prediction, "target": target, "depth": depth, "opacity": opacity}
 
     @torch.inference_mode()
     def render(self, rays: Rays) -> RenderedRays:
@@ -153,17 +197,22 @@ class NerfModel(LightningModule, ABC):
 
     def _render_chunk(self, rays: Rays) -> tuple[Tensor, ...]:
         rendering = self(rays)[-1]
-        return rendering.rgb.clamp(0, 1), rendering.depth, rendering.opacity, rendering.path.exit_directions
+        return rendering.rgb, rendering.depth, rendering.opacity, rendering.exit_directions
 
 
 @dataclass(frozen=True)
 class RenderedRays:
-    """What evaluation keeps: colour (sRGB in [0, 1]), expected arc length, opacity and leaving direction."""
+    """What evaluation keeps: radiance as the model adds it up, expected arc length, opacity and leaving direction."""
 
-    rgb: Float[Tensor, "R 3"]
+    radiance: Float[Tensor, "R 3"]
     depth: Float[Tensor, "R"]
     opacity: Float[Tensor, "R"]
     exit_directions: Float[Tensor, "R 3"]
+
+
+def psnr(prediction: Tensor, target: Tensor) -> Float[Tensor, ""]:
+    """Peak signal-to-noise ratio of values in [0, 1], dB."""
+    return -10 * torch.log10((prediction - target).square().mean())
 
 
 def step_seed(seed: int, step: int) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from nerfro.models.base import NerfModel, Parts
 from nerfro.registry import register
 from nerfro.rendering import composite
@@ -10,13 +12,17 @@ from nerfro.types import Path, Rendering
 
 @register("model", "mip_nerf")
 class MipNerfModel(NerfModel):
-    """mip-NeRF: one field for all levels, resampled where it had weight, with a boundary term (constant or a sky)."""
+    """mip-NeRF: one field for all levels, resampled where it had weight, with a boundary term (constant or a sky).
 
-    def __init__(self, parts: Parts) -> None:
-        super().__init__(parts, [parts.make_field()])
+    Args:
+        colour: see `model=refractive`.
+    """
+
+    def __init__(self, parts: Parts, colour: Literal["linear", "srgb"] = "linear") -> None:
+        super().__init__(parts, [parts.make_field()], colour)
 
     def render_path(self, path: Path) -> list[Rendering]:
-        boundary_rgb = self.boundary.along(path, path.exit_directions)
+        boundary_rgb = self.boundary(path.exits())
         (field,) = self.fields
         renderings: list[Rendering] = []
         for _ in range(self.point_sampler.num_levels):

@@ -18,7 +18,8 @@ class OptimizerConfig:
 
     Attributes:
         learning_rate, final_learning_rate: at the beginning and the end of the run.
-        boundary_learning_rate: of the boundary at the beginning, decaying in proportion; none for the same.
+        boundary_learning_rate, medium_learning_rate, camera_learning_rate: of the other parts that learn, at the
+            beginning, decaying in proportion; none for the same.
         warmup_steps: length of the warm-up; 0 for none.
         warmup_factor: factor of the learning rate at its first step.
         adam_epsilon: of Adam.
@@ -27,17 +28,21 @@ class OptimizerConfig:
     learning_rate: float = 5e-4
     final_learning_rate: float = 5e-6
     boundary_learning_rate: Optional[float] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    medium_learning_rate: Optional[float] = None  # noqa: UP045
+    camera_learning_rate: Optional[float] = None  # noqa: UP045
     warmup_steps: int = 2500
     warmup_factor: float = 0.01
     adam_epsilon: float = 1e-8
 
     def __post_init__(self) -> None:
-        if min(self.learning_rate, self.final_learning_rate, self.boundary_rate) <= 0 or self.warmup_steps < 0:
+        rates = [self.final_learning_rate, *map(self.rate, ("fields", "boundary", "medium", "camera"))]
+        if min(rates) <= 0 or self.warmup_steps < 0:
             raise NerfroError(f"{self}: learning rates must be positive and warmup_steps not negative")
 
-    @property
-    def boundary_rate(self) -> float:
-        return self.learning_rate if self.boundary_learning_rate is None else self.boundary_learning_rate
+    def rate(self, part: str) -> float:
+        """Learning rate of a part at the beginning."""
+        own: float | None = getattr(self, f"{part}_learning_rate", None)
+        return self.learning_rate if own is None else own
 
 
 def learning_rate_factor(step: int, progress: float, config: OptimizerConfig) -> float:

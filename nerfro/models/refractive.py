@@ -17,16 +17,22 @@ class RefractiveModel(NerfModel):
     Args:
         boundary_direction: where the boundary is asked: in the path's `exit` direction, or in the direction of the
             `last_coarse` sample as in the authors' code.
+        colour: what fields and boundary return and rays add up: `linear` radiance, or `srgb` as in the authors' code.
     """
 
-    def __init__(self, parts: Parts, boundary_direction: Literal["exit", "last_coarse"] = "exit") -> None:
-        super().__init__(parts, [parts.make_field() for _ in range(parts.point_sampler.num_levels)])
+    def __init__(
+        self,
+        parts: Parts,
+        boundary_direction: Literal["exit", "last_coarse"] = "exit",
+        colour: Literal["linear", "srgb"] = "linear",
+    ) -> None:
+        super().__init__(parts, [parts.make_field() for _ in range(parts.point_sampler.num_levels)], colour)
         self.boundary_direction = boundary_direction
 
     def render_path(self, path: Path) -> list[Rendering]:
         samples = self.point_sampler(path, None)
-        leaving = path.exit_directions if self.boundary_direction == "exit" else samples.directions[:, -1]
-        boundary_rgb = self.boundary.along(path, leaving)
+        leaving = None if self.boundary_direction == "exit" else samples.directions[:, -1]
+        boundary_rgb = self.boundary(path.exits(leaving))
         renderings = [composite(samples, self.fields[0](samples), boundary_rgb, path)]
         for field in self.fields[1:]:
             samples = self.point_sampler(path, renderings[-1])

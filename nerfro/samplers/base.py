@@ -27,9 +27,20 @@ class PathSampler(nn.Module, ABC):
     def forward(self, rays: Rays, medium: Medium) -> Path:
         """Trace every ray from near to far through the medium; a bent path ends outside it, if need be beyond far."""
 
+    def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
+        """The traced path with gradients by what bends it; asked only where something of that learns.
+
+        Args:
+            path: of these rays through this medium, as `forward` traced it.
+            rays, medium: may want gradients.
+        """
+        return path
+
 
 class PointSampler(nn.Module, ABC):
-    """Chooses samples on a path; random in training (by `distributed.rand_rays`), deterministic in evaluation.
+    """Chooses arc lengths on a path; random in training (by `Path.rand`), the same every time in evaluation.
+
+    `Samples.along` asks the path for positions and directions there.
 
     Attributes:
         num_levels: how often the path is sampled, each level guided by the rendering of the one before.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,9 +41,10 @@ def snell_on_grid(
         medium.coefficients.numpy(), medium.coarse_clearance.numpy(), np.array(medium.iors), low, high,
         inverse_spacing, inverse_spacing / BLOCK, min_step * float((high - low).min()), max_events,
     )  # fmt: skip
-    vertices, (events, exceeded) = _with_enough_vertices(rays, trace_snell, settings)
+    (*vertices, body), (events, exceeded) = _with_enough_vertices(rays, trace_snell, settings, 4)
     num_events = torch.from_numpy(events)
-    return _path(rays, vertices, num_events > 0), num_events, torch.from_numpy(exceeded)
+    path = replace(_path(rays, vertices, num_events > 0), body=torch.from_numpy(np.ascontiguousarray(body)))
+    return path, num_events, torch.from_numpy(exceeded)
 
 
 def eikonal_on_grid(
@@ -73,14 +76,14 @@ def eikonal_on_grid(
         table, clearance, coefficients, iors, shell, low, high, inverse_spacing, inverse_block, step, tolerance,
         max_steps,
     )  # fmt: skip
-    vertices, (refracted, exceeded) = _with_enough_vertices(rays, march_adaptive, settings)
+    vertices, (refracted, exceeded) = _with_enough_vertices(rays, march_adaptive, settings, 3)
     return _path(rays, vertices, torch.from_numpy(refracted)), torch.from_numpy(exceeded)
 
 
 def uniform_on_grid(rays: Rays, medium: VoxelGrid, integrator: str, num_steps: int) -> Path:
     """`samplers.eikonal.march_uniform` by the compiled kernel."""
     *vertices, refracted = _march_uniform(rays, medium, integrator, num_steps, keep_all=True)
-    return _path(rays, tuple(vertices), torch.from_numpy(refracted))
+    return _path(rays, vertices, torch.from_numpy(refracted))
 
 
 def uniform_exit_on_grid(rays: Rays, medium: VoxelGrid, integrator: str, num_steps: int) -> Float[Tensor, "R 3"]:
@@ -101,23 +104,27 @@ def _march_uniform(
     return eikonal.march_uniform(origins, directions, near, far, table, low, inverse_spacing, code, num_steps, keep_all)
 
 
-def _with_enough_vertices(rays: Rays, kernel, settings: tuple) -> tuple[tuple, tuple]:
-    """Run a kernel, and run it again for the rays whose vertices did not fit."""
+def _with_enough_vertices(
+    rays: Rays, kernel: Callable, settings: tuple, num_arrays: int
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Run a kernel, and run it again for the rays whose vertices did not fit.
+
+    Returns:
+        The first `num_arrays` results, which have a column for each vertex, and those that follow the counts.
+    """
     use_threads()
     arrays = _arrays(rays)
     capacity = _CAPACITY
-    positions, directions, s, counts, *rest = kernel(*arrays, *settings, capacity)
+    results = kernel(*arrays, *settings, capacity)
+    columns, counts, rest = list(results[:num_arrays]), results[num_arrays], list(results[num_arrays + 1 :])
     width = max(int(counts.max(initial=2)), 2)
     if width > capacity:
         rows = np.nonzero(counts > capacity)[0]
-        again = kernel(*(array[rows] for array in arrays), *settings, width)[:3]
-        longer = []
-        for short, long in zip((positions, directions, s), again, strict=True):
-            padded = np.concatenate([short, np.repeat(short[:, -1:], width - capacity, axis=1)], axis=1)
-            padded[rows] = long
-            longer.append(padded)
-        positions, directions, s = longer
-    return (positions[:, :width], directions[:, :width], s[:, :width]), tuple(rest)
+        again = kernel(*(array[rows] for array in arrays), *settings, width)[:num_arrays]
+        for i, (short, long) in enumerate(zip(columns, again, strict=True)):
+            columns[i] = np.concatenate([short, np.repeat(short[:, -1:], width - capacity, axis=1)], axis=1)
+            columns[i][rows] = long
+    return [column[:, :width] for column in columns], rest
 
 
 def _arrays(rays: Rays) -> tuple[np.ndarray, ...]:
@@ -130,6 +137,6 @@ def _frame(box: Tensor, shape: torch.Size) -> tuple[np.ndarray, np.ndarray, np.n
     return low, high, (np.array(shape) - 1) / (high - low)
 
 
-def _path(rays: Rays, vertices: tuple, refracted: Tensor) -> Path:
+def _path(rays: Rays, vertices: Sequence[np.ndarray], refracted: Tensor) -> Path:
     positions, directions, s = (torch.from_numpy(np.ascontiguousarray(array)) for array in vertices)
     return Path(positions, directions, s, directions[:, -1], refracted, rays.radii)

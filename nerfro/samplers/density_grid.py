@@ -67,10 +67,12 @@ class DensityGridSampler(PointSampler):
         self.register_buffer("box", torch.tensor([list(box_min), list(box_max)]), persistent=False)
         self.register_buffer("density", torch.zeros(resolution, resolution, resolution))
 
-    @torch.no_grad()
     def forward(self, path: Path, previous: Rendering | None) -> Samples:
-        u = spread_uniform(len(path.s), self.num_samples + 1, self.training, path.s)
-        return self.draw_compiled(path, u) if path.s.device.type == "cpu" else self.draw(path, u)
+        with torch.no_grad():
+            u = spread_uniform(path, self.num_samples + 1, self.training)
+            samples = self.draw_compiled(path, u) if path.s.device.type == "cpu" else self.draw(path, u)
+        # The kernel has found positions too; they are asked of the path only where it has gradients to give.
+        return Samples.along(path, samples.s, samples.edges) if path.positions.requires_grad else samples
 
     def draw(self, path: Path, u: Float[Tensor, "R N+1"]) -> Samples:
         """Samples at places `u` of the cumulative weights: the plain reference of the compiled kernel."""
@@ -89,9 +91,9 @@ class DensityGridSampler(PointSampler):
 
         use_threads()
         drawn = draw(
-            path.positions.contiguous().numpy(),
-            path.directions.contiguous().numpy(),
-            path.s.contiguous().numpy(),
+            path.positions.detach().contiguous().numpy(),
+            path.directions.detach().contiguous().numpy(),
+            path.s.detach().contiguous().numpy(),
             self.box[0].numpy(),
             self.box[1].numpy(),
             self.density.numpy(),

@@ -63,17 +63,17 @@ class Hierarchical(PointSampler):
         if previous is None:
             return self.coarse(path, None)
         if self.cast == "cones":
-            return cone_samples(path, self._draw(previous.samples.edges, previous.weights, self.num_fine + 1))
+            return cone_samples(path, self._draw(path, previous.samples.edges, previous.weights, self.num_fine + 1))
         # Weights belong to samples; the bins that they are drawn from lie between the samples' midpoints.
-        s = self._draw(midpoints(previous.samples.s), previous.weights[:, 1:-1], self.num_fine)
+        s = self._draw(path, midpoints(previous.samples.s), previous.weights[:, 1:-1], self.num_fine)
         if self.union:
             s = torch.cat([previous.samples.s, s], dim=1)
         return point_samples(path, s.sort(dim=1).values)
 
     @torch.no_grad()
     def _draw(
-        self, edges: Float[Tensor, "R B+1"], weights: Float[Tensor, "R B"], num_samples: int
+        self, path: Path, edges: Float[Tensor, "R B+1"], weights: Float[Tensor, "R B"], num_samples: int
     ) -> Float[Tensor, "R N"]:
         weights = weights.detach().to(edges.dtype)
         weights = blur_weights(weights, self.padding) if self.blur else weights + self.padding
-        return invert_cdf(edges, weights, spread_uniform(len(edges), num_samples, self.training, edges))
+        return invert_cdf(edges, weights, spread_uniform(path, num_samples, self.training))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from nerfro.geometry.interpolation import intersect_box
@@ -35,15 +35,15 @@ def snell_on_mesh(rays: Rays, medium: SdfGrid, max_events: int) -> tuple[Path, I
     origins, far = rays.origins.double().cpu(), rays.far.double().cpu()
     d, s = rays.directions.double().cpu().clone(), rays.near.double().cpu().clone()
     x = origins + s[:, None] * d
-    lines = Polylines(len(rays), x)
     rows = torch.arange(len(rays))
-    lines.append(rows, x, d, s)
     enter, leave = intersect_box(box, x, d)
     active = rows[(enter < leave) & (leave > 0) & (enter < far - s)]
     inside = torch.zeros(len(rays), len(medium.iors), dtype=torch.bool)
     within = active[enter[active] < 0]
     if len(within):
         inside[within] = (medium.signed_distances(x[within].to(medium.box))[0] < 0).cpu()
+    lines = Polylines(len(rays), x)
+    lines.append(rows, x, d, s, medium.innermost(inside))
     num_events, exceeded = torch.zeros_like(rows), torch.zeros(len(rays), dtype=torch.bool)
     last_face = torch.full_like(rows, -1)
     offset = _OFFSET * float(torch.linalg.vector_norm(box[1] - box[0]))
@@ -60,7 +60,7 @@ def snell_on_mesh(rays: Rays, medium: SdfGrid, max_events: int) -> tuple[Path, I
         flipped = inside[active]
         body = scene.body[face][:, None]
         flipped = flipped.scatter(1, body, ~flipped.gather(1, body))
-        n_before, n_after = (_innermost(iors, flags) for flags in (inside[active], flipped))
+        n_before, n_after = (iors[medium.innermost(flags)] for flags in (inside[active], flipped))
         visible = n_before != n_after
         over = visible & (num_events[active] >= max_events)
         exceeded[active] = over
@@ -76,19 +76,13 @@ def snell_on_mesh(rays: Rays, medium: SdfGrid, max_events: int) -> tuple[Path, I
         d[active] = torch.where(visible[:, None], turned[keep], d[active])
         num_events[active] += visible
         bent = active[visible]
-        lines.append(bent, x[bent], d[bent], s[bent])
+        lines.append(bent, x[bent], d[bent], s[bent], medium.innermost(inside[bent]))
         active = torch.cat([active, retry])
     lines.append_ends(far, box, num_events > 0, x, d, s)
     path = lines.path(rays, num_events > 0)
     like = rays.origins
     path = Path(
         path.positions.to(like), path.directions.to(like), path.s.to(like), path.exit_directions.to(like),
-        path.refracted.to(device), rays.radii,
+        path.refracted.to(device), rays.radii, body=path.body.to(device),
     )  # fmt: skip
     return path, num_events.to(device), exceeded.to(device)
-
-
-def _innermost(iors: Float[Tensor, "K+1"], inside: Bool[Tensor, "R K"]) -> Float[Tensor, "R"]:
-    """Index of the last body that a ray is in; `iors` begins with that of air."""
-    numbers = torch.arange(1, inside.shape[1] + 1)
-    return iors[torch.where(inside, numbers, 0).amax(-1)]

@@ -16,6 +16,7 @@ class Polylines:
 
     def __init__(self, num_rays: int, like: Float[Tensor, "..."]) -> None:
         self._vertices = like.new_zeros(num_rays, 4, 7)
+        self._bodies = torch.zeros(num_rays, 4, dtype=torch.int8, device=like.device)
         self.counts = torch.zeros(num_rays, dtype=torch.long, device=like.device)
 
     def append(
@@ -24,11 +25,14 @@ class Polylines:
         positions: Float[Tensor, "A 3"],
         directions: Float[Tensor, "A 3"],
         s: Float[Tensor, "A"],
+        bodies: Int[Tensor, "A"] | int = 0,
     ) -> None:
-        """Add one vertex to each of the given rows."""
+        """Add one vertex to each of the given rows; `bodies` are those in which it is left."""
         if len(rows) and int(self.counts[rows].max()) == self._vertices.shape[1]:
             self._vertices = torch.cat([self._vertices, torch.zeros_like(self._vertices)], 1)
+            self._bodies = torch.cat([self._bodies, torch.zeros_like(self._bodies)], 1)
         self._vertices[rows, self.counts[rows]] = torch.cat([positions, directions, s[:, None]], -1)
+        self._bodies[rows, self.counts[rows]] = bodies.to(torch.int8) if isinstance(bodies, Tensor) else bodies
         self.counts[rows] += 1
 
     def append_ends(
@@ -53,4 +57,7 @@ class Polylines:
         index = torch.arange(capacity, device=self.counts.device).minimum(self.counts[:, None] - 1)
         vertices = self._vertices.gather(1, index[..., None].expand(-1, -1, 7))
         directions = vertices[..., 3:6]
-        return Path(vertices[..., :3], directions, vertices[..., 6], directions[:, -1], refracted, rays.radii)
+        bodies = self._bodies.gather(1, index)
+        return Path(
+            vertices[..., :3], directions, vertices[..., 6], directions[:, -1], refracted, rays.radii, body=bodies
+        )

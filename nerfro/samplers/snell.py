@@ -99,9 +99,10 @@ def trace_interfaces(rays: Rays, medium: Solid, max_events: int) -> tuple[Path, 
     num_rays = len(rays)
     rows = torch.arange(num_rays, device=rays.near.device)
     x, d, s = rays.origins + rays.near[:, None] * rays.directions, rays.directions.clone(), rays.near.clone()
-    lines = Polylines(num_rays, x)
-    lines.append(rows, x, d, s)
     enter, leave = intersect_box(medium.box, x, d)
+    in_box = ((x >= medium.box[0]) & (x <= medium.box[1])).all(-1, keepdim=True)
+    lines = Polylines(num_rays, x)
+    lines.append(rows, x, d, s, medium.innermost(in_box & (medium.signed_distances(x)[0] < 0)))
     num_events = torch.zeros_like(rows)
     exceeded = torch.zeros_like(rows, dtype=torch.bool)
     active = rows[(enter < leave) & (leave > 0) & (enter < rays.far - s)]
@@ -139,7 +140,7 @@ def trace_interfaces(rays: Rays, medium: Solid, max_events: int) -> tuple[Path, 
         d[active] = torch.where(visible[:, None], turned, d[active])
         num_events[active] += visible
         bent = active[visible]
-        lines.append(bent, x[bent], d[bent], s[bent])
+        lines.append(bent, x[bent], d[bent], s[bent], medium.innermost(inside[bent]))
     refracted = num_events > 0
     lines.append_ends(rays.far, medium.box, refracted, x, d, s)
     return lines.path(rays, refracted), num_events, exceeded

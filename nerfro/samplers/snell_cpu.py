@@ -53,13 +53,20 @@ def _root(coefficients, low, inverse_spacing, x, y, z, dx, dy, dz, start, end, t
 
 
 @compiled
+def _innermost(inside):
+    """Number of the last body that a point is in, from 1 on; 0 in none."""
+    number = 0
+    for body in range(len(inside)):
+        if inside[body]:
+            number = body + 1
+    return number
+
+
+@compiled
 def _index(inside, iors):
     """Index of the last body that a point is in, 1 in none."""
-    n = 1.0
-    for body in range(len(iors)):
-        if inside[body]:
-            n = iors[body]
-    return n
+    number = _innermost(inside)
+    return iors[number - 1] if number > 0 else 1.0
 
 
 @compiled_parallel
@@ -83,6 +90,7 @@ def trace_snell(
 
     Returns:
         positions [R, V, 3], directions [R, V, 3], s [R, V]: with V the capacity, in the rays' precision.
+        bodies [R, V]: number of the body in which each vertex is left, see `types.Path`.
         counts [R]: vertices of each path, more than the capacity where it did not suffice.
         events [R]: refractions and reflections of each ray.
         exceeded [R]: whether a ray met the limit of events; it goes straight on from there.
@@ -91,6 +99,7 @@ def trace_snell(
     out_positions = np.empty((num_rays, capacity, 3), origins.dtype)
     out_directions = np.empty((num_rays, capacity, 3), origins.dtype)
     out_s = np.empty((num_rays, capacity), origins.dtype)
+    bodies = np.zeros((num_rays, capacity), np.int8)
     counts = np.empty(num_rays, np.int64)
     events = np.zeros(num_rays, np.int64)
     exceeded = np.zeros(num_rays, np.bool_)
@@ -109,6 +118,7 @@ def trace_snell(
             inside = np.empty(num_bodies, np.bool_)
             for body in range(num_bodies):
                 inside[body] = spline_value(coefficients[body], low, inverse_spacing, x, y, z) < 0.0
+            bodies[ray, 0] = _innermost(inside)
             while True:
                 _, leave = box_span(low, high, x, y, z, dx, dy, dz)
                 t, before, crossed = 0.0, 0.0, False
@@ -172,6 +182,8 @@ def trace_snell(
                 dx, dy, dz = scale * dx + along * nx, scale * dy + along * ny, scale * dz + along * nz
                 norm = math.sqrt(dx * dx + dy * dy + dz * dz)
                 dx, dy, dz = dx / norm, dy / norm, dz / norm
+                if count < capacity:
+                    bodies[ray, count] = _innermost(inside)
                 count = put_vertex(*row, count, x, y, z, dx, dy, dz, s)
         # A bent path ends outside the box, however long it is; far bounds what lies beyond.
         jump = end - s
@@ -180,4 +192,4 @@ def trace_snell(
         count = put_vertex(*row, count, x + jump * dx, y + jump * dy, z + jump * dz, dx, dy, dz, s + jump)
         counts[ray] = count
         repeat_last(*row, min(count, capacity))
-    return out_positions, out_directions, out_s, counts, events, exceeded
+    return out_positions, out_directions, out_s, bodies, counts, events, exceeded

@@ -6,23 +6,24 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.distributed import rand_rays
+from nerfro.types import Path
 
 # Below this total weight a ray is treated as empty and sampled uniformly (mip-NeRF's code).
 _MIN_TOTAL_WEIGHT = 1e-5
 
 
-def spread_uniform(num_rays: int, num_samples: int, random: bool, like: Tensor) -> Float[Tensor, "R N"]:
+def spread_uniform(path: Path, num_samples: int, random: bool) -> Float[Tensor, "R N"]:
     """Numbers in [0, 1), ascending along each ray: one uniform draw per bin, or evenly spaced from 0 to 1 - eps.
 
     The evenly spaced ones include both ends, which is what inverse transform sampling is given in evaluation
     (authors' code); `random` is the stratified draw of the paper's Eqn. stratified.
     """
+    like = path.s
     if random:
-        jitter = rand_rays(num_rays, num_samples, like)
+        jitter = path.rand(num_samples)
         return (torch.arange(num_samples, device=like.device, dtype=like.dtype) + jitter) / num_samples
     eps = torch.finfo(like.dtype).eps
-    return torch.linspace(0.0, 1.0 - eps, num_samples, device=like.device, dtype=like.dtype).expand(num_rays, -1)
+    return torch.linspace(0.0, 1.0 - eps, num_samples, device=like.device, dtype=like.dtype).expand(len(like), -1)
 
 
 def invert_cdf(

@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.distributed import rand_rays
 from nerfro.errors import NerfroError
 from nerfro.registry import register
 from nerfro.samplers.base import PointSampler
@@ -62,7 +61,7 @@ class Stratified(PointSampler):
         near, far = (path.near, path.far) if self.box is None else path.span(self.box)
         cones = self.cast == "cones"
         fractions = (
-            self._cone_fractions(path.s) if cones else (self._bins(path.s) + self._offsets(path.s)) / self.num_samples
+            self._cone_fractions(path) if cones else (self._bins(path.s) + self._offsets(path)) / self.num_samples
         )
         s = near[:, None] + fractions * (far - near)[:, None]
         return cone_samples(path, s) if cones else point_samples(path, s)
@@ -70,18 +69,19 @@ class Stratified(PointSampler):
     def _bins(self, like: Tensor) -> Float[Tensor, "N"]:
         return torch.arange(self.num_samples, device=like.device, dtype=like.dtype)
 
-    def _offsets(self, like: Tensor) -> Float[Tensor, "R N"]:
+    def _offsets(self, path: Path) -> Float[Tensor, "R N"]:
         if self.training:
-            return rand_rays(len(like), self.num_samples, like)
-        return torch.full((len(like), self.num_samples), self.offset, device=like.device, dtype=like.dtype)
+            return path.rand(self.num_samples)
+        return path.s.new_full((len(path.s), self.num_samples), self.offset)
 
-    def _cone_fractions(self, like: Tensor) -> Float[Tensor, "R N+1"]:
+    def _cone_fractions(self, path: Path) -> Float[Tensor, "R N+1"]:
+        like = path.s
         fractions = torch.linspace(0.0, 1.0, self.num_samples + 1, device=like.device, dtype=like.dtype)
         if self.training:  # each edge moves within half a bin of its place, as mip-NeRF's do
             middle = 0.5 * (fractions[1:] + fractions[:-1])
             low = torch.cat([fractions[:1], middle])
             high = torch.cat([middle, fractions[-1:]])
-            return low + (high - low) * rand_rays(len(like), len(fractions), like)
+            return low + (high - low) * path.rand(len(fractions))
         return fractions.expand(len(like), -1)
 
     def _draw_vertices(self, path: Path) -> Samples:
@@ -91,7 +91,7 @@ class Stratified(PointSampler):
                 f"sampler/points: draw=vertices needs a multiple of {self.num_samples} path vertices, this path has "
                 f"{path.s.shape[1]}; set sampler.path.num_steps to a multiple, or draw=arc_length"
             )
-        offsets = (self._offsets(path.s) * steps).long()  # floor: 0 .. steps - 1
+        offsets = (self._offsets(path) * steps).long()  # floor: 0 .. steps - 1
         vertex = torch.arange(self.num_samples, device=path.s.device) * steps + offsets
         s = path.s.gather(1, vertex)
         index = vertex[..., None].expand(-1, -1, 3)
@@ -101,15 +101,12 @@ class Stratified(PointSampler):
 
 def point_samples(path: Path, s: Float[Tensor, "R N"]) -> Samples:
     """Samples at ascending arc lengths, each standing for the interval up to the next."""
-    positions, directions = path.at(s)
-    return Samples(positions, directions, s, _edges_from_starts(s), path.radii)
+    return Samples.along(path, s, _edges_from_starts(s))
 
 
 def cone_samples(path: Path, edges: Float[Tensor, "R N+1"]) -> Samples:
     """Samples that fill the intervals between ascending edges, placed at their middles."""
-    s = 0.5 * (edges[:, 1:] + edges[:, :-1])
-    positions, directions = path.at(s)
-    return Samples(positions, directions, s, edges, path.radii)
+    return Samples.along(path, 0.5 * (edges[:, 1:] + edges[:, :-1]), edges)
 
 
 def _edges_from_starts(s: Float[Tensor, "R N"]) -> Float[Tensor, "R N+1"]:

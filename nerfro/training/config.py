@@ -138,7 +138,7 @@ class TrainConfig:
     Attributes:
         name: of the experiment; names the run folder.
         seed: of initialisation and of all random draws.
-        data, medium, field, boundary, model: one plugin of that kind.
+        data, camera, medium, field, boundary, model: one plugin of that kind.
         sampler: path and point sampler.
         loss: fields of each training loss, by the loss's registered name.
         content, authors, optimizer, batches, evaluation, checkpoint: see there.
@@ -151,6 +151,7 @@ class TrainConfig:
     name: str = "refractive"
     seed: int = 0
     data: Any = MISSING
+    camera: Any = MISSING
     medium: Any = MISSING
     sampler: SamplerConfig = dataclasses.field(default_factory=SamplerConfig)
     field: Any = MISSING
@@ -206,6 +207,7 @@ def build_model(config: DictConfig) -> NerfModel:
         point_sampler=build(config.sampler.points),
         make_field=lambda: build(config.field),
         boundary=build(config.boundary),
+        camera=build(config.camera),
         losses=losses,
         optimizer=optimizer,
         seed=config.seed,

@@ -16,9 +16,10 @@ from torch import Tensor
 from nerfro.boundaries.lat_long import directions
 from nerfro.cameras import Cameras
 from nerfro.evaluation.path_plot import picture_of_paths
+from nerfro.evaluation.pictures import triptych
 from nerfro.media.analytic import Vacuum
 from nerfro.models.base import NerfModel
-from nerfro.types import Batch, Rays, Rendering
+from nerfro.types import Batch, Exits, Rays, Rendering
 
 _SKY_HEIGHT = 128  # rows of the picture of the sky
 _NUM_RAYS = 128  # at most, for the histograms
@@ -28,14 +29,15 @@ _NUM_PATHS = 12  # of these, in the picture of bent paths
 class TrainingLog(Callback):
     """Logs learning rates and memory with the losses, and pictures at every look at a validation view.
 
-    The pictures are those of `NerfModel.validation_step`, the sky, and the paths of a few rays through the middle row
-    of the view; the histograms tell at which arc lengths the rays of that row are sampled, for each sampling level.
+    The pictures are the view beside its photograph and the error, its depth and opacity, the sky, and the paths of a
+    few rays through its middle row; the histograms tell at which arc lengths the rays of that row are sampled, for each
+    sampling level.
     """
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
     ) -> None:
-        for name, rate in learning_rates(trainer, pl_module).items():
+        for name, rate in learning_rates(trainer).items():
             pl_module.log(f"learning_rate/{name}", rate)
         pl_module.log("train/peak_memory_gib", peak_memory(pl_module.device) / 2**30)
 
@@ -57,8 +59,12 @@ class TrainingLog(Callback):
         rays = _middle_row(trainer.datamodule.validation.cameras.to(pl_module.device), batch)  # type: ignore[attr-defined]
         with torch.inference_mode():
             renderings: list[Rendering] = pl_module(rays)
-        pictures = {name: _to_8bit(picture) for name, picture in outputs.items()}
-        pictures["val/sky"] = sky(pl_module)
+        maps = torch.cat([outputs["depth"], outputs["opacity"]], 1)[..., None].expand(-1, -1, 3)
+        pictures = {
+            "val/prediction_reference_error": _to_8bit(triptych(outputs["prediction"], outputs["target"])),
+            "val/depth_opacity": _to_8bit(maps),
+            "val/sky": sky(pl_module),
+        }
         if not isinstance(pl_module.medium, Vacuum):
             shown = torch.linspace(0, len(rays) - 1, min(_NUM_PATHS, len(rays))).long().to(rays.origins.device)
             pictures["val/paths"] = picture_of_paths(renderings[-1].path[shown], pl_module.medium)
@@ -71,10 +77,9 @@ class TrainingLog(Callback):
                     _log_histogram(logger, f"samples/arc_length_level_{level}", s, trainer.global_step)
 
 
-def learning_rates(trainer: Trainer, model: LightningModule) -> dict[str, float]:
-    """Present learning rate of each part of the model that learns."""
-    parts = [name for name in ("fields", "boundary") if any(True for _ in getattr(model, name).parameters())]
-    return {name: group["lr"] for name, group in zip(parts, trainer.optimizers[0].param_groups, strict=True)}
+def learning_rates(trainer: Trainer) -> dict[str, float]:
+    """Present learning rate of each part of the model that learns (`NerfModel.parameter_groups`)."""
+    return {group["name"]: group["lr"] for group in trainer.optimizers[0].param_groups}
 
 
 def peak_memory(device: torch.device) -> int:
@@ -95,7 +100,7 @@ def sky(model: NerfModel, height: int = _SKY_HEIGHT) -> UInt8[np.ndarray, "H 2*H
     was_training = model.boundary.training
     model.boundary.eval()
     try:
-        return _to_8bit(model.boundary(directions(height).to(model.device)))
+        return _to_8bit(model.encode(model.boundary(Exits(directions(height).to(model.device)))))
     finally:
         model.boundary.train(was_training)
 

@@ -141,6 +141,7 @@ class RayBatches:
             jitter = torch.from_numpy(offsets[self._share]).to(cameras.device, non_blocking=True)
         return Batch(
             rays=cameras.rays(index // (height * width), index // width % height, index % width, jitter),
+            view=index // (height * width),
             rgb=self._pixels[index],
             index=index,
             cameras=cameras.crop(window),
@@ -173,6 +174,7 @@ class RayBatches:
         num_whole = int((~divided).sum())
         return Batch(
             rays=PixelParts(self._cameras).rays(index[:num_whole]).followed_by(self._parts.rays(index[num_whole:])),
+            view=pixels // (self._cameras.height * self._cameras.width),
             rgb=self._pixels[pixels],
             index=index,
             cameras=cameras,

@@ -14,7 +14,7 @@ from nerfro.fields.base import Field
 from nerfro.fields.selection import inside_box
 from nerfro.geometry.interpolation import trilinear
 from nerfro.geometry.smoothing import smooth
-from nerfro.types import Radiance, Samples
+from nerfro.types import Exits, Radiance, Samples
 
 # Directions are looked up on the unit sphere in a grid over this cube.
 _SKY_SIDE = 1.1
@@ -62,7 +62,7 @@ class Background:
             radiance[index] = _mean_radiance(field, vertices[index])
         cube = torch.tensor([[-_SKY_SIDE] * 3, [_SKY_SIDE] * 3], device=box.device)
         directions = torch.nn.functional.normalize(_vertices(cube, resolution), dim=-1)
-        sky = torch.cat([boundary(chunk).float() for chunk in directions.split(_POINTS_AT_ONCE)])
+        sky = torch.cat([boundary(Exits(chunk)).float() for chunk in directions.split(_POINTS_AT_ONCE)])
         sides = (resolution,) * 3
         return cls(radiance.view(*sides, 4), box, sky.view(*sides, 3))
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from enum import IntEnum
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
@@ -138,11 +137,10 @@ class EikonalFields(NerfModel):
         if self._blurred is None or level != self._level:
             self._level, self._blurred = level, self._sharp.blurred(self.blur / 2**level)
 
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        optimizer = super().configure_optimizers()
+    def parameter_groups(self) -> dict[str, tuple[list[nn.Parameter], float]]:
         # Parameters outside of a stage get no gradient, which Adam skips.
-        optimizer.param_groups[0]["params"] += [*self.interior.parameters(), *self.medium.parameters()]
-        return optimizer
+        interior = list(self.interior.parameters()), self.optimizer_config.learning_rate
+        return {**super().parameter_groups(), "interior": interior}
 
     def forward(self, rays: Rays) -> list[Rendering]:
         """Render rays as the present stage sees them."""
@@ -155,22 +153,18 @@ class EikonalFields(NerfModel):
 
     def render_path(self, path: Path) -> list[Rendering]:
         stage = Stage(int(self.stage))
-        with torch.no_grad():
-            samples = self.point_sampler(path, None)
+        samples = self.point_sampler(path, None)
         (field,) = self.fields
         if stage == Stage.SCENE:
-            return [composite(samples, field(samples), self.boundary(path.exit_directions), path)]
-        # The samples' arc lengths are given, what bends with the index is where they lie.
-        positions, directions = path.at(samples.s)
-        samples = replace(samples, positions=positions, directions=directions)
-        outside = ~inside_box(positions.detach(), *self.medium.box)
+            return [composite(samples, field(samples), self.boundary(path.exits()), path)]
+        outside = ~inside_box(samples.positions.detach(), *self.medium.box)
         if stage == Stage.INDEX and self.training:
             assert self._blurred is not None  # made at the start of the step
             radiance = radiance_where(self._blurred.radiance_at, samples, outside)
             return [composite(samples, radiance, self._blurred.sky_towards(path.exit_directions), path)]
         with torch.no_grad():
             radiance = radiance_where(field, samples, outside)
-            sky = self.boundary(path.exit_directions)
+            sky = self.boundary(path.exits())
         if stage == Stage.INTERIOR:
             inner = radiance_where(self.interior, samples, ~outside)
             radiance = Radiance(radiance.density + inner.density, radiance.rgb + inner.rgb)

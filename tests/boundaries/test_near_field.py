@@ -16,7 +16,7 @@ from nerfro.errors import NerfroError
 from nerfro.media.shapes import Ball
 from nerfro.samplers.snell import Snell
 from nerfro.samplers.straight import straight_path
-from nerfro.types import Path, Rays
+from nerfro.types import Exits, Path, Rays
 
 SMALL = {
     "grid_resolution": 32,
@@ -74,8 +74,8 @@ def test_a_ray_through_the_box_is_seen_from_where_it_leaves_it(near_field):
     # Enters at z = 3 and leaves at z = 0, whatever lies before.
     down = straight_path(rays([[0.2, 0.1, 9.0]], [[0.0, 0.0, -1.0]]))
     nearer = straight_path(rays([[0.2, 0.1, 4.0]], [[0.0, 0.0, -1.0]]))
-    colour = near_field.along(down, down.exit_directions)
-    torch.testing.assert_close(near_field.along(nearer, nearer.exit_directions), colour)
+    colour = near_field(down.exits())
+    torch.testing.assert_close(near_field(nearer.exits()), colour)
     expected = near_field._render(torch.tensor([[0.2, 0.1, 0.0]]), down.exit_directions)
     torch.testing.assert_close(colour, expected, rtol=0, atol=1e-5)
 
@@ -83,20 +83,20 @@ def test_a_ray_through_the_box_is_seen_from_where_it_leaves_it(near_field):
 def test_a_ray_that_misses_the_box_is_seen_from_its_near_end(near_field):
     aside = straight_path(rays([[5.0, 0.0, 9.0]], [[0.0, 0.0, -1.0]], near=0.5))
     expected = near_field._render(torch.tensor([[5.0, 0.0, 8.5]]), aside.exit_directions)
-    torch.testing.assert_close(near_field.along(aside, aside.exit_directions), expected, rtol=0, atol=1e-5)
+    torch.testing.assert_close(near_field(aside.exits()), expected, rtol=0, atol=1e-5)
 
 
 def test_by_direction_alone_it_is_seen_from_the_middle(near_field):
     directions = normalize(torch.randn(2, 4, 3), dim=-1)
     expected = near_field._render(torch.tensor([[0.0, 0.0, 1.5]]).expand(8, 3), directions.reshape(-1, 3))
-    assert torch.equal(near_field(directions), expected.view(2, 4, 3))
+    assert torch.equal(near_field(Exits(directions)), expected.view(2, 4, 3))
 
 
 def test_a_sky_does_not_depend_on_the_place():
     sky = EnvironmentMap([4, 8])
     path = straight_path(rays([[5.0, 0.0, 9.0], [0.0, 1.0, 2.0]], [[0.0, 0.3, -1.0], [0.0, 0.3, -1.0]]))
-    colours = sky.along(path, path.exit_directions)
-    assert torch.equal(colours, sky(path.exit_directions))
+    colours = sky(path.exits())
+    assert torch.equal(colours, sky(Exits(path.exit_directions)))
 
 
 def wall_colour(origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
@@ -132,14 +132,14 @@ def trained_psnr(boundary: Boundary, rate: float, num_steps: int) -> tuple[float
         optimizer.param_groups[0]["lr"] = rate * 0.1 ** (step / num_steps)
         chosen = torch.randint(len(target), (512,))
         batch = path[chosen]
-        loss = (boundary.along(batch, batch.exit_directions) - target[chosen]).square().mean()
+        loss = (boundary(batch.exits()) - target[chosen]).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
     boundary.eval()
     path, target = photographs(2, 2)
     with torch.no_grad():
-        error = (boundary.along(path, path.exit_directions) - target).square().mean(-1)
+        error = (boundary(path.exits()) - target).square().mean(-1)
     return tuple(float(-10 * torch.log10(e.mean())) for e in (error, error[path.refracted]))
 
 
@@ -175,5 +175,5 @@ def test_impossible_options_are_refused(fields, message):
 def test_mixed_refraction_takes_the_direction_that_it_is_given(near_field):
     path = straight_path(rays([[0.2, 0.1, 9.0]], [[0.0, 0.0, -1.0]]))
     aside = normalize(torch.tensor([[0.3, 0.0, -1.0]]), dim=-1)
-    assert not torch.equal(near_field.along(path, aside), near_field.along(path, path.exit_directions))
-    assert torch.equal(near_field.along(replace(path, exit_directions=aside), aside), near_field.along(path, aside))
+    assert not torch.equal(near_field(path.exits(aside)), near_field(path.exits()))
+    assert torch.equal(near_field(replace(path, exit_directions=aside).exits()), near_field(path.exits(aside)))

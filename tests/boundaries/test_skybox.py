@@ -9,6 +9,7 @@ from torch.nn.functional import normalize
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.boundaries.skybox import Skybox
 from nerfro.errors import NerfroError
+from nerfro.types import Exits
 
 
 def test_published_skybox_has_its_layers() -> None:
@@ -28,18 +29,18 @@ def test_skybox_learns_a_smooth_sky() -> None:
     target = 0.5 + 0.4 * directions
     optimizer = torch.optim.Adam(sky.parameters(), 1e-2)
     for _ in range(150):
-        error = (sky(directions) - target).square().mean()
+        error = (sky(Exits(directions)) - target).square().mean()
         optimizer.zero_grad()
         error.backward()
         optimizer.step()
     unseen = normalize(torch.randn(500, 3), dim=-1)
-    assert (sky(unseen) - (0.5 + 0.4 * unseen)).square().mean() < 1e-3
+    assert (sky(Exits(unseen)) - (0.5 + 0.4 * unseen)).square().mean() < 1e-3
 
 
 def test_skybox_keeps_all_leading_axes() -> None:
     directions = normalize(torch.randn(4, 5, 3), dim=-1)
     sky = Skybox(width=8)
-    torch.testing.assert_close(sky(directions)[2, 3], sky(directions[2, 3]))
+    torch.testing.assert_close(sky(Exits(directions))[2, 3], sky(Exits(directions[2, 3])))
 
 
 def test_constant_boundary_is_the_same_in_every_direction() -> None:

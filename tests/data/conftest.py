@@ -10,26 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
 Writer = Callable[..., Path]
 
 
-def _random_pose(seed: int) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.random(random_state=seed).as_matrix()
-    pose[:3, 3] = np.random.default_rng(seed).normal(size=3)
-    return pose
-
-
 def _random_image(seed: int, width: int = 8, height: int = 6, num_channels: int = 3) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (height, width, num_channels), dtype=np.uint8)
-
-
-@pytest.fixture
-def random_pose() -> Callable[[int], np.ndarray]:
-    """Camera-to-world matrix [4, 4] of a seed, with any orientation."""
-    return _random_pose
 
 
 @pytest.fixture
@@ -39,7 +25,7 @@ def random_image() -> Callable[..., np.ndarray]:
 
 
 @pytest.fixture
-def write_blender(tmp_path: Path) -> Writer:
+def write_blender(tmp_path: Path, random_pose: Callable[[int], np.ndarray]) -> Writer:
     """Write a split in the Blender format: a file for each image [H, W, C], and the folder is returned."""
 
     def write(
@@ -54,7 +40,7 @@ def write_blender(tmp_path: Path) -> Writer:
         frames = []
         for i, image in enumerate(images):
             Image.fromarray(image).save(tmp_path / split / f"r_{i}.png")
-            pose = _random_pose(i) if poses is None else poses[i]
+            pose = random_pose(i) if poses is None else poses[i]
             frames.append({"file_path": f"./{split}/r_{i}{suffix}", "rotation": 0.1, "transform_matrix": pose.tolist()})
         for i, mask in enumerate(masks):
             Image.fromarray(mask).save(tmp_path / split / f"mask_r_{i}.png")

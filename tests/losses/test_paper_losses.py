@@ -35,7 +35,7 @@ def model() -> NerfModel:
         losses={},
         optimizer=OptimizerConfig(),
     )
-    return RefractiveModel(parts)
+    return RefractiveModel(parts, colour="srgb")
 
 
 def gradient_norms(model: NerfModel, value: Tensor) -> dict[str, float]:

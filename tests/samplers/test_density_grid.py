@@ -32,7 +32,7 @@ def trained_sampler() -> DensityGridSampler:
 def test_compiled_kernel_draws_what_the_plain_twin_draws() -> None:
     sampler, path = trained_sampler(), example_path(64)
     for random in (False, True):
-        u = spread_uniform(64, sampler.num_samples + 1, random, path.s)
+        u = spread_uniform(path, sampler.num_samples + 1, random)
         plain, compiled = sampler.draw(path, u), sampler.draw_compiled(path, u)
         torch.testing.assert_close(compiled.edges, plain.edges, rtol=0, atol=2e-4)
         torch.testing.assert_close(compiled.s, plain.s, rtol=0, atol=2e-4)

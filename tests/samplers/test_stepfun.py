@@ -10,6 +10,13 @@ import torch
 from torch import Tensor
 
 from nerfro.samplers.stepfun import blur_weights, invert_cdf, midpoints, spread_uniform
+from nerfro.samplers.straight import straight_path
+from nerfro.types import Path
+from tests.closed_forms import make_rays
+
+
+def _paths(num: int) -> Path:
+    return straight_path(make_rays(torch.zeros(num, 3), torch.randn(num, 3), 0, 1))
 
 
 def slow_invert_cdf(edges: np.ndarray, weights: np.ndarray, u: float) -> float:
@@ -71,7 +78,7 @@ def test_samples_stay_inside_at_both_ends_of_u() -> None:
 
 def test_ascending_u_gives_ascending_samples() -> None:
     edges, weights = random_step_function(50, 40)
-    s = invert_cdf(edges.float(), weights.float(), spread_uniform(50, 128, True, edges.float()))
+    s = invert_cdf(edges.float(), weights.float(), spread_uniform(_paths(50), 128, True))
     assert (s.diff(dim=1) >= -1e-6).all()
 
 
@@ -99,13 +106,13 @@ def test_blur_equals_a_slow_loop() -> None:
 
 @pytest.mark.parametrize("num_samples", [1, 5, 64])
 def test_random_u_has_one_draw_in_each_bin(num_samples: int) -> None:
-    u = spread_uniform(100, num_samples, True, torch.zeros(()))
+    u = spread_uniform(_paths(100), num_samples, True)
     assert ((u * num_samples).floor() == torch.arange(num_samples)).all()
     assert len(u.unique()) > 0.9 * u.numel()
 
 
 def test_even_u_runs_from_zero_to_just_below_one() -> None:
-    u = spread_uniform(2, 9, False, torch.zeros(()))
+    u = spread_uniform(_paths(2), 9, False)
     torch.testing.assert_close(u, torch.linspace(0, 1, 9).expand(2, -1))
     assert (u < 1).all()
 

@@ -1,0 +1,1 @@
+"""What is believed of the training cameras: rays of a view -> rays."""
