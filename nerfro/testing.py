@@ -205,7 +205,7 @@ def _check_loss(plugin: Plugin, fields: dict[str, object]) -> None:
 
 
 def _check_model(plugin: Plugin, fields: dict[str, object]) -> None:
-    model = _make(plugin, fields, parts=_example_parts())
+    model = _make(plugin, fields, parts=example_parts())
     _require(isinstance(model, NerfModel), "a model derives from nerfro.models.base.NerfModel")
     renderings = model(example_rays())
     _require(len(renderings) >= 1, "forward returns a rendering for each level")
@@ -238,7 +238,8 @@ _CONTRACTS: dict[str, Callable[[Plugin, dict[str, object]], None]] = {
 }
 
 
-def _example_parts() -> Parts:
+def example_parts() -> Parts:
+    """Parts of a small model on straight rays before a black sky."""
     return Parts(
         medium=Ball(),
         path_sampler=Straight(),
@@ -251,7 +252,7 @@ def _example_parts() -> Parts:
 
 
 def _example_model() -> NerfModel:
-    return RefractiveModel(_example_parts())
+    return RefractiveModel(example_parts())
 
 
 def _unit(directions: torch.Tensor) -> bool:

@@ -13,7 +13,6 @@ import nerfro.distributed
 from nerfro.cameras import Cameras
 from nerfro.data.base import Views
 from nerfro.distributed import drawing_for, rand_rays
-from nerfro.light import to_linear
 from nerfro.pixel_parts import PixelParts
 from nerfro.training.ray_batches import RayBatches
 
@@ -74,18 +73,16 @@ def test_divided_pixels_bring_all_their_rays(views: Views, parts: PixelParts, ba
     assert torch.equal(parts.pixels[batch.index[n::4] // 4], drawn.index[is_divided])
     torch.testing.assert_close(batch.rays.directions[n:], parts.rays(batch.index[n:]).directions)
     # Rows of one pixel have its colour, and the pixels are those that were drawn.
-    torch.testing.assert_close(
-        batch.pixel_colours(batch.rgb), torch.cat([drawn.rgb[~is_divided], drawn.rgb[is_divided]])
-    )
+    torch.testing.assert_close(batch.of_pixels(batch.rgb), torch.cat([drawn.rgb[~is_divided], drawn.rgb[is_divided]]))
 
 
 def test_a_pixel_is_the_mean_of_linear_radiance(views: Views, parts: PixelParts) -> None:
     batch = RayBatches(views, 20, seed=1).dividing(parts).batch(0)
     rgb = torch.rand(len(batch.rays), 3)
-    pixels, n = batch.pixel_colours(rgb), batch.num_whole
+    pixels, n = batch.of_pixels(rgb), batch.num_whole
     assert torch.equal(pixels[:n], rgb[:n])
-    torch.testing.assert_close(to_linear(pixels[n]), to_linear(rgb[n : n + 4]).mean(0))
-    assert torch.equal(replace(batch, num_whole=None).pixel_colours(rgb), rgb)
+    torch.testing.assert_close(pixels[n], rgb[n : n + 4].mean(0))
+    assert torch.equal(replace(batch, num_whole=None).of_pixels(rgb), rgb)
 
 
 def test_processes_share_pixels_and_random_numbers(
@@ -107,7 +104,7 @@ def test_processes_share_pixels_and_random_numbers(
     seen = torch.zeros(len(expected.rays))
     for rank in range(3):
         batch = batches.share(rank, 3).batch(4)
-        assert len(batch.pixel_colours(batch.rgb)) == 10
+        assert len(batch.of_pixels(batch.rgb)) == 10
         assert torch.equal(batch.rays.directions, expected.rays.directions[batch.rows])
         assert torch.equal(batch.index, expected.index[batch.rows])
         assert torch.equal(draw(batch), numbers[batch.rows])

@@ -30,11 +30,11 @@ def smooth_sky(directions: torch.Tensor) -> torch.Tensor:
 
 
 def test_it_starts_grey() -> None:
-    assert torch.allclose(EnvironmentMap()(random_directions(10)), torch.full((10, 3), 0.5))
+    assert torch.allclose(EnvironmentMap()(Exits(random_directions(10))), torch.full((10, 3), 0.5))
 
 
 def test_any_batch_shape_is_kept() -> None:
-    assert EnvironmentMap([4])(random_directions(12).view(3, 2, 2, 3)).shape == (3, 2, 2, 3)
+    assert EnvironmentMap([4])(Exits(random_directions(12).view(3, 2, 2, 3))).shape == (3, 2, 2, 3)
 
 
 def test_compiled_and_plain_colours_agree() -> None:

@@ -44,7 +44,7 @@ def test_skybox_keeps_all_leading_axes() -> None:
 
 
 def test_constant_boundary_is_the_same_in_every_direction() -> None:
-    rgb = ConstantBoundary([0.1, 0.2, 0.3])(torch.randn(4, 5, 3))
+    rgb = ConstantBoundary([0.1, 0.2, 0.3])(Exits(torch.randn(4, 5, 3)))
     assert torch.equal(rgb, torch.tensor([0.1, 0.2, 0.3]).expand(4, 5, 3))
 
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import torch
 
-from nerfro.light import to_linear, to_srgb
+from nerfro.light import to_srgb
 from nerfro.losses.boundary import BoundaryRegulariser
 from nerfro.losses.photometric import Photometric
+from nerfro.models.refractive import RefractiveModel
+from nerfro.testing import example_parts
 from nerfro.types import Batch, Path, Rendering, Samples
 
 NUM_WHOLE, NUM_DIVIDED, PARTS = 3, 2, 4
 NUM_RAYS = NUM_WHOLE + NUM_DIVIDED * PARTS
+MODEL = RefractiveModel(example_parts())
 
 
 def rendering(colour: torch.Tensor, boundary: torch.Tensor, passed: torch.Tensor) -> Rendering:
@@ -25,16 +28,16 @@ def rendering(colour: torch.Tensor, boundary: torch.Tensor, passed: torch.Tensor
 def batch() -> Batch:
     pixels = torch.rand(NUM_WHOLE + NUM_DIVIDED, 3)
     rgb = torch.cat([pixels[:NUM_WHOLE], pixels[NUM_WHOLE:].repeat_interleave(PARTS, 0)])
-    return Batch(None, rgb, None, None, num_whole=NUM_WHOLE, rays_per_pixel=PARTS)  # type: ignore[arg-type]
+    return Batch(None, None, rgb, None, num_whole=NUM_WHOLE, rays_per_pixel=PARTS)  # type: ignore[arg-type]
 
 
 def test_a_divided_pixel_is_compared_as_a_whole_and_teaches_the_field_alone() -> None:
     colour, boundary = (torch.rand(NUM_RAYS, 3, requires_grad=True) for _ in range(2))
     given, passed = batch(), torch.rand(NUM_RAYS)
     rendered = rendering(colour, boundary, passed)
-    loss = Photometric()([rendered], given, None)  # type: ignore[arg-type]  # the model is not asked
-    parts = to_linear(rendered.rgb[NUM_WHOLE:]).view(NUM_DIVIDED, PARTS, 3)
-    pixels = torch.cat([rendered.rgb[:NUM_WHOLE], to_srgb(parts.mean(1))])
+    loss = Photometric()([rendered], given, MODEL)
+    parts = rendered.rgb[NUM_WHOLE:].view(NUM_DIVIDED, PARTS, 3)
+    pixels = to_srgb(torch.cat([rendered.rgb[:NUM_WHOLE], parts.mean(1)]))
     target = torch.cat([given.rgb[:NUM_WHOLE], given.rgb[NUM_WHOLE::PARTS]])
     expected = (pixels - target).square().mean()
     torch.testing.assert_close(loss, expected)
@@ -49,7 +52,25 @@ def test_a_divided_pixel_is_compared_as_a_whole_and_teaches_the_field_alone() ->
 def test_parts_of_a_pixel_need_not_have_its_colour_for_the_regulariser() -> None:
     given, passed = batch(), torch.full((NUM_RAYS,), 0.9, requires_grad=True)
     rendered = rendering(torch.rand(NUM_RAYS, 3), torch.rand(NUM_RAYS, 3), passed)
-    value = BoundaryRegulariser()([rendered], given, None)  # type: ignore[arg-type]
+    value = BoundaryRegulariser()([rendered], given, MODEL)
     (gradient,) = torch.autograd.grad(value, passed)
     assert (gradient[:NUM_WHOLE] != 0).all()
     assert (gradient[NUM_WHOLE:] == 0).all()
+
+
+def test_a_saturated_pixel_is_no_error_where_both_clip_and_keeps_a_gradient_where_one_does() -> None:
+    photograph = torch.tensor([1.0, 1.0, 0.6])  # saturated, saturated, not
+    radiance = torch.tensor([3.0, 0.5, 3.0], requires_grad=True)
+    prediction, target = MODEL.difference(radiance, photograph)
+    (prediction - target).square().sum().backward()
+    lamp, too_dark, too_bright = radiance.grad
+    assert lamp == 0
+    assert too_dark < 0 < too_bright
+
+
+def test_in_the_authors_arithmetic_nothing_is_encoded_or_clipped() -> None:
+    model = RefractiveModel(example_parts(), colour="srgb")
+    radiance, photograph = 1.2 * torch.rand(50, 3), torch.rand(50, 3).round()
+    prediction, target = model.difference(radiance, photograph)
+    assert prediction is radiance
+    assert target is photograph

@@ -26,10 +26,14 @@ def test_pairs_are_the_angle_apart_and_uniform() -> None:
     torch.testing.assert_close((first * second).sum(-1), torch.full((20_000,), math.cos(0.3)), rtol=0, atol=1e-5)
 
 
+def model(boundary) -> SimpleNamespace:
+    return SimpleNamespace(boundary=boundary, encode=lambda radiance: radiance)
+
+
 def test_value_is_that_of_a_linear_sky() -> None:
     # For C = d . a the mean of |C(d') - C(d)| is angle |a| / 2, the mean of |cos| over the sphere, to second order.
     torch.manual_seed(0)
-    sky = SimpleNamespace(boundary=lambda d: (d * 0.8).sum(-1, keepdim=True).expand(-1, 3) * 0.5 / math.sqrt(3))
+    sky = model(lambda exits: (exits.directions * 0.8).sum(-1, keepdim=True).expand(-1, 3) * 0.5 / math.sqrt(3))
     value = TotalVariation(num_directions=100_000, angle=1.0)([], BATCH, sky)
     assert float(value) == pytest.approx(math.radians(1.0) * 0.4 / 2, rel=0.02)
 
@@ -40,7 +44,7 @@ def test_descending_it_flattens_a_sky() -> None:
     torch.nn.init.normal_(boundary.texels)
     optimiser, values = torch.optim.Adam(boundary.parameters(), lr=0.05), []
     for _ in range(100):
-        value = loss([], BATCH, SimpleNamespace(boundary=boundary))
+        value = loss([], BATCH, model(boundary))
         values.append(float(value.detach()))
         optimiser.zero_grad()
         value.backward()

@@ -86,10 +86,10 @@ def test_rays_that_bend_see_another_sky_than_straight_ones(parts: Parts) -> None
 def test_rendering_is_as_in_evaluation_and_leaves_the_mode_as_it_was(training: bool, parts: Parts) -> None:
     model = RefractiveModel(parts).train(training)
     first, second = model.render(example_rays()), model.render(example_rays())
-    assert torch.equal(first.rgb, second.rgb), "nothing random"
+    assert torch.equal(first.radiance, second.radiance), "nothing random"
     assert model.training is training
     assert model.point_sampler.training is training
-    assert not first.rgb.requires_grad
+    assert not first.radiance.requires_grad
 
 
 def test_an_error_while_rendering_leaves_the_mode_as_it_was(parts: Parts) -> None:
@@ -100,7 +100,7 @@ def test_an_error_while_rendering_leaves_the_mode_as_it_was(parts: Parts) -> Non
 
 
 def test_chunks_bound_how_many_rays_are_rendered_at_once(parts: Parts, monkeypatch: pytest.MonkeyPatch) -> None:
-    model, sizes = RefractiveModel(parts), []
+    model, sizes = RefractiveModel(parts).eval(), []
     whole = model(example_rays())  # 24 rays
     forward = model.path_sampler.forward
     monkeypatch.setattr(

@@ -81,8 +81,8 @@ def test_run_without_a_budget_makes_no_progress() -> None:
 
 
 def test_boundary_has_the_fields_rate_unless_given_its_own() -> None:
-    assert OptimizerConfig(learning_rate=3e-4).boundary_rate == 3e-4
-    assert OptimizerConfig(learning_rate=3e-4, boundary_learning_rate=1e-5).boundary_rate == 1e-5
+    assert OptimizerConfig(learning_rate=3e-4).rate("boundary") == 3e-4
+    assert OptimizerConfig(learning_rate=3e-4, boundary_learning_rate=1e-5).rate("boundary") == 1e-5
 
 
 @pytest.mark.parametrize("wrong", [{"learning_rate": 0.0}, {"final_learning_rate": -1.0}, {"warmup_steps": -1}])

@@ -113,7 +113,7 @@ def test_random_u_has_one_draw_in_each_bin(num_samples: int) -> None:
 
 def test_even_u_runs_from_zero_to_just_below_one() -> None:
     u = spread_uniform(_paths(2), 9, False)
-    torch.testing.assert_close(u, torch.linspace(0, 1, 9).expand(2, -1))
+    torch.testing.assert_close(u, torch.linspace(0, 1, 9, dtype=torch.float64).expand(2, -1))
     assert (u < 1).all()
 
 

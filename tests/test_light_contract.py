@@ -1,0 +1,188 @@
+"""Light adds: several polylines of a ray, linear radiance from parts to pixels, and what a model learns."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path as FilePath
+
+import pytest
+import torch
+from torch import Tensor
+
+from nerfro.boundaries import lat_long
+from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.light import to_linear, to_srgb
+from nerfro.losses.boundary import BoundaryRegulariser
+from nerfro.losses.distortion import Distortion
+from nerfro.losses.photometric import Photometric
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.models.refractive import RefractiveModel
+from nerfro.rendering import composite
+from nerfro.samplers.density_grid import DensityGridSampler
+from nerfro.samplers.hierarchical import Hierarchical
+from nerfro.samplers.snell import Snell, trace_interfaces
+from nerfro.samplers.straight import straight_path
+from nerfro.samplers.stratified import Stratified
+from nerfro.testing import NUM_RAYS, example_batch, example_parts, example_path, example_rays
+from nerfro.types import Exits, Path, Radiance
+
+
+def split_path(of_straight: float) -> Path:
+    """Two polylines for each example ray: bent by a ball, and straight on, which brings the given share."""
+    bent, straight = example_path(), straight_path(example_rays())
+    both = bent.followed_by(straight)
+    order = torch.stack([torch.arange(NUM_RAYS), torch.arange(NUM_RAYS) + NUM_RAYS], 1).flatten()
+    chosen = both[order]
+    share = torch.tensor([1 - of_straight, of_straight]).repeat(NUM_RAYS)
+    return Path(
+        chosen.positions, chosen.directions, chosen.s, chosen.exit_directions, chosen.refracted, chosen.radii,
+        ray=torch.arange(NUM_RAYS).repeat_interleave(2), throughput=share[:, None].expand(-1, 3), body=chosen.body,
+    )  # fmt: skip
+
+
+def rendered(path: Path) -> Tensor:
+    model = RefractiveModel(replace(example_parts(), boundary=EnvironmentMap([4]))).eval()
+    torch.manual_seed(1)
+    torch.nn.init.normal_(model.boundary.texels)
+    for parameter in model.fields.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    with torch.no_grad():
+        return model.render_path(path)[-1].rgb
+
+
+def test_a_ray_is_the_sum_of_its_polylines_weighted_by_throughput() -> None:
+    both = rendered(split_path(0.3))
+    expected = 0.7 * rendered(example_path()) + 0.3 * rendered(straight_path(example_rays()))
+    assert both.shape == (NUM_RAYS, 3)
+    torch.testing.assert_close(both, expected)
+
+
+def test_one_polyline_a_ray_is_the_same_bit_for_bit_however_it_is_said() -> None:
+    path = example_path()
+    said = Path(
+        path.positions, path.directions, path.s, path.exit_directions, path.refracted, path.radii,
+        ray=torch.arange(NUM_RAYS), throughput=torch.ones(NUM_RAYS, 3),
+    )  # fmt: skip
+    assert torch.equal(rendered(said), rendered(path))
+
+
+def test_opacity_and_depth_are_those_of_rays() -> None:
+    path = split_path(0.25)
+    samples = Stratified(8).eval()(path, None)
+    density = torch.zeros_like(samples.s)
+    density[1::2] = 50.0  # the straight polylines are blocked at once, the bent ones pass
+    rendering = composite(samples, Radiance(density, samples.positions), torch.zeros(2 * NUM_RAYS, 3), path)
+    torch.testing.assert_close(rendering.opacity, torch.full((NUM_RAYS,), 0.25))
+    first = 0.5 * (samples.edges[1::2, 0] + samples.edges[1::2, 1])
+    torch.testing.assert_close(rendering.depth, first, rtol=1e-3, atol=0)
+    assert torch.equal(rendering.exit_directions, path.exit_directions[::2])
+
+
+@pytest.mark.parametrize("sampler", [Stratified(8), Hierarchical(8, 8), DensityGridSampler(8, 16)])
+def test_random_numbers_are_drawn_for_each_ray(sampler: Stratified | Hierarchical | DensityGridSampler) -> None:
+    same = straight_path(example_rays())
+    twice = Path(
+        *(getattr(same, name).repeat_interleave(2, 0) for name in
+          ("positions", "directions", "s", "exit_directions", "refracted", "radii")),
+        ray=torch.arange(NUM_RAYS).repeat_interleave(2),
+    )  # fmt: skip
+    samples = sampler.train()(twice, None)
+    assert torch.equal(samples.s[::2], samples.s[1::2]), "polylines of a ray share its numbers"
+    torch.manual_seed(3)
+    first = sampler(twice, None).s[::2]
+    torch.manual_seed(3)
+    assert torch.equal(first, sampler(same, None).s), "and splitting changes nobody's"
+
+
+@pytest.mark.parametrize("loss", [Photometric(), BoundaryRegulariser(start=0), Distortion()])
+def test_losses_take_rays_that_split(loss: Photometric | BoundaryRegulariser | Distortion) -> None:
+    model, batch = RefractiveModel(example_parts()).eval(), example_batch()
+    with torch.no_grad():
+        bent = model.render_path(example_path())
+        split = model.render_path(split_path(0.0))  # a second polyline that brings nothing
+        assert loss([*split], batch, model) == pytest.approx(float(loss([*bent], batch, model)), rel=1e-5)
+
+
+def test_samples_follow_the_gradients_of_their_path() -> None:
+    path = example_path()
+    positions = path.positions.clone().requires_grad_()
+    moving = path.moved(positions, path.directions, path.s, path.exit_directions)
+    for sampler in (Stratified(8).eval(), DensityGridSampler(8, 16).eval()):
+        samples = sampler(moving, None)
+        assert not samples.s.requires_grad
+        (gradient,) = torch.autograd.grad(samples.positions.sum(), positions)
+        assert gradient.sum() == pytest.approx(samples.positions.numel(), rel=1e-4)
+        torch.testing.assert_close(samples.positions.detach(), sampler(path, None).positions, atol=1e-5, rtol=0)
+
+
+def test_bodies_are_counted_along_nested_bodies() -> None:
+    axis = torch.linspace(-1.5, 1.5, 48)
+    radius = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).norm(dim=-1)
+    box = torch.tensor([[-1.5] * 3, [1.5] * 3])
+    medium = SdfGrid.from_distances(torch.stack([radius - 0.8, radius - 0.5]), box, [1.5, 1.2], 0.02)
+    traced = Snell()(example_rays(), medium)
+    plain, _, _ = trace_interfaces(example_rays(), medium, 16)
+    assert torch.equal(traced.body, plain.body)
+    assert int(traced.body.max()) == 2
+    middle = 0.5 * (traced.positions[:, :-1] + traced.positions[:, 1:]).norm(dim=-1)
+    clear = (traced.s.diff(dim=1) > 1e-3) & ((middle - 0.8).abs() > 0.02) & ((middle - 0.5).abs() > 0.02)
+    expected = (middle < 0.8).int() + (middle < 0.5).int()
+    assert torch.equal(traced.body[:, :-1][clear].int(), expected[clear])
+
+
+def test_exits_begin_where_the_last_straight_run_does() -> None:
+    path = example_path()
+    exits = path.exits()
+    straight = ~path.refracted
+    torch.testing.assert_close(exits.positions[straight], path.positions[straight, 0])
+    on_ball = exits.positions[path.refracted].norm(dim=-1)
+    torch.testing.assert_close(on_ball, torch.full_like(on_ball, 0.8))
+    assert torch.equal(exits.directions, path.exit_directions)
+
+
+# --- linear radiance ---
+
+
+def test_a_pixel_is_the_encoded_mean_of_radiance_not_the_mean_of_its_code() -> None:
+    batch = replace(example_batch(), num_whole=0, rays_per_pixel=NUM_RAYS)
+    radiance = torch.zeros(NUM_RAYS, 3)
+    radiance[::2] = 1
+    assert float(to_srgb(batch.of_pixels(radiance))[0, 0]) == pytest.approx(0.7354, abs=1e-3)
+
+
+@pytest.mark.parametrize("suffix", [".hdr", ".exr"])
+def test_lamps_of_a_sky_survive_a_file_and_a_texture(tmp_path: FilePath, suffix: str) -> None:
+    if suffix == ".exr":
+        pytest.importorskip("mitsuba")
+    sky = torch.full((32, 64, 3), 0.02)
+    sky[8:16, 16:32] = torch.tensor([40.0, 25.0, 10.0])
+    lat_long.save_lat_long(tmp_path / f"sky{suffix}", sky)
+    # Radiance's mantissa of eight bits is shared by the channels.
+    torch.testing.assert_close(lat_long.load_lat_long(tmp_path / f"sky{suffix}"), sky, rtol=0.02, atol=1e-3)
+    boundary = EnvironmentMap([64], image=str(tmp_path / f"sky{suffix}"))
+    lamp = lat_long.directions(32)[12, 24]
+    torch.testing.assert_close(boundary(Exits(lamp[None]))[0], sky[12, 24], rtol=0.03, atol=0)
+    boundary.save_lat_long(tmp_path / f"again{suffix}", height=32)
+    assert lat_long.load_lat_long(tmp_path / f"again{suffix}").max() > 35
+
+
+def test_a_png_sky_is_decoded_and_encoded_again(tmp_path: FilePath) -> None:
+    levels = torch.linspace(0, 1, 64).expand(32, 64)[..., None].expand(-1, -1, 3)
+    lat_long.save_lat_long(tmp_path / "sky.png", to_linear(levels))
+    torch.testing.assert_close(to_srgb(lat_long.load_lat_long(tmp_path / "sky.png")), levels, rtol=0, atol=1 / 400)
+
+
+# --- what learns ---
+
+
+def test_all_that_learns_has_a_group_and_a_rate() -> None:
+    model = RefractiveModel(example_parts())
+    assert set(model.parameter_groups()) == {"fields"}
+    model.medium.index = torch.nn.Parameter(torch.tensor(1.5))
+    model.camera.shift = torch.nn.Parameter(torch.zeros(3))
+    groups = model.configure_optimizers().param_groups
+    assert [group["name"] for group in groups] == ["fields", "medium", "camera"]
+    assert sum(len(group["params"]) for group in groups) == len(list(model.parameters()))
+    assert model.paths_learn
+    with torch.no_grad():
+        assert not model.paths_learn
