@@ -18,12 +18,12 @@ from nerfro.types import Exits
 
 # Softplus of 0 is log 2.
 _GREY = 0.5 / math.log(2)
-_BLACK = 1e-4
+_BLACK = 1e-3
 
 
 @register("boundary", "envmap")
 class EnvironmentMap(Boundary):
-    """Softplus of a sum of cube maps, coarse to fine, so that coarse ones fill in where no ray has looked.
+    """Squared softplus of a sum of cube maps, coarse to fine, so that coarse ones fill in where no ray has looked.
 
     It starts as an even grey, or as the given picture. There is no preferred axis; lat-long pictures have z up.
 
@@ -77,11 +77,11 @@ class EnvironmentMap(Boundary):
 
 
 def _radiance(raw: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-    """Linear radiance: softplus, scaled to 0.5 at 0. Like a sigmoid where it is dark, without end above."""
-    return F.softplus(raw.float()) * _GREY
+    """Linear radiance: the square of a softplus that is 0.5 at 0; see `HashGridField` for why, without end above."""
+    return (F.softplus(raw.float()) * _GREY).square()
 
 
 def _raw(radiance: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
     """The inverse of `_radiance`; black is not quite reached."""
-    y = (radiance / _GREY).clamp(min=_BLACK)
+    y = (radiance.sqrt() / _GREY).clamp(min=_BLACK)
     return y + torch.log(-torch.expm1(-y))

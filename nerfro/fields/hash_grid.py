@@ -13,7 +13,7 @@ from nerfro.errors import NerfroError
 from nerfro.fields import hash_encoding
 from nerfro.fields import spherical_harmonics as harmonics
 from nerfro.fields.base import Field
-from nerfro.fields.mlp import padded_sigmoid
+from nerfro.fields.mlp import radiance
 from nerfro.fields.selection import evaluate_selected, inside_box
 from nerfro.registry import register
 from nerfro.types import Radiance, Samples
@@ -89,7 +89,7 @@ class HashGridField(Field):
         geometry = self.apply_mlp(self.density_mlp, self.encode(positions))
         raw = self.apply_mlp(self.colour_mlp, geometry, self.encode_directions(directions))
         density = self.initial_density * torch.exp(geometry[:, 0].float().clamp(max=_MAX_EXPONENT))
-        return density, padded_sigmoid(raw)
+        return density, radiance(raw)
 
     def encode(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P F"]:
         """Hash encoding in single precision, compiled on the CPU."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -11,6 +13,8 @@ from nerfro.errors import NerfroError
 
 # Colours reach a little beyond [0, 1], so that black and white need no infinite activation (mip-NeRF's code).
 RGB_PADDING = 1e-3
+# The squared sigmoid of this is 1 / 240 in sRGB.
+_BLACK = -4.0
 
 
 class SkipMLP(nn.Module):
@@ -94,3 +98,26 @@ def glorot_linear(num_inputs: int, num_outputs: int) -> nn.Linear:
 def padded_sigmoid(raw: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """Sigmoid stretched to [-0.001, 1.001], in single precision."""
     return torch.sigmoid(raw.float()) * (1 + 2 * RGB_PADDING) - RGB_PADDING
+
+
+def radiance(raw: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Linear radiance in [0, 1]: a squared sigmoid, for pictures store about the root of radiance.
+
+    Thin fog before a bright sky is soonest explained by black, and a sigmoid that was driven far down would never come
+    back: below `_BLACK`, a pixel's last level above 0, nothing drives it on.
+    """
+    return torch.sigmoid(_HeldBack.apply(raw.float())).square()
+
+
+class _HeldBack(torch.autograd.Function):
+    """The identity, cut off at `_BLACK`; there it passes the gradients alone that lead back."""
+
+    @staticmethod
+    def forward(ctx: Any, raw: Tensor) -> Tensor:
+        ctx.save_for_backward(raw)
+        return raw.clamp(min=_BLACK)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (raw,) = ctx.saved_tensors
+        return torch.where((raw < _BLACK) & (gradient > 0), 0.0, gradient)

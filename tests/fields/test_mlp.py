@@ -9,8 +9,17 @@ import torch
 
 from nerfro.errors import NerfroError
 from nerfro.fields.mip_nerf import MipNerfField
-from nerfro.fields.mlp import RGB_PADDING, RadianceMLP, SkipMLP, compile_networks, glorot_linear, padded_sigmoid
+from nerfro.fields.mlp import (
+    RGB_PADDING,
+    RadianceMLP,
+    SkipMLP,
+    compile_networks,
+    glorot_linear,
+    padded_sigmoid,
+    radiance,
+)
 from nerfro.fields.nerf import NerfField
+from nerfro.light import to_srgb
 from nerfro.samplers.stratified import Stratified
 from nerfro.testing import example_path, example_samples
 
@@ -141,3 +150,14 @@ def test_compiled_networks_equal_plain_ones_and_keep_their_weights_names() -> No
 def test_unknown_backend_of_the_compiler_is_refused() -> None:
     with pytest.raises(NerfroError, match=r"compile=cuda is no backend of torch.compile here; there are .*inductor"):
         compile_networks(NerfField(width=4, depth=1, skip=1, view_width=4), "cuda")
+
+
+def test_radiance_that_was_driven_below_black_comes_back_and_is_not_driven_on() -> None:
+    raw = torch.tensor([-50.0, -50.0, 0.3], requires_grad=True)
+    (gradient,) = torch.autograd.grad((radiance(raw) * torch.tensor([-1.0, 1.0, 1.0])).sum(), raw)
+    brighter, darker, ordinary = gradient
+    assert brighter < 0
+    assert darker == 0
+    sigma = torch.sigmoid(torch.tensor(0.3))
+    torch.testing.assert_close(ordinary, 2 * sigma.square() * (1 - sigma))
+    assert to_srgb(radiance(raw))[0] * 255 < 1.1
