@@ -2,7 +2,10 @@
 
 Written out here because torchmetrics and lpips both take the networks from torchvision, whose published builds do not
 load beside a CPU build of torch. The linear heads are the published ones, under lpips' licence beside them; the values
-are those of both packages. Source: Zhang et al., "The unreasonable effectiveness of deep features as a perceptual metric", CVPR 2018.
+are those of both packages.
+
+Source:
+    Zhang et al., "The unreasonable effectiveness of deep features as a perceptual metric", CVPR 2018.
 """
 
 from __future__ import annotations
@@ -21,7 +24,6 @@ from nerfro.errors import NerfroError
 from nerfro.evaluation.pretrained import ALEXNET, VGG16, Published, load_weights
 from nerfro.evaluation.regions import mean_over
 from nerfro.paths import ASSETS_DIR
-
 
 _HEADS = ASSETS_DIR / "_lpips/heads.npz"  # alex<l> and vgg<l>, lpips v0.1
 
