@@ -29,6 +29,7 @@ from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.light import to_linear
+from nerfro.paths import user_path
 
 _TARGETS, _BOARDS, _LENSES = (
     ("apriltag", "charuco", "colmap"),
@@ -91,13 +92,13 @@ class CalibrateConfig:
 def main(config: DictConfig) -> None:
     """Find the target, estimate, write the data set, and say what to do next."""
     given = _check(config)
-    out = Path(config.out).expanduser()
+    out = user_path(config.out)
     target = None if config.target == "colmap" else make_target(config)
     if config.write_board:
         _write_board(config, target, out)
         if config.images is None:
             return
-    images, size = _list_photographs(Path(config.images).expanduser())
+    images, size = _list_photographs(user_path(config.images))
     # Where the loader of the data set will look for them.
     masks = [find_mask(out, out / _relative(image, out)) for image in images]
     names = [*(f"transforms_{split}.json" for split in _SPLITS), _REPORT, _PLOT]
@@ -226,7 +227,7 @@ def _find_model(
 ) -> Path:
     """The folder of the COLMAP model, which is made where there is none."""
     if config.model is not None:
-        return Path(config.model).expanduser()
+        return user_path(config.model)
     folder = images[0].parent
     for candidate in (root / name for root in (folder.parent, folder) for name in _MODEL_FOLDERS):
         if any((candidate / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):

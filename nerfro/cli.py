@@ -6,13 +6,15 @@ import contextlib
 import functools
 import os
 import re
+import shlex
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import hydra
+import yaml
 from hydra.core.config_store import ConfigStore
-from hydra.errors import HydraException
+from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
@@ -21,6 +23,7 @@ from nerfro.paths import CONF_DIR
 from nerfro.registry import discover, fields_of_config
 
 EXIT_INTERRUPTED = 130
+EXIT_BROKEN_PIPE = 141  # as a shell tells of a program that SIGPIPE ended
 
 
 def entry_point(
@@ -61,6 +64,10 @@ def errors_in_one_line() -> Iterator[None]:
     """Tell a user's mistake in one line and exit with status 1; a bug keeps its traceback."""
     try:
         yield
+        sys.stdout.flush()
+    except BrokenPipeError:  # `| head` has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still to be flushed at exit
+        sys.exit(EXIT_BROKEN_PIPE)
     except KeyboardInterrupt:
         print("nerfro: interrupted", file=sys.stderr)
         sys.exit(EXIT_INTERRUPTED)
@@ -76,6 +83,12 @@ def in_one_line(error: Exception) -> str | None:
     """What to tell the user about a mistake of theirs; None for a bug."""
     if isinstance(error, NerfroError):
         return str(error)
+    if isinstance(error, OverrideParseException):
+        return _not_parsed(error.override)
+    if isinstance(error, yaml.YAMLError):
+        return " ".join(str(error).split())
+    if isinstance(error, MemoryError):
+        return f"not enough memory ({error}); take smaller sizes" if str(error) else "not enough memory"
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return " ".join(_messages(error))
     # Hydra's refusal of a group that is set to no option (field=null); any other ValueError is a bug.
@@ -84,6 +97,15 @@ def in_one_line(error: Exception) -> str | None:
     if isinstance(error, OSError):
         return f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}"
     return None
+
+
+def _not_parsed(override: str) -> str:
+    """What to tell about an override that Hydra's grammar does not allow."""
+    key, equals, value = override.partition("=")
+    if not equals or not key:
+        return f"{override} is no option; write key=value"
+    quoted = value if value[:1] in "\"'" else '"' + value.replace('"', '\\"') + '"'
+    return f"{override} cannot be read; quote the value for Hydra and for the shell: {shlex.quote(f'{key}={quoted}')}"
 
 
 def _messages(error: BaseException) -> list[str]:

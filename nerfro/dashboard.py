@@ -5,17 +5,22 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
+import re
+import shutil
+import socket
 import tempfile
 import time
 import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
 
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
+from nerfro.files.foreign_config import foreign_config
+from nerfro.paths import user_path
 from nerfro.training.sweeps import scene_name
 
 _LOGS = "tensorboard"  # the folder in a run folder, see conf/logger/tensorboard.yaml
@@ -35,7 +40,7 @@ class DashboardConfig:
 @entry_point("dashboard", DashboardConfig)
 def main(config: DictConfig) -> None:
     """Serve until Ctrl-C."""
-    outputs = Path(config.outputs).expanduser()
+    outputs = user_path(config.outputs)
     if not outputs.is_dir():
         raise NerfroError(f"outputs={outputs} is not a folder; give the one that holds the run folders")
     with tempfile.TemporaryDirectory(prefix="nerfro_dashboard_") as names:
@@ -53,11 +58,11 @@ def main(config: DictConfig) -> None:
 
 
 def link_runs(outputs: Path, names: Path) -> int:
-    """Make a link to the logs of every run: TensorBoard calls runs by their folders.
+    """Make a link to the logs of every run, or a copy where links are not allowed: TensorBoard calls runs by folders.
 
     Args:
         outputs: searched for run folders at any depth.
-        names: folder for the links; those that are there stay.
+        names: folder for the links; those that are there stay, and copies grow.
 
     Returns:
         Number of runs.
@@ -65,28 +70,56 @@ def link_runs(outputs: Path, names: Path) -> int:
     logs = sorted(path for path in outputs.rglob(_LOGS) if path.is_dir())
     for path in logs:
         link = names / run_name(path.parent, outputs)
-        if not link.is_symlink():
+        if link.is_symlink():
+            continue
+        try:
             link.parent.mkdir(parents=True, exist_ok=True)
-            link.symlink_to(path.resolve(), target_is_directory=True)
+            if not link.exists():
+                link.symlink_to(path.resolve(), target_is_directory=True)
+                continue
+        except OSError:  # Windows lets administrators alone make links
+            link.mkdir()
+        _copy_new(path, link)
     return len(logs)
+
+
+def _copy_new(logs: Path, copies: Path) -> None:
+    """Append to copies of files that only grow what they do not have yet."""
+    for path in logs.glob("events.*"):
+        with path.open("rb") as source, (copies / path.name).open("ab") as copy:
+            source.seek(copy.tell())
+            shutil.copyfileobj(source, copy)
 
 
 def run_name(folder: Path, outputs: Path) -> str:
     """`experiment/scene/` and what tells the run from others: where it lies in `outputs`, without what was said."""
     rest = folder.relative_to(outputs).parts
     try:
-        config = OmegaConf.load(folder / "config.yaml")
-        name, scene = str(config.name), scene_name(config.data.root)
-    except (OSError, OmegaConfBaseException, AttributeError):  # no run of ours, or one that is just being written
+        path = folder / "config.yaml"
+        config = foreign_config(path.read_text(encoding="utf-8"), path)
+        name, scene = _as_folder(config.name), _as_folder(scene_name(config.data.root))
+    # No run of ours, or one that is just being written.
+    except (OSError, UnicodeDecodeError, OmegaConfBaseException, AttributeError, NerfroError):
         return "/".join(rest) or folder.resolve().name
     said = {name, "sweeps"}
     return "/".join([name, scene, *(part.removeprefix(f"{name}-{scene}-") for part in rest if part not in said)])
+
+
+def _as_folder(name: str) -> str:
+    """A name from a run's file as that of one folder: it leads nowhere else."""
+    return re.sub(r"[^\w.=+-]+", "_", str(name)).strip(".") or "_"
 
 
 def _serve(logs: Path, host: str, port: int) -> str:
     from tensorboard import program
     from tensorboard.util import tb_logging
 
+    try:
+        socket.getaddrinfo(host, None)
+    except OSError as error:
+        raise NerfroError(f"host={host} is no address of this machine ({error.strerror}); try localhost") from error
+    if not 0 <= port < 2**16:
+        raise NerfroError(f"port={port} is no port; give 1 to {2**16 - 1}, or 0 for any that is free")
     # Its warning about reduced functions without TensorFlow; nothing here needs it.
     tb_logging.get_logger().setLevel(logging.ERROR)
     server = program.TensorBoard()

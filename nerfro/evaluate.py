@@ -28,6 +28,7 @@ from nerfro.evaluation.score_views import score_views
 from nerfro.evaluation.tables import to_rich, write_table
 from nerfro.files.atomic import refuse_existing
 from nerfro.models.base import NerfModel
+from nerfro.paths import user_path
 from nerfro.registry import build
 from nerfro.training.callbacks import Throughput
 from nerfro.training.config import build_model
@@ -84,7 +85,7 @@ def main(config: DictConfig) -> None:
 
 
 def _evaluate_checkpoint(config: DictConfig) -> Path:
-    path = Path(config.checkpoint).expanduser()
+    path = user_path(config.checkpoint)
     checkpoint, trained = load_checkpoint(path)
     folder = _free_folder(config, path.parent.parent / f"evaluate_{config.split}")
     if config.root is not None:
@@ -112,8 +113,8 @@ def _evaluate_checkpoint(config: DictConfig) -> Path:
 
 
 def _evaluate_folder(config: DictConfig) -> Path:
-    predictions, references = Path(config.predictions).expanduser(), Path(config.references).expanduser()
-    masks = None if config.masks is None else Path(config.masks).expanduser()
+    predictions, references = user_path(config.predictions), user_path(config.references)
+    masks = None if config.masks is None else user_path(config.masks)
     pairs = match_folders(predictions, references, masks)
     folder = _free_folder(config, predictions / "scores")
     device = _device(config.device)
@@ -153,7 +154,7 @@ def _require_one_task(config: DictConfig) -> None:
 
 
 def _free_folder(config: DictConfig, default: Path) -> Path:
-    folder = default if config.out is None else Path(config.out).expanduser()
+    folder = default if config.out is None else user_path(config.out)
     refuse_existing([folder / "metrics.json"], config.overwrite)
     return folder
 

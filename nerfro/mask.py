@@ -29,7 +29,7 @@ from nerfro.data.image_files import read_mask
 from nerfro.data.masks import masks_left_out
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
-from nerfro.paths import EMBEDDED_PREFIX
+from nerfro.paths import EMBEDDED_PREFIX, user_path
 from nerfro.registry import build
 
 _SHEET = "masks.png"
@@ -102,7 +102,7 @@ def read_outlines(given: object) -> dict[str, list]:
     if OmegaConf.is_config(given):
         given = OmegaConf.to_container(given)  # type: ignore[arg-type]
     if isinstance(given, str):
-        path = Path(given).expanduser()
+        path = user_path(given)
         try:
             given = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:

@@ -23,9 +23,25 @@ def resolve_path(location: str | Path) -> Path:
     """
     location = str(location)
     if not location.startswith(EMBEDDED_PREFIX):
-        return Path(location).expanduser()
+        return user_path(location)
     name = location.removeprefix(EMBEDDED_PREFIX)
-    if not (ASSETS_DIR / Path(name).parts[0]).is_dir():
-        known = ", ".join(sorted(p.name for p in ASSETS_DIR.iterdir() if p.is_dir() and not p.name.startswith("_")))
-        raise NerfroError(f"'{location}' is not embedded; embedded scenes: {known}; give a folder of your own instead")
+    known = sorted(path.name for path in ASSETS_DIR.iterdir() if path.is_dir() and not path.name.startswith("_"))
+    if not set(Path(name).parts[:1]) & set(known):
+        raise NerfroError(
+            f"'{location}' is not embedded; embedded scenes: {', '.join(known)}; give a folder of your own instead"
+        )
     return ASSETS_DIR / name
+
+
+def user_path(location: str | Path) -> Path:
+    """A path that a user gave, `~` and `~name` written out.
+
+    Raises:
+        NerfroError: it can be no path, or nobody is called that.
+    """
+    try:
+        if "\0" in str(location):
+            raise NerfroError(f"{str(location)!r} holds a zero byte, which no path can; give another")
+        return Path(location).expanduser()
+    except RuntimeError as error:
+        raise NerfroError(f"{location}: no home folder is known for it; write the path out") from error

@@ -34,7 +34,7 @@ from nerfro.errors import NerfroError, first_of
 from nerfro.evaluation.images import save_png
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
-from nerfro.paths import EMBEDDED_PREFIX, resolve_path
+from nerfro.paths import EMBEDDED_PREFIX, resolve_path, user_path
 from nerfro.registry import build
 
 _MESH, _SHEET, _REPORT = "mesh.ply", "overlays.png", "overlaps.json"
@@ -130,7 +130,7 @@ def _claim(config: DictConfig) -> Path:
         raise NerfroError(f"box_min={config.box_min}, box_max={config.box_max} is no box; give three numbers each")
     if config.out is None and str(config.data.root).startswith(EMBEDDED_PREFIX):
         raise NerfroError(f"data.root={config.data.root} ships with nerfro and is not written to; add out=FOLDER")
-    folder = resolve_path(config.data.root) if config.out is None else Path(config.out).expanduser()
+    folder = resolve_path(config.data.root) if config.out is None else user_path(config.out)
     names = [_SHEET, _REPORT] if config.mesh is not None else [_MESH, _SHEET, _REPORT]
     refuse_existing([folder / name for name in names], config.overwrite)
     return folder

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Optional
 
 import rich
@@ -14,6 +13,7 @@ from nerfro.errors import NerfroError
 from nerfro.evaluation.results import FULL, OBJECT_REGIONS
 from nerfro.evaluation.tables import to_rich, write_table
 from nerfro.files.atomic import refuse_existing, write_atomically
+from nerfro.paths import user_path
 from nerfro.report.comparison import compare, find_metrics, to_table
 from nerfro.report.page import report_page, table_page
 from nerfro.report.runs import find_runs
@@ -69,7 +69,7 @@ def main(config: DictConfig) -> None:
     tables = {c.budget.file_name: to_table(c, metrics, config.region) for c in comparisons}
 
     folder = "outputs/summary" if config.out is None and config.report else config.out
-    out = None if folder is None else Path(folder).expanduser()
+    out = None if folder is None else user_path(folder)
     if out is not None:
         names = [name + suffix for name in tables for suffix in (".csv", ".md", ".tex", ".html")]
         written = [*names, "report.html"] if config.report else names

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
-from nerfro.paths import CONF_DIR
+from nerfro.paths import CONF_DIR, user_path
 from nerfro.scenes import SCENES, dataset, photographs
 from nerfro.scenes.baking import bake
 from nerfro.scenes.path_tracer import PathTracer, Pinhole, load_mitsuba
@@ -88,7 +88,7 @@ def synthesize(config: DictConfig) -> tuple[Scene, Path]:
     """
     _check(config)
     scene = build_scene(config.scene, config.resolution)
-    folder = Path(config.out).expanduser()
+    folder = user_path(config.out)
     mitsuba = load_mitsuba(config.variant)  # before anything is cleared that could not be rendered again
     write = _photograph if config.scene in CAPTURES else _render_views
     write(config, scene, folder, mitsuba)

@@ -21,6 +21,7 @@ from nerfro.files.atomic import refuse_existing
 from nerfro.files.cache import load_arrays, save_arrays
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
+from nerfro.paths import user_path
 from nerfro.registry import build
 from nerfro.samplers.snell import Snell
 from nerfro.types import Path as RayPath
@@ -66,11 +67,11 @@ class TraceConfig:
 @entry_point("trace", TraceConfig)
 def main(config: DictConfig) -> None:
     """Read rays, trace them, write where they leave; whatever can be refused is refused before tracing starts."""
-    out = Path(config.out).expanduser()
+    out = user_path(config.out)
     if out.suffix != ".npz":
         raise NerfroError(f"out={out} must end in .npz, for that is what is written")
     refuse_existing([out, out.with_suffix(".png")] if config.plot else [out], config.overwrite)
-    origins, directions = _read_rays(Path(config.rays).expanduser())
+    origins, directions = _read_rays(user_path(config.rays))
     sampler = build(config.sampler.path)
     medium = build(config.medium)
     rays = make_rays(origins, directions, medium, config.near, config.far)

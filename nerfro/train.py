@@ -163,10 +163,13 @@ def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.
     if config.trainer.get("strategy") == "ddp":
         # The index grid is a buffer and would be sent around in every step, though all processes have the same one.
         ours["strategy"] = DDPStrategy(broadcast_buffers=False)
+    limit = config.trainer.get("max_time")
+    if isinstance(limit, (int, float)):
+        raise NerfroError(f"trainer.max_time={limit} has no unit; write DD:HH:MM:SS, such as 00:00:05:00")
     trainer = build(config.trainer, **ours)
     if trainer.world_size > 1 and HydraConfig.get().mode == RunMode.MULTIRUN:
         raise NerfroError("a sweep (-m) cannot use several devices; start its runs one by one")
-    if config.trainer.get("max_time") is None and trainer.max_steps < 0:
+    if limit is None and trainer.max_steps < 0:
         raise NerfroError("the run would never end; set trainer.max_time (DD:HH:MM:SS), trainer.max_steps, or both")
     return trainer
 

@@ -45,6 +45,41 @@ def test_runs_are_named_by_experiment_and_scene(outputs: Path, tmp_path: Path) -
     assert list((names / "nerf" / "star" / "late").glob("events.*"))
 
 
+def test_runs_are_shown_where_links_are_not_allowed(
+    outputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(1314, "A required privilege is not held by the client")
+
+    monkeypatch.setattr(Path, "symlink_to", refuse)
+    names = tmp_path / "names"
+    assert link_runs(outputs, names) == 2
+    copies = [path for path in names.rglob("events.*")]
+    assert sorted(path.parent.relative_to(names).as_posix() for path in copies) == NAMES
+    (source,) = (outputs / "sweeps").rglob("events.*")
+    (copy,) = (names / NAMES[0]).glob("events.*")
+    for more in (b"", b"more of a run that goes on"):
+        with source.open("ab") as log:
+            log.write(more)
+        link_runs(outputs, names)
+        assert copy.read_bytes() == source.read_bytes()
+
+
+@pytest.mark.parametrize("name", ["../../../evil", "/tmp/evil", "..", "a/b"])
+def test_a_runs_name_leads_nowhere_else(name: str, tmp_path: Path) -> None:
+    make_run(tmp_path / "outputs" / "run", name, "embedded:torus")
+    parts = run_name(tmp_path / "outputs" / "run", tmp_path / "outputs").split("/")
+    assert len(parts) == 3
+    assert not {"", ".", ".."} & set(parts)
+
+
+@pytest.mark.parametrize("content", ["name: [", "name: ${oc.env:HOME}\ndata: {root: a}", "- 1", "\xff"])
+def test_a_damaged_configuration_does_not_end_the_dashboard(content: str, outputs: Path) -> None:
+    folder = outputs / "sweeps" / "seeds" / "mipnerf-ship-seed1"
+    (folder / "config.yaml").write_bytes(content.encode("latin-1"))
+    assert run_name(folder, outputs) == "sweeps/seeds/mipnerf-ship-seed1"
+
+
 def test_logs_of_other_programs_keep_their_folder(tmp_path: Path) -> None:
     (tmp_path / "theirs" / "tensorboard").mkdir(parents=True)
     assert run_name(tmp_path / "theirs", tmp_path) == "theirs"
@@ -52,11 +87,21 @@ def test_logs_of_other_programs_keep_their_folder(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [(["outputs=nowhere"], "outputs=nowhere is not a folder"), (["prot=1"], "Key 'prot' not in 'DashboardConfig'")],
+    [
+        (["outputs=nowhere"], "outputs=nowhere is not a folder"),
+        (["prot=1"], "Key 'prot' not in 'DashboardConfig'"),
+        (["outputs=.", "port=-5"], "port=-5 is no port"),
+        (["outputs=.", "host=nosuchhost.invalid"], "host=nosuchhost.invalid is no address"),
+    ],
 )
 def test_refuses_in_one_line(
-    arguments: list[str], message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["nerfro.dashboard", "open=false", *arguments])
     with pytest.raises(SystemExit) as end:
         nerfro.dashboard.main()

@@ -207,7 +207,11 @@ def test_places_are_folders_and_globs_and_runs_without_scores_are_named(tmp_path
     [
         ("config.yaml", "name: a"),
         ("config.yaml", "{[: not yaml"),
+        ("config.yaml", ""),
         ("run.json", "{"),
+        ("run.json", "null"),
+        ("run.json", "{}"),
+        ("metrics.json", ""),
         ("metrics.json", "{}"),
         ("images/test_000.png", ""),
     ],

@@ -14,6 +14,7 @@ from scipy.ndimage import binary_closing, binary_fill_holes, label
 from nerfro.cameras import Cameras
 from nerfro.capture.targets import opencv
 from nerfro.capture.visual_hull import Silhouettes, find_box, nearest_point
+from nerfro.errors import NerfroError
 
 _ITERATIONS = 5
 # GrabCut sees the object and its surroundings in at most so many pixels along the longer side.
@@ -122,6 +123,9 @@ def propagate(
     Returns:
         Silhouettes of all views, and for each that was not given its overlap (intersection over union) with the hull of
         the others.
+
+    Raises:
+        NerfroError: no other view shows what the given silhouettes show.
     """
     masks = dict(done)
     hull = _Hull(cameras, masks)
@@ -137,6 +141,8 @@ def propagate(
         else:
             hull.add(view, masks[view])
         progress(count := count + 1)
+    if wanted and not any(masks[view].any() for view in wanted):
+        raise NerfroError("what is outlined is seen in no other image; draw the outline around the whole object")
     hull = _Hull(cameras, masks)
     refined, overlaps = {}, {}
     for view in wanted:
@@ -156,6 +162,7 @@ class _Hull:
 
     def __init__(self, cameras: Cameras, masks: Mapping[int, Bool[np.ndarray, "H W"]]) -> None:
         self.cameras = cameras
+        masks = {view: mask for view, mask in masks.items() if mask.any()}  # a view without the object says nothing
         box = _find_box(cameras, masks)
         self.centre = box.mean(0)
         axes = [torch.linspace(float(box[0][a]), float(box[1][a]), _GRID) for a in range(3)]
@@ -167,6 +174,8 @@ class _Hull:
             self.add(view, mask)
 
     def add(self, view: int, mask: Bool[np.ndarray, "H W"]) -> None:
+        if not mask.any():
+            return
         silhouettes = Silhouettes.of(_some(self.cameras, [view]), torch.from_numpy(mask[None]).float())
         inside, width, _ = silhouettes.depth_inside(0, self.points)
         # A little generous, for thin parts lie between the grid's points.
@@ -186,7 +195,7 @@ class _Hull:
         if len(depth) == 0:
             return region
         # The grid's points are drawn into pixels of a voxel's width, which then have no gaps.
-        step = max(1, int(np.ceil(self.voxel * float(camera.fx) / float(depth.min()))))
+        step = int(np.clip(np.ceil(self.voxel * float(camera.fx) / float(depth.min())), 1, max(region.shape)))
         coarse = np.zeros((-(-camera.height // step), -(-camera.width // step)), bool)
         column, row = (pixels / step).floor().long().T
         framed = (column >= 0) & (column < coarse.shape[1]) & (row >= 0) & (row < coarse.shape[0])

@@ -9,10 +9,12 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from nerfro.capture.targets import Sheet
+from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 
 _DOTS_PER_METRE = 300 / 0.0254
 _MARGIN = 0.008  # metres
+_WIDEST = 3.0  # metres
 
 
 def print_sheets(sheets: list[Sheet], folder: Path) -> list[Path]:
@@ -22,11 +24,18 @@ def print_sheets(sheets: list[Sheet], folder: Path) -> list[Path]:
 
     Returns:
         The files.
+
+    Raises:
+        NerfroError: a sheet is wider than any printer's.
     """
     pages, resolution = [], 0.0
     for sheet in sheets:
         # Whole pixels for each of the sheet's, so that its edges stay sharp and in place.
         width = float(np.linalg.norm(sheet.corners[1] - sheet.corners[0]))
+        if width > _WIDEST:
+            raise NerfroError(
+                f"a board {width:g} m wide is not printed; give size in metres, for at most {_WIDEST:g} in all"
+            )
         enlarged = max(1, round(width * _DOTS_PER_METRE / sheet.levels.shape[1]))
         levels = np.kron(sheet.levels, np.ones((enlarged, enlarged), np.uint8))
         per_metre = levels.shape[1] / width

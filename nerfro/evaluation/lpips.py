@@ -1,16 +1,20 @@
 """Learned perceptual image patch similarity (LPIPS v0.1) over the features of AlexNet or VGG-16.
 
 Written out here because torchmetrics and lpips both take the networks from torchvision, whose published builds do not
-load beside a CPU build of torch. The linear heads are those that torchmetrics carries; the values are those of both
-packages. Source: Zhang et al., "The unreasonable effectiveness of deep features as a perceptual metric", CVPR 2018.
+load beside a CPU build of torch. The linear heads are the published ones, under lpips' licence beside them; the values
+are those of both packages.
+
+Source:
+    Zhang et al., "The unreasonable effectiveness of deep features as a perceptual metric", CVPR 2018.
 """
 
 from __future__ import annotations
 
-from importlib.resources import as_file, files
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
@@ -19,6 +23,9 @@ from torch import Tensor, nn
 from nerfro.errors import NerfroError
 from nerfro.evaluation.pretrained import ALEXNET, VGG16, Published, load_weights
 from nerfro.evaluation.regions import mean_over
+from nerfro.paths import ASSETS_DIR
+
+_HEADS = ASSETS_DIR / "_lpips/heads.npz"  # alex<l> and vgg<l>, lpips v0.1
 
 
 class Convolution(NamedTuple):
@@ -39,7 +46,7 @@ class Backbone(NamedTuple):
 
     Attributes:
         published: where its weights are.
-        heads: file of torchmetrics with the linear heads.
+        heads: name of its linear heads in the file of published ones.
         min_size: pixels; in smaller pictures the last pooling has nothing left to pool.
         layers: its convolutions, in order.
     """
@@ -52,7 +59,7 @@ class Backbone(NamedTuple):
 
 ALEX = Backbone(
     ALEXNET,
-    "alex.pth",
+    "alex",
     31,
     (
         Convolution("features.0", 3, 64, kernel=11, stride=4, padding=2),
@@ -64,7 +71,7 @@ ALEX = Backbone(
 )
 VGG = Backbone(
     VGG16,
-    "vgg.pth",
+    "vgg",
     16,
     (
         Convolution("features.0", 3, 64, compared=False),
@@ -95,13 +102,13 @@ class LpipsNetwork(nn.Module):
     shift: Tensor
     scale: Tensor
 
-    def __init__(self, backbone: Backbone, weights: dict[str, Tensor], heads: dict[str, Tensor]) -> None:
+    def __init__(self, backbone: Backbone, weights: dict[str, Tensor], heads: Sequence[Float[Tensor, "C"]]) -> None:
         """Take the weights.
 
         Args:
             backbone: which network.
             weights: its state dict, `features.<i>.weight` and `features.<i>.bias`.
-            heads: weights of the linear heads, `lin<l>.model.1.weight`, each [1, channels, 1, 1].
+            heads: weights of the linear heads, one for each layer that is compared.
 
         Raises:
             NerfroError: if a weight is missing or of another shape.
@@ -112,8 +119,8 @@ class LpipsNetwork(nn.Module):
             shape = (layer.channels, layer.channels_in, layer.kernel, layer.kernel)
             self._take(f"kernel{i}", weights, f"{layer.key}.weight", shape)
             self._take(f"bias{i}", weights, f"{layer.key}.bias", (layer.channels,))
-        for i, layer in enumerate(layer for layer in backbone.layers if layer.compared):
-            self._take(f"head{i}", heads, f"lin{i}.model.1.weight", (1, layer.channels, 1, 1))
+        for i, head in enumerate(heads):
+            self.register_buffer(f"head{i}", head.view(1, -1, 1, 1), persistent=False)
         # The colours of ImageNet, for inputs in [-1, 1].
         self.register_buffer("shift", torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("scale", torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1), persistent=False)
@@ -213,8 +220,9 @@ def load_lpips_network(backbone: Backbone, path: Path | str | None = None, downl
     Raises:
         NerfroError: if the weights cannot be had, or are another network's.
     """
-    with as_file(files("torchmetrics") / "functional/image/lpips_models" / backbone.heads) as heads_file:
-        heads = torch.load(heads_file, map_location="cpu", weights_only=True)
+    with np.load(_HEADS, allow_pickle=False) as file:
+        layers = range(sum(layer.compared for layer in backbone.layers))
+        heads = [torch.from_numpy(file[f"{backbone.heads}{i}"]) for i in layers]
     return LpipsNetwork(backbone, load_weights(backbone.published, path, download), heads)
 
 

@@ -234,7 +234,7 @@ class ImageMetrics(torchmetrics.Metric):
         if metric.startswith("lpips") and metric not in self.lpips_networks:
             return self.reasons.get(metric, "no network was given")
         where = {FULL: "pictures", "mask": "pictures or masks", "crop": "crops"}[region]
-        return f"{where} smaller than the {self.min_sizes[metric]} pixels that it needs"
+        return f"{where} below {self.min_sizes[metric]} pixels"
 
 
 def _named(scores: Sequence[float]) -> dict[str, Score]:

@@ -63,12 +63,12 @@ def load_weights(published: Published, path: Path | str | None = None, download:
         return _read(Path(path), title)
     cached = Path(torch.hub.get_dir()) / "checkpoints" / url.rsplit("/", 1)[-1]
     if not cached.is_file():
-        by_hand = f"put {url} there by hand"
+        by_hand = f"put {url} at {cached} by hand"
         if not download:
-            raise NerfroError(f"no {title} weights at {cached}; {by_hand}")
+            raise NerfroError(f"no weights; {title}'s are not in torch's cache: {by_hand}")
         reason = unreachable(url)
         if reason:
-            raise NerfroError(f"no {title} weights at {cached}, and no network ({reason}); {by_hand}")
+            raise NerfroError(f"no weights; {title}'s are not in torch's cache, and no network ({reason}): {by_hand}")
         try:
             with _socket_timeout(STALL_SECONDS):
                 return torch.hub.load_state_dict_from_url(url, map_location="cpu", check_hash=True, weights_only=True)

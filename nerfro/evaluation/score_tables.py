@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from nerfro.evaluation.results import FULL, METRICS, EvaluationResult, Region
+from collections.abc import Mapping, Sequence
+
+from nerfro.evaluation.results import FULL, METRICS, EvaluationResult, Region, Score
 from nerfro.evaluation.tables import MISSING, Column, Row, Table
+
+_Scores = Sequence[tuple[str, Mapping[str, Score]]]
 
 
 def views_table(result: EvaluationResult, title: str, region: Region = FULL) -> Table:
@@ -15,42 +19,54 @@ def views_table(result: EvaluationResult, title: str, region: Region = FULL) -> 
         region: which part of the pictures.
 
     Returns:
-        A row for each view, with a footnote for each metric that is missing.
+        A row for each view, a column for each metric that a view has, and below in one line why others are missing.
     """
-    rows = tuple(Row(view.name, tuple(view.score(m.name, region) for m in METRICS)) for view in result.views)
-    mean = Row("mean", tuple(result.means_of(region).values()))
-    return Table(title, "view", _columns(), rows, summary=(mean,), notes=tuple(_footnotes(result, region).values()))
+    scores = [(view.name, {m.name: view.score(m.name, region) for m in METRICS}) for view in result.views]
+    notes = [_mask_note(result) if region != FULL else "", _missing(result, region)]
+    return _table(title, "view", scores, [("mean", result.means_of(region))], notes)
 
 
 def regions_table(result: EvaluationResult, title: str) -> Table:
-    """The mean scores of each region, with footnotes for what is missing in one of them for another reason than in all.
+    """The mean scores of each region, to stand below `views_table`: what is missing in all of them was told there.
 
     Args:
         result: what an evaluation found.
         title: heading of the table.
     """
-    rows = tuple(Row(region, tuple(result.means_of(region).values())) for region in result.regions)
-    told = _footnotes(result, FULL)
-    notes = [
-        f"{region}: {note}" if region != FULL and key != "mask" else note
-        for region in result.regions
-        for key, note in _footnotes(result, region).items()
-        if region == FULL or told.get(key) != note
-    ]
-    return Table(title, "region", _columns(), rows, notes=tuple(dict.fromkeys(notes)))
+    scores = [(region, result.means_of(region)) for region in result.regions]
+    told = _missing(result, FULL)
+    missing = {region: _missing(result, region) for region in result.regions}
+    notes = [f"{region}: {note}" for region, note in missing.items() if note and note != told]
+    return _table(title, "region", scores, [], [_mask_note(result), *notes])
 
 
-def _columns() -> tuple[Column, ...]:
-    return tuple(Column(metric.title, metric.better, metric.decimals) for metric in METRICS)
+def short(reason: str) -> str:
+    """A reason without the remedy behind its semicolon, which `metrics.json` keeps."""
+    return reason.partition(";")[0]
 
 
-def _footnotes(result: EvaluationResult, region: Region) -> dict[str, str]:
-    """Why something is missing in a region, by the metric's name, or `mask` for views that lack the region."""
-    notes = {}
-    if region != FULL and "mask" in result.notes:
-        notes["mask"] = f"Mask and crop {MISSING}: {result.notes['mask']}"
+def _table(title: str, label: str, rows: _Scores, summary: _Scores, notes: Sequence[str]) -> Table:
+    """A table of the metrics that any row has; of all where none has one."""
+    kept = [m for m in METRICS if any(scores[m.name] is not None for _, scores in rows)] or list(METRICS)
+    body, foot = (
+        tuple(Row(name, tuple(scores[metric.name] for metric in kept)) for name, scores in part)
+        for part in (rows, summary)
+    )
+    columns = tuple(Column(metric.title, metric.better, metric.decimals) for metric in kept)
+    return Table(title, label, columns, body, summary=foot, notes=tuple(note for note in notes if note))
+
+
+def _mask_note(result: EvaluationResult) -> str:
+    """Why views lack both regions of the object."""
+    return f"Mask and crop {MISSING}: {result.notes['mask']}" if "mask" in result.notes else ""
+
+
+def _missing(result: EvaluationResult, region: Region) -> str:
+    """In one line, which metrics are missing in a region and why."""
+    by_reason: dict[str, list[str]] = {}
     for metric in METRICS:
-        key = metric.name if region == FULL else f"{region}.{metric.name}"
-        if key in result.notes:
-            notes[metric.name] = f"{metric.title} {MISSING}: {result.notes[key]}"
-    return notes
+        reason = result.notes.get(metric.name if region == FULL else f"{region}.{metric.name}")
+        if reason is not None:
+            by_reason.setdefault(short(reason), []).append(metric.title)
+    told = ", ".join(f"{', '.join(titles)} ({reason})" for reason, titles in by_reason.items())
+    return f"{MISSING}: {told}" if told else ""

@@ -42,6 +42,9 @@ class TriangleMesh:
         return bool((uses % 2 == 0).all())
 
 
+_THINNEST = 1e-4  # world units; boxes are kept to six decimals
+
+
 def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
     """Read a triangle mesh and merge its duplicate vertices.
 
@@ -68,6 +71,14 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
         raise NerfroError(f"mesh {path} has no triangles; export a surface, not a point cloud or a scene without one")
     if not np.isfinite(vertices).all():
         raise NerfroError(f"mesh {path} has vertices that are not finite; export it again")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise NerfroError(f"mesh {path} has triangles of vertices that it lacks; export it again")
+    extent = float(np.ptp(vertices, axis=0).min())
+    if extent < _THINNEST:
+        raise NerfroError(
+            f"mesh {path} is {extent:g} world units thin, so it has no inside; "
+            "export a solid, and scale cameras and mesh so that it is about one unit wide"
+        )
     # trimesh computes normals on demand; in its cache before anybody asked are only those that were read.
     read = loaded.vertex_normals if "vertex_normals" in loaded._cache else None
     mesh = merge_vertices(vertices, faces, None if read is None else _unit(np.asarray(read, np.float64))[faces])

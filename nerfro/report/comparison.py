@@ -9,6 +9,7 @@ from typing import Any
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation.results import FULL, METRICS, Metric, Region
+from nerfro.evaluation.score_tables import short
 from nerfro.evaluation.tables import MISSING, Column, Row, Table
 from nerfro.report.runs import Budget, Run, Scored, shown
 from nerfro.training.run_folder import flatten
@@ -100,7 +101,7 @@ def to_table(comparison: Comparison, metrics: Sequence[Metric], region: Region) 
         ]
         rows.append(Row(method, tuple(mean for mean, _ in cells), tuple(spread for _, spread in cells)))
     notes += dict.fromkeys(
-        f"{metric.title} {MISSING}: {reason}"
+        f"{metric.title} {MISSING}: {short(reason)}"
         for run in comparison.runs
         for metric in metrics
         if (reason := _reason(run, metric.name, region))

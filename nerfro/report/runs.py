@@ -11,15 +11,17 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from PIL import Image
 
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, first_of
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
-from nerfro.paths import EMBEDDED_PREFIX
+from nerfro.files.foreign_config import foreign_config
+from nerfro.paths import EMBEDDED_PREFIX, user_path
 from nerfro.training.sweeps import CELL_FILE, scene_name
+
+_FACTS = {"command", "machine", "python", "threads", "versions"}  # of run.json
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,8 @@ class Run:
 
     Attributes:
         folder: where it lies.
+        name: of its experiment.
+        seed: of its random draws.
         config: its resolved configuration.
         facts: its run.json: command, commit, versions and machine.
         metrics: scores and what was spent.
@@ -94,20 +98,14 @@ class Run:
     """
 
     folder: Path
+    name: str
+    seed: int
     config: Mapping[str, Any]
     facts: Mapping[str, Any]
     metrics: RunMetrics
     budget: Budget
     scored: Scored
     evaluated_at: float
-
-    @property
-    def name(self) -> str:
-        return str(self.config["name"])
-
-    @property
-    def seed(self) -> int:
-        return int(self.config["seed"])
 
 
 def find_runs(places: Sequence[str]) -> tuple[list[Run], list[str]]:
@@ -124,7 +122,7 @@ def find_runs(places: Sequence[str]) -> tuple[list[Run], list[str]]:
     """
     folders: set[Path] = set()
     for place in places:
-        matches = [Path(match) for match in glob.glob(str(Path(place).expanduser()), recursive=True)]
+        matches = [Path(match) for match in glob.glob(str(user_path(place)), recursive=True)]
         if not matches:
             raise NerfroError(f"runs: {place} does not exist; give run folders, folders that hold some, or globs")
         # A cell of a sweep that failed early has nothing but the record of its failure.
@@ -159,8 +157,12 @@ def read_run(folder: Path) -> Run:
     """
     metrics = read_metrics_json(folder / "metrics.json")
     try:
-        config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"), resolve=True)
+        text = (folder / "config.yaml").read_text(encoding="utf-8")
+        config: Any = OmegaConf.to_container(foreign_config(text, folder / "config.yaml"))
         facts = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+        absent = _FACTS - facts.keys()
+        if absent:
+            raise NerfroError(f"{folder / 'run.json'} lacks {first_of(sorted(absent))}; leave the run out")
         data, trainer = config["data"], config["trainer"]
         view = metrics.result.views[0].name
         with Image.open(folder / "images" / f"{view}.png") as image:
@@ -168,6 +170,8 @@ def read_run(folder: Path) -> Run:
         reading = sorted((key, str(value)) for key, value in data.items() if key not in ("root", "near", "far"))
         return Run(
             folder=folder,
+            name=str(config["name"]),
+            seed=int(config["seed"]),
             config=config,
             facts=facts,
             metrics=metrics,
@@ -188,7 +192,6 @@ def read_run(folder: Path) -> Run:
         raise NerfroError(f"the run {shown(folder)} cannot be read: {reason}; repair it or leave it out") from error
     except (
         OmegaConfBaseException,
-        yaml.YAMLError,
         KeyError,
         IndexError,
         TypeError,
@@ -238,4 +241,4 @@ def _budget(trainer: Mapping[str, Any], rays: int, facts: Mapping[str, Any]) -> 
 
 
 def _root(root: str) -> str:
-    return root if root.startswith(EMBEDDED_PREFIX) else str(Path(root).expanduser().resolve())
+    return root if root.startswith(EMBEDDED_PREFIX) else str(user_path(root).resolve())

@@ -57,6 +57,9 @@ class Throughput(Callback):
         self.num_rays, self.seconds = state_dict["num_rays"], state_dict["seconds"]
 
 
+_FORM = "{desc} {percentage:3.0f}%|{bar}| "
+
+
 class TrainingProgress(ProgressBar):
     """One line with the share of the budget (steps or time) that is spent, the ETA, rays/s and the batch's PSNR."""
 
@@ -74,8 +77,7 @@ class TrainingProgress(ProgressBar):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._begun, self._begun_at = time.perf_counter(), training_progress(trainer)
-        form = "{desc} {percentage:3.0f}%|{bar}| {postfix}"
-        self._bar = tqdm(total=1.0, desc="train", bar_format=form, dynamic_ncols=True, disable=not self._enabled)
+        self._bar = tqdm(total=1.0, desc="train", bar_format=_FORM, dynamic_ncols=True, disable=not self._enabled)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
@@ -89,11 +91,13 @@ class TrainingProgress(ProgressBar):
         eta = tqdm.format_interval((1 - done) / rate) if rate > 0 else "?"
         shown = {name: float(value) for name, value in trainer.callback_metrics.items()}
         self._bar.n = done
-        self._bar.set_postfix_str(
+        # Not tqdm's postfix, which is always led by a comma.
+        self._bar.bar_format = _FORM + (
             f"step {trainer.global_step} ETA {eta} {shown.get('train/rays_per_second', 0):,.0f} rays/s "
             f"train PSNR {shown.get('train/psnr', float('nan')):.2f}"
             + (f" val PSNR {shown['val/psnr']:.2f}" if "val/psnr" in shown else "")
         )
+        self._bar.refresh()
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._bar is not None:

@@ -19,7 +19,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
-from nerfro.paths import PACKAGE_DIR
+from nerfro.files.foreign_config import foreign_config
+from nerfro.paths import PACKAGE_DIR, user_path
 
 LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
 _PACKAGES = ("nerfro", "torch", "lightning", "hydra-core", "torchmetrics", "numpy", "numba", "trimesh")
@@ -79,7 +80,7 @@ def find_checkpoint(ckpt_path: str | None, folder: Path) -> Path | None:
     if ckpt_path is None:
         return None
     if ckpt_path != "last":
-        path = Path(ckpt_path).expanduser()
+        path = user_path(ckpt_path)
         if not path.is_file():
             raise NerfroError(f"checkpoint {path} does not exist; give a .ckpt file or ckpt_path=last")
         return path
@@ -101,13 +102,15 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], DictConfig]:
     """
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        config = OmegaConf.create(checkpoint["nerfro_config"])
+        config = foreign_config(checkpoint["nerfro_config"], path)
+    except NerfroError:
+        raise
     except FileNotFoundError as error:
         raise NerfroError(f"checkpoint {path} does not exist; it is usually RUN/{LAST_CHECKPOINT}") from error
     except Exception as error:  # torch.load raises nearly anything on a damaged file
         reason = str(error).strip().split("\n", 1)[0]
         raise NerfroError(f"{path} is not a readable nerfro checkpoint ({type(error).__name__}: {reason})") from error
-    return checkpoint, config  # type: ignore[return-value]
+    return checkpoint, config
 
 
 def require_same_configuration(path: Path, trained: DictConfig, wanted: DictConfig) -> None:

@@ -134,6 +134,18 @@ def test_a_rough_polygon_from_a_file(tmp_path: Path, photographs: list) -> None:
     assert overlap(grab(picture, likely, possible), mask) > 0.95
 
 
+@pytest.mark.parametrize("rows", [slice(0, 12), slice(60, 72)])
+@pytest.mark.parametrize("columns", [slice(0, 12), slice(84, 96)])
+def test_a_mask_in_the_corner_is_told_in_one_line(
+    rows: slice, columns: slice, capture: Path, command: Callable[..., str]
+) -> None:
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[rows, columns] = 255
+    Image.fromarray(mask).save(capture / "photos" / "mask_p_1.png")
+    printed = command("mask", f"data.root={capture}")
+    assert "is seen in no other image; draw the outline around the whole object" in printed or "look at it" in printed
+
+
 def test_mistakes_are_told_in_one_line(capture: Path, command: Callable[..., str]) -> None:
     root = f"data.root={capture}"
     assert "no mask to start from" in command("mask", root)

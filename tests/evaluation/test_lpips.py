@@ -1,3 +1,4 @@
+import builtins
 import functools
 import importlib.util
 import subprocess
@@ -14,6 +15,7 @@ from nerfro.errors import NerfroError
 from nerfro.evaluation import pretrained
 from nerfro.evaluation.lpips import ALEX, VGG, Backbone, LpipsNetwork, find_lpips_networks, load_lpips_network
 from nerfro.evaluation.metrics import MeanOverPictures
+from nerfro.paths import ASSETS_DIR
 
 
 class Reference(NamedTuple):
@@ -110,6 +112,29 @@ def test_distance_map_is_that_of_lpips(reference: Reference) -> None:
         torch.testing.assert_close(reference.network.distance_map(prediction, target), expected, atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize("backbone", [ALEX, VGG])
+def test_heads_are_the_published_ones_to_the_last_bit(backbone: Backbone, tmp_path: Path) -> None:
+    installed = importlib.util.find_spec("lpips")
+    if installed is None or installed.origin is None:
+        pytest.skip("lpips is not installed; pip install --no-deps lpips")
+    file = Path(installed.origin).with_name("weights") / "v0.1" / f"{backbone.heads}.pth"
+    published = torch.load(file, map_location="cpu", weights_only=True)
+    torch.save(random_weights(backbone), tmp_path / "weights.pth")
+    network = load_lpips_network(backbone, tmp_path / "weights.pth")
+    assert len(published) == 5
+    for i in range(5):
+        assert torch.equal(network.get_buffer(f"head{i}"), published[f"lin{i}.model.1.weight"])
+
+
+def test_heads_are_read_from_no_other_package(backbone_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened, really_open = [], open
+    monkeypatch.setattr(
+        builtins, "open", lambda file, *a, **k: (opened.append(str(file)), really_open(file, *a, **k))[1]
+    )
+    load_lpips_network(ALEX, backbone_file)
+    assert {Path(file) for file in opened} == {backbone_file, ASSETS_DIR / "_lpips" / "heads.npz"}
+
+
 def test_equal_pictures_have_distance_zero(network: LpipsNetwork) -> None:
     picture = torch.rand(40, 50, 3)
     assert network(picture, picture).item() == 0
@@ -166,7 +191,8 @@ def test_missing_networks_are_reported_with_the_reason(tmp_path: Path, monkeypat
     assert networks == {}
     assert reasons.keys() == {"lpips", "lpips_vgg"}
     for name, title in (("lpips", "AlexNet"), ("lpips_vgg", "VGG-16")):
-        assert f"no {title} weights at {tmp_path}" in reasons[name]
+        assert reasons[name].startswith(f"no weights; {title}'s are not in torch's cache")
+        assert f" at {tmp_path}" in reasons[name]
         assert "\n" not in reasons[name]
 
 

@@ -129,7 +129,7 @@ def test_every_region_has_the_scores_of_its_pixels() -> None:
             else:
                 assert result.mean(name, region) == pytest.approx(function(*compared).item(), abs=1e-6), (name, region)
     assert len({result.mean("psnr", region) for region in regions}) == 3
-    assert result.notes["crop.ms_ssim"] == "crops smaller than the 161 pixels that it needs"
+    assert result.notes["crop.ms_ssim"] == "crops below 161 pixels"
 
 
 def test_views_without_the_object_have_the_full_image_only() -> None:
@@ -170,8 +170,8 @@ def test_missing_metrics_are_none_with_a_reason() -> None:
     assert [row.scores["ssim"] is None for row in result.views] == [False, True]
     assert result.mean("ssim") is None
     assert result.notes == {
-        "ssim": "pictures smaller than the 11 pixels that it needs",
-        "ms_ssim": "pictures smaller than the 161 pixels that it needs",
+        "ssim": "pictures below 11 pixels",
+        "ms_ssim": "pictures below 161 pixels",
         "lpips": "no cable",
         "lpips_vgg": "no file",
     }

@@ -1,3 +1,10 @@
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerfro.evaluation.lpips import find_lpips_networks
+from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import METRICS, EvaluationResult, ViewScores
 from nerfro.evaluation.score_tables import regions_table, views_table
 from nerfro.evaluation.tables import Row
@@ -9,7 +16,7 @@ def scores(psnr: float | None) -> dict[str, float | None]:
 
 
 def line(label: str, psnr: float) -> Row:
-    return Row(label, tuple({"psnr": psnr, "flip": 0.5}.get(metric.name) for metric in METRICS))
+    return Row(label, (psnr, 0.5))
 
 
 FULL_ONLY = EvaluationResult(
@@ -23,26 +30,46 @@ REGIONS = EvaluationResult(
 
 def test_views_table_has_a_row_for_each_view_and_their_mean() -> None:
     table = views_table(FULL_ONLY, "test views")
-    assert [column.title for column in table.columns] == ["PSNR", "SSIM", "MS-SSIM", "LPIPS", "LPIPS-VGG", "FLIP"]
+    assert [column.title for column in table.columns] == ["PSNR", "FLIP"], "no column without a number"
     assert table.rows == (line("test_000", 20.0), line("test_001", 21.0))
     assert table.summary == (line("mean", 20.5),)
-    assert table.notes == ("LPIPS n/a: no network",)
+    assert table.notes == ("n/a: LPIPS (no network)",)
 
 
 def test_views_table_of_a_region_has_its_numbers_and_reasons() -> None:
     table = views_table(REGIONS, "test views", "crop")
     assert table.rows == (line("r_0", 15.0), line("r_1", 16.0))
-    assert table.notes == ("MS-SSIM n/a: crops too small", "LPIPS n/a: no network")
+    assert table.notes == ("n/a: MS-SSIM (crops too small), LPIPS (no network)",)
 
 
-def test_regions_table_has_their_means_and_gives_each_reason_once() -> None:
+def test_regions_table_has_their_means_and_what_the_views_did_not_tell() -> None:
     table = regions_table(REGIONS, "means")
     assert table.rows == (line("full", 20.5), line("mask", 10.0), line("crop", 15.5))
-    assert table.notes == ("LPIPS n/a: no network", "crop: MS-SSIM n/a: crops too small")
+    assert table.notes == ("crop: n/a: MS-SSIM (crops too small), LPIPS (no network)",)
+
+
+def test_a_first_run_without_networks_tells_why_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    metrics = ImageMetrics({}, find_lpips_networks(download=False)[1])
+    metrics.update(torch.rand(128, 128, 3), torch.rand(128, 128, 3), coverage=torch.ones(128, 128))
+    result = metrics.result()
+    for table in (views_table(result, "t"), regions_table(result, "t")):
+        assert all(any(row.values[j] is not None for row in table.rows) for j in range(len(table.columns)))
+    (note,) = views_table(result, "t").notes
+    assert note == "n/a: MS-SSIM (pictures below 161 pixels), LPIPS, LPIPS-VGG (no weights)"
+    assert len(note) <= 80
+    assert "https://download.pytorch.org/models/alexnet" in result.notes["lpips"]
+
+
+def test_a_column_with_some_numbers_stays() -> None:
+    views = (ViewScores("a", {**scores(20.0), "ssim": 0.5}), ViewScores("b", scores(21.0)))
+    table = views_table(EvaluationResult(views, {"ssim": "pictures below 11 pixels"}), "t")
+    assert [column.title for column in table.columns] == ["PSNR", "SSIM", "FLIP"]
+    assert table.summary[0].values == (20.5, None, 0.5)
 
 
 def test_views_without_the_object_are_told_once_for_both_regions() -> None:
     nothing = {"mask": scores(None), "crop": scores(None)}
     result = EvaluationResult((ViewScores("r_0", scores(20.0), nothing),), {"mask": "the mask is empty in r_0"})
-    assert views_table(result, "t", "mask").rows[0].values[0] is None
+    assert [column.title for column in views_table(result, "t", "mask").columns] == ["FLIP"]
     assert regions_table(result, "t").notes == ("Mask and crop n/a: the mask is empty in r_0",)

@@ -44,3 +44,24 @@ def test_missing_garbled_and_empty_files_are_named(tmp_path: Path) -> None:
     (tmp_path / "nan.obj").write_text("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     with pytest.raises(NerfroError, match=r"nan\.obj"):
         load_mesh(tmp_path / "nan.obj")
+
+
+@pytest.mark.parametrize("index", [-1, 8, 2**31 - 1])
+def test_triangles_of_vertices_that_are_not_there_are_refused(index: int, tmp_path: Path) -> None:
+    box = trimesh.creation.box()
+    lines = [f"{x} {y} {z}" for x, y, z in box.vertices] + [f"3 {a} {b} {c}" for a, b, c in box.faces]
+    lines[-1] = f"3 0 1 {index}"
+    header = ["ply", "format ascii 1.0", "element vertex 8", *(f"property float {axis}" for axis in "xyz")]
+    header += ["element face 12", "property list uchar int vertex_indices", "end_header"]
+    (tmp_path / "bad.ply").write_text("\n".join([*header, *lines]) + "\n")
+    with pytest.raises(NerfroError, match=r"bad\.ply (has triangles of vertices that it lacks|cannot be read)"):
+        load_mesh(tmp_path / "bad.ply", accept_open_mesh=True)
+
+
+@pytest.mark.parametrize("extents", [(1, 1, 0), (1e-5, 1e-5, 1e-5), (0, 0, 0)])
+def test_meshes_without_an_inside_are_refused(extents: tuple[float, float, float], tmp_path: Path) -> None:
+    trimesh.Trimesh(trimesh.creation.box().vertices * extents, trimesh.creation.box().faces, process=False).export(
+        tmp_path / "flat.ply"
+    )
+    with pytest.raises(NerfroError, match=r"flat\.ply is \S+ world units thin, so it has no inside"):
+        load_mesh(tmp_path / "flat.ply")

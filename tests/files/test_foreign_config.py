@@ -1,0 +1,36 @@
+"""Configurations of other people's runs are plain values, and nothing in them reaches this machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerfro.errors import NerfroError
+from nerfro.files.foreign_config import foreign_config
+from nerfro.training.run_folder import load_checkpoint
+
+
+def test_plain_values_are_read_as_they_were_written() -> None:
+    config = foreign_config("name: a\nfield: {scale: 1e-3, sizes: [1, 2]}\n", Path("c.yaml"))
+    assert config == {"name": "a", "field": {"scale": 1e-3, "sizes": [1, 2]}}
+
+
+HOSTILE = [
+    "name: ${oc.env:NERFRO_SECRET}",
+    'field: {widths: [1, "\\x24{oc.env:NERFRO_SECRET}"]}',
+    "${oc.env:NERFRO_SECRET}: 3",
+    "name: ${seed}\nseed: 1",
+]
+
+
+@pytest.mark.parametrize("text", [*HOSTILE, "{[: no yaml", "name: !!python/name:os.system", "- 1", "a: 1\na: 2"])
+def test_what_a_run_does_not_write_is_refused(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NERFRO_SECRET", "hunter2")
+    torch.save({"nerfro_config": text}, tmp_path / "last.ckpt")
+    for read in (lambda: foreign_config(text, Path("c.yaml")), lambda: load_checkpoint(tmp_path / "last.ckpt")):
+        with pytest.raises(NerfroError, match=r"c\.yaml|last\.ckpt") as caught:
+            read()
+        assert "hunter2" not in str(caught.value)
+        assert "\n" not in str(caught.value)

@@ -1,0 +1,94 @@
+"""What every command shares: how it ends, and mistakes told in one line."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import OverrideParseException
+
+from nerfro.cli import in_one_line
+from nerfro.errors import NerfroError
+from nerfro.paths import resolve_path, user_path
+from nerfro.training import callbacks
+
+
+@pytest.mark.parametrize("num_lines", [1, 10_000])  # less and more than a pipe's buffer
+def test_a_reader_that_has_seen_enough_is_no_error(num_lines: int) -> None:
+    program = f"import nerfro.cli\nwith nerfro.cli.errors_in_one_line():\n    print('line\\n' * {num_lines})"
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        [sys.executable, "-c", program], stdout=writer, stderr=subprocess.PIPE, text=True, timeout=120
+    )
+    os.close(writer)
+    assert done.stderr == ""
+    assert done.returncode == 141
+
+
+@pytest.mark.parametrize(
+    ("override", "hint"),
+    [
+        ("data.root=DIR/Übung", """'data.root="DIR/Übung"'"""),
+        ("data.root=a(1),b", """'data.root="a(1),b"'"""),
+        ('data.root=a"(', """'data.root="a\\"("'"""),
+        ("--seed", "write key=value"),
+    ],
+)
+def test_overrides_that_cannot_be_read_are_told_how_to_quote(override: str, hint: str) -> None:
+    parser = OverridesParser.create()
+    with pytest.raises(OverrideParseException) as caught:
+        parser.parse_overrides([override])
+    line = in_one_line(caught.value)
+    assert line is not None
+    assert "\n" not in line
+    assert line.startswith(override)
+    assert hint in line
+    if "'" in hint:
+        (parsed,) = parser.parse_overrides([hint.strip("'")])
+        assert parsed.value() == override.partition("=")[2]
+
+
+def test_a_file_that_is_no_yaml_is_named_with_the_line(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    for content in ("seed: 1\nfield: {width: [\n", "seed: 1\nfield: !!python/object:os.system {}\n"):
+        path.write_text(content)
+        with pytest.raises(yaml.YAMLError) as caught, path.open() as file:
+            yaml.safe_load(file)
+        line = in_one_line(caught.value)
+        assert line is not None
+        assert "\n" not in line
+        assert f'"{path}", line' in line
+
+
+@pytest.mark.parametrize("location", ["~nobody_of_that_name/run", "a\0b"])
+def test_paths_that_cannot_be_are_refused(location: str) -> None:
+    for take in (user_path, resolve_path):
+        with pytest.raises(NerfroError, match=r"write the path out|give another"):
+            take(location)
+
+
+@pytest.mark.parametrize("location", ["embedded:", "embedded:nothing", "embedded:_lpips", "embedded:.."])
+def test_what_is_not_embedded_is_refused(location: str) -> None:
+    with pytest.raises(NerfroError, match="embedded scenes: torus"):
+        resolve_path(location)
+
+
+def test_progress_begins_with_the_step(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(callbacks, "training_progress", lambda trainer: trainer.done)
+    trainer = SimpleNamespace(done=0.0, global_step=250, callback_metrics={"train/psnr": 20.0, "val/psnr": 19.0})
+    progress = callbacks.TrainingProgress()
+    progress.on_train_start(trainer, None)
+    trainer.done = 0.25
+    progress.on_train_batch_end(trainer, None, None, None, 0)
+    progress.on_train_end(trainer, None)
+    last = capsys.readouterr().err.split("\r")[-1].strip()
+    assert last.startswith("train  25%|")
+    assert "| step 250 ETA " in last
+    assert last.endswith("0 rays/s train PSNR 20.00 val PSNR 19.00")
