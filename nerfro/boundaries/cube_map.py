@@ -101,7 +101,7 @@ def lookup(
 ) -> Float[Tensor, "P 3"]:
     """Bilinear lookups of all levels, summed; continuous over the whole sphere.
 
-    Differentiable in the texels only.
+    Differentiable in the texels and, between their centres, in the coordinates.
 
     Args:
         face, coordinates: where to look, see `project`.
@@ -128,6 +128,7 @@ def lookup(
 
 
 @lru_cache(maxsize=8)
+@torch.inference_mode(False)  # a training step may save them for its gradients
 def _layout(levels: CubeLevels, device: torch.device) -> tuple[Int[Tensor, "L"], Int[Tensor, "L"], Int[Tensor, "L"]]:
     """Resolutions, first texels and first padded places; kept, because a copy to a GPU at each step would stall it."""
     padded_sizes = [6 * (n + 2) ** 2 for n in levels.resolutions]

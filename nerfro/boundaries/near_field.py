@@ -90,7 +90,8 @@ class NearField(Boundary):
             starts = self.box.mean(0).expand_as(directions)
         else:
             starts = exits.positions.reshape(-1, 3)
-            enter, leave = intersect_box(self.box, starts, directions)
+            # A parallel face is far away, not at infinity, where gradients are no numbers.
+            enter, leave = intersect_box(self.box, starts, torch.where(directions == 0, 1e-20, directions))
             through = (enter < leave) & (leave > 0)
             starts = starts + torch.where(through, leave, 0.0)[:, None] * directions
         return self._render(starts, directions).view(exits.directions.shape)
@@ -110,8 +111,8 @@ class NearField(Boundary):
             directions=directions[:, None].expand_as(samples.positions),
         )
         radiance = self.field(samples)
-        weights, left = volume_weights(radiance.density.float(), samples.deltas)
-        rgb = radiance.rgb.float()
+        density, rgb = radiance.density.to(starts.dtype), radiance.rgb.to(starts.dtype)
+        weights, left = volume_weights(density, samples.deltas)
         return (weights[..., None] * rgb).sum(-2) + left[:, None] * rgb[:, -1]
 
 

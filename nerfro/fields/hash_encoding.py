@@ -81,7 +81,7 @@ def hash_encode(
 ) -> Float[Tensor, "P 2*L"]:
     """Trilinearly interpolated features of every level, side by side.
 
-    Differentiable in the table only; positions are taken as constants.
+    Differentiable in the table and, within a cell, in the positions.
 
     Args:
         positions: in the unit cube; what lies outside is clamped to it.
@@ -89,9 +89,9 @@ def hash_encode(
         levels: where they lie.
 
     Returns:
-        Features in single precision, those of a level next to each other.
+        Features in the table's precision, those of a level next to each other.
     """
-    index, weight = _vertices(positions.detach().float(), levels)
+    index, weight = _vertices(positions.to(table.dtype), levels)
     # index_select, because its gradient is one index_add: indexing with brackets would sort all indices first.
     features = table.index_select(0, index.flatten()).view(*index.shape, NUM_FEATURES)
     return (features * weight[..., None]).sum(2).flatten(1)
@@ -110,11 +110,13 @@ def _vertices(
     dense = x + stride * (y + stride * z)
     hashed = (x ^ (y * HASH_Y) ^ (z * HASH_Z)) % size[:, None]
     index = torch.where(is_dense[:, None], dense, hashed) + offset[:, None]
-    weight = torch.where(corner.bool(), fraction[:, :, None], 1 - fraction[:, :, None]).prod(-1)
-    return index, weight
+    # Not prod, whose gradient waits for the device to count zeros.
+    along_x, along_y, along_z = torch.where(corner.bool(), fraction[:, :, None], 1 - fraction[:, :, None]).unbind(-1)
+    return index, along_x * along_y * along_z
 
 
 @lru_cache(maxsize=8)
+@torch.inference_mode(False)  # a training step may save them for its gradients
 def _layout(levels: GridLevels, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Resolution, size, offset and density of the levels, and the corners of a cell, x fastest.
 
