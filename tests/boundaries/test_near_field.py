@@ -13,6 +13,7 @@ from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.boundaries.near_field import NearField, _share, contract, contracted_lines, curve
 from nerfro.cameras import Cameras
+from nerfro.distributed import drawing_for
 from nerfro.errors import NerfroError
 from nerfro.fields import hash_encoding
 from nerfro.fields.spherical_harmonics import spherical_harmonics
@@ -150,12 +151,25 @@ def test_kernels_pass_the_gradients_that_autograd_finds(near_field, monkeypatch)
 
 def test_lines_through_the_box_pass_gradients_to_where_they_leave_it(near_field, monkeypatch):
     near_field.double()
-    monkeypatch.setattr(near_field, "_render", lambda starts, directions: starts)
+    monkeypatch.setattr(near_field, "_render", lambda starts, directions, ray: starts)
     starts = torch.tensor([[0.2, 0.1, 9.0], [0.9, 0.2, 1.0], [5.0, 0.0, 9.0]], dtype=torch.float64)
     # One is parallel to four faces, one begins inside and one misses.
     directions = normalize(torch.tensor([[0.0, 0.0, -1.0], [0.3, 0.2, -0.5], [0.1, 0.0, -1.0]]).double(), dim=-1)
     lines = directions.requires_grad_(), starts.requires_grad_()
     assert torch.autograd.gradcheck(lambda d, x: near_field(Exits(d, x)), lines)
+
+
+def test_polylines_of_a_ray_share_its_random_numbers(near_field):
+    nn.init.normal_(near_field.field.table)
+    near_field.train()
+    path = straight_path(rays([[0.2, 0.1, 9.0], [5.0, 0.0, 9.0]], [[0.0, 0.3, -1.0]] * 2))
+    split = replace(path[torch.tensor([0, 0, 1])], ray=torch.tensor([0, 0, 1]))
+    colours = []
+    for exits in (path.exits(), split.exits()):
+        torch.manual_seed(3)
+        with drawing_for(torch.tensor([5, 2]), 7):  # rows of a batch that several processes share
+            colours.append(near_field(exits))
+    assert torch.equal(colours[0][[0, 0, 1]], colours[1])
 
 
 def wall_colour(origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
