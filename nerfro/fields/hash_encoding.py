@@ -7,16 +7,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.errors import NerfroError
+from nerfro.kernels.constants import constant
 
 # Features at a vertex. The compiled kernels are written for a pair, which one 64-bit load fetches.
 NUM_FEATURES = 2
+
+# Corners of a cell, x fastest.
+_CORNERS = tuple((i, j, k) for k in (0, 1) for j in (0, 1) for i in (0, 1))
 
 # Factors of the spatial hash (Eqn. 4); the factor of x is 1, so that neighbours in x share a cache line.
 HASH_Y, HASH_Z = 2654435761, 805459861
@@ -101,7 +104,11 @@ def _vertices(
     positions: Float[Tensor, "P 3"], levels: GridLevels
 ) -> tuple[Float[Tensor, "P L 8"], Float[Tensor, "P L 8"]]:
     """Table entries and interpolation weights of the eight vertices around each position, on every level."""
-    resolution, size, offset, is_dense, corner = _layout(levels, positions.device)
+    resolution, size, offset = (
+        constant(values, positions.device) for values in (levels.resolutions, levels.sizes, levels.offsets)
+    )
+    is_dense = constant(levels.dense, positions.device, torch.bool)
+    corner = constant(_CORNERS, positions.device)
     scaled = positions.clamp(0, 1)[:, None] * resolution[:, None]
     cell = torch.minimum(scaled.long(), resolution[:, None] - 1)
     fraction = scaled - cell
@@ -113,18 +120,3 @@ def _vertices(
     # Not prod, whose gradient waits for the device to count zeros.
     along_x, along_y, along_z = torch.where(corner.bool(), fraction[:, :, None], 1 - fraction[:, :, None]).unbind(-1)
     return index, along_x * along_y * along_z
-
-
-@lru_cache(maxsize=8)
-@torch.inference_mode(False)  # a training step may save them for its gradients
-def _layout(levels: GridLevels, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Resolution, size, offset and density of the levels, and the corners of a cell, x fastest.
-
-    Kept, because a copy to a GPU at each step would stall it.
-    """
-    corners = [(i, j, k) for k in (0, 1) for j in (0, 1) for i in (0, 1)]
-    resolution, size, offset, dense, corner = (
-        torch.tensor(values, device=device)
-        for values in (levels.resolutions, levels.sizes, levels.offsets, levels.dense, corners)
-    )
-    return resolution, size, offset, dense, corner

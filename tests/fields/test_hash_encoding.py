@@ -8,6 +8,7 @@ import torch
 from nerfro.errors import NerfroError
 from nerfro.fields import hash_encoding
 from nerfro.fields import hash_encoding_cpu as kernels
+from nerfro.kernels.constants import constant
 
 # Two dense levels and three hashed ones, the last of them much finer than its table.
 LEVELS = hash_encoding.grid_levels(num_levels=5, base_resolution=4, finest_resolution=64, log2_table_size=10)
@@ -102,8 +103,8 @@ def test_only_gradients_that_are_asked_for_are_computed(monkeypatch: pytest.Monk
 
 
 def test_positions_learn_after_a_picture_was_rendered() -> None:
-    # Tensors made in inference mode, as pictures are, cannot be saved for a gradient, and layouts are kept.
-    hash_encoding._layout.cache_clear()
+    # Tensors made in inference mode, as pictures are, cannot be saved for a gradient, and constants are kept.
+    constant.cache_clear()
     positions = random_positions(9).requires_grad_()
     with torch.inference_mode():
         hash_encoding.hash_encode(positions, random_table(), LEVELS)
