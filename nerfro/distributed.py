@@ -15,6 +15,8 @@ import torch.distributed as dist
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from nerfro.errors import NerfroError
+
 _own_rows: ContextVar[tuple[Tensor, int] | None] = ContextVar("own_rows", default=None)
 
 
@@ -52,9 +54,17 @@ def rand_rays(num_rays: int, num_samples: int, like: Tensor) -> Float[Tensor, "R
         num_rays: of this process.
         num_samples: numbers for each ray.
         like: gives device and type.
+
+    Raises:
+        NerfroError: inside of `drawing_for`, for another number of rays than this process has of the batch.
     """
     if (own := _own_rows.get()) is not None:
         rows, num_rows = own
+        if num_rays != len(rows):
+            raise NerfroError(
+                f"random numbers were asked for {num_rays} rays, but the batch has {len(rows)}; draw them once "
+                "for each ray (Path.rand does, and serves all polylines of a ray), or in a loss"
+            )
         return torch.rand(num_rows, num_samples, device=like.device, dtype=like.dtype)[rows]
     rank, size = rank_and_size()
     everything = torch.rand(size * num_rays, num_samples, device=like.device, dtype=like.dtype)

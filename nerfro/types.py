@@ -121,7 +121,8 @@ class Path:
         turns = (self.directions[:, 1:] != self.directions[:, :-1]).any(-1)
         last = (turns * torch.arange(1, self.s.shape[1], device=self.s.device)).amax(-1)
         start = self.positions.gather(1, last[:, None, None].expand(-1, 1, 3))[:, 0]
-        return Exits(self.exit_directions if directions is None else directions, start, self.radii)
+        directions = self.exit_directions if directions is None else directions
+        return Exits(directions, start, self.radii, self.ray if self._splits else None)
 
     @property
     def near(self) -> Float[Tensor, "R"]:
@@ -207,11 +208,13 @@ class Exits:
         positions: where these lines begin: at the last event of a path, or at the camera where there is none; None
             asks for what is seen from the middle of all.
         radii: of the pixel's cone at unit distance along the line; 0 where nothing is known of it.
+        ray: the ray that each line belongs to, see `Path`; None where each is one of its own.
     """
 
     directions: Float[Tensor, "*batch 3"]
     positions: Float[Tensor, "*batch 3"] | None = None
     radii: Float[Tensor, "*batch"] | float = 0.0
+    ray: Int[Tensor, "*batch"] | None = None
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ import pytest
 import torch
 
 import nerfro.distributed
-from nerfro.distributed import rand_rays
+from nerfro.distributed import drawing_for, rand_rays
+from nerfro.errors import NerfroError
 from nerfro.training.callbacks import StopOnSignal
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 
@@ -210,6 +211,15 @@ def test_processes_draw_the_rows_that_one_would_draw(monkeypatch: pytest.MonkeyP
     shares = [draw(3, rank, 4) for rank in range(4)]
     assert torch.equal(torch.cat([rows for rows, _ in shares]), whole)
     assert all(torch.equal(after, following) for _, after in shares)
+
+
+@pytest.mark.parametrize("asked", [2, 5])
+def test_numbers_for_other_rows_than_the_batchs_are_refused(asked: int) -> None:
+    with (
+        drawing_for(torch.tensor([4, 5, 0]), 6),
+        pytest.raises(NerfroError, match=f"for {asked} rays, but the batch has 3"),
+    ):
+        rand_rays(asked, 2, torch.zeros(()))
 
 
 def test_a_signal_is_not_lost_while_the_processes_agree() -> None:

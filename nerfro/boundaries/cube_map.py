@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+from nerfro.kernels.constants import constant
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def lookup(
 ) -> Float[Tensor, "P 3"]:
     """Bilinear lookups of all levels, summed; continuous over the whole sphere.
 
-    Differentiable in the texels only.
+    Differentiable in the texels and, between their centres, in the coordinates.
 
     Args:
         face, coordinates: where to look, see `project`.
@@ -109,7 +110,11 @@ def lookup(
         padded: `padded_texels` of all levels, flattened one after the other.
         levels: where the texels lie.
     """
-    resolution, offset, padded_offset = _layout(levels, texels.device)
+    padded_sizes = [6 * (n + 2) ** 2 for n in levels.resolutions]
+    padded_offsets = tuple(sum(padded_sizes[:level]) for level in range(len(levels)))
+    resolution, offset, padded_offset = (
+        constant(values, texels.device) for values in (levels.resolutions, levels.offsets, padded_offsets)
+    )
     place = (coordinates[:, None] + 1) * (0.5 * resolution[:, None]) + 0.5  # of padded texels, with integer centres
     corner = torch.minimum(place.long().clamp(min=0), resolution[:, None])
     (u, v), (column, row) = (place - corner).unbind(-1), corner.unbind(-1)
@@ -125,14 +130,3 @@ def lookup(
     texel = padded.index_select(0, index.flatten()).view(index.shape) + offset[:, None]
     # index_select, because its gradient is one index_add: indexing with brackets would sort all indices first.
     return (texels.index_select(0, texel.flatten()).view(*texel.shape, 3) * weights[..., None]).sum((1, 2))
-
-
-@lru_cache(maxsize=8)
-def _layout(levels: CubeLevels, device: torch.device) -> tuple[Int[Tensor, "L"], Int[Tensor, "L"], Int[Tensor, "L"]]:
-    """Resolutions, first texels and first padded places; kept, because a copy to a GPU at each step would stall it."""
-    padded_sizes = [6 * (n + 2) ** 2 for n in levels.resolutions]
-    padded_offsets = [sum(padded_sizes[:level]) for level in range(len(levels))]
-    resolution, offset, padded_offset = (
-        torch.tensor(values, device=device) for values in (levels.resolutions, levels.offsets, padded_offsets)
-    )
-    return resolution, offset, padded_offset

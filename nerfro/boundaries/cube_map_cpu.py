@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nerfro.boundaries.cube_map import CubeLevels
+from nerfro.kernels.arrays import arrays
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.threads import use_threads
 
@@ -29,7 +30,7 @@ def lookup(
     levels: CubeLevels,
 ) -> Float[Tensor, "P 3"]:
     """The same as `nerfro.boundaries.cube_map.lookup`, on the CPU."""
-    return _Lookup.apply(face.contiguous(), coordinates.contiguous(), texels, padded, levels)
+    return _Lookup.apply(face, coordinates.contiguous(), texels, padded, levels)
 
 
 class _Lookup(torch.autograd.Function):
@@ -42,56 +43,58 @@ class _Lookup(torch.autograd.Function):
         padded: Int[Tensor, "Q"],
         levels: CubeLevels,
     ) -> Float[Tensor, "P 3"]:
-        ctx.save_for_backward(face, coordinates, padded)
+        ctx.save_for_backward(face, coordinates, texels, padded)
         ctx.levels = levels
         total = torch.zeros(len(face), 3)
         use_threads()
-        _forward(
-            face.numpy(), coordinates.numpy(), padded.numpy(), *_layout(levels), texels.detach().numpy(), total.numpy()
-        )
+        _forward(*_places(face, coordinates, padded, levels), *arrays(texels, total))
         return total
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Float[Tensor, "P 3"]) -> tuple:
-        face, coordinates, padded = ctx.saved_tensors
-        texels = torch.zeros(ctx.levels.num_texels, 3)
-        threads = min(use_threads(), len(ctx.levels))
-        _backward(
-            face.numpy(),
-            coordinates.numpy(),
-            padded.numpy(),
-            *_layout(ctx.levels),
-            threads,
-            gradient.contiguous().numpy(),
-            texels.numpy(),
-        )
-        return None, None, texels, None, None
+        face, coordinates, texels, padded = ctx.saved_tensors
+        places, threads = _places(face, coordinates, padded, ctx.levels), use_threads()
+        of_coordinates = of_texels = None
+        if ctx.needs_input_grad[1]:
+            of_coordinates = torch.empty_like(coordinates)
+            _backward_to_coordinates(*places, *arrays(texels, gradient, of_coordinates))
+        if ctx.needs_input_grad[2]:
+            of_texels = torch.zeros(texels.shape)
+            _backward(min(threads, len(ctx.levels)), *places, *arrays(gradient, of_texels))
+        return None, of_coordinates, of_texels, None, None
 
 
-def _layout(levels: CubeLevels) -> tuple[np.ndarray, np.ndarray]:
-    return np.array(levels.resolutions), np.array(levels.offsets)
+def _places(face: Tensor, coordinates: Tensor, padded: Tensor, levels: CubeLevels) -> tuple[np.ndarray, ...]:
+    return *arrays(face, coordinates, padded), np.array(levels.resolutions), np.array(levels.offsets)
 
 
 @compiled
 def _taps(face, x, y, n, padded, padded_offset):
-    """Four texels of a level and their weights; where three faces meet, the missing texel is the mean of the three."""
+    """Four texels of a level, the place between them, and which of them is missing where three faces meet (or -1)."""
     x = (x + _ONE) * np.float32(0.5 * n) + np.float32(0.5)
     y = (y + _ONE) * np.float32(0.5 * n) + np.float32(0.5)
     column, row = max(min(np.int64(x), n), 0), max(min(np.int64(y), n), 0)
     u, v = x - np.float32(column), y - np.float32(row)
+    at_corner = (column == 0 or column == n) and (row == 0 or row == n)
+    missing = (1 if column == n else 0) + (2 if row == n else 0) if at_corner else -1
+    width = n + 2
+    first = padded_offset + (face * width + row) * width + column
+    texels = (padded[first], padded[first + 1], padded[first + width], padded[first + width + 1])
+    return texels, u, v, missing
+
+
+@compiled
+def _weights(u, v, missing):
+    """Weights of the four texels; the missing one is the mean of the other three."""
     w0, w1, w2, w3 = (_ONE - u) * (_ONE - v), u * (_ONE - v), (_ONE - u) * v, u * v
-    if (column == 0 or column == n) and (row == 0 or row == n):
-        missing = (1 if column == n else 0) + (2 if row == n else 0)
+    if missing >= 0:
         absent = (w0 if missing == 0 else w1 if missing == 1 else w2 if missing == 2 else w3) / np.float32(3)
         w0 = np.float32(0) if missing == 0 else w0 + absent
         w1 = np.float32(0) if missing == 1 else w1 + absent
         w2 = np.float32(0) if missing == 2 else w2 + absent
         w3 = np.float32(0) if missing == 3 else w3 + absent
-    width = n + 2
-    first = padded_offset + (face * width + row) * width + column
-    texels = (padded[first], padded[first + 1], padded[first + width], padded[first + width + 1])
-    return texels, (w0, w1, w2, w3)
+    return w0, w1, w2, w3
 
 
 @compiled_parallel
@@ -100,7 +103,8 @@ def _forward(face, coordinates, padded, resolutions, offsets, texels, total):
         padded_offset = 0
         for level in range(resolutions.shape[0]):
             n = resolutions[level]
-            texel, weight = _taps(face[p], coordinates[p, 0], coordinates[p, 1], n, padded, padded_offset)
+            texel, u, v, missing = _taps(face[p], coordinates[p, 0], coordinates[p, 1], n, padded, padded_offset)
+            weight = _weights(u, v, missing)
             for corner in range(4):
                 entry = offsets[level] + texel[corner]
                 for channel in range(3):
@@ -109,16 +113,42 @@ def _forward(face, coordinates, padded, resolutions, offsets, texels, total):
 
 
 @compiled_parallel
-def _backward(face, coordinates, padded, resolutions, offsets, threads, gradient, texels):
+def _backward(threads, face, coordinates, padded, resolutions, offsets, gradient, texels):
     for thread in prange(threads):
         padded_offset = 0
         for level in range(resolutions.shape[0]):
             n = resolutions[level]
             if level % threads == thread:
                 for p in range(face.shape[0]):
-                    texel, weight = _taps(face[p], coordinates[p, 0], coordinates[p, 1], n, padded, padded_offset)
+                    x, y = coordinates[p, 0], coordinates[p, 1]
+                    texel, u, v, missing = _taps(face[p], x, y, n, padded, padded_offset)
+                    weight = _weights(u, v, missing)
                     for corner in range(4):
                         entry = offsets[level] + texel[corner]
                         for channel in range(3):
                             texels[entry, channel] += weight[corner] * gradient[p, channel]
             padded_offset += 6 * (n + 2) * (n + 2)
+
+
+@compiled_parallel
+def _backward_to_coordinates(face, coordinates, padded, resolutions, offsets, texels, gradient, of_coordinates):
+    for p in prange(face.shape[0]):
+        padded_offset = 0
+        along_x, along_y = np.float32(0), np.float32(0)
+        # What the loss would gain from each of the four texels if it alone had weight.
+        gain = np.empty(4, np.float32)
+        for level in range(resolutions.shape[0]):
+            n = resolutions[level]
+            texel, u, v, missing = _taps(face[p], coordinates[p, 0], coordinates[p, 1], n, padded, padded_offset)
+            for corner in range(4):
+                entry = offsets[level] + texel[corner]
+                gain[corner] = np.float32(0)
+                for channel in range(3):
+                    gain[corner] += gradient[p, channel] * texels[entry, channel]
+            if missing >= 0:
+                gain[missing] = (gain[0] + gain[1] + gain[2] + gain[3] - gain[missing]) / np.float32(3)
+            scale = np.float32(0.5 * n)
+            along_x += scale * ((_ONE - v) * (gain[1] - gain[0]) + v * (gain[3] - gain[2]))
+            along_y += scale * ((_ONE - u) * (gain[2] - gain[0]) + u * (gain[3] - gain[1]))
+            padded_offset += 6 * (n + 2) * (n + 2)
+        of_coordinates[p, 0], of_coordinates[p, 1] = along_x, along_y

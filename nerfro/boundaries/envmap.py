@@ -50,7 +50,7 @@ class EnvironmentMap(Boundary):
             self.set_lat_long(lat_long.load_lat_long(image))
 
     def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
-        face, coordinates = cube_map.project(exits.directions.detach().float().reshape(-1, 3))
+        face, coordinates = cube_map.project(exits.directions.float().reshape(-1, 3))
         if face.device.type == "cpu":
             from nerfro.boundaries.cube_map_cpu import lookup  # compiled code, so only where it is used
         else:

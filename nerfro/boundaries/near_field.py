@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerfro.boundaries.base import Boundary
@@ -90,17 +90,20 @@ class NearField(Boundary):
             starts = self.box.mean(0).expand_as(directions)
         else:
             starts = exits.positions.reshape(-1, 3)
-            enter, leave = intersect_box(self.box, starts, directions)
+            # A parallel face is far away, not at infinity, where gradients are no numbers.
+            enter, leave = intersect_box(self.box, starts, torch.where(directions == 0, 1e-20, directions))
             through = (enter < leave) & (leave > 0)
             starts = starts + torch.where(through, leave, 0.0)[:, None] * directions
-        return self._render(starts, directions).view(exits.directions.shape)
+        return self._render(starts, directions, exits.ray).view(exits.directions.shape)
 
     def after_step(self, step: int) -> None:
         self.sampler.after_step(step, [self.field])
 
-    def _render(self, starts: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
+    def _render(
+        self, starts: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"], ray: Int[Tensor, "P"] | None = None
+    ) -> Float[Tensor, "P 3"]:
         offsets = (starts - self.box.mean(0)) / self.radius
-        path = contracted_lines(offsets, directions)
+        path = contracted_lines(offsets, directions, ray)
         samples = self.sampler(path, None)
         # Chords serve to measure lengths. Places lie on the curve, or lines that meet in the world would not meet here;
         # and colour depends on the direction in the world.
@@ -110,12 +113,14 @@ class NearField(Boundary):
             directions=directions[:, None].expand_as(samples.positions),
         )
         radiance = self.field(samples)
-        weights, left = volume_weights(radiance.density.float(), samples.deltas)
-        rgb = radiance.rgb.float()
+        density, rgb = radiance.density.to(starts.dtype), radiance.rgb.to(starts.dtype)
+        weights, left = volume_weights(density, samples.deltas)
         return (weights[..., None] * rgb).sum(-2) + left[:, None] * rgb[:, -1]
 
 
-def contracted_lines(offsets: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]) -> Path:
+def contracted_lines(
+    offsets: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"], ray: Int[Tensor, "P"] | None = None
+) -> Path:
     """Lines from `offsets` to infinity as polylines in contracted space, with lengths measured there."""
     share = torch.linspace(0, 1, _NUM_CHORDS + 1, device=offsets.device).expand(len(offsets), -1)
     vertices = curve(offsets, directions, share)
@@ -124,7 +129,8 @@ def contracted_lines(offsets: Float[Tensor, "R 3"], directions: Float[Tensor, "R
     tangents = chords / lengths.clamp(min=1e-9)[..., None]
     s = torch.cat([torch.zeros_like(lengths[:, :1]), lengths.cumsum(-1)], dim=1)
     nothing = torch.zeros(len(offsets), device=offsets.device)
-    return Path(vertices, torch.cat([tangents, tangents[:, -1:]], 1), s, directions, nothing.bool(), nothing)
+    tangents = torch.cat([tangents, tangents[:, -1:]], 1)
+    return Path(vertices, tangents, s, directions, nothing.bool(), nothing, ray)  # type: ignore[arg-type]
 
 
 def curve(

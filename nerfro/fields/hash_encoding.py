@@ -7,16 +7,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.errors import NerfroError
+from nerfro.kernels.constants import constant
 
 # Features at a vertex. The compiled kernels are written for a pair, which one 64-bit load fetches.
 NUM_FEATURES = 2
+
+# Corners of a cell, x fastest.
+_CORNERS = tuple((i, j, k) for k in (0, 1) for j in (0, 1) for i in (0, 1))
 
 # Factors of the spatial hash (Eqn. 4); the factor of x is 1, so that neighbours in x share a cache line.
 HASH_Y, HASH_Z = 2654435761, 805459861
@@ -81,7 +84,7 @@ def hash_encode(
 ) -> Float[Tensor, "P 2*L"]:
     """Trilinearly interpolated features of every level, side by side.
 
-    Differentiable in the table only; positions are taken as constants.
+    Differentiable in the table and, within a cell, in the positions.
 
     Args:
         positions: in the unit cube; what lies outside is clamped to it.
@@ -89,9 +92,9 @@ def hash_encode(
         levels: where they lie.
 
     Returns:
-        Features in single precision, those of a level next to each other.
+        Features in the table's precision, those of a level next to each other.
     """
-    index, weight = _vertices(positions.detach().float(), levels)
+    index, weight = _vertices(positions.to(table.dtype), levels)
     # index_select, because its gradient is one index_add: indexing with brackets would sort all indices first.
     features = table.index_select(0, index.flatten()).view(*index.shape, NUM_FEATURES)
     return (features * weight[..., None]).sum(2).flatten(1)
@@ -101,7 +104,11 @@ def _vertices(
     positions: Float[Tensor, "P 3"], levels: GridLevels
 ) -> tuple[Float[Tensor, "P L 8"], Float[Tensor, "P L 8"]]:
     """Table entries and interpolation weights of the eight vertices around each position, on every level."""
-    resolution, size, offset, is_dense, corner = _layout(levels, positions.device)
+    resolution, size, offset = (
+        constant(values, positions.device) for values in (levels.resolutions, levels.sizes, levels.offsets)
+    )
+    is_dense = constant(levels.dense, positions.device, torch.bool)
+    corner = constant(_CORNERS, positions.device)
     scaled = positions.clamp(0, 1)[:, None] * resolution[:, None]
     cell = torch.minimum(scaled.long(), resolution[:, None] - 1)
     fraction = scaled - cell
@@ -110,19 +117,6 @@ def _vertices(
     dense = x + stride * (y + stride * z)
     hashed = (x ^ (y * HASH_Y) ^ (z * HASH_Z)) % size[:, None]
     index = torch.where(is_dense[:, None], dense, hashed) + offset[:, None]
-    weight = torch.where(corner.bool(), fraction[:, :, None], 1 - fraction[:, :, None]).prod(-1)
-    return index, weight
-
-
-@lru_cache(maxsize=8)
-def _layout(levels: GridLevels, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Resolution, size, offset and density of the levels, and the corners of a cell, x fastest.
-
-    Kept, because a copy to a GPU at each step would stall it.
-    """
-    corners = [(i, j, k) for k in (0, 1) for j in (0, 1) for i in (0, 1)]
-    resolution, size, offset, dense, corner = (
-        torch.tensor(values, device=device)
-        for values in (levels.resolutions, levels.sizes, levels.offsets, levels.dense, corners)
-    )
-    return resolution, size, offset, dense, corner
+    # Not prod, whose gradient waits for the device to count zeros.
+    along_x, along_y, along_z = torch.where(corner.bool(), fraction[:, :, None], 1 - fraction[:, :, None]).unbind(-1)
+    return index, along_x * along_y * along_z

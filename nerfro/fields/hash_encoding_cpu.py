@@ -2,7 +2,8 @@
 
 Forward, threads share the points; each thread takes them block by block and level by level, so that a block's output
 stays in the first-level cache and a level's table in the second. Backward, threads share the levels: no two threads
-write to the same entry, so there are no atomics, and the sums do not depend on the number of threads. What can be done
+write to the same entry, so there are no atomics, and the sums do not depend on the number of threads. Gradients of
+positions are computed where they are asked for alone, with threads sharing the points again. What can be done
 for many points at once (cells, fractions, the part of the hash that y and z make) is done in loops of its own, because
 those become vector instructions, and the fetching of table entries does not.
 """
@@ -19,6 +20,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nerfro.fields.hash_encoding import HASH_Y, HASH_Z, NUM_FEATURES, GridLevels
+from nerfro.kernels.arrays import arrays
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.threads import use_threads
 
@@ -32,7 +34,7 @@ def hash_encode(
     positions: Float[Tensor, "P 3"], table: Float[Tensor, "T 2"], levels: GridLevels
 ) -> Float[Tensor, "P 2*L"]:
     """The same as `nerfro.fields.hash_encoding.hash_encode`, on the CPU."""
-    return _HashEncode.apply(positions.detach().float().t().contiguous(), table, levels)
+    return _HashEncode.apply(positions.float().t().contiguous(), table, levels)
 
 
 class _HashEncode(torch.autograd.Function):
@@ -40,21 +42,28 @@ class _HashEncode(torch.autograd.Function):
     def forward(
         ctx: Any, positions: Float[Tensor, "3 P"], table: Float[Tensor, "T 2"], levels: GridLevels
     ) -> Float[Tensor, "P 2*L"]:
-        ctx.save_for_backward(positions)
-        ctx.levels, ctx.num_entries = levels, table.shape[0]
+        ctx.save_for_backward(positions, table)
+        ctx.levels = levels
         features = positions.new_empty(positions.shape[1], NUM_FEATURES * len(levels))
         use_threads()
-        _forward(positions.numpy(), table.detach().contiguous().numpy(), *_layout(levels), features.numpy())
+        places, entries = arrays(positions, table)
+        _forward(places, entries, *_layout(levels), features.numpy())
         return features
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Float[Tensor, "P 2*L"]) -> tuple[None, Float[Tensor, "T 2"], None]:
-        (positions,) = ctx.saved_tensors
-        table = torch.zeros(ctx.num_entries, NUM_FEATURES)
-        threads = min(use_threads(), len(ctx.levels))
-        _backward(positions.numpy(), gradient.contiguous().numpy(), *_layout(ctx.levels), threads, table.numpy())
-        return None, table, None
+    def backward(ctx: Any, gradient: Float[Tensor, "P 2*L"]) -> tuple[Tensor | None, Tensor | None, None]:
+        positions, table = ctx.saved_tensors
+        places, entries, upstream = arrays(positions, table, gradient)
+        layout, threads = _layout(ctx.levels), use_threads()
+        of_positions = of_table = None
+        if ctx.needs_input_grad[0]:
+            of_positions = torch.empty_like(positions)
+            _backward_to_positions(places, entries, upstream, *layout, of_positions.numpy())
+        if ctx.needs_input_grad[1]:
+            of_table = torch.zeros(table.shape)
+            _backward(places, upstream, *layout, min(threads, len(ctx.levels)), of_table.numpy())
+        return of_positions, of_table, None
 
 
 def _layout(levels: GridLevels) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -147,6 +156,50 @@ def _forward(positions, table, resolutions, sizes, offsets, dense, features):
                 _interpolate(cells, fractions, edges, entries, True, mask, features[start : start + size], 2 * level)
             else:
                 _interpolate(cells, fractions, edges, entries, False, mask, features[start : start + size], 2 * level)
+
+
+@compiled
+def _gain(entries, vertex, first, second):
+    """What the loss would gain from a vertex if it alone had weight."""
+    return first * entries[vertex, 0] + second * entries[vertex, 1]
+
+
+@compiled
+def _slope(x, y, low_low, high_low, low_high, high_high):
+    """Difference along an axis from a cell's edges along it, interpolated in the other two."""
+    return (_ONE - y) * ((_ONE - x) * low_low + x * high_low) + y * ((_ONE - x) * low_high + x * high_high)
+
+
+@compiled_parallel
+def _backward_to_positions(positions, table, gradient, resolutions, sizes, offsets, dense, of_positions):
+    num_points = positions.shape[1]
+    for block in prange((num_points + _BLOCK - 1) // _BLOCK):
+        start = block * _BLOCK
+        size = min(num_points - start, _BLOCK)
+        cells, fractions = np.empty((3, size), _UINT), np.empty((3, size), np.float32)
+        edges = np.empty((4, size), _UINT)
+        slopes = np.zeros((3, size), np.float32)
+        for level in range(resolutions.shape[0]):
+            is_dense, mask, scale = dense[level], _UINT(sizes[level] - 1), np.float32(resolutions[level])
+            entries = table[offsets[level] : offsets[level] + sizes[level]]
+            _locate(positions, start, size, resolutions[level], is_dense, cells, fractions, edges)
+            for p in range(size):
+                first, second = gradient[start + p, 2 * level] * scale, gradient[start + p, 2 * level + 1] * scale
+                x, y, z = fractions[0, p], fractions[1, p], fractions[2, p]
+                low_low, high_low, low_high, high_high = edges[0, p], edges[1, p], edges[2, p], edges[3, p]
+                a, b, c, d, e, f, g, h = _vertices(cells[0, p], low_low, high_low, low_high, high_high, is_dense, mask)
+                a, b = _gain(entries, a, first, second), _gain(entries, b, first, second)
+                c, d = _gain(entries, c, first, second), _gain(entries, d, first, second)
+                e, f = _gain(entries, e, first, second), _gain(entries, f, first, second)
+                g, h = _gain(entries, g, first, second), _gain(entries, h, first, second)
+                slopes[0, p] += _slope(y, z, b - a, d - c, f - e, h - g)
+                slopes[1, p] += _slope(x, z, c - a, d - b, g - e, h - f)
+                slopes[2, p] += _slope(x, y, e - a, f - b, g - c, h - d)
+        for axis in range(3):
+            for p in range(size):
+                # Positions outside are clamped: they may move without any change.
+                moves = np.float32(0) <= positions[axis, start + p] <= _ONE
+                of_positions[axis, start + p] = slopes[axis, p] if moves else np.float32(0)
 
 
 @compiled_parallel

@@ -49,9 +49,11 @@ class _ReluMLP(torch.autograd.Function):
     def backward(ctx: Any, gradient: Float[Tensor, "P O"]) -> tuple[Tensor | None, ...]:
         num_layers = len(ctx.saved_tensors) // 2
         activations, layers = ctx.saved_tensors[:num_layers], ctx.saved_tensors[num_layers:]
-        of_weights = []
+        of_weights: list[Tensor | None] = []
+        wanted = ctx.needs_input_grad[2:]
         for i in reversed(range(num_layers)):
-            of_weights.append(_product_of_columns(gradient, activations[i]).to(ctx.weight_dtype))
+            learns = wanted[len(ctx.parts) + i]
+            of_weights.append(_product_of_columns(gradient, activations[i]).to(ctx.weight_dtype) if learns else None)
             if i > 0:
                 gradient = gradient @ layers[i]
                 bits = _comparable(gradient)
@@ -59,8 +61,7 @@ class _ReluMLP(torch.autograd.Function):
         of_parts: list[Tensor | None] = []
         start = 0
         for i, (width, dtype) in enumerate(ctx.parts):
-            wanted = ctx.needs_input_grad[2 + i]
-            of_parts.append((gradient @ layers[0][:, start : start + width]).to(dtype) if wanted else None)
+            of_parts.append((gradient @ layers[0][:, start : start + width]).to(dtype) if wanted[i] else None)
             start += width
         return None, None, *of_parts, *reversed(of_weights)
 

@@ -1,12 +1,15 @@
-"""Compiled CPU kernel of spherical harmonics; `nerfro.fields.spherical_harmonics` is its reference."""
+"""Compiled CPU kernels of spherical harmonics; `nerfro.fields.spherical_harmonics` is its reference."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from numba import prange
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from nerfro.fields.spherical_harmonics import check_bands
 from nerfro.kernels.compilation import compiled_parallel
@@ -18,16 +21,34 @@ _C2, _C2_ZZ, _C2_XX_YY = np.float32(1.0925484305920792), np.float32(0.3153915652
 _C3_OUTER, _C3_XYZ = np.float32(0.5900435899266435), np.float32(2.890611442640554)
 _C3_MIDDLE, _C3_ZZZ = np.float32(0.4570457994644658), np.float32(0.3731763325901154)
 _C3_XX_YY = np.float32(1.445305721320277)
-_ONE, _THREE, _FIVE = np.float32(1), np.float32(3), np.float32(5)
+_ONE, _TWO, _THREE, _FIVE, _SIX = np.float32(1), np.float32(2), np.float32(3), np.float32(5), np.float32(6)
+_TEN, _FIFTEEN = np.float32(10), np.float32(15)
 
 
 def spherical_harmonics(directions: Float[Tensor, "P 3"], num_bands: int) -> Float[Tensor, "P K"]:
-    """The same as `nerfro.fields.spherical_harmonics.spherical_harmonics`, on the CPU and without a gradient."""
+    """The same as `nerfro.fields.spherical_harmonics.spherical_harmonics`, on the CPU."""
     check_bands(num_bands)
-    values = torch.empty(len(directions), num_bands**2)
-    use_threads()
-    _harmonics(directions.detach().float().contiguous().numpy(), num_bands, values.numpy())
-    return values
+    return _Harmonics.apply(directions.float().contiguous(), num_bands)
+
+
+class _Harmonics(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, directions: Float[Tensor, "P 3"], num_bands: int) -> Float[Tensor, "P K"]:
+        ctx.save_for_backward(directions)
+        ctx.num_bands = num_bands
+        values = torch.empty(len(directions), num_bands**2)
+        use_threads()
+        _harmonics(directions.detach().numpy(), num_bands, values.numpy())
+        return values
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Float[Tensor, "P K"]) -> tuple[Float[Tensor, "P 3"], None]:
+        (directions,) = ctx.saved_tensors
+        of_directions = torch.zeros_like(directions)
+        use_threads()
+        _backward(directions.detach().numpy(), gradient.contiguous().numpy(), ctx.num_bands, of_directions.numpy())
+        return of_directions, None
 
 
 @compiled_parallel
@@ -48,3 +69,26 @@ def _harmonics(directions, num_bands, values):
             values[p, 12] = _C3_ZZZ * z * (_FIVE * zz - _THREE)
             values[p, 13] = _C3_MIDDLE * x * (_FIVE * zz - _ONE)
             values[p, 14], values[p, 15] = _C3_XX_YY * z * (xx - yy), _C3_OUTER * x * (xx - _THREE * yy)
+
+
+@compiled_parallel
+def _backward(directions, gradient, num_bands, of_directions):
+    """Derivatives of the polynomials above, each times its upstream gradient."""
+    for p in prange(directions.shape[0]):
+        x, y, z, g = directions[p, 0], directions[p, 1], directions[p, 2], gradient[p]
+        xx, yy, zz = x * x, y * y, z * z
+        dx, dy, dz = np.float32(0), np.float32(0), np.float32(0)
+        if num_bands > 1:
+            dx, dy, dz = _C1 * g[3], _C1 * g[1], _C1 * g[2]
+        if num_bands > 2:
+            dx += _C2 * (y * g[4] + z * g[7]) + _TWO * _C2_XX_YY * x * g[8]
+            dy += _C2 * (x * g[4] + z * g[5]) - _TWO * _C2_XX_YY * y * g[8]
+            dz += _C2 * (y * g[5] + x * g[7]) + _SIX * _C2_ZZ * z * g[6]
+        if num_bands > 3:
+            dx += _C3_OUTER * (_SIX * x * y * g[9] + _THREE * (xx - yy) * g[15]) + _C3_XYZ * y * z * g[10]
+            dx += _C3_MIDDLE * (_FIVE * zz - _ONE) * g[13] + _TWO * _C3_XX_YY * x * z * g[14]
+            dy += _C3_OUTER * (_THREE * (xx - yy) * g[9] - _SIX * x * y * g[15]) + _C3_XYZ * x * z * g[10]
+            dy += _C3_MIDDLE * (_FIVE * zz - _ONE) * g[11] - _TWO * _C3_XX_YY * y * z * g[14]
+            dz += _C3_XYZ * x * y * g[10] + _TEN * _C3_MIDDLE * z * (y * g[11] + x * g[13])
+            dz += _C3_ZZZ * (_FIFTEEN * zz - _THREE) * g[12] + _C3_XX_YY * (xx - yy) * g[14]
+        of_directions[p, 0], of_directions[p, 1], of_directions[p, 2] = dx, dy, dz

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.kernels.constants import constant
+
 
 def trilinear(
     table: Float[Tensor, "X Y Z C"], box: Float[Tensor, "2 3"], positions: Float[Tensor, "*batch 3"]
@@ -17,7 +19,7 @@ def trilinear(
         box: lower and upper corner of the grid, world units.
         positions: points, world units.
     """
-    shape = torch.tensor(table.shape[:3], device=table.device)
+    shape = constant(table.shape[:3], table.device)
     scale = (shape - 1) / (box[1] - box[0])
     coordinates = ((positions - box[0]) * scale).reshape(-1, 3)
     coordinates = torch.minimum(coordinates.clamp(min=0), (shape - 1).to(coordinates))
@@ -78,7 +80,7 @@ def quadratic_spline(
     Returns:
         Values and their exact gradients (per world unit).
     """
-    shape = torch.tensor(coefficients.shape, device=coefficients.device)
+    shape = constant(coefficients.shape, coefficients.device)
     scale = (shape - 1) / (box[1] - box[0])
     coordinates = ((positions - box[0]) * scale).reshape(-1, 3)
     centre = torch.minimum((coordinates + 0.5).floor().long().clamp(min=1), shape - 2)

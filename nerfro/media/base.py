@@ -3,10 +3,26 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+
+
+class lazy_buffer:  # noqa: N801 (used like functools.cached_property)
+    """A tensor computed when it is first asked for, and kept as a buffer: it moves to other devices with its module."""
+
+    def __init__(self, compute: Callable[[Any], Tensor]) -> None:
+        self._compute, self._name, self.__doc__ = compute, f"_{compute.__name__}", compute.__doc__
+
+    def __get__(self, module: nn.Module, owner: type) -> Tensor:
+        if self._name not in module._buffers:
+            with torch.inference_mode(False):  # pictures may be the first to ask, but training asks too
+                module.register_buffer(self._name, self._compute(module), persistent=False)
+        return module.get_buffer(self._name)
+
 
 # Steps along the diagonal of a medium that says nothing about where its index varies.
 _STEPS_PER_DIAGONAL = 512

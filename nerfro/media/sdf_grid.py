@@ -16,6 +16,8 @@ from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.signed_distance import signed_distance_grid
 from nerfro.geometry.smoothing import smooth
+from nerfro.kernels.constants import constant
+from nerfro.media.base import lazy_buffer
 from nerfro.media.solid import Solid
 from nerfro.media.voxel_grid import check_box, check_margin
 from nerfro.paths import resolve_path
@@ -129,7 +131,7 @@ class SdfGrid(Solid):
         """Finds the triangles of the meshes that rays hit."""
         return MeshIntersector(self.meshes, self.crease_degrees)
 
-    @functools.cached_property
+    @lazy_buffer
     def coarse_clearance(self) -> Float[Tensor, "x y z"]:
         """Lower bound of the distance to all surfaces from any point of each block of `BLOCK`^3 cells, world units."""
         blocks = torch.tensor(self.coefficients.shape[1:]).sub(1).div(BLOCK, rounding_mode="floor").add(1).tolist()
@@ -146,9 +148,9 @@ class SdfGrid(Solid):
     def clearance(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Distance to the nearest shell: a lower bound from the blocks, or where that is none the distance itself."""
         grid = self.coarse_clearance
-        vertices = torch.tensor(self.coefficients.shape[1:], device=grid.device)
+        vertices = constant(self.coefficients.shape[1:], grid.device)
         block = ((positions - self.box[0]) * (vertices - 1) / (self.box[1] - self.box[0]) / BLOCK).floor().long()
-        x, y, z = torch.minimum(block.clamp(min=0), torch.tensor(grid.shape, device=grid.device) - 1).unbind(-1)
+        x, y, z = torch.minimum(block.clamp(min=0), constant(grid.shape, grid.device) - 1).unbind(-1)
         coarse = grid[x, y, z] - self.shell
         near = coarse <= 0
         clearance = coarse.to(positions.dtype, copy=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,8 @@ from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.occupancy import occupancy_fraction
 from nerfro.geometry.signed_distance import distance_to_set
 from nerfro.geometry.smoothing import gradient, smooth
-from nerfro.media.base import Medium
+from nerfro.kernels.constants import constant
+from nerfro.media.base import Medium, lazy_buffer
 from nerfro.paths import resolve_path
 from nerfro.registry import register
 
@@ -131,8 +131,7 @@ class VoxelGrid(Medium):
     @property
     def spacing(self) -> Float[Tensor, "3"]:
         """Distance between neighbouring vertices, world units."""
-        shape = torch.tensor(self.table.shape[:3], device=self.box.device)
-        return (self.box[1] - self.box[0]) / (shape - 1)
+        return (self.box[1] - self.box[0]) / (constant(self.table.shape[:3], self.box.device) - 1)
 
     @property
     def content_box(self) -> Float[Tensor, "2 3"]:
@@ -149,7 +148,7 @@ class VoxelGrid(Medium):
         n = torch.where(inside, values[..., 0], 1.0)
         return n, torch.where(inside[..., None], values[..., 1:], 0.0)
 
-    @functools.cached_property
+    @lazy_buffer
     def clearance_grid(self) -> Float[Tensor, "X-1 Y-1 Z-1"]:
         """Distance from any point of each cell within which grad n is zero, world units."""
         varies = (self.table[..., 1:] != 0).any(-1).cpu()
@@ -165,9 +164,8 @@ class VoxelGrid(Medium):
     def clearance(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Distance within which grad n is zero, for the cell that holds each point."""
         grid = self.clearance_grid
-        shape = torch.tensor(grid.shape, device=grid.device)
         cell = ((positions - self.box[0]) / self.spacing).floor().long()
-        x, y, z = torch.minimum(cell.clamp(min=0), shape - 1).unbind(-1)
+        x, y, z = torch.minimum(cell.clamp(min=0), constant(grid.shape, grid.device) - 1).unbind(-1)
         return grid[x, y, z]
 
     def step_length(

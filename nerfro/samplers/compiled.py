@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from nerfro.kernels.arrays import arrays
 from nerfro.kernels.threads import use_threads
 from nerfro.types import Path, Rays
 
@@ -99,7 +100,7 @@ def _march_uniform(
     code = {"euler": eikonal.EULER, "leapfrog": eikonal.LEAPFROG, "rk4": eikonal.RK4}[integrator]
     use_threads()
     low, _, inverse_spacing = _frame(medium.box, medium.table.shape[:3])
-    origins, directions, near, far = _arrays(rays)
+    origins, directions, near, far = _ray_arrays(rays)
     table = medium.table.numpy()
     return eikonal.march_uniform(origins, directions, near, far, table, low, inverse_spacing, code, num_steps, keep_all)
 
@@ -113,23 +114,22 @@ def _with_enough_vertices(
         The first `num_arrays` results, which have a column for each vertex, and those that follow the counts.
     """
     use_threads()
-    arrays = _arrays(rays)
+    of_rays = _ray_arrays(rays)
     capacity = _CAPACITY
-    results = kernel(*arrays, *settings, capacity)
+    results = kernel(*of_rays, *settings, capacity)
     columns, counts, rest = list(results[:num_arrays]), results[num_arrays], list(results[num_arrays + 1 :])
     width = max(int(counts.max(initial=2)), 2)
     if width > capacity:
         rows = np.nonzero(counts > capacity)[0]
-        again = kernel(*(array[rows] for array in arrays), *settings, width)[:num_arrays]
+        again = kernel(*(array[rows] for array in of_rays), *settings, width)[:num_arrays]
         for i, (short, long) in enumerate(zip(columns, again, strict=True)):
             columns[i] = np.concatenate([short, np.repeat(short[:, -1:], width - capacity, axis=1)], axis=1)
             columns[i][rows] = long
     return [column[:, :width] for column in columns], rest
 
 
-def _arrays(rays: Rays) -> tuple[np.ndarray, ...]:
-    tensors = (rays.origins, rays.directions, rays.near, rays.far)
-    return tuple(np.ascontiguousarray(tensor.detach().numpy()) for tensor in tensors)
+def _ray_arrays(rays: Rays) -> list[np.ndarray]:
+    return arrays(rays.origins, rays.directions, rays.near, rays.far)
 
 
 def _frame(box: Tensor, shape: torch.Size) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -85,7 +85,13 @@ class DensityGridSampler(PointSampler):
         return cone_samples(path, invert_cdf(edges, share + self._floor, u))
 
     def draw_compiled(self, path: Path, u: Float[Tensor, "R N+1"]) -> Samples:
-        """The same as `draw`, on the CPU."""
+        """The same as `draw`, on the CPU.
+
+        Raises:
+            NerfroError: not one row of places for each path, which the kernel would read beyond their end.
+        """
+        if len(u) != len(path.s):
+            raise NerfroError(f"{len(u)} rows of random numbers for {len(path.s)} paths; draw them with Path.rand")
         from nerfro.kernels.threads import use_threads
         from nerfro.samplers.density_grid_cpu import draw  # compiled code, so only where it is used
 

@@ -95,14 +95,36 @@ def test_weights_sum_to_one_everywhere() -> None:
 @pytest.mark.parametrize("num", [0, 1, 2000])
 def test_kernels_match_the_reference_forward_and_backward(num: int) -> None:
     face, coordinates = cube_map.project(torch.cat([random_directions(num), special_directions()]))
-    ours, reference = random_texels().requires_grad_(), random_texels().requires_grad_()
-    found = kernels.lookup(face, coordinates, ours, PADDED, LEVELS)
-    expected = cube_map.lookup(face, coordinates, reference, PADDED, LEVELS)
+    inputs = (coordinates.requires_grad_(), random_texels().requires_grad_())
+    found, expected = (look(face, *inputs, PADDED, LEVELS) for look in (kernels.lookup, cube_map.lookup))
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
     upstream = torch.randn(expected.shape, generator=torch.Generator().manual_seed(2))
-    found.backward(upstream)
-    expected.backward(upstream)
-    torch.testing.assert_close(ours.grad, reference.grad, rtol=1e-5, atol=1e-5 * float(reference.grad.abs().max()))
+    gradients = (torch.autograd.grad(output, inputs, upstream) for output in (found, expected))
+    for ours, reference in zip(*gradients, strict=True):
+        torch.testing.assert_close(ours, reference, rtol=1e-5, atol=1e-5 * float(reference.abs().max()))
+
+
+def test_gradients_are_those_of_differences() -> None:
+    # Beside the cube's corners too, where three faces meet and one of four texels is missing.
+    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3) + 0.1 * random_directions(8, seed=3)
+    directions = torch.cat([random_directions(12), corners]).double().requires_grad_()
+    texels = random_texels().double()
+
+    def sky(d: torch.Tensor) -> torch.Tensor:
+        return cube_map.lookup(*cube_map.project(d), texels, PADDED, LEVELS)
+
+    assert torch.autograd.gradcheck(sky, directions)
+
+
+def test_only_gradients_that_are_asked_for_are_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    done = []
+    for name in ("_backward", "_backward_to_coordinates"):
+        monkeypatch.setattr(kernels, name, lambda *arrays, name=name: done.append(name))
+    for places, texels in ((False, True), (True, False)):
+        face, coordinates = cube_map.project(random_directions(9))
+        inputs = coordinates.requires_grad_(places), random_texels().requires_grad_(texels)
+        kernels.lookup(face, *inputs, PADDED, LEVELS).sum().backward()
+    assert done == ["_backward", "_backward_to_coordinates"]
 
 
 def test_texels_have_similar_solid_angles() -> None:

@@ -6,17 +6,21 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import nn
 from torch.nn.functional import normalize
 
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.boundaries.near_field import NearField, _share, contract, contracted_lines, curve
 from nerfro.cameras import Cameras
+from nerfro.distributed import drawing_for
 from nerfro.errors import NerfroError
+from nerfro.fields import hash_encoding
+from nerfro.fields.spherical_harmonics import spherical_harmonics
 from nerfro.media.shapes import Ball
 from nerfro.samplers.snell import Snell
 from nerfro.samplers.straight import straight_path
-from nerfro.types import Exits, Path, Rays
+from nerfro.types import Exits, Path, Radiance, Rays, Samples
 
 SMALL = {
     "grid_resolution": 32,
@@ -97,6 +101,75 @@ def test_a_sky_does_not_depend_on_the_place():
     path = straight_path(rays([[5.0, 0.0, 9.0], [0.0, 1.0, 2.0]], [[0.0, 0.3, -1.0], [0.0, 0.3, -1.0]]))
     colours = sky(path.exits())
     assert torch.equal(colours, sky(Exits(path.exit_directions)))
+
+
+class Cloud(nn.Module):
+    """A smooth field in any precision."""
+
+    def forward(self, samples: Samples) -> Radiance:
+        x = samples.positions
+        return Radiance(3 * torch.exp(-x.square().sum(-1)), torch.sigmoid(x * x.roll(1, -1) + samples.directions))
+
+
+def kept(near_field: NearField, starts: torch.Tensor, directions: torch.Tensor) -> None:
+    """Let its sampler choose the arc lengths of these lines, whatever it is asked later."""
+    offsets = (starts - near_field.box.mean(0)) / near_field.radius
+    chosen = near_field.sampler(contracted_lines(offsets, directions), None)
+    near_field.sampler.forward = lambda path, previous: chosen
+
+
+def some_lines(num: int) -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.randn(num, 3) * torch.tensor([1.0, 0.5, 4.0]), normalize(torch.randn(num, 3), dim=-1)
+
+
+def test_gradients_are_those_of_differences(near_field):
+    starts, directions = some_lines(6)
+    kept(near_field, starts, directions)
+    near_field.double().field = Cloud()
+    lines = (starts.double().requires_grad_(), directions.double().requires_grad_())
+    assert torch.autograd.gradcheck(near_field._render, lines)
+
+
+def test_kernels_pass_the_gradients_that_autograd_finds(near_field, monkeypatch):
+    nn.init.normal_(near_field.field.table, std=0.5)
+    near_field.field.precision = "float32"
+    starts, directions = some_lines(40)
+    kept(near_field, starts, directions)
+    gradients = []
+    for plain in (False, True):
+        if plain:
+            encode = hash_encoding.hash_encode
+            monkeypatch.setattr("nerfro.fields.hash_encoding_cpu.hash_encode", encode)
+            monkeypatch.setattr("nerfro.fields.spherical_harmonics_cpu.spherical_harmonics", spherical_harmonics)
+        lines = (starts.clone().requires_grad_(), directions.clone().requires_grad_())
+        colours = (near_field._render(*lines) * torch.tensor([1.0, -2.0, 3.0])).sum()
+        gradients.append(torch.autograd.grad(colours, lines))
+    for ours, reference in zip(*gradients, strict=True):
+        assert reference.abs().max() > 0.01
+        torch.testing.assert_close(ours, reference, rtol=1e-3, atol=1e-4 * float(reference.abs().max()))
+
+
+def test_lines_through_the_box_pass_gradients_to_where_they_leave_it(near_field, monkeypatch):
+    near_field.double()
+    monkeypatch.setattr(near_field, "_render", lambda starts, directions, ray: starts)
+    starts = torch.tensor([[0.2, 0.1, 9.0], [0.9, 0.2, 1.0], [5.0, 0.0, 9.0]], dtype=torch.float64)
+    # One is parallel to four faces, one begins inside and one misses.
+    directions = normalize(torch.tensor([[0.0, 0.0, -1.0], [0.3, 0.2, -0.5], [0.1, 0.0, -1.0]]).double(), dim=-1)
+    lines = directions.requires_grad_(), starts.requires_grad_()
+    assert torch.autograd.gradcheck(lambda d, x: near_field(Exits(d, x)), lines)
+
+
+def test_polylines_of_a_ray_share_its_random_numbers(near_field):
+    nn.init.normal_(near_field.field.table)
+    near_field.train()
+    path = straight_path(rays([[0.2, 0.1, 9.0], [5.0, 0.0, 9.0]], [[0.0, 0.3, -1.0]] * 2))
+    split = replace(path[torch.tensor([0, 0, 1])], ray=torch.tensor([0, 0, 1]))
+    colours = []
+    for exits in (path.exits(), split.exits()):
+        torch.manual_seed(3)
+        with drawing_for(torch.tensor([5, 2]), 7):  # rows of a batch that several processes share
+            colours.append(near_field(exits))
+    assert torch.equal(colours[0][[0, 0, 1]], colours[1])
 
 
 def wall_colour(origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:

@@ -8,6 +8,7 @@ import torch
 from nerfro.errors import NerfroError
 from nerfro.fields import hash_encoding
 from nerfro.fields import hash_encoding_cpu as kernels
+from nerfro.kernels.constants import constant
 
 # Two dense levels and three hashed ones, the last of them much finer than its table.
 LEVELS = hash_encoding.grid_levels(num_levels=5, base_resolution=4, finest_resolution=64, log2_table_size=10)
@@ -72,17 +73,43 @@ def test_encoding_is_continuous_across_cells(encode) -> None:
 
 @pytest.mark.parametrize("num_points", [0, 1, 3000])
 def test_kernels_match_the_reference_forward_and_backward(num_points: int) -> None:
-    positions = random_positions(num_points)
-    ours, reference = random_table().requires_grad_(), random_table().requires_grad_()
-    encoded, expected = (
-        kernels.hash_encode(positions, ours, LEVELS),
-        hash_encoding.hash_encode(positions, reference, LEVELS),
-    )
+    inputs = (random_positions(num_points).requires_grad_(), random_table().requires_grad_())
+    encoded, expected = kernels.hash_encode(*inputs, LEVELS), hash_encoding.hash_encode(*inputs, LEVELS)
     torch.testing.assert_close(encoded, expected, rtol=1e-5, atol=1e-5)
     upstream = torch.randn(expected.shape, generator=torch.Generator().manual_seed(3))
-    encoded.backward(upstream)
-    expected.backward(upstream)
-    torch.testing.assert_close(ours.grad, reference.grad, rtol=1e-5, atol=1e-5 * float(reference.grad.abs().max()))
+    gradients = (torch.autograd.grad(output, inputs, upstream) for output in (encoded, expected))
+    for ours, reference in zip(*gradients, strict=True):
+        torch.testing.assert_close(ours, reference, rtol=1e-5, atol=1e-5 * float(reference.abs().max()))
+
+
+def test_gradients_are_those_of_differences() -> None:
+    # A dense level of one cell, a dense one of 27 vertices and a hashed one; places outside the cube do not move.
+    levels = hash_encoding.grid_levels(num_levels=3, base_resolution=1, finest_resolution=6, log2_table_size=5)
+    assert levels.dense == (True, True, False)
+    generator = torch.Generator().manual_seed(5)
+    positions = (1.4 * torch.rand(12, 3, generator=generator, dtype=torch.float64) - 0.2).requires_grad_()
+    table = torch.randn(levels.num_entries, 2, generator=generator, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda p, t: hash_encoding.hash_encode(p, t, levels), (positions, table))
+
+
+def test_only_gradients_that_are_asked_for_are_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    done = []
+    for name in ("_backward", "_backward_to_positions"):
+        monkeypatch.setattr(kernels, name, lambda *arrays, name=name: done.append(name))
+    for positions, table in ((False, True), (True, False)):
+        inputs = random_positions(9).requires_grad_(positions), random_table().requires_grad_(table)
+        kernels.hash_encode(*inputs, LEVELS).sum().backward()
+    assert done == ["_backward", "_backward_to_positions"]
+
+
+def test_positions_learn_after_a_picture_was_rendered() -> None:
+    # Tensors made in inference mode, as pictures are, cannot be saved for a gradient, and constants are kept.
+    constant.cache_clear()
+    positions = random_positions(9).requires_grad_()
+    with torch.inference_mode():
+        hash_encoding.hash_encode(positions, random_table(), LEVELS)
+    hash_encoding.hash_encode(positions, random_table(), LEVELS).sum().backward()
+    assert positions.grad.any()
 
 
 def test_kernels_accept_an_empty_list() -> None:

@@ -9,6 +9,7 @@ from nerfro.errors import NerfroError
 from nerfro.fields import hash_encoding
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.fields.selection import evaluate_selected, inside_box
+from nerfro.fields.spherical_harmonics import spherical_harmonics
 from nerfro.types import Samples
 
 
@@ -81,6 +82,36 @@ def test_compiled_field_equals_the_plain_one(monkeypatch: pytest.MonkeyPatch) ->
         results.append([radiance.density.detach(), radiance.rgb.detach(), *(p.grad for p in field.parameters())])
     for compiled, expected in zip(*results, strict=True):
         torch.testing.assert_close(compiled, expected, rtol=1e-5, atol=1e-5 * float(expected.abs().max()))
+
+
+def decoded_in_double(
+    field: HashGridField, positions: torch.Tensor, directions: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Density and colour by plain PyTorch in double precision."""
+    unit = (positions - field.box_min) / field.side
+    geometry = field.density_mlp.double()(hash_encoding.hash_encode(unit, field.table.double(), field.levels))
+    inputs = torch.cat([geometry, spherical_harmonics(directions, field.direction_bands)], -1)
+    return field.initial_density * geometry[:, 0].exp(), torch.sigmoid(field.colour_mlp.double()(inputs)) * 1.002
+
+
+def test_positions_and_directions_get_the_gradients_that_autograd_finds() -> None:
+    inputs = [values.requires_grad_() for values in (torch.rand(80, 3) * 3 - 1.5, torch.randn(80, 3))]
+    upstream = torch.tensor([1.0, -2.0, 3.0])
+    field = make_field()
+    edges = torch.tensor([[0.0, 1.0]]).expand(80, 2)
+    samples = Samples(*(values[:, None] for values in inputs), edges[:, :1], edges, edges[:, 0])
+    radiance = field(samples)
+    ours = torch.autograd.grad(radiance.density.sum() + (radiance.rgb * upstream).sum(), inputs)
+    in_double = [values.detach().double().requires_grad_() for values in inputs]
+    density, rgb = decoded_in_double(field, *in_double)
+    expected = torch.autograd.grad(density.sum() + (rgb * upstream).sum(), in_double)
+    inside = inside_box(inputs[0], field.box_min, field.box_max)
+    assert 10 < inside.sum() < 70
+    for found, reference in zip(ours, expected, strict=True):
+        assert not found[~inside].any()
+        torch.testing.assert_close(found[inside].double(), reference[inside], rtol=1e-3, atol=1e-4)
+    few = [values[inside][:5].detach().requires_grad_() for values in in_double]
+    assert torch.autograd.gradcheck(lambda p, d: decoded_in_double(field, p, d), few)
 
 
 def test_bfloat16_products_stay_close_to_single_precision() -> None:

@@ -50,6 +50,15 @@ def test_inputs_side_by_side_of_which_one_learns() -> None:
     torch.testing.assert_close(mine, theirs)
 
 
+def test_nothing_is_computed_for_weights_that_do_not_learn(monkeypatch: pytest.MonkeyPatch) -> None:
+    mlp = layers(5, 8, 3).requires_grad_(False)
+    inputs = torch.randn(20, 5, requires_grad=True)
+    monkeypatch.delattr("nerfro.fields.relu_mlp._product_of_columns")
+    (mine,) = torch.autograd.grad(relu_mlp(inputs, weights(mlp), torch.float32).sum(), inputs)
+    (theirs,) = torch.autograd.grad(mlp(inputs).sum(), inputs)
+    torch.testing.assert_close(mine, theirs)
+
+
 def test_gradient_against_differences() -> None:
     mlp = layers(4, 6, 5, 2).double()
     inputs = torch.randn(7, 4, dtype=torch.float64, requires_grad=True)

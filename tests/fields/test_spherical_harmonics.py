@@ -49,7 +49,17 @@ def test_too_many_bands_are_refused() -> None:
 
 
 @pytest.mark.parametrize("num_bands", [1, 2, 3, 4])
-def test_kernel_equals_the_reference(num_bands: int) -> None:
-    directions = torch.nn.functional.normalize(torch.randn(70, 3), dim=-1)
-    expected = spherical_harmonics(directions, num_bands)
-    torch.testing.assert_close(kernel.spherical_harmonics(directions, num_bands), expected, rtol=0, atol=1e-6)
+def test_kernel_equals_the_reference_forward_and_backward(num_bands: int) -> None:
+    directions = torch.nn.functional.normalize(torch.randn(70, 3), dim=-1).requires_grad_()
+    # The first band is constant, which plain PyTorch takes for independent of the directions.
+    expected = spherical_harmonics(directions, num_bands) + 0 * directions[:, :1]
+    found = kernel.spherical_harmonics(directions, num_bands)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+    upstream = torch.randn_like(expected)
+    ours, reference = (torch.autograd.grad(values, directions, upstream)[0] for values in (found, expected))
+    torch.testing.assert_close(ours, reference, rtol=1e-5, atol=1e-5)
+
+
+def test_gradients_are_those_of_differences() -> None:
+    directions = torch.nn.functional.normalize(torch.randn(9, 3, dtype=torch.float64), dim=-1).requires_grad_()
+    assert torch.autograd.gradcheck(lambda d: spherical_harmonics(d, 4), directions)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from torch import nn
 
+from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.samplers.density_grid import DensityGridSampler, field_density
 from nerfro.samplers.stepfun import spread_uniform
@@ -39,6 +41,13 @@ def test_compiled_kernel_draws_what_the_plain_twin_draws() -> None:
         torch.testing.assert_close(compiled.positions, plain.positions, rtol=0, atol=1e-3)
         close = (compiled.directions - plain.directions).norm(dim=-1) < 1e-5
         assert close.float().mean() > 0.99  # a sample within rounding of a vertex may lie on either side
+
+
+@pytest.mark.parametrize("num_rows", [63, 65])
+def test_kernel_refuses_other_numbers_of_rows_than_of_paths(num_rows: int) -> None:
+    sampler, u = DensityGridSampler(num_samples=16), torch.zeros(num_rows, 17)
+    with pytest.raises(NerfroError, match=f"{num_rows} rows .* 64 paths"):
+        sampler.draw_compiled(example_path(64), u)
 
 
 def test_samples_gather_where_the_density_is() -> None:

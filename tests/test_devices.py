@@ -1,0 +1,70 @@
+"""Every kind of experiment on a GPU, pretended: nothing is left on the CPU, and it is known where the host waits."""
+
+from __future__ import annotations
+
+import warnings
+
+import pytest
+
+from nerfro.evaluation.render_view import Supersampling, render_view
+from nerfro.kernels.constants import constant
+from nerfro.models.base import NerfModel
+from nerfro.registry import build
+from nerfro.training.config import build_model
+from nerfro.training.ray_batches import RayBatches
+from tests.pretended_gpu import GPU, OnGpu, PretendedGpu
+from tests.test_experiments import SMALL, composed, shrunk
+
+# A step at which all losses have begun and densities are looked at.
+STEP = 100_000
+
+# Loops end when the last ray has ended, and triangles are met on the CPU.
+TRACING = ("samplers/snell.py", "samplers/eikonal.py", "samplers/polylines.py", "media/sdf_grid.py")
+TRACING += ("samplers/mesh_interfaces.py",)
+
+ADAPTIVE = ["sampler.path.integrator=adaptive", "sampler.path.max_steps=60", "sampler.points.draw=arc_length"]
+
+# A constant is copied to the device once. Fields are asked for samples in the object alone, whose number must be known.
+ONCE = "kernels/constants.py: constant (tensor)"
+SELECTED = "fields/selection.py: evaluate_selected (nonzero)"
+
+
+@pytest.mark.parametrize(
+    ("experiment", "waits"),
+    [
+        (["refractive", "sampler.path.max_events=2"], {ONCE, SELECTED}),
+        (["refractive", "sampler/path=eikonal", "sampler.path.max_steps=60"], {ONCE, SELECTED}),
+        (["refractive", "sampler.path.interface=mesh"], {ONCE, SELECTED}),
+        (["refractive_room", "sampler.path.max_events=2"], {ONCE, SELECTED}),
+        (["mipnerf"], set()),
+        (["paper_refractive"], {ONCE}),
+        (["paper_refractive", *ADAPTIVE], {ONCE}),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_training_and_rendering_stay_on_the_gpu(
+    experiment: list[str], waits: set[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(NerfModel, "log", lambda *values, **options: None)
+    monkeypatch.setattr(NerfModel, "global_step", STEP)
+    overrides = [f"+experiment={experiment[0]}", *experiment[1:], *SMALL, "data.downscale=16"]
+    config = composed(*overrides, *shrunk(composed(*overrides)))
+    model, views = build_model(config), build(config.data).load("train")
+    # What is computed and kept while the model is on the CPU must move with it.
+    model.render(views.cameras.image_rays(0))
+    constant.cache_clear()
+    with PretendedGpu() as gpu, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*CUDA is not available.*")
+        model.to(GPU)
+        batches, cameras = RayBatches(views, 8, config.batches.batching).to(GPU), views.cameras.to(GPU)
+        gpu.waits.clear()
+        loss = model.training_step(batches.batch(STEP), 0)
+        loss.backward()
+        model.point_sampler.after_step(STEP, list(model.fields))
+        model.boundary.after_step(STEP)
+        assert {wait for wait in gpu.waits if not wait.startswith(TRACING)} == waits
+        rendered = render_view(model, cameras, 0, Supersampling())
+    assert isinstance(loss, OnGpu)
+    assert isinstance(rendered.radiance, OnGpu)
+    assert all(isinstance(tensor, OnGpu) for tensor in (*model.parameters(), *model.buffers()))
+    assert all(parameter.grad is not None for parameter in model.parameters())
