@@ -18,7 +18,6 @@ from nerfro.errors import NerfroError
 from nerfro.evaluation.error_maps import error_maps
 from nerfro.evaluation.error_sheets import error_sheet
 from nerfro.evaluation.folders import match_folders
-from nerfro.evaluation.images import load_png, save_png
 from nerfro.evaluation.lpips import LpipsNetwork, find_lpips_networks
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.render_view import Supersampling
@@ -27,6 +26,7 @@ from nerfro.evaluation.score_tables import regions_table, views_table
 from nerfro.evaluation.score_views import score_views
 from nerfro.evaluation.tables import to_rich, write_table
 from nerfro.files.atomic import refuse_existing
+from nerfro.files.images import load_png, save_png
 from nerfro.models.base import NerfModel
 from nerfro.registry import build
 from nerfro.training.callbacks import Throughput

@@ -31,8 +31,8 @@ from nerfro.capture.visual_hull import (
 from nerfro.cli import entry_point
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError, first_of
-from nerfro.evaluation.images import save_png
 from nerfro.files.atomic import refuse_existing, write_atomically
+from nerfro.files.images import save_png
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.paths import EMBEDDED_PREFIX, resolve_path
 from nerfro.registry import build

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerfro.capture.silhouettes import mesh_silhouette, pixel_stride
 from nerfro.data.base import Views
-from nerfro.evaluation.drawing import GAP, LINE_HEIGHT, fit, paper, write
+from nerfro.files.drawing import GAP, LINE_HEIGHT, fit, paper, write
 from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh
 

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.evaluation.drawing import GAP, LINE_HEIGHT, colour_scale, fit, paper, write
 from nerfro.evaluation.error_maps import ErrorMap
+from nerfro.files.drawing import GAP, LINE_HEIGHT, colour_scale, fit, paper, write
 
 MIN_WIDTH = 256  # pixels; smaller pictures are enlarged to it, so that titles have room
 _SCALE_HEIGHT = 64  # pixels

@@ -13,9 +13,9 @@ import torch.nn.functional as F
 from nerfro.boundaries import cube_map, lat_long
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.errors import NerfroError
-from nerfro.evaluation.images import save_png
 from nerfro.files import radiance_hdr
 from nerfro.types import Exits
+from nerfro.files.images import save_png
 
 
 def random_directions(num: int, seed: int = 0) -> torch.Tensor:

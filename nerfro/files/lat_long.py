@@ -16,10 +16,10 @@ from PIL import Image
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.images import save_png
 from nerfro.files import radiance_hdr
 from nerfro.files.atomic import write_atomically
 from nerfro.light import to_linear, to_srgb
+from nerfro.files.images import save_png
 
 _FORMATS = (".png", ".jpg", ".jpeg", ".hdr", ".exr")
 

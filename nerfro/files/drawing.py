@@ -10,13 +10,13 @@ from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from nerfro.evaluation.error_maps import magma
-from nerfro.evaluation.images import to_8bit
+from nerfro.errors import NerfroError
+from nerfro.files.images import to_8bit
 
 GAP = 6  # pixels between pictures
 TEXT_SIZE = 14  # pixels
 LINE_HEIGHT = 22  # pixels
-PAPER, INK, EMPTY = (255, 255, 255), (25, 25, 25), (225, 225, 225)
+PAPER, INK, EMPTY = (255, 255, 255), (25, 25, 25), (225, 225, 225)  # EMPTY: grey of what is not known
 
 
 def paper(width: int, height: int) -> Image.Image:
@@ -56,3 +56,27 @@ def colour_scale(width: int, height: int, title: str, limit: float) -> Image.Ima
     write(cell, "0", left, below)
     write(cell, f"≥ {limit:g}", left + length, below)
     return cell
+
+
+def magma(values: Float[Tensor, "H W"], limit: float) -> Float[Tensor, "H W 3"]:
+    """Colours of matplotlib's magma: black at 0, through purple and orange, to pale yellow at `limit` and above.
+
+    The scale is given and never fitted to the values, so that pictures can be compared.
+
+    Args:
+        values: non-negative numbers; those that are NaN become grey.
+        limit: value of the last colour, positive.
+
+    Returns:
+        sRGB in [0, 1], float32.
+
+    Raises:
+        NerfroError: if the limit is not positive.
+    """
+    if not limit > 0:
+        raise NerfroError(f"the limit of a colour scale must be positive, got {limit}")
+    num_colours = 256
+    table = torch.from_numpy(matplotlib.colormaps["magma"](range(num_colours))[:, :3]).float()
+    values = values.detach().cpu().float()
+    index = (values.nan_to_num() / limit * (num_colours - 1)).round().clamp(0, num_colours - 1)
+    return torch.where(values.isnan()[..., None], torch.tensor(EMPTY) / 255, table[index.long()])
