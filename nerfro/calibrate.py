@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Optional
 
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 from omegaconf import DictConfig
 from rich.progress import track
@@ -207,7 +206,7 @@ def luminance(image: Path) -> UInt8[np.ndarray, "H W"]:
     A pixel on an edge averages light, and sRGB's curve shows half the light as more than half a level. The edges of
     what is bright are then found too far outside, those of tags by 0.2 to 0.3 pixels.
     """
-    light = to_linear(torch.tensor(read_rgb(image, "drop"))).numpy() @ _LUMINANCE
+    light = to_linear(read_rgb(image, "drop")) @ _LUMINANCE
     white = max(float(np.quantile(light, 0.999)), 1 / 255)
     return np.uint8(np.rint(255 * np.minimum(light / white, 1.0)))
 

@@ -17,11 +17,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
+from nerfro.light import to_srgb
 from nerfro.paths import CONF_DIR
 from nerfro.scenes import SCENES, dataset, photographs
 from nerfro.scenes.baking import bake
 from nerfro.scenes.path_tracer import PathTracer, Pinhole, load_mitsuba
-from nerfro.scenes.patterns import to_srgb
 from nerfro.scenes.scene import Scene
 from nerfro.scenes.skies import lat_long_texture
 

@@ -18,8 +18,8 @@ from torch import Tensor
 from nerfro.errors import NerfroError
 from nerfro.files import radiance_hdr
 from nerfro.files.atomic import write_atomically
-from nerfro.light import to_linear, to_srgb
 from nerfro.files.images import save_png
+from nerfro.light import to_linear, to_srgb
 
 _FORMATS = (".png", ".jpg", ".jpeg", ".hdr", ".exr")
 

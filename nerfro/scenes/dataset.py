@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
-import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,7 +13,8 @@ import numpy as np
 from PIL import Image
 
 from nerfro.errors import NerfroError
-from nerfro.scenes.patterns import to_srgb
+from nerfro.files.atomic import atomic_file, write_atomically
+from nerfro.light import to_srgb
 from nerfro.scenes.scene import Scene
 from nerfro.scenes.skies import lat_long_directions
 from nerfro.scenes.viewpoints import directions_on_sphere, look_at_origin
@@ -168,22 +167,10 @@ def write_view(folder: Path, view: View, radiance: np.ndarray, silhouette: np.nd
 
 
 def write_image(path: Path, image: np.ndarray) -> None:
-    """Write sRGB [H, W, 3] or shares [H, W] in [0, 1] as an 8-bit PNG, or bool [H, W] as a 1-bit PNG."""
-    picture = Image.fromarray(image if image.dtype == bool else np.rint(image * 255).astype(np.uint8))
-    buffer = io.BytesIO()
-    picture.save(buffer, format="PNG", optimize=True)
-    write_bytes(path, buffer.getvalue())
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file so that an interruption leaves either the whole file or none."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    try:
-        partial.write_bytes(content)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    """Write sRGB [H, W, 3] or shares [H, W], clipped to [0, 1], as an 8-bit PNG, or bool [H, W] as a 1-bit PNG."""
+    levels = image if image.dtype == bool else np.rint(np.clip(image, 0.0, 1.0) * 255).astype(np.uint8)
+    with atomic_file(path) as file:
+        Image.fromarray(levels).save(file, "PNG", optimize=True)
 
 
 def write_meta(folder: Path, settings: Settings, scene: Scene, versions: dict[str, str]) -> None:
@@ -201,7 +188,7 @@ def write_meta(folder: Path, settings: Settings, scene: Scene, versions: dict[st
         "settings": asdict(settings),
         "versions": versions,
     }
-    write_bytes(folder / META, (json.dumps(meta, indent=1) + "\n").encode())
+    write_atomically(folder / META, json.dumps(meta, indent=1) + "\n")
 
 
 def write_transforms(folder: Path, planned: list[View]) -> None:
@@ -217,7 +204,7 @@ def write_transforms(folder: Path, planned: list[View]) -> None:
             if view.split == split
         ]
         content = json.dumps({"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}, indent=1)
-        write_bytes(folder / f"transforms_{split}.json", (content + "\n").encode())
+        write_atomically(folder / f"transforms_{split}.json", content + "\n")
 
 
 def _stored_settings(meta: Path) -> dict | None:

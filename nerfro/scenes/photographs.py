@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from nerfro.scenes.dataset import write_bytes, write_image
+from nerfro.files.atomic import write_atomically
+from nerfro.light import to_srgb
+from nerfro.scenes.dataset import write_image
 from nerfro.scenes.path_tracer import Pinhole
-from nerfro.scenes.patterns import to_srgb
 from nerfro.scenes.scene import Scene
 from nerfro.scenes.viewpoints import hand_held
 
@@ -98,7 +99,7 @@ def write_photograph(
     """
     grain = np.random.default_rng(photograph.seed).normal(scale=noise, size=radiance.shape)
     write_image(folder / photograph.mask_path, silhouette >= 0.5)
-    write_image(folder / photograph.image_path, np.clip(to_srgb(radiance) + grain, 0.0, 1.0))
+    write_image(folder / photograph.image_path, to_srgb(np.clip(radiance, 0.0, 1.0)) + grain)
 
 
 def write_truth(folder: Path, planned: list[Photograph], settings: Settings, scene: Scene) -> None:
@@ -116,10 +117,10 @@ def write_truth(folder: Path, planned: list[Photograph], settings: Settings, sce
     ]
     matrix = [[lens.focal, 0.0, lens.cx], [0.0, lens.focal, lens.cy], [0.0, 0.0, 1.0]]
     content = {"cam_mat": matrix, "w": lens.width, "h": lens.height, "frames": frames}
-    write_bytes(folder / TRUTH / "transforms_train.json", (json.dumps(content, indent=1) + "\n").encode())
+    write_atomically(folder / TRUTH / "transforms_train.json", json.dumps(content, indent=1) + "\n")
 
 
 def write_meta(folder: Path, settings: Settings, scene: Scene, versions: dict[str, str]) -> None:
     """Write truth/meta.json: what the folder holds and how it came about."""
     meta = {"scene": scene.name, "ior": scene.ior, "settings": asdict(settings), "versions": versions}
-    write_bytes(folder / META, (json.dumps(meta, indent=1) + "\n").encode())
+    write_atomically(folder / META, json.dumps(meta, indent=1) + "\n")

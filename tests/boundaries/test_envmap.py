@@ -10,12 +10,12 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from nerfro.boundaries import cube_map, lat_long
+from nerfro.boundaries import cube_map
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.errors import NerfroError
-from nerfro.files import radiance_hdr
-from nerfro.types import Exits
+from nerfro.files import lat_long, radiance_hdr
 from nerfro.files.images import save_png
+from nerfro.types import Exits
 
 
 def random_directions(num: int, seed: int = 0) -> torch.Tensor:
