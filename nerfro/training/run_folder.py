@@ -20,12 +20,10 @@ from omegaconf import DictConfig, OmegaConf
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.paths import PACKAGE_DIR
+from nerfro.training.settings import RESUMING, first_difference, settings
 
 LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
 _PACKAGES = ("nerfro", "torch", "lightning", "hydra-core", "torchmetrics", "numpy", "numba", "trimesh")
-
-# A checkpoint fits a run only if these parts of the two configurations agree.
-_MUST_AGREE = ("model", "field", "boundary", "medium", "sampler", "data", "batches", "seed")
 
 
 def claim(folder: Path, resumed: bool, needed_bytes: int) -> None:
@@ -116,22 +114,13 @@ def require_same_configuration(path: Path, trained: DictConfig, wanted: DictConf
     Raises:
         NerfroError: the first field that differs is named, with both values.
     """
-    for section in _MUST_AGREE:
-        old = flatten(OmegaConf.to_container(trained, resolve=True).get(section), section)  # type: ignore[union-attr]
-        new = flatten(OmegaConf.to_container(wanted, resolve=True).get(section), section)  # type: ignore[union-attr]
-        for key in sorted(old.keys() | new.keys()):
-            if old.get(key) != new.get(key):
-                raise NerfroError(
-                    f"{path} was trained with {key}={old.get(key)}, this run has {new.get(key)}; "
-                    "use the same experiment and overrides, or start without ckpt_path"
-                )
-
-
-def flatten(node: Any, prefix: str) -> dict[str, Any]:
-    """A nested configuration as one dictionary: `{"field": {"width": 64}}` below `prefix` is `prefix.field.width`."""
-    if not isinstance(node, dict):
-        return {prefix: node}
-    return {key: value for name, child in node.items() for key, value in flatten(child, f"{prefix}.{name}").items()}
+    old, new = settings(trained, RESUMING), settings(wanted, RESUMING)
+    key = first_difference(old, new)
+    if key is not None:
+        raise NerfroError(
+            f"{path} was trained with {key}={old.get(key)}, this run has {new.get(key)}; "
+            "use the same experiment and overrides, or start without ckpt_path"
+        )
 
 
 def _git(*command: str) -> str | None:
