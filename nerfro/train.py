@@ -2,39 +2,32 @@
 
 from __future__ import annotations
 
-import logging
 import shlex
 import sys
-import warnings
-from datetime import timedelta
 from pathlib import Path
 
 import lightning.pytorch as pl
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint
-from lightning.pytorch.loggers import Logger, WandbLogger
-from lightning.pytorch.strategies import DDPStrategy
-from omegaconf import DictConfig, OmegaConf
+from lightning.pytorch.loggers import WandbLogger
+from omegaconf import DictConfig
 
 from nerfro.cameras import Cameras
 from nerfro.cli import EXIT_INTERRUPTED, entry_point
 from nerfro.distributed import leave
 from nerfro.errors import NerfroError
-from nerfro.evaluate import report
 from nerfro.evaluation.lpips import find_lpips_networks
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.render_view import Supersampling
+from nerfro.evaluation.score_tables import report
 from nerfro.evaluation.score_views import score_views
 from nerfro.fields.mlp import compile_networks
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.models.base import NerfModel
 from nerfro.registry import build
 from nerfro.samplers.training_paths import TrainingPaths
-from nerfro.training.callbacks import ConfigInCheckpoint, StopOnSignal, Throughput, TrainingProgress
+from nerfro.training.callbacks import StopOnSignal, Throughput
 from nerfro.training.config import TrainConfig, build_model
 from nerfro.training.data_module import RayDataModule
-from nerfro.training.log import TrainingLog
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.run_folder import (
     LAST_CHECKPOINT,
@@ -44,6 +37,7 @@ from nerfro.training.run_folder import (
     record,
     require_same_configuration,
 )
+from nerfro.training.trainer import make_trainer, quieten_lightning
 
 _SPARE_BYTES = 64 * 2**20  # pictures and logs, beside the checkpoints
 
@@ -55,7 +49,7 @@ def main(config: DictConfig) -> None:
     checkpoint = find_checkpoint(config.ckpt_path, folder)
     if not 0 <= config.seed < 2**32:
         raise NerfroError(f"seed={config.seed} is no seed; give 0 to {2**32 - 1}")
-    _quieten_lightning()
+    quieten_lightning()
     keep_freed_memory()
     pl.seed_everything(config.seed, verbose=False)
 
@@ -111,7 +105,7 @@ def main(config: DictConfig) -> None:
     metrics = ImageMetrics(*lpips, prefix=config.evaluation.split)
     result = score_views(model, test, metrics, folder, supersampling)
     title = f"{config.name} on {config.data.root}, {config.evaluation.split} views"
-    report(result, title, folder, trainer.global_step, throughput)
+    report(result, title, folder, trainer.global_step, throughput.seconds, throughput.rays_per_second)
     print(f"{trainer.global_step} steps in {throughput.seconds:.0f} s, {throughput.rays_per_second or 0:,.0f} rays/s.")
     print("Look at:")
     print(f"  {folder}/images/  the pictures; metrics.json, .csv, .md and .tex beside them")
@@ -126,68 +120,6 @@ def trace_training_rays(config: DictConfig, model: NerfModel, cameras: Cameras) 
     if not wanted.cache_paths or wanted.jitter or not model.path_sampler.few_vertices:
         return None
     return TrainingPaths.build(model.path_sampler, model.medium, cameras, wanted.supersample, wanted.divergence)
-
-
-def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.Trainer:
-    """Lightning's Trainer with the callbacks that every run has.
-
-    Raises:
-        NerfroError: a field of the trainer, logger or checkpoint section is unknown or wrong.
-    """
-    if (config.checkpoint.every_seconds is None) == (config.checkpoint.every_steps is None):
-        raise NerfroError("set one of checkpoint.every_seconds and checkpoint.every_steps, and the other to null")
-    seconds, every = config.checkpoint.every_seconds, config.evaluation.every
-    checkpoints = ModelCheckpoint(
-        dirpath=folder / LAST_CHECKPOINT.parent,
-        filename=LAST_CHECKPOINT.stem,
-        every_n_train_steps=config.checkpoint.every_steps,
-        train_time_interval=None if seconds is None else timedelta(seconds=seconds),
-        enable_version_counter=False,
-        save_on_train_epoch_end=False,
-    )
-    in_checkpoint = ConfigInCheckpoint(OmegaConf.to_yaml(config, resolve=True))
-    ours = {
-        "default_root_dir": str(folder),
-        "callbacks": [checkpoints, TrainingProgress(), in_checkpoint, TrainingLog(), *extra],
-        "logger": _loggers(config, folder),
-        "max_epochs": -1,
-        "val_check_interval": every if every > 0 else None,
-        "check_val_every_n_epoch": None,
-        "limit_val_batches": 1 if every > 0 else 0,
-        "num_sanity_val_steps": 0,
-        "use_distributed_sampler": False,
-    }
-    taken = sorted(ours.keys() & config.trainer.keys())
-    if taken:
-        raise NerfroError(f"trainer.{taken[0]} is set by nerfro.train itself; see evaluation, checkpoint and logger")
-    if config.trainer.get("strategy") == "ddp":
-        # The index grid is a buffer and would be sent around in every step, though all processes have the same one.
-        ours["strategy"] = DDPStrategy(broadcast_buffers=False)
-    trainer = build(config.trainer, **ours)
-    if trainer.world_size > 1 and HydraConfig.get().mode == RunMode.MULTIRUN:
-        raise NerfroError("a sweep (-m) cannot use several devices; start its runs one by one")
-    if config.trainer.get("max_time") is None and trainer.max_steps < 0:
-        raise NerfroError("the run would never end; set trainer.max_time (DD:HH:MM:SS), trainer.max_steps, or both")
-    return trainer
-
-
-def _loggers(config: DictConfig, folder: Path) -> list[Logger]:
-    return [build(node, save_dir=str(folder)) for node in (config.logger or {}).values()]
-
-
-def _quieten_lightning() -> None:
-    """Keep Lightning's hints about loaders and hardware from the user: batches are made on the device here."""
-    for package in ("lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(package).setLevel(logging.WARNING)
-    for message in (
-        ".*does not have many workers.*",
-        ".*You are using .* devices.*",
-        ".*Starting from v1.9.*",
-        ".*sync_dist=True.*",  # one process looks at validation views
-        ".*broadcast_buffers.* is deprecated.*",  # its successor is not in all versions of torch that are supported
-        ".*LeafSpec.* is deprecated.*",
-    ):
-        warnings.filterwarnings("ignore", message)
 
 
 if __name__ == "__main__":

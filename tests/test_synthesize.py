@@ -17,7 +17,7 @@ from nerfro.errors import NerfroError
 from nerfro.light import to_linear, to_srgb
 from nerfro.paths import ASSETS_DIR, CONF_DIR
 from nerfro.scenes import torus
-from nerfro.synthesize import SynthesizeConfig, synthesize
+from nerfro.scenes.synthesis import SynthesizeConfig, synthesize
 
 EMBEDDED = ASSETS_DIR / "torus"
 SPLITS = {"train": 100, "val": 10, "test": 20}

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from nerfro.evaluation.results import FULL, METRICS, EvaluationResult, Region
-from nerfro.evaluation.tables import MISSING, Column, Row, Table
+from pathlib import Path
+
+import rich
+
+from nerfro.evaluation.results import FULL, METRICS, EvaluationResult, Region, write_metrics_json
+from nerfro.evaluation.tables import MISSING, Column, Row, Table, to_rich, write_table
 
 
 def views_table(result: EvaluationResult, title: str, region: Region = FULL) -> Table:
@@ -54,3 +58,29 @@ def _footnotes(result: EvaluationResult, region: Region) -> dict[str, str]:
         if key in result.notes:
             notes[metric.name] = f"{metric.title} {MISSING}: {result.notes[key]}"
     return notes
+
+
+def report(
+    result: EvaluationResult,
+    title: str,
+    folder: Path,
+    steps: int | None = None,
+    seconds: float | None = None,
+    rays_per_second: float | None = None,
+) -> None:
+    """Write metrics.json and the tables into a folder, and print the views' and the regions' table.
+
+    Args:
+        result: scores.
+        title: of the table.
+        folder: where the files go.
+        steps, seconds, rays_per_second: of the training; None for pictures of another program.
+    """
+    write_metrics_json(folder / "metrics.json", result, steps, seconds, rays_per_second)
+    for region in result.regions:
+        full = region == FULL
+        table = views_table(result, title if full else f"{title}, {region}", region)
+        write_table(table, folder / ("metrics" if full else f"metrics_{region}"))
+    rich.print(to_rich(views_table(result, title)))
+    if len(result.regions) > 1:
+        rich.print(to_rich(regions_table(result, "means of the full images, of the object's mask, and of the crop")))

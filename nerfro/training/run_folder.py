@@ -19,7 +19,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
+from nerfro.models.base import NerfModel
 from nerfro.paths import PACKAGE_DIR
+from nerfro.training.config import build_model
 from nerfro.training.settings import RESUMING, first_difference, settings
 
 LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
@@ -106,6 +108,23 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], DictConfig]:
         reason = str(error).strip().split("\n", 1)[0]
         raise NerfroError(f"{path} is not a readable nerfro checkpoint ({type(error).__name__}: {reason})") from error
     return checkpoint, config  # type: ignore[return-value]
+
+
+def restore(checkpoint: dict, config: DictConfig) -> NerfModel:
+    """The trained model of a checkpoint.
+
+    Raises:
+        NerfroError: the weights do not fit the configuration.
+    """
+    model = build_model(config)
+    try:
+        model.load_state_dict(checkpoint["state_dict"])
+    except RuntimeError as error:
+        reason = str(error).strip().split("\n")[-1].strip()
+        raise NerfroError(
+            f"the checkpoint's weights do not fit its configuration: {reason}; was nerfro updated?"
+        ) from error
+    return model.eval()
 
 
 def require_same_configuration(path: Path, trained: DictConfig, wanted: DictConfig) -> None:
