@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
@@ -33,6 +34,29 @@ def fit(picture: Float[Tensor, "h w 3"] | None, width: int, height: int) -> Imag
     image = Image.fromarray(to_8bit(picture).cpu().numpy())
     method = Image.Resampling.NEAREST if width >= image.width else Image.Resampling.BOX
     return image.resize((width, height), method)
+
+
+def sheet(
+    pictures: Sequence[Float[Tensor, "h w 3"]], captions: Sequence[str], width: int, columns: int, title: str
+) -> Image.Image:
+    """Pictures of one size in rows, each with a caption below it, under a title.
+
+    Args:
+        pictures: sRGB in [0, 1].
+        captions: as many.
+        width: of each picture in the sheet, pixels.
+        columns: at most so many pictures in a row.
+        title: above all.
+    """
+    columns, height = min(columns, len(pictures)), round(width * pictures[0].shape[0] / pictures[0].shape[1])
+    pitch = height + LINE_HEIGHT + GAP
+    whole = paper(columns * (width + GAP) - GAP, LINE_HEIGHT + -(-len(pictures) // columns) * pitch)
+    write(whole, title, whole.width // 2, LINE_HEIGHT // 2)
+    for place, (picture, caption) in enumerate(zip(pictures, captions, strict=True)):
+        left, top = place % columns * (width + GAP), LINE_HEIGHT + place // columns * pitch
+        whole.paste(fit(picture, width, height), (left, top))
+        write(whole, caption, left + width // 2, top + height + LINE_HEIGHT // 2)
+    return whole
 
 
 def write(image: Image.Image, text: str, x: int, y: int) -> None:

@@ -56,9 +56,13 @@ def save_png(path: Path | str, rgb: Float[Tensor, "H W 3"]) -> None:
     """
     if rgb.ndim != 3 or rgb.shape[-1] != 3:
         raise NerfroError(f"cannot write {path}: expected a picture [H, W, 3], got {list(rgb.shape)}")
-    picture = Image.fromarray(to_8bit(rgb).cpu().numpy())
+    save_picture(path, Image.fromarray(to_8bit(rgb).cpu().numpy()))
+
+
+def save_picture(path: Path | str, picture: Image.Image, optimize: bool = False) -> None:
+    """Write any picture as PNG, whole or not at all."""
     with atomic_file(path) as file:
-        picture.save(file, "PNG")
+        picture.save(file, "PNG", optimize=optimize)
 
 
 def load_png(path: Path | str) -> Float[Tensor, "H W 3"]:

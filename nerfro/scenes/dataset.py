@@ -13,7 +13,8 @@ import numpy as np
 from PIL import Image
 
 from nerfro.errors import NerfroError
-from nerfro.files.atomic import atomic_file, write_atomically
+from nerfro.files.atomic import write_atomically
+from nerfro.files.images import save_picture
 from nerfro.light import to_srgb
 from nerfro.scenes.scene import Scene
 from nerfro.scenes.skies import lat_long_directions
@@ -148,8 +149,7 @@ def write_view(folder: Path, view: Planned, radiance: np.ndarray, silhouette: np
 def write_image(path: Path, image: np.ndarray) -> None:
     """Write sRGB [H, W, 3] or shares [H, W], clipped to [0, 1], as an 8-bit PNG, or bool [H, W] as a 1-bit PNG."""
     levels = image if image.dtype == bool else np.rint(np.clip(image, 0.0, 1.0) * 255).astype(np.uint8)
-    with atomic_file(path) as file:
-        Image.fromarray(levels).save(file, "PNG", optimize=True)
+    save_picture(path, Image.fromarray(levels), optimize=True)
 
 
 def write_meta(folder: Path, settings: Settings, scene: Scene, versions: dict[str, str]) -> None:

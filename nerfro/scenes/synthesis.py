@@ -11,11 +11,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import numpy as np
+import torch
 from omegaconf import MISSING, DictConfig
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from nerfro.errors import NerfroError
+from nerfro.files.lat_long import save_lat_long
 from nerfro.light import to_srgb
 from nerfro.scenes import SCENES, dataset, photographs
 from nerfro.scenes.baking import bake
@@ -120,7 +121,7 @@ def _render_views(config: DictConfig, scene: Scene, folder: Path, mitsuba: Modul
     dataset.write_image(folder / "sky.png", to_srgb(sky))
     if config.extras:
         scene.interior.save(folder / "interior.ply")
-        _write_exr(mitsuba, folder / "sky.exr", sky)
+        save_lat_long(folder / "sky.exr", torch.from_numpy(sky))
     dataset.write_transforms(folder, planned)
 
 
@@ -185,8 +186,3 @@ def _versions(mitsuba: ModuleType) -> dict[str, str]:
     names = ("mitsuba", "drjit", "numpy")
     versions = {name: importlib.metadata.version(name) for name in names}
     return {**versions, "python": platform.python_version(), "variant": mitsuba.variant()}
-
-
-def _write_exr(mitsuba: ModuleType, path: Path, linear: np.ndarray) -> None:
-    bitmap = mitsuba.Bitmap(np.ascontiguousarray(linear, np.float32))
-    bitmap.convert(component_format=mitsuba.Struct.Type.Float16).write(str(path))
