@@ -1,4 +1,4 @@
-"""`python -m nerfro.mask data=... data.root=DIR outlines={NAME:[LEFT,TOP,RIGHT,BOTTOM]}`: masks where none exist."""
+"""`python -m nerfro.mask data=... data.root=DIR outlines={NAME:BOX}`: masks of the object where none exist."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from nerfro.capture.mask_files import (
 from nerfro.capture.masking import grab, outline_region, propagate
 from nerfro.capture.targets import opencv
 from nerfro.cli import entry_point, warn
-from nerfro.data.frames import Frame
+from nerfro.data.base import Frame
 from nerfro.errors import NerfroError, first_of
 from nerfro.files.images import save_picture
 from nerfro.paths import EMBEDDED_PREFIX

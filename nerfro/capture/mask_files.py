@@ -17,8 +17,7 @@ from PIL import Image
 
 from nerfro.cameras import Cameras
 from nerfro.capture.targets import opencv
-from nerfro.data.base import DataSource
-from nerfro.data.frames import Frame
+from nerfro.data.base import DataSource, Frame
 from nerfro.data.image_files import read_mask
 from nerfro.data.masks import masks_left_out
 from nerfro.errors import NerfroError
