@@ -39,8 +39,7 @@ from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.models.base import NerfModel
 from nerfro.paths import ASSETS_DIR, CONF_DIR
 from nerfro.registry import build, discover
-from nerfro.samplers.training_paths import TrainingPaths
-from nerfro.train import trace_training_rays
+from nerfro.samplers.training_paths import TrainingPaths, trace_training_rays
 from nerfro.training.config import TrainConfig, build_model
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.ray_batches import RayBatches

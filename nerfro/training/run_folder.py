@@ -25,6 +25,7 @@ from nerfro.training.config import build_model
 from nerfro.training.settings import RESUMING, first_difference, settings
 
 LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
+_SPARE_BYTES = 64 * 2**20  # pictures and logs, beside the checkpoints
 _PACKAGES = ("nerfro", "torch", "lightning", "hydra-core", "torchmetrics", "numpy", "numba", "trimesh")
 
 
@@ -48,6 +49,12 @@ def claim(folder: Path, resumed: bool, needed_bytes: int) -> None:
             f"{folder} has {free / 2**20:,.0f} MiB free and this run needs {needed_bytes / 2**20:,.0f}; "
             "free some or choose another hydra.run.dir"
         )
+
+
+def needed_bytes(model: NerfModel) -> int:
+    """What a run writes: weights and Adam's two moments, beside an old checkpoint until the new one is whole."""
+    weights = sum(parameter.numel() * parameter.element_size() for parameter in model.parameters())
+    return 2 * 3 * weights + _SPARE_BYTES
 
 
 def record(folder: Path, config: DictConfig) -> None:

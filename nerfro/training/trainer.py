@@ -11,10 +11,12 @@ import lightning.pytorch as pl
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.loggers import WandbLogger
 from lightning.pytorch.strategies import DDPStrategy
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.errors import NerfroError
+from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.registry import build
 from nerfro.training.callbacks import ConfigInCheckpoint, TrainingProgress
 from nerfro.training.log import TrainingLog
@@ -64,7 +66,27 @@ def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.
     return trainer
 
 
-def quieten_lightning() -> None:
+def prepare_process(seed: int) -> None:
+    """Set what this process computes with: the seed, how memory is given back, and what Lightning prints.
+
+    Raises:
+        NerfroError: the seed is out of range.
+    """
+    if not 0 <= seed < 2**32:
+        raise NerfroError(f"seed={seed} is no seed; give 0 to {2**32 - 1}")
+    _quieten_lightning()
+    keep_freed_memory()
+    pl.seed_everything(seed, verbose=False)
+
+
+def finish_logs(trainer: pl.Trainer) -> None:
+    """End logs that the next job of a sweep would go on with."""
+    for logger in trainer.loggers:
+        if isinstance(logger, WandbLogger):
+            logger.experiment.finish()
+
+
+def _quieten_lightning() -> None:
     """Keep Lightning's hints about loaders and hardware from the user: batches are made on the device here."""
     for package in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(package).setLevel(logging.WARNING)
