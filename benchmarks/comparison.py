@@ -11,10 +11,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-from nerfro.evaluation.images import load_png, save_png
 from nerfro.evaluation.pictures import PictureRow, most_telling_crop, picture_grid
 from nerfro.evaluation.results import METRICS, RunMetrics, read_metrics_json
 from nerfro.evaluation.tables import Column, Row, Table, to_markdown
+from nerfro.files.images import load_png, save_png
 from nerfro.paths import ASSETS_DIR
 
 METHODS = {

@@ -17,10 +17,9 @@ from pathlib import Path
 
 import torch
 
-from nerfro.evaluate import restore
 from nerfro.evaluation.render_view import Supersampling, render_view
 from nerfro.registry import build, discover
-from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
+from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint, restore
 
 BATCH_SIZES = (1024, 2048, 8192)
 CHUNK_SIZES = (1024, 4096, 16384)

@@ -33,19 +33,17 @@ from omegaconf import DictConfig
 from torch.profiler import ProfilerActivity, profile, record_function
 from torch.utils.flop_counter import FlopCounterMode
 
-from nerfro.evaluate import restore
 from nerfro.evaluation.render_view import Supersampling, render_view
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.models.base import NerfModel
 from nerfro.paths import ASSETS_DIR, CONF_DIR
 from nerfro.registry import build, discover
-from nerfro.samplers.training_paths import TrainingPaths
-from nerfro.train import trace_training_rays
+from nerfro.samplers.training_paths import TrainingPaths, trace_training_rays
 from nerfro.training.config import TrainConfig, build_model
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.ray_batches import RayBatches
-from nerfro.training.run_folder import load_checkpoint
+from nerfro.training.run_folder import load_checkpoint, restore
 from nerfro.types import Batch
 
 ROOT = Path(__file__).resolve().parent.parent

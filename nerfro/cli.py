@@ -117,3 +117,8 @@ def _messages(error: BaseException) -> list[str]:
     refused = re.search(r"not in '(\w+)'", " ".join(lines))
     fields = None if refused is None else fields_of_config(refused[1])
     return lines if fields is None else [*lines, f"fields: {', '.join(fields)}"]
+
+
+def warn(message: str) -> None:
+    """Tell the user of something that is allowed but looks wrong."""
+    print(f"nerfro: warning: {message}")

@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-import nerfro.synthesize
+import nerfro.scenes.synthesis
 from benchmarks.capture import measure, similarity
 from nerfro.capture.boards import tag_detector, twelve_faces
 from nerfro.data.opencv import OpenCVData
@@ -29,7 +29,7 @@ from nerfro.paths import CONF_DIR
 from nerfro.scenes.dataset import missing
 from nerfro.scenes.dolphin_capture import AIM, board_to_world
 from nerfro.scenes.photographs import Settings, photographs
-from nerfro.synthesize import SynthesizeConfig, synthesize
+from nerfro.scenes.synthesis import SynthesizeConfig, synthesize
 
 
 def photograph(folder: Path, **options: object) -> Path:
@@ -53,7 +53,7 @@ def few(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("mitsuba")
     pytest.importorskip("pupil_apriltags")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(nerfro.synthesize, "_BAKING_SPP", 8)
+        patch.setattr(nerfro.scenes.synthesis, "_BAKING_SPP", 8)
         return photograph(tmp_path_factory.mktemp("few"), resolution=320, photographs=2, spp=4)
 
 

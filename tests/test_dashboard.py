@@ -16,7 +16,7 @@ import pytest
 from torch.utils.tensorboard import SummaryWriter
 
 import nerfro.dashboard
-from nerfro.dashboard import link_runs, run_name
+from nerfro.report.dashboard import link_runs, run_name
 
 
 def make_run(folder: Path, name: str, root: str) -> None:

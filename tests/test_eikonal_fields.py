@@ -15,14 +15,14 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from nerfro.boundaries import lat_long
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
-from nerfro.evaluation.images import save_png
 from nerfro.fields.base import Field
 from nerfro.fields.nerf import NerfField
+from nerfro.files import lat_long
+from nerfro.files.images import save_png
 from nerfro.media.analytic import Luneburg
 from nerfro.media.base import Medium
 from nerfro.media.shapes import Ball

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
 from nerfro.light import to_linear, to_srgb
@@ -18,3 +19,11 @@ def test_encoding_undoes_decoding_with_finite_gradients() -> None:
     to_srgb(linear).sum().backward()
     assert srgb.grad is not None
     assert srgb.grad.isfinite().all()
+
+
+def test_arrays_are_coded_as_tensors_are() -> None:
+    values = np.linspace(0, 1.5, 24, dtype=np.float32).reshape(4, 6)[::-1]  # negative strides, as in flipped pictures
+    for code in (to_linear, to_srgb):
+        np.testing.assert_array_equal(code(values), code(torch.tensor(values.copy())).numpy())
+        assert code(values).dtype == np.float32
+    assert to_srgb(np.array(0.18)).shape == ()

@@ -13,9 +13,9 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.images import load_png, save_png
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import write_metrics_json
+from nerfro.files.images import load_png, save_png
 from nerfro.registry import discover
 from nerfro.report.comparison import compare, find_metrics, to_table
 from nerfro.report.curves import HEIGHT, MAX_POINTS, WIDTH, draw_charts, read_curves

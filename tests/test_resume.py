@@ -194,6 +194,8 @@ def test_missing_checkpoint_is_refused(ckpt_path: str, message: str, tmp_path: P
         ({"field": {"width": 16}}, "was trained with field.width=8, this run has 16; use the same experiment"),
         ({"seed": 1}, "was trained with seed=0, this run has 1"),
         ({"medium": {"ior": 1.3}}, "was trained with medium.ior=1.5, this run has 1.3"),
+        ({"loss": {"photometric": {"weight": 2}}}, "was trained with loss.photometric.weight=None, this run has 2"),
+        ({"optimizer": {"learning_rate": 0.1}}, "was trained with optimizer.learning_rate=None, this run has 0.1"),
         ({"batches": {"jitter": True}}, "was trained with batches.jitter=None, this run has True"),
     ],
 )

@@ -16,9 +16,9 @@ from omegaconf import OmegaConf
 
 import nerfro.summary
 from nerfro.errors import NerfroError
-from nerfro.evaluation.images import save_png
 from nerfro.evaluation.results import METRICS, EvaluationResult, ViewScores, write_metrics_json
 from nerfro.evaluation.tables import Column, Row, Table, to_csv, to_html, to_latex, to_markdown, to_rich
+from nerfro.files.images import save_png
 from nerfro.report.comparison import compare, differing, find_metrics, to_table
 from nerfro.report.runs import duration, find_runs
 from nerfro.training.run_folder import record

@@ -15,8 +15,7 @@ from PIL import Image
 
 import nerfro.evaluate
 from nerfro.data.blender import BlenderData
-from nerfro.evaluate import restore
-from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
+from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint, restore
 
 
 @pytest.fixture(scope="module")

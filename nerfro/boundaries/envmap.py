@@ -10,9 +10,10 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from nerfro.boundaries import cube_map, lat_long
+from nerfro.boundaries import cube_map
 from nerfro.boundaries.base import Boundary
 from nerfro.errors import NerfroError
+from nerfro.files import lat_long
 from nerfro.registry import register
 from nerfro.types import Exits
 

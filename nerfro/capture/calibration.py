@@ -61,6 +61,29 @@ class Calibration:
     skipped: dict[str, str]
     num_outliers: int
 
+    @property
+    def mean_error(self) -> float:
+        """Of reprojection, pixels."""
+        return float(np.nanmean([pose.error for pose in self.poses.values()]))
+
+    def lines(self, feature: str) -> list[str]:
+        """What there is to tell: each image's error, what was left out, and the lens.
+
+        Args:
+            feature: what features are, in the plural.
+        """
+        told = [f"reprojection error in pixels (rms), and {feature}, by image:"]
+        told += [f"  {pose.error:6.3f}  {pose.num_features:4d}  {name}" for name, pose in sorted(self.poses.items())]
+        largest = np.nanmax([pose.error for pose in self.poses.values()])
+        told.append(f"  {self.mean_error:6.3f}  mean; {largest:.3f} largest")
+        told += [f"  skipped: {name}: {reason}" for name, reason in sorted(self.skipped.items())]
+        if self.num_outliers:
+            told.append(f"{self.num_outliers} points were taken out as wrong: misread, or seen through the object")
+        matrix, deviation = self.intrinsics.matrix, self.intrinsics.focal_deviation
+        lens = f"fx={matrix[0, 0]:.2f} fy={matrix[1, 1]:.2f} cx={matrix[0, 2]:.2f} cy={matrix[1, 2]:.2f} "
+        lens += f"distortion={[round(number, 5) for number in self.intrinsics.distortion]}"
+        return [*told, lens + ("" if deviation is None else f"; standard deviation of fx {deviation:.2f}")]
+
 
 def calibrate(
     sightings: dict[str, Sighting],

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import torch
 from jaxtyping import Float
+from PIL import Image
 from torch import Tensor
 
 from nerfro.capture.silhouettes import mesh_silhouette, pixel_stride
 from nerfro.data.base import Views
-from nerfro.evaluation.drawing import GAP, LINE_HEIGHT, fit, paper, write
+from nerfro.files.drawing import sheet
 from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh
 
@@ -21,9 +22,7 @@ MASK_ONLY, SURFACE_ONLY = (235, 60, 45), (40, 110, 240)
 _BOTH = (60, 190, 90)
 
 
-def contact_sheet(
-    views: Views, mesh: TriangleMesh, overlaps: Float[np.ndarray, "V"], max_pixels: int
-) -> Float[Tensor, "H W 3"]:
+def contact_sheet(views: Views, mesh: TriangleMesh, overlaps: Float[np.ndarray, "V"], max_pixels: int) -> Image.Image:
     """Pictures with what mask and surface cover: both green, the mask alone red, the surface alone blue.
 
     Args:
@@ -31,30 +30,19 @@ def contact_sheet(
         mesh: the surface, world units.
         overlaps: of each view; the worst `MAX_VIEWS` are shown, the worst first.
         max_pixels: larger images are shown in every second, third, ... pixel.
-
-    Returns:
-        sRGB in [0, 1].
     """
     assert views.masks is not None
     stride = pixel_stride(views.cameras, max_pixels)
     intersector = MeshIntersector([mesh], crease_degrees=30.0)
     chosen = np.argsort(overlaps, kind="stable")[:MAX_VIEWS]
-    height = round(_WIDTH * views.cameras.height / views.cameras.width)
-    columns = min(_COLUMNS, len(chosen))
-    rows = -(-len(chosen) // columns)
-    sheet = paper(columns * (_WIDTH + GAP) - GAP, LINE_HEIGHT + rows * (height + LINE_HEIGHT + GAP))
-    legend = f"green: both, red: mask only, blue: surface only; worst {len(chosen)} of {len(views)} views"
-    write(sheet, legend, sheet.width // 2, LINE_HEIGHT // 2)
-    for place, view in enumerate(chosen.tolist()):
+    pictures, captions = [], []
+    for view in chosen.tolist():
         ours = mesh_silhouette(intersector, views.cameras, view, stride)
         theirs = views.masks[view, ::stride, ::stride] > 0.5
-        picture = _tinted(views.images[view, ::stride, ::stride], ours, theirs)
-        left = place % columns * (_WIDTH + GAP)
-        top = LINE_HEIGHT + place // columns * (height + LINE_HEIGHT + GAP)
-        sheet.paste(fit(picture, _WIDTH, height), (left, top))
-        caption = f"{overlaps[view]:.3f}  {views.names[view][-_NAME_LENGTH:]}"
-        write(sheet, caption, left + _WIDTH // 2, top + height + LINE_HEIGHT // 2)
-    return torch.from_numpy(np.array(sheet)).float() / 255
+        pictures.append(_tinted(views.images[view, ::stride, ::stride], ours, theirs))
+        captions.append(f"{overlaps[view]:.3f}  {views.names[view][-_NAME_LENGTH:]}")
+    legend = f"green: both, red: mask only, blue: surface only; worst {len(chosen)} of {len(views)} views"
+    return sheet(pictures, captions, _WIDTH, _COLUMNS, legend)
 
 
 def _tinted(image: Tensor, ours: Tensor, theirs: Tensor) -> Tensor:

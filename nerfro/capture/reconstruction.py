@@ -18,11 +18,48 @@ from nerfro.data.colmap_model import read_colmap
 from nerfro.data.frames import Lens
 from nerfro.data.image_files import read_mask
 from nerfro.errors import NerfroError
+from nerfro.files.atomic import refuse_existing
+from nerfro.paths import user_path
 
+_MODEL_FOLDERS = ("sparse/0", "sparse")
 # COLMAP's cameras that have the distortion of ours.
 _CAMERAS = {"pinhole": "PINHOLE", "radial": "RADIAL", "opencv": "OPENCV"}
 # A feature describes its neighbourhood: those near the object's outline see it too. Share of the image's width.
 _MARGIN = 0.01
+
+
+def find_model(
+    model: str | None,
+    images: list[Path],
+    masks: list[Path | None],
+    made: Path,
+    lens: LensModel,
+    given: Intrinsics | None,
+    overwrite: bool,
+) -> Path:
+    """The folder of the COLMAP model: the one that is named, else one beside the images, else one that is made.
+
+    Args:
+        model: its folder, if the user names one.
+        images, masks, given: see `reconstruct`.
+        made: folder for a model that is made.
+        lens: of that model.
+        overwrite: whether `made` may be replaced.
+
+    Raises:
+        NerfroError: `made` exists and may not be replaced, or no model can be made.
+    """
+    if model is not None:
+        return user_path(model)
+    folder = images[0].parent
+    for candidate in (root / name for root in (folder.parent, folder) for name in _MODEL_FOLDERS):
+        if any((candidate / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+            print(f"taking the model {candidate}")
+            return candidate
+    refuse_existing([made], overwrite)
+    num_masks = sum(mask is not None for mask in masks)
+    print(f"no COLMAP model: making one from {len(images)} images, {num_masks} of them with masks of the object")
+    return reconstruct(images, masks, made, lens, given)
 
 
 def reconstruct(

@@ -6,15 +6,29 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfro.cameras import Cameras
 
-if TYPE_CHECKING:
-    from nerfro.data.frames import Frame
+
+@dataclass(frozen=True)
+class Frame:
+    """One posed image.
+
+    Attributes:
+        name: of the image, as the data set calls it.
+        image: the image's file.
+        mask: the silhouette's file, if there is one.
+        camera_to_world: rotation and centre, camera axes as in the data set.
+    """
+
+    name: str
+    image: Path
+    mask: Path | None
+    camera_to_world: Float[np.ndarray, "3 4"]
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.data.base import DataSource, Views
+from nerfro.data.base import DataSource, Frame, Views
 from nerfro.data.colmap_model import ColmapCamera, ColmapModel, read_colmap
-from nerfro.data.frames import SPLITS, Frame, Lens, check_options, held_out, load_views, require_root
+from nerfro.data.frames import SPLITS, Lens, check_options, held_out, load_views, require_root
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
 from nerfro.lens import coefficients, opencv_coefficients

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.cameras import Cameras
-from nerfro.data.base import Views
+from nerfro.data.base import Frame, Views
 from nerfro.data.image_files import Alpha, read_rgb, read_stack
 from nerfro.data.masks import read_masks
 from nerfro.errors import NerfroError
@@ -28,23 +28,6 @@ _ROTATION_TOLERANCE = 1e-3
 
 # Distorting what was undistorted must lead back to within this many pixels.
 _LENS_TOLERANCE = 0.01
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One posed image.
-
-    Attributes:
-        name: of the image, as the data set calls it.
-        image: the image's file.
-        mask: the silhouette's file, if there is one.
-        camera_to_world: rotation and centre, camera axes as in the data set.
-    """
-
-    name: str
-    image: Path
-    mask: Path | None
-    camera_to_world: Float[np.ndarray, "3 4"]
 
 
 @dataclass(frozen=True)

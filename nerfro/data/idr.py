@@ -9,8 +9,8 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
-from nerfro.data.base import DataSource, Views
-from nerfro.data.frames import SPLITS, Frame, Lens, check_options, held_out, list_images, load_views, require_root
+from nerfro.data.base import DataSource, Frame, Views
+from nerfro.data.frames import SPLITS, Lens, check_options, held_out, list_images, load_views, require_root
 from nerfro.data.transforms import parse_matrix
 from nerfro.errors import NerfroError
 from nerfro.files.cache import load_arrays

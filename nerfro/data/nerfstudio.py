@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
-from nerfro.data.base import DataSource, Views
-from nerfro.data.frames import SPLITS, Frame, Lens, check_options, check_split, held_out, load_views, require_root
+from nerfro.data.base import DataSource, Frame, Views
+from nerfro.data.frames import SPLITS, Lens, check_options, check_split, held_out, load_views, require_root
 from nerfro.data.masks import find_mask, read_usable
 from nerfro.data.transforms import Manifest, find_splits, is_number, parse_manifest
 from nerfro.errors import NerfroError

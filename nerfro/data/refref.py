@@ -11,8 +11,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.data.base import DataSource, Views
-from nerfro.data.frames import SPLITS, Frame, Lens, check_options, check_pose, check_split, load_views
+from nerfro.data.base import DataSource, Frame, Views
+from nerfro.data.frames import SPLITS, Lens, check_options, check_pose, check_split, load_views
 from nerfro.data.transforms import parse_matrix
 from nerfro.errors import NerfroError
 from nerfro.paths import resolve_path

@@ -13,7 +13,8 @@ from typing import TypeGuard
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.data.frames import IMAGE_SUFFIXES, SPLITS, Frame, check_pose
+from nerfro.data.base import Frame
+from nerfro.data.frames import IMAGE_SUFFIXES, SPLITS, check_pose
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError, first_of
 

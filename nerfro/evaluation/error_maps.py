@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import matplotlib
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -15,10 +14,10 @@ from nerfro.errors import NerfroError
 from nerfro.evaluation.flip import flip_map
 from nerfro.evaluation.lpips import LpipsNetwork
 from nerfro.evaluation.ssim import WINDOW, ssim_map
+from nerfro.files.drawing import magma
 
 # Squared errors from 0 to this value are told apart; 0.05 is a difference of 0.22 in every channel.
 SQUARED_ERROR_LIMIT = 0.05
-NO_VALUE = (225, 225, 225)  # levels of the grey of pixels that an error map says nothing about
 
 
 @dataclass(frozen=True)
@@ -93,27 +92,3 @@ def squared_error_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, 
             "both must be of one size"
         )
     return (prediction - target).square().mean(-1)
-
-
-def magma(values: Float[Tensor, "H W"], limit: float) -> Float[Tensor, "H W 3"]:
-    """Colours of matplotlib's magma: black at 0, through purple and orange, to pale yellow at `limit` and above.
-
-    The scale is given and never fitted to the values, so that pictures can be compared.
-
-    Args:
-        values: non-negative numbers; those that are NaN become grey.
-        limit: value of the last colour, positive.
-
-    Returns:
-        sRGB in [0, 1], float32.
-
-    Raises:
-        NerfroError: if the limit is not positive.
-    """
-    if not limit > 0:
-        raise NerfroError(f"the limit of a colour scale must be positive, got {limit}")
-    num_colours = 256
-    table = torch.from_numpy(matplotlib.colormaps["magma"](range(num_colours))[:, :3]).float()
-    values = values.detach().cpu().float()
-    index = (values.nan_to_num() / limit * (num_colours - 1)).round().clamp(0, num_colours - 1)
-    return torch.where(values.isnan()[..., None], torch.tensor(NO_VALUE) / 255, table[index.long()])

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.evaluation.drawing import GAP, LINE_HEIGHT, colour_scale, fit, paper, write
-from nerfro.evaluation.error_maps import ErrorMap
+from nerfro.evaluation.error_maps import ErrorMap, error_maps
+from nerfro.evaluation.lpips import LpipsNetwork
+from nerfro.files.drawing import GAP, LINE_HEIGHT, colour_scale, fit, paper, write
+from nerfro.files.images import save_png
 
 MIN_WIDTH = 256  # pixels; smaller pictures are enlarged to it, so that titles have room
 _SCALE_HEIGHT = 64  # pixels
@@ -44,3 +47,15 @@ def error_sheet(
         if scale is not None:
             sheet.paste(scale, (left, LINE_HEIGHT + height))
     return torch.from_numpy(np.array(sheet)).float() / 255
+
+
+def write_error_sheet(
+    folder: Path,
+    name: str,
+    prediction: Float[Tensor, "H W 3"],
+    reference: Float[Tensor, "H W 3"],
+    networks: Mapping[str, LpipsNetwork],
+) -> None:
+    """Write a view's error maps to `folder/errors/<name>.png`."""
+    maps = error_maps(prediction, reference, networks)
+    save_png(folder / "errors" / f"{name}.png", error_sheet(prediction, reference, maps))

@@ -14,11 +14,11 @@ from torchmetrics.utilities import dim_zero_cat
 from nerfro.errors import NerfroError
 from nerfro.evaluation.error_maps import squared_error_map
 from nerfro.evaluation.flip import flip
-from nerfro.evaluation.images import round_to_8bit
 from nerfro.evaluation.lpips import LpipsNetwork
 from nerfro.evaluation.regions import crop_rectangle, mean_over, object_pixels
 from nerfro.evaluation.results import FULL, METRICS, OBJECT_REGIONS, EvaluationResult, Region, Score, ViewScores
 from nerfro.evaluation.ssim import MS_SSIM_MIN_SIZE, WINDOW, ms_ssim, ssim
+from nerfro.files.images import round_to_8bit
 
 MAX_PSNR = 100.0  # dB; equal pictures would have infinity, which no mean, table or JSON file can hold
 _REGIONS = (FULL, *OBJECT_REGIONS)

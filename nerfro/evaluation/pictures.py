@@ -13,8 +13,8 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.drawing import GAP, LINE_HEIGHT, colour_scale, fit, paper, write
-from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, magma, squared_error_map
+from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, squared_error_map
+from nerfro.files.drawing import GAP, LINE_HEIGHT, colour_scale, fit, magma, paper, write
 
 ROW_GAP = 18  # pixels between views
 CROP_COLOURS = ((225, 60, 50), (45, 125, 235), (40, 165, 85))  # frames of the first, second, ... inset

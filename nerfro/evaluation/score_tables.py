@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
-from nerfro.evaluation.results import FULL, METRICS, EvaluationResult, Region, Score
-from nerfro.evaluation.tables import MISSING, Column, Row, Table
+import rich
+
+from nerfro.evaluation.results import FULL, METRICS, EvaluationResult, Region, Score, write_metrics_json
+from nerfro.evaluation.tables import MISSING, Column, Row, Table, to_rich, write_table
 
 _Scores = Sequence[tuple[str, Mapping[str, Score]]]
 
@@ -70,3 +73,29 @@ def _missing(result: EvaluationResult, region: Region) -> str:
             by_reason.setdefault(short(reason), []).append(metric.title)
     told = ", ".join(f"{', '.join(titles)} ({reason})" for reason, titles in by_reason.items())
     return f"{MISSING}: {told}" if told else ""
+
+
+def report(
+    result: EvaluationResult,
+    title: str,
+    folder: Path,
+    steps: int | None = None,
+    seconds: float | None = None,
+    rays_per_second: float | None = None,
+) -> None:
+    """Write metrics.json and the tables into a folder, and print the views' and the regions' table.
+
+    Args:
+        result: scores.
+        title: of the table.
+        folder: where the files go.
+        steps, seconds, rays_per_second: of the training; None for pictures of another program.
+    """
+    write_metrics_json(folder / "metrics.json", result, steps, seconds, rays_per_second)
+    for region in result.regions:
+        full = region == FULL
+        table = views_table(result, title if full else f"{title}, {region}", region)
+        write_table(table, folder / ("metrics" if full else f"metrics_{region}"))
+    rich.print(to_rich(views_table(result, title)))
+    if len(result.regions) > 1:
+        rich.print(to_rich(regions_table(result, "means of the full images, of the object's mask, and of the crop")))

@@ -7,10 +7,10 @@ from pathlib import Path
 from tqdm import tqdm
 
 from nerfro.data.base import Views
-from nerfro.evaluation.images import save_png
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.render_view import Supersampling, render_view
 from nerfro.evaluation.results import EvaluationResult
+from nerfro.files.images import save_png
 from nerfro.models.base import NerfModel
 
 

@@ -1,50 +1,62 @@
-"""Files that are either whole or not there."""
+"""Files that are written whole or not at all, and existing ones that are not replaced unasked."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import IO
 
 from nerfro.errors import NerfroError
 
 
-def write_atomically(path: Path | str, content: bytes | str) -> None:
-    """Write a file so that a reader sees the old content or the new one, never a part of it.
+@contextlib.contextmanager
+def atomic_file(path: Path | str) -> Iterator[IO[bytes]]:
+    """Open a file for writing of which a reader sees the old content or the new one, never a part of it.
 
-    The content goes to a temporary file in the same folder, which then takes the place of `path` in one step. When
-    anything fails (a full disk, a missing permission), what was at `path` before is still there.
+    What is written goes to a temporary file in the same folder, which takes the place of `path` in one step at the
+    end. When anything fails (a full disk, a missing permission), what was at `path` before is still there.
 
     Args:
         path: the file to write; missing parent folders are made.
-        content: bytes, or text that is written as UTF-8.
 
     Raises:
-        NerfroError: if the file cannot be written.
+        NerfroError: the file cannot be written.
     """
     path = Path(path)
-    data = content.encode("utf-8") if isinstance(content, str) else content
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")
-        with os.fdopen(descriptor, "wb") as stream:
-            stream.write(data)
+        with os.fdopen(descriptor, "w+b") as stream:
+            yield stream
             stream.flush()
             os.fsync(stream.fileno())
         # mkstemp makes files private to their owner; give this one the permissions of any other new file.
         os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, path)
+        temporary = None
     except OSError as error:
-        if temporary is not None:
-            with contextlib.suppress(OSError):
-                os.unlink(temporary)
         raise NerfroError(
             f"cannot write {path}: {error.strerror or error}; what was there before is unchanged; "
             "free some space or choose another folder"
         ) from error
+    finally:
+        if temporary is not None:
+            with contextlib.suppress(OSError):
+                os.unlink(temporary)
+
+
+def write_atomically(path: Path | str, content: bytes | str) -> None:
+    """Write bytes, or text as UTF-8, whole or not at all (see `atomic_file`).
+
+    Raises:
+        NerfroError: the file cannot be written.
+    """
+    with atomic_file(path) as stream:
+        stream.write(content.encode("utf-8") if isinstance(content, str) else content)
 
 
 def refuse_existing(files: Iterable[Path], overwrite: bool) -> None:

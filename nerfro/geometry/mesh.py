@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nerfro.errors import NerfroError
+from nerfro.files.atomic import write_atomically
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,13 @@ class TriangleMesh:
         edges = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         _, uses = np.unique(edges, axis=0, return_counts=True)
         return bool((uses % 2 == 0).all())
+
+    def save(self, path: Path) -> None:
+        """Write vertices and triangles as a binary PLY."""
+        import trimesh
+
+        content = trimesh.exchange.ply.export_ply(trimesh.Trimesh(self.vertices, self.faces, process=False))
+        write_atomically(path, content)
 
 
 _THINNEST = 1e-4  # world units; boxes are kept to six decimals

@@ -12,33 +12,7 @@ from nerfro.evaluation.results import FULL, METRICS, Metric, Region
 from nerfro.evaluation.score_tables import short
 from nerfro.evaluation.tables import MISSING, Column, Row, Table
 from nerfro.report.runs import Budget, Run, Scored, shown
-from nerfro.training.run_folder import flatten
-
-# What may differ between the seeds of one method: where things are, how they are watched, and the budget, which has
-# a table of its own.
-_NOT_THE_METHOD = (
-    "seed",
-    "name",
-    "logger",
-    "checkpoint",
-    "ckpt_path",
-    "authors",
-    "data.root",
-    "medium.cache",
-    "evaluation.split",
-    "evaluation.every",
-    "evaluation.chunk_size",
-    "evaluation.lpips_backbone",
-    "evaluation.lpips_vgg_backbone",
-    "batches.cache_paths",
-    "trainer.max_time",
-    "trainer.max_steps",
-    "trainer.accelerator",
-    "trainer.devices",
-    "trainer.strategy",
-    "trainer.log_every_n_steps",
-    "trainer.enable_model_summary",
-)
+from nerfro.training.settings import TABLE_ROW, settings
 
 
 @dataclass(frozen=True)
@@ -173,12 +147,7 @@ def _method_titles(runs: Sequence[Run], titles: Mapping[str, str]) -> dict[Any, 
 def _method(run: Run) -> dict[str, Any]:
     """The fields of a configuration that make its method, with what lies in the data's folder named relative to it."""
     root = str(run.config["data"]["root"])
-    fields = {
-        key: value
-        for section, node in run.config.items()
-        for key, value in flatten(node, section).items()
-        if not any(key == name or key.startswith(f"{name}.") for name in _NOT_THE_METHOD)
-    }
+    fields = settings(run.config, TABLE_ROW)
     return {k: v.replace(root, "${data.root}") if isinstance(v, str) else v for k, v in fields.items()}
 
 

@@ -13,9 +13,9 @@ from markupsafe import Markup
 from omegaconf import OmegaConf
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.error_maps import magma
 from nerfro.evaluation.results import Metric, Region
 from nerfro.evaluation.tables import Table, to_html
+from nerfro.files.drawing import magma
 from nerfro.paths import PACKAGE_DIR
 from nerfro.report import curves
 from nerfro.report.comparison import Comparison

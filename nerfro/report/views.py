@@ -18,11 +18,11 @@ from torch import Tensor
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
 from nerfro.evaluation.error_maps import ErrorMap, error_maps
-from nerfro.evaluation.images import load_png, to_8bit
 from nerfro.evaluation.lpips import LpipsNetwork, find_lpips_networks
 from nerfro.evaluation.pictures import Crop, most_telling_crop
 from nerfro.evaluation.results import Metric, Region
 from nerfro.evaluation.tables import MISSING
+from nerfro.files.images import load_png, to_8bit
 from nerfro.registry import build
 from nerfro.report.comparison import Comparison
 from nerfro.report.runs import Run, Scored

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
+
+from omegaconf import DictConfig
 
 from nerfro.cameras import Cameras
 from nerfro.media.base import Medium
@@ -53,3 +56,11 @@ class TrainingPaths:
         whole, divided = slice(batch.num_whole), slice(batch.num_whole, None)
         path = self.whole(batch.index[whole], batch.rays[whole])
         return path.followed_by(self.divided(batch.index[divided], batch.rays[divided]))
+
+
+def trace_training_rays(config: DictConfig, model: Any, cameras: Cameras) -> TrainingPaths | None:
+    """Paths of all training rays, if they stay the same and are short enough to be kept."""
+    wanted = config.batches
+    if not wanted.cache_paths or wanted.jitter or not model.path_sampler.few_vertices:
+        return None
+    return TrainingPaths.build(model.path_sampler, model.medium, cameras, wanted.supersample, wanted.divergence)

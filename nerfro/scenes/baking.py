@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from skimage.transform import resize
 
+from nerfro.light import to_linear, to_srgb
 from nerfro.scenes.panels import Panel
 from nerfro.scenes.path_tracer import PathTracer, Pinhole
-from nerfro.scenes.patterns import to_linear, to_srgb
 from nerfro.scenes.scene import Scene
 
 TEXELS = 16  # of the light on a panel, each way
@@ -34,7 +34,8 @@ def bake(scene: Scene, spp: int, variant: str = "auto") -> Scene:
         if not panel.glows:
             light = tracer.render_flat(panel.to_world, _ABOVE, spp, number) / to_linear(even.picture[:1, :1])
             fine = resize(light, panel.picture.shape, order=1, mode="edge", anti_aliasing=False)
-            panel = replace(panel, picture=to_srgb(fine * to_linear(panel.picture)).astype(np.float32), glows=True)
+            lit = np.clip(fine * to_linear(panel.picture), 0.0, 1.0)
+            panel = replace(panel, picture=to_srgb(lit).astype(np.float32), glows=True)
         baked.append(panel)
     return replace(scene, panels=tuple(baked))
 

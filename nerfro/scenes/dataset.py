@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
-import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from nerfro.errors import NerfroError
-from nerfro.scenes.patterns import to_srgb
+from nerfro.files.atomic import write_atomically
+from nerfro.files.images import save_picture
+from nerfro.light import to_srgb
 from nerfro.scenes.scene import Scene
 from nerfro.scenes.skies import lat_long_directions
 from nerfro.scenes.viewpoints import directions_on_sphere, look_at_origin
@@ -59,30 +59,21 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class View:
-    """One picture to be rendered.
+class Planned:
+    """A picture that is to be rendered.
 
     Attributes:
-        split: `train`, `val` or `test`.
-        index: number within the split.
+        image_path, mask_path: where it and its mask go within the folder.
         pose: camera-to-world matrix [4, 4], OpenGL axes.
         spp: samples per pixel.
-        seed: seed of the sampler, different for every view.
+        seed: of the sampler (and of noise), different for every picture.
     """
 
-    split: str
-    index: int
+    image_path: str
+    mask_path: str
     pose: np.ndarray
     spp: int
     seed: int
-
-    @property
-    def image_path(self) -> str:
-        return f"{self.split}/r_{self.index:03d}.png"
-
-    @property
-    def mask_path(self) -> str:
-        return f"masks/{self.split}/r_{self.index:03d}.png"
 
 
 def fingerprint(scene: Scene) -> str:
@@ -99,7 +90,7 @@ def fingerprint(scene: Scene) -> str:
     return digest.hexdigest()[:16]
 
 
-def views(settings: Settings) -> list[View]:
+def views(settings: Settings) -> list[Planned]:
     """Return every view of a data set, in the order in which they are rendered."""
     planned = []
     for number, split in enumerate(SPLITS):
@@ -107,7 +98,8 @@ def views(settings: Settings) -> list[View]:
         spp = settings.test_spp if split == "test" else settings.spp
         for index, direction in enumerate(directions):
             pose = look_at_origin(CAMERA_DISTANCE * direction)
-            planned.append(View(split, index, pose, spp, seed=(settings.seed * 3 + number) * 100_000 + index))
+            seed, name = (settings.seed * 3 + number) * 100_000 + index, f"{split}/r_{index:03d}.png"
+            planned.append(Planned(name, f"masks/{name}", pose, spp, seed))
     return planned
 
 
@@ -141,49 +133,23 @@ def prepare(folder: Path, settings: Any, overwrite: bool, meta: str = META, file
     folder.mkdir(parents=True, exist_ok=True)
 
 
-class Planned(Protocol):
-    """A picture that is to be rendered, and where it and its mask go within the folder."""
-
-    @property
-    def image_path(self) -> str: ...
-
-    @property
-    def mask_path(self) -> str: ...
-
-
-AnyPlanned = TypeVar("AnyPlanned", bound=Planned)
-
-
-def missing(folder: Path, planned: list[AnyPlanned]) -> Iterator[AnyPlanned]:
+def missing(folder: Path, planned: list[Planned]) -> Iterator[Planned]:
     """Yield those whose picture or mask is not on disk yet."""
     for picture in planned:
         if not ((folder / picture.image_path).is_file() and (folder / picture.mask_path).is_file()):
             yield picture
 
 
-def write_view(folder: Path, view: View, radiance: np.ndarray, silhouette: np.ndarray) -> None:
+def write_view(folder: Path, view: Planned, radiance: np.ndarray, silhouette: np.ndarray) -> None:
     """Write one view: 8-bit pictures of linear radiance [H, W, 3], in sRGB, and of the share of pixels [H, W]."""
     write_image(folder / view.mask_path, silhouette)
     write_image(folder / view.image_path, to_srgb(radiance))
 
 
 def write_image(path: Path, image: np.ndarray) -> None:
-    """Write sRGB [H, W, 3] or shares [H, W] in [0, 1] as an 8-bit PNG, or bool [H, W] as a 1-bit PNG."""
-    picture = Image.fromarray(image if image.dtype == bool else np.rint(image * 255).astype(np.uint8))
-    buffer = io.BytesIO()
-    picture.save(buffer, format="PNG", optimize=True)
-    write_bytes(path, buffer.getvalue())
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file so that an interruption leaves either the whole file or none."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    try:
-        partial.write_bytes(content)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    """Write sRGB [H, W, 3] or shares [H, W], clipped to [0, 1], as an 8-bit PNG, or bool [H, W] as a 1-bit PNG."""
+    levels = image if image.dtype == bool else np.rint(np.clip(image, 0.0, 1.0) * 255).astype(np.uint8)
+    save_picture(path, Image.fromarray(levels), optimize=True)
 
 
 def write_meta(folder: Path, settings: Settings, scene: Scene, versions: dict[str, str]) -> None:
@@ -201,10 +167,10 @@ def write_meta(folder: Path, settings: Settings, scene: Scene, versions: dict[st
         "settings": asdict(settings),
         "versions": versions,
     }
-    write_bytes(folder / META, (json.dumps(meta, indent=1) + "\n").encode())
+    write_atomically(folder / META, json.dumps(meta, indent=1) + "\n")
 
 
-def write_transforms(folder: Path, planned: list[View]) -> None:
+def write_transforms(folder: Path, planned: list[Planned]) -> None:
     """Write transforms_{train,val,test}.json; done last, as their presence says that the pictures are complete."""
     for split in SPLITS:
         frames = [
@@ -214,10 +180,10 @@ def write_transforms(folder: Path, planned: list[View]) -> None:
                 "transform_matrix": view.pose.tolist(),
             }
             for view in planned
-            if view.split == split
+            if view.image_path.startswith(f"{split}/")
         ]
         content = json.dumps({"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}, indent=1)
-        write_bytes(folder / f"transforms_{split}.json", (content + "\n").encode())
+        write_atomically(folder / f"transforms_{split}.json", content + "\n")
 
 
 def _stored_settings(meta: Path) -> dict | None:

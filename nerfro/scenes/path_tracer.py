@@ -11,9 +11,9 @@ from types import ModuleType
 import numpy as np
 
 from nerfro.errors import NerfroError
+from nerfro.light import to_linear
 from nerfro.scenes.glass import PLUGIN, register_transmitting_glass
 from nerfro.scenes.panels import Panel
-from nerfro.scenes.patterns import to_linear
 from nerfro.scenes.scene import Scene
 from nerfro.scenes.skies import Sky
 from nerfro.scenes.surface import Surface

@@ -5,17 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 
-def to_linear(srgb: np.ndarray) -> np.ndarray:
-    """Decode sRGB values in [0, 1] to linear intensity (IEC 61966-2-1)."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0.0) + 0.055) / 1.055) ** 2.4)
-
-
-def to_srgb(linear: np.ndarray) -> np.ndarray:
-    """Encode linear intensity as sRGB (IEC 61966-2-1), clipped to [0, 1]."""
-    linear = np.clip(linear, 0.0, 1.0)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-
-
 def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
     """Return the cubic ramp that is 0 below `low` and 1 above `high`."""
     t = np.clip((x - low) / (high - low), 0.0, 1.0)

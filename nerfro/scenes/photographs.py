@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from nerfro.scenes.dataset import write_bytes, write_image
+from nerfro.files.atomic import write_atomically
+from nerfro.light import to_srgb
+from nerfro.scenes.dataset import Planned, write_image
 from nerfro.scenes.path_tracer import Pinhole
-from nerfro.scenes.patterns import to_srgb
 from nerfro.scenes.scene import Scene
 from nerfro.scenes.viewpoints import hand_held
 
@@ -51,31 +52,6 @@ class Settings:
     seed: int
 
 
-@dataclass(frozen=True)
-class Photograph:
-    """One picture to be taken.
-
-    Attributes:
-        index: number in the order in which they are taken.
-        pose: camera-to-world matrix [4, 4], OpenGL axes.
-        spp: samples per pixel.
-        seed: of the sampler and the noise, different for every photograph.
-    """
-
-    index: int
-    pose: np.ndarray
-    spp: int
-    seed: int
-
-    @property
-    def image_path(self) -> str:
-        return f"{IMAGES}/photo_{self.index:03d}.png"
-
-    @property
-    def mask_path(self) -> str:
-        return f"{MASKS}/photo_{self.index:03d}.png"
-
-
 def camera(resolution: int) -> Pinhole:
     """The camera whose pictures are `resolution` pixels wide."""
     height = resolution * 3 // 4
@@ -83,14 +59,23 @@ def camera(resolution: int) -> Pinhole:
     return Pinhole(resolution, height, FOCAL * resolution, cx, cy)
 
 
-def photographs(settings: Settings, target: np.ndarray) -> list[Photograph]:
+def photographs(settings: Settings, target: np.ndarray) -> list[Planned]:
     """Return all photographs of a capture around `target`, in the order in which they are taken."""
     poses = hand_held(settings.photographs, settings.seed, target, DISTANCE, ELEVATIONS, LAPS)
-    return [Photograph(index, pose, settings.spp, settings.seed * 100_000 + index) for index, pose in enumerate(poses)]
+    return [
+        Planned(
+            f"{IMAGES}/photo_{index:03d}.png",
+            f"{MASKS}/photo_{index:03d}.png",
+            pose,
+            settings.spp,
+            settings.seed * 100_000 + index,
+        )
+        for index, pose in enumerate(poses)
+    ]
 
 
 def write_photograph(
-    folder: Path, photograph: Photograph, radiance: np.ndarray, silhouette: np.ndarray, noise: float
+    folder: Path, photograph: Planned, radiance: np.ndarray, silhouette: np.ndarray, noise: float
 ) -> None:
     """Write one photograph: linear radiance [H, W, 3] as 8-bit sRGB with noise, and a mask in black and white.
 
@@ -98,10 +83,10 @@ def write_photograph(
     """
     grain = np.random.default_rng(photograph.seed).normal(scale=noise, size=radiance.shape)
     write_image(folder / photograph.mask_path, silhouette >= 0.5)
-    write_image(folder / photograph.image_path, np.clip(to_srgb(radiance) + grain, 0.0, 1.0))
+    write_image(folder / photograph.image_path, to_srgb(np.clip(radiance, 0.0, 1.0)) + grain)
 
 
-def write_truth(folder: Path, planned: list[Photograph], settings: Settings, scene: Scene) -> None:
+def write_truth(folder: Path, planned: list[Planned], settings: Settings, scene: Scene) -> None:
     """Write the true surface, and the true cameras as data of the format `opencv`; last, as a sign of completeness."""
     lens = camera(settings.resolution)
     scene.glass.save(folder / TRUTH / "mesh.ply")
@@ -116,10 +101,10 @@ def write_truth(folder: Path, planned: list[Photograph], settings: Settings, sce
     ]
     matrix = [[lens.focal, 0.0, lens.cx], [0.0, lens.focal, lens.cy], [0.0, 0.0, 1.0]]
     content = {"cam_mat": matrix, "w": lens.width, "h": lens.height, "frames": frames}
-    write_bytes(folder / TRUTH / "transforms_train.json", (json.dumps(content, indent=1) + "\n").encode())
+    write_atomically(folder / TRUTH / "transforms_train.json", json.dumps(content, indent=1) + "\n")
 
 
 def write_meta(folder: Path, settings: Settings, scene: Scene, versions: dict[str, str]) -> None:
     """Write truth/meta.json: what the folder holds and how it came about."""
     meta = {"scene": scene.name, "ior": scene.ior, "settings": asdict(settings), "versions": versions}
-    write_bytes(folder / META, (json.dumps(meta, indent=1) + "\n").encode())
+    write_atomically(folder / META, json.dumps(meta, indent=1) + "\n")

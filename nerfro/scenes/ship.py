@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from nerfro.light import to_linear
 from nerfro.scenes.distance import ball, block, capsule, painted
-from nerfro.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep, to_linear
+from nerfro.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
 from nerfro.scenes.scene import Scene
 from nerfro.scenes.skies import azimuth, clouds, elevation, skyline
 from nerfro.scenes.surface import Surface, join, rounded_box

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from nerfro.light import to_linear
 from nerfro.scenes import distance
-from nerfro.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep, to_linear
+from nerfro.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
 from nerfro.scenes.scene import Scene
 from nerfro.scenes.surface import join
 

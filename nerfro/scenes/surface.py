@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from nerfro.files.atomic import write_atomically
+
 
 @dataclass(frozen=True)
 class Surface:
@@ -39,7 +41,7 @@ class Surface:
 
     def save(self, path: Path) -> None:
         """Write a binary PLY with normals, and sRGB vertex colours where there are any."""
-        path.write_bytes(trimesh.exchange.ply.export_ply(self.as_trimesh(), vertex_normal=True))
+        write_atomically(path, trimesh.exchange.ply.export_ply(self.as_trimesh(), vertex_normal=True))
 
 
 def join(surfaces: Sequence[Surface]) -> Surface:

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from nerfro.scenes.patterns import chosen, hashed, mix, to_linear
+from nerfro.light import to_linear
+from nerfro.scenes.patterns import chosen, hashed, mix
 from nerfro.scenes.scene import Scene
 from nerfro.scenes.skies import clouds, elevation, skyline, tiles
 from nerfro.scenes.surface import Surface, rounded_box, torus_angles

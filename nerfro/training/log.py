@@ -13,10 +13,10 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from torch import Tensor
 
-from nerfro.boundaries.lat_long import directions
 from nerfro.cameras import Cameras
 from nerfro.evaluation.path_plot import picture_of_paths
 from nerfro.evaluation.pictures import triptych
+from nerfro.files.lat_long import directions
 from nerfro.media.analytic import Vacuum
 from nerfro.models.base import NerfModel
 from nerfro.types import Batch, Exits, Rays, Rendering
@@ -96,7 +96,7 @@ def peak_memory(device: torch.device) -> int:
 
 @torch.inference_mode()
 def sky(model: NerfModel, height: int = _SKY_HEIGHT) -> UInt8[np.ndarray, "H 2*H 3"]:
-    """The model's boundary as a lat-long picture (see boundaries/lat_long.py)."""
+    """The model's boundary as a lat-long picture (see files/lat_long.py)."""
     was_training = model.boundary.training
     model.boundary.eval()
     try:

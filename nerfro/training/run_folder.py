@@ -20,13 +20,14 @@ from omegaconf import DictConfig, OmegaConf
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.foreign_config import foreign_config
+from nerfro.models.base import NerfModel
 from nerfro.paths import PACKAGE_DIR, user_path
+from nerfro.training.config import build_model
+from nerfro.training.settings import RESUMING, first_difference, settings
 
 LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
+_SPARE_BYTES = 64 * 2**20  # pictures and logs, beside the checkpoints
 _PACKAGES = ("nerfro", "torch", "lightning", "hydra-core", "torchmetrics", "numpy", "numba", "trimesh")
-
-# A checkpoint fits a run only if these parts of the two configurations agree.
-_MUST_AGREE = ("model", "field", "boundary", "medium", "sampler", "data", "batches", "seed")
 
 
 def claim(folder: Path, resumed: bool, needed_bytes: int) -> None:
@@ -49,6 +50,12 @@ def claim(folder: Path, resumed: bool, needed_bytes: int) -> None:
             f"{folder} has {free / 2**20:,.0f} MiB free and this run needs {needed_bytes / 2**20:,.0f}; "
             "free some or choose another hydra.run.dir"
         )
+
+
+def needed_bytes(model: NerfModel) -> int:
+    """What a run writes: weights and Adam's two moments, beside an old checkpoint until the new one is whole."""
+    weights = sum(parameter.numel() * parameter.element_size() for parameter in model.parameters())
+    return 2 * 3 * weights + _SPARE_BYTES
 
 
 def record(folder: Path, config: DictConfig) -> None:
@@ -113,28 +120,36 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], DictConfig]:
     return checkpoint, config
 
 
+def restore(checkpoint: dict, config: DictConfig) -> NerfModel:
+    """The trained model of a checkpoint.
+
+    Raises:
+        NerfroError: the weights do not fit the configuration.
+    """
+    model = build_model(config)
+    try:
+        model.load_state_dict(checkpoint["state_dict"])
+    except RuntimeError as error:
+        reason = str(error).strip().split("\n")[-1].strip()
+        raise NerfroError(
+            f"the checkpoint's weights do not fit its configuration: {reason}; was nerfro updated?"
+        ) from error
+    return model.eval()
+
+
 def require_same_configuration(path: Path, trained: DictConfig, wanted: DictConfig) -> None:
     """Refuse to go on from a checkpoint of another configuration.
 
     Raises:
         NerfroError: the first field that differs is named, with both values.
     """
-    for section in _MUST_AGREE:
-        old = flatten(OmegaConf.to_container(trained, resolve=True).get(section), section)  # type: ignore[union-attr]
-        new = flatten(OmegaConf.to_container(wanted, resolve=True).get(section), section)  # type: ignore[union-attr]
-        for key in sorted(old.keys() | new.keys()):
-            if old.get(key) != new.get(key):
-                raise NerfroError(
-                    f"{path} was trained with {key}={old.get(key)}, this run has {new.get(key)}; "
-                    "use the same experiment and overrides, or start without ckpt_path"
-                )
-
-
-def flatten(node: Any, prefix: str) -> dict[str, Any]:
-    """A nested configuration as one dictionary: `{"field": {"width": 64}}` below `prefix` is `prefix.field.width`."""
-    if not isinstance(node, dict):
-        return {prefix: node}
-    return {key: value for name, child in node.items() for key, value in flatten(child, f"{prefix}.{name}").items()}
+    old, new = settings(trained, RESUMING), settings(wanted, RESUMING)
+    key = first_difference(old, new)
+    if key is not None:
+        raise NerfroError(
+            f"{path} was trained with {key}={old.get(key)}, this run has {new.get(key)}; "
+            "use the same experiment and overrides, or start without ckpt_path"
+        )
 
 
 def _git(*command: str) -> str | None:

@@ -19,7 +19,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nerfro.cli import in_one_line
 from nerfro.data.frames import IMAGE_SUFFIXES
@@ -28,12 +28,10 @@ from nerfro.files.atomic import write_atomically
 from nerfro.paths import EMBEDDED_PREFIX, resolve_path
 from nerfro.registry import build, discover
 from nerfro.scenes import SCENES
-from nerfro.training.run_folder import LAST_CHECKPOINT, flatten
+from nerfro.training.run_folder import LAST_CHECKPOINT
+from nerfro.training.settings import RESULT, first_difference, settings
 
 CELL_FILE, _LOCK = "cell.json", "cell.lock"
-
-# How a run is watched and stored is no part of what it computes.
-_NOT_HASHED = ("ckpt_path", "checkpoint", "logger")
 
 # Larger files of a data folder are told apart by name and size, so that no sweep begins with reading for minutes.
 _MAX_HASHED = 64 * 2**20  # bytes
@@ -57,7 +55,7 @@ class Identity:
     """What a cell computes: two cells with equal identities have equal results, up to the machine.
 
     Attributes:
-        settings: the resolved configuration, without what does not matter for the result.
+        settings: of the resolved configuration those that make the result, by their full names.
         data: hash of the files in the data's folder.
     """
 
@@ -67,22 +65,15 @@ class Identity:
     @classmethod
     def of(cls, config: DictConfig) -> Identity:
         """Identity of a run of nerfro.train; of images it reads the names and sizes only."""
-        settings: Any = OmegaConf.to_container(config, resolve=True)
-        kept = {key: value for key, value in settings.items() if key not in _NOT_HASHED}
-        return cls(kept, _hash_of_files(resolve_path(config.data.root)))
+        return cls(settings(config, RESULT), _hash_of_files(resolve_path(config.data.root)))
 
-    @property
-    def hash(self) -> str:
-        text = json.dumps([self.settings, self.data], sort_keys=True, default=str)
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-    def difference(self, record: Mapping[str, Any]) -> str:
-        """The first thing in which a cell's record differs from this identity, in words."""
-        old, new = flatten(record["settings"], ""), flatten(dict(self.settings), "")
-        for key in sorted(old.keys() | new.keys()):
-            if old.get(key) != new.get(key):
-                return f"{key.lstrip('.')}={old.get(key)}, now {new.get(key)}"
-        return "other files in its data's folder"
+    def difference(self, record: Mapping[str, Any]) -> str | None:
+        """The first thing in which a cell's record differs from this identity, in words; None if nothing does."""
+        old = settings(record["settings"], RESULT)
+        key = first_difference(old, self.settings)
+        if key is not None:
+            return f"{key}={old.get(key)}, now {self.settings.get(key)}"
+        return None if record["data"] == self.data else "other files in its data's folder"
 
 
 @dataclass(frozen=True)
@@ -183,13 +174,12 @@ class CellTask:
 
 def _record(folder: Path, identity: Identity, state: State, reason: str = "") -> None:
     record = {
-        "hash": identity.hash,
         "state": state.value,
         "reason": reason,
         "data": identity.data,
         "settings": identity.settings,
     }
-    write_atomically(folder / CELL_FILE, json.dumps(record, indent=2, default=str) + "\n")
+    write_atomically(folder / CELL_FILE, json.dumps(record, indent=2) + "\n")
 
 
 def _look(folder: Path, identity: Identity) -> tuple[State, str]:
@@ -211,11 +201,11 @@ def _recorded(folder: Path, identity: Identity) -> tuple[State, str]:
     holds_a_run = (folder / LAST_CHECKPOINT).is_file()
     if record is None:
         return (State.REFUSED, f"{folder} holds a run that is no cell of a sweep") if holds_a_run else (State.OPEN, "")
-    if record["hash"] != identity.hash:
+    different = identity.difference(record)
+    if different is not None:
         if not holds_a_run:
             return State.OPEN, ""
-        found = identity.difference(record)
-        return State.REFUSED, f"{folder} holds a run with {found}; choose another hydra.sweep.dir or remove it"
+        return State.REFUSED, f"{folder} holds a run with {different}; choose another hydra.sweep.dir or remove it"
     state = State(record["state"])
     if state is State.FINISHED and not (folder / "metrics.json").is_file():
         return State.OPEN, ""

@@ -10,11 +10,11 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from nerfro.boundaries import cube_map, lat_long
+from nerfro.boundaries import cube_map
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.errors import NerfroError
-from nerfro.evaluation.images import save_png
-from nerfro.files import radiance_hdr
+from nerfro.files import lat_long, radiance_hdr
+from nerfro.files.images import save_png
 from nerfro.light import to_srgb
 from nerfro.types import Exits
 

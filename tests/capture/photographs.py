@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from nerfro.capture.targets import Sheet
-from nerfro.scenes.patterns import to_linear, to_srgb
+from nerfro.light import to_linear, to_srgb
 
 _SAMPLES = 3  # per pixel and side
 _TO_CENTRES = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])  # OpenCV's pixel coordinates

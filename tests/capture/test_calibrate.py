@@ -14,9 +14,9 @@ from PIL import Image
 pytest.importorskip("cv2")
 pytest.importorskip("pupil_apriltags")
 
-from nerfro.calibrate import luminance
 from nerfro.capture.boards import tag_grid, twelve_faces
 from nerfro.capture.calibration import Intrinsics, calibrate
+from nerfro.capture.photographs import luminance
 from nerfro.capture.targets import CharucoTarget, Sighting, TagTarget, Target
 from nerfro.data.opencv import OpenCVData
 from tests.capture.photographs import angle, around, photograph

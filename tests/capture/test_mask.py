@@ -121,7 +121,7 @@ def test_masks_that_exist_are_kept_and_show_the_way(
 
 
 def test_a_rough_polygon_from_a_file(tmp_path: Path, photographs: list) -> None:
-    from nerfro.mask import read_outlines
+    from nerfro.capture.mask_files import read_outlines
 
     picture, mask, _ = photographs[4]
     rows, columns = np.nonzero(mask)

@@ -3,13 +3,14 @@ import torch
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.error_maps import ErrorMap, error_maps, magma, squared_error_map
+from nerfro.evaluation.error_maps import ErrorMap, error_maps, squared_error_map
 from nerfro.evaluation.error_sheets import error_sheet
 from nerfro.evaluation.flip import flip
-from nerfro.evaluation.images import round_to_8bit
 from nerfro.evaluation.lpips import ALEX
 from nerfro.evaluation.metrics import psnr
 from nerfro.evaluation.ssim import ssim
+from nerfro.files.drawing import magma
+from nerfro.files.images import round_to_8bit
 
 
 def test_mean_of_the_error_map_is_what_psnr_measures() -> None:

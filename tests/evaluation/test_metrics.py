@@ -9,11 +9,11 @@ from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation.flip import flip
-from nerfro.evaluation.images import load_png, save_png
 from nerfro.evaluation.lpips import ALEX
 from nerfro.evaluation.metrics import MAX_PSNR, ImageMetrics, MeanOverPictures, psnr
 from nerfro.evaluation.regions import mean_over
 from nerfro.evaluation.ssim import ms_ssim, ssim
+from nerfro.files.images import load_png, save_png
 
 
 def pictures(seed: int = 0, height: int = 37, width: int = 45) -> tuple[Tensor, Tensor]:

@@ -3,9 +3,10 @@ import torch
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.error_maps import magma, squared_error_map
-from nerfro.evaluation.images import round_to_8bit
+from nerfro.evaluation.error_maps import squared_error_map
 from nerfro.evaluation.pictures import GAP, LINE_HEIGHT, Crop, PictureRow, most_telling_crop, picture_grid, triptych
+from nerfro.files.drawing import magma
+from nerfro.files.images import round_to_8bit
 
 HEIGHT, WIDTH, ZOOM = 24, 32, 4
 

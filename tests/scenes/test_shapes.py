@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from matplotlib.path import Path as Polygon
 
-from nerfro.scenes import distance
-from nerfro.scenes.patterns import to_linear, to_srgb
+from nerfro.light import to_linear, to_srgb
+from nerfro.scenes import SCENES, distance
 from nerfro.scenes.skies import lat_long_directions, lat_long_texture
 from nerfro.scenes.surface import rounded_box, sphere, torus_angles
 from nerfro.scenes.viewpoints import directions_on_sphere, look_at_origin
-from nerfro.synthesize import SCENES
 
 
 def assert_closed_and_outward(surface, volume, tolerance):

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from nerfro.errors import NerfroError
-from nerfro.files.atomic import write_atomically
+from nerfro.files.atomic import atomic_file, write_atomically
 
 
 @pytest.mark.parametrize("step", ["fsync", "replace"])
@@ -37,3 +37,19 @@ def test_folder_that_cannot_be_made_is_an_error_of_one_line(tmp_path: Path) -> N
     with pytest.raises(NerfroError, match="cannot write") as caught:
         write_atomically(tmp_path / "file" / "metrics.json", "{}")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("stop", [ValueError, KeyboardInterrupt])
+def test_writing_that_is_broken_off_leaves_the_old_file_and_nothing_beside_it(tmp_path: Path, stop: type) -> None:
+    path = tmp_path / "paths.npz"
+    write_atomically(path, "old")
+
+    def write_half() -> None:
+        with atomic_file(path) as file:
+            file.write(b"half of the n")
+            raise stop
+
+    with pytest.raises(stop):
+        write_half()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]

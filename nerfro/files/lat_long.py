@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -16,9 +17,9 @@ from PIL import Image
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.images import save_png
 from nerfro.files import radiance_hdr
 from nerfro.files.atomic import write_atomically
+from nerfro.files.images import save_png
 from nerfro.light import to_linear, to_srgb
 
 _FORMATS = (".png", ".jpg", ".jpeg", ".hdr", ".exr")
@@ -61,10 +62,10 @@ def load_lat_long(path: Path | str) -> Float[Tensor, "H 2*H 3"]:
         if suffix == ".hdr":
             rgb = radiance_hdr.decode(path.read_bytes())
         elif suffix == ".exr":
-            rgb = np.array(_mitsuba_bitmap()(str(path)), np.float32)[..., :3]
+            rgb = np.array(_mitsuba().Bitmap(str(path)), np.float32)[..., :3]
         else:
             with Image.open(path) as image:
-                rgb = to_linear(torch.from_numpy(np.array(image.convert("RGB")) / 255)).numpy()
+                rgb = to_linear(np.array(image.convert("RGB")) / 255)
     except (OSError, ValueError, RuntimeError, SyntaxError) as error:
         raise NerfroError(f"the sky {path} cannot be read ({error}); write or copy it again") from error
     height, width = rgb.shape[:2]
@@ -94,8 +95,7 @@ def save_lat_long(path: Path | str, radiance: Float[Tensor, "H 2*H 3"]) -> None:
     if suffix == ".hdr":
         write_atomically(path, radiance_hdr.encode(linear))
     elif suffix == ".exr":
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _mitsuba_bitmap()(linear).write(str(path))
+        write_atomically(path, _exr(linear))
     else:
         raise NerfroError(f"a sky is not written as {suffix}, which loses detail; use .png, .hdr or .exr")
 
@@ -107,7 +107,14 @@ def _format(path: Path) -> str:
     return suffix
 
 
-def _mitsuba_bitmap() -> type:
+def _exr(linear: Float[np.ndarray, "H W 3"]) -> bytes:
+    mitsuba = _mitsuba()
+    stream = mitsuba.MemoryStream()
+    mitsuba.Bitmap(linear).write(stream, mitsuba.Bitmap.FileFormat.OpenEXR)
+    return stream.raw_buffer()
+
+
+def _mitsuba() -> ModuleType:
     try:
         import mitsuba
     except ImportError as error:
@@ -116,4 +123,4 @@ def _mitsuba_bitmap() -> type:
         ) from error
     if mitsuba.variant() is None:
         mitsuba.set_variant("scalar_rgb")
-    return mitsuba.Bitmap
+    return mitsuba

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.files.atomic import write_atomically
+from nerfro.files.atomic import atomic_file
 
 
 def to_8bit(rgb: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
@@ -57,9 +56,13 @@ def save_png(path: Path | str, rgb: Float[Tensor, "H W 3"]) -> None:
     """
     if rgb.ndim != 3 or rgb.shape[-1] != 3:
         raise NerfroError(f"cannot write {path}: expected a picture [H, W, 3], got {list(rgb.shape)}")
-    encoded = io.BytesIO()
-    Image.fromarray(to_8bit(rgb).cpu().numpy()).save(encoded, format="PNG")
-    write_atomically(path, encoded.getvalue())
+    save_picture(path, Image.fromarray(to_8bit(rgb).cpu().numpy()))
+
+
+def save_picture(path: Path | str, picture: Image.Image, optimize: bool = False) -> None:
+    """Write any picture as PNG, whole or not at all."""
+    with atomic_file(path) as file:
+        picture.save(file, "PNG", optimize=optimize)
 
 
 def load_png(path: Path | str) -> Float[Tensor, "H W 3"]:

@@ -6,7 +6,7 @@ import torch
 from PIL import Image
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.images import load_png, round_to_8bit, save_png, to_8bit
+from nerfro.files.images import load_png, round_to_8bit, save_png, to_8bit
 
 
 def test_values_are_rounded_to_the_nearest_level() -> None:

@@ -1,0 +1,42 @@
+"""`python -m nerfro`, or `nerfro` where it is installed: lists the commands, or runs one as `nerfro train seed=1`."""
+
+from __future__ import annotations
+
+import ast
+import runpy
+import sys
+
+from nerfro.cli import errors_in_one_line
+from nerfro.errors import NerfroError
+from nerfro.paths import PACKAGE_DIR
+
+
+def main() -> None:
+    """List the commands, or run the one that is named with the arguments behind it."""
+    with errors_in_one_line():
+        known = commands()
+        name = sys.argv[1] if len(sys.argv) > 1 else "--help"
+        if name in ("-h", "--help"):
+            print("nerfro COMMAND [key=value ...], or python -m nerfro.COMMAND [key=value ...]\n")
+            for command, purpose in known.items():
+                print(f"  {command:12}{purpose}")
+            return
+        if name not in known:
+            raise NerfroError(f"there is no command '{name}'; choose one of {', '.join(known)}")
+    del sys.argv[1]
+    # As python -m does it: Hydra, launchers and a run's record look for the command in `__main__`.
+    runpy.run_module(f"nerfro.{name}", run_name="__main__", alter_sys=True)
+
+
+def commands() -> dict[str, str]:
+    """What each command does, by its name: modules whose first line is "`python -m nerfro.NAME ...`: what it does"."""
+    found = {}
+    for file in sorted(PACKAGE_DIR.glob("*.py")):
+        first = (ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or "").partition("\n")[0]
+        if first.startswith(f"`python -m nerfro.{file.stem}"):
+            found[file.stem] = first.partition("`: ")[2]
+    return found
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""What `python -m nerfro.calibrate` can be asked: which board, which lens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Optional
+
+import numpy as np
+from omegaconf import DictConfig
+
+from nerfro.capture.boards import LAYOUTS, tag_grid, twelve_faces
+from nerfro.capture.calibration import Intrinsics
+from nerfro.capture.targets import CharucoTarget, TagTarget, Target
+from nerfro.errors import NerfroError
+
+_ALLOWED = {
+    "target": ("apriltag", "charuco", "colmap"),
+    "board": ("twelve_faces", "grid"),
+    "lens": ("pinhole", "radial", "opencv"),
+    "family": (*LAYOUTS, None),
+}
+
+
+@dataclass
+class CalibrateConfig:
+    """What `python -m nerfro.calibrate` is asked.
+
+    Attributes:
+        images: folder of the photographs, all of one lens and size; masks (`mask_*`) may lie among them.
+        out: folder that is written: transforms_{train,val,test}.json, calibration.json, cameras.png.
+        target: `apriltag` or `charuco`, a board that lies in the scene, or `colmap`, the scene itself.
+        board: of AprilTags: `twelve_faces` (the paper's) or `grid`, one sheet.
+        family: of the tags, `tag36h11` (default of grids) or `tagStandard41h12` (of the twelve faces).
+        columns, rows: tags of a grid, or squares of a ChArUco board; by default 5 and 7.
+        size: side of a tag between its detected corners (where a grid's outer borders end), or of a ChArUco square, in
+            the unit that poses shall have; metres for printing. By default 0.05, or 0.04 for a square.
+        marker: side of a ChArUco marker in the same unit; by default half a square.
+        dictionary: of the ChArUco markers.
+        write_board: write the board to print, board.pdf and board_*.png, into `out`, and nothing else without images.
+        model: folder of a COLMAP model; by default `images`/../sparse/0 or /sparse, and made anew where there is none.
+        lens: what is estimated beside focal lengths and principal point: `pinhole` nothing, as in the paper; `radial`
+            k1 and k2; `opencv` k1, k2, p1 and p2.
+        intrinsics: fx, fy, cx, cy in pixels from the image's corner, for a lens that is known; nothing is estimated.
+        distortion: of that lens, OpenCV's k1, k2, p1, p2.
+        test_every: every such image by name is for test, and as many for validation.
+        overwrite: whether files that exist may be replaced.
+    """
+
+    images: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    out: Optional[str] = None  # noqa: UP045
+    target: str = "apriltag"
+    board: str = "twelve_faces"
+    family: Optional[str] = None  # noqa: UP045
+    columns: Optional[int] = None  # noqa: UP045
+    rows: Optional[int] = None  # noqa: UP045
+    size: Optional[float] = None  # noqa: UP045
+    marker: Optional[float] = None  # noqa: UP045
+    dictionary: str = "6X6_250"
+    write_board: bool = False
+    model: Optional[str] = None  # noqa: UP045
+    lens: str = "pinhole"
+    intrinsics: Optional[list[float]] = None  # noqa: UP045
+    distortion: Optional[list[float]] = None  # noqa: UP045
+    test_every: int = 8
+    overwrite: bool = False
+
+
+def check_options(config: DictConfig) -> Intrinsics | None:
+    """The lens that is given, if one is; options that can be refused are refused here.
+
+    Raises:
+        NerfroError: an option is missing or out of range.
+    """
+    for name, allowed in _ALLOWED.items():
+        if config[name] not in allowed:
+            raise NerfroError(
+                f"{name}={config[name]} is not allowed; choose one of {', '.join(str(one) for one in allowed if one)}"
+            )
+    if config.out is None:
+        raise NerfroError("set out= to the folder that takes the data set")
+    if config.images is None and not (config.write_board and config.target != "colmap"):
+        raise NerfroError("set images= to the folder of the photographs; or write_board=true for a board to print")
+    if config.test_every < 2:
+        raise NerfroError(f"test_every={config.test_every} leaves nothing to train on; take 2 or more")
+    for name in ("columns", "rows", "size", "marker"):
+        if config[name] is not None and not config[name] > 0:
+            raise NerfroError(f"{name}={config[name]} is not allowed; it must be positive")
+    if config.intrinsics is None:
+        if config.distortion:
+            raise NerfroError("distortion= belongs to a lens that is known; give intrinsics=[fx,fy,cx,cy] as well")
+        return None
+    if len(config.intrinsics) != 4 or min(config.intrinsics) <= 0 or len(config.distortion or ()) not in (0, 4):
+        raise NerfroError(
+            f"intrinsics={config.intrinsics}, distortion={config.distortion} are no lens; give fx, fy, cx, cy in "
+            "pixels, and k1, k2, p1, p2 or nothing"
+        )
+    fx, fy, cx, cy = config.intrinsics
+    return Intrinsics(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), tuple(config.distortion or ()))
+
+
+def make_target(config: DictConfig) -> Target:
+    """The board that the options describe.
+
+    Raises:
+        NerfroError: there is no such board, or what finds it is not installed.
+    """
+    columns, rows = config.columns or 5, config.rows or 7
+    if config.target == "charuco":
+        square = config.size or 0.04
+        return CharucoTarget(columns, rows, square, config.marker or 0.5 * square, config.dictionary)
+    if config.board == "grid":
+        return TagTarget(tag_grid(config.family or "tag36h11", rows, columns, config.size or 0.05))
+    if config.columns or config.rows or config.family not in (None, "tagStandard41h12"):
+        raise NerfroError(
+            "board=twelve_faces has 3x3 tags of tagStandard41h12 on each face; set board=grid for other tags"
+        )
+    return TagTarget(twelve_faces(config.size or 0.05))

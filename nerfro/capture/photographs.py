@@ -1,0 +1,59 @@
+"""Photographs as calibration wants them: of one size, by their luminance, without what is seen through the object."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from rich.progress import track
+
+from nerfro.capture.targets import Sighting
+from nerfro.data.frames import list_images
+from nerfro.data.image_files import read_mask, read_rgb
+from nerfro.errors import NerfroError
+from nerfro.light import to_linear
+
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear sRGB (ITU-R BT.709)
+
+
+def list_photographs(folder: Path) -> tuple[list[Path], tuple[int, int]]:
+    """The photographs by name, and their size.
+
+    Raises:
+        NerfroError: there are none, one cannot be read, sizes differ, or two would share a mask's name.
+    """
+    images = list_images(folder)
+    repeated = [stem for stem, count in Counter(image.stem for image in images).items() if count > 1]
+    if repeated:
+        raise NerfroError(f"{folder} holds several images called {repeated[0]}; keep one of each name")
+    shapes = {image: read_rgb(image, "drop").shape[1::-1] for image in track(images, "reading")}
+    (size, _), *others = Counter(shapes.values()).most_common()
+    if others:
+        odd = next(image for image in images if shapes[image] != size)
+        raise NerfroError(
+            f"image {odd} has {shapes[odd][0]}x{shapes[odd][1]} pixels but most have {size[0]}x{size[1]}; all must be "
+            "of one lens and size: turn or remove it"
+        )
+    return images, size
+
+
+def luminance(image: Path) -> UInt8[np.ndarray, "H W"]:
+    """Luminance of an image, linear in light, its brightest thousandth white.
+
+    A pixel on an edge averages light, and sRGB's curve shows half the light as more than half a level. The edges of
+    what is bright are then found too far outside, those of tags by 0.2 to 0.3 pixels.
+    """
+    light = to_linear(read_rgb(image, "drop")) @ _LUMINANCE
+    white = max(float(np.quantile(light, 0.999)), 1 / 255)
+    return np.uint8(np.rint(255 * np.minimum(light / white, 1.0)))
+
+
+def outside(sighting: Sighting, mask: Path | None) -> Sighting:
+    """The features that are not seen through the object, or cut by it."""
+    if mask is None or len(sighting.points) == 0:
+        return sighting
+    inside = read_mask(mask) > 0.5
+    columns, rows = np.clip(sighting.pixels.astype(int), 0, np.array(inside.shape[::-1]) - 1).T
+    return sighting.only(~np.isin(sighting.features, sighting.features[inside[rows, columns]]))

@@ -1,0 +1,120 @@
+"""What `python -m nerfro.preprocess` can be asked, where it writes, and what it advises next."""
+
+from __future__ import annotations
+
+import typing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Optional
+
+import numpy as np
+from omegaconf import MISSING, DictConfig, OmegaConf
+
+from nerfro.capture.visual_hull import Silhouettes
+from nerfro.errors import NerfroError
+from nerfro.files.atomic import refuse_existing
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.paths import EMBEDDED_PREFIX, resolve_path, user_path
+from nerfro.registry import build
+
+MESH, SHEET, REPORT = "mesh.ply", "overlays.png", "overlaps.json"
+# The medium's grid is this much wider than the object.
+_MARGIN_SHARE = 0.15
+
+
+@dataclass
+class PreprocessConfig:
+    """What `python -m nerfro.preprocess` is asked.
+
+    Attributes:
+        data: the views (options of the group `data`).
+        medium: what becomes of the surface (options of the group `medium`).
+        split: whose masks are used.
+        mesh: a surface that was made elsewhere; it is checked against the masks, and no hull is made.
+        out: folder that mesh.ply, overlays.png and overlaps.json are written to; by default data.root.
+        resolution: voxels along the longest side of the hull.
+        box_min, box_max: box that the hull is carved in, world units; by default found from cameras and masks.
+        wrong_masks: number of views that may be wrong about any point of space.
+        keep: number of separate parts to keep, the largest; by default all but strays.
+        smoothing: how smooth the surface is where the masks leave it open; 0 for the carved hull itself.
+        overwrite: whether files that exist may be replaced.
+    """
+
+    data: Any = MISSING
+    medium: Any = MISSING
+    split: str = "train"
+    mesh: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    out: Optional[str] = None  # noqa: UP045
+    resolution: int = 96
+    box_min: Optional[list[float]] = None  # noqa: UP045
+    box_max: Optional[list[float]] = None  # noqa: UP045
+    wrong_masks: int = 0
+    keep: Optional[int] = None  # noqa: UP045
+    smoothing: float = 1.0
+    overwrite: bool = False
+
+
+def claim(config: DictConfig) -> Path:
+    """The folder to write to.
+
+    Raises:
+        NerfroError: an option is out of range, the folder is the package's, or a file would be replaced.
+    """
+    if not 16 <= config.resolution <= 1024:
+        raise NerfroError(f"resolution={config.resolution} is not allowed; take 16 to 1024 voxels a side")
+    if config.wrong_masks < 0 or (config.keep is not None and config.keep < 1) or not config.smoothing >= 0:
+        raise NerfroError(
+            f"wrong_masks={config.wrong_masks}, keep={config.keep}, smoothing={config.smoothing} are not allowed; "
+            "wrong_masks and smoothing start at 0, keep at 1"
+        )
+    if (config.box_min is None) != (config.box_max is None):
+        raise NerfroError("give both box_min and box_max, or neither to have the box found")
+    if config.box_min is not None and (
+        len(config.box_min) != 3 or len(config.box_max) != 3 or not (np.array(config.box_min) < config.box_max).all()
+    ):
+        raise NerfroError(f"box_min={config.box_min}, box_max={config.box_max} is no box; give three numbers each")
+    if config.out is None and str(config.data.root).startswith(EMBEDDED_PREFIX):
+        raise NerfroError(f"data.root={config.data.root} ships with nerfro and is not written to; add out=FOLDER")
+    folder = resolve_path(config.data.root) if config.out is None else user_path(config.out)
+    names = [SHEET, REPORT] if config.mesh is not None else [MESH, SHEET, REPORT]
+    refuse_existing([folder / name for name in names], config.overwrite)
+    return folder
+
+
+def train_command(
+    config: DictConfig, silhouettes: Silhouettes, mesh: TriangleMesh, location: str, overrides: list[str]
+) -> list[str]:
+    """The command that trains on the surface; makes the index grid, so that a bad one is refused now and not then.
+
+    Args:
+        config: of this run.
+        silhouettes: of the views.
+        mesh: the surface.
+        location: its file.
+        overrides: what the user has given on the command line.
+
+    Raises:
+        NerfroError: the medium refuses the mesh or an option.
+    """
+    given = {key.lstrip("+").split("=")[0] for key in overrides}
+    settings = {"medium.ior": config.medium.ior}
+    if location != f"{config.data.root}/{MESH}":
+        settings["medium.mesh"] = location
+    if not {"medium.box_min", "medium.box_max"} & given:
+        centre, half_side = mesh.bounds.mean(0), (0.5 + _MARGIN_SHARE) * float(np.ptp(mesh.bounds, axis=0).max())
+        digits = max(0, 3 - int(np.floor(np.log10(half_side))))
+        for name, corner in (("box_min", centre - half_side), ("box_max", centre + half_side)):
+            settings[f"medium.{name}"] = [round(float(x), digits) for x in corner]
+    offsets = silhouettes.cameras.camera_to_world[:, None, :, 3].double().numpy() - mesh.vertices[::16]
+    distance = np.linalg.norm(offsets, axis=-1)
+    if silhouettes.cameras.near >= distance.min():
+        settings["data.near"] = float(f"{0.8 * distance.min():.3g}")
+    if silhouettes.cameras.far <= distance.max():
+        settings["data.far"] = float(f"{1.2 * distance.max():.3g}")
+    medium = typing.cast(dict[str, object], OmegaConf.to_container(config.medium, resolve=True))
+    medium |= {name.removeprefix("medium."): value for name, value in settings.items() if name.startswith("medium.")}
+    build(medium | {"mesh": location})
+    kept = [text for text in overrides if text.lstrip("+").startswith(("data=", "data.", "medium=", "medium."))]
+    kept = [text for text in kept if text.lstrip("+").split("=")[0] not in {*settings, "medium.mesh"}]
+    written = [f"{name}={str(value).replace(' ', '')}" for name, value in settings.items()]
+    return ["python", "-m", "nerfro.train", *kept, *written]

@@ -1,0 +1,104 @@
+"""Lightning's Trainer as every run has it."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from datetime import timedelta
+from pathlib import Path
+
+import lightning.pytorch as pl
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.loggers import WandbLogger
+from lightning.pytorch.strategies import DDPStrategy
+from omegaconf import DictConfig, OmegaConf
+
+from nerfro.errors import NerfroError
+from nerfro.kernels.allocator import keep_freed_memory
+from nerfro.registry import build
+from nerfro.training.callbacks import ConfigInCheckpoint, TrainingProgress
+from nerfro.training.log import TrainingLog
+from nerfro.training.run_folder import LAST_CHECKPOINT
+
+
+def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.Trainer:
+    """Lightning's Trainer with the callbacks that every run has.
+
+    Raises:
+        NerfroError: a field of the trainer, logger or checkpoint section is unknown or wrong.
+    """
+    if (config.checkpoint.every_seconds is None) == (config.checkpoint.every_steps is None):
+        raise NerfroError("set one of checkpoint.every_seconds and checkpoint.every_steps, and the other to null")
+    seconds, every = config.checkpoint.every_seconds, config.evaluation.every
+    checkpoints = ModelCheckpoint(
+        dirpath=folder / LAST_CHECKPOINT.parent,
+        filename=LAST_CHECKPOINT.stem,
+        every_n_train_steps=config.checkpoint.every_steps,
+        train_time_interval=None if seconds is None else timedelta(seconds=seconds),
+        enable_version_counter=False,
+        save_on_train_epoch_end=False,
+    )
+    in_checkpoint = ConfigInCheckpoint(OmegaConf.to_yaml(config, resolve=True))
+    ours = {
+        "default_root_dir": str(folder),
+        "callbacks": [checkpoints, TrainingProgress(), in_checkpoint, TrainingLog(), *extra],
+        "logger": [build(node, save_dir=str(folder)) for node in (config.logger or {}).values()],
+        "max_epochs": -1,
+        "val_check_interval": every if every > 0 else None,
+        "check_val_every_n_epoch": None,
+        "limit_val_batches": 1 if every > 0 else 0,
+        "num_sanity_val_steps": 0,
+        "use_distributed_sampler": False,
+    }
+    taken = sorted(ours.keys() & config.trainer.keys())
+    if taken:
+        raise NerfroError(f"trainer.{taken[0]} is set by nerfro.train itself; see evaluation, checkpoint and logger")
+    if config.trainer.get("strategy") == "ddp":
+        # The index grid is a buffer and would be sent around in every step, though all processes have the same one.
+        ours["strategy"] = DDPStrategy(broadcast_buffers=False)
+    limit = config.trainer.get("max_time")
+    if isinstance(limit, (int, float)):
+        raise NerfroError(f"trainer.max_time={limit} has no unit; write DD:HH:MM:SS, such as 00:00:05:00")
+    trainer = build(config.trainer, **ours)
+    if trainer.world_size > 1 and HydraConfig.get().mode == RunMode.MULTIRUN:
+        raise NerfroError("a sweep (-m) cannot use several devices; start its runs one by one")
+    if limit is None and trainer.max_steps < 0:
+        raise NerfroError("the run would never end; set trainer.max_time (DD:HH:MM:SS), trainer.max_steps, or both")
+    return trainer
+
+
+def prepare_process(seed: int) -> None:
+    """Set what this process computes with: the seed, how memory is given back, and what Lightning prints.
+
+    Raises:
+        NerfroError: the seed is out of range.
+    """
+    if not 0 <= seed < 2**32:
+        raise NerfroError(f"seed={seed} is no seed; give 0 to {2**32 - 1}")
+    _quieten_lightning()
+    keep_freed_memory()
+    pl.seed_everything(seed, verbose=False)
+
+
+def finish_logs(trainer: pl.Trainer) -> None:
+    """End logs that the next job of a sweep would go on with."""
+    for logger in trainer.loggers:
+        if isinstance(logger, WandbLogger):
+            logger.experiment.finish()
+
+
+def _quieten_lightning() -> None:
+    """Keep Lightning's hints about loaders and hardware from the user: batches are made on the device here."""
+    for package in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(package).setLevel(logging.WARNING)
+    for message in (
+        ".*does not have many workers.*",
+        ".*You are using .* devices.*",
+        ".*Starting from v1.9.*",
+        ".*sync_dist=True.*",  # one process looks at validation views
+        ".*broadcast_buffers.* is deprecated.*",  # its successor is not in all versions of torch that are supported
+        ".*LeafSpec.* is deprecated.*",
+    ):
+        warnings.filterwarnings("ignore", message)

@@ -1,0 +1,69 @@
+"""Every import points down: from the commands through the packages to the core, types included."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from nerfro.paths import PACKAGE_DIR
+
+# From above to below: a package imports what follows it, and itself.
+ORDER = (
+    "commands", "testing", "report", "training", "evaluation", "scenes", "capture", "models", "losses", "boundaries",
+    "camera", "samplers", "fields", "media", "data", "geometry", "kernels", "files", "core",
+)  # fmt: skip
+FILES = {
+    ".".join(("nerfro", *file.relative_to(PACKAGE_DIR).with_suffix("").parts)).removesuffix(".__init__"): file
+    for file in PACKAGE_DIR.rglob("*.py")
+    if "_project" not in file.parts  # of a wheel
+}
+
+
+def imported(file: Path) -> Iterator[str]:
+    """Modules of nerfro that a file imports anywhere: at its top, in functions, for type checkers."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in FILES)
+        elif isinstance(node, ast.ImportFrom) and node.module in FILES:
+            yield from {
+                name if (name := f"{node.module}.{alias.name}") in FILES else node.module for alias in node.names
+            }
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file}: name the module from the root"
+
+
+IMPORTS = {module: set(imported(file)) - {module} for module, file in FILES.items()}
+
+
+def is_command(module: str) -> bool:
+    return module.count(".") == 1 and 'if __name__ == "__main__"' in FILES[module].read_text(encoding="utf-8")
+
+
+def room(module: str) -> str:
+    """The package of a module; top-level modules are commands, `testing` (for authors of plugins) or the core."""
+    name = module.split(".")[1] if "." in module else "core"
+    if (PACKAGE_DIR / name).is_dir() or name == "testing":
+        return name
+    return "commands" if is_command(module) else "core"
+
+
+@pytest.mark.parametrize("module", sorted(FILES))
+def test_imports_point_down(module: str) -> None:
+    below = ORDER[ORDER.index(room(module)) :]
+    assert {other for other in IMPORTS[module] if room(other) not in below} == set()
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    left = dict(IMPORTS)
+    while free := [module for module, others in left.items() if not others & left.keys()]:
+        left = {module: others for module, others in left.items() if module not in free}
+    assert sorted(left) == []
+
+
+@pytest.mark.parametrize("module", sorted(filter(is_command, FILES)))
+def test_commands_compose_call_and_print(module: str) -> None:
+    assert len(FILES[module].read_text(encoding="utf-8").splitlines()) < 100
+    assert {other for other in IMPORTS[module] if room(other) == "commands"} == set(), "commands share what lies below"
