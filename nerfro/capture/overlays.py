@@ -33,7 +33,7 @@ def contact_sheet(views: Views, mesh: TriangleMesh, overlaps: Float[np.ndarray, 
     """
     assert views.masks is not None
     stride = pixel_stride(views.cameras, max_pixels)
-    intersector = MeshIntersector([mesh], crease_degrees=30.0)
+    intersector = MeshIntersector(mesh.triangles)
     chosen = np.argsort(overlaps, kind="stable")[:MAX_VIEWS]
     pictures, captions = [], []
     for view in chosen.tolist():

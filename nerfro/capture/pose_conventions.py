@@ -53,7 +53,7 @@ def overlap(mesh: TriangleMesh, silhouettes: Silhouettes, max_pixels: int) -> Fl
         max_pixels: larger images are looked at in every second, third, ... pixel only.
     """
     cameras, masks = silhouettes.cameras, silhouettes.masks
-    intersector = MeshIntersector([mesh], crease_degrees=30.0)
+    intersector = MeshIntersector(mesh.triangles)
     stride = pixel_stride(cameras, max_pixels)
     return np.array(
         [
@@ -76,7 +76,7 @@ def coarse_agreement(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np
     remove_strays(distances)
     if not (distances < 0).any():
         return np.zeros(len(silhouettes))
-    intersector = MeshIntersector([extract_surface(distances, corner, spacing)], crease_degrees=30.0)
+    intersector = MeshIntersector(extract_surface(distances, corner, spacing).triangles)
     stride = pixel_stride(silhouettes.cameras, _COARSE_PIXELS)
     agreement = np.empty(len(silhouettes))
     for view in range(len(silhouettes)):

@@ -10,8 +10,8 @@ from nerfro.types import Radiance, Samples
 
 
 class Field(nn.Module, ABC):
-    """Density and radiance of a volume."""
+    """Density and colour of a volume."""
 
     @abstractmethod
     def forward(self, samples: Samples) -> Radiance:
-        """Density (per world unit) and linear radiance at every sample."""
+        """Density (per world unit) and colour (sRGB) at every sample."""

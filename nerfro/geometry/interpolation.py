@@ -43,12 +43,15 @@ def trilinear(
 def intersect_box(
     box: Float[Tensor, "2 3"], origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]
 ) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
-    """Distances at which lines enter and leave a box; the first exceeds the second where they miss it."""
-    # A component of zero gives infinities of both signs, which min and max sort out, except 0 * inf = nan on a face.
-    inverse = 1.0 / directions
-    to_low, to_high = (box[0] - origins) * inverse, (box[1] - origins) * inverse
-    enter = torch.minimum(to_low, to_high).nan_to_num(-torch.inf, torch.inf, -torch.inf).amax(-1)
-    leave = torch.maximum(to_low, to_high).nan_to_num(torch.inf, torch.inf, -torch.inf).amin(-1)
+    """Distances at which lines enter and leave a box, with gradients; the first exceeds the second where they miss."""
+    # A line along a slab is in it for ever or never. Dividing by its zero would make gradients nan.
+    parallel = directions == 0
+    inverse = 1.0 / torch.where(parallel, 1.0, directions)
+    below, above = box[0] - origins, box[1] - origins
+    missed = (below > 0) | (above < 0)
+    to_low, to_high = below * inverse, above * inverse
+    enter = torch.where(parallel, torch.where(missed, torch.inf, -torch.inf), torch.minimum(to_low, to_high)).amax(-1)
+    leave = torch.where(parallel, torch.where(missed, -torch.inf, torch.inf), torch.maximum(to_low, to_high)).amin(-1)
     return enter, leave
 
 

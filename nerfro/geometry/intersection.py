@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -9,21 +11,73 @@ from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.geometry.normals import corner_normals, face_normals
+from nerfro.geometry.normals import smooth_normals
 
 
-class MeshIntersector:
-    """First hits of rays with the surfaces of several bodies.
+@dataclass(frozen=True)
+class Triangles:
+    """The triangles of several bodies in double precision, with gradients by their vertices where these have them.
 
     Attributes:
-        triangles: of all bodies, world units.
+        corners: of each triangle, world units.
         normals: unit normal at each corner, split at creases.
-        face_normals: unit normal of each triangle.
         body: which body each triangle belongs to.
     """
 
-    def __init__(self, meshes: list[TriangleMesh], crease_degrees: float) -> None:
+    corners: Float[Tensor, "F 3 3"]
+    normals: Float[Tensor, "F 3 3"]
+    body: Int[Tensor, "F"]
+
+    @classmethod
+    def of(
+        cls, meshes: list[TriangleMesh], crease_degrees: float, vertices: Float[Tensor, "V 3"] | None = None
+    ) -> Triangles:
+        """Make them of meshes.
+
+        Args:
+            meshes: the bodies.
+            crease_degrees: larger angles between triangles are edges of the object.
+            vertices: of all meshes one after another, where they are not where the meshes have them.
+        """
+        counts = [len(mesh.vertices) for mesh in meshes]
+        if vertices is None:
+            vertices = torch.from_numpy(np.concatenate([mesh.vertices for mesh in meshes]))
+        corners = [
+            part[torch.from_numpy(mesh.faces)]
+            for mesh, part in zip(meshes, vertices.double().cpu().split(counts), strict=True)
+        ]
+        normals = [smooth_normals(mesh, part, crease_degrees) for mesh, part in zip(meshes, corners, strict=True)]
+        body = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
+        return cls(torch.cat(corners), torch.cat(normals), torch.from_numpy(body))
+
+    def areas(self, face: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
+        """Normals of triangles by the right-hand rule, twice as long as their areas."""
+        a, b, c = self.corners[face].unbind(1)
+        return torch.linalg.cross(b - a, c - a)
+
+    def distance(self, x: Float[Tensor, "R 3"], d: Float[Tensor, "R 3"], face: Int[Tensor, "R"]) -> Float[Tensor, "R"]:
+        """Distance to a triangle's plane along a ray."""
+        normal = self.areas(face)
+        slope = (d * normal).sum(-1)
+        return ((self.corners[face, 0] - x) * normal).sum(-1) / slope
+
+    def normal(self, x: Float[Tensor, "R 3"], face: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
+        """Unit normal at points of triangles: the corners' normals, weighted with the barycentric coordinates."""
+        corners, normal = self.corners[face], self.areas(face)
+        areas = [torch.linalg.cross(corners[:, (i + 1) % 3] - x, corners[:, (i + 2) % 3] - x) for i in range(3)]
+        weights = torch.stack([(area * normal).sum(-1) for area in areas], -1)
+        weights = (weights / weights.sum(-1, keepdim=True)).clamp(0, 1)
+        return torch.nn.functional.normalize((weights[..., None] * self.normals[face]).sum(1), dim=-1)
+
+
+class MeshIntersector:
+    """First hits of rays with triangles."""
+
+    def __init__(self, corners: Float[Tensor, "F 3 3"] | Float[np.ndarray, "F 3 3"]) -> None:
         """Build the hierarchy.
+
+        Args:
+            corners: of the triangles, world units.
 
         Raises:
             NerfroError: embreex is not installed.
@@ -33,29 +87,11 @@ class MeshIntersector:
             from embreex.rtcore_scene import EmbreeScene
         except ImportError as error:
             raise NerfroError("sampler.path.interface=mesh needs Embree; pip install embreex, or take =sdf") from error
-        self.triangles = torch.from_numpy(np.concatenate([mesh.triangles for mesh in meshes]))
-        self.normals = torch.from_numpy(np.concatenate([corner_normals(mesh, crease_degrees) for mesh in meshes]))
-        self.face_normals = torch.from_numpy(np.concatenate([face_normals(mesh) for mesh in meshes]))
-        self.body = torch.from_numpy(np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes]))
         self._scene = EmbreeScene()
         # The scene keeps a pointer to the mesh, not the mesh.
-        self._mesh = EmbreeMesh(self._scene, self.triangles.float().numpy())
+        self._mesh = EmbreeMesh(self._scene, np.asarray(corners, np.float32))
 
     def first_hits(self, x: Float[Tensor, "R 3"], d: Float[Tensor, "R 3"]) -> Int[Tensor, "R"]:
         """Triangle that each ray hits first, -1 for none."""
         hits = self._scene.run(x.float().numpy(), d.float().numpy())
         return torch.from_numpy(np.asarray(hits)).long()
-
-    def distance(self, x: Float[Tensor, "R 3"], d: Float[Tensor, "R 3"], face: Int[Tensor, "R"]) -> Float[Tensor, "R"]:
-        """Distance to a triangle's plane along a ray, in double precision."""
-        normal = self.face_normals[face]
-        slope = (d * normal).sum(-1)
-        return ((self.triangles[face, 0] - x) * normal).sum(-1) / slope
-
-    def normal(self, x: Float[Tensor, "R 3"], face: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
-        """Unit normal at points of triangles: the corners' normals, weighted with the barycentric coordinates."""
-        corners = self.triangles[face]
-        areas = [torch.linalg.cross(corners[:, (i + 1) % 3] - x, corners[:, (i + 2) % 3] - x) for i in range(3)]
-        weights = torch.stack([(area * self.face_normals[face]).sum(-1) for area in areas], -1)
-        weights = (weights / weights.sum(-1, keepdim=True)).clamp(0, 1)
-        return torch.nn.functional.normalize((weights[..., None] * self.normals[face]).sum(1), dim=-1)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from nerfro.geometry.mesh import TriangleMesh
 
@@ -20,7 +22,14 @@ def face_normals(mesh: TriangleMesh) -> Float[np.ndarray, "F 3"]:
 
 
 def corner_normals(mesh: TriangleMesh, crease_degrees: float = 30.0) -> Float[np.ndarray, "F 3 3"]:
-    """Unit normal at each corner of each triangle, smooth over the vertex up to creases.
+    """Unit normal at each corner of each triangle, smooth over the vertex up to creases; see `smooth_normals`."""
+    return smooth_normals(mesh, torch.from_numpy(mesh.triangles), crease_degrees).numpy()
+
+
+def smooth_normals(
+    mesh: TriangleMesh, triangles: Float[Tensor, "F 3 3"], crease_degrees: float
+) -> Float[Tensor, "F 3 3"]:
+    """Unit normal at each corner of each triangle, smooth over the vertex up to creases, with gradients by the corners.
 
     The mesh's own normals are taken where it has them and they lie within the crease angle of the face. Else it is the
     mean normal of the faces around the vertex whose normals are within the crease angle of the corner's own face, with
@@ -29,19 +38,21 @@ def corner_normals(mesh: TriangleMesh, crease_degrees: float = 30.0) -> Float[np
     face knows the normal.
 
     Args:
-        mesh: triangles.
+        mesh: says which triangles meet in which vertex, and the normals of its file if there are any.
+        triangles: corners of the mesh's triangles, where they are now.
         crease_degrees: larger angles between faces are edges of the object.
 
     Source:
         N. Max, "Weights for computing vertex normals from facet normals", Journal of Graphics Tools 4(2), 1999.
     """
-    normals = face_normals(mesh)
-    triangles = mesh.triangles
-    forward = np.roll(triangles, -1, axis=1) - triangles
-    backward = np.roll(triangles, 1, axis=1) - triangles
-    lengths = (forward**2).sum(-1) * (backward**2).sum(-1)
-    areas = np.linalg.norm(np.cross(forward, backward), axis=-1)
-    weights = np.divide(areas, lengths, out=np.zeros_like(areas), where=lengths > 0)
+    forward = triangles.roll(-1, 1) - triangles
+    backward = triangles.roll(1, 1) - triangles
+    crosses = torch.linalg.cross(forward, backward)
+    normals = _unit(crosses[:, 0])
+    areas = torch.linalg.vector_norm(crosses, dim=-1).reshape(-1)
+    lengths = ((forward**2).sum(-1) * (backward**2).sum(-1)).reshape(-1)
+    weights = torch.where(lengths > 0, areas / torch.where(lengths > 0, lengths, 1.0), 0.0)
+    cosine = np.cos(np.radians(crease_degrees))
     # All pairs of corners that meet in a vertex: corners sorted by vertex, then every corner against its whole run.
     corner_vertex = mesh.faces.reshape(-1)
     order = np.argsort(corner_vertex, kind="stable")
@@ -50,19 +61,25 @@ def corner_normals(mesh: TriangleMesh, crease_degrees: float = 30.0) -> Float[np
     first = np.repeat(np.arange(len(corner_vertex)), runs)
     within = np.arange(runs.sum()) - np.repeat(np.cumsum(runs) - runs, runs)
     second = order[np.repeat(starts[corner_vertex], runs) + within]
-    smooth = (normals[first // 3] * normals[second // 3]).sum(1) >= np.cos(np.radians(crease_degrees))
-    area = areas.reshape(-1)
-    fan_areas = np.where(smooth, area[second], area[first])
+    # What is smooth and what is uneven is decided, not differentiated.
+    flat, size = normals.detach().numpy(), areas.detach().numpy()
+    smooth = (flat[first // 3] * flat[second // 3]).sum(1) >= cosine
+    fan_areas = np.where(smooth, size[second], size[first])
     fans = np.cumsum(runs) - runs
     uneven = np.maximum.reduceat(fan_areas, fans) > _UNEVEN * np.minimum.reduceat(fan_areas, fans)
-    weight = np.where(uneven[first], area[second], weights.reshape(-1)[second]) * smooth
+    weight = torch.where(torch.from_numpy(uneven[first]), areas[second], weights[second]) * torch.from_numpy(smooth)
     contribution = normals[second // 3] * weight[:, None]
-    sums = np.stack([np.bincount(first, contribution[:, axis], len(corner_vertex)) for axis in range(3)], -1)
-    length = np.linalg.norm(sums, axis=1, keepdims=True)
-    own = np.repeat(normals, 3, axis=0)
-    smoothed = np.where(length > 0, sums / np.where(length > 0, length, 1), own).reshape(-1, 3, 3)
+    sums = torch.zeros_like(contribution[: len(corner_vertex)]).index_add(0, torch.from_numpy(first), contribution)
+    smoothed = torch.where((sums != 0).any(-1, keepdim=True), _unit(sums), normals.repeat_interleave(3, 0))
+    smoothed = smoothed.reshape(-1, 3, 3)
     if mesh.normals is None:
         return smoothed
     # Averages tilt where large flat triangles meet small round ones; a modeller's normals do not.
-    trusted = (mesh.normals * normals[:, None]).sum(-1, keepdims=True) >= np.cos(np.radians(crease_degrees))
-    return np.where(trusted, mesh.normals, smoothed)
+    trusted = (mesh.normals * flat[:, None]).sum(-1, keepdims=True) >= cosine
+    return torch.where(torch.from_numpy(trusted), torch.from_numpy(mesh.normals), smoothed)
+
+
+def _unit(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Vectors of length one; zero where there is none, with finite gradients."""
+    length = torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
+    return vectors / torch.where(length > 0, length, 1.0)

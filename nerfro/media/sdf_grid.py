@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -12,7 +10,7 @@ from torch import Tensor
 from nerfro.errors import NerfroError
 from nerfro.files.cache import cached_arrays, content_hash
 from nerfro.geometry.interpolation import quadratic_spline, spline_coefficients
-from nerfro.geometry.intersection import MeshIntersector
+from nerfro.geometry.intersection import MeshIntersector, Triangles
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.signed_distance import signed_distance_grid
 from nerfro.geometry.smoothing import smooth
@@ -39,10 +37,14 @@ class SdfGrid(Solid):
         distances: signed distance of each body at the grid's vertices.
         coefficients: of the quadratic B-splines through them.
         meshes: the surfaces themselves; empty where the medium was made of distances.
+        vertices: where the meshes' vertices are now, one mesh after another, world units; a parameter where the
+            triangles are learned.
     """
 
     distances: Float[Tensor, "K X Y Z"]
     coefficients: Float[Tensor, "K X Y Z"]
+    vertices: Float[Tensor, "V 3"]
+    _traced: tuple[Tensor, int, Triangles, MeshIntersector] | None = None
 
     def __init__(
         self,
@@ -126,10 +128,19 @@ class SdfGrid(Solid):
         """Bounds of the outer mesh; the grid's box where there is none."""
         return torch.from_numpy(self.meshes[0].bounds).float() if self.meshes else self.box
 
-    @functools.cached_property
-    def intersector(self) -> MeshIntersector:
-        """Finds the triangles of the meshes that rays hit."""
-        return MeshIntersector(self.meshes, self.crease_degrees)
+    @torch.no_grad()
+    def traced_triangles(self) -> tuple[Triangles, MeshIntersector]:
+        """The triangles without gradients, and what finds those that rays hit; made anew when `vertices` have moved."""
+        known = self._traced
+        if known is None or known[0] is not self.vertices or known[1] != self.vertices._version:
+            triangles = self.triangles()
+            known = self.vertices, self.vertices._version, triangles, MeshIntersector(triangles.corners)
+            self._traced = known
+        return known[2:]
+
+    def triangles(self) -> Triangles:
+        """The triangles of all meshes where `vertices` are now, with gradients by them."""
+        return Triangles.of(self.meshes, self.crease_degrees, self.vertices)
 
     @lazy_buffer
     def coarse_clearance(self) -> Float[Tensor, "x y z"]:
@@ -160,6 +171,8 @@ class SdfGrid(Solid):
     def _set(self, distances: Tensor, box: Tensor) -> None:
         # Grids are made of the mesh at every start and do not belong in checkpoints.
         self.register_buffer("box", box, persistent=False)
+        vertices = np.concatenate([np.empty((0, 3)), *(mesh.vertices for mesh in self.meshes)])
+        self.register_buffer("vertices", torch.from_numpy(vertices), persistent=False)
         coefficients = torch.stack([spline_coefficients(values) for values in distances])
         self.register_buffer("coefficients", coefficients, persistent=False)
         self.register_buffer("distances", distances, persistent=False)

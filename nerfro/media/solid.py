@@ -21,9 +21,11 @@ class Solid(Medium):
     n <- n + (ior - n) S.
 
     Attributes:
-        iors: refractive index of each body.
+        iors: refractive index of each body; a parameter where it is learned.
         shell: half width w, world units.
     """
+
+    iors: Float[Tensor, "K"]
 
     def __init__(self, iors: list[float], shell: float) -> None:
         """Set what all solids share.
@@ -36,7 +38,8 @@ class Solid(Medium):
             raise NerfroError(f"{iors} are no refractive indices; give positive numbers such as 1.5")
         if not shell > 0:
             raise NerfroError(f"a shell of half width {shell} is impossible; give a positive number")
-        self.iors = tuple(float(ior) for ior in iors)
+        # Double precision: kernels ask for it, and a number without dimensions takes on the precision of what it meets.
+        self.register_buffer("iors", torch.tensor(iors, dtype=torch.float64), persistent=False)
         self.shell = float(shell)
 
     @abstractmethod
@@ -54,7 +57,7 @@ class Solid(Medium):
     def index_inside(self, inside: Bool[Tensor, "*batch K"]) -> Float[Tensor, "*batch"]:
         """Index of the last body that a point is in, 1 in none."""
         n = torch.ones(inside.shape[:-1], dtype=self.box.dtype, device=inside.device)
-        for body, ior in enumerate(self.iors):
+        for body, ior in enumerate(self.iors.unbind()):
             n = torch.where(inside[..., body], ior, n)
         return n
 
@@ -65,7 +68,7 @@ class Solid(Medium):
         phi, normals = self.signed_distances(positions)
         in_box = ((positions >= self.box[0]) & (positions <= self.box[1])).all(-1)
         n, gradient = torch.ones_like(phi[..., 0]), torch.zeros_like(positions)
-        for body, ior in enumerate(self.iors):
+        for body, ior in enumerate(self.iors.unbind()):
             t = (0.5 - 0.5 * phi[..., body] / self.shell).clamp(0, 1)
             step = (t * t * (3 - 2 * t))[..., None]
             slope = (ior - n) * 6 * t * (1 - t) * (-0.5 / self.shell)
@@ -83,7 +86,8 @@ class Solid(Medium):
     ) -> Float[Tensor, "*batch"]:
         """The shell's width over `STEPS_PER_SHELL`, longer for slanting rays."""
         slope = torch.linalg.vector_norm(gradients, dim=-1)
-        cosine = ((directions * gradients).sum(-1) / slope).abs()
-        # Where there is no gradient there is no normal either.
-        cosine = torch.where(slope > 0, cosine, 1.0)
+        # Where there is no gradient there is no normal either; dividing by it would make gradients nan.
+        varies = slope > 0
+        cosine = ((directions * gradients).sum(-1) / torch.where(varies, slope, 1.0)).abs()
+        cosine = torch.where(varies, cosine, 1.0)
         return 2 * self.shell / STEPS_PER_SHELL / cosine.clamp(min=MIN_COSINE)

@@ -13,7 +13,7 @@ from nerfro.types import Path, Rays, Rendering, Samples
 
 
 class PathSampler(nn.Module, ABC):
-    """Bends rays into paths.
+    """Bends rays into paths: traced without gradients, and refined where something learns from them.
 
     Attributes:
         needs_medium: whether it asks the medium at all; if not, none is built.
@@ -28,7 +28,9 @@ class PathSampler(nn.Module, ABC):
         """Trace every ray from near to far through the medium; a bent path ends outside it, if need be beyond far."""
 
     def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
-        """The traced path with gradients by what bends it; asked only where something of that learns.
+        """The traced path with gradients by what bends it, and the same values; asked where something of that learns.
+
+        Silhouettes that move, and events that appear or go, have no gradients.
 
         Args:
             path: of these rays through this medium, as `forward` traced it.

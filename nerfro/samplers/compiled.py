@@ -39,8 +39,8 @@ def snell_on_grid(
 
     low, high, inverse_spacing = _frame(medium.box, medium.coefficients.shape[1:])
     settings = (
-        medium.coefficients.numpy(), medium.coarse_clearance.numpy(), np.array(medium.iors), low, high,
-        inverse_spacing, inverse_spacing / BLOCK, min_step * float((high - low).min()), max_events,
+        medium.coefficients.detach().numpy(), medium.coarse_clearance.numpy(), medium.iors.detach().double().numpy(),
+        low, high, inverse_spacing, inverse_spacing / BLOCK, min_step * float((high - low).min()), max_events,
     )  # fmt: skip
     (*vertices, body), (events, exceeded) = _with_enough_vertices(rays, trace_snell, settings, 4)
     num_events = torch.from_numpy(events)
@@ -66,11 +66,15 @@ def eikonal_on_grid(
     if isinstance(medium, SdfGrid):
         low, high, inverse_spacing = _frame(medium.box, medium.coefficients.shape[1:])
         table, clearance = np.empty((0, 0, 0, 4), np.float32), medium.coarse_clearance.numpy()
-        coefficients, iors, shell = medium.coefficients.numpy(), np.array(medium.iors), medium.shell
+        coefficients, iors, shell = (
+            medium.coefficients.detach().numpy(),
+            medium.iors.detach().double().numpy(),
+            medium.shell,
+        )
         inverse_block = inverse_spacing / BLOCK
     else:
         low, high, inverse_spacing = _frame(medium.box, medium.table.shape[:3])
-        table, clearance = medium.table.numpy(), medium.clearance_grid.numpy()
+        table, clearance = medium.table.detach().numpy(), medium.clearance_grid.numpy()
         coefficients, iors, shell = np.empty((0, 0, 0, 0), table.dtype), np.empty(0), 0.0
         inverse_block = inverse_spacing
     settings = (
@@ -101,7 +105,7 @@ def _march_uniform(
     use_threads()
     low, _, inverse_spacing = _frame(medium.box, medium.table.shape[:3])
     origins, directions, near, far = _ray_arrays(rays)
-    table = medium.table.numpy()
+    table = medium.table.detach().numpy()
     return eikonal.march_uniform(origins, directions, near, far, table, low, inverse_spacing, code, num_steps, keep_all)
 
 

@@ -19,7 +19,11 @@ from nerfro.samplers.base import PathSampler
 from nerfro.samplers.compiled import eikonal_on_grid, uniform_on_grid
 from nerfro.samplers.integrators import INTEGRATORS, Integrator, RayState, leapfrog
 from nerfro.samplers.polylines import Polylines
+from nerfro.samplers.replay import Vertices, assembled, events, with_gradient
 from nerfro.types import Path, Rays
+
+# Share of a step by which a replay may reach the end of one earlier than the trace.
+_ROUNDING = 0.01
 
 
 @register("sampler/path", "eikonal")
@@ -76,6 +80,18 @@ class Eikonal(PathSampler):
             return eikonal_on_grid(rays, medium, step, tolerance, self.max_steps)[0]
         return march_adaptive(rays, medium, tolerance, self.max_steps)[0]
 
+    def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
+        """The path with gradients by rays and medium: its steps once more, with the states of all kept for backward.
+
+        At a thin shell they grow without bound towards grazing and critical angles, as at a sharp surface.
+        """
+        if self.integrator == "adaptive":
+            return replay_adaptive(path, rays, medium, self.max_steps)
+        rays = rays[path.ray]
+        replayed = march_uniform(rays, medium, INTEGRATORS[self.integrator], self.num_steps)
+        names = ("positions", "directions", "s", "exit_directions")
+        return path.moved(*(with_gradient(getattr(path, name), getattr(replayed, name)) for name in names))
+
 
 def march_uniform(rays: Rays, medium: Medium, integrator: Integrator, num_steps: int) -> Path:
     """Vertices at equal steps ds = (far - near) / (num_steps - 1) (paper, Eqn. eikonal).
@@ -99,12 +115,53 @@ def march_uniform(rays: Rays, medium: Medium, integrator: Integrator, num_steps:
     return Path(positions, directions, s, directions[:, -1], refracted, rays.radii)
 
 
+class _NewVertices:
+    """The vertices of a trace: kept where a path has left the tangent of the last one, and at the start of jumps."""
+
+    def __init__(self, rays: Rays, tolerance: float) -> None:
+        self.kept = _start(rays)
+        self.lines = Polylines(len(rays), rays.near)
+        self.lines.append(torch.arange(len(rays), device=rays.near.device), *self.kept)
+        self.tolerance = tolerance
+
+    def before_jump(self, rows: Tensor, x: Tensor, d: Tensor, s: Tensor) -> None:
+        self._keep(rows[(d[rows] - self.kept[1][rows]).square().sum(-1) > MIN_TURN], x, d, s)
+
+    def after_step(self, rows: Tensor, length: Tensor, x: Tensor, d: Tensor, s: Tensor) -> None:
+        kept_x, kept_d, kept_s = (values[rows] for values in self.kept)
+        tangent = kept_x + (s[rows] - kept_s)[:, None] * kept_d
+        self._keep(rows[(x[rows] - tangent).square().sum(-1) > self.tolerance**2], x, d, s)
+
+    def _keep(self, rows: Tensor, *state: Tensor) -> None:
+        self.lines.append(rows, *(values[rows] for values in state))
+        for kept, values in zip(self.kept, state, strict=True):
+            kept[rows] = values[rows]
+
+
+class _KnownVertices:
+    """The vertices of a replay: where the trace has them."""
+
+    def __init__(self, path: Path) -> None:
+        self.s, self.last = path.s, events(path).sum(-1)
+        self.next = torch.ones_like(path.ray)
+        self.found: list[Vertices] = []
+
+    def before_jump(self, rows: Tensor, x: Tensor, d: Tensor, s: Tensor) -> None:
+        """It begins where the step before has ended."""
+
+    def after_step(self, rows: Tensor, length: Tensor, x: Tensor, d: Tensor, s: Tensor) -> None:
+        column = self.next[rows]
+        # A vertex lies at the end of a step; rounding must not move it to the end of the next one.
+        due = (column <= self.last[rows]) & (s[rows] >= self.s[rows, column] - _ROUNDING * length)
+        rows, column = rows[due], column[due]
+        self.found.append((rows, column, x[rows], d[rows], s[rows]))
+        self.next[rows] += 1
+
+
 def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int) -> tuple[Path, Bool[Tensor, "R"]]:
     """Leapfrog steps where the index varies, straight jumps elsewhere: the plain reference of the compiled kernel.
 
-    The box is entered and left along straight lines. Inside it a ray jumps by the medium's clearance where there is
-    any, and else takes a leapfrog step of the medium's step length. A vertex is kept where the path has left the
-    tangent of the last one by `tolerance`, and at the start of jumps.
+    A vertex is kept where the path has left the tangent of the last one by `tolerance`, and at the start of jumps.
 
     Args:
         rays: in world space.
@@ -115,28 +172,55 @@ def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int)
     Returns:
         Paths, and whether a ray met the limit; such a ray goes straight on.
     """
+    vertices = _NewVertices(rays, tolerance)
+    state, refracted, exceeded = _march(rays, medium, max_steps, vertices)
+    vertices.before_jump(torch.arange(len(rays), device=rays.near.device), *state)
+    vertices.lines.append_ends(rays.far, medium.box, refracted, *state)
+    return vertices.lines.path(rays, refracted), exceeded
+
+
+def replay_adaptive(path: Path, rays: Rays, medium: Medium, max_steps: int) -> Path:
+    """The steps of `march_adaptive` once more, with gradients by rays and medium, lengths of steps included.
+
+    In double precision, as the compiled kernel computes. The states of all steps are kept for the backward pass.
+    """
+    names = ("origins", "directions", "radii", "near", "far")
+    precise = Rays(*(path.of_ray(getattr(rays, name)).double() for name in names))
+    vertices = _KnownVertices(path)
+    state, _, _ = _march(precise, medium, max_steps, vertices)
+    rows = torch.arange(len(precise), device=path.s.device)
+    first = (rows, torch.zeros_like(rows), *_start(precise))
+    return assembled(path, rays, medium, [first, *vertices.found], state)
+
+
+def _start(rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
+    return rays.origins + rays.near[:, None] * rays.directions, rays.directions.clone(), rays.near.clone()
+
+
+def _march(
+    rays: Rays, medium: Medium, max_steps: int, vertices: _NewVertices | _KnownVertices
+) -> tuple[tuple[Tensor, Tensor, Tensor], Bool[Tensor, "R"], Bool[Tensor, "R"]]:
+    """Follow rays until they have left the medium's box, which is entered and left along straight lines.
+
+    Inside it a ray jumps by the medium's clearance where there is any, and else takes a leapfrog step of the medium's
+    step length.
+
+    Returns:
+        Last positions, directions and arc lengths; whether the index varied on the way; whether a ray met the limit.
+    """
     num_rays = len(rays)
     rows = torch.arange(num_rays, device=rays.near.device)
-    x, d, s = rays.origins + rays.near[:, None] * rays.directions, rays.directions.clone(), rays.near.clone()
-    lines = Polylines(num_rays, x)
-    lines.append(rows, x, d, s)
-    kept_x, kept_d, kept_s = x.clone(), d.clone(), s.clone()
-
-    def keep(chosen: Tensor) -> None:
-        lines.append(chosen, x[chosen], d[chosen], s[chosen])
-        kept_x[chosen], kept_d[chosen], kept_s[chosen] = x[chosen], d[chosen], s[chosen]
-
-    def turned(chosen: Tensor) -> Tensor:
-        return chosen[(d[chosen] - kept_d[chosen]).square().sum(-1) > MIN_TURN]
-
+    x, d, s = _start(rays)
     refracted = torch.zeros(num_rays, dtype=torch.bool, device=x.device)
     enter, leave = intersect_box(medium.box, x, d)
     active = rows[(enter < leave) & (leave > 0) & (enter < rays.far - s)]
     jump = enter[active].clamp(min=0)
     x[active] += jump[:, None] * d[active]
     s[active] += jump
-    n, g = medium(x)
-    v = n[:, None] * d
+    # Values of all rays are changed in place, so what autograd keeps are those of rows.
+    n, g, v = torch.ones_like(s), torch.zeros_like(x), torch.zeros_like(x)
+    n[active], g[active] = medium(x[active])
+    v[active] = n[active, None] * d[active]
     for _ in range(max_steps):
         if not len(active):
             break
@@ -144,7 +228,7 @@ def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int)
         free = medium.clearance(x[active])
         jumps = free > REACHED * step
         jumping, stepping = active[jumps], active[~jumps]
-        keep(turned(jumping))
+        vertices.before_jump(jumping, x, d, s)
         length = free[jumps]
         x[jumping] += length[:, None] * d[jumping]
         s[jumping] += length
@@ -154,17 +238,15 @@ def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int)
         refracted[stepping] |= varies
         ds = step[~jumps]
         state = leapfrog(RayState(x[stepping], v[stepping], n[stepping], g[stepping]), ds, medium)
-        s[stepping] += torch.linalg.vector_norm(state.positions - x[stepping], dim=-1)
+        length = torch.linalg.vector_norm(state.positions - x[stepping], dim=-1)
+        s[stepping] += length
         x[stepping], v[stepping], n[stepping], g[stepping] = state
         # A straight step leaves the direction as it is, to the last bit.
         bent = stepping[varies | (state.gradients != 0).any(-1)]
         d[bent] = torch.nn.functional.normalize(v[bent], dim=-1)
-        tangent = kept_x[stepping] + (s - kept_s)[stepping, None] * kept_d[stepping]
-        keep(stepping[(x[stepping] - tangent).square().sum(-1) > tolerance**2])
+        vertices.after_step(stepping, length, x, d, s)
         outside = ((x[active] < medium.box[0]) | (x[active] > medium.box[1])).any(-1)
         active = active[~outside]
     exceeded = torch.zeros_like(refracted)
     exceeded[active] = True
-    keep(turned(rows))
-    lines.append_ends(rays.far, medium.box, refracted, x, d, s)
-    return lines.path(rays, refracted), exceeded
+    return (x, d, s), refracted, exceeded

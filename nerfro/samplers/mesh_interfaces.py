@@ -29,8 +29,8 @@ def snell_on_mesh(rays: Rays, medium: SdfGrid, max_events: int) -> tuple[Path, I
     Returns:
         Paths, the number of events on each, and whether a ray met the limit.
     """
-    scene = medium.intersector
-    iors = torch.tensor([1.0, *medium.iors], dtype=torch.float64)
+    triangles, scene = medium.traced_triangles()
+    iors = torch.cat([torch.ones(1), medium.iors.detach().cpu()]).double()
     box, device = medium.box.double().cpu(), rays.origins.device
     origins, far = rays.origins.double().cpu(), rays.far.double().cpu()
     d, s = rays.directions.double().cpu().clone(), rays.near.double().cpu().clone()
@@ -51,21 +51,21 @@ def snell_on_mesh(rays: Rays, medium: SdfGrid, max_events: int) -> tuple[Path, I
     while len(active):
         face = scene.first_hits(x[active] + start[active, None] * d[active], d[active])
         active, face = active[face >= 0], face[face >= 0]
-        length = scene.distance(x[active], d[active], face)
+        length = triangles.distance(x[active], d[active], face)
         # A straight line meets a plane once: the triangle that the ray comes from is found again only by rounding.
         again = face == last_face[active]
         start[active[again]] += offset
         retry, ahead = active[again], ~again
         active, face, length = active[ahead], face[ahead], length[ahead].clamp(min=0)
         flipped = inside[active]
-        body = scene.body[face][:, None]
+        body = triangles.body[face][:, None]
         flipped = flipped.scatter(1, body, ~flipped.gather(1, body))
         n_before, n_after = (iors[medium.innermost(flags)] for flags in (inside[active], flipped))
         visible = n_before != n_after
         over = visible & (num_events[active] >= max_events)
         exceeded[active] = over
         hit = x[active] + length[:, None] * d[active]
-        turned, reflected = refract(d[active], scene.normal(hit, face), n_before, n_after)
+        turned, reflected = refract(d[active], triangles.normal(hit, face), n_before, n_after)
         reflected &= visible
         keep = ~over
         active, face, hit, length = active[keep], face[keep], hit[keep], length[keep]

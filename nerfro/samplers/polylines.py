@@ -11,6 +11,20 @@ from nerfro.kernels.tolerances import BEYOND_BOX
 from nerfro.types import Path, Rays
 
 
+def distance_to_end(
+    far: Float[Tensor, "R"],
+    box: Float[Tensor, "2 3"],
+    refracted: Bool[Tensor, "R"],
+    positions: Float[Tensor, "R 3"],
+    directions: Float[Tensor, "R 3"],
+    s: Float[Tensor, "R"],
+) -> Float[Tensor, "R"]:
+    """From the last event of rays to their end: at far, but when bent not before they are out of the box."""
+    _, leave = intersect_box(box, positions, directions)
+    out = leave.clamp(min=0) + BEYOND_BOX * (box[1] - box[0]).min()
+    return torch.where(refracted, torch.maximum(far - s, out), far - s)
+
+
 class Polylines:
     """Paths under construction: rows of vertices, each row as long as it needs to be."""
 
@@ -44,10 +58,8 @@ class Polylines:
         directions: Float[Tensor, "R 3"],
         s: Float[Tensor, "R"],
     ) -> None:
-        """Add the last vertex of every row: at far, but for a bent path never before it has left the medium's box."""
-        _, leave = intersect_box(box, positions, directions)
-        out = leave.clamp(min=0) + BEYOND_BOX * (box[1] - box[0]).min()
-        ahead = torch.where(refracted, torch.maximum(far - s, out), far - s)
+        """Add the last vertex of every row."""
+        ahead = distance_to_end(far, box, refracted, positions, directions, s)
         rows = torch.arange(len(s), device=s.device)
         self.append(rows, positions + ahead[:, None] * directions, directions, s + ahead)
 

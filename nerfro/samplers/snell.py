@@ -21,6 +21,7 @@ from nerfro.samplers.base import PathSampler
 from nerfro.samplers.compiled import snell_on_grid
 from nerfro.samplers.mesh_interfaces import snell_on_mesh
 from nerfro.samplers.polylines import Polylines
+from nerfro.samplers.replay import meet_solid, meet_triangles, replay
 from nerfro.samplers.snell_law import refract
 from nerfro.samplers.straight import straight_path
 from nerfro.types import Path, Rays
@@ -67,6 +68,19 @@ class Snell(PathSampler):
     def forward(self, rays: Rays, medium: Medium) -> Path:
         """Trace every ray from near to far, or until it has left the medium's box; straight runs are two vertices."""
         return self.trace(rays, medium).path
+
+    def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
+        """The path with gradients by rays, indices and the surface that was traced; see `samplers.replay`.
+
+        They are unbounded at grazing and critical angles: leave out paths whose `smallest_cosine` is below 0.15.
+        """
+        if self.interface == "mesh" and isinstance(medium, SdfGrid):
+            meet = meet_triangles(medium.triangles(), medium.traced_triangles()[1])
+        elif isinstance(medium, Solid):
+            meet = meet_solid(medium)
+        else:
+            return straight_path(rays[path.ray])
+        return replay(path, rays, medium, meet)
 
     @torch.no_grad()
     def trace(self, rays: Rays, medium: Medium) -> SnellTrace:

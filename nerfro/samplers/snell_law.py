@@ -12,6 +12,7 @@ def refract(
     normals: Float[Tensor, "R 3"],
     n_before: Float[Tensor, "R"],
     n_after: Float[Tensor, "R"],
+    reflected: Bool[Tensor, "R"] | None = None,
 ) -> tuple[Float[Tensor, "R 3"], Bool[Tensor, "R"]]:
     """Snell's law in vector form, and total reflection where it has no solution.
 
@@ -21,6 +22,7 @@ def refract(
         directions: unit, towards the surface.
         normals: unit, of either orientation.
         n_before, n_after: index on the ray's side and beyond.
+        reflected: which rays are reflected, where that is known already; else those without a solution.
 
     Returns:
         Unit directions after the event, and whether it was a reflection.
@@ -30,9 +32,10 @@ def refract(
     cosine = cosine.abs()
     ratio = n_before / n_after
     squared = 1 - ratio**2 * (1 - cosine**2)
-    reflected = squared <= 0
+    total = squared <= 0
+    reflected = total if reflected is None else reflected
     # The root of 1 where it is not used: that of zero or less would make gradients nan.
-    root = torch.where(reflected, 1.0, squared).sqrt()
+    root = torch.where(total, 1.0, squared).sqrt()
     along = torch.where(reflected, 2 * cosine, ratio * cosine - root)
     scale = torch.where(reflected, 1.0, ratio)
     after = scale[..., None] * directions + along[..., None] * normals

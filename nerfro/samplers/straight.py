@@ -21,6 +21,9 @@ class Straight(PathSampler):
         """The two-vertex path of every ray; `refracted` is false throughout."""
         return straight_path(rays)
 
+    def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
+        return straight_path(rays[path.ray])
+
 
 def straight_path(rays: Rays) -> Path:
     """Paths of two vertices, at near and far."""

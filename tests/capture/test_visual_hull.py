@@ -43,7 +43,7 @@ def cameras_around(count: int, size: int, distance: float = 4.0, focal: float = 
 def photographed(mesh: trimesh.Trimesh, cameras: Cameras) -> Silhouettes:
     """Binary masks: pixels whose central ray meets the mesh."""
     body = TriangleMesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
-    intersector = MeshIntersector([body], 30.0)
+    intersector = MeshIntersector(body.triangles)
     masks = torch.stack([mesh_silhouette(intersector, cameras, view, 1) for view in range(len(cameras))])
     return Silhouettes.of(cameras, masks.float())
 

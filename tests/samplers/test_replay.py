@@ -1,0 +1,272 @@
+"""Refined paths: the traced values, and their first derivatives against central differences of the trace itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path as FilePath
+
+import pytest
+import torch
+import trimesh
+from torch import Tensor, nn
+
+from nerfro.media.analytic import Vacuum
+from nerfro.media.base import Medium
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.shapes import Ball, RoundedBox
+from nerfro.media.solid import Solid
+from nerfro.media.voxel_grid import VoxelGrid
+from nerfro.samplers.base import PathSampler
+from nerfro.samplers.eikonal import Eikonal, march_adaptive
+from nerfro.samplers.replay import smallest_cosine
+from nerfro.samplers.snell import Snell, trace_interfaces
+from nerfro.samplers.straight import Straight
+from nerfro.types import Path, Rays
+from tests.closed_forms import beam, make_rays, to
+
+BOX = torch.tensor([[-1.2] * 3, [1.2] * 3], dtype=torch.float64)
+STEADY = 0.15
+
+
+class PlainSnell(Snell):
+    """Finds surfaces to the last bit; the compiled kernel stops a billionth before."""
+
+    @torch.no_grad()
+    def forward(self, rays: Rays, medium: Medium) -> Path:
+        return trace_interfaces(rays, medium, self.max_events)[0]
+
+
+class PlainEikonal(Eikonal):
+    """Takes the very steps of the replay; the compiled kernel cuts free flights otherwise."""
+
+    @torch.no_grad()
+    def forward(self, rays: Rays, medium: Medium) -> Path:
+        return march_adaptive(rays, medium, 1e-3, self.max_steps)[0]
+
+
+class NestedBalls(Solid):
+    """A ball in a ball in closed form."""
+
+    box = BOX
+
+    def signed_distances(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        centres = torch.tensor([[0, 0, 0], [0.2, 0.1, 0]], dtype=torch.float64)
+        offsets = positions[..., None, :] - centres
+        distances = torch.linalg.vector_norm(offsets, dim=-1)
+        return distances - torch.tensor([0.8, 0.4], dtype=torch.float64), offsets / distances[..., None]
+
+
+def _rays(num: int = 40, seed: int = 0) -> Rays:
+    generator = torch.Generator().manual_seed(seed)
+    directions = torch.nn.functional.normalize(torch.randn(num, 3, generator=generator), dim=-1)
+    targets = torch.rand(num, 3, generator=generator) - 0.5
+    return make_rays(targets - 3 * directions, directions, 0.5, 4.0)
+
+
+def _ball(centre: list[float], radius: float) -> Tensor:
+    axis = torch.linspace(-1.2, 1.2, 33, dtype=torch.float64)
+    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    return (points - torch.tensor(centre, dtype=torch.float64)).norm(dim=-1) - radius
+
+
+def _nested_grid() -> SdfGrid:
+    """A ball of glass with a bubble beside its middle; rays are totally reflected at either."""
+    return SdfGrid.from_distances(
+        torch.stack([_ball([0, 0, 0], 0.8), _ball([0.2, 0.1, 0], 0.4)]), BOX, [1.5, 1.0], 0.02
+    )
+
+
+def _nested_mesh(folder: FilePath) -> SdfGrid:
+    outer, inner = trimesh.creation.icosphere(3, 0.8), trimesh.creation.icosphere(2, 0.4)
+    inner.apply_translation([0.2, 0.1, 0])
+    outer.export(folder / "outer.ply")
+    inner.export(folder / "inner.ply")
+    return SdfGrid(
+        str(folder / "outer.ply"), 1.5, [str(folder / "inner.ply")], [1.2], resolution=24, cache=False
+    ).double()
+
+
+def _cube_mesh(folder: FilePath) -> SdfGrid:
+    trimesh.creation.box(extents=[1.1, 1.2, 1.3]).export(folder / "cube.ply")
+    return SdfGrid(str(folder / "cube.ply"), 1.52, resolution=24, cache=False).double()
+
+
+SCENES: dict[str, tuple[PathSampler, Callable[[FilePath], Medium]]] = {
+    "snell-ball": (Snell(), lambda folder: Ball(0.8, 1.5).double()),
+    "snell-rounded-cube": (Snell(), lambda folder: RoundedBox(0.6, 0.15, 1.52).double()),
+    "snell-nested-grid": (PlainSnell(), lambda folder: _nested_grid()),
+    "snell-nested-mesh": (Snell("mesh"), _nested_mesh),
+    "snell-cube-mesh": (Snell("mesh"), _cube_mesh),
+    "eikonal-ball": (Eikonal(), lambda folder: Ball(0.8, 1.5, 0.05).double()),
+    "eikonal-rounded-cube": (Eikonal(max_steps=400), lambda folder: RoundedBox(0.6, 0.15, 1.52, 0.05).double()),
+    "eikonal-nested-balls": (Eikonal(), lambda folder: NestedBalls([1.5, 1.2], 0.05)),
+    "eikonal-nested-grid": (PlainEikonal(), lambda folder: _nested_grid()),
+}
+
+
+def _vertices(path: Path) -> Tensor:
+    """All that a path gives downstream, the last vertex repeated: [P, everything]."""
+    column = torch.arange(40).clamp(max=path.s.shape[1] - 1)
+    every = (path.positions[:, column], path.directions[:, column], path.s[:, column, None])
+    return torch.cat([*(values.flatten(1) for values in every), path.exit_directions], -1)
+
+
+def _shifted(what: str, rays: Rays, medium: Medium) -> Callable[[Tensor], Rays]:
+    """Shifts something by a multiple of a random direction, in the rays that it returns or in the medium."""
+    generator = torch.Generator().manual_seed(7)
+
+    def random(like: Tensor) -> Tensor:
+        return torch.randn(like.shape, generator=generator, dtype=torch.float64).to(like)
+
+    if what in ("origin", "direction"):
+        old = rays.origins if what == "origin" else rays.directions
+        change = random(old)
+
+        def shift_rays(step: Tensor) -> Rays:
+            new = old + step * change
+            if what == "origin":
+                return replace(rays, origins=new)
+            return replace(rays, directions=torch.nn.functional.normalize(new, dim=-1))
+
+        return shift_rays
+    old = getattr(medium, what)
+    change = random(old) * (1 if what == "iors" else 0.1)
+
+    def shift_medium(step: Tensor) -> Rays:
+        setattr(medium, what, old + step * change)
+        return rays
+
+    return shift_medium
+
+
+# On a grid the cell that a ray is in says where its steps begin; now and then differences see that.
+EVERYWHERE = [name for name in SCENES if name != "eikonal-nested-grid"]
+CASES = [(name, what) for name in EVERYWHERE for what in ("iors", "origin", "direction")]
+CASES += [("snell-nested-grid", "coefficients"), ("eikonal-nested-grid", "coefficients")]
+CASES += [("snell-nested-mesh", "vertices"), ("snell-cube-mesh", "vertices")]
+
+
+@pytest.mark.parametrize(("name", "what"), CASES)
+def test_derivatives_are_those_of_central_differences(name: str, what: str, tmp_path: FilePath) -> None:
+    sampler, make = SCENES[name]
+    rays, medium = _rays(), make(tmp_path)
+    shift = _shifted(what, rays, medium)
+
+    def traced(step: float) -> Path:
+        return sampler(shift(torch.tensor(step, dtype=torch.float64)), medium)
+
+    def refined(step: Tensor) -> Tensor:
+        shifted = shift(step)
+        with torch.no_grad():
+            path = sampler(shifted, medium)
+        return _vertices(sampler.refine(path, shifted, medium))
+
+    _, found = torch.autograd.functional.jvp(
+        refined, torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64)
+    )
+
+    def difference(h: float) -> Tensor:
+        after, before = (_vertices(traced(sign * h)) for sign in (1, -1))
+        return (after - before) / (2 * h)
+
+    # Differences are no measure where a cube's rounding begins or a step is added between their two sides.
+    wide, narrow = difference(4e-6), difference(2e-6)
+    expected = (4 * narrow - wide) / 3
+    sound = (wide - narrow).norm(dim=-1) < 3e-7 * expected.norm(dim=-1)
+    if isinstance(sampler, Snell):
+        path = traced(0.0)
+        assert path.refracted.all()
+        sound &= smallest_cosine(path, medium) > STEADY
+    error = (found - expected).norm(dim=-1) / expected.norm(dim=-1)
+    assert sound.sum() > 28
+    assert error[sound].max() < 1e-6
+
+
+REFINED: list[tuple[PathSampler, Callable[[FilePath], Medium]]] = [
+    *(SCENES[name] for name in ("snell-ball", "snell-nested-mesh", "eikonal-ball")),
+    (Snell(), lambda folder: _nested_grid()),
+    (Eikonal(), lambda folder: _nested_grid()),
+    (Eikonal("leapfrog", 64), lambda folder: _nested_grid()),
+    (Eikonal("euler", 64), lambda folder: _voxels()),
+    (Snell(), lambda folder: Vacuum()),
+    (Straight(), lambda folder: Vacuum()),
+]
+
+
+def _voxels() -> VoxelGrid:
+    return VoxelGrid.from_occupancy((_ball([0, 0, 0], 0.8) < 0).double(), BOX, 1.5, 5, 1.0)
+
+
+@pytest.mark.parametrize(("sampler", "make"), REFINED)
+def test_values_are_the_traced_ones_and_gradients_finite(
+    sampler: PathSampler, make: Callable[[FilePath], Medium], tmp_path: FilePath
+) -> None:
+    rays, medium = to(_rays(300), torch.float32), make(tmp_path).float()
+    rays.origins.requires_grad_()
+    path = sampler(rays, medium)
+    assert not path.positions.requires_grad
+    found = sampler.refine(path, rays, medium)
+    for name in ("positions", "directions", "s", "exit_directions", "refracted", "body", "ray"):
+        assert torch.equal(getattr(found, name), getattr(path, name))
+    (gradient,) = torch.autograd.grad(found.positions.sum() + found.exit_directions.sum(), rays.origins)
+    assert gradient.isfinite().all()
+    assert (gradient != 0).any(-1).all()
+
+
+def test_straight_rows_have_the_derivatives_of_lines_beside_bent_ones() -> None:
+    rays = make_rays([[-3, 0.3, 0], [-3, 1.1, 0]], [[1, 0, 0], [1, 0, 0]], 0.5, 4.0)
+    d = rays.directions.clone().requires_grad_()
+    rays = replace(rays, directions=d)
+    sampler, medium = Snell(), Ball(0.8, 1.5).double()
+    path = sampler.refine(sampler(rays, medium), rays, medium)
+    assert path.refracted.tolist() == [True, False]
+    for vertex, s in enumerate([0.5, 4.0, 4.0, 4.0]):
+        (gradient,) = torch.autograd.grad(path.positions[1, vertex, 1], d, retain_graph=True)
+        assert gradient.tolist() == [[0, 0, 0], [0, s, 0]]
+
+
+def test_polylines_of_one_ray_bring_it_their_gradients_together() -> None:
+    sampler, medium, rays = Snell(), Ball(0.8, 1.5).double(), _rays(3)
+    rays.origins.requires_grad_()
+    path = sampler(rays, medium)
+    twice = torch.tensor([0, 0, 1, 2])
+    split = replace(path[twice], ray=twice)
+    (single,) = torch.autograd.grad(sampler.refine(path, rays, medium).exit_directions.sum(), rays.origins)
+    (double,) = torch.autograd.grad(sampler.refine(split, rays, medium).exit_directions.sum(), rays.origins)
+    torch.testing.assert_close(double, single * torch.tensor([[2.0], [1.0], [1.0]]))
+
+
+def test_smallest_cosine_is_that_of_the_angles_at_a_ball() -> None:
+    # Entry and exit are alike: outside cos i with sin i = b / R, inside cos t, which is larger.
+    heights = torch.tensor([0.0, 0.3, 0.7, 0.79, 0.9], dtype=torch.float64)
+    medium = Ball(0.8, 1.5).double()
+    cosines = smallest_cosine(Snell()(beam(heights), medium), medium)
+    torch.testing.assert_close(cosines[:4], (1 - (heights[:4] / 0.8) ** 2).sqrt())
+    assert cosines[4] == 1
+
+
+def test_an_index_is_found_from_exit_directions() -> None:
+    rays, sampler = _rays(100), Snell()
+    target = sampler(rays, Ball(0.8, 1.5).double()).exit_directions
+    medium = Ball(0.8, 1.3).double()
+    medium.iors = nn.Parameter(medium.iors)
+    optimizer = torch.optim.Adam(medium.parameters(), lr=0.02)
+    for _ in range(120):
+        path = sampler.refine(sampler(rays, medium), rays, medium)
+        steady = smallest_cosine(path, medium) > STEADY
+        optimizer.zero_grad()
+        (path.exit_directions - target)[steady].square().mean().backward()
+        optimizer.step()
+    assert medium.iors.item() == pytest.approx(1.5, abs=2e-3)
+
+
+def test_vertices_that_move_are_traced_where_they_are(tmp_path: FilePath) -> None:
+    medium, sampler = _cube_mesh(tmp_path), Snell("mesh")
+    rays = make_rays([[-3, 0.1, 0.2]], [[1, 0.1, 0]], 0.5, 6)
+    before = sampler(rays, medium)
+    with torch.no_grad():
+        medium.vertices[:, 0] += 0.1
+    moved = sampler(rays, medium)
+    along = 0.1 / float(rays.directions[0, 0])
+    torch.testing.assert_close(moved.s[:, 1:-1], before.s[:, 1:-1] + along)
