@@ -1,75 +1,116 @@
-"""Peak memory of training and of evaluating one view with the default preset, each in a process of its own.
+"""Memory of whole runs: training with the default preset and the evaluation after it, each in a process of its own.
 
-    python benchmarks/memory.py [--side 400] [--steps 30]
+    python benchmarks/memory.py [--steps 300] [ROW ...]
 
-Prints a Markdown table of peak resident memory, libraries and data included; load on the machine does not change it.
+Makes folders of noise in the sizes of the table, trains on them, scores one view, and prints a Markdown table. Load on
+the machine changes the seconds, not the memory.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import math
 import os
+import re
 import subprocess
 import sys
 import tempfile
+import threading
+import time
+from collections.abc import Iterator
 from datetime import date
 from pathlib import Path
 
+import numpy as np
 import torch
+from PIL import Image
 
-from nerfro.evaluation.render_view import Supersampling, render_view
-from nerfro.registry import build, discover
-from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint, restore
+from nerfro.files.cache import cache_dir
 
-BATCH_SIZES = (1024, 2048, 8192)
-CHUNK_SIZES = (1024, 4096, 16384)
-# A run evaluates its test views in the end; so that this is not its peak.
-_TRAINING = ("trainer.max_time=null", "evaluation.every=0", "evaluation.chunk_size=256", "evaluation.supersample=1")
+# Training pictures, width and height; 0 for the embedded scene.
+ROWS = {"embedded": (0, 128, 128), "800x800": (200, 800, 800), "1600x1200": (300, 1600, 1200)}
+_FIRST_STEP = re.compile(r"step [1-9]")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
-    parser.add_argument("--side", type=int, default=400, help="pixels along each side of the view")
-    parser.add_argument("--steps", type=int, default=30, help="of training")
-    parser.add_argument("--render", nargs=2, metavar=("CHECKPOINT", "CHUNK"), help="only render; 0 rays: only load")
+    parser.add_argument("rows", nargs="*", metavar="ROW", help=f"of {', '.join(ROWS)}; all by default")
+    parser.add_argument("--steps", type=int, default=300, help="of training")
     arguments = parser.parse_args()
-    if arguments.render is not None:
-        render(Path(arguments.render[0]), int(arguments.render[1]), arguments.side)
-        return
-    print(f"{os.cpu_count()} CPU cores, torch {torch.__version__}, {date.today()}\n")
-    print("| task | rays at once | peak, MiB |\n|---|---|---|")
-    with tempfile.TemporaryDirectory() as folder:
-        for size in BATCH_SIZES:
-            options = [*_TRAINING, f"trainer.max_steps={arguments.steps}", f"batches.size={size}"]
-            run = Path(folder, str(size))
-            print(f"| {arguments.steps} steps of training | {size} | ", end="", flush=True)
-            print(f"{peak([sys.executable, '-m', 'nerfro.train', *options, f'hydra.run.dir={run}']):.0f} |", flush=True)
-        for size in (0, *CHUNK_SIZES):
-            task = "nothing rendered" if size == 0 else f"a {arguments.side}x{arguments.side} view"
-            print(f"| {task} | {size or ''} | ", end="", flush=True)
-            command = [sys.executable, __file__, "--side", str(arguments.side), "--render"]
-            print(f"{peak([*command, str(run / LAST_CHECKPOINT), str(size)]):.0f} |", flush=True)
+    print(f"{os.cpu_count()} CPU cores, torch {torch.__version__}, {arguments.steps} steps, {date.today()}\n")
+    print("| training pictures | first step, s | resident after it, MiB | a minute later | at the last step | peak |")
+    print("|---|---|---|---|---|---|")
+    for name in arguments.rows or ROWS:
+        count, width, height = ROWS[name]
+        with tempfile.TemporaryDirectory() as folder:
+            options = [f"trainer.max_steps={arguments.steps}", f"hydra.run.dir={folder}/run"]
+            if count > 0:
+                make_noise(Path(folder), count, width, height)
+                options += [f"data.root={folder}", "medium.mesh=embedded:torus/mesh.ply"]
+            kept = set(cache_dir().glob("mapped_*.npy"))
+            measured = measure(["trainer.max_time=null", "evaluation.every=0", *options])
+            for path in set(cache_dir().glob("mapped_*.npy")) - kept:
+                path.unlink()
+        print(f"| {count or 100} of {width}x{height} | {' | '.join(measured)} |", flush=True)
 
 
-def peak(command: list[str]) -> float:
-    """Peak resident memory of a command, MiB."""
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+def make_noise(folder: Path, count: int, width: int, height: int) -> None:
+    """Write pictures of noise, whose cameras look at the origin from a circle; one of them is for testing."""
+    generator = np.random.default_rng(0)
+    frames = []
+    for number in range(count + 1):
+        levels = generator.integers(0, 256, (height, width, 3), dtype=np.uint8)
+        Image.fromarray(levels).save(folder / f"{number}.png", compress_level=1)
+        turn = 2 * math.pi * number / count
+        cos, sin = math.cos(turn), math.sin(turn)
+        pose = [[-sin, 0, cos, 4 * cos], [cos, 0, sin, 4 * sin], [0, 1, 0, 0], [0, 0, 0, 1]]
+        frames.append({"file_path": f"{number}.png", "transform_matrix": pose})
+    for split, chosen in (("train", frames[:count]), ("test", frames[count:])):
+        document = {"camera_angle_x": 0.69, "frames": chosen}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(document))
+
+
+def measure(options: list[str]) -> list[str]:
+    """Seconds to the first step; MiB after it, a minute later and at the last step; most MiB of the process."""
+    begun = time.perf_counter()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "nerfro.train", *options], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    )
+    samples: list[tuple[float, float]] = []  # seconds, MiB
+
+    def watch() -> None:
+        for megabytes in _resident(process.pid):
+            samples.append((time.perf_counter() - begun, megabytes))
+            time.sleep(0.5)
+
+    threading.Thread(target=watch, daemon=True).start()
+    assert process.stderr is not None
+    first, last, shown = math.inf, 0.0, ""
+    while part := os.read(process.stderr.fileno(), 4096).decode(errors="replace"):
+        shown = (shown + part)[-8192:]
+        now = time.perf_counter() - begun
+        if first == math.inf and _FIRST_STEP.search(part):
+            first = now
+        if "evaluate" not in shown:
+            last = now
     _, status, usage = os.wait4(process.pid, 0)
     if status != 0:
-        raise SystemExit(f"failed: {' '.join(command)}")
-    return usage.ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+        raise SystemExit(f"failed: {' '.join(options)}\n{shown}")
+    at = (next((m for t, m in reversed(samples) if t <= when), math.nan) for when in (first + 1, first + 60, last))
+    return [f"{first:.0f}", *(f"{megabytes:.0f}" for megabytes in at), f"{usage.ru_maxrss / 1024:.0f}"]
 
 
-def render(checkpoint: Path, chunk_size: int, side: int) -> None:
-    """Render the first test view at another resolution, supersampled as the preset does."""
-    discover()
-    trained, config = load_checkpoint(checkpoint)
-    config.evaluation.chunk_size = max(chunk_size, 1)
-    cameras = build(config.data).load("test").cameras
-    model = restore(trained, config)
-    if chunk_size > 0:
-        # The preset's own supersampling, which the run was told to leave out.
-        render_view(model, cameras.resized(side, side), 0, Supersampling(3, config.evaluation.divergence))
+def _resident(pid: int) -> Iterator[float]:
+    """MiB of a process, again and again until it ends."""
+    while True:
+        try:
+            found = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())
+        except OSError:
+            return
+        if found is None:
+            return
+        yield int(found[1]) / 1024
 
 
 if __name__ == "__main__":

@@ -43,7 +43,7 @@ def _evaluate_checkpoint(config: DictConfig) -> Path:
     wanted = trained.evaluation
     supersampling = Supersampling(wanted.supersample, wanted.divergence)
     device = find_device(config.device)
-    views = build(trained.data).load(config.split)
+    views = build(trained.data).load(config.split).checked()
     model = restore(checkpoint, trained).to(device)
     # Checkpoints from before there was LPIPS over VGG-16 lack the option.
     networks, reasons = find_lpips_networks(wanted.lpips_backbone, wanted.get("lpips_vgg_backbone"))

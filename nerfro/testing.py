@@ -218,11 +218,13 @@ def _check_data(plugin: Plugin, fields: dict[str, object]) -> None:
     source = _make(plugin, fields)
     for split in source.splits:
         views = source.load(split)
-        size = (len(views), views.cameras.height, views.cameras.width)
-        _require(views.images.shape == (*size, 3), "images are [V, H, W, 3]")
-        _require(len(views.cameras) == len(views), "there is a camera for each image")
-        _require(views.masks is None or views.masks.shape == size, "masks are [V, H, W]")
-        _require(views.usable is None or views.usable.shape == size, "usable pixels are [V, H, W]")
+        size = (views.cameras.height, views.cameras.width)
+        _require(len(views.cameras) == len(views.images) == len(views), "there is a camera for each image")
+        _require(all(image.shape == (*size, 3) for image in views.images), "images are [H, W, 3]")
+        _require(views.masks is None or all(mask.shape == size for mask in views.masks), "masks are [H, W]")
+        _require(
+            views.usable is None or all(usable.shape == size for usable in views.usable), "usable pixels are [H, W]"
+        )
 
 
 _CONTRACTS: dict[str, Callable[[Plugin, dict[str, object]], None]] = {

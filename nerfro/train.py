@@ -22,6 +22,7 @@ from nerfro.samplers.training_paths import trace_training_rays
 from nerfro.training.callbacks import StopOnSignal, Throughput
 from nerfro.training.config import TrainConfig, build_model
 from nerfro.training.data_module import RayDataModule
+from nerfro.training.memory import require_memory
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.run_folder import (
     LAST_CHECKPOINT,
@@ -42,8 +43,8 @@ def main(config: DictConfig) -> None:
     checkpoint = find_checkpoint(config.ckpt_path, folder)
     prepare_process(config.seed)
     source = build(config.data)
-    test = source.load(config.evaluation.split)
-    validation = source.load("val") if config.evaluation.every > 0 and "val" in source.splits else None
+    test = source.load(config.evaluation.split).checked()
+    validation = source.load("val").checked() if config.evaluation.every > 0 and "val" in source.splits else None
     wanted, training = config.batches, source.load("train")
     precrop = wanted.precrop_steps, wanted.precrop_fraction
     batches = RayBatches(training, wanted.size, wanted.batching, config.seed, *precrop, wanted.jitter)
@@ -56,10 +57,11 @@ def main(config: DictConfig) -> None:
     throughput, interruption = Throughput(), StopOnSignal()
     trainer = make_trainer(config, folder, [throughput, interruption])
     batches = batches.share(trainer.global_rank, trainer.world_size)
+    memory = require_memory(model, batches.batch(0).rays, trainer.strategy.root_device)
     if trainer.is_global_zero:
         claim(folder, checkpoint is not None, needed_bytes(model))
         record(folder, config)
-        print(f"nerfro: {config.name} on {config.data.root} -> {folder}", flush=True)
+        print(f"nerfro: {config.name} on {config.data.root} -> {folder}\n{memory}", flush=True)
     model.training_paths = trace_training_rays(config, model, training.cameras)
     if model.training_paths is not None and model.training_paths.parts is not None:
         batches = batches.dividing(model.training_paths.parts)

@@ -51,6 +51,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     "truncated test json": (lambda root: truncate(root / "transforms_test.json"), ["transforms_test.json"]),
     "missing image": (lambda root: (root / "train" / "r_1.png").unlink(), ["r_1.png"]),
     "truncated image": (lambda root: truncate(root / "train" / "r_1.png"), ["r_1.png"]),
+    "truncated test image": (lambda root: truncate(root / "test" / "r_1.png"), ["test", "r_1.png"]),
     "wrong size": (wrong_size, ["r_1", "12", "16"]),
     "pose that is not a number": (lambda root: edit(root / "transforms_train.json", put_nan), ["r_1"]),
     "no field of view": (

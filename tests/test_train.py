@@ -68,13 +68,13 @@ def test_run_writes_metrics_pictures_and_what_repeats_it(run: Path, overrides: l
 
     pictures = sorted((run / "images").iterdir())
     assert [path.name for path in pictures] == ["test_000.png", "test_001.png"]
-    references = BlenderData(str(tiny_scene)).load("test").images.numpy()
+    references = BlenderData(str(tiny_scene)).load("test").images
     for path, reference, view in zip(pictures, references, metrics["views"], strict=True):
         picture = read(path)
         assert picture.shape == (16, 16, 3)
         assert picture.dtype == np.uint8
         # The score of the written picture is the score that is reported.
-        error = np.mean((picture / 255 - reference.astype(np.float64)) ** 2)
+        error = np.mean((picture / 255 - reference.double().numpy()) ** 2)
         assert view["psnr"] == pytest.approx(-10 * np.log10(error), abs=1e-3)
 
     config = OmegaConf.load(run / "config.yaml")

@@ -18,7 +18,7 @@ from PIL import Image
 from nerfro.cameras import Cameras
 from nerfro.capture.targets import opencv
 from nerfro.data.base import DataSource, Frame
-from nerfro.data.image_files import read_mask
+from nerfro.data.image_files import read_mask, to_unit
 from nerfro.data.masks import masks_left_out
 from nerfro.errors import NerfroError
 from nerfro.files.drawing import sheet
@@ -167,7 +167,7 @@ def read_resized(mask: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
     Raises:
         NerfroError: it has other proportions.
     """
-    share = read_mask(mask)
+    share = to_unit(read_mask(mask))
     if share.shape[0] * size[0] != share.shape[1] * size[1]:
         raise NerfroError(
             f"mask {mask} has {share.shape[1]}x{share.shape[0]} pixels, of other proportions than its image"

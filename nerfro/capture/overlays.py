@@ -38,8 +38,8 @@ def contact_sheet(views: Views, mesh: TriangleMesh, overlaps: Float[np.ndarray, 
     pictures, captions = [], []
     for view in chosen.tolist():
         ours = mesh_silhouette(intersector, views.cameras, view, stride)
-        theirs = views.masks[view, ::stride, ::stride] > 0.5
-        pictures.append(_tinted(views.images[view, ::stride, ::stride], ours, theirs))
+        theirs = views.masks[view][::stride, ::stride] > 0.5
+        pictures.append(_tinted(views.images[view][::stride, ::stride], ours, theirs))
         captions.append(f"{overlaps[view]:.3f}  {views.names[view][-_NAME_LENGTH:]}")
     legend = f"green: both, red: mask only, blue: surface only; worst {len(chosen)} of {len(views)} views"
     return sheet(pictures, captions, _WIDTH, _COLUMNS, legend)

@@ -11,7 +11,7 @@ from rich.progress import track
 
 from nerfro.capture.targets import Sighting
 from nerfro.data.frames import list_images
-from nerfro.data.image_files import read_mask, read_rgb
+from nerfro.data.image_files import read_mask, read_rgb, to_unit
 from nerfro.errors import NerfroError
 from nerfro.light import to_linear
 
@@ -45,7 +45,7 @@ def luminance(image: Path) -> UInt8[np.ndarray, "H W"]:
     A pixel on an edge averages light, and sRGB's curve shows half the light as more than half a level. The edges of
     what is bright are then found too far outside, those of tags by 0.2 to 0.3 pixels.
     """
-    light = to_linear(read_rgb(image, "drop")) @ _LUMINANCE
+    light = to_linear(to_unit(read_rgb(image, "drop"))) @ _LUMINANCE
     white = max(float(np.quantile(light, 0.999)), 1 / 255)
     return np.uint8(np.rint(255 * np.minimum(light / white, 1.0)))
 
@@ -54,6 +54,6 @@ def outside(sighting: Sighting, mask: Path | None) -> Sighting:
     """The features that are not seen through the object, or cut by it."""
     if mask is None or len(sighting.points) == 0:
         return sighting
-    inside = read_mask(mask) > 0.5
+    inside = to_unit(read_mask(mask)) > 0.5
     columns, rows = np.clip(sighting.pixels.astype(int), 0, np.array(inside.shape[::-1]) - 1).T
     return sighting.only(~np.isin(sighting.features, sighting.features[inside[rows, columns]]))

@@ -16,7 +16,7 @@ from nerfro.capture.calibration import Calibration, Intrinsics, LensModel, Pose
 from nerfro.data.colmap import lens_of
 from nerfro.data.colmap_model import read_colmap
 from nerfro.data.frames import Lens
-from nerfro.data.image_files import read_mask
+from nerfro.data.image_files import read_mask, to_unit
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing
 from nerfro.paths import user_path
@@ -195,7 +195,7 @@ def _intrinsics(lens: Lens) -> Intrinsics:
 
 def _write_ignored(mask: Path, file: Path) -> None:
     """COLMAP's mask: black where features are ignored."""
-    inside: Float[np.ndarray, "H W"] = read_mask(mask) > 0.5
+    inside: Float[np.ndarray, "H W"] = to_unit(read_mask(mask)) > 0.5
     margin = max(1, round(_MARGIN * inside.shape[1]))
     Image.fromarray(np.where(binary_dilation(inside, iterations=margin), 0, 255).astype(np.uint8)).save(file)
 

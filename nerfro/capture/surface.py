@@ -44,7 +44,8 @@ def read_silhouettes(views: Views, has_box: bool) -> Silhouettes:
             "the data has no masks, and the hull is made of them; docs/capture.md tells where they are looked for "
             "and how to make them"
         )
-    inside = views.masks > 0.5
+    masks = torch.stack(list(views.masks))
+    inside = masks > 0.5
     share = inside.flatten(1).float().mean(1)
     for wrong, what in ((share == 0, "empty"), (share == 1, "all object")):
         if wrong.any():
@@ -66,7 +67,7 @@ def read_silhouettes(views: Views, has_box: bool) -> Silhouettes:
         )
     if len(views) < _FEW_VIEWS:
         warn(f"{len(views)} views make a coarse hull; 30 from all sides make a good one")
-    silhouettes = Silhouettes.of(views.cameras, views.masks)
+    silhouettes = Silhouettes.of(views.cameras, masks)
     if silhouettes.cut.all() and not has_box:
         raise NerfroError(
             f"the object is cut by the frame in all {len(views)} views, so that it has no whole outline; "

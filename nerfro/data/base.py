@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfro.cameras import Cameras
+from nerfro.data.pictures import Pictures
 
 
 @dataclass(frozen=True)
@@ -33,26 +35,37 @@ class Frame:
 
 @dataclass(frozen=True)
 class Views:
-    """Posed images of one split.
+    """Posed images of one split. `images[i]`, `masks[i]` and `usable[i]` are tensors, mostly read when asked for.
 
     Attributes:
         cameras: one camera for each image, all of one resolution.
-        images: colours, sRGB in [0, 1].
-        masks: share of each pixel that the refractive object covers, or None where the data has no masks.
+        images: colours [H, W, 3], sRGB in [0, 1].
+        masks: share [H, W] of each pixel that the refractive object covers, or None where the data has no masks.
         names: of the images, as the data set calls them.
-        usable: pixels that may be trained on, or None for all of them.
+        usable: 1 (or True) in the pixels [H, W] that may be trained on, or None for all of them.
         frames: files of the images and their masks, where the loader knows them.
     """
 
     cameras: Cameras
-    images: Float[Tensor, "V H W 3"]
-    masks: Float[Tensor, "V H W"] | None
+    images: Pictures | Float[Tensor, "V H W 3"]
+    masks: Pictures | Float[Tensor, "V H W"] | None
     names: list[str]
-    usable: Bool[Tensor, "V H W"] | None = None
+    usable: Pictures | Bool[Tensor, "V H W"] | None = None
     frames: Sequence[Frame] = ()
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def checked(self) -> Views:
+        """These views, of which every picture has been decoded once, and forgotten.
+
+        Raises:
+            NerfroError: one is truncated or corrupt.
+        """
+        for pictures in (self.images, self.masks):
+            if isinstance(pictures, Pictures):
+                deque(pictures.all_levels(), maxlen=0)
+        return self
 
 
 class DataSource(ABC):
@@ -71,8 +84,8 @@ class DataSource(ABC):
 
     @abstractmethod
     def load(self, split: str) -> Views:
-        """Read one split, checked.
+        """One split, checked but for the pixels of its pictures, which are read later: see `Views.checked`.
 
         Raises:
-            NerfroError: unknown split, or anything missing, truncated, of the wrong size or not finite.
+            NerfroError: unknown split, or anything missing, of the wrong size or not finite.
         """

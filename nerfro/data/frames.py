@@ -14,10 +14,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.cameras import Cameras
+from nerfro.cameras import Cameras, central_window
 from nerfro.data.base import Frame, Views
-from nerfro.data.image_files import Alpha, read_rgb, read_stack
-from nerfro.data.masks import read_masks
+from nerfro.data.image_files import Alpha, read_rgb
+from nerfro.data.masks import find_masks
+from nerfro.data.pictures import Pictures
 from nerfro.errors import NerfroError
 from nerfro.lens import distort, undistort
 
@@ -73,8 +74,9 @@ def load_views(
     downscale: int,
     alpha: Alpha,
     size: tuple[int, int] | None = None,
+    crop: float = 1.0,
 ) -> Views:
-    """Read the frames' images and silhouettes and set up their cameras.
+    """Look at the frames' images and silhouettes, which are read when they are asked for, and set up their cameras.
 
     Args:
         frames: at least one.
@@ -84,16 +86,16 @@ def load_views(
         downscale: side of the blocks of pixels that are averaged.
         alpha: what becomes of transparency, see `read_rgb`.
         size: width and height of the images as stored, where the data set states them.
+        crop: share of each side that is kept, around the centre.
 
     Raises:
-        NerfroError: an image or mask is missing, corrupt or of the wrong size, `downscale` does not divide it, or a
+        NerfroError: an image or mask is missing, no image or of the wrong size, `downscale` does not divide it, or a
             lens has no inverse.
     """
     files = [frame.image for frame in frames]
-    images = read_stack(files, lambda path: read_rgb(path, alpha), downscale, size)
-    height, width = images.shape[1:3]
-    stored = width * downscale, height * downscale
-    masks = read_masks(files, [frame.mask for frame in frames], downscale, stored)
+    images = Pictures.of(files, lambda path: read_rgb(path, alpha), downscale, size, alpha != "drop", alpha)
+    (height, width), stored = images.shape, images.size[::-1]
+    masks = find_masks(files, [frame.mask for frame in frames], downscale, stored)
     full = lenses(*stored)
     poses = np.stack([frame.camera_to_world for frame in frames])
     if axes == "opencv":
@@ -105,6 +107,9 @@ def load_views(
     distortion = torch.tensor([lens.distortion or (0.0,) * 9 for lens in full]) if distorted else None
     cameras = Cameras(torch.from_numpy(poses).float(), fx, fy, cx, cy, width, height, *bounds, distortion)
     _check_distortion(cameras, frames)
+    if crop < 1:
+        window = central_window(height, width, crop)
+        cameras, images, masks = cameras.crop(window), images.cut(window), masks and masks.cut(window)
     return Views(cameras, images, masks, [frame.name for frame in frames], frames=frames)
 
 

@@ -1,41 +1,68 @@
-"""Reading images and masks: every bit depth, checked, many at a time."""
+"""Reading images and masks: every bit depth, checked, in the levels that the files have."""
 
 from __future__ import annotations
 
+import contextlib
 import io
-import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8, UInt16
 from PIL import Image, UnidentifiedImageError
-from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.files.png16 import decode_png16, is_png16
 
 Alpha = Literal["drop", "white", "black"]
-Read = Callable[[Path], Float[np.ndarray, "H W *C"]]
+Levels = UInt8[np.ndarray, "H W *C"] | UInt16[np.ndarray, "H W *C"]
 
 
-def read_levels(path: Path) -> Float[np.ndarray, "H W C"]:
+def to_unit(levels: Levels) -> Float[np.ndarray, "H W *C"]:
+    """Levels of 8 or 16 bits as numbers in [0, 1]."""
+    return levels.astype(np.float32) / np.iinfo(levels.dtype).max
+
+
+def to_levels(values: Float[np.ndarray, "H W *C"]) -> UInt16[np.ndarray, "H W *C"]:
+    """Numbers in [0, 1] as the nearest levels of 16 bits."""
+    return np.rint(values * 65535).astype(np.uint16)
+
+
+def read_levels(path: Path) -> Levels:
     """Read an image file with 8 or 16 bits per channel, whichever it has.
 
     Returns:
-        Values in [0, 1], float32; C is 1 (grey), 2 (grey, alpha), 3 (RGB) or 4 (RGBA).
+        Levels [H, W, C] of 8 or 16 bits; C is 1 (grey), 2 (grey, alpha), 3 (RGB) or 4 (RGBA).
 
     Raises:
         NerfroError: the file is missing, truncated, corrupt or not an image of 8 or 16 bits.
     """
-    try:
+    with _naming(path):
         content = path.read_bytes()
-        if is_png16(content):
-            return decode_png16(content).astype(np.float32) / 65535
-        return _read_8bit(content, path)
+        return decode_png16(content) if is_png16(content) else _read_8bit(content, path)
+
+
+def read_size(path: Path) -> tuple[int, int, int]:
+    """Width, height and bits per channel of an image file, from its header alone.
+
+    Raises:
+        NerfroError: the file is missing or no image.
+    """
+    with _naming(path), path.open("rb") as file:
+        start = file.read(29)
+        if is_png16(start):
+            return (*struct.unpack_from(">II", start, 16), 16)
+        with Image.open(file) as image:
+            return *image.size, 8
+
+
+@contextlib.contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Errors within it that tell of a bad file name it."""
+    try:
+        yield
     except FileNotFoundError as error:
         raise NerfroError(f"image {path} does not exist; restore it or take it out of the frames") from error
     except UnidentifiedImageError as error:
@@ -45,7 +72,7 @@ def read_levels(path: Path) -> Float[np.ndarray, "H W C"]:
         raise NerfroError(f"image {path} cannot be read ({error}); copy or export it again") from error
 
 
-def _read_8bit(content: bytes, path: Path) -> Float[np.ndarray, "H W C"]:
+def _read_8bit(content: bytes, path: Path) -> UInt8[np.ndarray, "H W C"]:
     with Image.open(io.BytesIO(content)) as image:
         # Pillow reduces colour TIFF of more bits without a word, as it does PNG; tag 258 is BitsPerSample.
         deep_tiff = image.format == "TIFF" and max(image.tag_v2.get(258, (1,))) > 8
@@ -55,15 +82,18 @@ def _read_8bit(content: bytes, path: Path) -> Float[np.ndarray, "H W C"]:
             transparent = image.has_transparency_data
             image = image.convert("RGBA" if transparent else "L" if image.mode == "1" else "RGB")
         levels = np.asarray(image)
-    return levels.reshape(*levels.shape[:2], -1).astype(np.float32) / 255
+    return levels.reshape(*levels.shape[:2], -1)
 
 
-def read_rgb(path: Path, alpha: Alpha) -> Float[np.ndarray, "H W 3"]:
+def read_rgb(path: Path, alpha: Alpha) -> Levels:
     """Read an image's colours.
 
     Args:
         path: an image with or without transparency.
         alpha: `drop` takes the colours as they are, `white` and `black` composite them over that colour.
+
+    Returns:
+        Levels [H, W, 3]; of 16 bits where colours were composited, else as the file has them.
 
     Raises:
         NerfroError: as `read_levels`.
@@ -72,20 +102,21 @@ def read_rgb(path: Path, alpha: Alpha) -> Float[np.ndarray, "H W 3"]:
     num_colours = 1 if levels.shape[-1] < 3 else 3
     rgb = levels[..., :num_colours]
     if alpha != "drop" and levels.shape[-1] > num_colours:
-        opacity = levels[..., num_colours:]
-        rgb = rgb * opacity + (1 - opacity) * (1.0 if alpha == "white" else 0.0)
+        opacity = to_unit(levels[..., num_colours:])
+        rgb = to_levels(to_unit(rgb) * opacity + (1 - opacity) * (1.0 if alpha == "white" else 0.0))
     return np.broadcast_to(rgb, (*rgb.shape[:2], 3))
 
 
-def read_mask(path: Path) -> Float[np.ndarray, "H W"]:
-    """Read the share of each pixel that the object covers; a mask whose levels are 0 and 1 only is taken as labels.
+def read_mask(path: Path) -> Levels:
+    """Read the share [H, W] of each pixel that the object covers; a mask of levels 0 and 1 only is taken as labels.
 
     Raises:
         NerfroError: as `read_levels`.
     """
     levels = read_levels(path)
     share = levels[..., : 1 if levels.shape[-1] < 3 else 3].max(-1)
-    return (share > 0).astype(np.float32) if share.max() < 1.5 / 255 else share
+    most = np.iinfo(levels.dtype).max
+    return np.where(share > 0, most, 0).astype(levels.dtype) if share.max() < 1.5 / 255 * most else share
 
 
 def area_mean(values: Float[np.ndarray, "H W *C"], factor: int, path: Path) -> Float[np.ndarray, "h w *C"]:
@@ -105,47 +136,3 @@ def area_mean(values: Float[np.ndarray, "H W *C"], factor: int, path: Path) -> F
         return values
     blocks = values.reshape(height // factor, factor, width // factor, factor, *values.shape[2:])
     return blocks.mean((1, 3), dtype=np.float32)
-
-
-def read_stack(
-    paths: Sequence[Path], read: Read, downscale: int, expected_size: tuple[int, int] | None = None
-) -> Float[Tensor, "V H W *C"]:
-    """Read images of one size side by side on all CPU cores.
-
-    Args:
-        paths: image files.
-        read: reader of one file.
-        downscale: side of the blocks of pixels that are averaged.
-        expected_size: width and height in pixels before downscaling, where the data states them.
-
-    Raises:
-        NerfroError: a file cannot be read, has another size than expected or than the first, or does not divide.
-    """
-    first = read(paths[0])
-    width, height = first.shape[1], first.shape[0]
-    if expected_size is not None and expected_size != (width, height):
-        raise NerfroError(
-            f"image {paths[0]} has {width}x{height} pixels where {expected_size[0]}x{expected_size[1]} are expected; "
-            "restore the right image or correct the transforms file"
-        )
-    stack = np.empty((len(paths), *area_mean(first, downscale, paths[0]).shape), np.float32)
-
-    def read_into(index: int) -> None:
-        path = paths[index]
-        values = first if index == 0 else read(path)
-        if values.shape != first.shape:
-            raise NerfroError(
-                f"image {path} has {values.shape[1]}x{values.shape[0]} pixels but {paths[0]} has {width}x{height}; "
-                "all images of a split must have one size"
-            )
-        stack[index] = area_mean(values, downscale, path)
-
-    # Decoding releases the interpreter's lock, so threads suffice.
-    with ThreadPoolExecutor(min(len(paths), os.cpu_count() or 1)) as pool:
-        futures = [pool.submit(read_into, index) for index in range(len(paths))]
-        try:
-            for future in futures:
-                future.result()
-        finally:
-            pool.shutdown(cancel_futures=True)
-    return torch.from_numpy(stack)

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
 from PIL import Image
-from torch import Tensor
 
-from nerfro.data.image_files import Read, read_levels, read_mask, read_stack
+from nerfro.data.image_files import Levels, read_levels, read_mask, read_size
+from nerfro.data.pictures import Pictures
 from nerfro.errors import NerfroError
 
 MASKS_FOLDER = "masks"
@@ -63,10 +62,10 @@ def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None
     return next((path for path in candidates if path.is_file()), None)
 
 
-def read_masks(
+def find_masks(
     images: Sequence[Path], masks: Sequence[Path | None], downscale: int, size: tuple[int, int]
-) -> Float[Tensor, "V H W"] | None:
-    """Read the silhouettes of images; where they have no files, the images' transparency, if they have any.
+) -> Pictures | None:
+    """The silhouettes of images; where they have no files, the images' transparency, if they have any.
 
     Args:
         images: the images' files.
@@ -78,19 +77,19 @@ def read_masks(
         Share of each pixel that the object covers; None where there are no silhouettes.
 
     Raises:
-        NerfroError: some images have a silhouette and others none, or one is corrupt or of another size.
+        NerfroError: some images have a silhouette and others none, or one is no image or of another size.
     """
     if _left_out.get():
         return None
     if any(masks):
-        return _read_files(images, masks, read_mask, downscale, size)
-    return read_stack(images, _read_alpha, downscale, size) if _is_transparent(images[0]) else None
+        return _of_files(images, masks, read_mask, downscale, size)
+    return Pictures.of(images, _read_alpha, downscale) if _is_transparent(images[0]) else None
 
 
-def read_usable(
+def find_usable(
     images: Sequence[Path], masks: Sequence[Path | None], downscale: int, size: tuple[int, int]
-) -> Bool[Tensor, "V H W"]:
-    """Read masks that rule pixels out: black ones are ignored, white ones are used, grey ones by the nearer of the two.
+) -> Pictures:
+    """Masks that rule pixels out: black ones are ignored, white ones are used, grey ones by the nearer of the two.
 
     Args:
         images: the images' files.
@@ -98,13 +97,15 @@ def read_usable(
         downscale: side of the blocks of pixels that are averaged; a block is used if all of it is.
         size: width and height of the images in pixels before downscaling.
 
+    Returns:
+        1 in the pixels that are used, less in all others.
+
     Raises:
         NerfroError: an image has no mask, or one that is corrupt, of another size, or leaves no pixel.
     """
-    share = _read_files(images, masks, lambda path: (read_mask(path) >= 0.5).astype(np.float32), downscale, size)
-    usable = share == 1
-    for image, mask, pixels in zip(images, masks, usable, strict=True):
-        if not pixels.any():
+    usable = _of_files(images, masks, _read_usable, downscale, size)
+    for image, mask, levels in zip(images, masks, usable.all_levels(), strict=True):
+        if levels.max() < np.iinfo(levels.dtype).max:
             blocks = f" in blocks of {downscale}x{downscale}" if downscale > 1 else ""
             raise NerfroError(
                 f"mask {mask} rules out all pixels of {image}{blocks}: black is ignored, white is used; "
@@ -113,9 +114,13 @@ def read_usable(
     return usable
 
 
-def _read_files(
-    images: Sequence[Path], masks: Sequence[Path | None], read_one: Read, downscale: int, size: tuple[int, int]
-) -> Float[Tensor, "V H W"]:
+def _of_files(
+    images: Sequence[Path],
+    masks: Sequence[Path | None],
+    read: Callable[[Path], Levels],
+    downscale: int,
+    size: tuple[int, int],
+) -> Pictures:
     files = [mask for mask in masks if mask is not None]
     if len(files) < len(images):
         bare = [str(image) for image, mask in zip(images, masks, strict=True) if mask is None]
@@ -123,17 +128,20 @@ def _read_files(
             f"{len(bare)} of {len(images)} images have no mask ({bare[0]} is the first) but others have; "
             "give all of them masks, or none"
         )
-
-    def read(path: Path) -> Float[np.ndarray, "H W"]:
-        share = read_one(path)
-        if share.shape != (size[1], size[0]):
+    for mask in files:
+        width, height, _ = read_size(mask)
+        if (width, height) != size:
             raise NerfroError(
-                f"mask {path} has {share.shape[1]}x{share.shape[0]} pixels but its image has {size[0]}x{size[1]}; "
+                f"mask {mask} has {width}x{height} pixels but its image has {size[0]}x{size[1]}; "
                 "make it again for the image as it is"
             )
-        return share
+    return Pictures.of(files, read, downscale)
 
-    return read_stack(files, read, downscale)
+
+def _read_usable(mask: Path) -> Levels:
+    levels = read_mask(mask)
+    most = np.iinfo(levels.dtype).max
+    return np.where(levels > most // 2, most, 0).astype(levels.dtype)
 
 
 def _is_transparent(image: Path) -> bool:
@@ -144,9 +152,12 @@ def _is_transparent(image: Path) -> bool:
                 return False
     except OSError:
         return False  # told where the colours are read
-    return bool((_read_alpha(image) < 1).any())
+    levels = _read_alpha(image)
+    return bool((levels < np.iinfo(levels.dtype).max).any())
 
 
-def _read_alpha(image: Path) -> Float[np.ndarray, "H W"]:
+def _read_alpha(image: Path) -> Levels:
     levels = read_levels(image)
-    return levels[..., -1] if levels.shape[-1] in (2, 4) else np.ones(levels.shape[:2], np.float32)
+    if levels.shape[-1] in (2, 4):
+        return levels[..., -1]
+    return np.full(levels.shape[:2], np.iinfo(levels.dtype).max, levels.dtype)

@@ -10,7 +10,7 @@ from typing import Literal
 
 from nerfro.data.base import DataSource, Frame, Views
 from nerfro.data.frames import SPLITS, Lens, check_options, check_split, held_out, load_views, require_root
-from nerfro.data.masks import find_mask, read_usable
+from nerfro.data.masks import find_mask, find_usable
 from nerfro.data.transforms import Manifest, find_splits, is_number, parse_manifest
 from nerfro.errors import NerfroError
 from nerfro.lens import coefficients
@@ -87,7 +87,7 @@ class NerfstudioData(DataSource):
         if not any(ignoring):
             return views
         stored = views.cameras.width * self.downscale, views.cameras.height * self.downscale
-        return replace(views, usable=read_usable([frame.image for frame in frames], ignoring, self.downscale, stored))
+        return replace(views, usable=find_usable([frame.image for frame in frames], ignoring, self.downscale, stored))
 
     def _find_ignoring(self, frame: Frame, entry: Mapping[str, object], where: str) -> Path | None:
         """The file of a frame's mask of pixels to ignore, if it states one."""

@@ -7,7 +7,6 @@ from typing import Literal
 
 import numpy as np
 
-from nerfro.cameras import central_window
 from nerfro.data.base import DataSource, Views
 from nerfro.data.frames import Lens, check_options, load_views
 from nerfro.data.transforms import Manifest, find_splits, is_number, parse_matrix, read_manifest
@@ -76,13 +75,8 @@ class OpenCVData(DataSource):
                 )
             return [lens] * len(manifest.frames)
 
-        bounds = self.near, self.far
-        views = load_views(manifest.frames, lenses, "opencv", bounds, self.downscale, self.alpha, manifest.size)
-        if split == "train" or self.eval_crop == 1:
-            return views
-        window = central_window(views.cameras.height, views.cameras.width, self.eval_crop)
-        masks = None if views.masks is None else window.cut(views.masks)
-        return Views(views.cameras.crop(window), window.cut(views.images), masks, views.names, frames=views.frames)
+        bounds, crop = (self.near, self.far), 1.0 if split == "train" else self.eval_crop
+        return load_views(manifest.frames, lenses, "opencv", bounds, self.downscale, self.alpha, manifest.size, crop)
 
 
 def _distortion(manifest: Manifest) -> tuple[float, ...] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import tempfile
 from dataclasses import replace
@@ -66,14 +67,14 @@ class RefRefData(DataSource):
         first = SPLITS.index(split) * _VIEWS_PER_SPLIT
         rows = _read_rows(files, range(first, first + _VIEWS_PER_SPLIT), _COLUMNS)
         far = _find_far(files) if self.far is None else self.far
-        with tempfile.TemporaryDirectory() as folder:
-            frames = [_unpack(row, number, Path(folder), files[0]) for number, row in rows]
+        folder = Path(tempfile.mkdtemp(dir=_unpacked().name))
+        frames = [_unpack(row, number, folder, files[0]) for number, row in rows]
 
-            def lenses(width: int, height: int) -> list[Lens]:
-                return [Lens.of_angle(_CAMERA_ANGLE_X, width, height)] * len(frames)
+        def lenses(width: int, height: int) -> list[Lens]:
+            return [Lens.of_angle(_CAMERA_ANGLE_X, width, height)] * len(frames)
 
-            views = load_views(frames, lenses, "opengl", (self.near, far), self.downscale, self.alpha)
-        return replace(views, frames=())  # their files are gone
+        views = load_views(frames, lenses, "opengl", (self.near, far), self.downscale, self.alpha)
+        return replace(views, frames=())  # their files go with this process
 
     def _files(self) -> list[Path]:
         """The scene's files in order."""
@@ -86,6 +87,12 @@ class RefRefData(DataSource):
         if len(scenes) > 1:
             raise NerfroError(f"data.root={self.root} holds several scenes; choose data.scene={', '.join(scenes[:5])}")
         return files
+
+
+@functools.cache
+def _unpacked() -> tempfile.TemporaryDirectory[str]:
+    """Where pictures are unpacked, for as long as this process runs."""
+    return tempfile.TemporaryDirectory(prefix="nerfro_refref_")
 
 
 def _find_far(files: list[Path]) -> float:

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.data.frames import IMAGE_SUFFIXES
-from nerfro.data.image_files import Alpha, read_rgb
-from nerfro.data.masks import find_mask, read_masks
+from nerfro.data.image_files import Alpha, read_rgb, to_unit
+from nerfro.data.masks import find_mask, find_masks
 from nerfro.errors import NerfroError
 from nerfro.evaluation.regions import object_pixels
 
@@ -41,7 +41,9 @@ class PicturePair:
         Raises:
             NerfroError: a file cannot be read, sizes differ, or the mask is empty.
         """
-        prediction, reference = (torch.tensor(read_rgb(path, alpha)) for path in (self.prediction, self.reference))
+        prediction, reference = (
+            torch.tensor(to_unit(read_rgb(path, alpha))) for path in (self.prediction, self.reference)
+        )
         if prediction.shape != reference.shape:
             raise NerfroError(
                 f"{self.prediction} has {_size(prediction)} pixels but its reference {self.reference} has "
@@ -56,7 +58,7 @@ class PicturePair:
         return prediction, reference, coverage
 
     def _coverage(self, size: tuple[int, int]) -> Float[Tensor, "H W"] | None:
-        masks = read_masks([self.reference], [self.mask], 1, size)
+        masks = find_masks([self.reference], [self.mask], 1, size)
         return None if masks is None else masks[0]
 
 

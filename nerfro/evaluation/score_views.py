@@ -23,7 +23,7 @@ def score_views(
 
     Args:
         model: the trained model.
-        views: what is compared with, on any device.
+        views: what is compared with; each is read when it has been rendered.
         metrics: collects the scores and names the pictures.
         folder: the run's folder.
         supersampling: rays per pixel.
@@ -36,7 +36,7 @@ def score_views(
             rendered = render_view(model, cameras, view, supersampling)
             rgb = model.encode(rendered.radiance).clamp(0, 1).reshape(height, width, 3).cpu()
             save_png(folder / "images" / f"{metrics.prefix}_{view:03d}.png", rgb)
-            coverage = None if views.masks is None else views.masks[view].cpu()
-            metrics.update(rgb, views.images[view].cpu(), view, coverage)
+            coverage = None if views.masks is None else views.masks[view]
+            metrics.update(rgb, views.images[view], view, coverage)
             progress.update(height * width)
     return metrics.result()

@@ -9,9 +9,14 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+
+# Rows of a product. oneDNN makes a program for each shape and keeps a thousand of them; every batch has another number
+# of points, so each step left 5 MB of programs behind, scattered over the memory. Rows of zeros fill up a step.
+_BLOCK, _STEP = 16384, 2048
 
 
 def relu_mlp(
@@ -34,15 +39,20 @@ class _ReluMLP(torch.autograd.Function):
     def forward(ctx: Any, dtype: torch.dtype, num_parts: int, *tensors: Tensor) -> Float[Tensor, "P O"]:
         parts, weights = tensors[:num_parts], tensors[num_parts:]
         layers = [weight.to(dtype) for weight in weights]
-        joined = torch.cat([part.to(dtype) for part in parts], dim=-1) if num_parts > 1 else parts[0].to(dtype)
+        num_points, start = len(parts[0]), 0
+        num_rows = -(-num_points // _STEP) * _STEP
+        joined = parts[0].new_zeros(num_rows, sum(part.shape[1] for part in parts), dtype=dtype)
+        for part in parts:
+            joined[:num_points, start : start + part.shape[1]] = part
+            start += part.shape[1]
         activations = [joined]
         for layer in layers[:-1]:
-            hidden = activations[-1] @ layer.t()
+            hidden = _product(activations[-1], layer.t())
             _comparable(hidden).relu_()
             activations.append(hidden)
         ctx.save_for_backward(*activations, *layers)
         ctx.parts, ctx.weight_dtype = [(part.shape[1], part.dtype) for part in parts], weights[0].dtype
-        return activations[-1] @ layers[-1].t()
+        return _product(activations[-1], layers[-1].t())[:num_points]
 
     @staticmethod
     @once_differentiable
@@ -50,18 +60,21 @@ class _ReluMLP(torch.autograd.Function):
         num_layers = len(ctx.saved_tensors) // 2
         activations, layers = ctx.saved_tensors[:num_layers], ctx.saved_tensors[num_layers:]
         of_weights: list[Tensor | None] = []
+        num_points = len(gradient)
+        gradient = F.pad(gradient, (0, 0, 0, len(activations[0]) - num_points))
         wanted = ctx.needs_input_grad[2:]
         for i in reversed(range(num_layers)):
             learns = wanted[len(ctx.parts) + i]
             of_weights.append(_product_of_columns(gradient, activations[i]).to(ctx.weight_dtype) if learns else None)
             if i > 0:
-                gradient = gradient @ layers[i]
+                gradient = _product(gradient, layers[i])
                 bits = _comparable(gradient)
                 torch.ops.aten.threshold_backward.grad_input(bits, _comparable(activations[i]), 0, grad_input=bits)
         of_parts: list[Tensor | None] = []
         start = 0
         for i, (width, dtype) in enumerate(ctx.parts):
-            of_parts.append((gradient @ layers[0][:, start : start + width]).to(dtype) if wanted[i] else None)
+            columns = layers[0][:, start : start + width]
+            of_parts.append(_product(gradient, columns)[:num_points].to(dtype) if wanted[i] else None)
             start += width
         return None, None, *of_parts, *reversed(of_weights)
 
@@ -74,6 +87,19 @@ def _comparable(values: Tensor) -> Tensor:
     return values.view(torch.int16) if values.dtype == torch.bfloat16 else values
 
 
-def _product_of_columns(left: Float[Tensor, "P O"], right: Float[Tensor, "P I"]) -> Float[Tensor, "O I"]:
-    """left^T right, with the narrower one on the left: so the matrix library is faster."""
-    return left.t() @ right if left.shape[1] < right.shape[1] else (right.t() @ left).t()
+def _product(rows: Float[Tensor, "Q I"], matrix: Float[Tensor, "I O"]) -> Float[Tensor, "Q O"]:
+    """rows matrix, in blocks."""
+    product = rows.new_empty(len(rows), matrix.shape[1])
+    for block, of_block in zip(rows.split(_BLOCK), product.split(_BLOCK), strict=True):
+        torch.mm(block, matrix, out=of_block)
+    return product
+
+
+def _product_of_columns(left: Float[Tensor, "Q O"], right: Float[Tensor, "Q I"]) -> Float[Tensor, "O I"]:
+    """left^T right, in blocks, with the narrower one on the left: so the matrix library is faster."""
+    if left.shape[1] > right.shape[1]:
+        return _product_of_columns(right, left).t()
+    total = left.new_zeros(left.shape[1], right.shape[1], dtype=torch.promote_types(left.dtype, torch.float32))
+    for ours, theirs in zip(left.split(_BLOCK), right.split(_BLOCK), strict=True):
+        total += ours.t() @ theirs
+    return total

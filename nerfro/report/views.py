@@ -161,8 +161,6 @@ def scene_pictures(
 ) -> ScenePictures:
     """Gather the pictures of a scene.
 
-    Memory: all pictures of the split, as the loader returns them.
-
     Args:
         comparison: the runs; of each method the first seed is shown.
         scored: the scene.
@@ -178,15 +176,16 @@ def scene_pictures(
     titles = {number: comparison.methods[number] for number in runs}
     first = next(iter(runs.values()))
     references: Views = build(OmegaConf.create(dict(first.config["data"]))).load(scored.split)
-    if tuple(references.images.shape[:3]) != (scored.num_views, scored.height, scored.width):
+    cameras = references.cameras
+    if (len(references), cameras.height, cameras.width) != (scored.num_views, scored.height, scored.width):
         raise NerfroError(f"{scored.root} does not hold the views that were scored; has it been changed since?")
     figure = wanted.view.get(scored.name, _median_view(list(runs.values()), metric, region))
     count = min(wanted.num_views or scored.num_views, scored.num_views)
     views = {
-        index: _view(index, references.images[index].cpu(), runs, titles, metric, region, wanted)
+        index: _view(index, references.images[index], runs, titles, metric, region, wanted)
         for index in sorted({round(i) for i in np.linspace(0, scored.num_views - 1, count)} | {figure})
     }
-    reference, predictions = references.images[figure].cpu(), [_prediction(run, figure) for run in runs.values()]
+    reference, predictions = references.images[figure], [_prediction(run, figure) for run in runs.values()]
     error = _error_map(predictions[0], reference, wanted)
     crops = wanted.crops.get(scored.name)
     if crops is None:

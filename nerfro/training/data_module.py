@@ -35,6 +35,9 @@ class RayDataModule(LightningDataModule):
     def val_dataloader(self) -> RotatingView | list[int]:
         return [] if self.validation is None else RotatingView(self)
 
+    def teardown(self, stage: str) -> None:
+        self.batches.forget()
+
     def transfer_batch_to_device(self, batch: Batch | int, device: torch.device, dataloader_idx: int) -> Batch | int:
         return batch  # it is there already
 

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int, UInt8
 from torch import Tensor
 
 from nerfro.cameras import Cameras, Window, central_window
 from nerfro.data.base import Views
+from nerfro.data.pictures import Pictures
 from nerfro.distributed import share_of
 from nerfro.errors import NerfroError
 from nerfro.pixel_parts import PixelParts
+from nerfro.training.pixel_store import PixelStore
 from nerfro.types import Batch
 
 Batching = Literal["single_image", "all_images"]
@@ -72,7 +74,7 @@ class RayBatches:
         self._place: Int[np.ndarray, "V*H*W"] = np.empty(0, np.int32)  # of each pixel among the divided ones, or -1
         cameras = views.cameras
         self._cameras = cameras
-        self._pixels = views.images.reshape(-1, 3)
+        self._pixels = PixelStore(views.images)
         self._crop = central_window(cameras.height, cameras.width, precrop_fraction if precrop_steps > 0 else 1.0)
         if batching == "single_image" and batch_size > self._crop.height * self._crop.width:
             raise NerfroError(
@@ -82,7 +84,7 @@ class RayBatches:
         self._usable: dict[Window, _Usable] | None = None
         if views.usable is not None:
             windows = {self._crop, central_window(cameras.height, cameras.width, 1.0)}
-            self._usable = {window: _Usable.of(views.usable, window) for window in windows}
+            self._usable = {window: _Usable(views.usable, window) for window in windows}
             self._check_usable(np.diff(self._usable[self._crop].starts), views.names)
 
     def to(self, device: torch.device | str) -> RayBatches:
@@ -97,9 +99,13 @@ class RayBatches:
         assert parts.pixels is not None
         divided = copy.copy(self)
         divided._parts = parts
-        divided._place = np.full(self._pixels.shape[0], -1, np.int32)
+        divided._place = np.full(len(self._cameras) * self._cameras.height * self._cameras.width, -1, np.int32)
         divided._place[parts.pixels.cpu().numpy()] = np.arange(len(parts.pixels))
         return divided
+
+    def forget(self) -> None:
+        """Give back the memory of mapped pixels, which are read again when they are asked for."""
+        self._pixels.forget()
 
     def share(self, rank: int, size: int) -> RayBatches:
         """The sequence of process `rank` of `size`: an equal part of every batch, in its order.
@@ -190,14 +196,12 @@ class RayBatches:
         num_pixels = window.height * window.width
         if self.batching == "single_image":
             view = generator.integers(len(self._cameras))
-            allowed = None if usable is None else usable.pixels[usable.starts[view] : usable.starts[view + 1]]
-            num_allowed = num_pixels if allowed is None else len(allowed)
+            first, end = (0, num_pixels) if usable is None else usable.starts[view : view + 2]
             # Floyd's algorithm or a partial shuffle inside: far cheaper than a permutation of all pixels.
-            drawn = generator.choice(num_allowed, self.batch_size, replace=False, shuffle=False)
-            return view, drawn if allowed is None else allowed[drawn].astype(np.int64)
+            drawn = generator.choice(end - first, self.batch_size, replace=False, shuffle=False)
+            return (view, drawn) if usable is None else usable.find(first + drawn)
         if usable is not None:
-            drawn = generator.integers(len(usable.pixels), size=self.batch_size)
-            return np.searchsorted(usable.starts, drawn, side="right") - 1, usable.pixels[drawn].astype(np.int64)
+            return usable.find(generator.integers(usable.starts[-1], size=self.batch_size))
         views = generator.integers(len(self._cameras), size=self.batch_size)
         return views, generator.integers(num_pixels, size=self.batch_size)
 
@@ -214,18 +218,34 @@ class RayBatches:
             raise NerfroError(f"the masks leave no pixel to train on{precropped}; black is ignored, white is used")
 
 
-class _Usable(NamedTuple):
-    """The pixels of a window that may be drawn, one view's after another's.
+class _Usable:
+    """The pixels of a window that may be drawn, numbered one view's after another's, kept as bits.
+
+    Args:
+        usable: 1 in the pixels [H, W] that may be drawn, of each view.
+        window: of pixels.
 
     Attributes:
-        pixels: their numbers in the window, row by row; of 32 bits, for there is one for each pixel of all images.
-        starts: where those of each view begin, and the end.
+        starts: numbers at which those of each view begin, and the end.
     """
 
-    pixels: Int[np.ndarray, "U"]
-    starts: Int[np.ndarray, "V+1"]
+    _BLOCK = 64  # bits that are counted together
 
-    @classmethod
-    def of(cls, usable: Bool[Tensor, "V H W"], window: Window) -> _Usable:
-        by_view = [np.flatnonzero(view).astype(np.int32) for view in window.cut(usable).cpu().numpy()]
-        return cls(np.concatenate(by_view), np.cumsum([0, *map(len, by_view)]))
+    def __init__(self, usable: Pictures | Bool[Tensor, "V H W"], window: Window) -> None:
+        num_blocks = -(-window.height * window.width // self._BLOCK)
+        self._bits: UInt8[np.ndarray, "V B 8"] = np.empty((len(usable), num_blocks, self._BLOCK // 8), np.uint8)
+        counts = np.empty((len(usable), num_blocks), np.int64)
+        for index, view in enumerate(usable):
+            blocks = np.zeros((num_blocks, self._BLOCK), bool)
+            blocks.flat[: window.height * window.width] = window.cut(view[None] == 1).flatten().cpu().numpy()
+            self._bits[index], counts[index] = np.packbits(blocks, axis=-1), blocks.sum(-1)
+        self._before = np.cumsum(counts) - counts.flatten()  # usable pixels before each block
+        self.starts: Int[np.ndarray, "V+1"] = np.cumsum([0, *counts.sum(1)])
+
+    def find(self, numbers: Int[np.ndarray, "P"]) -> tuple[Int[np.ndarray, "P"], Int[np.ndarray, "P"]]:
+        """View and pixel, row by row of the window, of usable pixels by their numbers."""
+        block = np.searchsorted(self._before, numbers, side="right") - 1
+        view, within = np.divmod(block, self._bits.shape[1])
+        counted = np.unpackbits(self._bits[view, within], axis=-1).cumsum(-1, dtype=np.int64)
+        place = (counted <= (numbers - self._before[block])[:, None]).sum(-1)
+        return view, within * self._BLOCK + place

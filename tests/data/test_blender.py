@@ -17,7 +17,7 @@ from nerfro.errors import NerfroError
 def test_images_poses_and_names_are_read_in_the_files_order(write_blender, random_image, random_pose):
     pictures = [random_image(i) for i in range(3)]
     views = BlenderData(str(write_blender(pictures))).load("train")
-    torch.testing.assert_close(views.images, torch.from_numpy(np.stack(pictures) / 255).float())
+    torch.testing.assert_close(torch.stack(list(views.images)), torch.from_numpy(np.stack(pictures) / 255).float())
     poses = torch.from_numpy(np.stack([random_pose(i)[:3] for i in range(3)])).float()
     assert torch.equal(views.cameras.camera_to_world, poses)
     assert views.names == ["train/r_0", "train/r_1", "train/r_2"]
@@ -58,7 +58,7 @@ def test_file_path_may_have_its_extension(write_blender, random_image):
     pictures = [random_image(i) for i in range(2)]
     views = BlenderData(str(write_blender(pictures, suffix=".png"))).load("train")
     assert views.names == ["train/r_0.png", "train/r_1.png"]
-    assert views.images.shape == (2, 6, 8, 3)
+    assert [image.shape for image in views.images] == 2 * [(6, 8, 3)]
 
 
 def test_dot_in_a_name_is_no_extension(write_blender, edit_transforms, random_image):
@@ -81,13 +81,13 @@ def test_masks_are_found_beside_the_images_or_by_mask_path(write_blender, edit_t
     mask = np.zeros((6, 8), np.uint8)
     mask[2:4, 3:7] = 255
     root = write_blender([random_image(0)], masks=[mask])
-    beside = BlenderData(str(root)).load("train").masks
-    assert torch.equal(beside[0], torch.from_numpy(mask / 255).float())
+    beside = BlenderData(str(root)).load("train").masks[0]
+    assert torch.equal(beside, torch.from_numpy(mask / 255).float())
     (root / "masks").mkdir()
     (root / "train" / "mask_r_0.png").rename(root / "masks" / "other.png")
     assert BlenderData(str(root)).load("train").masks is None
     edit_transforms(root, lambda document: document["frames"][0].update(mask_path="./masks/other.png"))
-    assert torch.equal(BlenderData(str(root)).load("train").masks, beside)
+    assert torch.equal(BlenderData(str(root)).load("train").masks[0], beside)
 
 
 def test_splits_are_listed_in_the_usual_order(write_blender, random_image):
@@ -225,7 +225,7 @@ def test_corrupt_image_is_named(write_blender, random_image):
     path = root / "train" / "r_2.png"
     path.write_bytes(path.read_bytes()[:-30])
     with pytest.raises(NerfroError, match=r"r_2\.png cannot be read \(.*\); copy or export it again"):
-        BlenderData(str(root)).load("train")
+        BlenderData(str(root)).load("train").checked()
 
 
 def test_pose_of_three_rows_is_accepted(write_blender, edit_transforms, random_image):

@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from nerfro.data.masks import find_mask, read_masks
+from nerfro.data.masks import find_mask, find_masks
 from nerfro.errors import NerfroError
 
 
@@ -55,16 +55,16 @@ def test_transparency_is_a_silhouette_where_there_are_no_files(tmp_path: Path) -
     paths = [tmp_path / "0.png", tmp_path / "1.png"]
     for path in paths:
         Image.fromarray(levels).save(path)
-    assert read_masks(paths, [None, None], 1, (4, 2)) is None  # opaque throughout: says nothing
+    assert find_masks(paths, [None, None], 1, (4, 2)) is None  # opaque throughout: says nothing
     levels[0, :2, 3] = 0
     levels[1, 3, 3] = 51
     Image.fromarray(levels).save(paths[0])
-    share = read_masks(paths, [None, None], 2, (4, 2))
+    share = find_masks(paths, [None, None], 2, (4, 2))
     assert share is not None
-    torch.testing.assert_close(share, torch.tensor([[[0.5, 0.8]], [[1.0, 1.0]]]))
+    torch.testing.assert_close(torch.stack(list(share)), torch.tensor([[[0.5, 0.8]], [[1.0, 1.0]]]))
 
 
 def test_masks_of_some_images_only_are_refused(tmp_path: Path) -> None:
     image = _touch(tmp_path / "a.png")
     with pytest.raises(NerfroError, match=r"1 of 2 images have no mask \(.*a\.png is the first\)"):
-        read_masks([image, image], [None, image], 1, (4, 2))
+        find_masks([image, image], [None, image], 1, (4, 2))

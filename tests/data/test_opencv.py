@@ -57,7 +57,7 @@ def test_both_loaders_agree_on_the_same_cameras(write_opencv, write_blender, edi
 
     edit_transforms(root, turn_axes)
     blender = BlenderData(str(root)).load("train")
-    assert torch.equal(opencv.images, blender.images)
+    assert all(map(torch.equal, opencv.images, blender.images))
     for view in range(3):
         ours, theirs = opencv.cameras.image_rays(view), blender.cameras.image_rays(view)
         torch.testing.assert_close(ours.directions, theirs.directions)
@@ -72,10 +72,10 @@ def test_evaluation_images_are_cropped_with_their_rays_and_training_images_are_n
     source = OpenCVData(str(root), eval_crop=0.5)
     full, test = source.load("train"), source.load("test")
     # Half of 6 // 2 is 1 and of 8 // 2 is 2, to each side of the centre.
-    assert test.images.shape == (1, 2, 4, 3)
-    assert full.images.shape == (1, 6, 8, 3)
-    assert torch.equal(test.images[0], full.images[0, 2:4, 2:6])
-    assert torch.equal(test.masks[0], full.masks[0, 2:4, 2:6])
+    assert test.images[0].shape == (2, 4, 3)
+    assert full.images[0].shape == (6, 8, 3)
+    assert torch.equal(test.images[0], full.images[0][2:4, 2:6])
+    assert torch.equal(test.masks[0], full.masks[0][2:4, 2:6])
     directions = full.cameras.image_rays(0).directions.reshape(6, 8, 3)[2:4, 2:6]
     torch.testing.assert_close(test.cameras.image_rays(0).directions.reshape(2, 4, 3), directions)
 

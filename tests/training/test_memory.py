@@ -1,0 +1,69 @@
+"""What a run needs is counted, compared with what there is, and refused where it does not fit."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerfro.boundaries.constant import ConstantBoundary
+from nerfro.errors import NerfroError
+from nerfro.fields.nerf import NerfField
+from nerfro.media.analytic import Vacuum
+from nerfro.models.base import NerfModel, Parts
+from nerfro.models.optimizer import OptimizerConfig
+from nerfro.models.refractive import RefractiveModel
+from nerfro.samplers.straight import Straight
+from nerfro.samplers.stratified import Stratified
+from nerfro.testing import example_rays
+from nerfro.training import memory
+from nerfro.training.memory import available_bytes, require_memory
+
+
+def model_of(width: int) -> NerfModel:
+    def field() -> NerfField:
+        return NerfField(width=width, depth=8, skip=4, view_width=8)
+
+    return RefractiveModel(
+        Parts(Vacuum(), Straight(), Stratified(8), field, ConstantBoundary(), {}, OptimizerConfig(), chunk_size=256)
+    )
+
+
+def test_what_autograd_keeps_is_counted_and_grows_with_the_network() -> None:
+    rays, samples = example_rays(), 8
+    kept = [memory._kept_bytes(model_of(width), rays) for width in (64, 256)]
+    # Each of eight layers keeps its activations of 4 bytes.
+    assert kept[1] - kept[0] == pytest.approx(8 * samples * (256 - 64) * 4, rel=0.5)
+    assert memory._kept_bytes(model_of(64), rays[:4]) == pytest.approx(kept[0], rel=0.1)
+
+
+def test_counting_draws_no_random_numbers() -> None:
+    model, before = model_of(16), torch.get_rng_state()
+    require_memory(model, example_rays(), torch.device("cpu"))
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_run_that_does_not_fit_is_refused_with_what_to_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "available_bytes", lambda: 1e6)
+    with pytest.raises(NerfroError, match=r"needs about \d.* kB are for each ray: take a smaller batches\.size"):
+        require_memory(model_of(16), example_rays(), torch.device("cpu"))
+    monkeypatch.setattr(memory, "available_bytes", lambda: math.inf)
+    assert "memory: about" in require_memory(model_of(16), example_rays(), torch.device("cpu"))
+
+
+@pytest.mark.parametrize(
+    ("limit", "free"), [("5000000\n", 5_000_000 - 3_000_000 + 1_000_000), ("max\n", math.inf), (None, math.inf)]
+)
+def test_limit_of_a_control_group_counts_without_files_that_can_go(
+    limit: str | None, free: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system = available_bytes()
+    (tmp_path / "memory.current").write_text("3000000\n")
+    (tmp_path / "memory.stat").write_text("anon 5\ninactive_file 1000000\nactive_file 7\n")
+    if limit is not None:
+        (tmp_path / "memory.max").write_text(limit)
+    monkeypatch.setattr(memory, "_control_groups", lambda: iter([(tmp_path, "memory.max", "memory.current")]))
+    assert 0 < system < math.inf
+    assert available_bytes() == free if free < math.inf else available_bytes() > 1e8
