@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfro.boundaries import lat_long
 from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.files import lat_long
 from nerfro.light import to_linear, to_srgb
 from nerfro.losses.boundary import BoundaryRegulariser
 from nerfro.losses.distortion import Distortion

@@ -34,8 +34,8 @@ class OneGrey(Boundary):
         super().__init__()
         self.grey = grey
 
-    def forward(self, directions):
-        return torch.full_like(directions, self.grey)
+    def forward(self, exits):
+        return torch.full_like(exits.directions, self.grey)
 '''
 
 
@@ -179,7 +179,10 @@ def test_list_of_one_kind_or_one_plugin_shows_no_other(
 
 @pytest.mark.parametrize(
     ("argument", "message"),
-    [("colour", "'colour' is not a plugin kind; kinds: model, medium"), ("field=x", "no field is called 'x'; known: ")],
+    [
+        ("colour", "'colour' is not a plugin kind; kinds: model, camera, medium"),
+        ("field=x", "no field is called 'x'; known: "),
+    ],
 )
 def test_list_of_nothing_known_is_refused(
     argument: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

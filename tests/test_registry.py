@@ -127,7 +127,7 @@ def test_the_same_class_may_register_again() -> None:
 
 
 def test_unknown_kind_is_refused_with_the_kinds() -> None:
-    with pytest.raises(NerfroError, match="'colour' is not a plugin kind; kinds: model, medium, sampler/path"):
+    with pytest.raises(NerfroError, match="'colour' is not a plugin kind; kinds: model, camera, medium, sampler/path"):
         register("colour", "red")
 
 
@@ -241,7 +241,7 @@ def test_wrong_losses_are_refused(losses: dict[str, object], message: str) -> No
         (["logger=none", "+logger.x={_target_: os.system, command: 'false'}"], ["'os.system' is not registered"]),
         (["+trainer.callbacks=[]"], ["trainer.callbacks is set by nerfro.train itself"]),
         (["+experiment=nope"], ["Could not find 'experiment/nope'", "ablation_noBD", "refractive"]),
-        (["foo"], ["missing EQUAL"]),
+        (["foo"], ["foo is no option; write key=value"]),
         (["seed=-1"], ["seed=-1 is no seed; give 0 to 4294967295"]),
         (["data.root=${nope}"], ["Interpolation key 'nope' not found"]),
         (["batches.batching=some"], ["batching='some' is unknown; choose 'single_image' or 'all_images'"]),
