@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerfro.kernels.arrays import arrays
-from nerfro.kernels.threads import use_threads
 from nerfro.types import Path, Rays
 
 if TYPE_CHECKING:
@@ -102,7 +101,6 @@ def _march_uniform(
     from nerfro.samplers import eikonal_cpu as eikonal
 
     code = {"euler": eikonal.EULER, "leapfrog": eikonal.LEAPFROG, "rk4": eikonal.RK4}[integrator]
-    use_threads()
     low, _, inverse_spacing = _frame(medium.box, medium.table.shape[:3])
     origins, directions, near, far = _ray_arrays(rays)
     table = medium.table.detach().numpy()
@@ -117,7 +115,6 @@ def _with_enough_vertices(
     Returns:
         The first `num_arrays` results, which have a column for each vertex, and those that follow the counts.
     """
-    use_threads()
     of_rays = _ray_arrays(rays)
     capacity = _CAPACITY
     results = kernel(*of_rays, *settings, capacity)
