@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,8 +42,7 @@ def snell_on_grid(
     )  # fmt: skip
     (*vertices, body), (events, exceeded) = _with_enough_vertices(rays, trace_snell, settings, 4)
     num_events = torch.from_numpy(events)
-    path = replace(_path(rays, vertices, num_events > 0), body=torch.from_numpy(np.ascontiguousarray(body)))
-    return path, num_events, torch.from_numpy(exceeded)
+    return _path(rays, vertices, num_events > 0, body), num_events, torch.from_numpy(exceeded)
 
 
 def eikonal_on_grid(
@@ -138,6 +136,7 @@ def _frame(box: Tensor, shape: torch.Size) -> tuple[np.ndarray, np.ndarray, np.n
     return low, high, (np.array(shape) - 1) / (high - low)
 
 
-def _path(rays: Rays, vertices: Sequence[np.ndarray], refracted: Tensor) -> Path:
-    positions, directions, s = (torch.from_numpy(np.ascontiguousarray(array)) for array in vertices)
-    return Path(positions, directions, s, directions[:, -1], refracted, rays.radii)
+def _path(rays: Rays, vertices: Sequence[np.ndarray], refracted: Tensor, body: np.ndarray | None = None) -> Path:
+    arrays = [*vertices] if body is None else [*vertices, body]
+    positions, directions, s, *bodies = (torch.from_numpy(np.ascontiguousarray(array)) for array in arrays)
+    return Path(positions, directions, s, directions[:, -1], refracted, rays.radii, body=bodies[0] if bodies else None)  # type: ignore[arg-type]
