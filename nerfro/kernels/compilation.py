@@ -30,6 +30,11 @@ def compiled(function: Function) -> Function:
     return _compile(function, parallel=False)
 
 
+def inlined(function: Function) -> Function:
+    """Compile into the kernels that call it: for what is done at every step along a ray."""
+    return cast(Function, numba.njit(inline="always")(function))
+
+
 def compiled_parallel(function: Function) -> Function:
     """Compile with `prange` loops spread over the cores that PyTorch uses, and keep the machine code on disk.
 
