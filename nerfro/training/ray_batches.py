@@ -140,9 +140,9 @@ class RayBatches:
         # One small copy to the device; the rest is computed there.
         index = self._to_device(drawn[self._share])
         place = self._to_device(self._random(generator, 2)[self._share]) if self.jitter else None
-        rays, view = pixel_rays(cameras, index, place), index // (height * width)
-        path = None if self._trace is None else self._trace(rays, view)
-        return Batch(rays, view, self._pixels[index], cameras.crop(window), path=path, index=index)
+        rays, views = pixel_rays(cameras, index, place), index // (height * width)
+        path = None if self._trace is None else self._trace(rays, views)
+        return Batch(rays, views, self._pixels[index], cameras.crop(window), path=path, index=index)
 
     def _divided_batch(self, drawn: Int[np.ndarray, "P"], generator: np.random.Generator, cameras: Cameras) -> Batch:
         """The batch of the drawn pixels: first those that have one ray, then the divided ones with all of theirs."""
