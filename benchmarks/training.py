@@ -247,7 +247,7 @@ class TracedInStep(RayDataModule):
             return self.batches.batch(batch)
 
 
-def report_paths(turns: int = 10, num_steps: int = 21) -> None:
+def report_paths(turns: int = 6, num_steps: int = 11) -> None:
     """What live tracing costs of a step of the default preset, against the same batches made before.
 
     Ways take turns, and the median of each way's turns counts. Processor time is of all threads.

@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from nerfro.media.sdf_grid import SdfGrid
     from nerfro.media.voxel_grid import VoxelGrid
 
-# Vertices that a first attempt has room for; the few rays that need more are traced again with twice as many.
-_CAPACITY = 12
+# Vertices that a first attempt has room for; the few rays that need more are traced again. Those of many reflections
+# are slow, so there is room for all that is usual.
+_CAPACITY = 18
 
 
 def snell_on_grid(
