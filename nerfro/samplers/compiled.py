@@ -79,7 +79,8 @@ def _march_uniform(
     from nerfro.samplers import eikonal_cpu as eikonal
 
     code = {"euler": eikonal.EULER, "leapfrog": eikonal.LEAPFROG, "rk4": eikonal.RK4}[integrator]
-    return eikonal.march_uniform(*_ray_arrays(rays), _for_kernels(medium), code, num_steps, keep_all)
+    origins, directions, near, far = _ray_arrays(rays)
+    return eikonal.march_uniform(origins, directions, near, far, _for_kernels(medium), code, num_steps, keep_all)
 
 
 def _with_enough_vertices(
