@@ -20,14 +20,11 @@ from rounded_cube import trace_rounded_cube
 from torch import Tensor
 
 from nerfro.cameras import Cameras
-from nerfro.files.cache import cache_dir
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball, RoundedBox
 from nerfro.media.voxel_grid import VoxelGrid
-from nerfro.pixel_parts import PixelParts
 from nerfro.samplers.compiled import uniform_exit_on_grid
 from nerfro.samplers.eikonal import Eikonal
-from nerfro.samplers.path_cache import PathCache
 from nerfro.samplers.snell import Snell
 from nerfro.types import Rays
 
@@ -69,7 +66,6 @@ def main() -> None:
         cube_errors(mesh_cube, arguments.resolution)
         coarse = VoxelGrid(str(ball), N_BALL, arguments.resolution, cache=False)
         speed([voxels, coarse], {"sphere": mesh_ball, "cube": mesh_cube})
-        cached_paths(mesh_ball)
     print("\nGPU: not measured, there was none.")
 
 
@@ -184,35 +180,6 @@ def speed(baselines: list[VoxelGrid], solids: dict[str, SdfGrid]) -> None:
             print(
                 f"| {scene} | {name} | {1e3 * seconds:.0f} | {rate:.2f} | {ratio:.1f}x | {limit} | {met} |", flush=True
             )
-
-
-def cached_paths(solid: SdfGrid) -> None:
-    """Time to get the paths of a training batch, from the cache and live."""
-    camera, batch = view(), 1024
-    rays = camera.image_rays(0)
-    index = torch.randint(0, SIDE * SIDE, (batch,))
-    chosen = rays[index]
-    print(f"\n### Paths of {batch} random rays of that view (sphere)\n")
-    print("| sampler | live, ms | cached, ms | bytes of cache per ray of the view |\n|---|---|---|---|")
-    for name, sampler in (("snell", Snell()), ("eikonal", Eikonal())):
-        cache = PathCache.build(sampler, solid, PixelParts(camera))
-        live = best_time(lambda s=sampler: s(chosen, solid))
-        warm = best_time(lambda c=cache: c(index, chosen))
-        size = (cache.vertices.numel() * 4 + cache.starts.numel() * 8) / (SIDE * SIDE)
-        print(f"| {name} | {1e3 * live:.2f} | {1e3 * warm:.2f} | {size:.0f} |", flush=True)
-    for file in cache_dir().glob("paths_*"):
-        if file.stat().st_mtime > time.time() - 60:
-            file.unlink()
-
-
-def best_time(function: Callable[[], object], repetitions: int = 50) -> float:
-    """Seconds of the fastest of many calls."""
-    best = math.inf
-    for _ in range(repetitions):
-        start = time.perf_counter()
-        function()
-        best = min(best, time.perf_counter() - start)
-    return best
 
 
 def exits(sampler: Eikonal | Snell, medium: torch.nn.Module) -> Trace:

@@ -3,7 +3,7 @@
     python benchmarks/training.py step                        # a step of the paper's recipe, plain and fast
     python benchmarks/training.py curve                       # their losses over 200 steps
     python benchmarks/training.py profile refractive          # where a step's milliseconds go
-    python benchmarks/training.py paths                       # what fetching cached paths takes of a step
+    python benchmarks/training.py paths                       # what live tracing costs of a step; see docs for one core
     python benchmarks/training.py budget 00:00:05:00          # default preset and paper's recipe, given the same time
     python benchmarks/training.py view RUN/checkpoints/last.ckpt   # rendering a 400x400 view
 
@@ -39,9 +39,8 @@ from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.models.base import NerfModel
 from nerfro.paths import ASSETS_DIR, CONF_DIR
 from nerfro.registry import build, discover
-from nerfro.samplers.training_paths import TrainingPaths, trace_training_rays
 from nerfro.training.config import TrainConfig, build_model
-from nerfro.training.data_module import RayDataModule
+from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.run_folder import load_checkpoint, restore
 from nerfro.types import Batch
@@ -118,13 +117,11 @@ class Training:
         pl.seed_everything(self.config.seed, verbose=False)
         wanted, views = self.config.batches, build(self.config.data).load("train")
         self.model: NerfModel = build_model(self.config)
-        self.batches = RayBatches(views, wanted.size, wanted.batching, self.config.seed, jitter=wanted.jitter)
-        paths = self.model.training_paths = trace_training_rays(self.config, self.model, views.cameras)
-        if paths is not None and paths.parts is not None:
-            self.batches = self.batches.dividing(paths.parts)
+        batches = RayBatches(views, wanted.size, wanted.batching, self.config.seed, jitter=wanted.jitter)
+        self.batches = traced(batches, self.model, self.config)
         self.num_rays = wanted.size
 
-    def run(self, num_steps: int) -> Steps:
+    def run(self, num_steps: int, data: RayDataModule | None = None) -> Steps:
         """Train for some steps with a new optimiser."""
         steps = Steps()
         trainer = pl.Trainer(
@@ -139,7 +136,7 @@ class Training:
             num_sanity_val_steps=0,
             use_distributed_sampler=False,
         )
-        trainer.fit(self.model, datamodule=RayDataModule(self.batches, None, 0))
+        trainer.fit(self.model, datamodule=data or RayDataModule(self.batches, None, 0))
         return steps
 
 
@@ -201,12 +198,8 @@ def report_profile(experiment: str, num_steps: int) -> None:
         "boundary, forward": [(model.boundary, "forward")],
         "losses, forward": [(loss, "forward") for loss in model.losses.values()],
     }
-    if model.training_paths is None:
-        parts = {"tracing": [(model.path_sampler, "forward")], **parts}
-    else:
-        parts = {"cached paths": [(TrainingPaths, "__call__")], **parts}
     around = {
-        "batch of pixels and rays": [(RayBatches, "batch")],
+        "batch of pixels and paths, or waiting for it": [(RayDataModule, "transfer_batch_to_device")],
         "update of the density grid": [(model.point_sampler, "after_step")],
         "backward pass": [(torch.Tensor, "backward")],
     }
@@ -234,24 +227,52 @@ def report_profile(experiment: str, num_steps: int) -> None:
         print(f"A product of 65536x256 and 256x256 in {str(dtype)[6:]} runs at {rate:.2f} TFLOP/s.")
 
 
-def report_paths(num_steps: int = 200) -> None:
-    """Share of a step of the default preset that fetching the cached paths takes, without a profiler's own time."""
+class ReadyBatches(RayDataModule):
+    """The batches of the first steps again and again, traced before training starts."""
+
+    def __init__(self, batches: RayBatches, num_steps: int) -> None:
+        super().__init__(batches, None, 0)
+        with torch.no_grad():
+            self.ready = [batches.batch(step) for step in range(num_steps)]
+
+    def transfer_batch_to_device(self, batch: int, device: torch.device, dataloader_idx: int) -> Batch:
+        return self.ready[batch]
+
+
+class TracedInStep(RayDataModule):
+    """Paths are traced when a step asks for them, as where the medium learns."""
+
+    def transfer_batch_to_device(self, batch: int, device: torch.device, dataloader_idx: int) -> Batch:
+        with torch.no_grad():
+            return self.batches.batch(batch)
+
+
+def report_paths(turns: int = 6, num_steps: int = 11) -> None:
+    """What live tracing costs of a step of the default preset, against the same batches made before.
+
+    Ways take turns, and the median of each way's turns counts. Processor time is of all threads.
+    """
     training = Training("+experiment=refractive")
-    training.run(5)
-    cached = training.model.training_paths
-    assert cached is not None
-    seconds: list[float] = []
-
-    def fetch(*batch: object) -> object:
-        start = time.perf_counter()
-        path = cached(*batch)  # type: ignore[arg-type]
-        seconds.append(time.perf_counter() - start)
-        return path
-
-    training.model.training_paths = fetch  # type: ignore[assignment]
-    steps = training.run(num_steps).seconds[1:]
-    share = np.median(seconds) / np.median(steps)
-    print(f"cached paths {1e3 * np.median(seconds):.2f} ms of {1e3 * np.median(steps):.1f} ms a step: {share:.2%}")
+    batches = training.batches
+    ready = ReadyBatches(batches, num_steps)
+    ways: dict[str, Callable[[], RayDataModule]] = {
+        "ready before training": lambda: ready,
+        "one step ahead (as trained)": lambda: RayDataModule(batches, None, 0),
+        "in the step": lambda: TracedInStep(batches, None, 0),
+    }
+    seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
+    for turn in range(turns + 1):
+        for name, make in ways.items():
+            begun = time.process_time()
+            steps = training.run(num_steps, make()).seconds[1:]
+            if turn > 0:  # the first one compiles and allocates
+                seconds[name].append((float(np.median(steps)), (time.process_time() - begun) / num_steps))
+    base = np.median([wall for wall, _ in seconds["ready before training"]])
+    cores = len(os.sched_getaffinity(0))
+    print(f"| default preset, {cores} cores: paths | ms a step | cost | processor, ms a step |\n|---|---|---|---|")
+    for name, measured in seconds.items():
+        wall, processor = np.median(measured, 0)
+        print(f"| {name} | {1e3 * wall:.1f} | {wall / base - 1:+.1%} | {1e3 * processor:.1f} |")
 
 
 def label(stack: ExitStack, owner: object, method: str, name: str) -> None:

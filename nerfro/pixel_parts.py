@@ -1,8 +1,8 @@
-"""Rays through the parts of pixels: a pixel shows the mean over its square, which one ray may not stand for."""
+"""Rays through pixels and parts of them: a pixel shows the mean over its square, which one ray may not stand for."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
 
 import torch
 from jaxtyping import Float, Int
@@ -11,46 +11,55 @@ from torch import Tensor
 from nerfro.cameras import Cameras
 from nerfro.rays import Rays
 
+# From a ray to the one beside it, in pixels, along both axes: one pixel on the diagonal, where edges along rows and
+# columns are seen alike.
+_BESIDE = math.sqrt(0.5)
 
-@dataclass(frozen=True)
-class PixelParts:
-    """Rays through the centres of side x side equal parts of pixels, numbered pixel by pixel.
 
-    Attributes:
+def pixel_rays(
+    cameras: Cameras, pixels: Int[Tensor, "R"], place: Float[Tensor, "R 2"] | Float[Tensor, "2"] | None = None
+) -> Rays:
+    """Rays through pixels.
+
+    Args:
         cameras: whose pixels.
-        side: parts in each direction; 1 is the pixel itself.
-        pixels: the divided pixels, as view * H * W + row * W + column; all by default.
+        pixels: as view * H * W + row * W + column.
+        place: where in the pixels, (x, y) in [0, 1); their centres by default.
     """
-
-    cameras: Cameras
-    side: int = 1
-    pixels: Int[Tensor, "U"] | None = None
-
-    @property
-    def rays_per_pixel(self) -> int:
-        return self.side**2
-
-    def __len__(self) -> int:
-        cameras = self.cameras
-        num_pixels = len(cameras) * cameras.height * cameras.width if self.pixels is None else len(self.pixels)
-        return num_pixels * self.rays_per_pixel
-
-    def to(self, device: torch.device | str) -> PixelParts:
-        return replace(
-            self, cameras=self.cameras.to(device), pixels=None if self.pixels is None else self.pixels.to(device)
-        )
-
-    def rays(self, number: Int[Tensor, "R"]) -> Rays:
-        """The rays of some numbers, in [0, len(self))."""
-        width, height = self.cameras.width, self.cameras.height
-        pixel, part = number // self.rays_per_pixel, number % self.rays_per_pixel
-        if self.pixels is not None:
-            pixel = self.pixels[pixel]
-        place = None if self.side == 1 else part_centres(self.side).to(part.device)[part]
-        return self.cameras.rays(pixel // (height * width), pixel // width % height, pixel % width, place)
+    width, height = cameras.width, cameras.height
+    return cameras.rays(pixels // (height * width), pixels // width % height, pixels % width, place)
 
 
-def part_centres(side: int) -> Float[Tensor, "K 2"]:
-    """Centres of side x side equal parts of a pixel, as (x, y) in [0, 1)."""
-    ticks = (torch.arange(side) + 0.5) / side
-    return torch.cartesian_prod(ticks, ticks).view(-1, 2)
+def part_rays(
+    cameras: Cameras, pixels: Int[Tensor, "P"], side: int, place: Float[Tensor, "P K 2"] | None = None
+) -> Rays:
+    """Rays through the K = side x side equal parts of pixels, those of each pixel together.
+
+    Args:
+        cameras, pixels: see `pixel_rays`.
+        side: parts in each direction.
+        place: where in the parts, in [0, 1); their centres by default.
+    """
+    ticks = torch.arange(side, device=pixels.device)
+    corners = torch.cartesian_prod(ticks, ticks).view(-1, 2)
+    places = (corners + (0.5 if place is None else place)) / side
+    return pixel_rays(cameras, pixels.repeat_interleave(side**2), places.expand(len(pixels), -1, 2).reshape(-1, 2))
+
+
+def rays_beside(cameras: Cameras, pixels: Int[Tensor, "R"], place: Float[Tensor, "R 2"] | None = None) -> Rays:
+    """Rays one pixel beside those of `pixel_rays`, to see where neighbours part."""
+    centre = torch.full((2,), 0.5, device=pixels.device)
+    return pixel_rays(cameras, pixels, (centre if place is None else place) + _BESIDE)
+
+
+def divergence(
+    cameras: Cameras, pixels: Int[Tensor, "R"], exits: Float[Tensor, "R 3"], beside: Float[Tensor, "R 3"]
+) -> Float[Tensor, "R"]:
+    """Angle between the directions in which rays and those beside them leave, in pixel angles 1 / fx.
+
+    Straight rays diverge by 1 or less. Where the angle is wide, on the object's rim and edges, a pixel shows a mean
+    over directions far apart, which a ray through its centre would teach to one of them, as speckle.
+    """
+    chord = torch.linalg.vector_norm(exits - beside, dim=-1)
+    view = pixels // (cameras.height * cameras.width)
+    return 2 * torch.asin((0.5 * chord).clamp(max=1)) * cameras.fx[view]

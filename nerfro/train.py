@@ -18,10 +18,9 @@ from nerfro.evaluation.score_tables import report
 from nerfro.evaluation.score_views import score_views
 from nerfro.fields.mlp import compile_networks
 from nerfro.registry import build
-from nerfro.samplers.training_paths import trace_training_rays
 from nerfro.training.callbacks import StopOnSignal, Throughput
 from nerfro.training.config import TrainConfig, build_model
-from nerfro.training.data_module import RayDataModule
+from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.memory import require_memory
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.run_folder import (
@@ -62,9 +61,7 @@ def main(config: DictConfig) -> None:
         claim(folder, checkpoint is not None, needed_bytes(model))
         record(folder, config)
         print(f"nerfro: {config.name} on {config.data.root} -> {folder}\n{memory}", flush=True)
-    model.training_paths = trace_training_rays(config, model, training.cameras)
-    if model.training_paths is not None and model.training_paths.parts is not None:
-        batches = batches.dividing(model.training_paths.parts)
+    batches = traced(batches, model, config)
     if config.compile is not None:
         compile_networks(model, config.compile)
 

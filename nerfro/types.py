@@ -309,7 +309,8 @@ class Batch:
         rays_per_pixel: of the divided ones.
         rows: which rows of the whole batch these are, where several processes share it.
         num_rows: of the whole batch.
-        path: of the rays, where it was traced ahead of the step.
+        path: of the rays, without gradients, where they are traced already.
+        index: the pixel that each ray belongs to: `view * H * W + row * W + column`.
     """
 
     rays: Rays

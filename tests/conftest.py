@@ -113,6 +113,7 @@ def tiny_run(tiny_scene: Path) -> list[str]:
         "loss.boundary.ramp=0",
         "loss.smoothness.weight=1",
         "evaluation.supersample=1",
+        "batches.supersample=1",
         "batches.jitter=false",
         "medium.resolution=32",
         "medium.smoothing_size=3",

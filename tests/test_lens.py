@@ -10,9 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nerfro.cameras import Cameras
-from nerfro.files.cache import content_hash
 from nerfro.lens import coefficients, distort, opencv_coefficients, undistort
-from nerfro.samplers.path_cache import _describe_cameras
 
 LENSES = {
     "barrel": coefficients([-0.18, 0.03]),
@@ -118,9 +116,3 @@ def test_projection_by_hand_and_behind_the_camera():
     pixels, depth = camera.project(torch.tensor([[0.4, 0.2, -4.0], [0.0, 0.0, 3.0]]))
     torch.testing.assert_close(pixels[0, 0], torch.tensor([42.0, 19.0]))
     assert depth[0].tolist() == [4.0, -3.0]
-
-
-def test_paths_that_were_kept_for_one_lens_are_not_taken_for_another(cameras):
-    other = replace(cameras, distortion=cameras.distortion * 0.5)
-    keys = [content_hash(*_describe_cameras(c)) for c in (cameras, other, replace(cameras, distortion=None))]
-    assert len(set(keys)) == 3

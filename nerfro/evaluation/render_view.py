@@ -9,8 +9,7 @@ import torch
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.models.base import NerfModel, RenderedRays
-from nerfro.pixel_parts import PixelParts
-from nerfro.samplers.divergence import exit_divergence
+from nerfro.pixel_parts import divergence, part_rays, rays_beside
 
 
 @dataclass(frozen=True)
@@ -19,8 +18,8 @@ class Supersampling:
 
     Attributes:
         side: rays in each direction; a chosen pixel costs side^2 more rays.
-        divergence: pixels are chosen whose exit direction differs from a neighbour's by more than this many pixel
-            angles; 0 chooses all.
+        divergence: pixels are chosen whose ray leaves in another direction than the one beside it, by this many pixel
+            angles or more (`pixel_parts.divergence`); 0 chooses all.
     """
 
     side: int = 1
@@ -45,16 +44,14 @@ def render_view(model: NerfModel, cameras: Cameras, view: int, supersampling: Su
     rendered = model.render(cameras.image_rays(view))
     if supersampling.side == 1:
         return rendered
-    diverging = exit_divergence(rendered.exit_directions.view(cameras.height, cameras.width, 3))
-    pixel_angle = 1 / float(cameras.fx[view])
-    chosen = (diverging >= supersampling.divergence * pixel_angle).flatten().nonzero()[:, 0]
-    if len(chosen) == 0:
-        return rendered
-    parts = PixelParts(cameras, supersampling.side, view * cameras.height * cameras.width + chosen)
-    total = torch.zeros_like(rendered.radiance[chosen])
-    for part in range(parts.rays_per_pixel):
-        rays = parts.rays(torch.arange(part, len(parts), parts.rays_per_pixel, device=cameras.device))
-        total += model.render(rays).radiance
-    radiance = rendered.radiance.clone()
-    radiance[chosen] = total / parts.rays_per_pixel
+    size = cameras.height * cameras.width
+    pixels = torch.arange(view * size, (view + 1) * size, device=cameras.device)
+    beside = [model.path_sampler(rays_beside(cameras, some), model.medium) for some in pixels.split(model.chunk_size)]
+    exits = torch.cat([path.exit_directions for path in beside])
+    angles = divergence(cameras, pixels, rendered.exit_directions, exits)
+    chosen = (angles >= supersampling.divergence).nonzero()[:, 0]
+    radiance, num_parts = rendered.radiance.clone(), supersampling.side**2
+    for some in chosen.split(max(1, model.chunk_size // num_parts)):
+        parts = model.render(part_rays(cameras, pixels[some], supersampling.side)).radiance
+        radiance[some] = parts.view(-1, num_parts, 3).mean(1)
     return replace(rendered, radiance=radiance)

@@ -15,7 +15,7 @@ from nerfro.files.atomic import atomic_file
 
 
 def cache_dir() -> Path:
-    """Where computed grids and paths are kept: `NERFRO_CACHE`, else ~/.cache/nerfro."""
+    """Where computed grids are kept: `NERFRO_CACHE`, else ~/.cache/nerfro."""
     return Path(os.environ.get("NERFRO_CACHE") or "~/.cache/nerfro").expanduser()
 
 

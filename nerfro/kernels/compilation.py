@@ -6,11 +6,12 @@ import functools
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
 
 from nerfro.files.cache import cache_dir
+from nerfro.kernels.threads import use_threads
 from nerfro.paths import PACKAGE_DIR
 
 # Files that hold kernels, or the constants that are compiled into them; a kernel lies beside its plain twin.
@@ -25,21 +26,39 @@ if numba.config.THREADING_LAYER == "default":  # type: ignore[attr-defined]
 
 
 def compiled(function: Function) -> Function:
-    """Compile for one thread on the first call, and keep the machine code on disk."""
+    """Compile for one thread on the first call, and keep the machine code on disk; Python goes on meanwhile."""
     return _compile(function, parallel=False)
 
 
+def inlined(function: Function) -> Function:
+    """Compile into the kernels that call it: for what is done at every step along a ray."""
+    return cast(Function, numba.njit(inline="always")(function))
+
+
 def compiled_parallel(function: Function) -> Function:
-    """Compile with `prange` loops spread over the cores, and keep the machine code on disk."""
-    return _compile(function, parallel=True)
+    """Compile with `prange` loops spread over the cores that PyTorch uses, and keep the machine code on disk.
+
+    A thread to which PyTorch gives one core has the same loops run one after the other. Several threads may call
+    those at once; Numba's work queue may have one caller only.
+    """
+    serial, parallel = _compile(function, parallel=False), _compile(function, parallel=True)
+
+    @functools.wraps(function)
+    def run(*arguments: Any) -> Any:
+        return (serial if use_threads() == 1 else parallel)(*arguments)
+
+    return cast(Function, run)
 
 
 def _compile(function: Function, parallel: bool) -> Function:
     # Fused multiply-add is the only liberty taken with floating point: infinities and exact comparisons stay.
-    options: dict[str, Any] = {"parallel": parallel, "fastmath": {"contract"}, "error_model": "numpy"}
+    options: dict[str, Any] = {"parallel": parallel, "nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
     before = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-    # Numba looks at this once, when it makes the function's cache. An install may be read-only, hence a folder of ours.
-    folder = (Path(before) if before else cache_dir() / "kernels") / _fingerprint()
+    # Numba looks at this once, when it makes the function's cache. An install may be read-only, hence a folder of ours;
+    # and Numba takes the two forms of one function for the same.
+    folder = (
+        (Path(before) if before else cache_dir() / "kernels") / _fingerprint() / ("parallel" if parallel else "serial")
+    )
     numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
     try:
         return numba.njit(cache=True, **options)(function)

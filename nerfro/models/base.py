@@ -87,9 +87,9 @@ class NerfModel(LightningModule, ABC):
         """Bend rays and render their paths."""
         return self.render_path(self.trace(rays))
 
-    def trace(self, rays: Rays) -> Path:
-        """Paths of rays; with gradients by what bends them where that learns."""
-        path = self.path_sampler(rays, self.medium)
+    def trace(self, rays: Rays, path: Path | None = None) -> Path:
+        """Paths of rays, or the ones given; with gradients by what bends them where that learns."""
+        path = self.path_sampler(rays, self.medium) if path is None else path
         return self.path_sampler.refine(path, rays, self.medium) if self.paths_learn else path
 
     @property
@@ -128,10 +128,7 @@ class NerfModel(LightningModule, ABC):
 
     def training_step(self, batch: Batch, batch_index: int) -> Float[Tensor, ""]:
         with drawing_for(batch.rows, batch.num_rows):
-            if batch.path is None:
-                renderings = self(self.camera(batch.rays, batch.view))
-            else:
-                renderings = self.render_path(batch.path)
+            renderings = self.render_path(self.trace(self.camera(batch.rays, batch.view), batch.path))
         total = torch.zeros((), device=self.device)
         for name, loss in self.losses.items():
             weight = loss.weight_at(self.global_step)  # type: ignore[operator]

@@ -17,11 +17,9 @@ class PathSampler(nn.Module, ABC):
 
     Attributes:
         needs_medium: whether it asks the medium at all; if not, none is built.
-        few_vertices: whether its paths are short enough to be kept for all training rays.
     """
 
     needs_medium = True
-    few_vertices = False
 
     @abstractmethod
     def forward(self, rays: Rays, medium: Medium) -> Path:
@@ -37,6 +35,10 @@ class PathSampler(nn.Module, ABC):
             rays, medium: may want gradients.
         """
         return path
+
+    def releases_python(self, medium: Medium) -> bool:
+        """Whether a thread that traces on the CPU leaves Python to others, so that it can work beside them."""
+        return False
 
 
 class PointSampler(nn.Module, ABC):

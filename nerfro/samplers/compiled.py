@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,15 +11,16 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerfro.kernels.arrays import arrays
-from nerfro.kernels.threads import use_threads
 from nerfro.types import Path, Rays
 
 if TYPE_CHECKING:
+    from nerfro.kernels.lookup import MediumGrid
     from nerfro.media.sdf_grid import SdfGrid
     from nerfro.media.voxel_grid import VoxelGrid
 
-# Vertices that a first attempt has room for; the few rays that need more are traced again with twice as many.
-_CAPACITY = 12
+# Vertices that a first attempt has room for; the few rays that need more are traced again. Those of many reflections
+# are slow, so there is room for all that is usual.
+_CAPACITY = 18
 
 
 def snell_on_grid(
@@ -34,18 +34,13 @@ def snell_on_grid(
         min_step: shortest step of the search, as a share of the box's shortest side.
         max_events: refractions and reflections, at most.
     """
-    from nerfro.media.sdf_grid import BLOCK
     from nerfro.samplers.snell_cpu import trace_snell
 
-    low, high, inverse_spacing = _frame(medium.box, medium.coefficients.shape[1:])
-    settings = (
-        medium.coefficients.detach().numpy(), medium.coarse_clearance.numpy(), medium.iors.detach().double().numpy(),
-        low, high, inverse_spacing, inverse_spacing / BLOCK, min_step * float((high - low).min()), max_events,
-    )  # fmt: skip
+    solids = _for_kernels(medium)
+    settings = (solids, min_step * float((solids.high - solids.low).min()), max_events)
     (*vertices, body), (events, exceeded) = _with_enough_vertices(rays, trace_snell, settings, 4)
     num_events = torch.from_numpy(events)
-    path = replace(_path(rays, vertices, num_events > 0), body=torch.from_numpy(np.ascontiguousarray(body)))
-    return path, num_events, torch.from_numpy(exceeded)
+    return _path(rays, vertices, num_events > 0, body), num_events, torch.from_numpy(exceeded)
 
 
 def eikonal_on_grid(
@@ -60,27 +55,9 @@ def eikonal_on_grid(
         tolerance: distance from its last tangent at which a path gets a vertex, world units.
         max_steps: steps of a ray, at most.
     """
-    from nerfro.media.sdf_grid import BLOCK, SdfGrid
     from nerfro.samplers.eikonal_cpu import march_adaptive
 
-    if isinstance(medium, SdfGrid):
-        low, high, inverse_spacing = _frame(medium.box, medium.coefficients.shape[1:])
-        table, clearance = np.empty((0, 0, 0, 4), np.float32), medium.coarse_clearance.numpy()
-        coefficients, iors, shell = (
-            medium.coefficients.detach().numpy(),
-            medium.iors.detach().double().numpy(),
-            medium.shell,
-        )
-        inverse_block = inverse_spacing / BLOCK
-    else:
-        low, high, inverse_spacing = _frame(medium.box, medium.table.shape[:3])
-        table, clearance = medium.table.detach().numpy(), medium.clearance_grid.numpy()
-        coefficients, iors, shell = np.empty((0, 0, 0, 0), table.dtype), np.empty(0), 0.0
-        inverse_block = inverse_spacing
-    settings = (
-        table, clearance, coefficients, iors, shell, low, high, inverse_spacing, inverse_block, step, tolerance,
-        max_steps,
-    )  # fmt: skip
+    settings = (_for_kernels(medium), step, tolerance, max_steps)
     vertices, (refracted, exceeded) = _with_enough_vertices(rays, march_adaptive, settings, 3)
     return _path(rays, vertices, torch.from_numpy(refracted)), torch.from_numpy(exceeded)
 
@@ -102,11 +79,8 @@ def _march_uniform(
     from nerfro.samplers import eikonal_cpu as eikonal
 
     code = {"euler": eikonal.EULER, "leapfrog": eikonal.LEAPFROG, "rk4": eikonal.RK4}[integrator]
-    use_threads()
-    low, _, inverse_spacing = _frame(medium.box, medium.table.shape[:3])
     origins, directions, near, far = _ray_arrays(rays)
-    table = medium.table.detach().numpy()
-    return eikonal.march_uniform(origins, directions, near, far, table, low, inverse_spacing, code, num_steps, keep_all)
+    return eikonal.march_uniform(origins, directions, near, far, _for_kernels(medium), code, num_steps, keep_all)
 
 
 def _with_enough_vertices(
@@ -117,7 +91,6 @@ def _with_enough_vertices(
     Returns:
         The first `num_arrays` results, which have a column for each vertex, and those that follow the counts.
     """
-    use_threads()
     of_rays = _ray_arrays(rays)
     capacity = _CAPACITY
     results = kernel(*of_rays, *settings, capacity)
@@ -136,11 +109,23 @@ def _ray_arrays(rays: Rays) -> list[np.ndarray]:
     return arrays(rays.origins, rays.directions, rays.near, rays.far)
 
 
-def _frame(box: Tensor, shape: torch.Size) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    low, high = box.double().numpy()
-    return low, high, (np.array(shape) - 1) / (high - low)
+def _for_kernels(medium: VoxelGrid | SdfGrid) -> MediumGrid:
+    from nerfro.kernels.lookup import MediumGrid
+    from nerfro.media.sdf_grid import BLOCK, SdfGrid
+
+    low, high = medium.box.double().numpy()
+    if isinstance(medium, SdfGrid):
+        inverse_spacing = (np.array(medium.coefficients.shape[1:]) - 1) / (high - low)
+        values, clearance = medium.coefficients.detach().numpy(), medium.coarse_clearance.numpy()
+        return MediumGrid(
+            values, clearance, medium.iors.detach().double().numpy(), medium.shell, low, high, inverse_spacing, inverse_spacing / BLOCK
+        )
+    inverse_spacing = (np.array(medium.table.shape[:3]) - 1) / (high - low)
+    values, clearance = medium.table.detach().numpy(), medium.clearance_grid.numpy()
+    return MediumGrid(values, clearance, None, 0.0, low, high, inverse_spacing, inverse_spacing)
 
 
-def _path(rays: Rays, vertices: Sequence[np.ndarray], refracted: Tensor) -> Path:
-    positions, directions, s = (torch.from_numpy(np.ascontiguousarray(array)) for array in vertices)
-    return Path(positions, directions, s, directions[:, -1], refracted, rays.radii)
+def _path(rays: Rays, vertices: Sequence[np.ndarray], refracted: Tensor, body: np.ndarray | None = None) -> Path:
+    arrays = [*vertices] if body is None else [*vertices, body]
+    positions, directions, s, *bodies = (torch.from_numpy(np.ascontiguousarray(array)) for array in arrays)
+    return Path(positions, directions, s, directions[:, -1], refracted, rays.radii, body=bodies[0] if bodies else None)  # type: ignore[arg-type]

@@ -58,7 +58,6 @@ class Eikonal(PathSampler):
             raise NerfroError(
                 f"sampler.path.tolerance={tolerance}, max_steps={max_steps} must be positive; 2e-4 and 16384 are usual"
             )
-        self.few_vertices = integrator == "adaptive"
         self.integrator = integrator
         self.num_steps = num_steps
         self.tolerance = tolerance
@@ -91,6 +90,9 @@ class Eikonal(PathSampler):
         replayed = march_uniform(rays, medium, INTEGRATORS[self.integrator], self.num_steps)
         names = ("positions", "directions", "s", "exit_directions")
         return path.moved(*(with_gradient(getattr(path, name), getattr(replayed, name)) for name in names))
+
+    def releases_python(self, medium: Medium) -> bool:
+        return isinstance(medium, VoxelGrid) or (self.integrator == "adaptive" and isinstance(medium, SdfGrid))
 
 
 def march_uniform(rays: Rays, medium: Medium, integrator: Integrator, num_steps: int) -> Path:

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import prange
 
-from nerfro.kernels.compilation import compiled, compiled_parallel
+from nerfro.kernels.compilation import compiled, compiled_parallel, inlined
 from nerfro.kernels.lookup import (
     block_clearance,
     box_span,
@@ -32,93 +32,6 @@ def _rescaled(vx, vy, vz, n):
     return vx * scale, vy * scale, vz * scale
 
 
-@compiled_parallel
-def march_uniform(origins, directions, near, far, table, low, inverse_spacing, integrator, num_steps, keep_all):
-    """Steps of equal arc length through a voxel grid.
-
-    Returns:
-        positions [R, V, 3], directions [R, V, 3], s [R, V]: with V the number of steps, or 1 (the last vertex alone) if
-            not `keep_all`.
-        refracted [R]: whether the index varied along the path.
-    """
-    num_rays = origins.shape[0]
-    kept = num_steps if keep_all else 1
-    out_positions = np.empty((num_rays, kept, 3), origins.dtype)
-    out_directions = np.empty((num_rays, kept, 3), origins.dtype)
-    out_s = np.empty((num_rays, kept), origins.dtype)
-    refracted = np.zeros(num_rays, np.bool_)
-    for ray in prange(num_rays):
-        vx, vy, vz = float(directions[ray, 0]), float(directions[ray, 1]), float(directions[ray, 2])
-        s = float(near[ray])
-        x, y, z = origins[ray, 0] + s * vx, origins[ray, 1] + s * vy, origins[ray, 2] + s * vz
-        ds = (far[ray] - s) / (num_steps - 1)
-        n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
-        vx, vy, vz = n * vx, n * vy, n * vz
-        bent = False
-        for step in range(num_steps):
-            if keep_all or step == num_steps - 1:
-                norm = math.sqrt(vx * vx + vy * vy + vz * vz)
-                slot = step if keep_all else 0
-                put_vertex(
-                    out_positions[ray], out_directions[ray], out_s[ray],
-                    slot, x, y, z, vx / norm, vy / norm, vz / norm, s,
-                )  # fmt: skip
-            bent = bent or gx != 0.0 or gy != 0.0 or gz != 0.0
-            if step == num_steps - 1:
-                break
-            x0, y0, z0 = x, y, z
-            if integrator == EULER:
-                h = ds / n
-                x, y, z = x + h * vx, y + h * vy, z + h * vz
-                vx, vy, vz = vx + ds * gx, vy + ds * gy, vz + ds * gz
-                n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
-            elif integrator == LEAPFROG:
-                h = ds / max(n + 0.5 * ds * (gx * vx + gy * vy + gz * vz) / n, 0.5 * n)
-                kick = 0.5 * h * n
-                px, py, pz = vx + kick * gx, vy + kick * gy, vz + kick * gz
-                x, y, z = x + h * px, y + h * py, z + h * pz
-                n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
-                kick = 0.5 * h * n
-                px, py, pz = px + kick * gx, py + kick * gy, pz + kick * gz
-                varies = gx != 0.0 or gy != 0.0 or gz != 0.0
-                vx, vy, vz = _with_length_along(px, py, pz, px - vx, py - vy, pz - vz, n, varies)
-            else:
-                half = 0.5 * ds
-                ax, ay, az = vx / n, vy / n, vz / n
-                n2, bgx, bgy, bgz = voxel_index(
-                    table, low, inverse_spacing, x + half * ax, y + half * ay, z + half * az
-                )
-                bx, by, bz = (vx + half * gx) / n2, (vy + half * gy) / n2, (vz + half * gz) / n2
-                n3, cgx, cgy, cgz = voxel_index(
-                    table, low, inverse_spacing, x + half * bx, y + half * by, z + half * bz
-                )
-                cx, cy, cz = (vx + half * bgx) / n3, (vy + half * bgy) / n3, (vz + half * bgz) / n3
-                px, py, pz = x + ds * cx, y + ds * cy, z + ds * cz
-                n4, dgx, dgy, dgz = voxel_index(table, low, inverse_spacing, px, py, pz)
-                ex, ey, ez = (vx + ds * cgx) / n4, (vy + ds * cgy) / n4, (vz + ds * cgz) / n4
-                sixth = ds / 6.0
-                x += sixth * (ax + 2.0 * bx + 2.0 * cx + ex)
-                y += sixth * (ay + 2.0 * by + 2.0 * cy + ey)
-                z += sixth * (az + 2.0 * bz + 2.0 * cz + ez)
-                vx += sixth * (gx + 2.0 * bgx + 2.0 * cgx + dgx)
-                vy += sixth * (gy + 2.0 * bgy + 2.0 * cgy + dgy)
-                vz += sixth * (gz + 2.0 * bgz + 2.0 * cgz + dgz)
-                n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
-                vx, vy, vz = _rescaled(vx, vy, vz, n)
-            s += math.sqrt((x - x0) ** 2 + (y - y0) ** 2 + (z - z0) ** 2)
-        refracted[ray] = bent
-    return out_positions, out_directions, out_s, refracted
-
-
-@compiled
-def _look_up(table, clearance, coefficients, iors, shell, low, inverse_spacing, x, y, z):
-    """Index, gradient and clearance from whichever of the two grids is given."""
-    if coefficients.shape[0] > 0:
-        return solid_index(coefficients, iors, shell, low, inverse_spacing, x, y, z)
-    n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
-    return n, gx, gy, gz, float(block_clearance(clearance, low, inverse_spacing, x, y, z))
-
-
 @compiled
 def _with_length_along(vx, vy, vz, kx, ky, kz, n, varies):
     """Set the length of v to n by its component along the kick, where that is called for (`integrators.leapfrog`)."""
@@ -134,11 +47,229 @@ def _with_length_along(vx, vy, vz, kx, ky, kz, n, varies):
     return vx + change * kx, vy + change * ky, vz + change * kz
 
 
+@inlined
+def _euler(table, low, inverse_spacing, ds, x, y, z, vx, vy, vz, n, gx, gy, gz):
+    """`integrators.euler`, for one ray."""
+    h = ds / n
+    x, y, z = x + h * vx, y + h * vy, z + h * vz
+    vx, vy, vz = vx + ds * gx, vy + ds * gy, vz + ds * gz
+    return x, y, z, vx, vy, vz, *voxel_index(table, low, inverse_spacing, x, y, z)
+
+
+@inlined
+def _drift(ds, x, y, z, vx, vy, vz, n, gx, gy, gz):
+    """First half of a leapfrog step: where it leads, v after half a kick, and the step's parameter."""
+    h = ds / max(n + 0.5 * ds * (gx * vx + gy * vy + gz * vz) / n, 0.5 * n)
+    kick = 0.5 * h * n
+    px, py, pz = vx + kick * gx, vy + kick * gy, vz + kick * gz
+    return x + h * px, y + h * py, z + h * pz, px, py, pz, h
+
+
+@inlined
+def _kick(h, px, py, pz, vx, vy, vz, n, gx, gy, gz):
+    """Second half: v after the other half of the kick, of length n."""
+    kick = 0.5 * h * n
+    px, py, pz = px + kick * gx, py + kick * gy, pz + kick * gz
+    varies = gx != 0.0 or gy != 0.0 or gz != 0.0
+    return _with_length_along(px, py, pz, px - vx, py - vy, pz - vz, n, varies)
+
+
+@inlined
+def _leapfrog(table, low, inverse_spacing, ds, x, y, z, vx, vy, vz, n, gx, gy, gz):
+    """`integrators.leapfrog`, for one ray."""
+    x, y, z, px, py, pz, h = _drift(ds, x, y, z, vx, vy, vz, n, gx, gy, gz)
+    n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
+    vx, vy, vz = _kick(h, px, py, pz, vx, vy, vz, n, gx, gy, gz)
+    return x, y, z, vx, vy, vz, n, gx, gy, gz
+
+
+@inlined
+def _rk4(table, low, inverse_spacing, ds, x, y, z, vx, vy, vz, n, gx, gy, gz):
+    """`integrators.rk4`, for one ray."""
+    half, sixth = 0.5 * ds, ds / 6.0
+    ax, ay, az = vx / n, vy / n, vz / n
+    n2, bgx, bgy, bgz = voxel_index(table, low, inverse_spacing, x + half * ax, y + half * ay, z + half * az)
+    bx, by, bz = (vx + half * gx) / n2, (vy + half * gy) / n2, (vz + half * gz) / n2
+    n3, cgx, cgy, cgz = voxel_index(table, low, inverse_spacing, x + half * bx, y + half * by, z + half * bz)
+    cx, cy, cz = (vx + half * bgx) / n3, (vy + half * bgy) / n3, (vz + half * bgz) / n3
+    n4, dgx, dgy, dgz = voxel_index(table, low, inverse_spacing, x + ds * cx, y + ds * cy, z + ds * cz)
+    ex, ey, ez = (vx + ds * cgx) / n4, (vy + ds * cgy) / n4, (vz + ds * cgz) / n4
+    x += sixth * (ax + 2.0 * bx + 2.0 * cx + ex)
+    y += sixth * (ay + 2.0 * by + 2.0 * cy + ey)
+    z += sixth * (az + 2.0 * bz + 2.0 * cz + ez)
+    vx += sixth * (gx + 2.0 * bgx + 2.0 * cgx + dgx)
+    vy += sixth * (gy + 2.0 * bgy + 2.0 * cgy + dgy)
+    vz += sixth * (gz + 2.0 * bgz + 2.0 * cgz + dgz)
+    n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
+    vx, vy, vz = _rescaled(vx, vy, vz, n)
+    return x, y, z, vx, vy, vz, n, gx, gy, gz
+
+
+@compiled
+def _march_ray_uniformly(voxels, origin, direction, near, far, integrator, num_steps, row):
+    """One ray's vertices into its row, the last one alone where it has no place for more; whether the index varied."""
+    table, low, inverse_spacing = voxels.values, voxels.low, voxels.inverse_spacing
+    positions, directions, lengths = row
+    vx, vy, vz = float(direction[0]), float(direction[1]), float(direction[2])
+    s = float(near)
+    x, y, z = origin[0] + s * vx, origin[1] + s * vy, origin[2] + s * vz
+    ds = (far - s) / (num_steps - 1)
+    n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
+    vx, vy, vz = n * vx, n * vy, n * vz
+    keep_all = len(lengths) == num_steps
+    bent = False
+    for step in range(num_steps):
+        if keep_all or step == num_steps - 1:
+            norm = math.sqrt(vx * vx + vy * vy + vz * vz)
+            slot = step if keep_all else 0
+            put_vertex(positions, directions, lengths, slot, x, y, z, vx / norm, vy / norm, vz / norm, s)
+        bent = bent or gx != 0.0 or gy != 0.0 or gz != 0.0
+        if step == num_steps - 1:
+            break
+        x0, y0, z0 = x, y, z
+        if integrator == EULER:
+            x, y, z, vx, vy, vz, n, gx, gy, gz = _euler(
+                table, low, inverse_spacing, ds, x, y, z, vx, vy, vz, n, gx, gy, gz
+            )
+        elif integrator == LEAPFROG:
+            x, y, z, vx, vy, vz, n, gx, gy, gz = _leapfrog(
+                table, low, inverse_spacing, ds, x, y, z, vx, vy, vz, n, gx, gy, gz
+            )
+        else:
+            x, y, z, vx, vy, vz, n, gx, gy, gz = _rk4(
+                table, low, inverse_spacing, ds, x, y, z, vx, vy, vz, n, gx, gy, gz
+            )
+        s += math.sqrt((x - x0) ** 2 + (y - y0) ** 2 + (z - z0) ** 2)
+    return bent
+
+
 @compiled_parallel
-def march_adaptive(
-    origins, directions, near, far, table, clearance, coefficients, iors, shell, low, high, inverse_spacing,
-    inverse_block, step, tolerance, max_steps, capacity,
-):  # fmt: skip
+def march_uniform(origins, directions, near, far, voxels, integrator, num_steps, keep_all):
+    """Steps of equal arc length through a voxel grid.
+
+    Returns:
+        positions [R, V, 3], directions [R, V, 3], s [R, V]: with V the number of steps, or 1 (the last vertex alone) if
+            not `keep_all`.
+        refracted [R]: whether the index varied along the path.
+    """
+    num_rays = origins.shape[0]
+    kept = num_steps if keep_all else 1
+    out_positions = np.empty((num_rays, kept, 3), origins.dtype)
+    out_directions = np.empty((num_rays, kept, 3), origins.dtype)
+    out_s = np.empty((num_rays, kept), origins.dtype)
+    refracted = np.empty(num_rays, np.bool_)
+    for ray in prange(num_rays):
+        row = (out_positions[ray], out_directions[ray], out_s[ray])
+        refracted[ray] = _march_ray_uniformly(
+            voxels, origins[ray], directions[ray], near[ray], far[ray], integrator, num_steps, row
+        )
+    return out_positions, out_directions, out_s, refracted
+
+
+@compiled
+def _free_length(values, clearance, iors, shell, low, inverse_spacing, inverse_block, x, y, z, enough):
+    """A lower bound of the distance within which the index does not vary; tight where it is not `enough`."""
+    # Blocks are cheap to ask; only near a surface the distance itself is looked up.
+    free = block_clearance(clearance, low, inverse_block, x, y, z) - shell
+    if iors is None:
+        return free
+    if free <= enough:
+        free = solid_clearance(values, shell, low, inverse_spacing, x, y, z)
+    return free
+
+
+@compiled
+def _look_up(values, clearance, iors, shell, low, inverse_spacing, inverse_block, x, y, z):
+    """Index, gradient and the distance within which the index does not vary."""
+    if iors is None:
+        n, gx, gy, gz = voxel_index(values, low, inverse_spacing, x, y, z)
+        return n, gx, gy, gz, float(block_clearance(clearance, low, inverse_block, x, y, z))
+    return solid_index(values, iors, shell, low, inverse_spacing, x, y, z)
+
+
+@compiled
+def _step_length(iors, step, dx, dy, dz, gx, gy, gz):
+    """Arc length of the next step: across a shell it depends on the slant (`media.solid.Solid.step_length`)."""
+    if iors is None:
+        return step
+    slope = math.sqrt(gx * gx + gy * gy + gz * gz)
+    if slope == 0.0:
+        return step
+    return step / max(abs(dx * gx + dy * gy + dz * gz) / slope, MIN_COSINE)
+
+
+@compiled
+def _march_ray(medium, origin, direction, near, far, step, tolerance, max_steps, row):
+    """One ray's vertices into its row: their number, whether the index varied, and whether it took `max_steps`."""
+    values, clearance, iors, shell, low, high, inverse_spacing, inverse_block = medium
+    positions, directions, lengths = row
+    skip = REACHED * step
+    dx, dy, dz = float(direction[0]), float(direction[1]), float(direction[2])
+    s, end = float(near), float(far)
+    x, y, z = origin[0] + s * dx, origin[1] + s * dy, origin[2] + s * dz
+    count, refracted, exceeded = put_vertex(positions, directions, lengths, 0, x, y, z, dx, dy, dz, s), False, False
+    enter, leave = box_span(low, high, x, y, z, dx, dy, dz)
+    if enter < leave and leave > 0.0 and enter < end - s:
+        # Position, direction and length at the last vertex that was kept.
+        kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
+        jump = max(enter, 0.0)
+        x, y, z, s = x + jump * dx, y + jump * dy, z + jump * dz, s + jump
+        vx, vy, vz = dx, dy, dz
+        known, n, gx, gy, gz, free = False, 1.0, 0.0, 0.0, 0.0, 0.0
+        exceeded = True
+        for _ in range(max_steps):
+            if not known:
+                free = _free_length(values, clearance, iors, shell, low, inverse_spacing, inverse_block, x, y, z, skip)
+                if free <= skip:
+                    n, gx, gy, gz, free = _look_up(
+                        values, clearance, iors, shell, low, inverse_spacing, inverse_block, x, y, z
+                    )
+                    vx, vy, vz = n * dx, n * dy, n * dz
+                    known = True
+            if free > skip:
+                if (dx - kdx) ** 2 + (dy - kdy) ** 2 + (dz - kdz) ** 2 > MIN_TURN:
+                    count = put_vertex(positions, directions, lengths, count, x, y, z, dx, dy, dz, s)
+                    kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
+                x, y, z, s = x + free * dx, y + free * dy, z + free * dz, s + free
+                known = False
+            else:
+                varied = gx != 0.0 or gy != 0.0 or gz != 0.0
+                ds = _step_length(iors, step, dx, dy, dz, gx, gy, gz)
+                x, y, z, px, py, pz, h = _drift(ds, x, y, z, vx, vy, vz, n, gx, gy, gz)
+                s += h * math.sqrt(px * px + py * py + pz * pz)
+                refracted = refracted or varied
+                n, gx, gy, gz, free = _look_up(
+                    values, clearance, iors, shell, low, inverse_spacing, inverse_block, x, y, z
+                )
+                vx, vy, vz = _kick(h, px, py, pz, vx, vy, vz, n, gx, gy, gz)
+                # A straight step leaves the direction as it is, to the last bit.
+                if varied or gx != 0.0 or gy != 0.0 or gz != 0.0:
+                    norm = math.sqrt(vx * vx + vy * vy + vz * vz)
+                    dx, dy, dz = vx / norm, vy / norm, vz / norm
+                ahead = s - ks
+                ex, ey, ez = x - kx - ahead * kdx, y - ky - ahead * kdy, z - kz - ahead * kdz
+                if ex * ex + ey * ey + ez * ez > tolerance * tolerance:
+                    count = put_vertex(positions, directions, lengths, count, x, y, z, dx, dy, dz, s)
+                    kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
+            outside = x < low[0] or x > high[0] or y < low[1] or y > high[1] or z < low[2] or z > high[2]
+            if outside:
+                exceeded = False
+                break
+        if (dx - kdx) ** 2 + (dy - kdy) ** 2 + (dz - kdz) ** 2 > MIN_TURN:
+            count = put_vertex(positions, directions, lengths, count, x, y, z, dx, dy, dz, s)
+    # A bent path ends outside the box, however long it is; far bounds what lies beyond.
+    jump = end - s
+    if refracted:
+        jump = max(jump, distance_out(low, high, x, y, z, dx, dy, dz))
+    count = put_vertex(
+        positions, directions, lengths, count, x + jump * dx, y + jump * dy, z + jump * dz, dx, dy, dz, s + jump
+    )
+    repeat_last(positions, directions, lengths, min(count, len(lengths)))
+    return count, refracted, exceeded
+
+
+@compiled_parallel
+def march_adaptive(origins, directions, near, far, medium, step, tolerance, max_steps, capacity):
     """Steps where the index varies, straight jumps elsewhere; vertices where the path leaves its last tangent.
 
     Returns:
@@ -152,81 +283,11 @@ def march_adaptive(
     out_directions = np.empty((num_rays, capacity, 3), origins.dtype)
     out_s = np.empty((num_rays, capacity), origins.dtype)
     counts = np.empty(num_rays, np.int64)
-    refracted = np.zeros(num_rays, np.bool_)
-    exceeded = np.zeros(num_rays, np.bool_)
-    skip = REACHED * step
+    refracted = np.empty(num_rays, np.bool_)
+    exceeded = np.empty(num_rays, np.bool_)
     for ray in prange(num_rays):
-        dx, dy, dz = float(directions[ray, 0]), float(directions[ray, 1]), float(directions[ray, 2])
-        s, end = float(near[ray]), float(far[ray])
-        x, y, z = origins[ray, 0] + s * dx, origins[ray, 1] + s * dy, origins[ray, 2] + s * dz
         row = (out_positions[ray], out_directions[ray], out_s[ray])
-        count = put_vertex(*row, 0, x, y, z, dx, dy, dz, s)
-        enter, leave = box_span(low, high, x, y, z, dx, dy, dz)
-        if enter < leave and leave > 0.0 and enter < end - s:
-            # Position, direction and length at the last vertex that was kept.
-            kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
-            jump = max(enter, 0.0)
-            x, y, z, s = x + jump * dx, y + jump * dy, z + jump * dz, s + jump
-            vx, vy, vz = dx, dy, dz
-            known, n, gx, gy, gz, free = False, 1.0, 0.0, 0.0, 0.0, 0.0
-            exceeded[ray] = True
-            for _ in range(max_steps):
-                if not known:
-                    # Blocks are cheap to ask; only near a surface the index itself is looked up.
-                    free = block_clearance(clearance, low, inverse_block, x, y, z) - shell
-                    if free <= skip and coefficients.shape[0] > 0:
-                        free = solid_clearance(coefficients, shell, low, inverse_spacing, x, y, z)
-                    if free <= skip:
-                        n, gx, gy, gz, free = _look_up(
-                            table, clearance, coefficients, iors, shell, low, inverse_spacing, x, y, z
-                        )
-                        vx, vy, vz = n * dx, n * dy, n * dz
-                        known = True
-                if free > skip:
-                    if (dx - kdx) ** 2 + (dy - kdy) ** 2 + (dz - kdz) ** 2 > MIN_TURN:
-                        count = put_vertex(*row, count, x, y, z, dx, dy, dz, s)
-                        kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
-                    x, y, z, s = x + free * dx, y + free * dy, z + free * dz, s + free
-                    known = False
-                else:
-                    slope = math.sqrt(gx * gx + gy * gy + gz * gz)
-                    ds = step
-                    if coefficients.shape[0] > 0 and slope > 0.0:
-                        cosine = abs(dx * gx + dy * gy + dz * gz) / slope
-                        ds = step / max(cosine, MIN_COSINE)
-                    h = ds / max(n + 0.5 * ds * (gx * vx + gy * vy + gz * vz) / n, 0.5 * n)
-                    kick = 0.5 * h * n
-                    px, py, pz = vx + kick * gx, vy + kick * gy, vz + kick * gz
-                    x, y, z = x + h * px, y + h * py, z + h * pz
-                    s += h * math.sqrt(px * px + py * py + pz * pz)
-                    refracted[ray] = refracted[ray] or slope > 0.0
-                    n, gx, gy, gz, free = _look_up(
-                        table, clearance, coefficients, iors, shell, low, inverse_spacing, x, y, z
-                    )
-                    kick = 0.5 * h * n
-                    px, py, pz = px + kick * gx, py + kick * gy, pz + kick * gz
-                    varies = gx != 0.0 or gy != 0.0 or gz != 0.0
-                    vx, vy, vz = _with_length_along(px, py, pz, px - vx, py - vy, pz - vz, n, varies)
-                    # A straight step leaves the direction as it is, to the last bit.
-                    if varies or slope > 0.0:
-                        norm = math.sqrt(vx * vx + vy * vy + vz * vz)
-                        dx, dy, dz = vx / norm, vy / norm, vz / norm
-                    ahead = s - ks
-                    ex, ey, ez = x - kx - ahead * kdx, y - ky - ahead * kdy, z - kz - ahead * kdz
-                    if ex * ex + ey * ey + ez * ez > tolerance * tolerance:
-                        count = put_vertex(*row, count, x, y, z, dx, dy, dz, s)
-                        kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
-                outside = x < low[0] or x > high[0] or y < low[1] or y > high[1] or z < low[2] or z > high[2]
-                if outside:
-                    exceeded[ray] = False
-                    break
-            if (dx - kdx) ** 2 + (dy - kdy) ** 2 + (dz - kdz) ** 2 > MIN_TURN:
-                count = put_vertex(*row, count, x, y, z, dx, dy, dz, s)
-        # A bent path ends outside the box, however long it is; far bounds what lies beyond.
-        jump = end - s
-        if refracted[ray]:
-            jump = max(jump, distance_out(low, high, x, y, z, dx, dy, dz))
-        count = put_vertex(*row, count, x + jump * dx, y + jump * dy, z + jump * dz, dx, dy, dz, s + jump)
-        counts[ray] = count
-        repeat_last(*row, min(count, capacity))
+        counts[ray], refracted[ray], exceeded[ray] = _march_ray(
+            medium, origins[ray], directions[ray], near[ray], far[ray], step, tolerance, max_steps, row
+        )
     return out_positions, out_directions, out_s, counts, refracted, exceeded

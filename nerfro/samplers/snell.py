@@ -48,8 +48,6 @@ class SnellTrace:
 class Snell(PathSampler):
     """Exact refraction (Snell's law) and total reflection at the surface of a solid."""
 
-    few_vertices = True
-
     def __init__(self, interface: Literal["sdf", "mesh"] = "sdf", max_events: int = 16) -> None:
         """Choose the surface.
 
@@ -81,6 +79,9 @@ class Snell(PathSampler):
         else:
             return straight_path(rays[path.ray])
         return replay(path, rays, medium, meet)
+
+    def releases_python(self, medium: Medium) -> bool:
+        return self.interface == "sdf" and isinstance(medium, SdfGrid)
 
     @torch.no_grad()
     def trace(self, rays: Rays, medium: Medium) -> SnellTrace:

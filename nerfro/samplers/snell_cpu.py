@@ -69,23 +69,128 @@ def _index(inside, iors):
     return iors[number - 1] if number > 0 else 1.0
 
 
+@compiled
+def _surface_ahead(solids, inside, x, y, z, dx, dy, dz, min_step):
+    """Sphere tracing to the first surface: body (-1 where there is none), and arc lengths before and after it."""
+    clearance, low, inverse_spacing, inverse_block = (
+        solids.clearance,
+        solids.low,
+        solids.inverse_spacing,
+        solids.inverse_block,
+    )
+    splines, bodies = solids.values, len(inside)
+    _, leave = box_span(low, solids.high, x, y, z, dx, dy, dz)
+    t, before, crossed = 0.0, 0.0, False
+    while not crossed:
+        px, py, pz = x + t * dx, y + t * dy, z + t * dz
+        free = block_clearance(clearance, low, inverse_block, px, py, pz)
+        if free > 2.0 * min_step:
+            before = t
+            t += free
+            if t >= leave:
+                return -1, 0.0, 0.0
+            continue
+        distance = math.inf
+        for body in range(bodies):
+            value = spline_value(splines[body], low, inverse_spacing, px, py, pz)
+            crossed = crossed or (value < 0.0) != inside[body]
+            distance = min(distance, abs(value))
+        if crossed:
+            break
+        if t >= leave:
+            return -1, 0.0, 0.0
+        before = t
+        t = min(t + max(distance, min_step), leave)
+    # The first of the surfaces that were crossed in this step.
+    hit, hit_before, hit_after = -1, 0.0, math.inf
+    for body in range(bodies):
+        coefficients = splines[body]
+        value = spline_value(coefficients, low, inverse_spacing, x + t * dx, y + t * dy, z + t * dz)
+        if (value < 0.0) != inside[body]:
+            tolerance = _ROOT_TOLERANCE * min_step
+            first, last = _root(coefficients, low, inverse_spacing, x, y, z, dx, dy, dz, before, t, tolerance)
+            if last < hit_after:
+                hit, hit_before, hit_after = body, first, last
+    return hit, hit_before, hit_after
+
+
+@compiled
+def _turned(dx, dy, dz, nx, ny, nz, ratio):
+    """Direction after a surface with a gradient of any length, refracted or totally reflected, and which of the two."""
+    norm = math.sqrt(nx * nx + ny * ny + nz * nz)
+    nx, ny, nz = nx / norm, ny / norm, nz / norm
+    cosine = -(nx * dx + ny * dy + nz * dz)
+    if cosine < 0.0:
+        nx, ny, nz, cosine = -nx, -ny, -nz, -cosine
+    squared = 1.0 - ratio * ratio * (1.0 - cosine * cosine)
+    reflected = squared <= 0.0
+    scale, along = ratio, ratio * cosine
+    if reflected:
+        scale, along = 1.0, 2.0 * cosine
+    else:
+        along -= math.sqrt(squared)
+    dx, dy, dz = scale * dx + along * nx, scale * dy + along * ny, scale * dz + along * nz
+    norm = math.sqrt(dx * dx + dy * dy + dz * dz)
+    return dx / norm, dy / norm, dz / norm, reflected
+
+
+@compiled
+def _trace_ray(solids, origin, direction, near, far, min_step, max_events, row, bodies):
+    """One ray's vertices into its row: their number, the number of events, and whether there were too many."""
+    positions, directions, lengths = row
+    dx, dy, dz = float(direction[0]), float(direction[1]), float(direction[2])
+    s, end = float(near), float(far)
+    x, y, z = origin[0] + s * dx, origin[1] + s * dy, origin[2] + s * dz
+    count, events, exceeded = put_vertex(positions, directions, lengths, 0, x, y, z, dx, dy, dz, s), 0, False
+    enter, leave = box_span(solids.low, solids.high, x, y, z, dx, dy, dz)
+    if enter < leave and leave > 0.0 and enter < end - s:
+        jump = max(enter, 0.0)
+        x, y, z, s = x + jump * dx, y + jump * dy, z + jump * dz, s + jump
+        inside = np.empty(solids.values.shape[0], np.bool_)
+        for body in range(len(inside)):
+            value = spline_value(solids.values[body], solids.low, solids.inverse_spacing, x, y, z)
+            inside[body] = value < 0.0
+        bodies[0] = _innermost(inside)
+        while True:
+            hit, before, after = _surface_ahead(solids, inside, x, y, z, dx, dy, dz, min_step)
+            if hit < 0:
+                break
+            n_before = _index(inside, solids.iors)
+            inside[hit] = not inside[hit]
+            n_after = _index(inside, solids.iors)
+            if n_before == n_after:
+                x, y, z, s = x + after * dx, y + after * dy, z + after * dz, s + after
+                continue
+            if events >= max_events:
+                exceeded = True
+                break
+            events += 1
+            _, nx, ny, nz = spline_value_gradient(
+                solids.values[hit], solids.low, solids.inverse_spacing,
+                x + after * dx, y + after * dy, z + after * dz,
+            )  # fmt: skip
+            tx, ty, tz, reflected = _turned(dx, dy, dz, nx, ny, nz, n_before / n_after)
+            if reflected:
+                inside[hit] = not inside[hit]
+                after = before
+            x, y, z, s = x + after * dx, y + after * dy, z + after * dz, s + after
+            dx, dy, dz = tx, ty, tz
+            if count < len(bodies):
+                bodies[count] = _innermost(inside)
+            count = put_vertex(positions, directions, lengths, count, x, y, z, dx, dy, dz, s)
+    # A bent path ends outside the box, however long it is; far bounds what lies beyond.
+    jump = end - s
+    if events > 0:
+        jump = max(jump, distance_out(solids.low, solids.high, x, y, z, dx, dy, dz))
+    count = put_vertex(
+        positions, directions, lengths, count, x + jump * dx, y + jump * dy, z + jump * dz, dx, dy, dz, s + jump
+    )
+    repeat_last(positions, directions, lengths, min(count, len(bodies)))
+    return count, events, exceeded
+
+
 @compiled_parallel
-def trace_snell(
-    origins,
-    directions,
-    near,
-    far,
-    coefficients,
-    clearance,
-    iors,
-    low,
-    high,
-    inverse_spacing,
-    inverse_block,
-    min_step,
-    max_events,
-    capacity,
-):
+def trace_snell(origins, directions, near, far, solids, min_step, max_events, capacity):
     """Polylines of all rays.
 
     Returns:
@@ -101,95 +206,11 @@ def trace_snell(
     out_s = np.empty((num_rays, capacity), origins.dtype)
     bodies = np.zeros((num_rays, capacity), np.int8)
     counts = np.empty(num_rays, np.int64)
-    events = np.zeros(num_rays, np.int64)
-    exceeded = np.zeros(num_rays, np.bool_)
-    num_bodies = coefficients.shape[0]
-    tolerance = _ROOT_TOLERANCE * min_step
+    events = np.empty(num_rays, np.int64)
+    exceeded = np.empty(num_rays, np.bool_)
     for ray in prange(num_rays):
-        dx, dy, dz = float(directions[ray, 0]), float(directions[ray, 1]), float(directions[ray, 2])
-        s, end = float(near[ray]), float(far[ray])
-        x, y, z = origins[ray, 0] + s * dx, origins[ray, 1] + s * dy, origins[ray, 2] + s * dz
         row = (out_positions[ray], out_directions[ray], out_s[ray])
-        count = put_vertex(*row, 0, x, y, z, dx, dy, dz, s)
-        enter, leave = box_span(low, high, x, y, z, dx, dy, dz)
-        if enter < leave and leave > 0.0 and enter < end - s:
-            jump = max(enter, 0.0)
-            x, y, z, s = x + jump * dx, y + jump * dy, z + jump * dz, s + jump
-            inside = np.empty(num_bodies, np.bool_)
-            for body in range(num_bodies):
-                inside[body] = spline_value(coefficients[body], low, inverse_spacing, x, y, z) < 0.0
-            bodies[ray, 0] = _innermost(inside)
-            while True:
-                _, leave = box_span(low, high, x, y, z, dx, dy, dz)
-                t, before, crossed = 0.0, 0.0, False
-                while not crossed:
-                    free = block_clearance(clearance, low, inverse_block, x + t * dx, y + t * dy, z + t * dz)
-                    if free > 2.0 * min_step:
-                        before = t
-                        t += free
-                        if t >= leave:
-                            break
-                        continue
-                    distance = math.inf
-                    for body in range(num_bodies):
-                        value = spline_value(
-                            coefficients[body], low, inverse_spacing, x + t * dx, y + t * dy, z + t * dz
-                        )
-                        crossed = crossed or (value < 0.0) != inside[body]
-                        distance = min(distance, abs(value))
-                    if crossed or t >= leave:
-                        break
-                    before = t
-                    t = min(t + max(distance, min_step), leave)
-                if not crossed:
-                    break
-                # The first of the surfaces that were crossed in this step.
-                hit, hit_before, hit_after = -1, 0.0, math.inf
-                for body in range(num_bodies):
-                    value = spline_value(coefficients[body], low, inverse_spacing, x + t * dx, y + t * dy, z + t * dz)
-                    if (value < 0.0) != inside[body]:
-                        first, last = _root(
-                            coefficients[body], low, inverse_spacing, x, y, z, dx, dy, dz, before, t, tolerance
-                        )
-                        if last < hit_after:
-                            hit, hit_before, hit_after = body, first, last
-                n_before = _index(inside, iors)
-                inside[hit] = not inside[hit]
-                n_after = _index(inside, iors)
-                if n_before == n_after:
-                    x, y, z, s = x + hit_after * dx, y + hit_after * dy, z + hit_after * dz, s + hit_after
-                    continue
-                if events[ray] >= max_events:
-                    exceeded[ray] = True
-                    break
-                events[ray] += 1
-                hx, hy, hz = x + hit_after * dx, y + hit_after * dy, z + hit_after * dz
-                _, nx, ny, nz = spline_value_gradient(coefficients[hit], low, inverse_spacing, hx, hy, hz)
-                norm = math.sqrt(nx * nx + ny * ny + nz * nz)
-                nx, ny, nz = nx / norm, ny / norm, nz / norm
-                cosine = -(nx * dx + ny * dy + nz * dz)
-                if cosine < 0.0:
-                    nx, ny, nz, cosine = -nx, -ny, -nz, -cosine
-                ratio = n_before / n_after
-                squared = 1.0 - ratio * ratio * (1.0 - cosine * cosine)
-                if squared <= 0.0:
-                    inside[hit] = not inside[hit]
-                    hit_after = hit_before
-                    scale, along = 1.0, 2.0 * cosine
-                else:
-                    scale, along = ratio, ratio * cosine - math.sqrt(squared)
-                x, y, z, s = x + hit_after * dx, y + hit_after * dy, z + hit_after * dz, s + hit_after
-                dx, dy, dz = scale * dx + along * nx, scale * dy + along * ny, scale * dz + along * nz
-                norm = math.sqrt(dx * dx + dy * dy + dz * dz)
-                dx, dy, dz = dx / norm, dy / norm, dz / norm
-                if count < capacity:
-                    bodies[ray, count] = _innermost(inside)
-                count = put_vertex(*row, count, x, y, z, dx, dy, dz, s)
-        # A bent path ends outside the box, however long it is; far bounds what lies beyond.
-        jump = end - s
-        if events[ray] > 0:
-            jump = max(jump, distance_out(low, high, x, y, z, dx, dy, dz))
-        count = put_vertex(*row, count, x + jump * dx, y + jump * dy, z + jump * dz, dx, dy, dz, s + jump)
-        counts[ray] = count
-        repeat_last(*row, min(count, capacity))
+        counts[ray], events[ray], exceeded[ray] = _trace_ray(
+            solids, origins[ray], directions[ray], near[ray], far[ray], min_step, max_events, row, bodies[ray]
+        )
     return out_positions, out_directions, out_s, bodies, counts, events, exceeded

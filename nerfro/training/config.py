@@ -41,14 +41,13 @@ class BatchesConfig:
     """Which pixels are trained on.
 
     Attributes:
-        size: rays of a step.
+        size: pixels of a step.
         batching: pixels of `single_image` at a time, or of `all_images`.
         jitter: draw each ray anywhere inside its pixel instead of through its centre.
         precrop_steps: number of first steps that see only the central window of the images.
         precrop_fraction: side of that window.
-        cache_paths: trace all training rays once and keep their paths, where they do not change (no jitter).
-        supersample: rays in each direction of a pixel whose exit direction differs from a neighbour's by more than
-            `divergence` pixels, where paths are kept; 1 gives all pixels one ray.
+        supersample: rays in each direction of a pixel whose ray leaves `divergence` pixels or more away from the ray
+            beside it; 1 gives all pixels one ray.
         divergence: see there.
     """
 
@@ -57,7 +56,6 @@ class BatchesConfig:
     jitter: bool = False
     precrop_steps: int = 0
     precrop_fraction: float = 0.5
-    cache_paths: bool = True
     supersample: int = 1
     divergence: float = 8.0
 
@@ -73,7 +71,7 @@ class EvaluationConfig:
         lpips_vgg_backbone: file of VGG-16 weights; none looks in torch's hub cache only.
         every: steps between two looks at one validation image while training; 0 for never.
         supersample: rays along each side of a pixel that is supersampled, see `divergence`; 1 for one central ray.
-        divergence: supersample pixels whose exit direction differs from a neighbour's by this many pixels; 0 for all.
+        divergence: supersample pixels whose ray leaves this many pixels or more away from the one beside it; 0 for all.
     """
 
     split: str = "test"

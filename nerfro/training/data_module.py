@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import torch
 from lightning.pytorch import LightningDataModule
+from omegaconf import DictConfig
 
 from nerfro.data.base import Views
+from nerfro.models.base import NerfModel
 from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Batch
 
 
 class RayDataModule(LightningDataModule):
     """Random training pixels, resident on the training device, and one validation view at a time.
+
+    Lightning fetches data a step early. It is given the numbers of the steps, and each step's batch when it begins: so
+    paths that bend in a medium that learns bend in it as it is then.
 
     Args:
         batches: of training pixels.
@@ -24,22 +32,89 @@ class RayDataModule(LightningDataModule):
     def __init__(self, batches: RayBatches, validation: Views | None, every: int) -> None:
         super().__init__()
         self.batches, self.validation, self.every = batches, validation, every
+        self._ahead: OneAhead | None = None
 
-    def train_dataloader(self) -> RayBatches:
+    def train_dataloader(self) -> Iterator[int]:
         assert self.trainer is not None  # Lightning attaches it before it asks
-        batches = self.batches.to(self.trainer.strategy.root_device)
+        device = self.trainer.strategy.root_device
+        self._batches = self.batches.to(device)
+        self.end_thread()
+        if device.type == "cpu" and can_trace_ahead(self.trainer.lightning_module):  # type: ignore[arg-type]
+            self._ahead = OneAhead(self._batches.batch)
         # Lightning asks after it has restored a checkpoint, so a resumed run goes on with the batch it would have had.
-        batches.first_step = self.trainer.global_step
-        return batches
+        return itertools.count(self.trainer.global_step)
 
     def val_dataloader(self) -> RotatingView | list[int]:
         return [] if self.validation is None else RotatingView(self)
 
+    def transfer_batch_to_device(self, batch: int, device: torch.device, dataloader_idx: int) -> Batch | int:
+        assert self.trainer is not None
+        if not self.trainer.training:
+            return batch  # the number of a validation view
+        if self._ahead is not None:
+            return self._ahead(batch)
+        with torch.no_grad():
+            return self._batches.batch(batch)
+
     def teardown(self, stage: str) -> None:
+        self.end_thread()
         self.batches.forget()
 
-    def transfer_batch_to_device(self, batch: Batch | int, device: torch.device, dataloader_idx: int) -> Batch | int:
-        return batch  # it is there already
+    def on_exception(self, exception: BaseException) -> None:
+        self.end_thread()
+
+    def end_thread(self) -> None:
+        if self._ahead is not None:
+            self._ahead.close()
+            self._ahead = None
+
+
+class OneAhead:
+    """Has a thread make what is asked for next, on a core that waits. It makes the same as it would when it is asked.
+
+    The thread keeps to one core, and kernels leave Python and Numba's threads to others (`kernels.compilation`).
+
+    Args:
+        make: makes the batch of a step; a function of the step alone.
+    """
+
+    def __init__(self, make: Callable[[int], Batch]) -> None:
+        self._make = make
+        self._next: tuple[int, Future[Batch]] | None = None
+        # PyTorch counts threads for each thread on its own, and gives the last count to those that begin.
+        threads = torch.get_num_threads()
+        self._thread = ThreadPoolExecutor(1, "paths", lambda: torch.set_num_threads(1))
+        self._thread.submit(torch.get_num_threads).result()
+        torch.set_num_threads(threads)
+
+    def __call__(self, step: int) -> Batch:
+        """The batch of a step; whatever goes wrong in the thread is raised here."""
+        if self._next is None or self._next[0] != step:
+            self._next = (step, self._thread.submit(self._without_gradients, step))
+        batch = self._next[1].result()
+        self._next = (step + 1, self._thread.submit(self._without_gradients, step + 1))
+        return batch
+
+    def close(self) -> None:
+        """End the thread."""
+        self._thread.shutdown(cancel_futures=True)
+
+    def _without_gradients(self, step: int) -> Batch:
+        with torch.no_grad():
+            return self._make(step)
+
+
+def can_trace_ahead(model: NerfModel) -> bool:
+    """Whether a thread can trace the next step's rays meanwhile: nothing that bends them learns, and a core is free."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with torch.enable_grad():
+        return cores > 1 and not model.paths_learn and model.path_sampler.releases_python(model.medium)
+
+
+def traced(batches: RayBatches, model: NerfModel, config: DictConfig) -> RayBatches:
+    """The batches with their paths, and with several rays in pixels for which one does not stand."""
+    side = config.batches.supersample if model.path_sampler.needs_medium else 1  # straight rays do not part
+    return batches.traced(lambda rays, view: model.trace(model.camera(rays, view)), side, config.batches.divergence)
 
 
 class RotatingView:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable
 from typing import Literal, get_args
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from nerfro.cameras import Cameras, Window, central_window
@@ -16,17 +16,22 @@ from nerfro.data.base import Views
 from nerfro.data.pictures import Pictures
 from nerfro.distributed import share_of
 from nerfro.errors import NerfroError
-from nerfro.pixel_parts import PixelParts
+from nerfro.pixel_parts import divergence, part_rays, pixel_rays, rays_beside
+from nerfro.rays import Rays
 from nerfro.training.pixel_store import PixelStore
-from nerfro.types import Batch
+from nerfro.types import Batch, Path
 
 Batching = Literal["single_image", "all_images"]
+Tracer = Callable[[Rays, Tensor], Path]
+
+# Numbers of divided pixels are multiples of this share of a batch, so that tensors have few different sizes.
+_STEP_OF_DIVIDED = 1 / 32
 
 
 class RayBatches:
-    """An endless sequence of random training pixels, in which batch `i` depends on the seed and `i` alone.
+    """Random training pixels of every step, which depend on the seed and the step alone.
 
-    A run that stops and resumes with `first_step` set therefore sees the batches that it would have seen.
+    A run that stops and resumes therefore sees the batches that it would have seen.
 
     Args:
         views: posed images, of which the usable pixels are drawn; their tensors' device is where batches are made, see
@@ -37,8 +42,7 @@ class RayBatches:
         seed: of the sequence.
         precrop_steps: number of steps at first during which pixels come from the middle of the images.
         precrop_fraction: share of each side that this middle spans.
-        jitter: send rays through a random place in each pixel instead of through its centre.
-        first_step: step at which iteration begins.
+        jitter: send rays through a random place in each pixel (or part of one) instead of through its centre.
 
     Raises:
         NerfroError: an option is out of range, or an image (or its middle) has fewer usable pixels than a batch.
@@ -53,7 +57,6 @@ class RayBatches:
         precrop_steps: int = 0,
         precrop_fraction: float = 0.5,
         jitter: bool = False,
-        first_step: int = 0,
     ) -> None:
         if batching not in get_args(Batching):
             raise NerfroError(f"batching={batching!r} is unknown; choose {' or '.join(map(repr, get_args(Batching)))}")
@@ -61,17 +64,16 @@ class RayBatches:
             ("batch_size", batch_size, 1),
             ("seed", seed, 0),
             ("precrop_steps", precrop_steps, 0),
-            ("first_step", first_step, 0),
         ):
             if value < least:
                 raise NerfroError(f"{name}={value} is too small; take {least} or more")
         if len(views) == 0:
             raise NerfroError("there are no training images; give at least one")
         self.batch_size, self.batching, self.seed = batch_size, batching, seed
-        self.precrop_steps, self.jitter, self.first_step = precrop_steps, jitter, first_step
+        self.precrop_steps, self.jitter = precrop_steps, jitter
         self._share = slice(batch_size)
-        self._parts: PixelParts | None = None
-        self._place: Int[np.ndarray, "V*H*W"] = np.empty(0, np.int32)  # of each pixel among the divided ones, or -1
+        self._trace: Tracer | None = None
+        self._side, self._divergence = 1, 0.0
         cameras = views.cameras
         self._cameras = cameras
         self._pixels = PixelStore(views.images)
@@ -91,17 +93,20 @@ class RayBatches:
         """The same sequence with cameras and pixels on another device."""
         moved = copy.copy(self)
         moved._cameras, moved._pixels = self._cameras.to(device), self._pixels.to(device)
-        moved._parts = None if self._parts is None else self._parts.to(device)
         return moved
 
-    def dividing(self, parts: PixelParts) -> RayBatches:
-        """The sequence with all rays of `parts` where it has one of the pixels that they divide."""
-        assert parts.pixels is not None
-        divided = copy.copy(self)
-        divided._parts = parts
-        divided._place = np.full(len(self._cameras) * self._cameras.height * self._cameras.width, -1, np.int32)
-        divided._place[parts.pixels.cpu().numpy()] = np.arange(len(parts.pixels))
-        return divided
+    def traced(self, trace: Tracer, side: int = 1, divergence: float = 8.0) -> RayBatches:
+        """The sequence with the paths of its rays, more than one for pixels for which one does not stand.
+
+        Args:
+            trace: paths of the rays of views, without gradients.
+            side: rays in each direction of a divided pixel; 1 divides none.
+            divergence: pixels are divided whose ray leaves in another direction than the one beside it, by this many
+                pixel angles or more; see `pixel_parts.divergence`.
+        """
+        traced = copy.copy(self)
+        traced._trace, traced._side, traced._divergence = trace, side, divergence
+        return traced
 
     def forget(self) -> None:
         """Give back the memory of mapped pixels, which are read again when they are asked for."""
@@ -121,12 +126,6 @@ class RayBatches:
         shared._share = share_of(self.batch_size, rank, size)
         return shared
 
-    def __iter__(self) -> Iterator[Batch]:
-        step = self.first_step
-        while True:
-            yield self.batch(step)
-            step += 1
-
     def batch(self, step: int) -> Batch:
         """The batch (or the share) of a step: a function of seed and step alone, on every device the same pixels."""
         cameras = self._cameras
@@ -136,59 +135,70 @@ class RayBatches:
         view, pixel = self._draw(generator, window)
         row, column = window.top + pixel // window.width, window.left + pixel % window.width
         drawn = (view * height + row) * width + column
-        if self._parts is not None:
-            return self._divided_batch(drawn, cameras.crop(window))
-        drawn = drawn[self._share]
+        if self._side > 1:
+            return self._divided_batch(drawn, generator, cameras.crop(window))
         # One small copy to the device; the rest is computed there.
-        index = torch.from_numpy(drawn).to(cameras.device, non_blocking=True)
-        jitter = None
-        if self.jitter:
-            offsets = generator.random((self.batch_size, 2), dtype=np.float32)
-            jitter = torch.from_numpy(offsets[self._share]).to(cameras.device, non_blocking=True)
-        return Batch(
-            rays=cameras.rays(index // (height * width), index // width % height, index % width, jitter),
-            view=index // (height * width),
-            rgb=self._pixels[index],
-            index=index,
-            cameras=cameras.crop(window),
-        )
+        index = self._to_device(drawn[self._share])
+        place = self._to_device(self._random(generator, 2)[self._share]) if self.jitter else None
+        rays, views = pixel_rays(cameras, index, place), index // (height * width)
+        path = None if self._trace is None else self._trace(rays, views)
+        return Batch(rays, views, self._pixels[index], cameras.crop(window), path=path, index=index)
 
-    def _divided_batch(self, drawn: Int[np.ndarray, "P"], cameras: Cameras) -> Batch:
+    def _divided_batch(self, drawn: Int[np.ndarray, "P"], generator: np.random.Generator, cameras: Cameras) -> Batch:
         """The batch of the drawn pixels: first those that have one ray, then the divided ones with all of theirs."""
-        assert self._parts is not None
-        several = self._parts.rays_per_pixel
-        is_divided = self._place[drawn] >= 0
+        assert self._trace is not None
+        several = self._side**2
+        pixels = self._to_device(drawn)
+        view = pixels // (self._cameras.height * self._cameras.width)
+        place = self._to_device(self._random(generator, 2)) if self.jitter else None
+        place_in_part = self._to_device(self._random(generator, several, 2)) if self.jitter else None
+        # Every process traces the rays of the whole batch once, to know how the others divide their pixels.
+        rays = pixel_rays(self._cameras, pixels, place)
+        path = self._trace(rays.followed_by(rays_beside(self._cameras, pixels, place)), view.repeat(2))
+        exits, beside = path.first_of_ray(path.exit_directions).view(2, -1, 3)
+        divided = self._widest(divergence(self._cameras, pixels, exits, beside))
+
         # Each pixel's first row in the whole batch.
-        num_rays = np.where(is_divided, several, 1)
-        order = np.argsort(is_divided, kind="stable")
-        first_row = np.empty(len(drawn), np.int64)
-        first_row[order] = np.cumsum(num_rays[order]) - num_rays[order]
+        num_rays = torch.where(divided, several, 1)
+        order = torch.argsort(divided.int(), stable=True)
+        first_row = torch.empty_like(num_rays)
+        first_row[order] = num_rays[order].cumsum(0) - num_rays[order]
 
-        pixel, row, divided = drawn[self._share], first_row[self._share], is_divided[self._share]
-        first_part = several * self._place[pixel[divided]].astype(np.int64)
-
-        def for_each_ray(of_whole: np.ndarray, of_divided: np.ndarray, step: int) -> np.ndarray:
-            return np.concatenate([of_whole, (of_divided[:, None] + step * np.arange(several)).ravel()])
-
-        of_each_ray = (
-            for_each_ray(pixel[~divided], pixel[divided], 0),
-            for_each_ray(pixel[~divided], first_part, 1),
-            for_each_ray(row[~divided], row[divided], 1),
+        own = torch.zeros_like(divided)
+        own[self._share] = True
+        whole, divided = (own & ~divided).nonzero()[:, 0], (own & divided).nonzero()[:, 0]
+        parts = part_rays(
+            self._cameras, pixels[divided], self._side, None if place_in_part is None else place_in_part[divided]
         )
-        # One small copy to the device; the rest is computed there.
-        pixels, index, rows = torch.from_numpy(np.stack(of_each_ray)).to(self._cameras.device, non_blocking=True)
-        num_whole = int((~divided).sum())
+        view_of_part = view[divided].repeat_interleave(several)
+        index = torch.cat([pixels[whole], pixels[divided].repeat_interleave(several)])
+        rows = first_row[divided][:, None] + torch.arange(several, device=pixels.device)
         return Batch(
-            rays=PixelParts(self._cameras).rays(index[:num_whole]).followed_by(self._parts.rays(index[num_whole:])),
-            view=pixels // (self._cameras.height * self._cameras.width),
-            rgb=self._pixels[pixels],
-            index=index,
+            rays=rays[whole].followed_by(parts),
+            view=torch.cat([view[whole], view_of_part]),
+            rgb=self._pixels[index],
             cameras=cameras,
-            num_whole=num_whole,
+            num_whole=len(whole),
             rays_per_pixel=several,
-            rows=rows,
+            rows=torch.cat([first_row[whole], rows.flatten()]),
             num_rows=int(num_rays.sum()),
+            path=path[whole].followed_by(self._trace(parts, view_of_part)),
+            index=index,
         )
+
+    def _widest(self, divergence: Float[Tensor, "P"]) -> Bool[Tensor, "P"]:
+        """Which pixels are divided: all that diverge too much, and the next ones up to a round number."""
+        step = max(1, round(_STEP_OF_DIVIDED * len(divergence)))
+        wanted = -(-int((divergence >= self._divergence).sum()) // step) * step
+        chosen = torch.zeros_like(divergence, dtype=torch.bool)
+        chosen[divergence.argsort(descending=True, stable=True)[:wanted]] = True
+        return chosen
+
+    def _random(self, generator: np.random.Generator, *shape: int) -> Float[np.ndarray, "P ..."]:
+        return generator.random((self.batch_size, *shape), dtype=np.float32)
+
+    def _to_device(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(array).to(self._cameras.device, non_blocking=True)
 
     def _draw(self, generator: np.random.Generator, window: Window) -> tuple[np.ndarray | np.int64, np.ndarray]:
         """Views and pixels of the window, numbered row by row."""

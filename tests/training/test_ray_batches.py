@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import islice
 
 import numpy as np
 import pytest
@@ -166,12 +165,6 @@ def test_batch_without_equal_shares_is_refused(views):
     message = "batches.size=30 cannot be shared evenly by 4 processes; take a multiple of 4"
     with pytest.raises(NerfroError, match=message):
         RayBatches(views, 30).share(0, 4)
-
-
-def test_iteration_resumed_at_a_step_goes_on_with_the_same_batches(views):
-    whole = list(islice(RayBatches(views, 30, seed=1), 8))
-    rest = list(islice(RayBatches(views, 30, seed=1, first_step=5), 3))
-    assert [b.index.tolist() for b in rest] == [b.index.tolist() for b in whole[5:]]
 
 
 def test_batches_ignore_and_spare_the_global_generator(views):

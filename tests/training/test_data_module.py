@@ -1,0 +1,170 @@
+"""Batches made one step ahead are the ones that a step would make, and whatever goes wrong is told."""
+
+from __future__ import annotations
+
+import threading
+import time
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from nerfro.kernels import compilation
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.samplers.eikonal import Eikonal
+from nerfro.samplers.snell import Snell
+from nerfro.training.data_module import OneAhead, RayDataModule, can_trace_ahead
+from nerfro.types import Rays
+
+
+@pytest.fixture(scope="module")
+def ball() -> SdfGrid:
+    axis = torch.linspace(-1.5, 1.5, 40)
+    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    box = torch.tensor([[-1.5] * 3, [1.5] * 3])
+    return SdfGrid.from_distances(points.norm(dim=-1)[None] - 0.8, box, [1.5], 0.01)
+
+
+def rays(num: int, seed: int = 0) -> Rays:
+    generator = torch.Generator().manual_seed(seed)
+    origins = torch.nn.functional.normalize(torch.randn(num, 3, generator=generator), dim=-1) * 4
+    targets = torch.rand(num, 3, generator=generator) * 1.6 - 0.8
+    one = torch.ones(num)
+    return Rays(origins, torch.nn.functional.normalize(targets - origins, dim=-1), 0 * one, 2 * one, 6 * one)
+
+
+def running() -> list[str]:
+    return [thread.name for thread in threading.enumerate() if thread.name.startswith("paths")]
+
+
+@pytest.fixture
+def ahead():
+    """Makes an OneAhead and ends its thread."""
+    made: list[OneAhead] = []
+
+    def make(function) -> OneAhead:
+        made.append(OneAhead(function))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+    assert not running()
+
+
+def test_paths_made_ahead_are_those_of_the_step_in_any_order(ahead, ball: SdfGrid) -> None:
+    sampler = Snell()
+    make: Any = lambda step: sampler(rays(300, step), ball)  # noqa: E731
+    one = ahead(make)
+    for step in (0, 1, 2, 7, 8, 3):
+        expected, got = make(step), one(step)
+        for name in ("positions", "directions", "s", "exit_directions", "body"):
+            assert torch.equal(getattr(got, name), getattr(expected, name))
+
+
+def test_the_next_one_is_made_while_the_step_works(ahead) -> None:
+    begun = threading.Event()
+    one = ahead(lambda step: begun.set() if step == 1 else None)
+    one(0)
+    assert begun.wait(10), "nobody has asked for step 1 yet"
+
+
+def test_what_goes_wrong_in_the_thread_is_raised_where_the_batch_is_asked_for(ahead) -> None:
+    def make(step: int) -> int:
+        if step == 2:
+            raise ValueError("no rays")
+        return step
+
+    one = ahead(make)
+    assert [one(0), one(1)] == [0, 1]
+    with pytest.raises(ValueError, match="no rays"):
+        one(2)
+
+
+def test_the_thread_has_one_core_and_leaves_all_others_theirs(ahead) -> None:
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        one = ahead(lambda step: (torch.get_num_threads(), torch.is_grad_enabled()))
+        assert one(0) == (1, False)
+        assert torch.get_num_threads() == 2
+        assert ahead(lambda step: None) is not None
+        seen: list[int] = []
+        later = threading.Thread(target=lambda: seen.append(torch.get_num_threads()))
+        later.start()
+        later.join()
+        assert seen == [2]
+    finally:
+        torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize("sampler", [Snell(), Eikonal()], ids=["snell", "eikonal"])
+def test_python_goes_on_while_the_thread_traces(sampler: Snell | Eikonal, ahead, ball: SdfGrid) -> None:
+    assert sampler.releases_python(ball)
+    many = rays(50_000)
+    sampler(many[:10], ball)
+    spans: list[float] = []
+
+    def make(step: int) -> None:
+        begun = time.perf_counter()
+        sampler(many, ball)
+        spans.append(time.perf_counter() - begun)
+
+    one = ahead(lambda step: make(step) if step == 1 else sampler(many[:10], ball))
+    one(0)
+    longest, last = 0.0, time.perf_counter()
+    while not spans:
+        now = time.perf_counter()
+        longest, last = max(longest, now - last), now
+    assert longest < 0.5 * spans[0]
+
+
+def test_kernels_bend_rays_alike_on_one_core_and_on_several(monkeypatch: pytest.MonkeyPatch, ball: SdfGrid) -> None:
+    for sampler in (Snell(), Eikonal()):
+        paths = []
+        for threads in (1, 2):
+            monkeypatch.setattr(compilation, "use_threads", lambda threads=threads: threads)
+            paths.append(sampler(rays(2000), ball))
+        assert paths[0].refracted.any()
+        torch.testing.assert_close(paths[0].positions, paths[1].positions, rtol=0, atol=1e-6)
+        assert torch.equal(paths[0].refracted, paths[1].refracted)
+
+
+def test_nothing_is_traced_ahead_where_paths_learn_or_python_is_needed(ball: SdfGrid, monkeypatch) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1}, raising=False)
+
+    def model(path_sampler, learns: bool = False) -> Any:
+        return SimpleNamespace(path_sampler=path_sampler, medium=ball, paths_learn=learns)
+
+    assert can_trace_ahead(model(Snell()))
+    assert not can_trace_ahead(model(Snell(), learns=True))
+    assert not can_trace_ahead(model(Snell("mesh")))
+    assert not can_trace_ahead(model(Eikonal("rk4")))
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0}, raising=False)
+    assert not can_trace_ahead(model(Snell())), "one core has nobody who waits"
+
+
+@pytest.mark.parametrize("learns", [True, False])
+def test_a_batch_is_made_when_its_step_begins_if_paths_learn(
+    learns: bool, ball: SdfGrid, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lightning fetches one step early, so what it fetches must not be the batch."""
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1}, raising=False)
+    made: list[int] = []
+    batches: Any = SimpleNamespace(batch=lambda step: made.append(step) or step * 10)
+    batches.to = lambda device: batches
+    data = RayDataModule(batches, None, 0)
+    model = SimpleNamespace(path_sampler=Snell(), medium=ball, paths_learn=learns)
+    strategy = SimpleNamespace(root_device=torch.device("cpu"))
+    data.trainer = SimpleNamespace(strategy=strategy, lightning_module=model, global_step=5, training=True)  # type: ignore[assignment]
+    steps = iter(data.train_dataloader())
+    first, _second = next(steps), next(steps)
+    assert not made
+    assert data.transfer_batch_to_device(first, torch.device("cpu"), 0) == 50
+    assert bool(running()) != learns
+    assert made == [5] or not learns
+    data.trainer.training = False  # type: ignore[misc]
+    assert data.transfer_batch_to_device(3, torch.device("cpu"), 0) == 3, "a validation view stays its number"
+    data.teardown("fit")
+    assert not running()
