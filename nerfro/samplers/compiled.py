@@ -118,7 +118,14 @@ def _for_kernels(medium: VoxelGrid | SdfGrid) -> MediumGrid:
         inverse_spacing = (np.array(medium.coefficients.shape[1:]) - 1) / (high - low)
         values, clearance = medium.coefficients.detach().numpy(), medium.coarse_clearance.numpy()
         return MediumGrid(
-            values, clearance, medium.iors.detach().double().numpy(), medium.shell, low, high, inverse_spacing, inverse_spacing / BLOCK
+            values,
+            clearance,
+            medium.iors.detach().double().numpy(),
+            medium.shell,
+            low,
+            high,
+            inverse_spacing,
+            inverse_spacing / BLOCK,
         )
     inverse_spacing = (np.array(medium.table.shape[:3]) - 1) / (high - low)
     values, clearance = medium.table.detach().numpy(), medium.clearance_grid.numpy()

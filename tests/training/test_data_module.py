@@ -154,6 +154,7 @@ def test_a_batch_is_made_when_its_step_begins_if_paths_learn(
     made: list[int] = []
     batches: Any = SimpleNamespace(batch=lambda step: made.append(step) or step * 10)
     batches.to = lambda device: batches
+    batches.forget = lambda: None
     data = RayDataModule(batches, None, 0)
     model = SimpleNamespace(path_sampler=Snell(), medium=ball, paths_learn=learns)
     strategy = SimpleNamespace(root_device=torch.device("cpu"))
