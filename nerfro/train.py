@@ -56,12 +56,12 @@ def main(config: DictConfig) -> None:
     throughput, interruption = Throughput(), StopOnSignal()
     trainer = make_trainer(config, folder, [throughput, interruption])
     batches = batches.share(trainer.global_rank, trainer.world_size)
+    batches = traced(batches, model, config)
     memory = require_memory(model, batches.batch(0).rays, trainer.strategy.root_device)
     if trainer.is_global_zero:
         claim(folder, checkpoint is not None, needed_bytes(model))
         record(folder, config)
         print(f"nerfro: {config.name} on {config.data.root} -> {folder}\n{memory}", flush=True)
-    batches = traced(batches, model, config)
     if config.compile is not None:
         compile_networks(model, config.compile)
 

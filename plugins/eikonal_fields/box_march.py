@@ -57,6 +57,10 @@ class BoxMarch(PathSampler):
             rays.radii,
         )
 
+    def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
+        """The path traced again, for `forward` lets gradients through."""
+        return self(rays, medium)
+
     def _march(self, rays: Rays, entry: Float[Tensor, "R"], medium: Medium) -> Path:
         diagonal = torch.linalg.vector_norm(medium.box[1] - medium.box[0])
         end = torch.minimum(entry + diagonal, rays.far)

@@ -142,14 +142,13 @@ class EikonalFields(NerfModel):
         interior = list(self.interior.parameters()), self.optimizer_config.learning_rate
         return {**super().parameter_groups(), "interior": interior}
 
-    def forward(self, rays: Rays) -> list[Rendering]:
-        """Render rays as the present stage sees them."""
+    def trace(self, rays: Rays, path: Path | None = None) -> Path:
+        """Paths of rays as the present stage sees them, traced anew: what bends them is learned, or was."""
         stage = Stage(int(self.stage))
         if stage == Stage.SCENE:
-            return self.render_path(straight_path(rays))
+            return straight_path(rays)
         with torch.set_grad_enabled(stage == Stage.INDEX and torch.is_grad_enabled()):
-            path = self.path_sampler(rays, self.medium)
-        return self.render_path(path)
+            return self.path_sampler(rays, self.medium)
 
     def render_path(self, path: Path) -> list[Rendering]:
         stage = Stage(int(self.stage))
