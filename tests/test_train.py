@@ -221,5 +221,5 @@ def test_picture_does_not_depend_on_the_chunk_size(chunk_size: int, run: Path, t
     for size in (chunk_size, 8192):
         config.evaluation.chunk_size = size
         pictures.append(restore(checkpoint, config).render(rays))
-    for name in ("rgb", "depth", "opacity"):
+    for name in ("radiance", "depth", "opacity"):
         torch.testing.assert_close(getattr(pictures[0], name), getattr(pictures[1], name), atol=1e-5, rtol=1e-5)

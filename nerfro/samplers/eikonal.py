@@ -243,8 +243,8 @@ def _march(
         length = torch.linalg.vector_norm(state.positions - x[stepping], dim=-1)
         s[stepping] += length
         x[stepping], v[stepping], n[stepping], g[stepping] = state
-        # A straight step leaves the direction as it is, to the last bit.
-        bent = stepping[varies | (state.gradients != 0).any(-1)]
+        # A straight step leaves the direction as it is, to the last bit; but a replay must learn what would bend it.
+        bent = stepping if v.requires_grad else stepping[varies | (state.gradients != 0).any(-1)]
         d[bent] = torch.nn.functional.normalize(v[bent], dim=-1)
         vertices.after_step(stepping, length, x, d, s)
         outside = ((x[active] < medium.box[0]) | (x[active] > medium.box[1])).any(-1)
