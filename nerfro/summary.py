@@ -22,37 +22,23 @@ from nerfro.report.views import Wanted
 
 @dataclass
 class SummaryConfig:
-    """What `python -m nerfro.summary` is asked.
+    """What `python -m nerfro.summary` is asked."""
 
-    Attributes:
-        runs: run folders, folders that hold some at any depth, or globs of either.
-        out: folder for the tables, one for each budget, as .csv, .md, .tex and .html, and for the report;
-            none only prints.
-        report: whether to write the page `report.html`, to `outputs/summary` if `out` is none.
-        metrics: columns of each scene, see docs/metrics.md.
-        region: of the pictures: full, mask or crop.
-        methods: titles of experiments, in the order of the rows; others follow under their own names.
-        scenes: titles of scenes, by the last part of the data's folder, in the order of the columns.
-        views: number of views of each scene on the page, evenly spread; 0 for all.
-        view: views of the figures, as in {torus: 3}; otherwise those of the median score.
-        crops: insets of the figures, as in {torus: [[top, left, size], ...]}, pixels; otherwise those where methods
-            differ most.
-        error_map: what the error maps show: squared_error, ssim, lpips, lpips_vgg or flip.
-        overwrite: whether files in `out` may be replaced.
-    """
-
+    # Run folders, folders that hold some at any depth, or globs of either.
     runs: Any = field(default_factory=lambda: ["outputs"])
+    # Folder for the tables, one for each budget, as .csv, .md, .tex and .html, and for the report; none only prints.
     out: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    report: bool = False
-    metrics: list[str] = field(default_factory=lambda: ["psnr", "ssim", "lpips"])
-    region: str = FULL
-    methods: dict[str, str] = field(default_factory=dict)
-    scenes: dict[str, str] = field(default_factory=dict)
-    views: int = 8
-    view: Any = None
+    report: bool = False  # whether to write the page `report.html`, to `outputs/summary` if `out` is none
+    metrics: list[str] = field(default_factory=lambda: ["psnr", "ssim", "lpips"])  # columns, see docs/metrics.md
+    region: str = FULL  # of the pictures: full, mask or crop
+    methods: dict[str, str] = field(default_factory=dict)  # titles of experiments, in the order of the rows
+    scenes: dict[str, str] = field(default_factory=dict)  # titles of scenes, by the last part of the data's folder
+    views: int = 8  # number of views of each scene on the page, evenly spread; 0 for all
+    view: Any = None  # views of the figures, as in {torus: 3}; otherwise those of the median score
+    # Insets of the figures, as in {torus: [[top, left, size], ...]}, pixels; otherwise those where methods differ most.
     crops: Any = None
-    error_map: str = "squared_error"
-    overwrite: bool = False
+    error_map: str = "squared_error"  # what the error maps show: squared_error, ssim, lpips, lpips_vgg or flip
+    overwrite: bool = False  # whether files in `out` may be replaced
 
 
 @entry_point("summary", SummaryConfig)

@@ -22,19 +22,12 @@ SQUARED_ERROR_LIMIT = 0.05
 
 @dataclass(frozen=True)
 class ErrorMap:
-    """Error at each pixel of a picture.
+    """Error at each pixel of a picture."""
 
-    Attributes:
-        name: of the metric, as in file names.
-        title: what the values are, written at the colour scale.
-        values: 0 where there is no error; NaN where there is no value.
-        limit: value of the last colour of the scale, the same for all pictures.
-    """
-
-    name: str
-    title: str
-    values: Float[Tensor, "H W"]
-    limit: float
+    name: str  # of the metric, as in file names
+    title: str  # what the values are, written at the colour scale
+    values: Float[Tensor, "H W"]  # 0 where there is no error; NaN where there is no value
+    limit: float  # value of the last colour of the scale, the same for all pictures
 
     def colours(self) -> Float[Tensor, "H W 3"]:
         """The map in magma, sRGB in [0, 1]."""
@@ -50,14 +43,6 @@ def error_maps(
 
     1 - SSIM and LPIPS are left out where the picture is too small for them. 1 - SSIM has no values on the border of
     five pixels, whose windows stick out of the picture.
-
-    Args:
-        prediction: sRGB in [0, 1].
-        target: sRGB in [0, 1].
-        lpips_networks: by the name of their metric, see `find_lpips_networks`.
-
-    Raises:
-        NerfroError: if the shapes differ.
     """
     size = min(prediction.shape[:2])
     maps = [ErrorMap("squared_error", "squared error", squared_error_map(prediction, target), SQUARED_ERROR_LIMIT)]
@@ -74,18 +59,7 @@ def error_maps(
 
 
 def squared_error_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
-    """Squared error of each pixel, mean over channels; its mean over the picture is what PSNR measures.
-
-    Args:
-        prediction: sRGB in [0, 1].
-        target: sRGB in [0, 1].
-
-    Returns:
-        Values in [0, 1].
-
-    Raises:
-        NerfroError: if the shapes differ.
-    """
+    """Squared error of each pixel, mean over channels; its mean over the picture is what PSNR measures."""
     if prediction.shape != target.shape:
         raise NerfroError(
             f"cannot compare a prediction {list(prediction.shape)} with a reference {list(target.shape)}; "

@@ -25,14 +25,6 @@ def error_sheet(
     """Draw a prediction, its reference and its error maps in one row, with the colour scale below each map.
 
     Pictures are enlarged by a whole number, without smoothing, so that pixels are seen as they are.
-
-    Args:
-        prediction: sRGB in [0, 1].
-        target: sRGB in [0, 1].
-        maps: see `error_maps`.
-
-    Returns:
-        The drawn sheet, sRGB in [0, 1].
     """
     zoom = -(-MIN_WIDTH // target.shape[1])
     height, width = zoom * target.shape[0], zoom * target.shape[1]

@@ -16,15 +16,7 @@ from nerfro.evaluation.regions import mean_over
 
 
 def flip_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
-    """Visible difference at each pixel.
-
-    Args:
-        prediction: sRGB in [0, 1].
-        target: sRGB in [0, 1].
-
-    Returns:
-        Values in [0, 1], float32; 0 where nothing is seen.
-    """
+    """Visible difference at each pixel of sRGB in [0, 1]: values in [0, 1], float32; 0 where nothing is seen."""
     pictures = [image.detach().cpu().float().contiguous().numpy() for image in (target, prediction)]
     errors, _, _ = flip_evaluator.evaluate(*pictures, "LDR", applyMagma=False, computeMeanError=False)
     return torch.from_numpy(errors[..., 0]).to(prediction.device)

@@ -19,24 +19,15 @@ from nerfro.evaluation.regions import object_pixels
 
 @dataclass(frozen=True)
 class PicturePair:
-    """A prediction and what it is compared with.
+    """A prediction and what it is compared with."""
 
-    Attributes:
-        name: what both files are called, without extension.
-        prediction, reference: the files.
-        mask: the file that says where the object is; None to take the reference's transparency, if it has any.
-    """
-
-    name: str
-    prediction: Path
+    name: str  # what both files are called, without extension
+    prediction: Path  # the files
     reference: Path
-    mask: Path | None
+    mask: Path | None  # says where the object is; None to take the reference's transparency, if it has any
 
     def load(self, alpha: Alpha) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"], Float[Tensor, "H W"] | None]:
         """Read the prediction, the reference, and the share of each pixel that the object covers, if it is known.
-
-        Args:
-            alpha: what becomes of transparency in both pictures, see `read_rgb`.
 
         Raises:
             NerfroError: a file cannot be read, sizes differ, or the mask is empty.
@@ -63,16 +54,10 @@ class PicturePair:
 
 
 def match_folders(predictions: Path, references: Path, masks: Path | None) -> list[PicturePair]:
-    """Pair the pictures of two folders by their names without extension; none may be left over.
+    """Pair the pictures of two folders by their names without extension, in the order of their names.
 
-    Args:
-        predictions: folder of pictures.
-        references: folder of pictures; masks among them (`mask_<name>.png`) are not references.
-        masks: folder of masks of the same names; by default they are looked for as `find_mask` does, beside the
-            references and in masks/ there.
-
-    Returns:
-        Pairs in the order of their names.
+    Masks among the references (`mask_<name>.png`) are not references. Without a folder of masks, they are looked for as
+    `find_mask` does, beside the references and in masks/ there.
 
     Raises:
         NerfroError: a folder does not exist or has no pictures, a picture has no partner, or a name occurs twice.

@@ -42,19 +42,12 @@ class Convolution(NamedTuple):
 
 
 class Backbone(NamedTuple):
-    """A network whose features are compared.
+    """A network whose features are compared."""
 
-    Attributes:
-        published: where its weights are.
-        heads: name of its linear heads in the file of published ones.
-        min_size: pixels; in smaller pictures the last pooling has nothing left to pool.
-        layers: its convolutions, in order.
-    """
-
-    published: Published
-    heads: str
-    min_size: int
-    layers: tuple[Convolution, ...]
+    published: Published  # where its weights are
+    heads: str  # name of its linear heads in the file of published ones
+    min_size: int  # pixels; in smaller pictures the last pooling has nothing left to pool
+    layers: tuple[Convolution, ...]  # its convolutions, in order
 
 
 ALEX = Backbone(
@@ -103,16 +96,7 @@ class LpipsNetwork(nn.Module):
     scale: Tensor
 
     def __init__(self, backbone: Backbone, weights: dict[str, Tensor], heads: Sequence[Float[Tensor, "C"]]) -> None:
-        """Take the weights.
-
-        Args:
-            backbone: which network.
-            weights: its state dict, `features.<i>.weight` and `features.<i>.bias`.
-            heads: weights of the linear heads, one for each layer that is compared.
-
-        Raises:
-            NerfroError: if a weight is missing or of another shape.
-        """
+        """Take the weights of the backbone, as in its state dict, and of a linear head for each layer compared."""
         super().__init__()
         self.backbone = backbone
         for i, layer in enumerate(backbone.layers):
@@ -131,19 +115,9 @@ class LpipsNetwork(nn.Module):
         target: Float[Tensor, "H W 3"],
         inside: Bool[Tensor, "H W"] | None = None,
     ) -> Float[Tensor, ""]:
-        """Perceptual distance of two pictures.
+        """Perceptual distance of two pictures, sRGB in [0, 1]: the sum of the layers' means, as published.
 
-        Args:
-            prediction: sRGB in [0, 1].
-            target: sRGB in [0, 1].
-            inside: pixels over which `distance_map` is averaged; by default the published distance is taken, the sum
-                of the layers' own means.
-
-        Returns:
-            Distance, 0 for equal pictures; NaN for an empty mask.
-
-        Raises:
-            NerfroError: if the picture is smaller than the backbone's `min_size`.
+        With a mask it is the mean of `distance_map` over its pixels, and NaN if there are none.
         """
         if inside is not None:
             return mean_over(self.distance_map(prediction, target), inside)
@@ -152,15 +126,7 @@ class LpipsNetwork(nn.Module):
     def distance_map(self, prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
         """Perceptual distance around each pixel, for error maps: the layers enlarged bilinearly and added.
 
-        Args:
-            prediction: sRGB in [0, 1].
-            target: sRGB in [0, 1].
-
-        Returns:
-            Distances; their mean is close to, but not the same as, that of `forward`.
-
-        Raises:
-            NerfroError: if the picture is smaller than the backbone's `min_size`.
+        The mean is close to, but not the same as, the distance of `forward`.
         """
         size = prediction.shape[:2]
         layers = self._layer_distances(prediction, target)
@@ -207,19 +173,7 @@ def unit_length(features: Float[Tensor, "1 C h w"]) -> Float[Tensor, "1 C h w"]:
 
 
 def load_lpips_network(backbone: Backbone, path: Path | str | None = None, download: bool = True) -> LpipsNetwork:
-    """Build a network with the published weights.
-
-    Args:
-        backbone: `ALEX` or `VGG`.
-        path: file with its weights; by default torch hub's cache, or the network.
-        download: whether the weights may be fetched when they are not cached.
-
-    Returns:
-        The network, on the CPU.
-
-    Raises:
-        NerfroError: if the weights cannot be had, or are another network's.
-    """
+    """A network on the CPU, with the published weights: see `load_weights` for `path` and `download`."""
     with np.load(_HEADS, allow_pickle=False) as file:
         layers = range(sum(layer.compared for layer in backbone.layers))
         heads = [torch.from_numpy(file[f"{backbone.heads}{i}"]) for i in layers]
@@ -237,8 +191,7 @@ def find_lpips_networks(
         download: whether AlexNet's weights may be fetched when they are not cached.
 
     Returns:
-        The networks by the name of their metric, `lpips` and `lpips_vgg`, and by the same names the reasons, in one
-        line, for those that are missing.
+        By the name of their metric, `lpips` and `lpips_vgg`: the networks, and the reasons for those that are missing.
 
     Raises:
         NerfroError: if a file is given and is not that network's: whoever names a file wants it used.

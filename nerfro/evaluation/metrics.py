@@ -30,42 +30,23 @@ PictureMetric = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 def psnr(
     prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], inside: Bool[Tensor, "H W"] | None = None
 ) -> Float[Tensor, ""]:
-    """Peak signal-to-noise ratio, -10 log10(mean squared error), in dB.
+    """Peak signal-to-noise ratio of sRGB in [0, 1], -10 log10(mean squared error), in dB.
 
-    Args:
-        prediction: sRGB in [0, 1].
-        target: sRGB in [0, 1].
-        inside: pixels over which the squared error is averaged; all by default.
-
-    Returns:
-        Decibels, at most 100: equal pictures, and those with a mean squared error below 1e-10, score `MAX_PSNR`.
+    At most 100: equal pictures, and those with a mean squared error below 1e-10, score `MAX_PSNR`.
     """
     errors = squared_error_map(prediction.double(), target.double())
     return (-10 * torch.log10(mean_over(errors, inside))).clamp(max=MAX_PSNR)
 
 
 class MeanOverPictures(torchmetrics.Metric):
-    """Mean of a metric over pictures: of `psnr`, `ssim`, `ms_ssim`, `flip` or an `LpipsNetwork`.
-
-    Example:
-        ```
-        metric = MeanOverPictures(flip)
-        for prediction, target in views:
-            metric.update(prediction, target)
-        metric.compute()
-        ```
-    """
+    """Mean of a metric over pictures: of `psnr`, `ssim`, `ms_ssim`, `flip` or an `LpipsNetwork`."""
 
     full_state_update = False
     total: Tensor
     count: Tensor
 
     def __init__(self, metric: PictureMetric) -> None:
-        """Start with no pictures.
-
-        Args:
-            metric: of one picture.
-        """
+        """Start with no pictures."""
         super().__init__()
         self.metric = metric
         self.add_state("total", default=torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
@@ -90,17 +71,8 @@ class MeanOverPictures(torchmetrics.Metric):
 class ImageMetrics(torchmetrics.Metric):
     """Every metric of each view: on the full image, and on the object's mask and the crop around it where it is known.
 
-    With `round_predictions` (the default) predictions are clipped and rounded to 8 bits first, so that the numbers can
-    be computed again from the pictures that were written; without, they are clipped only. Targets are taken as they
-    are.
-
-    Example:
-        ```
-        metrics = ImageMetrics(*find_lpips_networks())
-        for prediction, target in views:
-            metrics.update(prediction, target)
-        metrics.result().means
-        ```
+    With `round_predictions` predictions are clipped and rounded to 8 bits first, so that the numbers can be computed
+    again from the pictures that were written; without, they are clipped only. Targets are taken as they are.
     """
 
     full_state_update = False
@@ -118,7 +90,7 @@ class ImageMetrics(torchmetrics.Metric):
         Args:
             lpips_networks: by the name of their metric, see `find_lpips_networks`; what is not there is left out.
             reasons: why a network is missing, by the same names.
-            round_predictions: whether predictions are rounded to 8 bits before they are scored.
+            round_predictions: see above.
             prefix: views are named `<prefix>_<number, three digits>`.
         """
         super().__init__()
@@ -146,9 +118,6 @@ class ImageMetrics(torchmetrics.Metric):
             view: number of the view; by default they are counted. Processes that share the work must give it.
             coverage: share of each pixel that the object covers; without it only the full image is scored, and so it
                 is where the object is not seen.
-
-        Raises:
-            NerfroError: if the shapes differ, or a value is NaN or infinite.
         """
         if prediction.shape != target.shape or prediction.ndim != 3 or prediction.shape[-1] != 3:
             raise NerfroError(
@@ -172,12 +141,8 @@ class ImageMetrics(torchmetrics.Metric):
     def compute(self) -> Float[Tensor, "V 1+K"]:
         """Scores of all views, gathered from all processes.
 
-        Returns:
-            A row for each view: its number, in rising order, then the scores on the full image in the order of
-            `METRICS`, those on the mask and those on the crop; NaN where one is not available.
-
-        Raises:
-            NerfroError: if no view was scored.
+        A row for each view: its number, in rising order, then the scores on the full image in the order of `METRICS`,
+        those on the mask and those on the crop; NaN where one is not available.
         """
         if len(self.rows) == 0:
             raise NerfroError("no view was scored; call update with at least one, or choose a split that has views")
@@ -187,14 +152,7 @@ class ImageMetrics(torchmetrics.Metric):
         return torch.stack([by_view[number] for number in sorted(by_view)])
 
     def result(self, names: Sequence[str] | None = None) -> EvaluationResult:
-        """The scores as named rows, with the reasons for what is missing.
-
-        Args:
-            names: of the views, in the order of their numbers; by default they are made from the prefix.
-
-        Raises:
-            NerfroError: if no view was scored.
-        """
+        """The scores as named rows, with the reasons for what is missing; names are made from the prefix by default."""
         rows = self.compute()
         if names is None:
             names = [f"{self.prefix}_{int(number):03d}" for number in rows[:, 0]]

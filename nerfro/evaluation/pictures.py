@@ -29,11 +29,7 @@ class Crop:
     size: int
 
     def of(self, picture: Float[Tensor, "H W C"]) -> Float[Tensor, "size size C"]:
-        """Cut the square out.
-
-        Raises:
-            NerfroError: if it does not lie inside the picture.
-        """
+        """Cut the square out; refused if it does not lie inside the picture."""
         height, width = picture.shape[:2]
         if min(self.top, self.left) < 0 or self.top + self.size > height or self.left + self.size > width:
             raise NerfroError(f"{self} does not lie inside a picture of {height} x {width} pixels; choose another one")
@@ -42,21 +38,13 @@ class Crop:
 
 @dataclass(frozen=True)
 class PictureRow:
-    """One view in a grid.
+    """One view in a grid."""
 
-    Attributes:
-        reference: ground truth, sRGB in [0, 1].
-        predictions: the same view by each method; None where a method has none.
-        label: written at the left, upwards; empty for none.
-        captions: a text below each prediction, such as its PSNR; empty for none.
-        crops: squares that are shown enlarged below the pictures.
-    """
-
-    reference: Float[Tensor, "H W 3"]
-    predictions: Sequence[Float[Tensor, "H W 3"] | None]
-    label: str = ""
-    captions: Sequence[str] = ()
-    crops: Sequence[Crop] = ()
+    reference: Float[Tensor, "H W 3"]  # ground truth, sRGB in [0, 1]
+    predictions: Sequence[Float[Tensor, "H W 3"] | None]  # the same view by each method; None where a method has none
+    label: str = ""  # written at the left, upwards; empty for none
+    captions: Sequence[str] = ()  # a text below each prediction, such as its PSNR; empty for none
+    crops: Sequence[Crop] = ()  # squares that are shown enlarged below the pictures
 
 
 def picture_grid(
@@ -65,19 +53,11 @@ def picture_grid(
     width: int = 256,
     error_limit: float | None = SQUARED_ERROR_LIMIT,
 ) -> Float[Tensor, "H W 3"]:
-    """Draw views as rows and methods as columns, the reference first.
+    """Draw views as rows and methods as columns, the reference first, each `width` pixels across.
 
-    Each row shows the pictures, below them the insets, below those the squared errors with their colour scale in the
-    column of the reference. Pictures are enlarged without smoothing, so that pixels are seen as they are.
-
-    Args:
-        rows: views.
-        titles: headings of the columns, the reference's first.
-        width: pixels across each column; pictures are brought to it.
-        error_limit: squared error at the last colour of the scale; None to draw no error maps.
-
-    Returns:
-        The drawn grid, sRGB in [0, 1].
+    Each row shows the pictures, below them the insets, below those the squared errors with their colour scale, up to
+    `error_limit` or None for no errors, in the column of the reference. Pictures are enlarged without smoothing, so
+    that pixels are seen as they are.
 
     Raises:
         NerfroError: if there is no row, titles or captions do not fit the predictions, or sizes differ in a row.
@@ -96,19 +76,7 @@ def picture_grid(
 def triptych(
     prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], error_limit: float = SQUARED_ERROR_LIMIT
 ) -> Float[Tensor, "H 3W 3"]:
-    """Prediction, reference and squared error side by side, without text: the picture for a training log.
-
-    Args:
-        prediction: sRGB in [0, 1].
-        target: sRGB in [0, 1].
-        error_limit: squared error at the last colour of the scale.
-
-    Returns:
-        sRGB in [0, 1], on the CPU.
-
-    Raises:
-        NerfroError: if the shapes differ.
-    """
+    """Prediction, reference and squared error side by side on the CPU, without text: the picture for a training log."""
     error = magma(squared_error_map(prediction, target), error_limit)
     return torch.cat([prediction.detach().cpu().float().clamp(0, 1), target.detach().cpu().float(), error], dim=1)
 
@@ -121,14 +89,7 @@ def most_telling_crop(
 ) -> Crop:
     """The square in which methods differ most: the largest sum of variances among their squared errors.
 
-    Args:
-        reference: ground truth, sRGB in [0, 1].
-        predictions: the same view by two or more methods; by one, the square of its largest error is taken.
-        size: side of the square in pixels.
-        apart_from: squares that are taken already; the new one does not overlap them.
-
-    Returns:
-        A square inside the picture.
+    By one method, the square of its largest error is taken. It does not overlap those of `apart_from`.
 
     Raises:
         NerfroError: if there is no prediction, or no room for the square.

@@ -24,15 +24,10 @@ STALL_SECONDS = 30.0
 
 @dataclass(frozen=True)
 class Published:
-    """A file of weights.
+    """A file of weights."""
 
-    Attributes:
-        title: the network's name.
-        url: where torchvision publishes it; the name ends in the first digits of its SHA-256, which is checked.
-    """
-
-    title: str
-    url: str
+    title: str  # the network's name
+    url: str  # where torchvision publishes it; the name ends in the first digits of its SHA-256, which is checked
 
 
 ALEXNET = Published("AlexNet", "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth")  # 233 MB
@@ -40,17 +35,14 @@ VGG16 = Published("VGG-16", "https://download.pytorch.org/models/vgg16-397923af.
 
 
 def load_weights(published: Published, path: Path | str | None = None, download: bool = True) -> dict[str, Tensor]:
-    """Load weights without executing pickled code.
+    """Load a state dict on the CPU, without executing pickled code.
 
     Args:
         published: which.
-        path: a file that holds the state dict as torchvision publishes it; by default the cache of torch hub is asked,
+        path: a file as torchvision publishes it; by default the cache of torch hub is asked,
             `torch.hub.get_dir()/checkpoints`, which honours TORCH_HOME.
         download: whether to fetch the file into that cache when it is not there. A network that does not answer within
             five seconds is given up, once for the whole process.
-
-    Returns:
-        The state dict, on the CPU.
 
     Raises:
         NerfroError: if the file cannot be read, or the weights are neither cached nor can be fetched; the message is
@@ -79,17 +71,10 @@ def load_weights(published: Published, path: Path | str | None = None, download:
 
 @functools.lru_cache
 def unreachable(url: str, seconds: float = CONNECT_SECONDS) -> str:
-    """Say why an address does not answer; the empty string if it does.
+    """Say in a few words why an address does not answer; the empty string if it does.
 
     The timeout of a socket bounds neither the resolution of names nor the number of addresses that are tried in turn,
     so the attempt runs in a thread that is left behind when the time is up.
-
-    Args:
-        url: address to ask for headers only.
-        seconds: wall-clock bound.
-
-    Returns:
-        A reason in a few words, or "".
     """
     reasons = [f"no answer within {seconds:g} s"]
 

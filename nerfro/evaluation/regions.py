@@ -37,13 +37,6 @@ def crop_rectangle(inside: Bool[Tensor, "H W"], dilation: int = DILATION) -> Rec
 
     Everything in the rectangle counts, object or not. Dilating by a centred box of odd side d moves each side of the
     bounding rectangle by (d - 1) / 2 pixels, as far as the picture goes, so that nothing needs to be dilated.
-
-    Args:
-        inside: the object's pixels.
-        dilation: side of the box in pixels, odd.
-
-    Raises:
-        NerfroError: if the mask is empty, or the side is not odd and positive.
     """
     if dilation < 1 or dilation % 2 == 0:
         raise NerfroError(f"dilation={dilation} has no centre; take an odd number of pixels, 1 for none")

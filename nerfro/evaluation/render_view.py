@@ -14,15 +14,10 @@ from nerfro.pixel_parts import divergence, part_rays, rays_beside
 
 @dataclass(frozen=True)
 class Supersampling:
-    """How many rays a pixel is given.
+    """How many rays a pixel is given."""
 
-    Attributes:
-        side: rays in each direction; a chosen pixel costs side^2 more rays.
-        divergence: pixels are chosen whose ray leaves in another direction than the one beside it, by this many pixel
-            angles or more (`pixel_parts.divergence`); 0 chooses all.
-    """
-
-    side: int = 1
+    side: int = 1  # rays in each direction; a chosen pixel costs side^2 more rays
+    # Pixels are chosen whose ray leaves so many pixel angles or more (`pixel_parts.divergence`) from the one beside it.
     divergence: float = 0.0
 
     def __post_init__(self) -> None:
@@ -33,14 +28,7 @@ class Supersampling:
 
 
 def render_view(model: NerfModel, cameras: Cameras, view: int, supersampling: Supersampling) -> RenderedRays:
-    """Render all pixels of one view, row by row; radiance is the mean over the rays of supersampled pixels.
-
-    Args:
-        model: the trained model.
-        cameras: on the model's device.
-        view: which of them.
-        supersampling: rays per pixel.
-    """
+    """Render all pixels of one view, row by row; radiance is the mean over the rays of supersampled pixels."""
     rendered = model.render(cameras.image_rays(view))
     if supersampling.side == 1:
         return rendered

@@ -1,5 +1,7 @@
 """What `python -m nerfro.evaluate` can be asked."""
 
+# ruff: noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -16,43 +18,27 @@ from nerfro.paths import user_path
 
 @dataclass
 class EvaluateConfig:
-    """What `python -m nerfro.evaluate` is asked: to score a trained model, or pictures that any program rendered.
+    """What `python -m nerfro.evaluate` is asked: to score a trained model, or pictures that any program rendered."""
 
-    Attributes:
-        checkpoint: file written by nerfro.train, to render and score.
-        split: of the data to render.
-        root: folder of the data, if it has moved since training.
-        chunk_size: rays rendered at once, which bounds the memory; the trained one by default.
-        supersample, divergence: rays per pixel (see docs/experiments.md); as trained by default.
-        predictions: folder of pictures to score, instead of a checkpoint.
-        references: folder of pictures of the same names, compared with `predictions`.
-        masks: folder of masks of the same names; by default those that lie with the references, or their transparency.
-        alpha: what becomes of transparency in `predictions` and `references`: `drop`, or composite over `white` or
-            `black`.
-        out: folder for pictures and tables; by default beside the checkpoint's folder, or `scores` in `predictions`.
-        protocol: `8bit` rounds predictions to what a PNG holds before they are scored, `float` does not.
-        lpips_backbone: file of AlexNet weights, if torch's hub cache has none.
-        lpips_vgg_backbone: file of VGG-16 weights, if torch's hub cache has none.
-        device: `cpu`, `cuda`, or `auto` for a GPU if there is one.
-        overwrite: whether an earlier evaluation in `out` may be replaced.
-    """
-
-    checkpoint: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    split: str = "test"
-    root: Optional[str] = None  # noqa: UP045
-    chunk_size: Optional[int] = None  # noqa: UP045
-    supersample: Optional[int] = None  # noqa: UP045
-    divergence: Optional[float] = None  # noqa: UP045
-    predictions: Optional[str] = None  # noqa: UP045
-    references: Optional[str] = None  # noqa: UP045
-    masks: Optional[str] = None  # noqa: UP045
-    alpha: str = "drop"
-    out: Optional[str] = None  # noqa: UP045
-    protocol: str = "8bit"
-    lpips_backbone: Optional[str] = None  # noqa: UP045
-    lpips_vgg_backbone: Optional[str] = None  # noqa: UP045
-    device: str = "auto"
-    overwrite: bool = False
+    checkpoint: Optional[str] = None  # file written by nerfro.train, to render and score
+    split: str = "test"  # of the data to render
+    root: Optional[str] = None  # folder of the data, if it has moved since training
+    chunk_size: Optional[int] = None  # rays rendered at once, which bounds the memory; the trained one by default
+    # Rays per pixel (see docs/experiments.md); as trained by default.
+    supersample: Optional[int] = None
+    divergence: Optional[float] = None
+    predictions: Optional[str] = None  # folder of pictures to score, instead of a checkpoint
+    references: Optional[str] = None  # folder of pictures of the same names, compared with `predictions`
+    # Folder of masks of the same names; by default those that lie with the references, or their transparency.
+    masks: Optional[str] = None
+    alpha: str = "drop"  # what becomes of transparency in both: `drop`, or composite over `white` or `black`
+    # Folder for pictures and tables; by default beside the checkpoint's folder, or `scores` in `predictions`.
+    out: Optional[str] = None
+    protocol: str = "8bit"  # `8bit` rounds predictions to what a PNG holds before they are scored, `float` does not
+    lpips_backbone: Optional[str] = None  # file of AlexNet weights, if torch's hub cache has none
+    lpips_vgg_backbone: Optional[str] = None  # file of VGG-16 weights, if torch's hub cache has none
+    device: str = "auto"  # `cpu`, `cuda`, or `auto` for a GPU if there is one
+    overwrite: bool = False  # whether an earlier evaluation in `out` may be replaced
 
 
 def require_one_task(config: DictConfig) -> None:
@@ -77,22 +63,14 @@ def require_one_task(config: DictConfig) -> None:
 
 
 def free_folder(config: DictConfig, default: Path) -> Path:
-    """Where the scores go.
-
-    Raises:
-        NerfroError: an earlier evaluation lies there, which may not be replaced.
-    """
+    """Where the scores go; refused if an earlier evaluation lies there and may not be replaced."""
     folder = default if config.out is None else user_path(config.out)
     refuse_existing([folder / "metrics.json"], config.overwrite)
     return folder
 
 
 def find_device(name: str) -> torch.device:
-    """The device of a name, or with `auto` the GPU if there is one.
-
-    Raises:
-        NerfroError: it cannot be used.
-    """
+    """The device of a name, or with `auto` the GPU if there is one; refused if it cannot be used."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     try:

@@ -17,19 +17,12 @@ Score = float | None  # None: not available, the reason stands in the notes
 
 @dataclass(frozen=True)
 class Metric:
-    """How a metric is called and read.
+    """How a metric is called and read."""
 
-    Attributes:
-        name: key in files and in code.
-        title: heading in tables.
-        better: whether higher or lower values are better.
-        decimals: digits after the point in tables.
-    """
-
-    name: str
-    title: str
-    better: Literal["higher", "lower"]
-    decimals: int
+    name: str  # key in files and in code
+    title: str  # heading in tables
+    better: Literal["higher", "lower"]  # whether higher or lower values are better
+    decimals: int  # digits after the point in tables
 
 
 METRICS = (
@@ -48,16 +41,11 @@ OBJECT_REGIONS: tuple[Region, ...] = ("mask", "crop")  # those that need to know
 
 @dataclass(frozen=True)
 class ViewScores:
-    """The scores of one picture.
+    """The scores of one picture."""
 
-    Attributes:
-        name: which view it is; `images/<name>.png` is the picture.
-        scores: value of each metric on the full image, by name; None where it is not available.
-        regions: the same on the object's mask and on the crop around it; empty where there is no mask.
-    """
-
-    name: str
-    scores: Mapping[str, Score]
+    name: str  # which view it is; `images/<name>.png` is the picture
+    scores: Mapping[str, Score]  # value of each metric on the full image, by name; None where it is not available
+    # The same on the object's mask and on the crop around it; empty where there is no mask.
     regions: Mapping[Region, Mapping[str, Score]] = field(default_factory=dict)
 
     def score(self, metric: str, region: Region = FULL) -> Score:
@@ -68,18 +56,13 @@ class ViewScores:
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """The scores of all views.
+    """The scores of all views."""
 
-    Attributes:
-        views: one row for each view, in order.
-        notes: for each metric that is not available, the reason; by its name for the full image, by
-            `<region>.<metric>` in a region, and by `mask` for views in which both regions are missing.
-        protocol: "8bit" if predictions were rounded to what a PNG holds before they were scored, "float" if not.
-    """
-
-    views: tuple[ViewScores, ...]
+    views: tuple[ViewScores, ...]  # one row for each view, in order
+    # Why a metric is not available: by its name for the full image, by `<region>.<metric>` in a region, and by `mask`
+    # for views in which both regions are missing.
     notes: Mapping[str, str] = field(default_factory=dict)
-    protocol: Literal["8bit", "float"] = "8bit"
+    protocol: Literal["8bit", "float"] = "8bit"  # whether predictions were rounded to what a PNG holds before scoring
 
     @property
     def regions(self) -> tuple[Region, ...]:
@@ -104,19 +87,12 @@ class EvaluationResult:
 
 @dataclass(frozen=True)
 class RunMetrics:
-    """The content of a run's `metrics.json`.
+    """The content of a run's `metrics.json`."""
 
-    Attributes:
-        result: scores of the test views.
-        steps: optimisation steps that the weights have seen; None for pictures of another program.
-        train_seconds: wall-clock time spent training, without evaluation; None if nothing was trained.
-        rays_per_second: training throughput; None if nothing was trained.
-    """
-
-    result: EvaluationResult
-    steps: int | None
-    train_seconds: float | None
-    rays_per_second: float | None
+    result: EvaluationResult  # scores of the test views
+    steps: int | None  # optimisation steps that the weights have seen; None for pictures of another program
+    train_seconds: float | None  # wall-clock time spent training, without evaluation; None if nothing was trained
+    rays_per_second: float | None  # training throughput; None if nothing was trained
 
 
 def write_metrics_json(
@@ -126,18 +102,7 @@ def write_metrics_json(
     train_seconds: float | None,
     rays_per_second: float | None,
 ) -> None:
-    """Write the file by which other tools read a run, whole or not at all.
-
-    It holds `{"test": {"psnr", "ssim", ...}, "regions": {"mask": {...}, "crop": {...}}, "views": [{"name", "psnr", ...,
-    "regions"}], "steps", "train_seconds", "rays_per_second", "notes", "protocol"}`: means over views, per-view rows,
-    and null for what is not available; see docs/metrics.md.
-
-    Args:
-        path: usually `metrics.json` in the run folder.
-        result: scores of the test views.
-        steps: optimisation steps done; None for pictures of another program.
-        train_seconds: wall-clock time spent training.
-        rays_per_second: training throughput.
+    """Write the file by which other tools read a run, whole or not at all; docs/metrics.md says what it holds.
 
     Raises:
         NerfroError: if a number is NaN or infinite (JSON has neither), or the file cannot be written.
@@ -160,15 +125,7 @@ def write_metrics_json(
 
 
 def read_metrics_json(path: Path | str) -> RunMetrics:
-    """Read what `write_metrics_json` wrote, now or when it knew fewer metrics and no regions.
-
-    Means are computed again from the rows.
-
-    Args:
-        path: a run's `metrics.json`.
-
-    Returns:
-        Scores and the budget they were reached with.
+    """Read what `write_metrics_json` wrote, now or when it knew fewer metrics and no regions; means are computed again.
 
     Raises:
         NerfroError: if the file is missing, truncated, or lacks a key.

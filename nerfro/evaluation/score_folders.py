@@ -24,18 +24,9 @@ def score_folders(
     folder: Path,
     device: torch.device,
 ) -> EvaluationResult:
-    """Score each prediction, and draw its error maps into `folder/errors`.
+    """Score each prediction on a device, and draw its error maps into `folder/errors`.
 
-    Args:
-        pairs: see `match_folders`.
-        alpha: what becomes of transparency, see `read_rgb`.
-        metrics: collects the scores.
-        networks: for error maps of LPIPS, see `find_lpips_networks`.
-        folder: for the pictures.
-        device: where the scores are computed.
-
-    Raises:
-        NerfroError: a file is damaged or does not fit its partner; told before anything is scored.
+    A file that is damaged or does not fit its partner is told before anything is scored.
     """
     for pair in pairs:  # kept in memory for no longer than it takes
         pair.load(alpha)

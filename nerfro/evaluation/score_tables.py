@@ -14,28 +14,14 @@ _Scores = Sequence[tuple[str, Mapping[str, Score]]]
 
 
 def views_table(result: EvaluationResult, title: str, region: Region = FULL) -> Table:
-    """The scores of each view in one region, and their means below.
-
-    Args:
-        result: what an evaluation found.
-        title: heading of the table.
-        region: which part of the pictures.
-
-    Returns:
-        A row for each view, a column for each metric that a view has, and below in one line why others are missing.
-    """
+    """The scores of each view in one region, their means below, and in one line why others are missing."""
     scores = [(view.name, {m.name: view.score(m.name, region) for m in METRICS}) for view in result.views]
     notes = [_mask_note(result) if region != FULL else "", _missing(result, region)]
     return _table(title, "view", scores, [("mean", result.means_of(region))], notes)
 
 
 def regions_table(result: EvaluationResult, title: str) -> Table:
-    """The mean scores of each region, to stand below `views_table`: what is missing in all of them was told there.
-
-    Args:
-        result: what an evaluation found.
-        title: heading of the table.
-    """
+    """The mean scores of each region, to stand below `views_table`: what is missing in all of them was told there."""
     scores = [(region, result.means_of(region)) for region in result.regions]
     told = _missing(result, FULL)
     missing = {region: _missing(result, region) for region in result.regions}
@@ -83,14 +69,7 @@ def report(
     seconds: float | None = None,
     rays_per_second: float | None = None,
 ) -> None:
-    """Write metrics.json and the tables into a folder, and print the views' and the regions' table.
-
-    Args:
-        result: scores.
-        title: of the table.
-        folder: where the files go.
-        steps, seconds, rays_per_second: of the training; None for pictures of another program.
-    """
+    """Write metrics.json and the tables into a folder, and print the views' and the regions' table."""
     write_metrics_json(folder / "metrics.json", result, steps, seconds, rays_per_second)
     for region in result.regions:
         full = region == FULL

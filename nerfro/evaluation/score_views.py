@@ -20,13 +20,6 @@ def score_views(
     """Render every view as `folder/images/<prefix>_NNN.png` (8-bit sRGB, rounded) and score it.
 
     Memory: one view's rays and pictures, plus `model.chunk_size` rays' samples and activations.
-
-    Args:
-        model: the trained model.
-        views: what is compared with; each is read when it has been rendered.
-        metrics: collects the scores and names the pictures.
-        folder: the run's folder.
-        supersampling: rays per pixel.
     """
     height, width = views.cameras.height, views.cameras.width
     cameras = views.cameras.to(model.device)

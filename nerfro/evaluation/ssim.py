@@ -18,21 +18,11 @@ MS_SSIM_MIN_SIZE = (WINDOW - 1) * 2 ** (len(SCALE_EXPONENTS) - 1) + 1  # pixels,
 
 
 def ssim_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H-10 W-10 3"]:
-    """Structural similarity at each pixel and channel whose whole window lies inside the picture.
+    """Structural similarity in [-1, 1] at each pixel and channel whose whole window lies inside the picture.
 
-    Gaussian window of 11 pixels and sigma 1.5, weighted (not unbiased) covariances, K = (0.01, 0.03), range 1; in
-    double precision, since variances are differences of nearly equal numbers. Source: Wang et al., "Image quality
+    Gaussian window of 11 pixels and sigma 1.5, weighted (not unbiased) covariances, K = (0.01, 0.03), sRGB in [0, 1];
+    in double precision, since variances are differences of nearly equal numbers. Source: Wang et al., "Image quality
     assessment: from error visibility to structural similarity", 2004, Eqn. 13 to 16.
-
-    Args:
-        prediction: sRGB in [0, 1].
-        target: sRGB in [0, 1].
-
-    Returns:
-        Similarity in [-1, 1], five pixels smaller on each side.
-
-    Raises:
-        NerfroError: if the picture is smaller than the window.
     """
     if min(prediction.shape[:2]) < WINDOW:
         raise NerfroError(f"SSIM needs at least {WINDOW} x {WINDOW} pixels, got {list(prediction.shape[:2])}")
@@ -57,19 +47,10 @@ def ms_ssim(
 
     prod_j cs_j^b_j, with the mean of contrast and structure on the scales 1 to 4 and of the whole similarity on the
     coarsest; negative means count as 0. By channel, then the mean over channels, as pytorch-msssim and TensorFlow do
-    it. Scales are means over 2 x 2 pixels; an odd last row or column is a mean over what is there. Source: Wang et al.,
-    "Multiscale structural similarity for image quality assessment", 2003, Eqn. 7.
-
-    Args:
-        prediction: sRGB in [0, 1].
-        target: sRGB in [0, 1].
-        inside: pixels that count; on coarser scales those that are covered by half or more. All by default.
-
-    Returns:
-        Similarity in [0, 1]; NaN if on some scale no pixel of the mask has its whole window inside the picture.
-
-    Raises:
-        NerfroError: if the picture is smaller than `MS_SSIM_MIN_SIZE`.
+    it. Scales are means over 2 x 2 pixels; an odd last row or column is a mean over what is there. Of a mask those
+    pixels count on coarser scales that are covered by half or more; NaN if on some scale none has its whole window
+    inside the picture. Source: Wang et al., "Multiscale structural similarity for image quality assessment", 2003, Eqn.
+    7.
     """
     if min(prediction.shape[:2]) < MS_SSIM_MIN_SIZE:
         raise NerfroError(

@@ -28,34 +28,21 @@ _MEDAL_COLOURS = {"gold": "F7DC8A", "silver": "DADDE2", "bronze": "EBC3A0"}  # p
 
 @dataclass(frozen=True)
 class Column:
-    """One column of numbers.
+    """One column of numbers."""
 
-    Attributes:
-        title: heading.
-        better: which values are better; None if the column is not a competition.
-        decimals: digits after the point, in all forms but CSV, which keeps every digit.
-        group: heading above this column and those beside it of the same group; empty for none.
-    """
-
-    title: str
-    better: Literal["higher", "lower"] | None = None
-    decimals: int = 2
-    group: str = ""
+    title: str  # heading
+    better: Literal["higher", "lower"] | None = None  # which values are better; None if the column is not a competition
+    decimals: int = 2  # digits after the point, in all forms but CSV, which keeps every digit
+    group: str = ""  # heading above this column and those beside it of the same group; empty for none
 
 
 @dataclass(frozen=True)
 class Row:
-    """One line of a table: what it is about, and a number for each column; None where there is none.
+    """One line of a table: what it is about, and a number for each column; None where there is none."""
 
-    Attributes:
-        label: what the line is about.
-        values: the numbers.
-        spreads: standard deviation of each number, None where there is none; empty for a line without any.
-    """
-
-    label: str
-    values: tuple[Score, ...]
-    spreads: tuple[Score, ...] = ()
+    label: str  # what the line is about
+    values: tuple[Score, ...]  # the numbers
+    spreads: tuple[Score, ...] = ()  # standard deviation of each number, None where there is none; empty without any
 
     def spread(self, column: int) -> Score:
         return self.spreads[column] if self.spreads else None
@@ -63,27 +50,16 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of numbers.
+    """A table of numbers."""
 
-    Attributes:
-        title: what it shows.
-        label_title: heading of the rows' labels.
-        columns: headings and meaning of the numbers.
-        rows: the lines, in order.
-        summary: lines below a rule, such as means.
-        mark_best: whether the best values of each column among `rows` are emphasised.
-        medals: whether the best three are marked gold, silver and bronze instead.
-        notes: footnotes, such as the reason for a missing number.
-    """
-
-    title: str
-    label_title: str
-    columns: tuple[Column, ...]
-    rows: tuple[Row, ...]
-    summary: tuple[Row, ...] = ()
-    mark_best: bool = False
-    medals: bool = False
-    notes: tuple[str, ...] = ()
+    title: str  # what it shows
+    label_title: str  # heading of the rows' labels
+    columns: tuple[Column, ...]  # headings and meaning of the numbers
+    rows: tuple[Row, ...]  # the lines, in order
+    summary: tuple[Row, ...] = ()  # lines below a rule, such as means
+    mark_best: bool = False  # whether the best values of each column among `rows` are emphasised
+    medals: bool = False  # whether the best three are marked gold, silver and bronze instead
+    notes: tuple[str, ...] = ()  # footnotes, such as the reason for a missing number
 
     def __post_init__(self) -> None:
         for row in (*self.rows, *self.summary):
@@ -288,18 +264,7 @@ def to_html(table: Table) -> str:
 
 
 def write_table(table: Table, stem: Path | str) -> list[Path]:
-    """Write `<stem>.csv`, `<stem>.md` and `<stem>.tex`.
-
-    Args:
-        table: what to write.
-        stem: path without suffix.
-
-    Returns:
-        The three paths.
-
-    Raises:
-        NerfroError: if a file cannot be written.
-    """
+    """Write `<stem>.csv`, `<stem>.md` and `<stem>.tex`, and return the three paths."""
     stem = Path(stem)
     texts = {".csv": to_csv(table), ".md": to_markdown(table), ".tex": to_latex(table)}
     paths = [stem.with_name(stem.name + suffix) for suffix in texts]

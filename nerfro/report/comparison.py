@@ -17,21 +17,13 @@ from nerfro.training.settings import TABLE_ROW, settings
 
 @dataclass(frozen=True)
 class Comparison:
-    """All runs of one budget.
+    """All runs of one budget."""
 
-    Attributes:
-        budget: what each was allowed to spend.
-        methods: titles of the methods, in the order of the table.
-        scenes: what was scored, in the order of the table, with titles.
-        cells: the runs of a method on a scene, one for each seed, by seed; absent where there is none.
-        notes: what a reader has to know.
-    """
-
-    budget: Budget
-    methods: tuple[str, ...]
-    scenes: Mapping[Scored, str]
-    cells: Mapping[tuple[str, Scored], tuple[Run, ...]]
-    notes: tuple[str, ...]
+    budget: Budget  # what each was allowed to spend
+    methods: tuple[str, ...]  # titles of the methods, in the order of the table
+    scenes: Mapping[Scored, str]  # what was scored, in the order of the table, with titles
+    cells: Mapping[tuple[str, Scored], tuple[Run, ...]]  # of a method on a scene, one for each seed, by seed
+    notes: tuple[str, ...]  # what a reader has to know
 
     @property
     def runs(self) -> list[Run]:
@@ -39,28 +31,17 @@ class Comparison:
 
 
 def compare(runs: Sequence[Run], methods: Mapping[str, str], scenes: Mapping[str, str]) -> list[Comparison]:
-    """Sort runs into comparisons, one for each budget.
+    """Sort runs into comparisons, one for each budget; `methods` and `scenes` are titles, in their order.
 
     Runs of one experiment whose configurations differ in more than the seed are different methods, and are told apart
-    by the fields that differ.
-
-    Args:
-        runs: any evaluated runs.
-        methods: titles of experiments, in their order; others follow by their own name.
-        scenes: the same of scenes.
+    by the fields that differ. What has no title follows under its own name.
     """
     budgets = sorted({run.budget for run in runs}, key=lambda b: (b.seconds or 0, b.steps or 0, b.label))
     return [_comparison(budget, [r for r in runs if r.budget == budget], methods, scenes) for budget in budgets]
 
 
 def to_table(comparison: Comparison, metrics: Sequence[Metric], region: Region) -> Table:
-    """The scores of a comparison, means and standard deviations over seeds, the best three marked.
-
-    Args:
-        comparison: the runs.
-        metrics: columns of each scene.
-        region: of the pictures: `full`, or one that the runs were scored on.
-    """
+    """The scores of a comparison, means and standard deviations over seeds, the best three marked."""
     columns = [
         Column(metric.title, metric.better, metric.decimals, group=title)
         for title in comparison.scenes.values()
@@ -87,11 +68,7 @@ def to_table(comparison: Comparison, metrics: Sequence[Metric], region: Region) 
 
 
 def find_metrics(names: Sequence[str]) -> list[Metric]:
-    """The metrics of these names.
-
-    Raises:
-        NerfroError: there is none of a name.
-    """
+    """The metrics of these names; a name that is none is refused."""
     known = {metric.name: metric for metric in METRICS}
     for name in names:
         if name not in known:

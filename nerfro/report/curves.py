@@ -39,20 +39,13 @@ class Line:
 
 @dataclass(frozen=True)
 class Chart:
-    """One quantity over the optimisation steps.
+    """One quantity over the optimisation steps."""
 
-    Attributes:
-        name: of the quantity.
-        logarithmic: whether values are drawn on a logarithmic scale.
-        x_ticks, y_ticks: the grid.
-        lines: one for each run that recorded the quantity.
-    """
-
-    name: str
-    logarithmic: bool
-    x_ticks: tuple[Tick, ...]
+    name: str  # of the quantity
+    logarithmic: bool  # whether values are drawn on a logarithmic scale
+    x_ticks: tuple[Tick, ...]  # the grid
     y_ticks: tuple[Tick, ...]
-    lines: tuple[Line, ...]
+    lines: tuple[Line, ...]  # one for each run that recorded the quantity
 
 
 Curve = tuple[np.ndarray, np.ndarray]  # steps and values
@@ -79,11 +72,7 @@ def read_curves(folder: Path) -> dict[str, Curve]:
 
 
 def draw_charts(runs: Sequence[tuple[int, Mapping[str, Curve]]]) -> list[Chart]:
-    """Charts of PSNR and of every loss.
-
-    Args:
-        runs: number of the method, and what was logged, of each run.
-    """
+    """Charts of PSNR and of every loss, from the number of the method, and what was logged, of each run."""
     names = {name for _, curves in runs for name in curves}
     ordered = [name for name in FIRST if name in names] + sorted(names - set(FIRST))
     charts = (_chart(name, [(method, curves[name]) for method, curves in runs if name in curves]) for name in ordered)

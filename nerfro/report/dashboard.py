@@ -33,14 +33,9 @@ class DashboardConfig:
 
 
 def link_runs(outputs: Path, names: Path) -> int:
-    """Make a link to the logs of every run, or a copy where links are not allowed: TensorBoard calls runs by folders.
+    """Link the logs of every run at any depth of `outputs` into the folder `names`, and return the number of runs.
 
-    Args:
-        outputs: searched for run folders at any depth.
-        names: folder for the links; those that are there stay, and copies grow.
-
-    Returns:
-        Number of runs.
+    TensorBoard calls runs by folders. Links that are there stay; where links are not allowed, copies are made and grow.
     """
     logs = sorted(path for path in outputs.rglob(_LOGS) if path.is_dir())
     for path in logs:
@@ -86,11 +81,7 @@ def _as_folder(name: str) -> str:
 
 
 def serve(logs: Path, host: str, port: int) -> str:
-    """Start TensorBoard in the background and return its address.
-
-    Raises:
-        NerfroError: the port is taken.
-    """
+    """Start TensorBoard in the background and return its address."""
     from tensorboard import program
     from tensorboard.util import tb_logging
 

@@ -28,21 +28,13 @@ _TEMPLATES = PACKAGE_DIR / "report"
 
 @dataclass(frozen=True)
 class SceneSection:
-    """What the page says about one scene of a comparison.
+    """What the page says about one scene of a comparison."""
 
-    Attributes:
-        id: of the section, unique on the page.
-        title: of the scene.
-        charts: training curves.
-        pictures: views, or None if they cannot be shown.
-        reason: why they cannot.
-    """
-
-    id: str
-    title: str
-    charts: Sequence[Chart]
-    pictures: ScenePictures | None
-    reason: str
+    id: str  # of the section, unique on the page
+    title: str  # of the scene
+    charts: Sequence[Chart]  # training curves
+    pictures: ScenePictures | None  # views, or None if they cannot be shown
+    reason: str  # why they cannot
 
 
 @dataclass(frozen=True)
@@ -76,15 +68,7 @@ def report_page(
     metric: Metric,
     region: Region,
 ) -> str:
-    """Write the page.
-
-    Args:
-        compared: the comparisons with their tables.
-        unfinished: a line on each run that is not in them.
-        wanted: which pictures.
-        metric: whose value stands below each picture.
-        region: that it was measured on.
-    """
+    """Write the page; below each picture stands its score by the metric in the region."""
     sections = [
         Section(
             id=f"b{number}",

@@ -26,19 +26,12 @@ _FACTS = {"command", "machine", "python", "threads", "versions"}  # of run.json
 
 @dataclass(frozen=True)
 class Budget:
-    """What a training was allowed to spend; only runs of one budget can be compared.
+    """What a training was allowed to spend; only runs of one budget can be compared."""
 
-    Attributes:
-        seconds: wall-clock time, None if it was not limited.
-        steps: optimisation steps, None if they were not limited.
-        rays: of a step; None if only the time was limited.
-        device: on which the time was spent; None if only the steps were limited, which cost the same everywhere.
-    """
-
-    seconds: float | None
-    steps: int | None
-    rays: int | None
-    device: str | None
+    seconds: float | None  # wall-clock time, None if it was not limited
+    steps: int | None  # optimisation steps, None if they were not limited
+    rays: int | None  # of a step; None if only the time was limited
+    device: str | None  # on which the time was spent; None if only steps were limited: they cost the same everywhere
 
     @property
     def file_name(self) -> str:
@@ -56,24 +49,15 @@ class Budget:
 
 @dataclass(frozen=True)
 class Scored:
-    """What a run was scored on; scores of different ones are different quantities.
+    """What a run was scored on; scores of different ones are different quantities."""
 
-    Attributes:
-        root: folder of the data.
-        split: of the data.
-        num_views: pictures that were scored.
-        width, height: of the pictures, in pixels.
-        protocol: "8bit" or "float", see `EvaluationResult`.
-        reading: options of the data source, apart from the folder and the range of its rays.
-    """
-
-    root: str
-    split: str
-    num_views: int
-    width: int
+    root: str  # folder of the data
+    split: str  # of the data
+    num_views: int  # pictures that were scored
+    width: int  # of the pictures, in pixels
     height: int
-    protocol: str
-    reading: tuple[tuple[str, str], ...]
+    protocol: str  # "8bit" or "float", see `EvaluationResult`
+    reading: tuple[tuple[str, str], ...]  # options of the data source, apart from the folder and the range of its rays
 
     @property
     def name(self) -> str:
@@ -83,39 +67,21 @@ class Scored:
 
 @dataclass(frozen=True)
 class Run:
-    """An evaluated run.
+    """An evaluated run."""
 
-    Attributes:
-        folder: where it lies.
-        name: of its experiment.
-        seed: of its random draws.
-        config: its resolved configuration.
-        facts: its run.json: command, commit, versions and machine.
-        metrics: scores and what was spent.
-        budget: what it was allowed to spend.
-        scored: what it was scored on.
-        evaluated_at: when its scores were written, seconds since the epoch.
-    """
-
-    folder: Path
-    name: str
-    seed: int
-    config: Mapping[str, Any]
-    facts: Mapping[str, Any]
-    metrics: RunMetrics
-    budget: Budget
-    scored: Scored
-    evaluated_at: float
+    folder: Path  # where it lies
+    name: str  # of its experiment
+    seed: int  # of its random draws
+    config: Mapping[str, Any]  # its resolved configuration
+    facts: Mapping[str, Any]  # its run.json: command, commit, versions and machine
+    metrics: RunMetrics  # scores and what was spent
+    budget: Budget  # what it was allowed to spend
+    scored: Scored  # what it was scored on
+    evaluated_at: float  # when its scores were written, seconds since the epoch
 
 
 def find_runs(places: Sequence[str]) -> tuple[list[Run], list[str]]:
-    """Read all runs below some folders.
-
-    Args:
-        places: run folders, folders that hold some at any depth, or globs of either.
-
-    Returns:
-        The evaluated runs by folder, and a line on each run that has no scores.
+    """Read all evaluated runs below some folders, by folder, and say in a line why each other run is left out.
 
     Raises:
         NerfroError: a place does not exist, none holds an evaluated run, or a run's files are damaged.
@@ -150,11 +116,7 @@ def _why_unfinished(folder: Path) -> str:
 
 
 def read_run(folder: Path) -> Run:
-    """Read an evaluated run folder.
-
-    Raises:
-        NerfroError: a file is missing or damaged.
-    """
+    """Read an evaluated run folder."""
     metrics = read_metrics_json(folder / "metrics.json")
     try:
         text = (folder / "config.yaml").read_text(encoding="utf-8")

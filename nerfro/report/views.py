@@ -36,30 +36,17 @@ JPEG_QUALITY = 95
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which pictures a page shows.
+    """Which pictures a page shows."""
 
-    Attributes:
-        num_views: of each scene, evenly spread; 0 for all.
-        view: of the figure, by the scene's name.
-        crops: insets of the figure, by the scene's name.
-        error_map: one of `ERROR_MAPS`.
-        lpips_networks: those that it needs.
-    """
-
-    num_views: int
-    view: Mapping[str, int]
-    crops: Mapping[str, tuple[Crop, ...]]
-    error_map: str
-    lpips_networks: Mapping[str, LpipsNetwork]
+    num_views: int  # of each scene, evenly spread; 0 for all
+    view: Mapping[str, int]  # of the figure, by the scene's name
+    crops: Mapping[str, tuple[Crop, ...]]  # insets of the figure, by the scene's name
+    error_map: str  # one of `ERROR_MAPS`
+    lpips_networks: Mapping[str, LpipsNetwork]  # those that it needs
 
     @classmethod
     def of(cls, num_views: int, view: Any, crops: Any, error_map: str = "squared_error") -> Wanted:
-        """Check the form of what the user gave; `view` and `crops` may be None.
-
-        Raises:
-            NerfroError: a negative number of views, `view` or `crops` is not what `SummaryConfig` says, there is no
-                such error map, or the network that it needs cannot be had.
-        """
+        """Check the form of what the user gave; `view` and `crops` may be None."""
         if error_map not in ERROR_MAPS:
             raise NerfroError(f"error_map={error_map} is not an error map; choose from {', '.join(ERROR_MAPS)}")
         networks, reasons = find_lpips_networks() if error_map.startswith("lpips") else ({}, {})
@@ -83,11 +70,7 @@ class Wanted:
         return cls(num_views, chosen, insets, error_map, networks)
 
     def check(self, scenes: Sequence[Scored]) -> None:
-        """Refuse what fits no scene.
-
-        Raises:
-            NerfroError: a scene is not among those given, has no such view, or a crop lies outside of its pictures.
-        """
+        """Refuse what fits no scene."""
         named = {scene.name: scene for scene in scenes}
         for name in (*self.view, *self.crops):
             if name not in named:
@@ -116,57 +99,33 @@ class Shown:
 
 @dataclass(frozen=True)
 class View:
-    """A view by all methods that rendered it.
+    """A view by all methods that rendered it."""
 
-    Attributes:
-        index: of the view in its split.
-        reference: the ground truth.
-        predictions, errors: of the methods, by their number in the comparison.
-    """
-
-    index: int
-    reference: Shown
-    predictions: Mapping[int, Shown]
+    index: int  # of the view in its split
+    reference: Shown  # the ground truth
+    predictions: Mapping[int, Shown]  # of the methods, by their number in the comparison
     errors: Mapping[int, Shown]
 
 
 @dataclass(frozen=True)
 class ScenePictures:
-    """What a page shows of a scene.
+    """What a page shows of a scene."""
 
-    Attributes:
-        width, height: of each picture, in pixels.
-        views: those that can be chosen.
-        figure: the view of the figure, one of them.
-        crops: its insets.
-        error_title: what the error maps show.
-        error_limit: error at the last colour of their scale.
-        methods: titles by number; those that have not been trained on this scene are absent.
-        seeds: of the runs whose pictures these are.
-    """
-
-    width: int
+    width: int  # of each picture, in pixels
     height: int
-    views: tuple[View, ...]
-    figure: View
-    crops: tuple[Crop, ...]
-    error_title: str
-    error_limit: float
-    methods: Mapping[int, str]
-    seeds: Sequence[int]
+    views: tuple[View, ...]  # those that can be chosen
+    figure: View  # the view of the figure, one of them
+    crops: tuple[Crop, ...]  # its insets
+    error_title: str  # what the error maps show
+    error_limit: float  # error at the last colour of their scale
+    methods: Mapping[int, str]  # titles by number; those that have not been trained on this scene are absent
+    seeds: Sequence[int]  # of the runs whose pictures these are
 
 
 def scene_pictures(
     comparison: Comparison, scored: Scored, wanted: Wanted, metric: Metric, region: Region
 ) -> ScenePictures:
-    """Gather the pictures of a scene.
-
-    Args:
-        comparison: the runs; of each method the first seed is shown.
-        scored: the scene.
-        wanted: which views and insets.
-        metric: whose value is written below each picture.
-        region: that it was measured on.
+    """Gather the pictures of a scene, of each method those of its first seed, with their scores.
 
     Raises:
         NerfroError: the references cannot be read, or a run's pictures are missing or of another size.
