@@ -318,7 +318,7 @@ def report_budget(budget: str) -> None:
             with (ROOT / "outputs" / f"{name}.log").open("w") as log:
                 subprocess.run([*command, f"hydra.run.dir={folder}"], check=True, cwd=ROOT, stdout=log, stderr=log)
         run = read_metrics_json(folder / "metrics.json")
-        means = run.result.means
+        means = run.result.means()
         print(
             f"| `{name}` | {run.steps} | {run.rays_per_second:.0f} | {means['psnr']:.2f} | {means['ssim']:.3f} |",
             flush=True,

@@ -7,15 +7,15 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from nerfro.cli import entry_point
-from nerfro.evaluation.error_sheets import write_error_sheet
+from nerfro.evaluation.error_maps import write_error_sheet
 from nerfro.evaluation.folders import match_folders
 from nerfro.evaluation.lpips import find_lpips_networks
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.render_view import Supersampling
 from nerfro.evaluation.request import EvaluateConfig, find_device, free_folder, require_one_task
-from nerfro.evaluation.score_folders import score_folders
+from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.score_tables import report
-from nerfro.evaluation.score_views import score_views
+from nerfro.evaluation.scoring import score_folders, score_views
 from nerfro.files.images import load_png
 from nerfro.paths import user_path
 from nerfro.registry import build
@@ -55,7 +55,7 @@ def _evaluate_checkpoint(config: DictConfig) -> Path:
     spent = Throughput()
     spent.load_state_dict(checkpoint["callbacks"]["Throughput"])
     title = f"{trained.name} on {trained.data.root}, {config.split} views"
-    report(result, title, folder, checkpoint["global_step"], spent.seconds, spent.rays_per_second)
+    report(RunMetrics(result, checkpoint["global_step"], spent.seconds, spent.rays_per_second), title, folder)
     return folder
 
 
@@ -68,7 +68,7 @@ def _evaluate_folder(config: DictConfig) -> Path:
     networks, reasons = find_lpips_networks(config.lpips_backbone, config.lpips_vgg_backbone)
     metrics = ImageMetrics(networks, reasons, config.protocol == "8bit")
     result = score_folders(pairs, config.alpha, metrics, networks, folder, device)
-    report(result, f"{predictions} against {references}", folder)
+    report(RunMetrics(result), f"{predictions} against {references}", folder)
     return folder
 
 

@@ -46,8 +46,8 @@ def main(config: DictConfig) -> None:
     """Read, compare, print, write."""
     if config.region not in (FULL, *OBJECT_REGIONS):
         raise NerfroError(f"region={config.region} is not a region; choose from {', '.join((FULL, *OBJECT_REGIONS))}")
-    wanted = Wanted.of(config.views, config.view, config.crops, config.error_map)
     metrics = find_metrics(config.metrics)
+    wanted = Wanted.of(config.views, config.view, config.crops, config.error_map, metrics[0], config.region)
     places = list(config.runs) if isinstance(config.runs, ListConfig) else [str(config.runs)]
     runs, unfinished = find_runs(places)
     wanted.check([run.scored for run in runs])
@@ -71,9 +71,7 @@ def main(config: DictConfig) -> None:
         write_atomically(out / f"{name}.html", table_page(table))
     print(f"tables: {out}")
     if config.report:
-        page = report_page(
-            list(zip(comparisons, tables.values(), strict=True)), unfinished, wanted, metrics[0], config.region
-        )
+        page = report_page(list(zip(comparisons, tables.values(), strict=True)), unfinished, wanted)
         write_atomically(out / "report.html", page)
         print(f"report: {out / 'report.html'}, {len(page) / 2**20:.1f} MiB")
 

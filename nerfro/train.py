@@ -14,8 +14,9 @@ from nerfro.distributed import leave
 from nerfro.evaluation.lpips import find_lpips_networks
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.render_view import Supersampling
+from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.score_tables import report
-from nerfro.evaluation.score_views import score_views
+from nerfro.evaluation.scoring import score_views
 from nerfro.fields.mlp import compile_networks
 from nerfro.registry import build
 from nerfro.training.callbacks import StopOnSignal, Throughput
@@ -81,7 +82,7 @@ def main(config: DictConfig) -> None:
     metrics = ImageMetrics(*lpips, prefix=config.evaluation.split)
     result = score_views(model, test, metrics, folder, supersampling)
     title = f"{config.name} on {config.data.root}, {config.evaluation.split} views"
-    report(result, title, folder, trainer.global_step, throughput.seconds, throughput.rays_per_second)
+    report(RunMetrics(result, trainer.global_step, throughput.seconds, throughput.rays_per_second), title, folder)
     print(f"{trainer.global_step} steps in {throughput.seconds:.0f} s, {throughput.rays_per_second or 0:,.0f} rays/s.")
     print("Look at:")
     print(f"  {folder}/images/  the pictures; metrics.json, .csv, .md and .tex beside them")

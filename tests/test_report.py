@@ -14,7 +14,7 @@ from PIL import Image
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation.metrics import ImageMetrics
-from nerfro.evaluation.results import write_metrics_json
+from nerfro.evaluation.results import RunMetrics, write_metrics_json
 from nerfro.files.images import load_png, save_png
 from nerfro.registry import discover
 from nerfro.report.comparison import compare, find_metrics, to_table
@@ -51,7 +51,7 @@ def write_run(folder: Path, name: str, scene: Path, noise: float) -> None:
         prediction = (reference + noise * (1 + view) * torch.randn_like(reference)).clamp(0, 1)
         save_png(folder / "images" / f"test_{view:03d}.png", prediction)
         metrics.update(prediction, reference, view)
-    write_metrics_json(folder / "metrics.json", metrics.result(), 30, 20.0, 1000.0)
+    write_metrics_json(folder / "metrics.json", RunMetrics(metrics.result(), 30, 20.0, 1000.0))
     (folder / "csv").mkdir()
     (folder / "csv" / "metrics.csv").write_text(CSV)
 
@@ -68,7 +68,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory, tiny_scene: Path) -> Path:
 def page(runs: Path, wanted: Wanted | None = None, unfinished: tuple[str, ...] = ()) -> str:
     comparisons = compare(find_runs([str(runs)])[0], {}, {})
     compared = [(comparison, to_table(comparison, [PSNR], "full")) for comparison in comparisons]
-    return report_page(compared, unfinished, wanted or Wanted.of(8, None, None), PSNR, "full")
+    return report_page(compared, unfinished, wanted or Wanted.of(8, None, None))
 
 
 def test_curves_are_read_by_name_without_empty_broken_or_endless_values(tmp_path: Path) -> None:
@@ -108,7 +108,7 @@ def test_long_logs_are_averaged_and_losses_of_zero_are_not_drawn() -> None:
 def test_figure_shows_the_view_of_the_median_score_and_insets_that_lie_apart(runs: Path) -> None:
     (comparison,) = compare(find_runs([str(runs)])[0], {}, {})
     (scored,) = comparison.scenes
-    pictures = scene_pictures(comparison, scored, Wanted.of(1, None, None), PSNR, "full")
+    pictures = scene_pictures(comparison, scored, Wanted.of(1, None, None))
     # View 1 has twice the noise; of two views the lower score is the lower median.
     assert pictures.figure.index == 1
     assert [view.index for view in pictures.views] == [0, 1]
@@ -117,7 +117,7 @@ def test_figure_shows_the_view_of_the_median_score_and_insets_that_lie_apart(run
     assert abs(first.top - second.top) >= 4 or abs(first.left - second.left) >= 4
     assert pictures.methods == dict(enumerate(comparison.methods))
     wanted = Wanted.of(8, {scored.name: 0}, {scored.name: [[1, 2, 5]]})
-    chosen = scene_pictures(comparison, scored, wanted, PSNR, "full")
+    chosen = scene_pictures(comparison, scored, wanted)
     assert chosen.figure.index == 0
     assert [(crop.top, crop.left, crop.size) for crop in chosen.crops] == [(1, 2, 5)]
 
@@ -180,7 +180,7 @@ def test_pictures_of_another_data_set_are_refused(runs: Path, tmp_path: Path, ti
     for run in comparison.runs:
         run.config["data"]["root"] = str(changed)  # type: ignore[index]
     with pytest.raises(NerfroError, match="has it been changed since"):
-        scene_pictures(comparison, scored, Wanted.of(8, None, None), PSNR, "full")
+        scene_pictures(comparison, scored, Wanted.of(8, None, None))
 
 
 # Does what a reader does, and writes down what is seen.

@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 
 import nerfro.summary
 from nerfro.errors import NerfroError
-from nerfro.evaluation.results import METRICS, EvaluationResult, ViewScores, write_metrics_json
+from nerfro.evaluation.results import METRICS, EvaluationResult, RunMetrics, ViewScores, write_metrics_json
 from nerfro.evaluation.tables import Column, Row, Table, to_csv, to_html, to_latex, to_markdown, to_rich
 from nerfro.files.images import save_png
 from nerfro.report.comparison import compare, differing, find_metrics, to_table
@@ -58,7 +58,7 @@ def write_run(
         for i in range(views)
     )
     result = EvaluationResult(rows, {} if lpips is not None else {"lpips": "no network"})
-    write_metrics_json(folder / "metrics.json", result, 1500, 240.0, 81000.0)
+    write_metrics_json(folder / "metrics.json", RunMetrics(result, 1500, 240.0, 81000.0))
     for row in rows:
         save_png(folder / "images" / f"{row.name}.png", torch.full((size, size, 3), 0.5))
     return folder

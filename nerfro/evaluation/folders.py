@@ -22,7 +22,7 @@ class PicturePair:
     """A prediction and what it is compared with."""
 
     name: str  # what both files are called, without extension
-    prediction: Path  # the files
+    prediction: Path
     reference: Path
     mask: Path | None  # says where the object is; None to take the reference's transparency, if it has any
 
@@ -40,17 +40,14 @@ class PicturePair:
                 f"{self.prediction} has {_size(prediction)} pixels but its reference {self.reference} has "
                 f"{_size(reference)}; render it in the reference's size, or give references of the predictions' size"
             )
-        coverage = self._coverage((reference.shape[1], reference.shape[0]))
+        masks = find_masks([self.reference], [self.mask], 1, (reference.shape[1], reference.shape[0]))
+        coverage = None if masks is None else masks[0]
         if coverage is not None and not object_pixels(coverage).any():
             raise NerfroError(
                 f"the mask {self.mask or f'(transparency) of {self.reference}'} is empty: no pixel is covered by half; "
                 "correct it, or leave the view out"
             )
         return prediction, reference, coverage
-
-    def _coverage(self, size: tuple[int, int]) -> Float[Tensor, "H W"] | None:
-        masks = find_masks([self.reference], [self.mask], 1, size)
-        return None if masks is None else masks[0]
 
 
 def match_folders(predictions: Path, references: Path, masks: Path | None) -> list[PicturePair]:
@@ -63,7 +60,7 @@ def match_folders(predictions: Path, references: Path, masks: Path | None) -> li
         NerfroError: a folder does not exist or has no pictures, a picture has no partner, or a name occurs twice.
     """
     predicted, truth = _pictures(predictions, "predictions"), _pictures(references, "references")
-    truth = {name: path for name, path in truth.items() if not _is_mask(name, truth)}
+    truth = {name: path for name, path in truth.items() if not (name[:5] == "mask_" and name[5:] in truth)}
     _require(predicted, truth, f"reference in references={references}")
     _require(truth, predicted, f"prediction in predictions={predictions}")
     if masks is None:
@@ -92,10 +89,6 @@ def _pictures(folder: Path, option: str) -> dict[str, Path]:
     if not pictures:
         raise NerfroError(f"{option}={folder} holds no pictures; allowed are {', '.join(IMAGE_SUFFIXES)}")
     return pictures
-
-
-def _is_mask(name: str, names: Collection[str]) -> bool:
-    return name.startswith("mask_") and name.removeprefix("mask_") in names
 
 
 def _require(pictures: Mapping[str, Path], partners: Collection[str], partner: str) -> None:

@@ -132,9 +132,9 @@ class ImageMetrics(torchmetrics.Metric):
         scores[0] = self._score(prediction, target, None)
         inside = None if coverage is None else object_pixels(coverage)
         if inside is not None and inside.any():
-            rectangle = crop_rectangle(inside)
+            crop = crop_rectangle(inside)
             scores[1] = self._score(prediction, target, inside)
-            scores[2] = self._score(rectangle.of(prediction), rectangle.of(target), None)
+            scores[2] = self._score(prediction[crop], target[crop], None)
         number = scores.new_tensor([len(self.rows) if view is None else view])
         self.rows.append(torch.cat([number, scores.flatten()])[None])
 

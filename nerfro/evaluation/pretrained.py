@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import http.client
 import pickle
 import socket
 import threading
 import urllib.request
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,11 +59,15 @@ def load_weights(published: Published, path: Path | str | None = None, download:
         reason = unreachable(url)
         if reason:
             raise NerfroError(f"no weights; {title}'s are not in torch's cache, and no network ({reason}): {by_hand}")
+        before = socket.getdefaulttimeout()
+        # Bound each wait for data: torch hub opens its address without a timeout and would wait for ever.
+        socket.setdefaulttimeout(STALL_SECONDS)
         try:
-            with _socket_timeout(STALL_SECONDS):
-                return torch.hub.load_state_dict_from_url(url, map_location="cpu", check_hash=True, weights_only=True)
+            return torch.hub.load_state_dict_from_url(url, map_location="cpu", check_hash=True, weights_only=True)
         except (OSError, http.client.HTTPException, RuntimeError) as error:  # RuntimeError: torch hub on a wrong hash
             raise NerfroError(f"the download of {title} weights failed ({error}); {by_hand}") from error
+        finally:
+            socket.setdefaulttimeout(before)
     return _read(cached, title)
 
 
@@ -90,17 +92,6 @@ def unreachable(url: str, seconds: float = CONNECT_SECONDS) -> str:
     thread.start()
     thread.join(seconds)
     return reasons[-1]
-
-
-@contextlib.contextmanager
-def _socket_timeout(seconds: float) -> Iterator[None]:
-    """Bound each wait for data: torch hub opens its address without a timeout and would wait for ever."""
-    before = socket.getdefaulttimeout()
-    socket.setdefaulttimeout(seconds)
-    try:
-        yield
-    finally:
-        socket.setdefaulttimeout(before)
 
 
 def _read(path: Path, title: str) -> dict[str, Tensor]:

@@ -75,14 +75,9 @@ class EvaluationResult:
         present = [value for value in values if value is not None]
         return math.fsum(present) / len(present) if present and len(present) == len(values) else None
 
-    def means_of(self, region: Region) -> dict[str, Score]:
+    def means(self, region: Region = FULL) -> dict[str, Score]:
         """The mean of every metric in a region, by name."""
         return {metric.name: self.mean(metric.name, region) for metric in METRICS}
-
-    @property
-    def means(self) -> dict[str, Score]:
-        """The mean of every metric on the full image, by name."""
-        return self.means_of(FULL)
 
 
 @dataclass(frozen=True)
@@ -90,33 +85,30 @@ class RunMetrics:
     """The content of a run's `metrics.json`."""
 
     result: EvaluationResult  # scores of the test views
-    steps: int | None  # optimisation steps that the weights have seen; None for pictures of another program
-    train_seconds: float | None  # wall-clock time spent training, without evaluation; None if nothing was trained
-    rays_per_second: float | None  # training throughput; None if nothing was trained
+    steps: int | None = None  # optimisation steps that the weights have seen; None for pictures of another program
+    train_seconds: float | None = (
+        None  # wall-clock time spent training, without evaluation; None if nothing was trained
+    )
+    rays_per_second: float | None = None  # training throughput; None if nothing was trained
 
 
-def write_metrics_json(
-    path: Path | str,
-    result: EvaluationResult,
-    steps: int | None,
-    train_seconds: float | None,
-    rays_per_second: float | None,
-) -> None:
+def write_metrics_json(path: Path | str, metrics: RunMetrics) -> None:
     """Write the file by which other tools read a run, whole or not at all; docs/metrics.md says what it holds.
 
     Raises:
         NerfroError: if a number is NaN or infinite (JSON has neither), or the file cannot be written.
     """
+    result = metrics.result
     content = {
-        "test": result.means,
-        "regions": {region: result.means_of(region) for region in result.regions if region != FULL},
+        "test": result.means(),
+        "regions": {region: result.means(region) for region in result.regions if region != FULL},
         "views": [
             {"name": view.name, **view.scores, "regions": {name: dict(row) for name, row in view.regions.items()}}
             for view in result.views
         ],
-        "steps": steps,
-        "train_seconds": train_seconds,
-        "rays_per_second": rays_per_second,
+        "steps": metrics.steps,
+        "train_seconds": metrics.train_seconds,
+        "rays_per_second": metrics.rays_per_second,
         "notes": dict(result.notes),
         "protocol": result.protocol,
     }
@@ -137,11 +129,7 @@ def read_metrics_json(path: Path | str) -> RunMetrics:
             ViewScores(
                 row["name"],
                 _scores(row),
-                {
-                    region: _scores(row["regions"][region])
-                    for region in OBJECT_REGIONS
-                    if region in row.get("regions", {})
-                },
+                {r: _scores(s) for r, s in row.get("regions", {}).items() if r in OBJECT_REGIONS},
             )
             for row in content["views"]
         )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import rich
 
-from nerfro.evaluation.results import FULL, METRICS, EvaluationResult, Region, Score, write_metrics_json
+from nerfro.evaluation.results import FULL, METRICS, EvaluationResult, Region, RunMetrics, Score, write_metrics_json
 from nerfro.evaluation.tables import MISSING, Column, Row, Table, to_rich, write_table
 
 _Scores = Sequence[tuple[str, Mapping[str, Score]]]
@@ -17,12 +17,12 @@ def views_table(result: EvaluationResult, title: str, region: Region = FULL) -> 
     """The scores of each view in one region, their means below, and in one line why others are missing."""
     scores = [(view.name, {m.name: view.score(m.name, region) for m in METRICS}) for view in result.views]
     notes = [_mask_note(result) if region != FULL else "", _missing(result, region)]
-    return _table(title, "view", scores, [("mean", result.means_of(region))], notes)
+    return _table(title, "view", scores, [("mean", result.means(region))], notes)
 
 
 def regions_table(result: EvaluationResult, title: str) -> Table:
     """The mean scores of each region, to stand below `views_table`: what is missing in all of them was told there."""
-    scores = [(region, result.means_of(region)) for region in result.regions]
+    scores = [(region, result.means(region)) for region in result.regions]
     told = _missing(result, FULL)
     missing = {region: _missing(result, region) for region in result.regions}
     notes = [f"{region}: {note}" for region, note in missing.items() if note and note != told]
@@ -61,16 +61,10 @@ def _missing(result: EvaluationResult, region: Region) -> str:
     return f"{MISSING}: {told}" if told else ""
 
 
-def report(
-    result: EvaluationResult,
-    title: str,
-    folder: Path,
-    steps: int | None = None,
-    seconds: float | None = None,
-    rays_per_second: float | None = None,
-) -> None:
+def report(metrics: RunMetrics, title: str, folder: Path) -> None:
     """Write metrics.json and the tables into a folder, and print the views' and the regions' table."""
-    write_metrics_json(folder / "metrics.json", result, steps, seconds, rays_per_second)
+    write_metrics_json(folder / "metrics.json", metrics)
+    result = metrics.result
     for region in result.regions:
         full = region == FULL
         table = views_table(result, title if full else f"{title}, {region}", region)

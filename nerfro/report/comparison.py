@@ -116,7 +116,11 @@ def _method_titles(runs: Sequence[Run], titles: Mapping[str, str]) -> dict[Any, 
         for scene in {run.scored for run in runs}:
             fields |= differing([configs[run.folder] for run in runs if run.name == name and run.scored == scene])
         for folder, config in configs.items():
-            values = [f"{_short(field)}={_value(config[field])}" for field in sorted(fields) if field in config]
+            values = [
+                f"{field.removesuffix('._target_')}={_value(config[field])}"
+                for field in sorted(fields)
+                if field in config
+            ]
             named[folder] = titles.get(name, name) + (f" ({', '.join(values)})" if values else "")
     return named
 
@@ -140,10 +144,6 @@ def differing(configs: Sequence[Mapping[str, Any]]) -> set[str]:
         if any(len(found) > 1 for found in values.values()):
             fields.add(key)
     return fields
-
-
-def _short(field: str) -> str:
-    return field.removesuffix("._target_")
 
 
 def _value(value: object) -> str:

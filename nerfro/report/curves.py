@@ -81,8 +81,8 @@ def draw_charts(runs: Sequence[tuple[int, Mapping[str, Curve]]]) -> list[Chart]:
 
 def _chart(name: str, curves: Sequence[tuple[int, Curve]]) -> Chart:
     logarithmic = name.startswith("loss/")
-    kept = [(method, _thin(*_positive(*curve) if logarithmic else curve)) for method, curve in curves]
-    kept = [(method, curve) for method, curve in kept if len(curve[0]) > 0]
+    drawable = [(method, steps, v > 0 if logarithmic else np.isfinite(v), v) for method, (steps, v) in curves]
+    kept = [(method, _thin(steps[mask], v[mask])) for method, steps, mask, v in drawable if mask.any()]
     if not kept:
         return Chart(name, logarithmic, (), (), ())
     last = max(float(steps[-1]) for _, (steps, _) in kept)
@@ -116,15 +116,11 @@ def _chart(name: str, curves: Sequence[tuple[int, Curve]]) -> Chart:
     )
 
 
-def _positive(steps: np.ndarray, values: np.ndarray) -> Curve:
-    return steps[values > 0], values[values > 0]
-
-
 def _thin(steps: np.ndarray, values: np.ndarray) -> Curve:
     """Means over equal numbers of neighbours, so that no more than `MAX_POINTS` are left."""
-    groups = np.array_split(np.arange(len(steps)), MAX_POINTS) if len(steps) > MAX_POINTS else None
-    if groups is None:
+    if len(steps) <= MAX_POINTS:
         return steps, values
+    groups = np.array_split(np.arange(len(steps)), MAX_POINTS)
     return np.array([steps[g].mean() for g in groups]), np.array([values[g].mean() for g in groups])
 
 

@@ -13,7 +13,6 @@ from markupsafe import Markup
 from omegaconf import OmegaConf
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.results import Metric, Region
 from nerfro.evaluation.tables import Table, to_html
 from nerfro.files.drawing import magma
 from nerfro.paths import PACKAGE_DIR
@@ -61,21 +60,15 @@ class Section:
     runs: Sequence[Provenance]
 
 
-def report_page(
-    compared: Sequence[tuple[Comparison, Table]],
-    unfinished: Sequence[str],
-    wanted: Wanted,
-    metric: Metric,
-    region: Region,
-) -> str:
-    """Write the page; below each picture stands its score by the metric in the region."""
+def report_page(compared: Sequence[tuple[Comparison, Table]], unfinished: Sequence[str], wanted: Wanted) -> str:
+    """Write the page, with a line on each run that is not evaluated."""
     sections = [
         Section(
             id=f"b{number}",
             title=f"Trained for {comparison.budget.label}",
             methods=comparison.methods,
             table=Markup(to_html(table)),
-            scenes=_scenes(f"b{number}", comparison, wanted, metric, region),
+            scenes=_scenes(f"b{number}", comparison, wanted),
             runs=[_provenance(comparison, run) for run in comparison.runs],
         )
         for number, (comparison, table) in enumerate(compared)
@@ -108,12 +101,12 @@ def _render(template: str, **context: object) -> str:
     return environment.get_template(template).render(context)
 
 
-def _scenes(prefix: str, comparison: Comparison, wanted: Wanted, metric: Metric, region: Region) -> list[SceneSection]:
+def _scenes(prefix: str, comparison: Comparison, wanted: Wanted) -> list[SceneSection]:
     sections = []
     for number, (scored, title) in enumerate(comparison.scenes.items()):
         pictures, reason = None, ""
         try:
-            pictures = scene_pictures(comparison, scored, wanted, metric, region)
+            pictures = scene_pictures(comparison, scored, wanted)
         except NerfroError as error:  # data that has moved away does not spoil the rest of the page
             reason = str(error)
         logged = [

@@ -125,7 +125,7 @@ def read_run(folder: Path) -> Run:
         absent = _FACTS - facts.keys()
         if absent:
             raise NerfroError(f"{folder / 'run.json'} lacks {first_of(sorted(absent))}; leave the run out")
-        data, trainer = config["data"], config["trainer"]
+        data, trainer, root = config["data"], config["trainer"], str(config["data"]["root"])
         view = metrics.result.views[0].name
         with Image.open(folder / "images" / f"{view}.png") as image:
             width, height = image.size
@@ -139,7 +139,7 @@ def read_run(folder: Path) -> Run:
             metrics=metrics,
             budget=_budget(trainer, int(config["batches"]["size"]), facts),
             scored=Scored(
-                root=_root(str(data["root"])),
+                root=root if root.startswith(EMBEDDED_PREFIX) else str(user_path(root).resolve()),
                 split=str(config["evaluation"]["split"]),
                 num_views=len(metrics.result.views),
                 width=width,
@@ -152,14 +152,7 @@ def read_run(folder: Path) -> Run:
     except OSError as error:
         reason = f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}"
         raise NerfroError(f"the run {shown(folder)} cannot be read: {reason}; repair it or leave it out") from error
-    except (
-        OmegaConfBaseException,
-        KeyError,
-        IndexError,
-        TypeError,
-        ValueError,
-        AttributeError,
-    ) as error:
+    except (OmegaConfBaseException, KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
         reason = str(error).strip().split("\n", 1)[0]
         raise NerfroError(
             f"the run {shown(folder)} is not as nerfro.train writes it ({type(error).__name__}: {reason}); leave it out"
@@ -200,7 +193,3 @@ def _budget(trainer: Mapping[str, Any], rays: int, facts: Mapping[str, Any]) -> 
     limited = steps is not None and steps >= 0
     where = None if seconds is None else device({"trainer": trainer}, facts)
     return Budget(seconds, steps if limited else None, rays if limited else None, where)
-
-
-def _root(root: str) -> str:
-    return root if root.startswith(EMBEDDED_PREFIX) else str(user_path(root).resolve())

@@ -20,7 +20,7 @@ from nerfro.errors import NerfroError
 from nerfro.evaluation.error_maps import ErrorMap, error_maps
 from nerfro.evaluation.lpips import LpipsNetwork, find_lpips_networks
 from nerfro.evaluation.pictures import Crop, most_telling_crop
-from nerfro.evaluation.results import Metric, Region
+from nerfro.evaluation.results import FULL, METRICS, Metric, Region, Score
 from nerfro.evaluation.tables import MISSING
 from nerfro.files.images import load_png, to_8bit
 from nerfro.registry import build
@@ -43,9 +43,19 @@ class Wanted:
     crops: Mapping[str, tuple[Crop, ...]]  # insets of the figure, by the scene's name
     error_map: str  # one of `ERROR_MAPS`
     lpips_networks: Mapping[str, LpipsNetwork]  # those that it needs
+    metric: Metric  # whose value stands below each picture
+    region: Region  # that it was measured on
 
     @classmethod
-    def of(cls, num_views: int, view: Any, crops: Any, error_map: str = "squared_error") -> Wanted:
+    def of(
+        cls,
+        num_views: int,
+        view: Any,
+        crops: Any,
+        error_map: str = "squared_error",
+        metric: Metric = METRICS[0],
+        region: Region = FULL,
+    ) -> Wanted:
         """Check the form of what the user gave; `view` and `crops` may be None."""
         if error_map not in ERROR_MAPS:
             raise NerfroError(f"error_map={error_map} is not an error map; choose from {', '.join(ERROR_MAPS)}")
@@ -67,7 +77,7 @@ class Wanted:
             raise NerfroError(
                 f"crops={crops} does not name squares; give {{SCENE: [[TOP, LEFT, SIZE], ...]}} in pixels"
             ) from error
-        return cls(num_views, chosen, insets, error_map, networks)
+        return cls(num_views, chosen, insets, error_map, networks, metric, region)
 
     def check(self, scenes: Sequence[Scored]) -> None:
         """Refuse what fits no scene."""
@@ -122,9 +132,7 @@ class ScenePictures:
     seeds: Sequence[int]  # of the runs whose pictures these are
 
 
-def scene_pictures(
-    comparison: Comparison, scored: Scored, wanted: Wanted, metric: Metric, region: Region
-) -> ScenePictures:
+def scene_pictures(comparison: Comparison, scored: Scored, wanted: Wanted) -> ScenePictures:
     """Gather the pictures of a scene, of each method those of its first seed, with their scores.
 
     Raises:
@@ -138,10 +146,10 @@ def scene_pictures(
     cameras = references.cameras
     if (len(references), cameras.height, cameras.width) != (scored.num_views, scored.height, scored.width):
         raise NerfroError(f"{scored.root} does not hold the views that were scored; has it been changed since?")
-    figure = wanted.view.get(scored.name, _median_view(list(runs.values()), metric, region))
+    figure = wanted.view.get(scored.name, _median_view(list(runs.values()), wanted))
     count = min(wanted.num_views or scored.num_views, scored.num_views)
     views = {
-        index: _view(index, references.images[index], runs, titles, metric, region, wanted)
+        index: _view(index, references.images[index], runs, titles, wanted)
         for index in sorted({round(i) for i in np.linspace(0, scored.num_views - 1, count)} | {figure})
     }
     reference, predictions = references.images[figure], [_prediction(run, figure) for run in runs.values()]
@@ -162,28 +170,25 @@ def scene_pictures(
     )
 
 
-def _median_view(runs: Sequence[Run], metric: Metric, region: Region) -> int:
+def _median_view(runs: Sequence[Run], wanted: Wanted) -> int:
     """The view whose mean score over methods is the median: neither the best nor the worst that could be shown."""
     scores = []
     for index in range(len(runs[0].metrics.result.views)):
-        values = [run.metrics.result.views[index].score(metric.name, region) for run in runs]
+        values = [_score(run, index, wanted) for run in runs]
         scores.append(statistics.fmean([value for value in values if value is not None] or [0.0]))
     return scores.index(statistics.median_low(scores))
 
 
-def _view(
-    index: int,
-    reference: Tensor,
-    runs: Mapping[int, Run],
-    titles: Mapping[int, str],
-    metric: Metric,
-    region: Region,
-    wanted: Wanted,
-) -> View:
+def _score(run: Run, view: int, wanted: Wanted) -> Score:
+    return run.metrics.result.views[view].score(wanted.metric.name, wanted.region)
+
+
+def _view(index: int, reference: Tensor, runs: Mapping[int, Run], titles: Mapping[int, str], wanted: Wanted) -> View:
+    metric = wanted.metric
     predictions, errors = {}, {}
     for number, run in runs.items():
         picture, title = _prediction(run, index), titles[number]
-        value = run.metrics.result.views[index].score(metric.name, region)
+        value = _score(run, index, wanted)
         score = f"{metric.title} {MISSING if value is None else f'{value:.{metric.decimals}f}'}"
         error = _error_map(picture, reference, wanted)
         predictions[number] = Shown(f"{title}, view {index}", score, data_uri(picture))

@@ -3,8 +3,7 @@ import torch
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.error_maps import ErrorMap, error_maps, squared_error_map
-from nerfro.evaluation.error_sheets import error_sheet
+from nerfro.evaluation.error_maps import ErrorMap, error_maps, error_sheet, squared_error_map
 from nerfro.evaluation.flip import flip
 from nerfro.evaluation.lpips import ALEX
 from nerfro.evaluation.metrics import psnr

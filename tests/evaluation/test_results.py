@@ -5,7 +5,14 @@ from pathlib import Path
 import pytest
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.results import METRICS, EvaluationResult, ViewScores, read_metrics_json, write_metrics_json
+from nerfro.evaluation.results import (
+    METRICS,
+    EvaluationResult,
+    RunMetrics,
+    ViewScores,
+    read_metrics_json,
+    write_metrics_json,
+)
 
 
 def scores(**given: float) -> dict[str, float | None]:
@@ -33,7 +40,7 @@ def refuse(constant: str) -> None:
 
 
 def test_file_holds_means_rows_and_budget(tmp_path: Path) -> None:
-    write_metrics_json(tmp_path / "metrics.json", result(), 1500, 312.5, 81000.0)
+    write_metrics_json(tmp_path / "metrics.json", RunMetrics(result(), 1500, 312.5, 81000.0))
     content = json.loads((tmp_path / "metrics.json").read_text(), parse_constant=refuse)
     means = scores(psnr=(25.123456789012345 + 27.0) / 2, ssim=pytest.approx(0.85), flip=0.1875)
     assert content["test"] == means
@@ -46,14 +53,14 @@ def test_file_holds_means_rows_and_budget(tmp_path: Path) -> None:
 
 
 def test_read_returns_what_was_written(tmp_path: Path) -> None:
-    write_metrics_json(tmp_path / "metrics.json", result(), 1500, 312.5, None)
+    write_metrics_json(tmp_path / "metrics.json", RunMetrics(result(), 1500, 312.5, None))
     run = read_metrics_json(tmp_path / "metrics.json")
     assert run.result == result()
     assert (run.steps, run.train_seconds, run.rays_per_second) == (1500, 312.5, None)
 
 
 def test_pictures_of_another_program_have_no_budget(tmp_path: Path) -> None:
-    write_metrics_json(tmp_path / "metrics.json", result(), None, None, None)
+    write_metrics_json(tmp_path / "metrics.json", RunMetrics(result()))
     run = read_metrics_json(tmp_path / "metrics.json")
     assert (run.steps, run.train_seconds, run.rays_per_second) == (None, None, None)
 
@@ -70,14 +77,14 @@ def test_files_from_before_there_were_regions_are_read(tmp_path: Path) -> None:
     }
     (tmp_path / "metrics.json").write_text(json.dumps(old))
     read = read_metrics_json(tmp_path / "metrics.json").result
-    assert read.means == scores(psnr=25.0, ssim=0.8)
+    assert read.means() == scores(psnr=25.0, ssim=0.8)
     assert read.regions == ("full",)
     assert read.mean("psnr", "crop") is None
 
 
 def test_mean_over_some_of_the_views_is_not_given() -> None:
     views = (ViewScores("a", scores(psnr=20.0)), ViewScores("b", scores(psnr=30.0, ssim=0.9)))
-    assert EvaluationResult(views).means == scores(psnr=25.0)
+    assert EvaluationResult(views).means() == scores(psnr=25.0)
     assert EvaluationResult(()).mean("psnr") is None
 
 
@@ -90,13 +97,13 @@ def test_means_of_a_region_are_over_its_own_numbers() -> None:
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_numbers_that_json_lacks_are_refused_and_the_old_file_stays(tmp_path: Path, bad: float) -> None:
     path = tmp_path / "metrics.json"
-    write_metrics_json(path, result(), 1, 1.0, 1.0)
+    write_metrics_json(path, RunMetrics(result(), 1, 1.0, 1.0))
     before = path.read_text()
     with pytest.raises(NerfroError, match=r"metrics\.rays_per_second"):
-        write_metrics_json(path, result(), 1, 1.0, bad)
+        write_metrics_json(path, RunMetrics(result(), 1, 1.0, bad))
     diverged = EvaluationResult((ViewScores("test_000", {"psnr": 20.0, "ssim": bad, "lpips": None}),))
     with pytest.raises(NerfroError, match="ssim"):
-        write_metrics_json(path, diverged, 1, 1.0, 1.0)
+        write_metrics_json(path, RunMetrics(diverged, 1, 1.0, 1.0))
     assert path.read_text() == before
 
 

@@ -1,12 +1,18 @@
-"""Rendering the views of a split, writing the pictures and scoring them."""
+"""Scoring the views of a split, which are rendered first, or the pictures of a folder."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
+import torch
 from tqdm import tqdm
 
 from nerfro.data.base import Views
+from nerfro.data.image_files import Alpha
+from nerfro.evaluation.error_maps import write_error_sheet
+from nerfro.evaluation.folders import PicturePair
+from nerfro.evaluation.lpips import LpipsNetwork
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.render_view import Supersampling, render_view
 from nerfro.evaluation.results import EvaluationResult
@@ -33,3 +39,26 @@ def score_views(
             metrics.update(rgb, views.images[view], view, coverage)
             progress.update(height * width)
     return metrics.result()
+
+
+def score_folders(
+    pairs: list[PicturePair],
+    alpha: Alpha,
+    metrics: ImageMetrics,
+    networks: Mapping[str, LpipsNetwork],
+    folder: Path,
+    device: torch.device,
+) -> EvaluationResult:
+    """Score each prediction on a device, and draw its error maps into `folder/errors`.
+
+    A file that is damaged or does not fit its partner is told before anything is scored.
+    """
+    for pair in pairs:  # kept in memory for no longer than it takes
+        pair.load(alpha)
+    metrics = metrics.to(device)
+    for pair in tqdm(pairs, unit="view", desc="evaluate", dynamic_ncols=True):
+        prediction, reference, coverage = pair.load(alpha)
+        prediction, reference = prediction.to(device), reference.to(device)
+        metrics.update(prediction, reference, coverage=None if coverage is None else coverage.to(device))
+        write_error_sheet(folder, pair.name, prediction, reference, networks)
+    return metrics.result([pair.name for pair in pairs])
