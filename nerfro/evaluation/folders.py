@@ -60,7 +60,7 @@ def match_folders(predictions: Path, references: Path, masks: Path | None) -> li
         NerfroError: a folder does not exist or has no pictures, a picture has no partner, or a name occurs twice.
     """
     predicted, truth = _pictures(predictions, "predictions"), _pictures(references, "references")
-    truth = {name: path for name, path in truth.items() if not (name[:5] == "mask_" and name[5:] in truth)}
+    truth = {name: path for name, path in truth.items() if not name.startswith("mask_") or name[5:] not in truth}
     _require(predicted, truth, f"reference in references={references}")
     _require(truth, predicted, f"prediction in predictions={predictions}")
     if masks is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import cycle
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, squared_error_map
 from nerfro.files.drawing import GAP, LINE_HEIGHT, colour_scale, fit, magma, paper, write
 
 ROW_GAP = 18  # pixels between views
-CROP_COLOURS = ((225, 60, 50), (45, 125, 235), (40, 165, 85))  # frames of the first, second, ... inset
+CROP_COLOURS = ((225, 60, 50), (45, 125, 235), (40, 165, 85))  # frames of the first, second, ... inset, in turn
 
 
 @dataclass(frozen=True)
@@ -28,10 +29,14 @@ class Crop:
     left: int
     size: int
 
+    def inside(self, height: int, width: int) -> bool:
+        """Whether it lies inside a picture."""
+        return min(self.top, self.left) >= 0 and self.top + self.size <= height and self.left + self.size <= width
+
     def of(self, picture: Float[Tensor, "H W C"]) -> Float[Tensor, "size size C"]:
         """Cut the square out; refused if it does not lie inside the picture."""
         height, width = picture.shape[:2]
-        if min(self.top, self.left) < 0 or self.top + self.size > height or self.left + self.size > width:
+        if not self.inside(height, width):
             raise NerfroError(f"{self} does not lie inside a picture of {height} x {width} pixels; choose another one")
         return picture[self.top : self.top + self.size, self.left : self.left + self.size]
 
@@ -65,7 +70,10 @@ def picture_grid(
     _check(rows, titles)
     margin = LINE_HEIGHT if any(row.label for row in rows) else 0
     across = margin + len(titles) * (width + GAP) - GAP
-    bands = [_titles_band(titles, margin, width, across)]
+    heading = paper(across, LINE_HEIGHT)
+    for column, title in enumerate(titles):
+        write(heading, title, margin + column * (width + GAP) + width // 2, LINE_HEIGHT // 2)
+    bands = [np.asarray(heading)]
     for index, row in enumerate(rows):
         if index > 0:
             bands.append(np.asarray(paper(across, ROW_GAP)))
@@ -129,18 +137,12 @@ def _check(rows: Sequence[PictureRow], titles: Sequence[str]) -> None:
                 )
 
 
-def _titles_band(titles: Sequence[str], margin: int, width: int, across: int) -> np.ndarray:
-    band = paper(across, LINE_HEIGHT)
-    for column, title in enumerate(titles):
-        write(band, title, margin + column * (width + GAP) + width // 2, LINE_HEIGHT // 2)
-    return np.asarray(band)
-
-
 def _row_band(row: PictureRow, margin: int, width: int, across: int, error_limit: float | None) -> np.ndarray:
     """One row of the grid: a column of stacked cells for each picture, and the row's label."""
+    captions = ["", *row.captions] if row.captions else [None] * (1 + len(row.predictions))  # None: no room for them
     columns = [
-        _column(row, picture, _caption(row, index), width, error_limit)
-        for index, picture in enumerate([row.reference, *row.predictions])
+        _column(row, picture, caption, width, error_limit)
+        for picture, caption in zip([row.reference, *row.predictions], captions, strict=True)
     ]
     band = paper(across, columns[0].height)
     for index, column in enumerate(columns):
@@ -150,13 +152,6 @@ def _row_band(row: PictureRow, margin: int, width: int, across: int, error_limit
         write(label, row.label, band.height // 2, margin // 2)
         band.paste(label.rotate(90, expand=True), (0, 0))
     return np.asarray(band)
-
-
-def _caption(row: PictureRow, column: int) -> str | None:
-    """Caption of a column; None where the row has no captions at all, and so no room for them."""
-    if not row.captions:
-        return None
-    return row.captions[column - 1] if column > 0 else ""
 
 
 def _column(
@@ -186,12 +181,10 @@ def _column(
 def _picture_cell(row: PictureRow, picture: Tensor | None, width: int, height: int) -> Image.Image:
     cell = fit(picture, width, height)
     zoom = width / row.reference.shape[1]
-    for index, crop in enumerate(row.crops if picture is not None else ()):
-        corners = [crop.left, crop.top, crop.left + crop.size, crop.top + crop.size]
-        frame = [round(zoom * corner) for corner in corners]
-        ImageDraw.Draw(cell).rectangle(
-            [frame[0], frame[1], frame[2] - 1, frame[3] - 1], outline=_crop_colour(index), width=2
-        )
+    for crop, colour in zip(row.crops if picture is not None else (), cycle(CROP_COLOURS), strict=False):
+        left, top = round(zoom * crop.left), round(zoom * crop.top)
+        right, bottom = round(zoom * (crop.left + crop.size)), round(zoom * (crop.top + crop.size))
+        ImageDraw.Draw(cell).rectangle([left, top, right - 1, bottom - 1], outline=colour, width=2)
     return cell
 
 
@@ -199,12 +192,8 @@ def _insets_cell(crops: Sequence[Crop], picture: Tensor | None, width: int) -> I
     """The crops side by side over the width of the column, framed in their colours."""
     side = (width - (len(crops) - 1) * GAP) // len(crops)
     cell = paper(width, side)
-    for index, crop in enumerate(crops):
+    for index, (crop, colour) in enumerate(zip(crops, cycle(CROP_COLOURS), strict=False)):
         inset = fit(None if picture is None else crop.of(picture), side, side)
-        ImageDraw.Draw(inset).rectangle([0, 0, side - 1, side - 1], outline=_crop_colour(index), width=3)
+        ImageDraw.Draw(inset).rectangle([0, 0, side - 1, side - 1], outline=colour, width=3)
         cell.paste(inset, (index * (side + GAP), 0))
     return cell
-
-
-def _crop_colour(index: int) -> tuple[int, int, int]:
-    return CROP_COLOURS[index % len(CROP_COLOURS)]

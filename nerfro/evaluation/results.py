@@ -86,9 +86,7 @@ class RunMetrics:
 
     result: EvaluationResult  # scores of the test views
     steps: int | None = None  # optimisation steps that the weights have seen; None for pictures of another program
-    train_seconds: float | None = (
-        None  # wall-clock time spent training, without evaluation; None if nothing was trained
-    )
+    train_seconds: float | None = None  # wall-clock, without evaluation; None if nothing was trained
     rays_per_second: float | None = None  # training throughput; None if nothing was trained
 
 

@@ -68,8 +68,10 @@ def to_table(comparison: Comparison, metrics: Sequence[Metric], region: Region) 
 
 
 def find_metrics(names: Sequence[str]) -> list[Metric]:
-    """The metrics of these names; a name that is none is refused."""
+    """The metrics of these names, at least one; a name that is none is refused."""
     known = {metric.name: metric for metric in METRICS}
+    if not names:
+        raise NerfroError(f"metrics: none is given; choose from {', '.join(known)}")
     for name in names:
         if name not in known:
             raise NerfroError(f"metrics: '{name}' is not a metric; choose from {', '.join(known)}")
@@ -116,11 +118,8 @@ def _method_titles(runs: Sequence[Run], titles: Mapping[str, str]) -> dict[Any, 
         for scene in {run.scored for run in runs}:
             fields |= differing([configs[run.folder] for run in runs if run.name == name and run.scored == scene])
         for folder, config in configs.items():
-            values = [
-                f"{field.removesuffix('._target_')}={_value(config[field])}"
-                for field in sorted(fields)
-                if field in config
-            ]
+            said = [field for field in sorted(fields) if field in config]
+            values = [f"{field.removesuffix('._target_')}={_value(config[field])}" for field in said]
             named[folder] = titles.get(name, name) + (f" ({', '.join(values)})" if values else "")
     return named
 

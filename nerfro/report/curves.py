@@ -81,8 +81,9 @@ def draw_charts(runs: Sequence[tuple[int, Mapping[str, Curve]]]) -> list[Chart]:
 
 def _chart(name: str, curves: Sequence[tuple[int, Curve]]) -> Chart:
     logarithmic = name.startswith("loss/")
-    drawable = [(method, steps, v > 0 if logarithmic else np.isfinite(v), v) for method, (steps, v) in curves]
-    kept = [(method, _thin(steps[mask], v[mask])) for method, steps, mask, v in drawable if mask.any()]
+    if logarithmic:
+        curves = [(method, (steps[values > 0], values[values > 0])) for method, (steps, values) in curves]
+    kept = [(method, _thin(*curve)) for method, curve in curves if len(curve[0]) > 0]
     if not kept:
         return Chart(name, logarithmic, (), (), ())
     last = max(float(steps[-1]) for _, (steps, _) in kept)

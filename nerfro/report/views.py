@@ -91,8 +91,7 @@ class Wanted:
                     f"view.{scene.name}={self.view[scene.name]} is not a view; give 0 to {scene.num_views - 1}"
                 )
             for crop in self.crops.get(scene.name, ()):
-                inside = crop.top + crop.size <= scene.height and crop.left + crop.size <= scene.width
-                if min(crop.top, crop.left) < 0 or crop.size < 1 or not inside:
+                if crop.size < 1 or not crop.inside(scene.height, scene.width):
                     raise NerfroError(
                         f"crops.{scene.name}: {crop} does not lie inside {scene.width} x {scene.height} pixels"
                     )

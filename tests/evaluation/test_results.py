@@ -91,7 +91,7 @@ def test_mean_over_some_of_the_views_is_not_given() -> None:
 def test_means_of_a_region_are_over_its_own_numbers() -> None:
     assert result().regions == ("full", "mask", "crop")
     assert result().mean("psnr", "mask") == 23.0
-    assert result().means_of("crop") == scores(psnr=24.5)
+    assert result().means("crop") == scores(psnr=24.5)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
