@@ -346,6 +346,7 @@ def test_command_prints_writes_all_forms_and_refuses_to_overwrite(
 @pytest.mark.parametrize(
     ("override", "said"),
     [
+        ("metrics=[]", "metrics: none is given; choose from psnr"),
         ("metrics=[psnr,foo]", "'foo' is not a metric; choose from psnr"),
         ("region=x", "choose from full, mask, crop"),
         ("views=-1", "views=-1"),
