@@ -184,4 +184,4 @@ def build(spacing: float) -> Scene:
         painted(pine, pine_colours, (x - 0.2, y - 0.2, -0.31), (x + 0.2, y + 0.2, 0.33), fine),
     ]
     glass = sphere(GLASS_RADIUS, GLASS_SUBDIVISIONS)
-    return Scene(name="deerglobe", ior=1.5, glass=glass, interior=join(parts), sky=sky)
+    return Scene(ior=1.5, glass=glass, interior=join(parts), sky=sky)

@@ -12,9 +12,8 @@ import numpy as np
 from nerfro.capture.boards import TagBoard, twelve_faces
 from nerfro.scenes import starlamp
 from nerfro.scenes.distance import Vector, ball, capsule, ellipsoid, painted, smooth_union, triangulate
-from nerfro.scenes.panels import Panel, painted_panel
 from nerfro.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
-from nerfro.scenes.scene import Scene
+from nerfro.scenes.scene import Panel, Scene, painted_panel
 from nerfro.scenes.surface import join
 
 WATER = 1.33
@@ -200,10 +199,10 @@ def build(spacing: float) -> Scene:
         0.01,
     )
     return Scene(
-        name="dolphin_capture",
         ior=WATER,
         glass=glass.moved(CENTRE),
         interior=join(parts).moved(CENTRE),
         sky=None,
+        aim=AIM,
         panels=(*room_panels(coarse), table, top, *board_panels(twelve_faces())),
     )

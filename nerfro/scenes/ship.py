@@ -173,4 +173,4 @@ def build(spacing: float) -> Scene:
         corners = (x, -half_width, low), (x + 0.1, half_width, high)
         parts.append(painted(sheet, sail_colours, *corners, min(fine, 0.005)))
     glass = rounded_box(HALF_SIDES, EDGE_RADIUS, edge_steps=12)
-    return Scene(name="ship", ior=1.5, glass=glass, interior=join(parts), sky=sky, tint=TINT)
+    return Scene(ior=1.5, glass=glass, interior=join(parts), sky=sky, tint=TINT)

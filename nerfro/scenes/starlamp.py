@@ -155,4 +155,4 @@ def build(spacing: float) -> Scene:
     extent = np.full(3, 1.1 * RING_RADII[1])
     rings = distance.painted(ring, ring_colours, -extent, extent, min(spacing, 0.006))
     glass = distance.triangulate(star_prism, (-OUTER, -HALF_DEPTH, -OUTER), (OUTER, HALF_DEPTH, OUTER), GLASS_SPACING)
-    return Scene(name="starlamp", ior=1.5, glass=glass, interior=join([planet, rings]), sky=sky)
+    return Scene(ior=1.5, glass=glass, interior=join([planet, rings]), sky=sky)

@@ -71,4 +71,4 @@ def build(spacing: float) -> Scene:
     ring, angles = torus_angles(MAJOR_RADIUS, MINOR_RADIUS, spacing)
     ring = replace(tilted(ring, TILT_DEGREES), colours=torus_colours(angles).astype(np.float32))
     glass = rounded_box((HALF_SIDE,) * 3, EDGE_RADIUS, edge_steps=12)
-    return Scene(name="torus", ior=1.5, glass=glass, interior=ring, sky=sky)
+    return Scene(ior=1.5, glass=glass, interior=ring, sky=sky)
