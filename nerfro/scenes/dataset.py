@@ -65,7 +65,7 @@ class DataSet(ABC):
 
     META: ClassVar[str]  # the file in which the settings stand
     FILES: ClassVar[tuple[str, ...]]  # patterns of all files
-    FACTS: ClassVar[dict[str, Any]]  # that META tells beside the settings
+    FACTS: ClassVar[dict[str, Any]] = {}  # that META tells beside the settings
     OPTIONS: ClassVar[tuple[str, ...]]  # that decide the contents of the pictures
     THINGS: ClassVar[str]
 
@@ -96,7 +96,7 @@ class DataSet(ABC):
         Raises:
             NerfroError: the folder holds another data set, and not `overwrite`, or other files.
         """
-        options = OmegaConf.to_container(self.config)
+        options: Any = OmegaConf.to_container(self.config)
         settings = {"scene": self.config.scene, "fingerprint": fingerprint(self.scene)}
         settings |= {name: options[name] for name in self.OPTIONS}
         try:
@@ -199,7 +199,6 @@ class Photographs(DataSet):
         *("images/photo_*.png", "masks/photo_*.png"),
         *(f"truth/{name}" for name in ("transforms_train.json", "mesh.ply", "interior.ply", "meta.json")),
     )
-    FACTS: ClassVar[dict[str, Any]] = {}
     OPTIONS = ("resolution", "photographs", "spp", "noise", "fresnel", "seed")
     THINGS = "photographs"
 

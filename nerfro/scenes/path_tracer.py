@@ -147,8 +147,7 @@ class PathTracer:
         Args:
             to_world: matrix [4, 4] from the square [-1, 1]^2 of x (to the right) and y (upwards); z points up from it.
             above: distance from the rectangle at which rays begin, world units.
-            spp: samples per pixel.
-            seed: of the sampler.
+            spp, seed: as for `render`.
         """
         pose = to_world.copy()
         pose[:3, 3] += above * to_world[:3, 2]
