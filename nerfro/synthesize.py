@@ -6,7 +6,6 @@ from omegaconf import DictConfig
 
 from nerfro.cli import entry_point
 from nerfro.paths import CONF_DIR
-from nerfro.scenes import photographs
 from nerfro.scenes.synthesis import CAPTURES, SynthesizeConfig, synthesize
 
 
@@ -16,8 +15,7 @@ def main(config: DictConfig) -> None:
     scene, folder = synthesize(config)
     print(f"done: {folder}")
     if config.scene in CAPTURES:
-        images = folder / photographs.IMAGES
-        print(f"calibrate it: python -m nerfro.calibrate images={images} target=apriltag out={folder}")
+        print(f"calibrate it: python -m nerfro.calibrate images={folder / 'images'} target=apriltag out={folder}")
         return
     mesh = folder / "mesh.ply"
     print(f"train on it: python -m nerfro.train data.root={folder} medium.mesh={mesh} medium.ior={scene.ior}")

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,15 +21,13 @@ from omegaconf import OmegaConf
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-import nerfro.scenes.synthesis
 from benchmarks.capture import measure, similarity
 from nerfro.capture.boards import tag_detector, twelve_faces
 from nerfro.data.opencv import OpenCVData
 from nerfro.geometry.mesh import load_mesh
 from nerfro.paths import CONF_DIR
-from nerfro.scenes.dataset import missing
+from nerfro.scenes import dataset
 from nerfro.scenes.dolphin_capture import AIM, board_to_world
-from nerfro.scenes.photographs import Settings, photographs
 from nerfro.scenes.synthesis import SynthesizeConfig, synthesize
 
 
@@ -53,7 +52,7 @@ def few(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("mitsuba")
     pytest.importorskip("pupil_apriltags")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(nerfro.scenes.synthesis, "_BAKING_SPP", 8)
+        patch.setattr(dataset, "BAKING_SPP", 8)
         return photograph(tmp_path_factory.mktemp("few"), resolution=320, photographs=2, spp=4)
 
 
@@ -91,12 +90,13 @@ def test_tags_are_photographed_where_the_true_cameras_see_them(few: Path) -> Non
 
 
 def test_only_what_is_not_on_disk_is_rendered_again(few: Path, tmp_path: Path) -> None:
-    settings = Settings(**json.loads((few / "truth" / "meta.json").read_text())["settings"])
-    planned = photographs(settings, AIM)
-    assert list(missing(few, planned)) == []
+    settings = OmegaConf.create(json.loads((few / "truth" / "meta.json").read_text())["settings"])
     shutil.copytree(few, tmp_path / "copy")
+    data = dataset.Photographs(settings, SimpleNamespace(aim=AIM), tmp_path / "copy")
+    planned = data.planned()
+    assert data.missing(planned) == []
     (tmp_path / "copy" / planned[1].mask_path).unlink()
-    assert [one.index for one in missing(tmp_path / "copy", planned)] == [1]
+    assert [picture.image_path for picture in data.missing(planned)] == ["images/photo_001.png"]
 
 
 def test_similarity_undoes_scale_turn_and_shift() -> None:

@@ -8,9 +8,8 @@ import numpy as np
 from skimage.transform import resize
 
 from nerfro.light import to_linear, to_srgb
-from nerfro.scenes.panels import Panel
 from nerfro.scenes.path_tracer import PathTracer, Pinhole
-from nerfro.scenes.scene import Scene
+from nerfro.scenes.scene import Panel, Scene
 
 TEXELS = 16  # of the light on a panel, each way
 _ABOVE = 2e-3  # world units; more than the renderer's own offsets, less than the gap under the globe
@@ -23,12 +22,12 @@ def bake(scene: Scene, spp: int, variant: str = "auto") -> Scene:
     colour; light that is thrown back and forth between them has no finer pattern than that.
 
     Args:
-        scene: whose panels all glow or are diffuse.
+        scene: with panels.
         spp: samples for each of `TEXELS` x `TEXELS` places on a panel.
         variant: Mitsuba variant, see `load_mitsuba`.
     """
     plain = [panel if panel.glows else replace(panel, picture=_mean(panel)) for panel in scene.panels]
-    tracer = PathTracer(replace(scene, panels=tuple(plain)), False, Pinhole.square(1.0, TEXELS), variant=variant)
+    tracer = PathTracer(replace(scene, panels=tuple(plain)), False, Pinhole.square(1.0, TEXELS), variant)
     baked = []
     for number, (panel, even) in enumerate(zip(scene.panels, plain, strict=True)):
         if not panel.glows:

@@ -1,61 +1,40 @@
-"""A rendered scene as a folder in Blender format, written so that an interrupted run can be continued."""
+"""A rendered scene as a folder that an interrupted run continues: views in Blender format, or photographs."""
 
 from __future__ import annotations
 
 import hashlib
+import importlib.metadata
 import json
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+import platform
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, ClassVar
 
 import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.images import save_picture
+from nerfro.files.lat_long import save_lat_long
 from nerfro.light import to_srgb
+from nerfro.scenes.baking import bake
+from nerfro.scenes.path_tracer import Pinhole
 from nerfro.scenes.scene import Scene
-from nerfro.scenes.skies import lat_long_directions
-from nerfro.scenes.viewpoints import directions_on_sphere, look_at_origin
+from nerfro.scenes.skies import lat_long_directions, lat_long_texture
+from nerfro.scenes.viewpoints import directions_on_sphere, hand_held, look_at_origin
 
 CAMERA_ANGLE_X = 0.6911112070083618  # the camera of the NeRF synthetic scenes, which the paper's scenes share
 CAMERA_DISTANCE = 4.03
-NEAR, FAR = 2.0, 6.0
-BOX = ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))
 SPLITS = ("train", "val", "test")
-META = "meta.json"
-_FILES = (
-    *(f"transforms_{split}.json" for split in SPLITS),
-    *(f"{folder}{split}/r_*.png" for split in SPLITS for folder in ("", "masks/")),
-    *("mesh.ply", "interior.ply", "sky.png", "sky.exr", META),
-)
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Everything that decides the contents of the pictures; a folder is continued only with equal settings.
-
-    Attributes:
-        scene: name of the scene.
-        fingerprint: hash of its geometry, colours and sky, so that pictures of an older model are not mixed in.
-        resolution: side of the square pictures, pixels.
-        spp: samples per pixel of training and validation views.
-        test_spp: samples per pixel of test views.
-        views: number of views per split.
-        fresnel: whether the glass reflects partially.
-        seed: seed of viewpoints and of the sampler.
-    """
-
-    scene: str
-    fingerprint: str
-    resolution: int
-    spp: int
-    test_spp: int
-    views: dict[str, int]
-    fresnel: bool
-    seed: int
+PHOTOGRAPHER_DISTANCE, ELEVATIONS, LAPS = 4.5, (5.0, 68.0), 4
+# Of the width, and in shares of it from the picture's centre: no lens sits exactly in front of the middle.
+FOCAL, OFF_CENTRE = 1.18, (0.006, -0.005)
+BAKING_SPP = 256
 
 
 @dataclass(frozen=True)
@@ -76,8 +55,200 @@ class Planned:
     seed: int
 
 
+@dataclass(frozen=True)
+class DataSet(ABC):
+    """The pictures of a scene in a folder; `config` is a resolved `SynthesizeConfig`."""
+
+    config: DictConfig
+    scene: Scene
+    folder: Path
+
+    META: ClassVar[str]  # the file in which the settings stand
+    FILES: ClassVar[tuple[str, ...]]  # patterns of all files
+    FACTS: ClassVar[dict[str, Any]] = {}  # that META tells beside the settings
+    OPTIONS: ClassVar[tuple[str, ...]]  # that decide the contents of the pictures
+    THINGS: ClassVar[str]
+
+    @property
+    @abstractmethod
+    def camera(self) -> Pinhole:
+        """The camera that takes all pictures."""
+
+    @abstractmethod
+    def planned(self) -> list[Planned]:
+        """All pictures, in the order in which they are rendered."""
+
+    @abstractmethod
+    def write(self, picture: Planned, radiance: np.ndarray, share: np.ndarray) -> None:
+        """Write a picture of linear radiance [H, W, 3], and a mask of the share of each pixel [H, W]."""
+
+    @abstractmethod
+    def finish(self, planned: list[Planned]) -> None:
+        """Write what belongs to the pictures; the cameras last, as they say that the pictures are complete."""
+
+    def lit(self) -> Scene:
+        """The scene as it is rendered."""
+        return self.scene
+
+    def prepare(self, mitsuba: ModuleType) -> None:
+        """Make the folder ready: new, continued if its settings are equal, or cleared.
+
+        Raises:
+            NerfroError: the folder holds another data set, and not `overwrite`, or other files.
+        """
+        options: Any = OmegaConf.to_container(self.config)
+        settings = {"scene": self.config.scene, "fingerprint": fingerprint(self.scene)}
+        settings |= {name: options[name] for name in self.OPTIONS}
+        try:
+            stored = json.loads((self.folder / self.META).read_text()).get("settings")
+        except (FileNotFoundError, NotADirectoryError, ValueError, AttributeError):
+            stored = None
+        if stored == settings:
+            return
+        if stored is not None:
+            if not self.config.overwrite:
+                raise NerfroError(
+                    f"'{self.folder}' holds a data set with other settings; choose another folder with out=DIR, "
+                    "or replace it with overwrite=true"
+                )
+            # Nothing else, that somebody may have put beside them.
+            for path in [path for pattern in self.FILES for path in self.folder.glob(pattern)]:
+                path.unlink()
+        elif self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
+            raise NerfroError(f"'{self.folder}' exists and is no data set of ours; choose another folder with out=DIR")
+        versions = {name: importlib.metadata.version(name) for name in ("mitsuba", "drjit", "numpy")}
+        versions |= {"python": platform.python_version(), "variant": mitsuba.variant()}
+        meta = {"scene": self.config.scene, "ior": self.scene.ior, "tint": list(self.scene.tint), **self.FACTS}
+        _write_json(self.folder / self.META, {**meta, "settings": settings, "versions": versions})
+
+    def missing(self, planned: list[Planned]) -> list[Planned]:
+        """Those whose picture or mask is not on disk yet."""
+        return [
+            picture
+            for picture in planned
+            if not all((self.folder / path).is_file() for path in (picture.image_path, picture.mask_path))
+        ]
+
+
+class Views(DataSet):
+    """Views from all sides in Blender format, split for training."""
+
+    META = "meta.json"
+    FILES = (
+        *(f"transforms_{split}.json" for split in SPLITS),
+        *(f"{folder}{split}/r_*.png" for split in SPLITS for folder in ("", "masks/")),
+        *("mesh.ply", "interior.ply", "sky.png", "sky.exr", META),
+    )
+    FACTS: ClassVar[dict[str, Any]] = {
+        "box": ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5)),
+        "near": 2.0,
+        "far": 6.0,
+        "camera_distance": CAMERA_DISTANCE,
+        "sky": "lat-long, z up: column u = 0.5 - atan2(y, x) / (2 pi), row v = acos(z) / pi, pixel centres + 0.5",
+        "masks": "share of the pixel that the glass covers",
+    }
+    OPTIONS = ("resolution", "spp", "test_spp", "views", "fresnel", "seed")
+    THINGS = "views"
+
+    @property
+    def camera(self) -> Pinhole:
+        return Pinhole.square(CAMERA_ANGLE_X, self.config.resolution)
+
+    def planned(self) -> list[Planned]:
+        planned = []
+        for number, split in enumerate(SPLITS):
+            spp = self.config.test_spp if split == "test" else self.config.spp
+            directions = directions_on_sphere(self.config.views[split], self.config.seed, number)
+            for index, direction in enumerate(directions):
+                pose = look_at_origin(CAMERA_DISTANCE * direction)
+                seed, name = (self.config.seed * 3 + number) * 100_000 + index, f"{split}/r_{index:03d}.png"
+                planned.append(Planned(name, f"masks/{name}", pose, spp, seed))
+        return planned
+
+    def write(self, picture: Planned, radiance: np.ndarray, share: np.ndarray) -> None:
+        _write_image(self.folder / picture.mask_path, share)
+        _write_image(self.folder / picture.image_path, to_srgb(radiance))
+
+    def finish(self, planned: list[Planned]) -> None:
+        assert self.scene.sky is not None
+        sky = lat_long_texture(self.scene.sky, self.config.sky_height)
+        self.scene.glass.save(self.folder / "mesh.ply")
+        _write_image(self.folder / "sky.png", to_srgb(sky))
+        if self.config.extras:
+            self.scene.interior.save(self.folder / "interior.ply")
+            save_lat_long(self.folder / "sky.exr", torch.from_numpy(sky))
+        for split in SPLITS:
+            frames = [
+                {
+                    "file_path": "./" + view.image_path.removesuffix(".png"),
+                    "mask_path": "./" + view.mask_path,
+                    "transform_matrix": view.pose.tolist(),
+                }
+                for view in planned
+                if view.image_path.startswith(f"{split}/")
+            ]
+            content = {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}
+            _write_json(self.folder / f"transforms_{split}.json", content)
+
+
+class Photographs(DataSet):
+    """Photographs and masks as somebody brings them home, and apart from them the truth."""
+
+    META = "truth/meta.json"
+    FILES = (
+        *("images/photo_*.png", "masks/photo_*.png"),
+        *(f"truth/{name}" for name in ("transforms_train.json", "mesh.ply", "interior.ply", "meta.json")),
+    )
+    OPTIONS = ("resolution", "photographs", "spp", "noise", "fresnel", "seed")
+    THINGS = "photographs"
+
+    @property
+    def camera(self) -> Pinhole:
+        width, height = self.config.resolution, self.config.resolution * 3 // 4
+        cx, cy = 0.5 * width + OFF_CENTRE[0] * width, 0.5 * height + OFF_CENTRE[1] * width
+        return Pinhole(width, height, FOCAL * width, cx, cy)
+
+    def lit(self) -> Scene:
+        return bake(self.scene, BAKING_SPP, self.config.variant)
+
+    def planned(self) -> list[Planned]:
+        config = self.config
+        poses = hand_held(config.photographs, config.seed, self.scene.aim, PHOTOGRAPHER_DISTANCE, ELEVATIONS, LAPS)
+        return [
+            Planned(f"images/{name}", f"masks/{name}", pose, config.spp, config.seed * 100_000 + index)
+            for index, pose in enumerate(poses)
+            for name in [f"photo_{index:03d}.png"]
+        ]
+
+    def write(self, picture: Planned, radiance: np.ndarray, share: np.ndarray) -> None:
+        """As 8-bit sRGB with noise, and a mask in black and white.
+
+        Noise of equal strength on sRGB values is about what the noise of counted photons becomes under sRGB's curve.
+        """
+        grain = np.random.default_rng(picture.seed).normal(scale=self.config.noise, size=radiance.shape)
+        _write_image(self.folder / picture.mask_path, share >= 0.5)
+        _write_image(self.folder / picture.image_path, to_srgb(np.clip(radiance, 0.0, 1.0)) + grain)
+
+    def finish(self, planned: list[Planned]) -> None:
+        """Write the truth: the surface, and the cameras as data of the format `opencv`."""
+        camera, truth = self.camera, self.folder / "truth"
+        self.scene.glass.save(truth / "mesh.ply")
+        self.scene.interior.save(truth / "interior.ply")
+        frames = [
+            {
+                "file_path": f"../{photograph.image_path}",
+                "mask_path": f"../{photograph.mask_path}",
+                "transform_matrix": (photograph.pose @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
+            }
+            for photograph in planned
+        ]
+        matrix = [[camera.focal, 0.0, camera.cx], [0.0, camera.focal, camera.cy], [0.0, 0.0, 1.0]]
+        content = {"cam_mat": matrix, "w": camera.width, "h": camera.height, "frames": frames}
+        _write_json(truth / "transforms_train.json", content)
+
+
 def fingerprint(scene: Scene) -> str:
-    """Return a short hash of a scene's geometry, colours, index, tint and surroundings."""
+    """A short hash of a scene, so that pictures of an older model are not mixed in."""
     digest = hashlib.sha256(repr((scene.ior, scene.tint)).encode())
     for surface in (scene.glass, scene.interior):
         for array in (surface.vertices, surface.faces, surface.normals, surface.colours):
@@ -90,105 +261,11 @@ def fingerprint(scene: Scene) -> str:
     return digest.hexdigest()[:16]
 
 
-def views(settings: Settings) -> list[Planned]:
-    """Return every view of a data set, in the order in which they are rendered."""
-    planned = []
-    for number, split in enumerate(SPLITS):
-        directions = directions_on_sphere(settings.views[split], settings.seed, number)
-        spp = settings.test_spp if split == "test" else settings.spp
-        for index, direction in enumerate(directions):
-            pose = look_at_origin(CAMERA_DISTANCE * direction)
-            seed, name = (settings.seed * 3 + number) * 100_000 + index, f"{split}/r_{index:03d}.png"
-            planned.append(Planned(name, f"masks/{name}", pose, spp, seed))
-    return planned
-
-
-def prepare(folder: Path, settings: Any, overwrite: bool, meta: str = META, files: tuple[str, ...] = _FILES) -> None:
-    """Make `folder` ready for pictures of `settings`: new, continued, or cleared.
-
-    Args:
-        folder: of the data set.
-        settings: dataclass of everything that decides the contents.
-        overwrite: whether another data set may be replaced.
-        meta: file in the folder in which a data set's settings stand.
-        files: patterns of the files that a data set consists of.
-
-    Raises:
-        NerfroError: the folder holds another data set, or other files, and `overwrite` is not set.
-    """
-    stored = _stored_settings(folder / meta)
-    if stored is not None:
-        if stored == asdict(settings):
-            return
-        if not overwrite:
-            raise NerfroError(
-                f"'{folder}' holds a data set with other settings; choose another folder with out=DIR, "
-                "or replace it with overwrite=true"
-            )
-        # Nothing else, that somebody may have put beside them.
-        for path in [path for pattern in files for path in folder.glob(pattern)]:
-            path.unlink()
-    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise NerfroError(f"'{folder}' exists and is no data set of ours; choose another folder with out=DIR")
-    folder.mkdir(parents=True, exist_ok=True)
-
-
-def missing(folder: Path, planned: list[Planned]) -> Iterator[Planned]:
-    """Yield those whose picture or mask is not on disk yet."""
-    for picture in planned:
-        if not ((folder / picture.image_path).is_file() and (folder / picture.mask_path).is_file()):
-            yield picture
-
-
-def write_view(folder: Path, view: Planned, radiance: np.ndarray, silhouette: np.ndarray) -> None:
-    """Write one view: 8-bit pictures of linear radiance [H, W, 3], in sRGB, and of the share of pixels [H, W]."""
-    write_image(folder / view.mask_path, silhouette)
-    write_image(folder / view.image_path, to_srgb(radiance))
-
-
-def write_image(path: Path, image: np.ndarray) -> None:
+def _write_image(path: Path, image: np.ndarray) -> None:
     """Write sRGB [H, W, 3] or shares [H, W], clipped to [0, 1], as an 8-bit PNG, or bool [H, W] as a 1-bit PNG."""
     levels = image if image.dtype == bool else np.rint(np.clip(image, 0.0, 1.0) * 255).astype(np.uint8)
     save_picture(path, Image.fromarray(levels), optimize=True)
 
 
-def write_meta(folder: Path, settings: Settings, scene: Scene, versions: dict[str, str]) -> None:
-    """Write meta.json: what the folder holds and how it came about."""
-    meta = {
-        "scene": scene.name,
-        "ior": scene.ior,
-        "tint": list(scene.tint),
-        "box": BOX,
-        "near": NEAR,
-        "far": FAR,
-        "camera_distance": CAMERA_DISTANCE,
-        "sky": "lat-long, z up: column u = 0.5 - atan2(y, x) / (2 pi), row v = acos(z) / pi, pixel centres + 0.5",
-        "masks": "share of the pixel that the glass covers",
-        "settings": asdict(settings),
-        "versions": versions,
-    }
-    write_atomically(folder / META, json.dumps(meta, indent=1) + "\n")
-
-
-def write_transforms(folder: Path, planned: list[Planned]) -> None:
-    """Write transforms_{train,val,test}.json; done last, as their presence says that the pictures are complete."""
-    for split in SPLITS:
-        frames = [
-            {
-                "file_path": "./" + view.image_path.removesuffix(".png"),
-                "mask_path": "./" + view.mask_path,
-                "transform_matrix": view.pose.tolist(),
-            }
-            for view in planned
-            if view.image_path.startswith(f"{split}/")
-        ]
-        content = json.dumps({"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}, indent=1)
-        write_atomically(folder / f"transforms_{split}.json", content + "\n")
-
-
-def _stored_settings(meta: Path) -> dict | None:
-    """Return the settings in a meta.json, or None when there is none or it is not one of ours."""
-    try:
-        return json.loads(meta.read_text()).get("settings")
-    except (FileNotFoundError, NotADirectoryError, ValueError, AttributeError):
-        return None
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    write_atomically(path, json.dumps(content, indent=1) + "\n")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from nerfro.light import to_linear
-from nerfro.scenes.distance import ball, capsule, ellipsoid, painted, smooth_union
+from nerfro.scenes.distance import ball, capsule, ellipsoid, mirrored, painted, smooth_union
 from nerfro.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
 from nerfro.scenes.scene import Scene
 from nerfro.scenes.skies import azimuth, elevation, skyline
@@ -49,8 +49,7 @@ def deer(points: np.ndarray) -> np.ndarray:
 
 def antlers(points: np.ndarray) -> np.ndarray:
     """Bound on the distance to both antlers."""
-    folded = points * np.array([1.0, 0.0, 1.0]) + np.abs(points) * np.array([0.0, 1.0, 0.0])
-    return smooth_union([capsule(folded, *branch) for branch in ANTLER], 0.015)
+    return smooth_union([capsule(mirrored(points), *branch) for branch in ANTLER], 0.015)
 
 
 def deer_colours(points: np.ndarray) -> np.ndarray:
@@ -65,10 +64,8 @@ def deer_colours(points: np.ndarray) -> np.ndarray:
     fur = np.where(spotted[:, None], np.array([0.98, 0.94, 0.84]), fur)
     pale = smoothstep(-0.05, -0.08, z) * (x > -0.2) * (x < 0.2) * (z > -0.13)
     fur = mix(fur, np.array([0.96, 0.90, 0.78]), np.maximum(pale, smoothstep(-0.235, -0.25, x)))
-    dark = (
-        (z < -0.215) | (x > 0.385) | (np.linalg.norm(np.abs(points) - np.array([0.29, 0.045, 0.265]), axis=1) < 0.018)
-    )
-    return np.where(dark[:, None], np.array([0.08, 0.06, 0.06]), fur)
+    eye = np.linalg.norm(np.abs(points) - np.array([0.29, 0.045, 0.265]), axis=1)
+    return np.where(((z < -0.215) | (x > 0.385) | (eye < 0.018))[:, None], np.array([0.08, 0.06, 0.06]), fur)
 
 
 def antler_colours(points: np.ndarray) -> np.ndarray:
@@ -86,15 +83,14 @@ def mound(points: np.ndarray) -> np.ndarray:
 
 def mound_colours(points: np.ndarray) -> np.ndarray:
     """Return sRGB [V, 3]: snow with stones and tufts of grass above, layers of earth below."""
-    _, _, z = points.T
     tufts = fractal_noise(points * 9.0, 4, seed=7)
     snow = mix(np.array([0.97, 0.98, 1.0]), np.array([0.34, 0.52, 0.26]), smoothstep(0.50, 0.56, tufts))
     pebbles = hashed(np.floor(points[:, :2] / 0.022).astype(int), 8) > 0.93
     snow = np.where(pebbles[:, None], np.array([0.42, 0.40, 0.44]), snow)
-    layer = np.floor((z + 0.03 * fractal_noise(points * 7.0, 3, seed=9)) / 0.03).astype(int)
+    layer = np.floor((points[:, 2] + 0.03 * fractal_noise(points * 7.0, 3, seed=9)) / 0.03).astype(int)
     tones = np.array([[0.48, 0.30, 0.18], [0.72, 0.52, 0.32], [0.36, 0.24, 0.18], [0.84, 0.66, 0.42]])
     earth = chosen(tones, hashed(layer[:, None], 11)) * (0.8 + 0.4 * fractal_noise(points * 50.0, 2, seed=12))[:, None]
-    return np.where((z > MOUND_TOP - 0.03)[:, None], snow, earth)
+    return np.where((points[:, 2] > MOUND_TOP - 0.03)[:, None], snow, earth)
 
 
 def pine(points: np.ndarray) -> np.ndarray:
@@ -130,14 +126,11 @@ def sky(directions: np.ndarray) -> np.ndarray:
     fold = np.concatenate([3 * directions[..., :2], 0.4 * directions[..., 2:]], -1)
     curtain = np.abs(fractal_noise(fold, 4, seed=51) - 0.5)
     colour = mix(colour, np.array([0.62, 0.98, 0.78]), smoothstep(0.05, 0.01, curtain) * smoothstep(0.15, 0.5, up))
-    colour = mix(
-        colour, np.array([0.96, 0.72, 0.90]), smoothstep(0.03, 0.0, np.abs(curtain - 0.09)) * smoothstep(0.2, 0.6, up)
-    )
+    hem = smoothstep(0.03, 0.0, np.abs(curtain - 0.09)) * smoothstep(0.2, 0.6, up)
+    colour = mix(colour, np.array([0.96, 0.72, 0.90]), hem)
     circle = np.stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)], -1)
-    for scale, base, size, rock, seed in (
-        (3.0, 8.0, 26.0, (0.60, 0.66, 0.82), 52),
-        (5.0, 1.0, 18.0, (0.36, 0.42, 0.58), 53),
-    ):
+    ranges = (3.0, 8.0, 26.0, (0.60, 0.66, 0.82), 52), (5.0, 1.0, 18.0, (0.36, 0.42, 0.58), 53)
+    for scale, base, size, rock, seed in ranges:
         crest = base + size * fractal_noise(np.concatenate([scale * circle, 0 * circle[..., :1]], -1), 5, seed)
         strata = fractal_noise(np.concatenate([9 * circle, height[..., None] / 4], -1), 4, seed + 10)
         side = np.asarray(rock) * (0.75 + 0.5 * strata)[..., None]
@@ -184,4 +177,4 @@ def build(spacing: float) -> Scene:
         painted(pine, pine_colours, (x - 0.2, y - 0.2, -0.31), (x + 0.2, y + 0.2, 0.33), fine),
     ]
     glass = sphere(GLASS_RADIUS, GLASS_SUBDIVISIONS)
-    return Scene(name="deerglobe", ior=1.5, glass=glass, interior=join(parts), sky=sky)
+    return Scene(ior=1.5, glass=glass, interior=join(parts), sky=sky)

@@ -7,6 +7,7 @@ zero set and never change faster than 1 per unit of length, which is all that `t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from skimage.measure import marching_cubes
@@ -27,6 +28,16 @@ def ball(points: np.ndarray, centre: Vector, radius: float) -> np.ndarray:
     return np.linalg.norm(points - np.asarray(centre), axis=-1) - radius
 
 
+def mirrored(points: np.ndarray) -> np.ndarray:
+    """Points with |y| instead of y: a solid of them is symmetric."""
+    return points * np.array([1.0, 0.0, 1.0]) + np.abs(points) * np.array([0.0, 1.0, 0.0])
+
+
+def rounded(excess: np.ndarray, rounding: float) -> np.ndarray:
+    """Distance to where all of `excess` [..., K], distances across each other, are negative, grown by `rounding`."""
+    return np.linalg.norm(np.maximum(excess, 0.0), axis=-1) + np.minimum(excess.max(-1), 0.0) - rounding
+
+
 def ellipsoid(points: np.ndarray, centre: Vector, radii: Vector) -> np.ndarray:
     """Bound on the distance to an ellipsoid with axes along x, y, z."""
     scaled = (points - np.asarray(centre)) / np.asarray(radii)
@@ -35,9 +46,7 @@ def ellipsoid(points: np.ndarray, centre: Vector, radii: Vector) -> np.ndarray:
 
 def block(points: np.ndarray, centre: Vector, half_sides: Vector, rounding: float) -> np.ndarray:
     """Distance to a box with rounded edges; `half_sides` include the rounding."""
-    excess = np.abs(points - np.asarray(centre)) - (np.asarray(half_sides) - rounding)
-    outside = np.linalg.norm(np.maximum(excess, 0.0), axis=-1)
-    return outside + np.minimum(excess.max(-1), 0.0) - rounding
+    return rounded(np.abs(points - np.asarray(centre)) - (np.asarray(half_sides) - rounding), rounding)
 
 
 def capsule(points: np.ndarray, start: Vector, end: Vector, start_radius: float, end_radius: float) -> np.ndarray:
@@ -50,21 +59,8 @@ def capsule(points: np.ndarray, start: Vector, end: Vector, start_radius: float,
     return (distance - (start_radius + (end_radius - start_radius) * along)) / np.sqrt(1 + slope**2)
 
 
-def cylinder(points: np.ndarray, centre: Vector, radius: float, half_height: float) -> np.ndarray:
-    """Bound on the distance to an upright cylinder."""
-    offset = points - np.asarray(centre)
-    return np.maximum(np.hypot(offset[..., 0], offset[..., 1]) - radius, np.abs(offset[..., 2]) - half_height)
-
-
 def star(points: np.ndarray, outer: float, inner: float, tips: int) -> np.ndarray:
-    """Distance in the x-z plane to a star with one tip up.
-
-    Args:
-        points: [..., 3]; y is ignored.
-        outer: radius of the tips.
-        inner: radius of the notches between them.
-        tips: number of tips.
-    """
+    """Distance in the x-z plane to a star with one tip up; `outer` and `inner` are the radii of tips and notches."""
     sector = np.pi / tips
     angle = np.arctan2(points[..., 0], points[..., 2])
     folded = np.abs((angle + sector) % (2 * sector) - sector)
@@ -93,12 +89,8 @@ def triangulate(distance: Distance, low: Vector, high: Vector, spacing: float) -
 
     Args:
         distance: signed distance, or a bound on it.
-        low: lower corner of a box that contains the solid.
-        high: upper corner.
-        spacing: cell size, world units.
-
-    Returns:
-        A watertight surface; vertices lie within about `spacing` squared of the zero set.
+        low, high: corners of a box that contains the solid.
+        spacing: cell size, world units; vertices lie within about its square of the zero set.
     """
     origin = np.asarray(low, np.float64) - 2 * spacing
     blocks = np.ceil((np.asarray(high) + 2 * spacing - origin) / (spacing * _BLOCK)).astype(int)
@@ -127,15 +119,12 @@ def triangulate(distance: Distance, low: Vector, high: Vector, spacing: float) -
 def painted(distance: Distance, colour: Colour, low: Vector, high: Vector, spacing: float) -> Surface:
     """Mesh a solid as `triangulate` does and colour its vertices with `colour`(points [V, 3]) -> sRGB [V, 3]."""
     surface = triangulate(distance, low, high, spacing)
-    colours = np.clip(colour(surface.vertices.astype(np.float64)), 0.0, 1.0).astype(np.float32)
-    return Surface(surface.vertices, surface.faces, surface.normals, colours)
+    colours = np.clip(colour(surface.vertices.astype(np.float64)), 0.0, 1.0)
+    return replace(surface, colours=colours.astype(np.float32))
 
 
 def _gradient(distance: Distance, points: np.ndarray, step: float) -> np.ndarray:
     """Return central differences of `distance`, [V, 3]."""
-    columns = []
-    for axis in range(3):
-        offset = np.zeros(3)
-        offset[axis] = step
-        columns.append((distance(points + offset) - distance(points - offset)) / (2 * step))
+    offsets = step * np.eye(3)
+    columns = [(distance(points + offset) - distance(points - offset)) / (2 * step) for offset in offsets]
     return np.stack(columns, -1)

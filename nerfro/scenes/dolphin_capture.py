@@ -5,16 +5,16 @@ The board lies on the table around the origin; the globe stands on the block in 
 
 from __future__ import annotations
 
+import functools
 import itertools
 
 import numpy as np
 
 from nerfro.capture.boards import TagBoard, twelve_faces
-from nerfro.scenes import starlamp
-from nerfro.scenes.distance import Vector, ball, capsule, ellipsoid, painted, smooth_union, triangulate
-from nerfro.scenes.panels import Panel, painted_panel
+from nerfro.scenes import distance, starlamp
+from nerfro.scenes.distance import Vector, ball, capsule, ellipsoid, mirrored, painted, smooth_union
 from nerfro.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
-from nerfro.scenes.scene import Scene
+from nerfro.scenes.scene import Panel, Scene, painted_panel
 from nerfro.scenes.surface import join
 
 WATER = 1.33
@@ -31,16 +31,7 @@ AIM = np.array([0.0, 0.0, 1.15])  # of the photographer
 ARC_RADIUS, ARC_CENTRE = 0.40, np.array([0.02, 0.0, -0.24])  # the back's curve, in the plane y = 0
 ARC_TAIL, ARC_NOSE = np.radians(152.0), np.radians(22.0)
 # place along the arc (0 at the tail, 1 at the nose), radius
-PROFILE = (
-    (0.0, 0.022),
-    (0.15, 0.042),
-    (0.4, 0.092),
-    (0.6, 0.105),
-    (0.78, 0.090),
-    (0.88, 0.066),
-    (0.93, 0.030),
-    (1.0, 0.018),
-)
+PROFILE = ((0, 0.022), (0.15, 0.042), (0.4, 0.092), (0.6, 0.105), (0.78, 0.09), (0.88, 0.066), (0.93, 0.03), (1, 0.018))
 SEA_LEVEL, SEA_RADIUS = -0.25, 0.555
 
 
@@ -59,7 +50,7 @@ def fin(points: np.ndarray, root: Vector, tip: Vector, widths: tuple[float, floa
 
 def dolphin(points: np.ndarray) -> np.ndarray:
     """Bound on the distance to the leaping dolphin: a body along an arc, fins and flukes."""
-    folded = points * np.array([1.0, 0.0, 1.0]) + np.abs(points) * np.array([0.0, 1.0, 0.0])
+    folded = mirrored(points)
     body = [
         capsule(points, along_arc(start), along_arc(end), first, second)
         for (start, first), (end, second) in itertools.pairwise(PROFILE)
@@ -93,9 +84,7 @@ def dolphin_colours(points: np.ndarray) -> np.ndarray:
     colours = mix(np.array([0.97, 0.93, 0.88]), colours, smoothstep(-0.055, -0.035, outward + wave))
     spots = hashed(np.floor(points / 0.028).astype(int), 23) > 0.93
     colours = np.where((spots & (outward > 0.02))[:, None], np.array([0.90, 0.92, 0.86]), colours)
-    eye = np.linalg.norm(
-        points * [1, 0, 1] + np.abs(points) * [0, 1, 0] - along_arc(0.86) - [0.012, 0.06, 0.01], axis=1
-    )
+    eye = np.linalg.norm(mirrored(points) - along_arc(0.86) - [0.012, 0.06, 0.01], axis=1)
     return np.where((eye < 0.017)[:, None], np.array([0.04, 0.04, 0.06]), colours)
 
 
@@ -121,7 +110,7 @@ def sea_colours(points: np.ndarray) -> np.ndarray:
 def globe(points: np.ndarray) -> np.ndarray:
     """Distance to a ball with a flat foot and a rounded edge around it."""
     parts = np.stack([ball(points, (0, 0, 0), GLOBE_RADIUS), -GLOBE_FOOT - points[..., 2]], -1) + GLOBE_ROUNDING
-    return np.linalg.norm(np.maximum(parts, 0.0), axis=-1) + np.minimum(parts.max(-1), 0.0) - GLOBE_ROUNDING
+    return distance.rounded(parts, GLOBE_ROUNDING)
 
 
 def board_to_world(points: np.ndarray) -> np.ndarray:
@@ -140,13 +129,19 @@ def board_panels(board: TagBoard) -> list[Panel]:
     return panels
 
 
+def wooden(half_side: float, height: float, tone: Vector, seed: int) -> Panel:
+    """A level square of planks along x, its middle at `height` above the origin."""
+    colour = functools.partial(wood, tone=tone, seed=seed)
+    edges = (2 * half_side, 0, 0), (0, -2 * half_side, 0)
+    return painted_panel((-half_side, half_side, height), *edges, colour, 0.01)
+
+
 def wood(points: np.ndarray, tone: Vector, seed: int) -> np.ndarray:
     """Return sRGB [..., 3] of planks along x."""
     plank = np.floor(points[..., 1:2] / 0.45).astype(int)
     shift = 9 * hashed(plank, seed)[..., None]
-    grain = fractal_noise(
-        np.concatenate([points[..., :1] * 1.5 + shift, points[..., 1:2] * 22, 0 * shift], -1), 4, seed
-    )
+    place = np.concatenate([points[..., :1] * 1.5 + shift, points[..., 1:2] * 22, 0 * shift], -1)
+    grain = fractal_noise(place, 4, seed)
     seam = np.abs(points[..., 1] / 0.45 % 1 - 0.5) > 0.485
     colour = np.asarray(tone) * (0.55 + 0.6 * grain + 0.25 * (hashed(plank, seed + 1) - 0.5))[..., None]
     return np.where(seam[..., None], 0.4 * colour, colour)
@@ -182,28 +177,14 @@ def build(spacing: float) -> Scene:
         painted(dolphin, dolphin_colours, (-0.55, -0.3, -0.4), (0.55, 0.3, 0.45), fine),
         painted(sea, sea_colours, (-0.56, -0.56, -0.56), (0.56, 0.56, -0.2), fine),
     ]
-    glass = triangulate(globe, (-GLOBE_RADIUS,) * 3, (GLOBE_RADIUS,) * 3, GLOBE_SPACING)
-    half = TABLE_HALF_SIDE
-    block = 0.5 * BOARD_SCALE * 0.27
-    table = painted_panel(
-        (-half, half, 0.0),
-        (2 * half, 0, 0),
-        (0, -2 * half, 0),
-        lambda points: wood(points, (0.62, 0.42, 0.28), 41),
-        0.01,
-    )
-    top = painted_panel(
-        (-block, block, BLOCK_TOP),
-        (2 * block, 0, 0),
-        (0, -2 * block, 0),
-        lambda points: wood(points, (0.80, 0.72, 0.60), 43),
-        0.01,
-    )
+    glass = distance.triangulate(globe, (-GLOBE_RADIUS,) * 3, (GLOBE_RADIUS,) * 3, GLOBE_SPACING)
+    table = wooden(TABLE_HALF_SIDE, 0.0, (0.62, 0.42, 0.28), 41)
+    top = wooden(0.5 * BOARD_SCALE * 0.27, BLOCK_TOP, (0.80, 0.72, 0.60), 43)
     return Scene(
-        name="dolphin_capture",
         ior=WATER,
         glass=glass.moved(CENTRE),
         interior=join(parts).moved(CENTRE),
         sky=None,
+        aim=AIM,
         panels=(*room_panels(coarse), table, top, *board_panels(twelve_faces())),
     )

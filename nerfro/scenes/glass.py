@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from types import ModuleType
+import functools
 
 PLUGIN = "transmitting_glass"
 
 
-def register_transmitting_glass(mitsuba: ModuleType) -> None:
-    """Register the BSDF `transmitting_glass` for the active Mitsuba variant.
+@functools.cache
+def register_transmitting_glass(variant: str) -> None:
+    """Register the BSDF `transmitting_glass` for a Mitsuba variant, which must be the active one: its base class is.
 
     A ray that meets the surface below the critical angle is transmitted as Snell's law says and keeps its radiance:
     there is no partial Fresnel reflection, and no scaling by n^2, which cancels anyway as both ends of every path lie
     in air. Above the critical angle it is reflected totally. That is the paper's image formation: one path per ray.
 
     Parameters of the plugin: `ior` (float, inside over outside) and `tint` (linear RGB factor per transmission).
-
-    Args:
-        mitsuba: the imported module, with its variant set; the class must be made per variant, as its base class is.
     """
-    mi = mitsuba
     import drjit as dr
+    import mitsuba as mi
 
     class TransmittingGlass(mi.BSDF):
         def __init__(self, properties: mi.Properties) -> None:

@@ -13,8 +13,7 @@ import numpy as np
 from nerfro.errors import NerfroError
 from nerfro.light import to_linear
 from nerfro.scenes.glass import PLUGIN, register_transmitting_glass
-from nerfro.scenes.panels import Panel
-from nerfro.scenes.scene import Scene
+from nerfro.scenes.scene import Panel, Scene
 from nerfro.scenes.skies import Sky
 from nerfro.scenes.surface import Surface
 
@@ -29,13 +28,7 @@ ROULETTE_DEPTH, MAX_DEPTH = 32, 1024  # light bounces long between the walls of 
 
 @functools.cache
 def load_mitsuba(variant: str = "auto") -> ModuleType:
-    """Import Mitsuba, choose its variant and register our material.
-
-    Args:
-        variant: one of `VARIANTS`, or `auto` for the first one that works on this machine.
-
-    Returns:
-        The mitsuba module.
+    """Import Mitsuba, choose its variant (one of `VARIANTS`, or the first that works here), register our material.
 
     Raises:
         NerfroError: Mitsuba is not installed, or the variant does not run here.
@@ -56,19 +49,11 @@ def load_mitsuba(variant: str = "auto") -> ModuleType:
             if variant == "auto" and name == "scalar_rgb":
                 warnings.warn(f"rendering without LLVM, some seventy times slower; {_GET_LLVM}", stacklevel=2)
             mitsuba.set_variant(name)
-            _register_materials(name)
+            register_transmitting_glass(name)
             return mitsuba
     raise NerfroError(
         f"Mitsuba variant '{variant}' does not run on this machine; {_GET_LLVM}, or take variant=scalar_rgb"
     )
-
-
-@functools.cache
-def _register_materials(variant: str) -> None:
-    """Register our material once per variant, which must be the active one."""
-    import mitsuba
-
-    register_transmitting_glass(mitsuba)
 
 
 @dataclass(frozen=True)
@@ -106,32 +91,21 @@ class PathTracer:
         fresnel: False for transmission and total reflection only (the paper's image formation), True for a physical
             dielectric with partial reflection.
         camera: that takes the pictures.
-        texels_per_pixel: sky texels per pixel of the background.
         variant: Mitsuba variant, see `load_mitsuba`.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        fresnel: bool,
-        camera: Pinhole,
-        texels_per_pixel: float = 2.0,
-        variant: str = "auto",
-    ) -> None:
-        self.mitsuba = load_mitsuba(variant)
+    def __init__(self, scene: Scene, fresnel: bool, camera: Pinhole, variant: str = "auto") -> None:
+        self.mitsuba = mi = load_mitsuba(variant)
         self.camera = camera
-        mi = self.mitsuba
-        glass = (
-            {"type": "dielectric", "int_ior": scene.ior, "ext_ior": 1.0}
-            if fresnel
-            else {"type": PLUGIN, "ior": scene.ior, "tint": mi.ScalarColor3f(*scene.tint)}
-        )
+        glass: dict = {"type": PLUGIN, "ior": scene.ior, "tint": mi.ScalarColor3f(*scene.tint)}
         if fresnel:
-            glass["specular_transmittance"] = {"type": "rgb", "value": list(scene.tint)}
+            tint = {"type": "rgb", "value": list(scene.tint)}
+            glass = {"type": "dielectric", "int_ior": scene.ior, "ext_ior": 1.0, "specular_transmittance": tint}
         paint = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
         surroundings = {f"panel_{number}": _panel(mi, panel) for number, panel in enumerate(scene.panels)}
         if scene.sky is not None:
-            height = int(np.clip(np.pi / camera.angle_x * camera.width * texels_per_pixel, 256, 2048))
+            # Two texels per pixel of the background.
+            height = int(np.clip(2 * np.pi / camera.angle_x * camera.width, 256, 2048))
             # The sky stands on its edge in Mitsuba's frame (y up); this turns y to our z.
             upright = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
             texture = mi.Bitmap(envmap_texture(scene.sky, height, np.asarray(upright.matrix)[:3, :3]))
@@ -148,14 +122,24 @@ class PathTracer:
         )
 
     def render(self, pose: np.ndarray, spp: int, seed: int) -> np.ndarray:
-        """Return linear radiance [H, W, 3], averaged over each pixel with a box filter.
+        """Return linear radiance [H, W, 3], averaged over each pixel with a box filter; equal seeds, equal pictures.
 
         Args:
             pose: camera-to-world matrix [4, 4], OpenGL axes.
             spp: samples per pixel; rendered in passes of at most `SAMPLES_PER_PASS` samples.
-            seed: seed of the sampler; equal seeds give equal pictures.
+            seed: of the sampler.
         """
-        return self._render(self._sensor(pose), spp, seed)
+        camera = self.camera
+        sensor = {
+            "type": "perspective",
+            "fov": float(np.degrees(camera.angle_x)),
+            "fov_axis": "x",
+            "principal_point_offset_x": 0.5 - camera.cx / camera.width,
+            "principal_point_offset_y": 0.5 - camera.cy / camera.height,
+            "near_clip": 0.01,
+            "far_clip": 100.0,
+        }
+        return self._render(sensor, pose, spp, seed)
 
     def render_flat(self, to_world: np.ndarray, above: float, spp: int, seed: int) -> np.ndarray:
         """Return the linear radiance [H, W, 3] that a rectangle sends straight up, averaged over its pixels.
@@ -163,18 +147,22 @@ class PathTracer:
         Args:
             to_world: matrix [4, 4] from the square [-1, 1]^2 of x (to the right) and y (upwards); z points up from it.
             above: distance from the rectangle at which rays begin, world units.
-            spp: samples per pixel.
-            seed: seed of the sampler.
+            spp, seed: as for `render`.
         """
-        pose = to_world @ np.diag([-1.0, 1.0, -1.0, 1.0])
+        pose = to_world.copy()
         pose[:3, 3] += above * to_world[:3, 2]
-        kind = {"type": "orthographic", "near_clip": 0.1 * above, "far_clip": 10.0 * above}
-        return self._render(self._film(kind, pose), spp, seed)
+        sensor = {"type": "orthographic", "near_clip": 0.1 * above, "far_clip": 10.0 * above}
+        return self._render(sensor, pose, spp, seed)
 
-    def _render(self, sensor, spp: int, seed: int) -> np.ndarray:
-        mi = self.mitsuba
-        per_pass = max(1, min(spp, SAMPLES_PER_PASS // (self.camera.width * self.camera.height)))
-        total = np.zeros((self.camera.height, self.camera.width, 3))
+    def _render(self, kind: dict, pose: np.ndarray, spp: int, seed: int) -> np.ndarray:
+        mi, camera = self.mitsuba, self.camera
+        film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
+        film |= {"pixel_format": "rgb", "component_format": "float32"}
+        # Mitsuba's cameras look along +z with x to the left; ours look along -z with x to the right.
+        to_world = mi.ScalarTransform4f((pose @ np.diag([-1.0, 1.0, -1.0, 1.0])).tolist())
+        sensor = mi.load_dict({**kind, "to_world": to_world, "film": film, "sampler": {"type": "independent"}})
+        per_pass = max(1, min(spp, SAMPLES_PER_PASS // (camera.width * camera.height)))
+        total = np.zeros((camera.height, camera.width, 3))
         for number, first in enumerate(range(0, spp, per_pass)):
             count = min(per_pass, spp - first)
             # Mitsuba hashes the seed, so neighbouring seeds are independent; 4096 passes is 24 G samples per view.
@@ -184,57 +172,20 @@ class PathTracer:
 
     def silhouette(self, pose: np.ndarray) -> np.ndarray:
         """Return the share [H, W] of each pixel that the glass, which nothing may hide, covers, to about 1 / 128."""
-        camera = self.camera
+        mi, camera = self.mitsuba, self.camera
         total = np.zeros((camera.height, camera.width))
         for x, y in SILHOUETTE_PLACES:
             u, v = np.meshgrid(np.arange(camera.width) + x - camera.cx, camera.cy - np.arange(camera.height) - y)
-            total += self._meets_glass(pose, u, v).reshape(total.shape)
+            directions = np.stack([u, v, np.full_like(u, -camera.focal)], -1).reshape(-1, 3) @ pose[:3, :3].T
+            directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+            if mi.variant().startswith("scalar"):
+                hits = [self.glass.ray_test(mi.Ray3f(list(pose[:3, 3]), list(direction))) for direction in directions]
+            else:
+                origins = mi.Point3f(*(mi.Float(np.full(len(directions), x, np.float32)) for x in pose[:3, 3]))
+                rays = mi.Ray3f(origins, mi.Vector3f(*(mi.Float(x.astype(np.float32)) for x in directions.T)))
+                hits = self.glass.ray_test(rays)
+            total += np.asarray(hits, bool).reshape(total.shape)
         return total / len(SILHOUETTE_PLACES)
-
-    def _meets_glass(self, pose: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Whether rays meet the glass, given where they cross the image plane, pixels from its principal point."""
-        mi, camera = self.mitsuba, self.camera
-        directions = np.stack([u, v, np.full_like(u, -camera.focal)], -1).reshape(-1, 3) @ pose[:3, :3].T
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        if mi.variant().startswith("scalar"):
-            hits = [self.glass.ray_test(mi.Ray3f(list(pose[:3, 3]), list(direction))) for direction in directions]
-        else:
-            origins = mi.Point3f(*(mi.Float(np.full(len(directions), x, np.float32)) for x in pose[:3, 3]))
-            rays = mi.Ray3f(origins, mi.Vector3f(*(mi.Float(x.astype(np.float32)) for x in directions.T)))
-            hits = self.glass.ray_test(rays)
-        return np.asarray(hits, bool)
-
-    def _sensor(self, pose: np.ndarray):
-        camera = self.camera
-        kind = {
-            "type": "perspective",
-            "fov": float(np.degrees(camera.angle_x)),
-            "fov_axis": "x",
-            "principal_point_offset_x": 0.5 - camera.cx / camera.width,
-            "principal_point_offset_y": 0.5 - camera.cy / camera.height,
-            "near_clip": 0.01,
-            "far_clip": 100.0,
-        }
-        # Mitsuba's camera looks along +z with x to the left; ours looks along -z with x to the right.
-        return self._film(kind, pose @ np.diag([-1.0, 1.0, -1.0, 1.0]))
-
-    def _film(self, kind: dict, to_world: np.ndarray):
-        mi, camera = self.mitsuba, self.camera
-        return mi.load_dict(
-            {
-                **kind,
-                "to_world": mi.ScalarTransform4f(to_world.tolist()),
-                "film": {
-                    "type": "hdrfilm",
-                    "width": camera.width,
-                    "height": camera.height,
-                    "rfilter": {"type": "box"},
-                    "pixel_format": "rgb",
-                    "component_format": "float32",
-                },
-                "sampler": {"type": "independent"},
-            }
-        )
 
 
 def envmap_texture(sky: Sky, height: int, to_world: np.ndarray) -> np.ndarray:
@@ -242,11 +193,7 @@ def envmap_texture(sky: Sky, height: int, to_world: np.ndarray) -> np.ndarray:
 
     Mitsuba reads row j at the polar angle pi j / (H - 1), the first and last rows being the poles, but column i at the
     azimuth 2 pi (i + 1/2) / W. Texels at edges of the sky are averages of several samples; elsewhere one is enough.
-
-    Args:
-        sky: the radiance.
-        height: rows H.
-        to_world: rotation [3, 3] from the emitter's frame (y up) to ours.
+    `to_world` [3, 3] turns the emitter's frame (y up) to ours.
     """
     width = 2 * height
 
@@ -262,20 +209,13 @@ def envmap_texture(sky: Sky, height: int, to_world: np.ndarray) -> np.ndarray:
     bands = np.array_split(np.arange(height), -(-height * width // _TEXELS_PER_TASK))
     with ThreadPoolExecutor() as pool:
         texture = np.concatenate(list(pool.map(lambda rows: sample(rows[:, None], np.arange(width)), bands)))
-        edges = np.argwhere(_contrast(texture) > _EDGE_CONTRAST)
+        right = np.abs(texture - np.roll(texture, -1, 1)).max(-1)
+        below = np.pad(np.abs(np.diff(texture, axis=0)).max(-1), ((1, 1), (0, 0)))
+        contrast = np.maximum.reduce([right, np.roll(right, 1, 1), below[:-1], below[1:]])
+        edges = np.argwhere(contrast > _EDGE_CONTRAST)
         tasks = np.array_split(edges, -(-9 * len(edges) // _TEXELS_PER_TASK) or 1)
         texture[edges[:, 0], edges[:, 1]] = np.concatenate(list(pool.map(refined, tasks)))
     return texture
-
-
-def _contrast(texture: np.ndarray) -> np.ndarray:
-    """Return the largest difference [H, W] of each texel to its neighbours to the right, left, above and below."""
-    right = np.abs(texture - np.roll(texture, -1, 1)).max(-1)
-    below = np.zeros_like(right)
-    below[:-1] = np.abs(texture[:-1] - texture[1:]).max(-1)
-    contrast = np.maximum(np.maximum(right, np.roll(right, 1, 1)), below)
-    contrast[1:] = np.maximum(contrast[1:], below[:-1])
-    return contrast
 
 
 def _panel(mi: ModuleType, panel: Panel) -> dict:

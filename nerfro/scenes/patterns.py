@@ -18,15 +18,7 @@ def mix(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.ndarray
 
 
 def hashed(cells: np.ndarray, seed: int) -> np.ndarray:
-    """Return a reproducible pseudo-random number in [0, 1) for every integer cell.
-
-    Args:
-        cells: integers [..., D].
-        seed: selects an independent field.
-
-    Returns:
-        float64 [...].
-    """
+    """Return a reproducible pseudo-random number in [0, 1) for every integer cell [..., D]; `seed` picks a field."""
     mixed = np.full(cells.shape[:-1], (seed * 0x9E3779B97F4A7C15) & 0xFFFFFFFFFFFFFFFF, np.uint64)
     for axis in range(cells.shape[-1]):
         mixed = (mixed ^ cells[..., axis].astype(np.int64).astype(np.uint64)) * np.uint64(0xFF51AFD7ED558CCD)
@@ -37,22 +29,12 @@ def hashed(cells: np.ndarray, seed: int) -> np.ndarray:
 
 
 def value_noise(points: np.ndarray, seed: int) -> np.ndarray:
-    """Return smooth noise in [0, 1): random values at the integer lattice, interpolated with smoothstep weights.
-
-    Args:
-        points: [..., D], one lattice cell per unit.
-        seed: selects an independent field.
-
-    Returns:
-        float64 [...].
-    """
+    """Return smooth noise in [0, 1): random values at the integer lattice, interpolated with smoothstep weights."""
     base = np.floor(points).astype(np.int64)
     fraction = points - base
     weights = fraction * fraction * (3 - 2 * fraction)
     total = np.zeros(points.shape[:-1])
-    dimensions = points.shape[-1]
-    for corner in np.ndindex(*(2,) * dimensions):
-        offset = np.asarray(corner)
+    for offset in np.asarray(list(np.ndindex(*(2,) * points.shape[-1]))):
         share = np.where(offset == 1, weights, 1 - weights).prod(-1)
         total += share * hashed(base + offset, seed)
     return total

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 from nerfro.light import to_linear
@@ -9,7 +11,7 @@ from nerfro.scenes.distance import ball, block, capsule, painted
 from nerfro.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
 from nerfro.scenes.scene import Scene
 from nerfro.scenes.skies import azimuth, clouds, elevation, skyline
-from nerfro.scenes.surface import Surface, join, rounded_box
+from nerfro.scenes.surface import join, rounded_box
 
 HALF_SIDES, EDGE_RADIUS = (0.80, 0.50, 0.66), 0.07
 TINT = (0.86, 0.98, 0.90)
@@ -17,6 +19,7 @@ KEEL, DECK, HALF_LENGTH, HALF_BEAM = -0.40, -0.16, 0.54, 0.17
 MASTS = ((-0.20, 0.36), (0.16, 0.44))  # x of the mast and height of its top
 # x, lowest and highest z, half width of each sail
 SAILS = ((-0.20, -0.06, 0.10, 0.24), (-0.20, 0.13, 0.29, 0.19), (0.16, -0.06, 0.13, 0.27), (0.16, 0.16, 0.36, 0.21))
+CABIN = functools.partial(block, centre=(-0.38, 0, -0.07), half_sides=(0.09, 0.085, 0.09), rounding=0.015)
 HOUSES = np.array([[0.93, 0.89, 0.80], [0.78, 0.42, 0.36], [0.52, 0.62, 0.70], [0.88, 0.74, 0.50]])
 
 
@@ -58,10 +61,8 @@ def sail(points: np.ndarray, x: float, low: float, high: float, half_width: floa
     v = np.clip((2 * points[..., 2] - low - high) / (high - low), -1, 1)
     belly = x + 0.02 + 0.07 * (1 - u**2) * (1 - v**2)
     sheet = np.abs(points[..., 0] - belly) - 0.007
-    frame = np.maximum(
-        np.abs(points[..., 1]) - half_width, np.abs(points[..., 2] - (low + high) / 2) - (high - low) / 2
-    )
-    return 0.5 * np.maximum(sheet, frame)
+    tall = np.abs(points[..., 2] - (low + high) / 2) - (high - low) / 2
+    return 0.5 * np.maximum(sheet, np.maximum(np.abs(points[..., 1]) - half_width, tall))
 
 
 def sail_colours(points: np.ndarray) -> np.ndarray:
@@ -75,9 +76,8 @@ def sail_colours(points: np.ndarray) -> np.ndarray:
     radius = np.hypot(y, z - 0.03)
     colours = np.where((radius < 0.075)[:, None], np.array([0.97, 0.80, 0.25]), colours)
     rays = np.sin(8 * np.arctan2(z - 0.03, y)) > 0
-    return np.where(
-        (((radius < 0.062) & rays & (radius > 0.03)) | (radius < 0.02))[:, None], np.array([0.13, 0.26, 0.50]), colours
-    )
+    blue = ((radius < 0.062) & rays & (radius > 0.03)) | (radius < 0.02)
+    return np.where(blue[:, None], np.array([0.13, 0.26, 0.50]), colours)
 
 
 def rigging(points: np.ndarray) -> np.ndarray:
@@ -87,9 +87,8 @@ def rigging(points: np.ndarray) -> np.ndarray:
         rods.append(capsule(points, (x, 0, DECK - 0.02), (x, 0, top + 0.06), 0.020, 0.010))
         rods.append(ball(points, (x, 0, top + 0.02), 0.035))
     for x, _, high, half_width in SAILS:
-        rods.append(
-            capsule(points, (x + 0.01, -half_width - 0.03, high), (x + 0.01, half_width + 0.03, high), 0.012, 0.012)
-        )
+        x, end = x + 0.01, half_width + 0.03
+        rods.append(capsule(points, (x, -end, high), (x, end, high), 0.012, 0.012))
     return np.minimum.reduce(rods)
 
 
@@ -99,13 +98,8 @@ def rigging_colours(points: np.ndarray) -> np.ndarray:
     return np.where(ring, np.array([0.88, 0.76, 0.52]), np.array([0.42, 0.26, 0.16]))
 
 
-def cabin(points: np.ndarray) -> np.ndarray:
-    """Distance to the cabin at the stern."""
-    return block(points, (-0.38, 0, -0.07), (0.09, 0.085, 0.09), 0.015)
-
-
 def cabin_colours(points: np.ndarray) -> np.ndarray:
-    """Return sRGB [V, 3]: blue walls, lit windows, a shingled roof."""
+    """Return sRGB [V, 3] of the cabin at the stern: blue walls, lit windows, a shingled roof."""
     x, y, z = points.T
     walls = np.tile(np.array([0.22, 0.44, 0.60]), (len(x), 1))
     window = (np.abs(((x + y) / 0.055) % 1 - 0.5) < 0.25) & (np.abs(z + 0.05) < 0.022)
@@ -119,19 +113,17 @@ def sky(directions: np.ndarray) -> np.ndarray:
     """Return linear radiance [..., 3] of a bay at sunset: clouds, a town, a lighthouse, islands and waves."""
     colour = clouds(directions, horizon=(0.99, 0.80, 0.60), zenith=(0.38, 0.52, 0.82), cover=0.70, seed=23)
     height, turn = elevation(directions), azimuth(directions)
-    ridge = 3 + 9 * fractal_noise(np.stack([turn * 30, 0 * turn, 0 * turn], -1), 4, seed=31) * (
-        np.sin(4 * np.pi * turn) > 0
-    )
+    side = np.sin(4 * np.pi * turn)
+    ridge = 3 + 9 * fractal_noise(np.stack([turn * 30, 0 * turn, 0 * turn], -1), 4, seed=31) * (side > 0)
     rock = 0.6 + 0.6 * fractal_noise(np.stack([turn * 160, height / 1.5, 0 * turn], -1), 3, seed=32)
     island = np.array([0.36, 0.46, 0.36]) * rock[..., None]
-    colour = mix(colour, island, (height < ridge) & (np.sin(4 * np.pi * turn) > 0.05))
+    colour = mix(colour, island, (height < ridge) & (side > 0.05))
     houses, covered = skyline(directions, HOUSES, count=40, heights=(5.0, 13.0), seed=17)
-    colour = mix(colour, houses, covered * (np.sin(4 * np.pi * turn) < -0.15))
+    colour = mix(colour, houses, covered * (side < -0.15))
     across = (turn - 0.17) * 360
     tower = (np.abs(across) < 2.6 - 0.05 * height) & (height < 26)
-    bands = np.where(
-        (np.floor(height / 4.0) % 2 == 0)[..., None], np.array([0.80, 0.18, 0.16]), np.array([0.97, 0.95, 0.90])
-    )
+    red = (np.floor(height / 4.0) % 2 == 0)[..., None]
+    bands = np.where(red, np.array([0.80, 0.18, 0.16]), np.array([0.97, 0.95, 0.90]))
     colour = mix(colour, bands, tower)
     colour = mix(colour, np.array([1.0, 0.93, 0.62]), (np.abs(across) < 2.0) & (height > 22) & (height < 25))
     colour = mix(colour, _sea(directions), height < 0)
@@ -149,9 +141,8 @@ def _sea(directions: np.ndarray) -> np.ndarray:
     cell = np.floor(place / 0.5).astype(int)
     offset = place / 0.5 - cell - 0.5
     buoy = np.linalg.norm(offset - 0.3 * (hashed(cell, 42) - 0.5)[..., None], axis=-1)
-    painted_buoy = np.where(
-        (buoy < 0.05)[..., None], np.array([0.98, 0.95, 0.88]), chosen(HOUSES * [1, 0.7, 0.5], hashed(cell, 43))
-    )
+    hue = chosen(HOUSES * [1, 0.7, 0.5], hashed(cell, 43))
+    painted_buoy = np.where((buoy < 0.05)[..., None], np.array([0.98, 0.95, 0.88]), hue)
     water = np.where(((buoy < 0.11) & (hashed(cell, 44) < 0.35))[..., None], painted_buoy, water)
     return mix(np.array([0.80, 0.72, 0.64]), water, smoothstep(0.0, 0.12, depth))
 
@@ -160,17 +151,14 @@ def build(spacing: float) -> Scene:
     """Return the scene; `spacing` is the distance between neighbouring coloured vertices, world units."""
     spacing = max(spacing, 0.0035)
     fine = min(spacing, 0.006)  # thin parts need a fine mesh whatever the resolution of the pictures
-    parts: list[Surface] = [
+    parts = [
         painted(hull, hull_colours, (-0.55, -0.18, -0.41), (0.55, 0.18, -0.05), fine),
         painted(rigging, rigging_colours, (-0.24, -0.31, -0.19), (0.74, 0.31, 0.52), fine),
-        painted(cabin, cabin_colours, (-0.48, -0.10, -0.17), (-0.28, 0.10, 0.03), fine),
+        painted(CABIN, cabin_colours, (-0.48, -0.10, -0.17), (-0.28, 0.10, 0.03), fine),
     ]
     for x, low, high, half_width in SAILS:
-
-        def sheet(points: np.ndarray, shape: tuple = (x, low, high, half_width)) -> np.ndarray:
-            return sail(points, *shape)
-
+        sheet = functools.partial(sail, x=x, low=low, high=high, half_width=half_width)
         corners = (x, -half_width, low), (x + 0.1, half_width, high)
         parts.append(painted(sheet, sail_colours, *corners, min(fine, 0.005)))
     glass = rounded_box(HALF_SIDES, EDGE_RADIUS, edge_steps=12)
-    return Scene(name="ship", ior=1.5, glass=glass, interior=join(parts), sky=sky, tint=TINT)
+    return Scene(ior=1.5, glass=glass, interior=join(parts), sky=sky, tint=TINT)

@@ -27,17 +27,9 @@ def elevation(directions: np.ndarray) -> np.ndarray:
 
 
 def clouds(directions: np.ndarray, horizon: tuple, zenith: tuple, cover: float, seed: int) -> np.ndarray:
-    """Paint an overhead sky: a gradient from `horizon` to `zenith` with clouds on a flat layer.
+    """Paint sRGB [..., 3]: a gradient of sRGB colours from `horizon` to `zenith` with clouds on a flat layer.
 
-    Args:
-        directions: [..., 3].
-        horizon: sRGB colour at elevation 0.
-        zenith: sRGB colour straight up.
-        cover: fraction-like amount of cloud in [0, 1].
-        seed: selects the clouds.
-
-    Returns:
-        sRGB [..., 3].
+    `cover` in [0, 1] is about the share of clouds; `seed` selects them.
     """
     height = np.maximum(directions[..., 2], 0.0)
     colour = mix(np.asarray(horizon), np.asarray(zenith), height**0.6)
@@ -51,17 +43,9 @@ def clouds(directions: np.ndarray, horizon: tuple, zenith: tuple, cover: float, 
 def skyline(
     directions: np.ndarray, palette: np.ndarray, count: int, heights: tuple[float, float], seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Paint a row of houses with windows standing on the horizon.
+    """Paint a row of `count` houses with windows on the horizon, their roofs between two `heights`, degrees.
 
-    Args:
-        directions: [..., 3].
-        palette: facade colours, sRGB [K, 3].
-        count: houses around the full circle.
-        heights: lowest and highest roof, degrees above the horizon.
-        seed: selects heights, colours and lit windows.
-
-    Returns:
-        sRGB colours [..., 3] and coverage [...], 1 where there is a house.
+    Returns sRGB [..., 3], of facades from a `palette` [K, 3], and coverage [...], 1 where there is a house.
     """
     turn, height = azimuth(directions) * count, elevation(directions)
     house = np.floor(turn).astype(np.int64)
@@ -83,31 +67,6 @@ def skyline(
     covered = (height < roof + gable) & (height >= 0)
     above_roof = height > roof
     return np.where(above_roof[..., None], np.array([0.55, 0.24, 0.18]), colour), covered.astype(np.float64)
-
-
-def tiles(directions: np.ndarray, palette: np.ndarray, size: float, grout: tuple, fade: tuple, seed: int) -> np.ndarray:
-    """Paint a tiled floor at height -1 below the viewer, fading to one colour towards the horizon.
-
-    Args:
-        directions: [..., 3]; those above the horizon get the `fade` colour.
-        palette: tile colours, sRGB [K, 3].
-        size: side of a tile, in units of the viewer's height.
-        grout: sRGB colour between tiles.
-        fade: sRGB colour at the horizon; hides the tiles before they are finer than a pixel.
-        seed: selects the tiles' colours.
-
-    Returns:
-        sRGB [..., 3].
-    """
-    depth = np.maximum(-directions[..., 2], 1e-3)
-    place = directions[..., :2] / depth[..., None] / size
-    cell = np.floor(place).astype(np.int64)
-    inside = np.abs(place - cell - 0.5).max(-1) < 0.46
-    checker = ((cell.sum(-1) % 2) == 0)[..., None]
-    colour = chosen(palette, hashed(cell, seed))
-    colour = np.where(checker, colour, 0.25 + 0.6 * colour)
-    colour = np.where(inside[..., None], colour, np.asarray(grout))
-    return mix(np.asarray(fade), colour, smoothstep(0.04, 0.24, depth))
 
 
 def lat_long_directions(height: int, width: int) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 from nerfro.light import to_linear
@@ -15,14 +17,7 @@ PLANET_RADIUS, RING_RADII = 0.21, (0.27, 0.37)
 AXIS = np.array([0.20, -0.82, 0.53]) / np.linalg.norm([0.20, -0.82, 0.53])  # the ring lies nearly in the star's plane
 ROOM_LOW, ROOM_HIGH = np.array([-1.7, -1.4, -1.0]), np.array([1.7, 1.4, 1.2])
 BOOKS = np.array(
-    [
-        [0.70, 0.20, 0.18],
-        [0.16, 0.33, 0.52],
-        [0.88, 0.70, 0.28],
-        [0.22, 0.46, 0.33],
-        [0.90, 0.86, 0.76],
-        [0.45, 0.26, 0.48],
-    ]
+    [[0.7, 0.2, 0.18], [0.16, 0.33, 0.52], [0.88, 0.7, 0.28], [0.22, 0.46, 0.33], [0.9, 0.86, 0.76], [0.45, 0.26, 0.48]]
 )
 GLASS_SPACING = 0.010
 
@@ -32,8 +27,7 @@ def star_prism(points: np.ndarray) -> np.ndarray:
     flat = distance.star(points, OUTER - ROUNDING, INNER - ROUNDING, tips=5)
     deep = np.abs(points[..., 1]) - (HALF_DEPTH - ROUNDING)
     # Rounds the concave notches and the crease between side and front alike.
-    excess = np.stack([flat, deep], -1)
-    return np.linalg.norm(np.maximum(excess, 0.0), axis=-1) + np.minimum(excess.max(-1), 0.0) - ROUNDING
+    return distance.rounded(np.stack([flat, deep], -1), ROUNDING)
 
 
 def planet_colours(points: np.ndarray) -> np.ndarray:
@@ -42,9 +36,7 @@ def planet_colours(points: np.ndarray) -> np.ndarray:
     swirl = fractal_noise(points * 14.0, 4, seed=2)
     band = 7.0 * latitude + 1.6 * swirl
     stripe = np.floor(band).astype(int)
-    palette = np.array(
-        [[0.93, 0.80, 0.58], [0.80, 0.46, 0.26], [0.97, 0.92, 0.80], [0.62, 0.36, 0.30], [0.88, 0.64, 0.36]]
-    )
+    palette = np.array([[0.93, 0.8, 0.58], [0.8, 0.46, 0.26], [0.97, 0.92, 0.8], [0.62, 0.36, 0.3], [0.88, 0.64, 0.36]])
     colours = palette[stripe % len(palette)] * (0.85 + 0.3 * (swirl - 0.5))[:, None]
     spot = np.linalg.norm(points / PLANET_RADIUS - np.array([0.5, -0.78, 0.3]), axis=1)
     colours = mix(colours, np.array([0.80, 0.16, 0.12]), smoothstep(0.34, 0.30, spot))
@@ -63,10 +55,8 @@ def ring(points: np.ndarray) -> np.ndarray:
     """Bound on the distance to the flat ring around the planet."""
     height = points @ AXIS
     radius = np.linalg.norm(points - height[..., None] * AXIS, axis=-1)
-    flat = np.maximum(
-        np.abs(radius - sum(RING_RADII) / 2) - (RING_RADII[1] - RING_RADII[0]) / 2, np.abs(height) - 0.012
-    )
-    return flat - 0.004
+    across = np.abs(radius - sum(RING_RADII) / 2) - (RING_RADII[1] - RING_RADII[0]) / 2
+    return np.maximum(across, np.abs(height) - 0.012) - 0.004
 
 
 def sky(directions: np.ndarray) -> np.ndarray:
@@ -149,10 +139,9 @@ def build(spacing: float) -> Scene:
     """Return the scene; `spacing` is the distance between neighbouring coloured vertices, world units."""
     spacing = max(spacing, 0.003)
     extent = np.full(3, 1.1 * PLANET_RADIUS)
-    planet = distance.painted(
-        lambda points: distance.ball(points, (0, 0, 0), PLANET_RADIUS), planet_colours, -extent, extent, spacing
-    )
+    ball = functools.partial(distance.ball, centre=(0, 0, 0), radius=PLANET_RADIUS)
+    planet = distance.painted(ball, planet_colours, -extent, extent, spacing)
     extent = np.full(3, 1.1 * RING_RADII[1])
     rings = distance.painted(ring, ring_colours, -extent, extent, min(spacing, 0.006))
     glass = distance.triangulate(star_prism, (-OUTER, -HALF_DEPTH, -OUTER), (OUTER, HALF_DEPTH, OUTER), GLASS_SPACING)
-    return Scene(name="starlamp", ior=1.5, glass=glass, interior=join([planet, rings]), sky=sky)
+    return Scene(ior=1.5, glass=glass, interior=join([planet, rings]), sky=sky)

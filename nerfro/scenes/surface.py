@@ -56,18 +56,10 @@ def join(surfaces: Sequence[Surface]) -> Surface:
 
 
 def rounded_box(half_sides: Sequence[float], radius: float, edge_steps: int) -> Surface:
-    """Mesh a box whose edges and corners are rounded with `radius`.
+    """Mesh a box around the origin whose edges and corners are rounded with `radius`, watertight.
 
     The surface is the set of points at distance `radius` from the inner box of half sides `half_sides - radius`. Flat
-    faces are two triangles each; all the resolution goes into the edges, in equal steps of angle.
-
-    Args:
-        half_sides: half the outer extent along x, y, z, world units.
-        radius: rounding radius, less than every half side.
-        edge_steps: steps per 45 degrees of an edge.
-
-    Returns:
-        A watertight surface around the origin with exact normals.
+    faces are two triangles each; all the resolution goes into the edges, in `edge_steps` equal angles per 45 degrees.
     """
     outer = np.asarray(half_sides, np.float64)
     inner = outer - radius
@@ -106,15 +98,9 @@ def sphere(radius: float, subdivisions: int) -> Surface:
 
 
 def torus_angles(major_radius: float, minor_radius: float, spacing: float) -> tuple[Surface, np.ndarray]:
-    """Mesh a torus around the z axis, and return the two angles that its colours are drawn with.
+    """Mesh a torus around the z axis with vertices every `spacing`, and return the angles its colours are drawn with.
 
-    Args:
-        major_radius: distance of the tube's centre line from the axis, world units.
-        minor_radius: radius of the tube.
-        spacing: distance between neighbouring vertices, world units.
-
-    Returns:
-        The uncoloured surface with exact normals, and angles [V, 2] in [0, 2 pi): around the axis, around the tube.
+    Angles [V, 2] in [0, 2 pi) run around the axis, and around the tube, whose centre line has `major_radius`.
     """
     around = int(np.ceil(2 * np.pi * (major_radius + minor_radius) / spacing))
     across = int(np.ceil(2 * np.pi * minor_radius / spacing))

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from nerfro.light import to_linear
-from nerfro.scenes.patterns import chosen, hashed, mix
+from nerfro.scenes.patterns import chosen, hashed, mix, smoothstep
 from nerfro.scenes.scene import Scene
-from nerfro.scenes.skies import clouds, elevation, skyline, tiles
-from nerfro.scenes.surface import Surface, rounded_box, torus_angles
+from nerfro.scenes.skies import clouds, elevation, skyline
+from nerfro.scenes.surface import rounded_box, torus_angles
 
 HALF_SIDE, EDGE_RADIUS = 0.75, 0.08
 MAJOR_RADIUS, MINOR_RADIUS = 0.38, 0.16
@@ -18,14 +18,7 @@ TILT_DEGREES = (35.0, 20.0)  # about x, then about y: the hole is seen from most
 
 RIBBONS = np.array([[0.92, 0.30, 0.22], [0.98, 0.80, 0.24], [0.20, 0.56, 0.80], [0.96, 0.94, 0.88], [0.24, 0.70, 0.46]])
 FACADES = np.array(
-    [
-        [0.80, 0.46, 0.33],
-        [0.91, 0.82, 0.64],
-        [0.42, 0.60, 0.62],
-        [0.86, 0.66, 0.40],
-        [0.70, 0.36, 0.36],
-        [0.66, 0.68, 0.74],
-    ]
+    [[0.8, 0.46, 0.33], [0.91, 0.82, 0.64], [0.42, 0.6, 0.62], [0.86, 0.66, 0.4], [0.7, 0.36, 0.36], [0.66, 0.68, 0.74]]
 )
 PAVING = np.array([[0.62, 0.58, 0.52], [0.72, 0.50, 0.40], [0.45, 0.50, 0.54], [0.80, 0.76, 0.66]])
 
@@ -50,25 +43,29 @@ def sky(directions: np.ndarray) -> np.ndarray:
     colour = clouds(directions, horizon=(0.86, 0.90, 0.94), zenith=(0.30, 0.52, 0.86), cover=0.55, seed=11)
     houses, covered = skyline(directions, FACADES, count=26, heights=(7.0, 24.0), seed=5)
     colour = mix(colour, houses, covered)
-    floor = tiles(directions, PAVING, size=0.34, grout=(0.30, 0.28, 0.27), fade=(0.62, 0.58, 0.54), seed=8)
-    colour = mix(colour, floor, elevation(directions) < 0)
+    colour = mix(colour, _paving(directions), elevation(directions) < 0)
     return to_linear(np.clip(colour, 0.0, 1.0))
 
 
-def tilted(surface: Surface, degrees: tuple[float, float]) -> Surface:
-    """Return the surface turned about x, then about y."""
-    (cx, cy), (sx, sy) = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    turn = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]) @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-    return replace(
-        surface,
-        vertices=(surface.vertices @ turn.T).astype(np.float32),
-        normals=(surface.normals @ turn.T).astype(np.float32),
-    )
+def _paving(directions: np.ndarray) -> np.ndarray:
+    depth = np.maximum(-directions[..., 2], 1e-3)
+    place = directions[..., :2] / depth[..., None] / 0.34
+    cell = np.floor(place).astype(np.int64)
+    inside = np.abs(place - cell - 0.5).max(-1) < 0.46
+    checker = ((cell.sum(-1) % 2) == 0)[..., None]
+    colour = chosen(PAVING, hashed(cell, 8))
+    colour = np.where(checker, colour, 0.25 + 0.6 * colour)
+    colour = np.where(inside[..., None], colour, np.array([0.30, 0.28, 0.27]))
+    # Fades towards the horizon before the tiles are finer than a pixel.
+    return mix(np.array([0.62, 0.58, 0.54]), colour, smoothstep(0.04, 0.24, depth))
 
 
 def build(spacing: float) -> Scene:
     """Return the scene; `spacing` is the distance between neighbouring coloured vertices, world units."""
     ring, angles = torus_angles(MAJOR_RADIUS, MINOR_RADIUS, spacing)
-    ring = replace(tilted(ring, TILT_DEGREES), colours=torus_colours(angles).astype(np.float32))
+    (cx, cy), (sx, sy) = np.cos(np.radians(TILT_DEGREES)), np.sin(np.radians(TILT_DEGREES))
+    turn = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]) @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    vertices, normals = ((array @ turn.T).astype(np.float32) for array in (ring.vertices, ring.normals))
+    ring = replace(ring, vertices=vertices, normals=normals, colours=torus_colours(angles).astype(np.float32))
     glass = rounded_box((HALF_SIDE,) * 3, EDGE_RADIUS, edge_steps=12)
-    return Scene(name="torus", ior=1.5, glass=glass, interior=ring, sky=sky)
+    return Scene(ior=1.5, glass=glass, interior=ring, sky=sky)

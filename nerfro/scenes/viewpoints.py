@@ -5,17 +5,13 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
+from nerfro.scenes.distance import Vector
+
 
 def directions_on_sphere(count: int, seed: int, split: int) -> np.ndarray:
-    """Return well-spread directions on the full sphere: a Fibonacci lattice, turned at random and jittered.
+    """Return well-spread unit directions [count, 3]: a Fibonacci lattice, turned at random and jittered.
 
-    Args:
-        count: number of directions.
-        seed: seed of the data set.
-        split: number of the split; each split gets its own rotation, so no test view repeats a training view.
-
-    Returns:
-        Unit directions [count, 3], float64.
+    Each `split` of the data set of a `seed` gets its own rotation, so no test view repeats a training view.
     """
     generator = np.random.default_rng([seed, split])
     index = np.arange(count) + 0.5
@@ -45,7 +41,7 @@ def look_at_origin(position: np.ndarray) -> np.ndarray:
 
 
 def hand_held(
-    count: int, seed: int, target: np.ndarray, distance: float, elevations: tuple[float, float], laps: int
+    count: int, seed: int, target: Vector, distance: float, elevations: tuple[float, float], laps: int
 ) -> list[np.ndarray]:
     """Return the poses of a photographer who climbs around the object in `laps` laps, none of them exactly.
 
@@ -54,8 +50,7 @@ def hand_held(
         seed: of what is not exact: direction, distance and aim (some per cent), and roll (6 degrees).
         target: what the camera looks at, world units.
         distance: of the camera from the target.
-        elevations: lowest and highest above the target, degrees; within them, equal areas of the hemisphere get
-            equally many photographs.
+        elevations: lowest and highest above the target, degrees; equal areas in between get equally many photographs.
         laps: number of times around.
 
     Returns:
@@ -71,7 +66,7 @@ def hand_held(
         level = np.sqrt(1 - height**2)
         direction = np.array([level * np.cos(azimuth), level * np.sin(azimuth), height])
         pose = look_at_origin(distance * generator.uniform(0.95, 1.05) * direction)
-        pose[:3, 3] += target + 0.02 * distance * generator.uniform(-1, 1, 3)
+        pose[:3, 3] += np.asarray(target) + 0.02 * distance * generator.uniform(-1, 1, 3)
         roll = np.radians(6.0) * generator.uniform(-1, 1)
         right, up = pose[:3, 0].copy(), pose[:3, 1].copy()
         pose[:3, 0] = np.cos(roll) * right + np.sin(roll) * up
