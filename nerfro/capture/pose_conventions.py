@@ -9,10 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.capture.silhouettes import intersection_over_union, mesh_silhouette, pixel_stride
+from nerfro.capture.silhouettes import mesh_silhouettes, pixel_stride
 from nerfro.capture.visual_hull import Silhouettes, carve_grid, extract_surface, find_box, remove_strays
 from nerfro.errors import NerfroError
-from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh
 
 # The first look is at so many voxels a side and at most so many pixels a side.
@@ -45,24 +44,11 @@ _ALTERNATIVES: tuple[tuple[str, bool, tuple[tuple[int, int, int], ...]], ...] = 
 
 
 def overlap(mesh: TriangleMesh, silhouettes: Silhouettes, max_pixels: int) -> Float[np.ndarray, "V"]:
-    """Intersection over union of a mesh's silhouette with each mask.
-
-    Args:
-        mesh: world units.
-        silhouettes: the masks.
-        max_pixels: larger images are looked at in every second, third, ... pixel only.
-    """
-    cameras, masks = silhouettes.cameras, silhouettes.masks
-    intersector = MeshIntersector(mesh.triangles)
-    stride = pixel_stride(cameras, max_pixels)
-    return np.array(
-        [
-            intersection_over_union(
-                mesh_silhouette(intersector, cameras, view, stride), masks[view, ::stride, ::stride] > 0.5
-            )
-            for view in range(len(masks))
-        ]
-    )
+    """Intersection over union of a mesh's silhouette with each mask, 1 where both are empty, see `pixel_stride`."""
+    stride = pixel_stride(silhouettes.cameras, max_pixels)
+    ours, theirs = mesh_silhouettes(mesh, silhouettes.cameras, stride), silhouettes.masks[:, ::stride, ::stride] > 0.5
+    both, either = (ours & theirs).sum((1, 2)).double(), (ours | theirs).sum((1, 2))
+    return torch.where(either > 0, both / either, 1.0).numpy()
 
 
 def coarse_agreement(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np.ndarray, "V"]:
@@ -70,21 +56,16 @@ def coarse_agreement(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np
 
     Counted in pixels of the mask; not below 0, and 0 where the hull is empty.
     """
-    distances, corner, spacing = carve_grid(
-        silhouettes, find_box(silhouettes, wrong_masks), _COARSE_VOXELS, wrong_masks
-    )
+    box = find_box(silhouettes, wrong_masks)
+    distances, corner, spacing = carve_grid(silhouettes, box, _COARSE_VOXELS, wrong_masks)
     remove_strays(distances)
     if not (distances < 0).any():
         return np.zeros(len(silhouettes))
-    intersector = MeshIntersector(extract_surface(distances, corner, spacing).triangles)
     stride = pixel_stride(silhouettes.cameras, _COARSE_PIXELS)
-    agreement = np.empty(len(silhouettes))
-    for view in range(len(silhouettes)):
-        ours = mesh_silhouette(intersector, silhouettes.cameras, view, stride)
-        outline = silhouettes.distances[view, ::stride, ::stride]
-        differs = (ours != (outline > 0)) & (outline.abs() > _SLACK * stride)
-        agreement[view] = max(0.0, 1 - int(differs.sum()) / max(int((outline > 0).sum()), 1))
-    return agreement
+    ours = mesh_silhouettes(extract_surface(distances, corner, spacing), silhouettes.cameras, stride)
+    outlines = silhouettes.distances[:, ::stride, ::stride]
+    differs = (ours != (outlines > 0)) & (outlines.abs() > _SLACK * stride)
+    return (1 - differs.sum((1, 2)).double() / (outlines > 0).sum((1, 2)).clamp(min=1)).clamp(min=0).numpy()
 
 
 def require_consistent_poses(silhouettes: Silhouettes, names: list[str], wrong_masks: int) -> None:
@@ -132,4 +113,4 @@ def _changed(silhouettes: Silhouettes, inverse: bool, turn: tuple[tuple[int, int
         rotation = rotation.transpose(1, 2)
         centre = -rotation @ centre
     poses = torch.cat([rotation @ torch.tensor(turn, dtype=rotation.dtype), centre], -1)
-    return silhouettes.seen_from(replace(silhouettes.cameras, camera_to_world=poses))
+    return replace(silhouettes, cameras=replace(silhouettes.cameras, camera_to_world=poses))

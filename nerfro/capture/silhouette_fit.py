@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,8 +19,7 @@ from nerfro.capture.visual_hull import Silhouettes
 from nerfro.geometry.mesh import TriangleMesh
 
 
-@dataclass(frozen=True)
-class _Prior:
+class _Prior(NamedTuple):
     """What is taken for likely where no outline tells.
 
     Attributes:
@@ -55,15 +55,10 @@ _TYPICAL = 0.35
 _GATE, _HALVED = 3.0, 0.7
 
 
-@dataclass(frozen=True)
-class _Rims:
+class _Rims(NamedTuple):
     """Where the surface's outlines are seen: on edge (first, second) of the mesh, `share` of the way to second.
 
-    Attributes:
-        first, second: vertices.
-        share: place between them.
-        misfit: distance that the surface there has to move outwards to meet the mask's outline, world units.
-        weight: of the observation.
+    To meet the mask's outline the surface has to move outwards by `misfit` there, world units.
     """
 
     first: Int[np.ndarray, "K"]
@@ -96,21 +91,13 @@ def fit_surface(
     That draws in sharp edges. So a second surface is fitted without C and p, with much area first and hardly any at
     last; it is taken where its outlines are clearly nearer to the masks'.
 
-    Args:
-        mesh: a closed surface around the object with triangles of about one size, such as marching cubes give.
-        silhouettes: the masks.
-        smoothing: multiplies the weights of area and bending; more for masks that were drawn by hand.
-        progress: called with the share of the work that is done.
-
-    Returns:
-        The same triangles with other vertices.
+    The mesh is closed and has triangles of about one size, such as marching cubes give. `smoothing` multiplies the
+    weights of area and bending; more of it suits masks that were drawn by hand. `progress` is told the share done.
     """
-    done = 0
+    count = itertools.count(1)
 
     def step() -> None:
-        nonlocal done
-        done += 1
-        progress(done / (_ROUND.iterations + _FLAT.iterations))
+        progress(next(count) / (_ROUND.iterations + _FLAT.iterations))
 
     outlines = [_nearest_outline_pixel(mask) for mask in (silhouettes.masks > 0.5).numpy()]
     rounded, rounded_misfit = _fit(mesh, silhouettes, outlines, smoothing, _ROUND, step)
@@ -141,17 +128,12 @@ def _fit(
         more = prior.first ** max(0.0, 1 - iteration / (prior.iterations - 3))
         area = smoothing * num_rims * prior.area * more
         bending = smoothing * num_rims * prior.bending * more * size**2
-        observed = sparse.csr_matrix(
-            (
-                np.concatenate([1 - rims.share, rims.share]),
-                (np.tile(np.arange(num_rims), 2), np.concatenate([rims.first, rims.second])),
-            ),
-            (num_rims, len(vertices)),
-        )
+        row, column = np.tile(np.arange(num_rims), 2), np.concatenate([rims.first, rims.second])
+        shares = np.concatenate([1 - rims.share, rims.share])
+        observed = sparse.csr_matrix((shares, (row, column)), (num_rims, len(vertices)))
         curvature, curved, around = _mean_curvature(vertices, normals, edges, mean)
         usual = _usual_curvature(curved, vertices, normals, _TURN * size) if prior.usual else np.zeros_like(curved)
-        along = [sparse.diags(normals[:, axis]) for axis in range(3)]
-        stretch = sum(n @ across.T @ across @ n for n in along)
+        stretch = sum(n @ across.T @ across @ n for n in map(sparse.diags, normals.T))
         stretched = sum(normals[:, a] * (across.T @ (across @ vertices[:, a])) for a in range(3))
         pressure = -degree * around / np.sqrt(around.mean()) * usual
         weights = sparse.diags(rims.weight)
@@ -264,20 +246,16 @@ def _mean_curvature(
     # Marching cubes leave some triangles so small that their curvature is noise.
     scale = sparse.diags(np.sqrt(typical) / around.clip(0.05 * typical))
     umbrella = mean - sparse.identity(len(vertices))
-    along = [sparse.diags(normals[:, axis]) for axis in range(3)]
-    change = scale @ sum(n @ umbrella @ n for n in along)
+    change = scale @ sum(n @ umbrella @ n for n in map(sparse.diags, normals.T))
     return change.tocsr(), scale @ (normals * (umbrella @ vertices)).sum(1), around
 
 
 def _usual_curvature(
     curved: Float[np.ndarray, "V"], vertices: Float[np.ndarray, "V 3"], normals: Float[np.ndarray, "V 3"], turn: float
 ) -> Float[np.ndarray, "V"]:
-    """The curvature that most vertices around each one reach, with the sign of their median.
+    """The curvature (negative on a ball) that most vertices around each one reach, with the sign of their median.
 
-    Args:
-        curved: negative on a ball.
-        vertices, normals: of the mesh.
-        turn: how far away a normal turned by a radian is: the other side of a thin wall is not near.
+    A normal turned by a radian is `turn` away: the other side of a thin wall is not near.
     """
     points = np.concatenate([vertices, turn * normals], 1)
     chosen = np.linspace(0, len(points) - 1, min(len(points), _NUM_SPREAD)).astype(np.int64)

@@ -12,17 +12,16 @@ import trimesh
 from nerfro.cameras import Cameras
 from nerfro.capture.pose_conventions import overlap, require_consistent_poses
 from nerfro.capture.silhouette_fit import fit_surface
-from nerfro.capture.silhouettes import mesh_silhouette, outline_distance
+from nerfro.capture.silhouettes import mesh_silhouettes, outline_distance
 from nerfro.capture.visual_hull import (
     Silhouettes,
     carve_grid,
     extract_surface,
     find_box,
-    reached_sides,
+    reaches_border,
     remove_strays,
 )
 from nerfro.errors import NerfroError
-from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh
 
 
@@ -42,9 +41,7 @@ def cameras_around(count: int, size: int, distance: float = 4.0, focal: float = 
 def photographed(mesh: trimesh.Trimesh, cameras: Cameras) -> Silhouettes:
     """Binary masks: pixels whose central ray meets the mesh."""
     body = TriangleMesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
-    intersector = MeshIntersector(body.triangles)
-    masks = torch.stack([mesh_silhouette(intersector, cameras, view, 1) for view in range(len(cameras))])
-    return Silhouettes.of(cameras, masks.float())
+    return Silhouettes.of(cameras, mesh_silhouettes(body, cameras, 1).float())
 
 
 def hull(silhouettes: Silhouettes, resolution: int, wrong_masks: int = 0) -> TriangleMesh:
@@ -137,7 +134,8 @@ def _arrays(mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
 def test_body_that_reaches_the_box_is_closed_there() -> None:
     distances = np.full((6, 6, 6), 0.5)
     distances[3:, 2:4, 2:4] = -0.5
-    assert reached_sides(distances) == [(0, 1)]
+    assert reaches_border(distances)
+    assert not reaches_border(np.pad(distances, 1, constant_values=0.5))
     mesh = extract_surface(distances, np.array([1.0, 2, 3]), 0.5)
     assert mesh.is_closed
     assert volume(mesh) > 0
@@ -178,7 +176,7 @@ def test_fit_is_the_same_in_any_unit_of_length() -> None:
     silhouettes = photographed(trimesh.creation.box((1.2, 0.9, 0.7)), cameras_around(12, 48))
     carved = hull(silhouettes, 24)
     poses = silhouettes.cameras.camera_to_world * torch.tensor([1.0, 1, 1, 8])
-    larger = silhouettes.seen_from(replace(silhouettes.cameras, camera_to_world=poses))
+    larger = replace(silhouettes, cameras=replace(silhouettes.cameras, camera_to_world=poses))
     scaled = fit_surface(TriangleMesh(8 * carved.vertices, carved.faces), larger)
     np.testing.assert_allclose(scaled.vertices / 8, fit_surface(carved, silhouettes).vertices, atol=2e-3)
 
@@ -202,7 +200,7 @@ MISREAD = {
 def test_misread_poses_are_named(odd_shape: trimesh.Trimesh, convention: str) -> None:
     silhouettes = photographed(odd_shape, cameras_around(16, 32))
     poses = MISREAD[convention](silhouettes.cameras.camera_to_world)
-    misread = silhouettes.seen_from(replace(silhouettes.cameras, camera_to_world=poses))
+    misread = replace(silhouettes, cameras=replace(silhouettes.cameras, camera_to_world=poses))
     with pytest.raises(NerfroError, match=rf"poses are in another convention: .*{convention}"):
         require_consistent_poses(misread, [str(view) for view in range(16)], wrong_masks=0)
 
