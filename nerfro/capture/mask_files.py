@@ -90,7 +90,7 @@ def load_all(source: DataSource) -> tuple[Cameras, list[UInt8[np.ndarray, "H W 3
             raise NerfroError("this data format does not tell where its images lie; convert it to data=opencv")
         known = {frame.image for frame in frames}
         fresh = [i for i, frame in enumerate(views.frames) if frame.image not in known]
-        parts.append(views.cameras.select(fresh))
+        parts += [views.cameras.select(fresh)] if fresh else []  # a split without new images may be cropped
         images += [np.uint8(np.rint(255 * views.images[i].numpy())) for i in fresh]
         frames += [views.frames[i] for i in fresh]
     sizes = {(part.width, part.height) for part in parts}
