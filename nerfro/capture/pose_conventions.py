@@ -23,18 +23,14 @@ _SLACK = 1.5
 
 # What a file's poses could have been, as what has to be done to them as they were read; most frequent mistakes first.
 # `turn` is applied to the camera's axes (x right, y up, z back), `inverse` to the whole matrix before.
-_ALTERNATIVES: tuple[tuple[str, bool, tuple[tuple[int, int, int], ...]], ...] = (
-    (
-        "the camera's y and z axes flipped (OpenCV's axes, y down, z forward, in a file read as OpenGL's, or reversed)",
-        False,
-        ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
-    ),
+_Turn = tuple[tuple[int, int, int], ...]
+_HALF_TURN = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
+_FLIP = "the camera's y and z axes flipped (OpenCV's axes, y down, z forward, in a file read as OpenGL's, or reversed)"
+_INVERTED_FLIP = "the matrices inverted and the y and z axes flipped (world-to-camera matrices in OpenCV's axes)"
+_ALTERNATIVES: tuple[tuple[str, bool, _Turn], ...] = (
+    (_FLIP, False, _HALF_TURN),
     ("the matrices inverted (they are world-to-camera)", True, ((1, 0, 0), (0, 1, 0), (0, 0, 1))),
-    (
-        "the matrices inverted and the y and z axes flipped (world-to-camera matrices in OpenCV's axes)",
-        True,
-        ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
-    ),
+    (_INVERTED_FLIP, True, _HALF_TURN),
     ("y flipped (images and masks are upside down, or y points down)", False, ((1, 0, 0), (0, -1, 0), (0, 0, 1))),
     ("x flipped (images and masks are mirrored)", False, ((-1, 0, 0), (0, 1, 0), (0, 0, 1))),
     ("x and y flipped (images turned by 180 degrees)", False, ((-1, 0, 0), (0, -1, 0), (0, 0, 1))),
@@ -69,19 +65,12 @@ def coarse_agreement(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np
 
 
 def require_consistent_poses(silhouettes: Silhouettes, names: list[str], wrong_masks: int) -> None:
-    """Check that the masks' common hull looks like the masks.
-
-    Raises:
-        NerfroError: it does not; the misread convention or the views that disagree with the others are named.
-    """
+    """Refuse masks whose common hull does not look like them; name the misread convention or the odd views."""
     found = float(np.median(coarse_agreement(silhouettes, wrong_masks)))
     if found >= GOOD_OVERLAP:
         return
-    state = (
-        "the visual hull is empty: no point lies inside all masks"
-        if found == 0
-        else f"the visual hull covers the masks badly (to {found:.0%})"
-    )
+    state = f"the visual hull covers the masks badly (to {found:.0%})"
+    state = "the visual hull is empty: no point lies inside all masks" if found == 0 else state
     scores = [float(np.median(coarse_agreement(_changed(silhouettes, i, t), wrong_masks))) for _, i, t in _ALTERNATIVES]
     # Of equally good ones (a ball is a ball upside down) the most frequent mistake.
     best = next(i for i, score in enumerate(scores) if score >= max(scores) - 0.002)
@@ -105,7 +94,7 @@ def require_consistent_poses(silhouettes: Silhouettes, names: list[str], wrong_m
     )
 
 
-def _changed(silhouettes: Silhouettes, inverse: bool, turn: tuple[tuple[int, int, int], ...]) -> Silhouettes:
+def _changed(silhouettes: Silhouettes, inverse: bool, turn: _Turn) -> Silhouettes:
     """The same masks with the poses read differently."""
     poses: Tensor = silhouettes.cameras.camera_to_world
     rotation, centre = poses[:, :, :3], poses[:, :, 3:]

@@ -22,18 +22,15 @@ from nerfro.geometry.mesh import TriangleMesh
 class _Prior(NamedTuple):
     """What is taken for likely where no outline tells.
 
-    Attributes:
-        area, bending: their last weights for each observation of the outline, in units of the object's size.
-        first: the weights fall from this many times the last ones. A surface that is too small is pulled out at the
-            edges, where the object is, whereas one that fills the hull touches all masks everywhere and would stay.
-        usual: whether the curvature that is usual around a vertex is likely, or none.
-        iterations: steps.
+    The last weights of area and bending for each observation of the outline are in units of the object's size. They
+    fall from `first` times that: a surface that is too small is pulled out at the edges, where the object is, whereas
+    one that fills the hull touches all masks everywhere and would stay.
     """
 
     area: float
     bending: float
     first: float
-    usual: bool
+    usual: bool  # whether the curvature that is usual around a vertex is likely, or none
     iterations: int
 
 
@@ -117,9 +114,11 @@ def _fit(
     faces, vertices = mesh.faces, mesh.vertices.copy()
     edges = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
     size = float(np.ptp(vertices, axis=0).max())
-    mean = _neighbour_mean(edges, len(vertices))
-    across = _differences(edges, len(vertices))
-    degree = np.bincount(edges.ravel())
+    both, degree = np.concatenate([edges, edges[:, ::-1]]), np.bincount(edges.ravel())
+    # These take values at vertices to the means of their neighbours', and to their differences along edges.
+    mean = sparse.csr_matrix((1 / degree[both[:, 0]], (both[:, 0], both[:, 1])), (len(vertices),) * 2)
+    signs, number = np.repeat([1.0, -1.0], len(edges)), np.tile(np.arange(len(edges)), 2)
+    across = sparse.csr_matrix((signs, (number, edges.T.ravel())), (len(edges), len(vertices)))
     for iteration in range(prior.iterations):
         normals = _vertex_normals(vertices, faces)
         rims = _find_rims(vertices, normals, edges, silhouettes, outlines)
@@ -210,20 +209,6 @@ def _vertex_normals(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "
     sums = [np.bincount(faces.ravel(), np.repeat(normal[:, axis], 3), len(vertices)) for axis in range(3)]
     total = np.stack(sums, -1)
     return total / np.linalg.norm(total, axis=1, keepdims=True).clip(1e-12)
-
-
-def _neighbour_mean(edges: Int[np.ndarray, "E 2"], num_vertices: int) -> sparse.csr_matrix:
-    """Takes values at vertices to the mean of their neighbours'."""
-    both = np.concatenate([edges, edges[:, ::-1]])
-    degree = np.bincount(both[:, 0], minlength=num_vertices)
-    return sparse.csr_matrix((1 / degree[both[:, 0]], (both[:, 0], both[:, 1])), (num_vertices, num_vertices))
-
-
-def _differences(edges: Int[np.ndarray, "E 2"], num_vertices: int) -> sparse.csr_matrix:
-    """Takes values at vertices to their differences along edges."""
-    number = np.arange(len(edges))
-    signs = np.repeat([1.0, -1.0], len(edges))
-    return sparse.csr_matrix((signs, (np.tile(number, 2), edges.T.ravel())), (len(edges), num_vertices))
 
 
 def _mean_curvature(

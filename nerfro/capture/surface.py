@@ -24,11 +24,7 @@ _ONE_SIDE = 75.0
 
 
 def read_silhouettes(views: Views, has_box: bool) -> Silhouettes:
-    """The outlines of views, checked; a box that the user has given bounds what the masks do not.
-
-    Raises:
-        NerfroError: there are no masks or too few views, masks are empty, full or inverted, or all are cut.
-    """
+    """The outlines of views, checked; a box that the user has given bounds what the masks do not."""
     if views.masks is None:
         raise NerfroError(
             "the data has no masks, and the hull is made of them; docs/capture.md tells where they are looked for "

@@ -200,11 +200,7 @@ def remove_strays(distances: Float[np.ndarray, "X Y Z"], keep: int | None = None
 def extract_surface(
     distances: Float[np.ndarray, "X Y Z"], corner: Float[np.ndarray, "3"], spacing: float
 ) -> TriangleMesh:
-    """The zero level as a closed mesh in world units; where it meets the grid's border it is closed there.
-
-    Raises:
-        NerfroError: nothing is inside.
-    """
+    """The zero level as a closed mesh in world units; where it meets the grid's border it is closed there."""
     if not (distances < 0).any():
         raise NerfroError("the visual hull is empty: no point is inside all masks")
     padded = np.pad(distances, 1, constant_values=0.5 * spacing)
