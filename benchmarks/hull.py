@@ -15,7 +15,6 @@ from jaxtyping import Float
 from nerfro.capture.silhouettes import pixel_stride
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
-from nerfro.geometry.normals import face_normals
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.paths import resolve_path
 from nerfro.registry import discover, find
@@ -89,7 +88,8 @@ def normal_errors(mesh: TriangleMesh, exact: SdfGrid) -> tuple[Float[np.ndarray,
     """Angle of each triangle to the true surface beside it, degrees, and its area."""
     a, b, c = mesh.triangles.swapaxes(0, 1)
     gradient = exact.signed_distances(torch.from_numpy(mesh.triangles.mean(1)).float())[1][:, 0].double().numpy()
-    return _degrees(face_normals(mesh), gradient), 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    normals = np.cross(b - a, c - a)
+    return _degrees(normals, gradient), 0.5 * np.linalg.norm(normals, axis=1)
 
 
 def _medium(mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], ior: float) -> SdfGrid:

@@ -13,9 +13,8 @@ from nerfro.capture.calibrate_options import CalibrateConfig, check_options, mak
 from nerfro.capture.calibrated_data import FILES, ray_range, relative, split_views, write_calibrated
 from nerfro.capture.calibration import Calibration, calibrate
 from nerfro.capture.photographs import list_photographs, luminance, outside
-from nerfro.capture.printing import print_sheets
 from nerfro.capture.reconstruction import find_model, import_model
-from nerfro.capture.targets import Target
+from nerfro.capture.targets import Target, print_sheets
 from nerfro.cli import entry_point, warn
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError

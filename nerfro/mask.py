@@ -69,10 +69,9 @@ def main(config: DictConfig) -> None:
     save_picture(source.root / _SHEET, mask_sheet(images, frames, masks, overlaps))
     _report(frames, overlaps, made, source.root / _SHEET)
     given = [text for text in HydraConfig.get().overrides.task if text.startswith(("data=", "data."))]
-    command = ["python", "-m", "nerfro.preprocess", *given, "medium.ior=1.33"]
-    if "data=opencv" not in given and not any(text.startswith("data=") for text in given):
-        command.insert(3, "data=opencv")
-    print(f"next: {shlex.join(command)}")
+    if not any(text.startswith("data=") for text in given):
+        given = ["data=opencv", *given]
+    print(f"next: {shlex.join(['python', '-m', 'nerfro.preprocess', *given, 'medium.ior=1.33'])}")
 
 
 def _report(frames: list[Frame], overlaps: Mapping[int, float], made: list[int], sheet: Path) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -17,17 +17,11 @@ from nerfro.errors import NerfroError
 Family = Literal["tag36h11", "tagStandard41h12"]
 
 
-@dataclass(frozen=True)
-class Layout:
-    """What a tag of a family measures, in modules (the squares that it is made of).
+class Layout(NamedTuple):
+    """What a tag of a family measures, in modules (the squares that it is made of)."""
 
-    Attributes:
-        side: of a whole tag, with the white border of tag36h11.
-        inset: of the corners that are detected, from the whole tag's sides.
-    """
-
-    side: int
-    inset: int
+    side: int  # of a whole tag, with the white border of tag36h11
+    inset: int  # of the corners that are detected, from the whole tag's sides
 
 
 LAYOUTS: dict[Family, Layout] = {"tag36h11": Layout(10, 1), "tagStandard41h12": Layout(9, 2)}
@@ -49,16 +43,17 @@ class Face:
     down: tuple[float, float, float]
     ids: Int[np.ndarray, "rows columns"]
 
+    @property
+    def front(self) -> str:
+        """The axis that its front looks along, as in +x."""
+        normal = np.cross(self.down, self.right)
+        axis = int(np.abs(normal).argmax())
+        return f"{'+' if normal[axis] > 0 else '-'}{'xyz'[axis]}"
+
 
 @dataclass(frozen=True)
 class TagBoard:
-    """AprilTags on one or several faces.
-
-    Attributes:
-        family: of the tags.
-        module: side of a module, board units.
-        faces: the sheets.
-    """
+    """AprilTags of modules of a side in board units, on one or several faces."""
 
     family: Family
     module: float
@@ -66,14 +61,11 @@ class TagBoard:
 
     def tag_corners(self) -> dict[int, Float[np.ndarray, "4 3"]]:
         """The corners that are detected of each tag by its id: upper left, upper right, lower right, lower left."""
-        layout = LAYOUTS[self.family]
-        near, far = layout.inset * self.module, (layout.side - layout.inset) * self.module
+        side, inset = LAYOUTS[self.family]
+        near, far = inset * self.module, (side - inset) * self.module
+        first = np.array([[near, near], [far, near], [far, far], [near, far]])
         return {
-            int(number): _on_face(
-                face,
-                np.array([[near, near], [far, near], [far, far], [near, far]])
-                + layout.side * self.module * np.array([column, row]),
-            )
+            int(number): _on_face(face, first + side * self.module * np.array([column, row]))
             for face in self.faces
             for (row, column), number in np.ndenumerate(face.ids)
         }
@@ -85,15 +77,7 @@ class TagBoard:
         return _on_face(face, np.array([[0, 0], [width, 0], [width, height], [0, height]]))
 
     def draw(self, face: Face, module_pixels: int = 1) -> UInt8[np.ndarray, "H W"]:
-        """A sheet as printed, without a margin: 0 is black, 255 white.
-
-        Args:
-            face: one of the board's.
-            module_pixels: side of a module in pixels.
-
-        Raises:
-            NerfroError: pupil-apriltags, which holds the codes, is not installed, or a tag does not exist.
-        """
+        """A sheet as printed, without a margin: 0 is black, 255 white."""
         sheet = np.block([[draw_tag(self.family, int(number)) for number in row] for row in face.ids])
         return np.kron(sheet, np.ones((module_pixels, module_pixels), np.uint8))
 
@@ -105,9 +89,7 @@ def twelve_faces(tag: float = 0.05) -> TagBoard:
     The walls of the block over the cell in the middle are faces 8 to 11 (towards +x, +y, -x, -y), and the object
     stands on top of it at z = 0.27. The positions are those of calib_camera_with_apriltag.py in
     https://github.com/alexkeroro86/SampleNeRFRO; a module is 0.01 units, and a face has 3x3 tags of tagStandard41h12.
-
-    Args:
-        tag: side of a tag between the corners that are detected; all lengths go with it, and 0.05 is the authors'.
+    All lengths go with a tag's side between the corners that are detected; 0.05 is the authors'.
     """
     module = tag / 5
     side, columnwise = 27 * module, np.arange(9).reshape(3, 3).T
@@ -116,15 +98,10 @@ def twelve_faces(tag: float = 0.05) -> TagBoard:
         Face((side * x, side * y, 0), (0, 1, 0), (1, 0, 0), columnwise + 9 * number)
         for number, (x, y) in enumerate(cells)
     ]
-    walls: list[tuple[tuple[int, int], tuple[float, float, float]]] = [
-        ((2, 1), (0, 1, 0)),
-        ((2, 2), (-1, 0, 0)),
-        ((1, 2), (0, -1, 0)),
-        ((1, 1), (1, 0, 0)),
-    ]
+    walls = [(2, 1, 0, 1), (2, 2, -1, 0), (1, 2, 0, -1), (1, 1, 1, 0)]
     faces += [
-        Face((side * x, side * y, side), right, (0, 0, -1), columnwise + 9 * number)
-        for number, ((x, y), right) in enumerate(walls, len(cells))
+        Face((side * x, side * y, side), (right_x, right_y, 0), (0, 0, -1), columnwise + 9 * number)
+        for number, (x, y, right_x, right_y) in enumerate(walls, len(cells))
     ]
     return TagBoard("tagStandard41h12", module, tuple(faces))
 
@@ -132,25 +109,16 @@ def twelve_faces(tag: float = 0.05) -> TagBoard:
 def tag_grid(family: Family, rows: int, columns: int, tag: float) -> TagBoard:
     """Tags 0, 1, ... row by row on one sheet in the plane z = 0: x to its right, y to its top, z out of the paper.
 
-    Args:
-        family: of the tags.
-        rows, columns: number of tags.
-        tag: side of a tag between the corners that are detected; it is the unit of the poses.
+    The side of a tag between the corners that are detected is in the unit of the poses.
     """
-    layout = LAYOUTS[family]
-    module = tag / (layout.side - 2 * layout.inset)
-    top = rows * layout.side * module
-    return TagBoard(
-        family, module, (Face((0, top, 0), (1, 0, 0), (0, -1, 0), np.arange(rows * columns).reshape(rows, columns)),)
-    )
+    side, inset = LAYOUTS[family]
+    module = tag / (side - 2 * inset)
+    ids = np.arange(rows * columns).reshape(rows, columns)
+    return TagBoard(family, module, (Face((0, rows * side * module, 0), (1, 0, 0), (0, -1, 0), ids),))
 
 
 def draw_tag(family: Family, number: int) -> UInt8[np.ndarray, "S S"]:
-    """A tag, one pixel for each module.
-
-    Raises:
-        NerfroError: pupil-apriltags is not installed, or the family has no such tag.
-    """
+    """A tag, one pixel for each module."""
     # The struct apriltag_family of https://github.com/AprilRobotics/apriltag, drawn as its apriltag_to_image does.
     codes = tag_detector(family).tag_families[family].contents
     if not 0 <= number < codes.ncodes:
@@ -159,9 +127,7 @@ def draw_tag(family: Family, number: int) -> UInt8[np.ndarray, "S S"]:
     tag = np.zeros((side, side), np.uint8)
     white = codes.width_at_border + (0 if codes.reversed_border else 2)
     start = (side - white) // 2
-    ring = np.ones((white, white), bool)
-    ring[1:-1, 1:-1] = False
-    tag[start : start + white, start : start + white][ring] = 255
+    tag[start : start + white, start : start + white] = np.pad(np.zeros((white - 2,) * 2), 1, constant_values=255)
     start = (side - codes.width_at_border) // 2
     for bit in range(codes.nbits):
         # Bits outside the border have negative places, which the struct holds as unsigned numbers.
@@ -172,11 +138,7 @@ def draw_tag(family: Family, number: int) -> UInt8[np.ndarray, "S S"]:
 
 @functools.cache
 def tag_detector(family: Family) -> Any:
-    """The detector of a family, a pupil_apriltags.Detector.
-
-    Raises:
-        NerfroError: pupil-apriltags is not installed.
-    """
+    """The pupil_apriltags.Detector of a family, which also holds its codes."""
     try:
         from pupil_apriltags import Detector
     except ImportError as error:

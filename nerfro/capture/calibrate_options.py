@@ -66,16 +66,10 @@ class CalibrateConfig:
 
 
 def check_options(config: DictConfig) -> Intrinsics | None:
-    """The lens that is given, if one is; options that can be refused are refused here.
-
-    Raises:
-        NerfroError: an option is missing or out of range.
-    """
+    """The lens that is given, if one is; options that can be refused are refused here."""
     for name, allowed in _ALLOWED.items():
         if config[name] not in allowed:
-            raise NerfroError(
-                f"{name}={config[name]} is not allowed; choose one of {', '.join(str(one) for one in allowed if one)}"
-            )
+            raise NerfroError(f"{name}={config[name]} is not allowed; choose one of {', '.join(filter(None, allowed))}")
     if config.out is None:
         raise NerfroError("set out= to the folder that takes the data set")
     if config.images is None and not (config.write_board and config.target != "colmap"):
@@ -99,11 +93,7 @@ def check_options(config: DictConfig) -> Intrinsics | None:
 
 
 def make_target(config: DictConfig) -> Target:
-    """The board that the options describe.
-
-    Raises:
-        NerfroError: there is no such board, or what finds it is not installed.
-    """
+    """The board that the options describe."""
     columns, rows = config.columns or 5, config.rows or 7
     if config.target == "charuco":
         square = config.size or 0.04

@@ -1,21 +1,26 @@
-"""The data set that a calibration becomes."""
+"""The data set that a calibration becomes, and a picture of its cameras in space."""
 
 from __future__ import annotations
 
+import io
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from nerfro.capture.calibration import Calibration
-from nerfro.capture.camera_plot import draw_cameras
 from nerfro.files.atomic import write_atomically
 
 SPLITS = ("train", "val", "test")
 REPORT, PLOT = "calibration.json", "cameras.png"
 FILES = (*(f"transforms_{split}.json" for split in SPLITS), REPORT, PLOT)
+# Side of a drawn camera's picture, as a share of the cameras' median distance from the middle.
+_CAMERA_SIZE = 0.08
+_MAX_POINTS = 4000
+_CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 
 
 def split_views(names: list[str], every: int) -> dict[str, list[str]]:
@@ -37,20 +42,9 @@ def write_calibrated(
     quads: list[Float[np.ndarray, "4 3"]],
     points: Float[np.ndarray, "P 3"],
 ) -> list[str]:
-    """Write the data set (see docs/data.md), calibration.json and cameras.png.
+    """Write the data set (see docs/data.md) of images of a size (width, height), calibration.json and cameras.png.
 
-    Args:
-        out: the folder.
-        images: all photographs.
-        size: of them, width and height.
-        calibration: what was found.
-        splits: names by split.
-        target: what was calibrated with.
-        quads: the board's sheets, for the plot.
-        points: of the scene, for the plot.
-
-    Returns:
-        What was written, in words.
+    The quads are the board's sheets and the points the scene's, for the plot. Returns what was written, in words.
     """
     files = {image.name: image for image in images}
     lens = calibration.intrinsics
@@ -84,14 +78,8 @@ def write_calibrated(
     write_atomically(out / REPORT, json.dumps(report, indent=1) + "\n")
     poses = list(calibration.poses.values())
     slopes = 0.5 * size[0] / lens.matrix[0, 0], 0.5 * size[1] / lens.matrix[1, 1]
-    picture = draw_cameras(
-        np.stack([pose.camera_to_world for pose in poses]),
-        np.nan_to_num([pose.error for pose in poses]),
-        slopes,
-        quads,
-        points,
-    )
-    write_atomically(out / PLOT, picture)
+    matrices, errors = np.stack([pose.camera_to_world for pose in poses]), [pose.error for pose in poses]
+    write_atomically(out / PLOT, _draw_cameras(matrices, np.nan_to_num(errors), slopes, quads, points))
     return [*written, str(out / REPORT), str(out / PLOT)]
 
 
@@ -111,3 +99,64 @@ def ray_range(calibration: Calibration, seen: Float[np.ndarray, "P 3"]) -> list[
     distances = np.linalg.norm(centres[:, None] - seen[None, :: max(1, len(seen) // 2000)], axis=-1)
     near, far = 0.5 * np.quantile(distances, 0.001), 1.5 * np.quantile(distances, 0.999)
     return [f"data.near={near:.3g}", f"data.far={far:.3g}"]
+
+
+def _draw_cameras(
+    poses: Float[np.ndarray, "V 3 4"],
+    errors: Float[np.ndarray, "V"],
+    slopes: tuple[float, float],
+    quads: Sequence[Float[np.ndarray, "4 3"]],
+    points: Float[np.ndarray, "P 3"],
+) -> bytes:
+    """Pyramids from each camera's centre, coloured by its reprojection error, from the side and from above, as PNG.
+
+    The poses are in OpenCV's axes; the slopes are half the width and height of the image at unit depth.
+    """
+    from matplotlib import colormaps
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+    from matplotlib.figure import Figure
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+
+    centres = poses[:, :, 3]
+    seen = np.concatenate([*quads, points]) if quads or len(points) else centres
+    middle = np.median(seen, axis=0)
+    size = _CAMERA_SIZE * float(np.median(np.linalg.norm(centres - middle, axis=1)))
+    norm = Normalize(0, max(0.5, float(errors.max())))
+    colours = colormaps["viridis"](norm(errors))
+    half = np.array(slopes) / max(slopes) * 0.5 * size
+    frame = np.array([[x * half[0], y * half[1], 0.5 * size / max(slopes)] for x, y in _CORNERS])
+    # Stray points of a reconstruction lie anywhere.
+    core = [np.quantile(points, (0.02, 0.98), axis=0)] if len(points) else []
+    shown = np.concatenate([centres, *quads, *core])
+    low, high = shown.min(0) - size, shown.max(0) + size
+    figure = Figure(figsize=(13, 6.5), layout="constrained", dpi=110)
+    FigureCanvasAgg(figure)
+    for place, (elevation, azimuth) in enumerate(((22, -60), (90, -90)), 1):
+        axes = figure.add_subplot(1, 2, place, projection="3d")
+        axes.set_proj_type("ortho")
+        axes.view_init(elevation, azimuth)
+        for pose, colour in zip(poses, colours, strict=True):
+            corners = frame @ pose[:, :3].T + pose[:, 3]
+            lines = [(pose[:, 3], corner) for corner in corners]
+            lines += [(corners[i], corners[(i + 1) % 4]) for i in range(4)]
+            axes.add_collection3d(Line3DCollection(lines, colors=colour, linewidths=0.9))
+        if quads:
+            style = {"facecolors": "0.75", "edgecolors": "0.2", "linewidths": 0.6, "alpha": 0.8}
+            axes.add_collection3d(Poly3DCollection(quads, **style))
+        chosen = points[:: -(-len(points) // _MAX_POINTS) or 1]
+        chosen = chosen[((chosen >= low) & (chosen <= high)).all(1)] if len(chosen) else chosen
+        axes.scatter(*chosen.T, s=1, c="0.4")
+        for i, axis in enumerate("xyz"):
+            getattr(axes, f"set_{axis}lim")(low[i], high[i])
+            getattr(axes, f"set_{axis}label")(axis)
+        axes.set_box_aspect(tuple(high - low), zoom=0.95)
+        if elevation == 90:  # from above
+            axes.set_zticks([])
+            axes.set_zlabel("")
+    scale = ScalarMappable(norm, "viridis")
+    figure.colorbar(scale, ax=figure.axes, shrink=0.6, label="reprojection error, pixels (rms)")
+    content = io.BytesIO()
+    figure.savefig(content, format="png")
+    return content.getvalue()

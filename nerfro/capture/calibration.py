@@ -42,13 +42,12 @@ class Pose:
 
     Attributes:
         camera_to_world: [R | centre], OpenCV's axes.
-        num_features, num_points: that it rests on.
+        num_features: that it rests on.
         error: root mean square distance between points and their projections, pixels.
     """
 
     camera_to_world: Float[np.ndarray, "3 4"]
     num_features: int
-    num_points: int
     error: float
 
 
@@ -67,11 +66,7 @@ class Calibration:
         return float(np.nanmean([pose.error for pose in self.poses.values()]))
 
     def lines(self, feature: str) -> list[str]:
-        """What there is to tell: each image's error, what was left out, and the lens.
-
-        Args:
-            feature: what features are, in the plural.
-        """
+        """What there is to tell: each image's error, what was left out, and the lens; `feature` is a plural."""
         told = [f"reprojection error in pixels (rms), and {feature}, by image:"]
         told += [f"  {pose.error:6.3f}  {pose.num_features:4d}  {name}" for name, pose in sorted(self.poses.items())]
         largest = np.nanmax([pose.error for pose in self.poses.values()])
@@ -95,63 +90,39 @@ def calibrate(
 ) -> Calibration:
     """Minimise the reprojection error over all poses and, unless it is given, the lens.
 
-    Points that stay far from their projection are taken out, and all is estimated anew, until none are.
-
-    Args:
-        sightings: of the target, by image.
-        size: of the images, width and height in pixels.
-        model: `pinhole` (the paper's), `radial` (k1, k2) or `opencv` (k1, k2, p1, p2).
-        given: a lens that is known; only poses are estimated then.
-        fewest: images with fewer features are skipped.
-        feature: what features are, in the plural.
-
-    Raises:
-        NerfroError: too few images have enough features.
+    Points that stay far from their projection are taken out, and all is estimated anew, until none are. Images of a
+    size (width, height) with fewer than `fewest` features (`feature` in the plural) are skipped.
     """
     skipped: dict[str, str] = {}
-    kept: dict[str, Sighting] = {}
-    num_outliers = 0
     lost = dict.fromkeys(sightings, 0)
-    current = dict(sightings)
+    current, needed = dict(sightings), 3 if given is None else 1
     for _ in range(_ROUNDS):
         kept = {name: sighting for name, sighting in current.items() if sighting.num_features >= fewest}
         for name, sighting in current.items():
             if name not in kept:
                 found = f"{sighting.num_features} {feature} found, {fewest} are needed"
                 skipped[name] = found + (f" ({lost[name]} points taken out as wrong)" if lost[name] else "")
-        _require_images(len(kept), len(sightings), given, fewest, feature)
-        intrinsics, rotations, shifts = _estimate(list(kept.values()), size, model, given)
-        errors = {
-            name: _errors(sighting, intrinsics, rotations[i], shifts[i])
-            for i, (name, sighting) in enumerate(kept.items())
-        }
+        if len(kept) < needed:
+            raise NerfroError(
+                f"{len(kept)} of {len(sightings)} images show {fewest} or more {feature} of the target, {needed} are "
+                "needed; is it this target (board=, family=, dictionary=), sharp, and large enough in the images?"
+            )
+        intrinsics, placed = _estimate(list(kept.values()), size, model, given)
+        located = dict(zip(kept, placed, strict=True))
+        errors = {name: _errors(sighting, intrinsics, *located[name]) for name, sighting in kept.items()}
         limit = max(_LEAST_ERROR, _OUTLIER * float(np.median(np.concatenate(list(errors.values())))) / 1.18)
         wrong = {name: _worst(kept[name], error, limit) for name, error in errors.items()}
         if not any(one.any() for one in wrong.values()):
             break
         for name, one in wrong.items():
             lost[name] += int(one.sum())
-            num_outliers += int(one.sum())
         current = {name: kept[name].only(~one) for name, one in wrong.items()}
-    poses = {
-        name: Pose(
-            _camera_to_world(rotations[i], shifts[i]),
-            sighting.num_features,
-            len(sighting.points),
-            float(np.sqrt((errors[name] ** 2).mean())),
-        )
-        for i, (name, sighting) in enumerate(kept.items())
-    }
-    return Calibration(intrinsics, poses, skipped, num_outliers)
-
-
-def _require_images(num_kept: int, num_images: int, given: Intrinsics | None, fewest: int, feature: str) -> None:
-    needed = 1 if given is not None else 3
-    if num_kept < needed:
-        raise NerfroError(
-            f"{num_kept} of {num_images} images show {fewest} or more {feature} of the target, {needed} are needed; is "
-            "it this target (board=, family=, dictionary=), sharp, and large enough in the images?"
-        )
+    poses = {}
+    for name, (rotation, shift) in located.items():
+        turn = opencv().Rodrigues(rotation)[0].T
+        error = float(np.sqrt((errors[name] ** 2).mean()))
+        poses[name] = Pose(np.column_stack([turn, -turn @ shift]), kept[name].num_features, error)
+    return Calibration(intrinsics, poses, skipped, sum(lost.values()))
 
 
 def _worst(sighting: Sighting, errors: Float[np.ndarray, "N"], limit: float) -> Bool[np.ndarray, "N"]:
@@ -165,12 +136,11 @@ def _worst(sighting: Sighting, errors: Float[np.ndarray, "N"], limit: float) -> 
 
 def _estimate(
     sightings: list[Sighting], size: tuple[int, int], model: LensModel, given: Intrinsics | None
-) -> tuple[Intrinsics, list[Float[np.ndarray, "3"]], list[Float[np.ndarray, "3"]]]:
+) -> tuple[Intrinsics, list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]]]:
     """The lens, and each image's rotation vector and shift from the world to the camera."""
     cv2 = opencv()
     if given is not None:
-        poses = [_pose(sighting, given) for sighting in sightings]
-        return given, [pose[0] for pose in poses], [pose[1] for pose in poses]
+        return given, [_pose(sighting, given) for sighting in sightings]
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
     if model != "opencv":
         flags |= cv2.CALIB_ZERO_TANGENT_DIST
@@ -186,16 +156,14 @@ def _estimate(
         np.zeros(5),
         flags=flags,
     )
-    kept = {"pinhole": 0, "radial": 4, "opencv": 4}[model]
-    intrinsics = Intrinsics(
-        np.asarray(matrix), tuple(map(float, np.ravel(distortion)[:kept])), float(np.ravel(deviations)[0])
-    )
     if not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1]) <= 0:
         raise NerfroError(
             "the lens cannot be found from these images; photograph the target from more directions, "
             "or give intrinsics=[fx,fy,cx,cy]"
         )
-    return intrinsics, [np.ravel(one) for one in rotations], [np.ravel(one) for one in shifts]
+    coefficients = () if model == "pinhole" else tuple(map(float, np.ravel(distortion)[:4]))
+    poses = [(np.ravel(rotation), np.ravel(shift)) for rotation, shift in zip(rotations, shifts, strict=True)]
+    return Intrinsics(np.asarray(matrix), coefficients, float(np.ravel(deviations)[0])), poses
 
 
 def _pose(sighting: Sighting, given: Intrinsics) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
@@ -214,8 +182,3 @@ def _errors(
     distortion = np.array(intrinsics.distortion) if intrinsics.distortion else None
     projected, _ = opencv().projectPoints(sighting.points, rotation, shift, intrinsics.matrix, distortion)
     return np.linalg.norm(projected.reshape(-1, 2) - sighting.pixels, axis=1)
-
-
-def _camera_to_world(rotation: Float[np.ndarray, "3"], shift: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 4"]:
-    matrix, _ = opencv().Rodrigues(rotation)
-    return np.column_stack([matrix.T, -matrix.T @ shift])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -46,11 +46,7 @@ class MaskConfig:
 
 
 def read_outlines(given: object) -> dict[str, list]:
-    """Outlines by name, from a mapping or a file.
-
-    Raises:
-        NerfroError: the file cannot be read, or an outline is neither a box nor a polygon.
-    """
+    """Outlines by name, each a box or a polygon, from a mapping or a file."""
     if OmegaConf.is_config(given):
         given = OmegaConf.to_container(given)  # type: ignore[arg-type]
     if isinstance(given, str):
@@ -83,38 +79,27 @@ def read_outlines(given: object) -> dict[str, list]:
 
 
 def load_all(source: DataSource) -> tuple[Cameras, list[UInt8[np.ndarray, "H W 3"]], list[Frame]]:
-    """All splits' views, each image once, without masks.
-
-    Raises:
-        NerfroError: splits have images of several sizes, or the loader does not tell its files.
-    """
+    """All splits' views, each image once, without masks; all must be of one size."""
     parts: list[Cameras] = []
     images: list[UInt8[np.ndarray, "H W 3"]] = []
     frames: list[Frame] = []
-    known: set[Path] = set()
     for split in source.splits:
         with masks_left_out():
             views = source.load(split)
         if len(views.frames) != len(views):
             raise NerfroError("this data format does not tell where its images lie; convert it to data=opencv")
+        known = {frame.image for frame in frames}
         fresh = [i for i, frame in enumerate(views.frames) if frame.image not in known]
-        if not fresh:
-            continue
-        parts.append(views.cameras.select(fresh))
+        parts += [views.cameras.select(fresh)] if fresh else []  # a split without new images may be cropped
         images += [np.uint8(np.rint(255 * views.images[i].numpy())) for i in fresh]
         frames += [views.frames[i] for i in fresh]
-        known |= {views.frames[i].image for i in fresh}
     sizes = {(part.width, part.height) for part in parts}
     if len(sizes) > 1:
         raise NerfroError(f"splits have images of several sizes ({sorted(sizes)}); leave data.eval_crop at 1")
-    return _joined(parts), images, frames
-
-
-def _joined(parts: Sequence[Cameras]) -> Cameras:
     names = ("camera_to_world", "fx", "fy", "cx", "cy")
     tensors: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
     lenses = [torch.zeros(len(part), 9) if part.distortion is None else part.distortion for part in parts]
-    return replace(parts[0], **tensors, distortion=torch.cat(lenses))
+    return replace(parts[0], **tensors, distortion=torch.cat(lenses)), images, frames
 
 
 def find_frame(name: str, frames: list[Frame]) -> int:
@@ -128,15 +113,11 @@ def find_frame(name: str, frames: list[Frame]) -> int:
 
 
 def check_start(frames: list[Frame], outlined: Mapping[int, object], kept: Mapping[int, object]) -> None:
-    """Check that there is something to start from, something to do, and a place for every mask.
-
-    Raises:
-        NerfroError: there is not.
-    """
+    """Refuse where there is nothing to start from, nothing to do, or no place for a mask."""
     if not outlined and not kept:
-        example = f"outlines={{{frames[0].name}:[LEFT,TOP,RIGHT,BOTTOM]}}"
         raise NerfroError(
-            f"there is no mask to start from; give the outline of the object in an image, as in {example}"
+            "there is no mask to start from; give the outline of the object in an image, as in "
+            f"outlines={{{frames[0].name}:[LEFT,TOP,RIGHT,BOTTOM]}}"
         )
     for view in outlined:
         if view in kept:
@@ -162,16 +143,11 @@ def stored_size(frame: Frame) -> tuple[int, int]:
 
 
 def read_resized(mask: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-    """A mask in the size [width, height] of the images as they are loaded.
-
-    Raises:
-        NerfroError: it has other proportions.
-    """
+    """A mask in the size (width, height) of the images as they are loaded."""
     share = to_unit(read_mask(mask))
-    if share.shape[0] * size[0] != share.shape[1] * size[1]:
-        raise NerfroError(
-            f"mask {mask} has {share.shape[1]}x{share.shape[0]} pixels, of other proportions than its image"
-        )
+    height, width = share.shape
+    if height * size[0] != width * size[1]:
+        raise NerfroError(f"mask {mask} has {width}x{height} pixels, of other proportions than its image")
     return opencv().resize(share, size, interpolation=opencv().INTER_AREA) > 0.5
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -40,13 +39,7 @@ def grab(
     possible: Bool[np.ndarray, "H W"],
     certain: Bool[np.ndarray, "H W"] | None = None,
 ) -> Bool[np.ndarray, "H W"]:
-    """Cut an object out by the colours inside and outside (Rother et al., GrabCut, SIGGRAPH 2004).
-
-    Args:
-        image: sRGB.
-        likely: where the object is thought to be.
-        possible: where it may be; all else is background.
-        certain: where it surely is.
+    """Cut an object out of an sRGB image by the colours inside and outside (Rother et al., GrabCut, SIGGRAPH 2004).
 
     Returns:
         The largest connected part of the object, without holes; empty where nothing is left.
@@ -86,14 +79,12 @@ def grab(
 def outline_region(
     outline: ArrayLike, size: tuple[int, int]
 ) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
-    """Where the object is likely, and where it is possible.
+    """Where the object is likely, and where it is possible, in an image of a size (width, height).
 
-    Args:
-        outline: a box (left, top, right, bottom) around the object, or the corners (column, row) of a polygon that
-            follows it roughly, pixels.
-        size: width and height of the image in pixels.
+    The outline is a box (left, top, right, bottom) around the object, or the corners (column, row) of a polygon that
+    follows it roughly, pixels.
     """
-    region = np.zeros((size[1], size[0]), np.uint8)
+    region = np.zeros(size[::-1], np.uint8)
     numbers = np.array(outline, np.float64)
     if numbers.ndim == 1:
         left, top, right, bottom = np.rint(numbers).astype(int)
@@ -109,16 +100,10 @@ def propagate(
     done: Mapping[int, Bool[np.ndarray, "H W"]],
     progress: Callable[[int], None] = lambda count: None,
 ) -> tuple[dict[int, Bool[np.ndarray, "H W"]], dict[int, float]]:
-    """Find the object in all views from its silhouettes in some.
+    """Find the object in all views from its silhouettes in some, at least one.
 
     The next view is always one that looks from nearly where a done one does. After all have had their turn, those that
-    were not given are cut out once more, each from the hull of all others.
-
-    Args:
-        images: of all views.
-        cameras: of all views.
-        done: silhouettes by view, at least one.
-        progress: called with the number of views that were cut out, twice each.
+    were not given are cut out once more, each from the hull of all others. `progress` counts the cuts, two a view.
 
     Returns:
         Silhouettes of all views, and for each that was not given its overlap (intersection over union) with the hull of
@@ -176,7 +161,7 @@ class _Hull:
     def add(self, view: int, mask: Bool[np.ndarray, "H W"]) -> None:
         if not mask.any():
             return
-        silhouettes = Silhouettes.of(_some(self.cameras, [view]), torch.from_numpy(mask[None]).float())
+        silhouettes = Silhouettes.of(self.cameras.select([view]), torch.from_numpy(mask[None]).float())
         inside, width, _ = silhouettes.depth_inside(0, self.points)
         # A little generous, for thin parts lie between the grid's points.
         self.outside[view] = (inside * width < -0.3 * self.voxel).numpy()
@@ -187,7 +172,7 @@ class _Hull:
         own = self.outside.get(view)
         num_others = len(self.outside) - (own is not None)
         inside = (self.count if own is None else self.count - own) <= int(_WRONG_SHARE * num_others)
-        camera = _some(self.cameras, [view])
+        camera = self.cameras.select([view])
         region = np.zeros((camera.height, camera.width), bool)
         points = self.points[torch.from_numpy(inside)]
         pixels, depth = (values[0] for values in camera.project(points))
@@ -206,7 +191,7 @@ class _Hull:
 
 def _find_box(cameras: Cameras, masks: Mapping[int, Bool[np.ndarray, "H W"]]) -> Float[np.ndarray, "2 3"]:
     views = sorted(masks)
-    chosen = _some(cameras, views)
+    chosen = cameras.select(views)
     inside = torch.from_numpy(np.stack([masks[view] for view in views]))
     if len(views) > 1:
         return find_box(Silhouettes.of(chosen, inside.float()))
@@ -229,11 +214,6 @@ def _nearest_view(cameras: Cameras, centre: Float[np.ndarray, "3"], wanted: list
     return wanted[int((towards[wanted] @ towards[done].T).max(1).argmax())]
 
 
-def _some(cameras: Cameras, views: list[int]) -> Cameras:
-    per_view = {name: getattr(cameras, name)[views] for name in ("camera_to_world", "fx", "fy", "cx", "cy")}
-    return replace(cameras, **per_view, distortion=None if cameras.distortion is None else cameras.distortion[views])
-
-
 def _diameter(region: Bool[np.ndarray, "H W"]) -> float:
     return 2 * float(np.sqrt(region.sum() / np.pi))
 
@@ -244,8 +224,7 @@ def _grown(region: Bool[np.ndarray, "H W"], share: float) -> Bool[np.ndarray, "H
 
 def _distance(region: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
     """To the nearest pixel outside, pixels."""
-    cv2 = opencv()
-    return cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5)
+    return opencv().distanceTransform(region.astype(np.uint8), opencv().DIST_L2, 5)
 
 
 def _largest_part(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:

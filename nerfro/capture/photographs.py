@@ -19,19 +19,15 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear sRGB (I
 
 
 def list_photographs(folder: Path) -> tuple[list[Path], tuple[int, int]]:
-    """The photographs by name, and their size.
-
-    Raises:
-        NerfroError: there are none, one cannot be read, sizes differ, or two would share a mask's name.
-    """
+    """The photographs by name, and their size, which is that of all."""
     images = list_images(folder)
     repeated = [stem for stem, count in Counter(image.stem for image in images).items() if count > 1]
     if repeated:
         raise NerfroError(f"{folder} holds several images called {repeated[0]}; keep one of each name")
     shapes = {image: read_rgb(image, "drop").shape[1::-1] for image in track(images, "reading")}
-    (size, _), *others = Counter(shapes.values()).most_common()
-    if others:
-        odd = next(image for image in images if shapes[image] != size)
+    ((size, _),) = Counter(shapes.values()).most_common(1)
+    odd = next((image for image in images if shapes[image] != size), None)
+    if odd is not None:
         raise NerfroError(
             f"image {odd} has {shapes[odd][0]}x{shapes[odd][1]} pixels but most have {size[0]}x{size[1]}; all must be "
             "of one lens and size: turn or remove it"

@@ -9,10 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.capture.silhouettes import intersection_over_union, mesh_silhouette, pixel_stride
+from nerfro.capture.silhouettes import mesh_silhouettes, pixel_stride
 from nerfro.capture.visual_hull import Silhouettes, carve_grid, extract_surface, find_box, remove_strays
 from nerfro.errors import NerfroError
-from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh
 
 # The first look is at so many voxels a side and at most so many pixels a side.
@@ -24,18 +23,14 @@ _SLACK = 1.5
 
 # What a file's poses could have been, as what has to be done to them as they were read; most frequent mistakes first.
 # `turn` is applied to the camera's axes (x right, y up, z back), `inverse` to the whole matrix before.
-_ALTERNATIVES: tuple[tuple[str, bool, tuple[tuple[int, int, int], ...]], ...] = (
-    (
-        "the camera's y and z axes flipped (OpenCV's axes, y down, z forward, in a file read as OpenGL's, or reversed)",
-        False,
-        ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
-    ),
+_Turn = tuple[tuple[int, int, int], ...]
+_HALF_TURN = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
+_FLIP = "the camera's y and z axes flipped (OpenCV's axes, y down, z forward, in a file read as OpenGL's, or reversed)"
+_INVERTED_FLIP = "the matrices inverted and the y and z axes flipped (world-to-camera matrices in OpenCV's axes)"
+_ALTERNATIVES: tuple[tuple[str, bool, _Turn], ...] = (
+    (_FLIP, False, _HALF_TURN),
     ("the matrices inverted (they are world-to-camera)", True, ((1, 0, 0), (0, 1, 0), (0, 0, 1))),
-    (
-        "the matrices inverted and the y and z axes flipped (world-to-camera matrices in OpenCV's axes)",
-        True,
-        ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
-    ),
+    (_INVERTED_FLIP, True, _HALF_TURN),
     ("y flipped (images and masks are upside down, or y points down)", False, ((1, 0, 0), (0, -1, 0), (0, 0, 1))),
     ("x flipped (images and masks are mirrored)", False, ((-1, 0, 0), (0, 1, 0), (0, 0, 1))),
     ("x and y flipped (images turned by 180 degrees)", False, ((-1, 0, 0), (0, -1, 0), (0, 0, 1))),
@@ -45,24 +40,11 @@ _ALTERNATIVES: tuple[tuple[str, bool, tuple[tuple[int, int, int], ...]], ...] = 
 
 
 def overlap(mesh: TriangleMesh, silhouettes: Silhouettes, max_pixels: int) -> Float[np.ndarray, "V"]:
-    """Intersection over union of a mesh's silhouette with each mask.
-
-    Args:
-        mesh: world units.
-        silhouettes: the masks.
-        max_pixels: larger images are looked at in every second, third, ... pixel only.
-    """
-    cameras, masks = silhouettes.cameras, silhouettes.masks
-    intersector = MeshIntersector(mesh.triangles)
-    stride = pixel_stride(cameras, max_pixels)
-    return np.array(
-        [
-            intersection_over_union(
-                mesh_silhouette(intersector, cameras, view, stride), masks[view, ::stride, ::stride] > 0.5
-            )
-            for view in range(len(masks))
-        ]
-    )
+    """Intersection over union of a mesh's silhouette with each mask, 1 where both are empty, see `pixel_stride`."""
+    stride = pixel_stride(silhouettes.cameras, max_pixels)
+    ours, theirs = mesh_silhouettes(mesh, silhouettes.cameras, stride), silhouettes.masks[:, ::stride, ::stride] > 0.5
+    both, either = (ours & theirs).sum((1, 2)).double(), (ours | theirs).sum((1, 2))
+    return torch.where(either > 0, both / either, 1.0).numpy()
 
 
 def coarse_agreement(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np.ndarray, "V"]:
@@ -70,37 +52,25 @@ def coarse_agreement(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np
 
     Counted in pixels of the mask; not below 0, and 0 where the hull is empty.
     """
-    distances, corner, spacing = carve_grid(
-        silhouettes, find_box(silhouettes, wrong_masks), _COARSE_VOXELS, wrong_masks
-    )
+    box = find_box(silhouettes, wrong_masks)
+    distances, corner, spacing = carve_grid(silhouettes, box, _COARSE_VOXELS, wrong_masks)
     remove_strays(distances)
     if not (distances < 0).any():
         return np.zeros(len(silhouettes))
-    intersector = MeshIntersector(extract_surface(distances, corner, spacing).triangles)
     stride = pixel_stride(silhouettes.cameras, _COARSE_PIXELS)
-    agreement = np.empty(len(silhouettes))
-    for view in range(len(silhouettes)):
-        ours = mesh_silhouette(intersector, silhouettes.cameras, view, stride)
-        outline = silhouettes.distances[view, ::stride, ::stride]
-        differs = (ours != (outline > 0)) & (outline.abs() > _SLACK * stride)
-        agreement[view] = max(0.0, 1 - int(differs.sum()) / max(int((outline > 0).sum()), 1))
-    return agreement
+    ours = mesh_silhouettes(extract_surface(distances, corner, spacing), silhouettes.cameras, stride)
+    outlines = silhouettes.distances[:, ::stride, ::stride]
+    differs = (ours != (outlines > 0)) & (outlines.abs() > _SLACK * stride)
+    return (1 - differs.sum((1, 2)).double() / (outlines > 0).sum((1, 2)).clamp(min=1)).clamp(min=0).numpy()
 
 
 def require_consistent_poses(silhouettes: Silhouettes, names: list[str], wrong_masks: int) -> None:
-    """Check that the masks' common hull looks like the masks.
-
-    Raises:
-        NerfroError: it does not; the misread convention or the views that disagree with the others are named.
-    """
+    """Refuse masks whose common hull does not look like them; name the misread convention or the odd views."""
     found = float(np.median(coarse_agreement(silhouettes, wrong_masks)))
     if found >= GOOD_OVERLAP:
         return
-    state = (
-        "the visual hull is empty: no point lies inside all masks"
-        if found == 0
-        else f"the visual hull covers the masks badly (to {found:.0%})"
-    )
+    state = f"the visual hull covers the masks badly (to {found:.0%})"
+    state = "the visual hull is empty: no point lies inside all masks" if found == 0 else state
     scores = [float(np.median(coarse_agreement(_changed(silhouettes, i, t), wrong_masks))) for _, i, t in _ALTERNATIVES]
     # Of equally good ones (a ball is a ball upside down) the most frequent mistake.
     best = next(i for i, score in enumerate(scores) if score >= max(scores) - 0.002)
@@ -124,7 +94,7 @@ def require_consistent_poses(silhouettes: Silhouettes, names: list[str], wrong_m
     )
 
 
-def _changed(silhouettes: Silhouettes, inverse: bool, turn: tuple[tuple[int, int, int], ...]) -> Silhouettes:
+def _changed(silhouettes: Silhouettes, inverse: bool, turn: _Turn) -> Silhouettes:
     """The same masks with the poses read differently."""
     poses: Tensor = silhouettes.cameras.camera_to_world
     rotation, centre = poses[:, :, :3], poses[:, :, 3:]
@@ -132,4 +102,4 @@ def _changed(silhouettes: Silhouettes, inverse: bool, turn: tuple[tuple[int, int
         rotation = rotation.transpose(1, 2)
         centre = -rotation @ centre
     poses = torch.cat([rotation @ torch.tensor(turn, dtype=rotation.dtype), centre], -1)
-    return silhouettes.seen_from(replace(silhouettes.cameras, camera_to_world=poses))
+    return replace(silhouettes, cameras=replace(silhouettes.cameras, camera_to_world=poses))

@@ -55,11 +55,7 @@ class PreprocessConfig:
 
 
 def claim(config: DictConfig) -> Path:
-    """The folder to write to.
-
-    Raises:
-        NerfroError: an option is out of range, the folder is the package's, or a file would be replaced.
-    """
+    """The folder to write to; refused if an option is out of range, or it is the package's, or a file is there."""
     if not 16 <= config.resolution <= 1024:
         raise NerfroError(f"resolution={config.resolution} is not allowed; take 16 to 1024 voxels a side")
     if config.wrong_masks < 0 or (config.keep is not None and config.keep < 1) or not config.smoothing >= 0:
@@ -86,15 +82,7 @@ def train_command(
 ) -> list[str]:
     """The command that trains on the surface; makes the index grid, so that a bad one is refused now and not then.
 
-    Args:
-        config: of this run.
-        silhouettes: of the views.
-        mesh: the surface.
-        location: its file.
-        overrides: what the user has given on the command line.
-
-    Raises:
-        NerfroError: the medium refuses the mesh or an option.
+    The surface's file is its `location`; the overrides are those of this command line.
     """
     given = {key.lstrip("+").split("=")[0] for key in overrides}
     settings = {"medium.ior": config.medium.ior}

@@ -26,6 +26,7 @@ _MODEL_FOLDERS = ("sparse/0", "sparse")
 _CAMERAS = {"pinhole": "PINHOLE", "radial": "RADIAL", "opencv": "OPENCV"}
 # A feature describes its neighbourhood: those near the object's outline see it too. Share of the image's width.
 _MARGIN = 0.01
+_SEED = 0
 
 
 def find_model(
@@ -37,18 +38,7 @@ def find_model(
     given: Intrinsics | None,
     overwrite: bool,
 ) -> Path:
-    """The folder of the COLMAP model: the one that is named, else one beside the images, else one that is made.
-
-    Args:
-        model: its folder, if the user names one.
-        images, masks, given: see `reconstruct`.
-        made: folder for a model that is made.
-        lens: of that model.
-        overwrite: whether `made` may be replaced.
-
-    Raises:
-        NerfroError: `made` exists and may not be replaced, or no model can be made.
-    """
+    """The folder of the COLMAP model: the one that is named, else one beside the images, else one in `made`."""
     if model is not None:
         return user_path(model)
     folder = images[0].parent
@@ -68,28 +58,14 @@ def reconstruct(
     folder: Path,
     model: LensModel,
     given: Intrinsics | None,
-    seed: int = 0,
 ) -> Path:
-    """Structure from motion with one lens for all images; features on the refractive object are discarded.
+    """Structure from motion of the images of one folder with one lens; the folder of the model with most images.
 
-    Rays that were bent do not meet in a point, and what is seen through the object would pull the poses.
-
-    Args:
-        images: files of one folder.
-        masks: the object's silhouettes, where there are any.
-        folder: takes the models, numbered; the one with most images is 0.
-        model: of the lens.
-        given: a lens that is known and kept.
-        seed: of the random samples.
-
-    Returns:
-        The folder of the model.
-
-    Raises:
-        NerfroError: pycolmap is not installed, or too few features match.
+    Features on the refractive object are discarded: rays that were bent do not meet in a point, and what is seen
+    through the object would pull the poses. A lens that is given is kept.
     """
     pycolmap = _pycolmap()
-    pycolmap.set_random_seed(seed)
+    pycolmap.set_random_seed(_SEED)
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     with tempfile.TemporaryDirectory() as scratch:
         database, masked = Path(scratch) / "database.db", Path(scratch) / "masks"
@@ -102,9 +78,7 @@ def reconstruct(
         if any(mask is not None for mask in masks):
             reader.mask_path = masked
         if given is not None:
-            k1, k2, p1, p2 = [*given.distortion, 0.0, 0.0, 0.0, 0.0][:4]
-            matrix = given.matrix
-            numbers = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], k1, k2, p1, p2]
+            numbers = [*given.matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *(given.distortion or [0.0] * 4)]
             reader.camera_model, reader.camera_params = "OPENCV", ",".join(f"{number:.12g}" for number in numbers)
         pycolmap.extract_features(
             database,
@@ -119,7 +93,7 @@ def reconstruct(
             options.ba_refine_focal_length = options.ba_refine_extra_params = False
         else:
             options.ba_refine_principal_point = False
-        options.random_seed = seed
+        options.random_seed = _SEED
         folder.mkdir(parents=True, exist_ok=True)
         found = pycolmap.incremental_mapping(database, images[0].parent, folder, options)
     if not found:
@@ -131,20 +105,7 @@ def reconstruct(
 
 
 def import_model(folder: Path, images: Sequence[Path], size: tuple[int, int]) -> tuple[Calibration, Any]:
-    """Lens and poses of a model, text or binary.
-
-    Args:
-        folder: of the model.
-        images: files whose names the model knows them by.
-        size: their width and height in pixels.
-
-    Returns:
-        The calibration, and the 3-D points [P, 3].
-
-    Raises:
-        NerfroError: pycolmap is not installed, the model is corrupt, has several lenses or one that is not supported,
-            or is not of these images.
-    """
+    """Lens and poses of a model, text or binary, for images of a size (width, height), and its 3-D points [P, 3]."""
     pycolmap = _pycolmap()
     parsed = read_colmap(folder)  # first, for pycolmap does not notice a file that is cut off
     names = {image.name for image in images}
@@ -165,7 +126,7 @@ def import_model(folder: Path, images: Sequence[Path], size: tuple[int, int]) ->
     poses = {}
     for image in registered:
         error, num_points = errors[image.name]
-        poses[image.name] = Pose(image.camera_to_world, num_points, num_points, error)
+        poses[image.name] = Pose(image.camera_to_world, num_points, error)
     skipped = {image.name: "not placed by COLMAP" for image in images if image.name not in poses}
     return Calibration(_intrinsics(lens), poses, skipped, 0), parsed.points
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,22 +19,18 @@ from nerfro.capture.visual_hull import Silhouettes
 from nerfro.geometry.mesh import TriangleMesh
 
 
-@dataclass(frozen=True)
-class _Prior:
+class _Prior(NamedTuple):
     """What is taken for likely where no outline tells.
 
-    Attributes:
-        area, bending: their last weights for each observation of the outline, in units of the object's size.
-        first: the weights fall from this many times the last ones. A surface that is too small is pulled out at the
-            edges, where the object is, whereas one that fills the hull touches all masks everywhere and would stay.
-        usual: whether the curvature that is usual around a vertex is likely, or none.
-        iterations: steps.
+    The last weights of area and bending for each observation of the outline are in units of the object's size. They
+    fall from `first` times that: a surface that is too small is pulled out at the edges, where the object is, whereas
+    one that fills the hull touches all masks everywhere and would stay.
     """
 
     area: float
     bending: float
     first: float
-    usual: bool
+    usual: bool  # whether the curvature that is usual around a vertex is likely, or none
     iterations: int
 
 
@@ -55,15 +52,10 @@ _TYPICAL = 0.35
 _GATE, _HALVED = 3.0, 0.7
 
 
-@dataclass(frozen=True)
-class _Rims:
+class _Rims(NamedTuple):
     """Where the surface's outlines are seen: on edge (first, second) of the mesh, `share` of the way to second.
 
-    Attributes:
-        first, second: vertices.
-        share: place between them.
-        misfit: distance that the surface there has to move outwards to meet the mask's outline, world units.
-        weight: of the observation.
+    To meet the mask's outline the surface has to move outwards by `misfit` there, world units.
     """
 
     first: Int[np.ndarray, "K"]
@@ -96,21 +88,13 @@ def fit_surface(
     That draws in sharp edges. So a second surface is fitted without C and p, with much area first and hardly any at
     last; it is taken where its outlines are clearly nearer to the masks'.
 
-    Args:
-        mesh: a closed surface around the object with triangles of about one size, such as marching cubes give.
-        silhouettes: the masks.
-        smoothing: multiplies the weights of area and bending; more for masks that were drawn by hand.
-        progress: called with the share of the work that is done.
-
-    Returns:
-        The same triangles with other vertices.
+    The mesh is closed and has triangles of about one size, such as marching cubes give. `smoothing` multiplies the
+    weights of area and bending; more of it suits masks that were drawn by hand. `progress` is told the share done.
     """
-    done = 0
+    count = itertools.count(1)
 
     def step() -> None:
-        nonlocal done
-        done += 1
-        progress(done / (_ROUND.iterations + _FLAT.iterations))
+        progress(next(count) / (_ROUND.iterations + _FLAT.iterations))
 
     outlines = [_nearest_outline_pixel(mask) for mask in (silhouettes.masks > 0.5).numpy()]
     rounded, rounded_misfit = _fit(mesh, silhouettes, outlines, smoothing, _ROUND, step)
@@ -130,9 +114,11 @@ def _fit(
     faces, vertices = mesh.faces, mesh.vertices.copy()
     edges = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
     size = float(np.ptp(vertices, axis=0).max())
-    mean = _neighbour_mean(edges, len(vertices))
-    across = _differences(edges, len(vertices))
-    degree = np.bincount(edges.ravel())
+    both, degree = np.concatenate([edges, edges[:, ::-1]]), np.bincount(edges.ravel())
+    # These take values at vertices to the means of their neighbours', and to their differences along edges.
+    mean = sparse.csr_matrix((1 / degree[both[:, 0]], (both[:, 0], both[:, 1])), (len(vertices),) * 2)
+    signs, number = np.repeat([1.0, -1.0], len(edges)), np.tile(np.arange(len(edges)), 2)
+    across = sparse.csr_matrix((signs, (number, edges.T.ravel())), (len(edges), len(vertices)))
     for iteration in range(prior.iterations):
         normals = _vertex_normals(vertices, faces)
         rims = _find_rims(vertices, normals, edges, silhouettes, outlines)
@@ -141,17 +127,12 @@ def _fit(
         more = prior.first ** max(0.0, 1 - iteration / (prior.iterations - 3))
         area = smoothing * num_rims * prior.area * more
         bending = smoothing * num_rims * prior.bending * more * size**2
-        observed = sparse.csr_matrix(
-            (
-                np.concatenate([1 - rims.share, rims.share]),
-                (np.tile(np.arange(num_rims), 2), np.concatenate([rims.first, rims.second])),
-            ),
-            (num_rims, len(vertices)),
-        )
+        row, column = np.tile(np.arange(num_rims), 2), np.concatenate([rims.first, rims.second])
+        shares = np.concatenate([1 - rims.share, rims.share])
+        observed = sparse.csr_matrix((shares, (row, column)), (num_rims, len(vertices)))
         curvature, curved, around = _mean_curvature(vertices, normals, edges, mean)
         usual = _usual_curvature(curved, vertices, normals, _TURN * size) if prior.usual else np.zeros_like(curved)
-        along = [sparse.diags(normals[:, axis]) for axis in range(3)]
-        stretch = sum(n @ across.T @ across @ n for n in along)
+        stretch = sum(n @ across.T @ across @ n for n in map(sparse.diags, normals.T))
         stretched = sum(normals[:, a] * (across.T @ (across @ vertices[:, a])) for a in range(3))
         pressure = -degree * around / np.sqrt(around.mean()) * usual
         weights = sparse.diags(rims.weight)
@@ -230,20 +211,6 @@ def _vertex_normals(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "
     return total / np.linalg.norm(total, axis=1, keepdims=True).clip(1e-12)
 
 
-def _neighbour_mean(edges: Int[np.ndarray, "E 2"], num_vertices: int) -> sparse.csr_matrix:
-    """Takes values at vertices to the mean of their neighbours'."""
-    both = np.concatenate([edges, edges[:, ::-1]])
-    degree = np.bincount(both[:, 0], minlength=num_vertices)
-    return sparse.csr_matrix((1 / degree[both[:, 0]], (both[:, 0], both[:, 1])), (num_vertices, num_vertices))
-
-
-def _differences(edges: Int[np.ndarray, "E 2"], num_vertices: int) -> sparse.csr_matrix:
-    """Takes values at vertices to their differences along edges."""
-    number = np.arange(len(edges))
-    signs = np.repeat([1.0, -1.0], len(edges))
-    return sparse.csr_matrix((signs, (np.tile(number, 2), edges.T.ravel())), (len(edges), num_vertices))
-
-
 def _mean_curvature(
     vertices: Float[np.ndarray, "V 3"],
     normals: Float[np.ndarray, "V 3"],
@@ -264,20 +231,16 @@ def _mean_curvature(
     # Marching cubes leave some triangles so small that their curvature is noise.
     scale = sparse.diags(np.sqrt(typical) / around.clip(0.05 * typical))
     umbrella = mean - sparse.identity(len(vertices))
-    along = [sparse.diags(normals[:, axis]) for axis in range(3)]
-    change = scale @ sum(n @ umbrella @ n for n in along)
+    change = scale @ sum(n @ umbrella @ n for n in map(sparse.diags, normals.T))
     return change.tocsr(), scale @ (normals * (umbrella @ vertices)).sum(1), around
 
 
 def _usual_curvature(
     curved: Float[np.ndarray, "V"], vertices: Float[np.ndarray, "V 3"], normals: Float[np.ndarray, "V 3"], turn: float
 ) -> Float[np.ndarray, "V"]:
-    """The curvature that most vertices around each one reach, with the sign of their median.
+    """The curvature (negative on a ball) that most vertices around each one reach, with the sign of their median.
 
-    Args:
-        curved: negative on a ball.
-        vertices, normals: of the mesh.
-        turn: how far away a normal turned by a radian is: the other side of a thin wall is not near.
+    A normal turned by a radian is `turn` away: the other side of a thin wall is not near.
     """
     points = np.concatenate([vertices, turn * normals], 1)
     chosen = np.linspace(0, len(points) - 1, min(len(points), _NUM_SPREAD)).astype(np.int64)

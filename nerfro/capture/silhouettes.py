@@ -11,6 +11,7 @@ from torch import Tensor
 
 from nerfro.cameras import Cameras
 from nerfro.geometry.intersection import MeshIntersector
+from nerfro.geometry.mesh import TriangleMesh
 
 # Standard deviation of the blur in which the outline is found, pixels: enough to see between a binary mask's steps (an
 # error of 0.15 pixels on straight lines), and little enough to keep corners (a bend of radius r moves in by 1 / 2r).
@@ -22,14 +23,11 @@ _LEAST = 0.05
 
 
 def outline_distance(mask: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
-    """Signed distance of each pixel's centre to a mask's outline, pixels, positive inside.
+    """Signed distance of each pixel's centre to the outline of a mask of shares, pixels, positive inside.
 
     Near a straight outline a blurred mask is Phi(distance / blur), Phi the normal distribution's integral; the inverse
     of that gives places between the pixels, for binary masks as well as for those that hold shares. The frame of the
     image is no outline.
-
-    Args:
-        mask: share of each pixel that the object covers.
     """
     inside = mask > 0.5
     if inside.all() or not inside.any():
@@ -41,10 +39,10 @@ def outline_distance(mask: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]
     return np.where(inside, distance.clip(min=_LEAST), distance.clip(max=-_LEAST)).astype(np.float32)
 
 
-def is_cut_by_frame(masks: Float[Tensor, "V H W"]) -> Bool[Tensor, "V"]:
-    """Which masks touch the frame of their image, so that the object may go on beyond it."""
+def frame_pixels(masks: Float[Tensor, "V H W"]) -> Bool[Tensor, "V P"]:
+    """Whether the pixels along the frame of each mask are object, so that it may go on beyond it."""
     inside = masks > 0.5
-    return inside[:, [0, -1]].flatten(1).any(1) | inside[:, :, [0, -1]].flatten(1).any(1)
+    return torch.cat([inside[:, [0, -1]].flatten(1), inside[:, :, [0, -1]].flatten(1)], 1)
 
 
 def pixel_stride(cameras: Cameras, max_pixels: int) -> int:
@@ -52,16 +50,13 @@ def pixel_stride(cameras: Cameras, max_pixels: int) -> int:
     return -(-max(cameras.width, cameras.height) // max_pixels)
 
 
-def mesh_silhouette(intersector: MeshIntersector, cameras: Cameras, view: int, stride: int) -> Bool[Tensor, "h w"]:
+def mesh_silhouettes(mesh: TriangleMesh, cameras: Cameras, stride: int) -> Bool[Tensor, "V h w"]:
     """Where the rays through the centres of every stride-th pixel, from the first on, meet a mesh."""
-    row, column = torch.meshgrid(
-        torch.arange(0, cameras.height, stride), torch.arange(0, cameras.width, stride), indexing="ij"
-    )
-    rays = cameras.rays(torch.full_like(row, view).flatten(), row.flatten(), column.flatten())
-    return (intersector.first_hits(rays.origins, rays.directions) >= 0).view(row.shape)
-
-
-def intersection_over_union(ours: Bool[Tensor, "h w"], theirs: Bool[Tensor, "h w"]) -> float:
-    """Of two silhouettes; 1 where both are empty."""
-    either = int((ours | theirs).sum())
-    return int((ours & theirs).sum()) / either if either else 1.0
+    intersector = MeshIntersector(mesh.triangles)
+    rows, columns = torch.arange(0, cameras.height, stride), torch.arange(0, cameras.width, stride)
+    row, column = torch.meshgrid(rows, columns, indexing="ij")
+    seen = []
+    for view in range(len(cameras)):
+        rays = cameras.rays(torch.full_like(row, view).flatten(), row.flatten(), column.flatten())
+        seen.append((intersector.first_hits(rays.origins, rays.directions) >= 0).view(row.shape))
+    return torch.stack(seen)

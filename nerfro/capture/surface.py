@@ -8,14 +8,8 @@ from jaxtyping import Float
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from nerfro.capture.silhouette_fit import fit_surface
-from nerfro.capture.visual_hull import (
-    Silhouettes,
-    carve_grid,
-    extract_surface,
-    find_box,
-    reached_sides,
-    remove_strays,
-)
+from nerfro.capture.silhouettes import frame_pixels
+from nerfro.capture.visual_hull import Silhouettes, carve_grid, extract_surface, find_box, reaches_border, remove_strays
 from nerfro.cli import warn
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError, first_of
@@ -30,32 +24,22 @@ _ONE_SIDE = 75.0
 
 
 def read_silhouettes(views: Views, has_box: bool) -> Silhouettes:
-    """The outlines of views, checked.
-
-    Args:
-        views: with masks.
-        has_box: whether the user has given a box that bounds what the masks do not.
-
-    Raises:
-        NerfroError: there are no masks or too few views, masks are empty, full or inverted, or all are cut.
-    """
+    """The outlines of views, checked; a box that the user has given bounds what the masks do not."""
     if views.masks is None:
         raise NerfroError(
             "the data has no masks, and the hull is made of them; docs/capture.md tells where they are looked for "
             "and how to make them"
         )
     masks = torch.stack(list(views.masks))
-    inside = masks > 0.5
-    share = inside.flatten(1).float().mean(1)
+    share = (masks > 0.5).flatten(1).float().mean(1)
     for wrong, what in ((share == 0, "empty"), (share == 1, "all object")):
         if wrong.any():
             raise NerfroError(
                 f"{_names(views, wrong)}: the mask is {what}; draw it (object white, everything else black), "
                 "or take the view out"
             )
-    border = torch.cat([inside[:, [0, -1]].flatten(1), inside[:, :, [0, -1]].flatten(1)], 1).float().mean(1)
     # The frame is object and the rest is not: true of no photograph of an object, let alone of most.
-    inverted = (border > 0.9) & (share < 1)
+    inverted = (frame_pixels(masks).float().mean(1) > 0.9) & (share < 1)
     if inverted.float().mean() > 0.5:
         raise NerfroError(
             f"{int(inverted.sum())} of {len(views)} masks cover the frame of their image and leave the inside: "
@@ -86,25 +70,12 @@ def make_mesh(
     keep: int | None,
     smoothing: float,
 ) -> TriangleMesh:
-    """Carve the hull and fit a smooth surface into it, see `PreprocessConfig`.
-
-    Args:
-        silhouettes: of the views.
-        corners: of the box that is carved, world units; None to find it.
-        resolution: voxels along the hull's longest side.
-        wrong_masks: number of views that may be wrong about any point.
-        keep: number of separate parts to keep; None for all but strays.
-        smoothing: 0 for the hull itself.
-    """
+    """Carve the hull and fit a smooth surface into it, see `PreprocessConfig`; the box is found where none is given."""
     with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()) as progress:
         box = _object_box(silhouettes, wrong_masks) if corners is None else corners
         carving = progress.add_task("carving", total=3)
         distances, corner, spacing = carve_grid(
-            silhouettes,
-            box,
-            resolution,
-            wrong_masks,
-            lambda done: progress.update(carving, completed=done),
+            silhouettes, box, resolution, wrong_masks, lambda done: progress.update(carving, completed=done)
         )
         num_parts, num_kept = remove_strays(distances, keep)
         mesh = extract_surface(distances, corner, spacing)
@@ -113,7 +84,7 @@ def make_mesh(
             mesh = fit_surface(mesh, silhouettes, smoothing, lambda done: progress.update(fitting, completed=done))
     if num_kept < num_parts:
         print(f"{num_kept} of {num_parts} separate parts kept, the largest")
-    if reached_sides(distances):
+    if reaches_border(distances):
         _warn_of_open_hull(silhouettes, box)
     print(f"{len(mesh.faces)} triangles, voxels of {spacing:.4g}")
     return mesh

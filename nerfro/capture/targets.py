@@ -1,18 +1,23 @@
-"""Calibration targets: their known points found in a photograph, and their sheets for printing."""
+"""Calibration targets: their known points found in a photograph, and their sheets on paper in true size."""
 
 from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from PIL import Image, ImageDraw, ImageFont
 
 from nerfro.capture.boards import TagBoard, tag_detector
 from nerfro.errors import NerfroError
+from nerfro.files.atomic import atomic_file
+
+_DOTS_PER_METRE = 300 / 0.0254
+_MARGIN, _WIDEST = 0.008, 3.0  # metres
 
 
 @dataclass(frozen=True)
@@ -40,12 +45,9 @@ class Sighting:
 
 @dataclass(frozen=True)
 class Sheet:
-    """One printed page of a target.
+    """One printed page of a target, 0 black to 255 white.
 
-    Attributes:
-        title: what it is and where it goes.
-        levels: 0 black to 255 white.
-        corners: upper left, upper right, lower right, lower left in the target's frame and unit.
+    The corners are upper left, upper right, lower right, lower left in the target's frame and unit.
     """
 
     title: str
@@ -96,7 +98,7 @@ class TagTarget(Target):
     def sheets(self) -> list[Sheet]:
         return [
             Sheet(
-                f"face {number} (tags {face.ids.min()} to {face.ids.max()}), its front towards {_towards(face)}",
+                f"face {number} (tags {face.ids.min()} to {face.ids.max()}), its front towards {face.front}",
                 self.board.draw(face),
                 self.board.face_corners(face),
             )
@@ -107,13 +109,7 @@ class TagTarget(Target):
 class CharucoTarget(Target):
     """A chessboard with ArUco markers on its white squares, on one sheet in the plane z = 0, y to its top.
 
-    Args:
-        columns, rows: number of squares.
-        square, marker: sides, in the unit of the poses.
-        dictionary: of the markers, as OpenCV calls it without DICT_.
-
-    Raises:
-        NerfroError: OpenCV is not installed, or has no such dictionary or board.
+    The sides `square` and `marker` are in the unit of the poses; OpenCV calls the dictionary DICT_<dictionary>.
     """
 
     feature, fewest = "chessboard corners", 6
@@ -131,9 +127,8 @@ class CharucoTarget(Target):
             )
         self.columns, self.rows, self.square = columns, rows, square
         try:
-            self.board = cv2.aruco.CharucoBoard(
-                (columns, rows), square, marker, cv2.aruco.getPredefinedDictionary(number)
-            )
+            markers = cv2.aruco.getPredefinedDictionary(number)
+            self.board = cv2.aruco.CharucoBoard((columns, rows), square, marker, markers)
             self.detector = cv2.aruco.CharucoDetector(self.board)
         except cv2.error as error:
             raise NerfroError(
@@ -158,23 +153,45 @@ class CharucoTarget(Target):
         return [Sheet(f"ChArUco board, {self.columns}x{self.rows} squares", np.asarray(levels), corners)]
 
 
+def print_sheets(sheets: list[Sheet], folder: Path) -> list[Path]:
+    """Write board.pdf, a page for each sheet, and the same pages as board_<number>.png.
+
+    The target's unit is taken for a metre. A page is a sheet with a margin, so it must be printed at 100 %.
+    """
+    pages, resolution = [], 0.0
+    for sheet in sheets:
+        # Whole pixels for each of the sheet's, so that its edges stay sharp and in place.
+        width = float(np.linalg.norm(sheet.corners[1] - sheet.corners[0]))
+        if width > _WIDEST:
+            message = f"a board {width:g} m wide is not printed; give size in metres, for at most {_WIDEST:g} in all"
+            raise NerfroError(message)
+        enlarged = max(1, round(width * _DOTS_PER_METRE / sheet.levels.shape[1]))
+        levels = np.kron(sheet.levels, np.ones((enlarged, enlarged), np.uint8))
+        per_metre = levels.shape[1] / width
+        resolution = 0.0254 * per_metre
+        margin = round(_MARGIN * per_metre)
+        page = Image.fromarray(np.pad(levels, margin, constant_values=255))
+        caption = f"{sheet.title}; {1000 * width:.1f} mm wide: print at 100 % and measure"
+        size = 0.45 * margin
+        size *= min(1, levels.shape[1] / ImageFont.load_default(size).getlength(caption))
+        place = margin, page.height - margin / 2
+        ImageDraw.Draw(page).text(place, caption, 0, ImageFont.load_default(size), anchor="lm")
+        pages.append(page.convert("1", dither=Image.Dither.NONE))  # a PDF of grey levels would be lossy
+    files = [folder / "board.pdf", *(folder / f"board_{number:02d}.png" for number in range(len(pages)))]
+    with atomic_file(files[0]) as stream:
+        pages[0].save(stream, "PDF", save_all=True, append_images=pages[1:], resolution=resolution)
+    for file, page in zip(files[1:], pages, strict=True):
+        with atomic_file(file) as stream:
+            page.save(stream, "PNG", dpi=(resolution, resolution))
+    return files
+
+
 @functools.cache
 def opencv() -> ModuleType:
-    """OpenCV.
-
-    Raises:
-        NerfroError: it is not installed.
-    """
+    """OpenCV, or an error that says how to install it."""
     try:
         import cv2
     except ImportError as error:
-        raise NerfroError(
-            f"this needs OpenCV ({error}); pip install 'nerfro[capture]', or opencv-python-headless"
-        ) from error
+        message = f"this needs OpenCV ({error}); pip install 'nerfro[capture]', or opencv-python-headless"
+        raise NerfroError(message) from error
     return cv2
-
-
-def _towards(face: Any) -> str:
-    normal = np.cross(face.down, face.right)
-    axis = int(np.abs(normal).argmax())
-    return f"{'+' if normal[axis] > 0 else '-'}{'xyz'[axis]}"

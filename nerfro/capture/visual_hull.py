@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 
 from nerfro.cameras import Cameras
-from nerfro.capture.silhouettes import is_cut_by_frame, outline_distance
+from nerfro.capture.silhouettes import frame_pixels, outline_distance
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh, merge_vertices
 
@@ -48,14 +48,10 @@ class Silhouettes:
     def of(cls, cameras: Cameras, masks: Float[Tensor, "V H W"]) -> Silhouettes:
         """Find the outlines of masks."""
         distances = np.stack([outline_distance(mask.numpy()) for mask in masks])
-        return cls(cameras, masks, torch.from_numpy(distances.astype(np.float32)), is_cut_by_frame(masks))
+        return cls(cameras, masks, torch.from_numpy(distances.astype(np.float32)), frame_pixels(masks).any(1))
 
     def __len__(self) -> int:
         return len(self.masks)
-
-    def seen_from(self, cameras: Cameras) -> Silhouettes:
-        """The same outlines with other cameras."""
-        return Silhouettes(cameras, self.masks, self.distances, self.cut)
 
     def depth_inside(
         self, view: int, points: Float[Tensor, "P 3"]
@@ -103,9 +99,7 @@ class Silhouettes:
 def find_box(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np.ndarray, "2 3"]:
     """A cube around the object: where the lines through the masks' centres meet, and as wide as the widest mask there.
 
-    Args:
-        silhouettes: none of them empty.
-        wrong_masks: number of views that may be wrong: the widest masks are passed over.
+    No mask is empty. The `wrong_masks` widest ones are passed over.
     """
     cameras, inside = silhouettes.cameras, silhouettes.masks > 0.5
     rows, columns = torch.arange(cameras.height) + 0.5, torch.arange(cameras.width) + 0.5
@@ -117,9 +111,7 @@ def find_box(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np.ndarray
     radii = []
     for view in range(len(cameras)):
         height, width = inside[view].any(1).nonzero(), inside[view].any(0).nonzero()
-        corners = torch.tensor(
-            [[w, h] for w in (width.min(), width.max() + 1) for h in (height.min(), height.max() + 1)]
-        )
+        corners = torch.tensor([[width.min(), height.min()], [width.max() + 1, height.max() + 1]])
         reach = (corners - pixels[view, 0]).abs().amax()
         radii.append(float(reach * depth[view, 0].abs() / (0.5 * (cameras.fx[view] + cameras.fy[view]))))
     half_side = 1.1 * sorted(radii)[-1 - min(wrong_masks, len(radii) - 1)]
@@ -152,14 +144,9 @@ def carve_grid(
     wrong_masks: int = 0,
     progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[Float[np.ndarray, "X Y Z"], Float[np.ndarray, "3"], float]:
-    """Carve a grid, finer and finer near the surface.
+    """Carve a grid of `resolution` voxels along the longest side, finer and finer near the surface.
 
-    Args:
-        silhouettes: of the object.
-        box: lower and upper corner; its far sides move out to a whole number of voxels.
-        resolution: voxels along the longest side.
-        wrong_masks: number of views that may be wrong about any point.
-        progress: called with the share of each level's work that is done, from 0 to the number of levels.
+    The box's far sides move out to a whole number of voxels. `progress` is told how many levels are done, in shares.
 
     Returns:
         Signed distances at the voxels' corners (see `Silhouettes.carve`), the lower corner, and a voxel's side.
@@ -190,11 +177,8 @@ def carve_grid(
 def remove_strays(distances: Float[np.ndarray, "X Y Z"], keep: int | None = None) -> tuple[int, int]:
     """Turn stray parts into air and enclosed voids into object, in place.
 
-    Silhouettes cannot show a void, and the cones of few views also meet where nothing is.
-
-    Args:
-        distances: negative inside.
-        keep: number of parts to keep, the largest ones; by default all that have 2 % of the largest one's volume.
+    Silhouettes cannot show a void, and the cones of few views also meet where nothing is. The `keep` largest parts
+    stay; by default all that have 2 % of the largest one's volume.
 
     Returns:
         Number of parts that there were, and that were kept.
@@ -216,11 +200,7 @@ def remove_strays(distances: Float[np.ndarray, "X Y Z"], keep: int | None = None
 def extract_surface(
     distances: Float[np.ndarray, "X Y Z"], corner: Float[np.ndarray, "3"], spacing: float
 ) -> TriangleMesh:
-    """The zero level as a closed mesh in world units; where it meets the grid's border it is closed there.
-
-    Raises:
-        NerfroError: nothing is inside.
-    """
+    """The zero level as a closed mesh in world units; where it meets the grid's border it is closed there."""
     if not (distances < 0).any():
         raise NerfroError("the visual hull is empty: no point is inside all masks")
     padded = np.pad(distances, 1, constant_values=0.5 * spacing)
@@ -228,7 +208,7 @@ def extract_surface(
     return merge_vertices(vertices.astype(np.float64) + corner - spacing, faces.astype(np.int64))
 
 
-def reached_sides(distances: Float[np.ndarray, "X Y Z"]) -> list[tuple[int, int]]:
-    """Sides of the grid that the body reaches, as (axis, -1 or 1)."""
-    sides: Sequence[tuple[int, int]] = [(axis, end) for axis in range(3) for end in (-1, 1)]
-    return [(a, e) for a, e in sides if (np.take(distances, 0 if e < 0 else -1, axis=a) < 0).any()]
+def reaches_border(distances: Float[np.ndarray, "X Y Z"]) -> bool:
+    """Whether the body touches a side of the grid."""
+    inside = distances < 0
+    return bool(inside.sum() > inside[1:-1, 1:-1, 1:-1].sum())

@@ -1,4 +1,4 @@
-"""Interpolation on regular grids whose vertices include both ends of the box."""
+"""Interpolation, smoothing and differences on regular grids whose vertices include both ends of the box."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.errors import NerfroError
 from nerfro.kernels.constants import constant
 
 
@@ -14,10 +15,7 @@ def trilinear(
 ) -> Float[Tensor, "*batch C"]:
     """Interpolate all channels of a grid linearly along each axis; positions outside take the border's values.
 
-    Args:
-        table: values at the grid's vertices.
-        box: lower and upper corner of the grid, world units.
-        positions: points, world units.
+    Box and positions are in world units, the box as its lower and upper corner, here and below.
     """
     shape = constant(table.shape[:3], table.device)
     scale = (shape - 1) / (box[1] - box[0])
@@ -62,26 +60,17 @@ def spline_coefficients(values: Float[Tensor, "X Y Z"]) -> Float[Tensor, "X Y Z"
     creases; this has three taps.
     """
     for axis in range(3):
-        first, last = values.narrow(axis, 0, 1), values.narrow(axis, values.shape[axis] - 1, 1)
-        padded = torch.cat([first, values, last], axis)
-        length = values.shape[axis]
-        neighbours = padded.narrow(axis, 0, length) + padded.narrow(axis, 2, length)
-        values = 1.25 * values - 0.125 * neighbours
+        before, values, after = _shifted(values, axis, 1)
+        values = 1.25 * values - 0.125 * (before + after)
     return values.contiguous()
 
 
 def quadratic_spline(
     coefficients: Float[Tensor, "X Y Z"], box: Float[Tensor, "2 3"], positions: Float[Tensor, "*batch 3"]
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-    """Quadratic B-spline on a grid, which has a continuous gradient, and that gradient.
+    """Quadratic B-spline on a grid and its exact, continuous gradient; cut off near and beyond the border.
 
-    Args:
-        coefficients: at the grid's vertices, see `spline_coefficients`.
-        box: lower and upper corner of the grid, world units.
-        positions: points, world units; near and beyond the border the spline is cut off.
-
-    Returns:
-        Values and their exact gradients (per world unit).
+    The coefficients are those at the grid's vertices, see `spline_coefficients`.
     """
     shape = constant(coefficients.shape, coefficients.device)
     scale = (shape - 1) / (box[1] - box[0])
@@ -101,3 +90,44 @@ def quadratic_spline(
     value = (plane * weights[:, 0]).sum(-1)
     gradient = [(plane * slopes[:, 0]).sum(-1), *((p * weights[:, 0]).sum(-1) for p in (plane_y, plane_z))]
     return value.reshape(positions.shape[:-1]), torch.stack(gradient, -1).reshape(positions.shape)
+
+
+def smooth(values: Float[Tensor, "X Y Z"], size: int, sigma: float) -> Float[Tensor, "X Y Z"]:
+    """Convolve with a normalised Gaussian of size^3 taps; the border repeats outwards. Size 0 changes nothing.
+
+    Raises:
+        NerfroError: the size is even or negative, or sigma is not positive.
+    """
+    if size == 0:
+        return values
+    if size < 0 or size % 2 == 0 or not sigma > 0:
+        raise NerfroError(
+            f"smoothing_size={size}, smoothing_sigma={sigma} is no kernel; "
+            "the size must be odd (or 0 for none) and sigma positive"
+        )
+    taps = torch.exp(-0.5 * ((torch.arange(size, dtype=torch.float64) - size // 2) / sigma) ** 2)
+    weights = (taps / taps.sum()).tolist()
+    for axis in range(3):
+        # Shifted sums of whole grids: much faster than a convolution with a single channel.
+        first, *others = _shifted(values, axis, size // 2)
+        values = weights[0] * first
+        for weight, other in zip(weights[1:], others, strict=True):
+            values.add_(other, alpha=weight)
+    return values
+
+
+def gradient(values: Float[Tensor, "X Y Z"], spacing: Float[Tensor, "3"]) -> Float[Tensor, "X Y Z 3"]:
+    """Central differences, (next - previous) / 2h; the border repeats outwards, so its gradient is half."""
+    parts = []
+    for axis in range(3):
+        before, _, after = _shifted(values, axis, 1)
+        parts.append((after - before) / (2 * spacing[axis]))
+    return torch.stack(parts, -1)
+
+
+def _shifted(values: Float[Tensor, "X Y Z"], axis: int, reach: int) -> list[Float[Tensor, "X Y Z"]]:
+    """The neighbours of all vertices at -reach, ..., reach along an axis; the border repeats outwards."""
+    length = values.shape[axis]
+    first, last = values.narrow(axis, 0, 1), values.narrow(axis, length - 1, 1)
+    padded = torch.cat([*[first] * reach, values, *[last] * reach], axis)
+    return [padded.narrow(axis, start, length) for start in range(2 * reach + 1)]

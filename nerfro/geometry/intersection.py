@@ -32,20 +32,12 @@ class Triangles:
     def of(
         cls, meshes: list[TriangleMesh], crease_degrees: float, vertices: Float[Tensor, "V 3"] | None = None
     ) -> Triangles:
-        """Make them of meshes.
-
-        Args:
-            meshes: the bodies.
-            crease_degrees: larger angles between triangles are edges of the object.
-            vertices: of all meshes one after another, where they are not where the meshes have them.
-        """
+        """Those of meshes, smooth up to the crease angle; `vertices` of all meshes replace those that they have."""
         counts = [len(mesh.vertices) for mesh in meshes]
         if vertices is None:
             vertices = torch.from_numpy(np.concatenate([mesh.vertices for mesh in meshes]))
-        corners = [
-            part[torch.from_numpy(mesh.faces)]
-            for mesh, part in zip(meshes, vertices.double().cpu().split(counts), strict=True)
-        ]
+        parts = vertices.double().cpu().split(counts)
+        corners = [part[torch.from_numpy(mesh.faces)] for mesh, part in zip(meshes, parts, strict=True)]
         normals = [smooth_normals(mesh, part, crease_degrees) for mesh, part in zip(meshes, corners, strict=True)]
         body = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
         return cls(torch.cat(corners), torch.cat(normals), torch.from_numpy(body))
@@ -58,8 +50,7 @@ class Triangles:
     def distance(self, x: Float[Tensor, "R 3"], d: Float[Tensor, "R 3"], face: Int[Tensor, "R"]) -> Float[Tensor, "R"]:
         """Distance to a triangle's plane along a ray."""
         normal = self.areas(face)
-        slope = (d * normal).sum(-1)
-        return ((self.corners[face, 0] - x) * normal).sum(-1) / slope
+        return ((self.corners[face, 0] - x) * normal).sum(-1) / (d * normal).sum(-1)
 
     def normal(self, x: Float[Tensor, "R 3"], face: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
         """Unit normal at points of triangles: the corners' normals, weighted with the barycentric coordinates."""
@@ -71,17 +62,9 @@ class Triangles:
 
 
 class MeshIntersector:
-    """First hits of rays with triangles."""
+    """First hits of rays with triangles, given by their corners."""
 
     def __init__(self, corners: Float[Tensor, "F 3 3"] | Float[np.ndarray, "F 3 3"]) -> None:
-        """Build the hierarchy.
-
-        Args:
-            corners: of the triangles, world units.
-
-        Raises:
-            NerfroError: embreex is not installed.
-        """
         try:
             from embreex.mesh_construction import TriangleMesh as EmbreeMesh
             from embreex.rtcore_scene import EmbreeScene

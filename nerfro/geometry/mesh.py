@@ -54,14 +54,10 @@ _THINNEST = 1e-4  # world units; boxes are kept to six decimals
 
 
 def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
-    """Read a triangle mesh and merge its duplicate vertices.
-
-    Args:
-        path: file of any format trimesh reads (ply, obj, stl, glb, ...).
-        accept_open_mesh: take meshes with holes as well.
+    """Read a triangle mesh of any format trimesh reads (ply, obj, stl, glb, ...) and merge its duplicate vertices.
 
     Raises:
-        NerfroError: the file is missing, unreadable, empty, not finite, or has holes.
+        NerfroError: the file is missing, unreadable, empty, not finite, or has holes that are not accepted.
     """
     import trimesh
 
@@ -88,8 +84,11 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
             "export a solid, and scale cameras and mesh so that it is about one unit wide"
         )
     # trimesh computes normals on demand; in its cache before anybody asked are only those that were read.
-    read = loaded.vertex_normals if "vertex_normals" in loaded._cache else None
-    mesh = merge_vertices(vertices, faces, None if read is None else _unit(np.asarray(read, np.float64))[faces])
+    read = np.asarray(loaded.vertex_normals, np.float64) if "vertex_normals" in loaded._cache else None
+    if read is not None:
+        length = np.linalg.norm(read, axis=-1, keepdims=True)
+        read = np.divide(read, length, out=np.zeros(read.shape), where=np.isfinite(length) & (length > 0))[faces]
+    mesh = merge_vertices(vertices, faces, read)
     if not accept_open_mesh and not mesh.is_closed:
         raise NerfroError(
             f"mesh {path} is not watertight, so its inside is not defined; close its holes, "
@@ -108,10 +107,3 @@ def merge_vertices(
     merged = inverse.reshape(-1)[faces]
     distinct = (merged[:, 0] != merged[:, 1]) & (merged[:, 1] != merged[:, 2]) & (merged[:, 2] != merged[:, 0])
     return TriangleMesh(unique, merged[distinct], None if normals is None else normals[distinct])
-
-
-def _unit(vectors: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
-    """Vectors of length one; zero where there is none or it is not finite."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    valid = np.isfinite(length) & (length > 0)
-    return np.divide(vectors, length, out=np.zeros_like(vectors), where=valid)

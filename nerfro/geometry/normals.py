@@ -13,14 +13,6 @@ from nerfro.geometry.mesh import TriangleMesh
 _UNEVEN = 8.0
 
 
-def face_normals(mesh: TriangleMesh) -> Float[np.ndarray, "F 3"]:
-    """Unit normals by the right-hand rule; zero for triangles without area."""
-    a, b, c = mesh.triangles.swapaxes(0, 1)
-    normals = np.cross(b - a, c - a)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
-
-
 def corner_normals(mesh: TriangleMesh, crease_degrees: float = 30.0) -> Float[np.ndarray, "F 3 3"]:
     """Unit normal at each corner of each triangle, smooth over the vertex up to creases; see `smooth_normals`."""
     return smooth_normals(mesh, torch.from_numpy(mesh.triangles), crease_degrees).numpy()
@@ -37,10 +29,7 @@ def smooth_normals(
     meets much smaller ones, as a flat side meets its rounded edge, the weights are the areas instead: there the large
     face knows the normal.
 
-    Args:
-        mesh: says which triangles meet in which vertex, and the normals of its file if there are any.
-        triangles: corners of the mesh's triangles, where they are now.
-        crease_degrees: larger angles between faces are edges of the object.
+    The mesh says which triangles meet in which vertex; `triangles` are its corners, where they are now.
 
     Source:
         N. Max, "Weights for computing vertex normals from facet normals", Journal of Graphics Tools 4(2), 1999.

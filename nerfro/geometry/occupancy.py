@@ -22,45 +22,25 @@ def occupancy_fraction(
     when a line from it crosses the mesh an odd number of times. One line serves a whole column of points, so the cost
     is that of rasterising the mesh, not of asking for each point.
 
-    Args:
-        mesh: triangles, world units. Where it is not closed, the majority of the lines along x, y and z decides.
-        box: lower and upper corner, world units.
-        resolution: vertices a side.
-        subsamples: points a side around each vertex.
-
-    Returns:
-        Fractions in [0, 1], float32.
+    Mesh and box (lower and upper corner) are in world units. Where the mesh is not closed, the majority of the lines
+    along x, y and z decides.
     """
-    if mesh.is_closed:
-        return _fraction_along_z(mesh.triangles, box, resolution, subsamples)
-    axes = ([0, 1, 2], [1, 2, 0], [2, 0, 1])
-    votes = []
-    for axis in axes:
-        fraction = _fraction_along_z(mesh.triangles[..., axis], box[:, axis], resolution, subsamples)
-        votes.append(fraction.transpose(np.argsort(axis)))
-    return np.median(votes, axis=0).astype(np.float32)
-
-
-def _fraction_along_z(
-    triangles: Float[np.ndarray, "F 3 3"], box: Float[np.ndarray, "2 3"], resolution: int, subsamples: int
-) -> Float[np.ndarray, "X Y Z"]:
-    origin = np.asarray(box[0], np.float64)
-    spacing = (np.asarray(box[1], np.float64) - origin) / (resolution - 1)
     offsets = np.linspace(-1.0, 1.0, subsamples) if subsamples > 1 else np.zeros(1)
-    order, starts = triangles_by_plane(triangles, origin[0], spacing[0], resolution, float(spacing[0]))
-    counts = _count_inside(np.ascontiguousarray(triangles), order, starts, origin, spacing, offsets, resolution)
-    return counts.astype(np.float32) / subsamples**3
+    votes = []
+    for axes in ([0, 1, 2],) if mesh.is_closed else ([0, 1, 2], [1, 2, 0], [2, 0, 1]):
+        triangles = np.ascontiguousarray(mesh.triangles[..., axes])
+        origin, end = np.asarray(box, np.float64)[:, axes]
+        spacing = (end - origin) / (resolution - 1)
+        order, starts = triangles_by_plane(triangles, origin[0], spacing[0], resolution, float(spacing[0]))
+        counts = _count_inside(triangles, order, starts, origin, spacing, offsets, resolution)
+        votes.append((counts.astype(np.float32) / subsamples**3).transpose(np.argsort(axes)))
+    return votes[0] if len(votes) == 1 else np.median(votes, axis=0).astype(np.float32)
 
 
 def triangles_by_plane(
     triangles: Float[np.ndarray, "F 3 3"], origin: float, spacing: float, num_planes: int, reach: float
 ) -> tuple[Int[np.ndarray, "U"], Int[np.ndarray, "P+1"]]:
-    """Sort triangles by the planes x = origin + i spacing that they come within `reach` of.
-
-    Returns:
-        order: triangles of the first plane, then of the second, and so on.
-        starts: where each plane's begin, and the end.
-    """
+    """The triangles within `reach` of the planes x = origin + i spacing, plane by plane, and where each begins."""
     low = np.ceil((triangles[:, :, 0].min(1) - reach - origin) / spacing).astype(np.int64).clip(0, num_planes)
     high = np.floor((triangles[:, :, 0].max(1) + reach - origin) / spacing).astype(np.int64).clip(-1, num_planes - 1)
     uses = (high - low + 1).clip(0)

@@ -16,13 +16,9 @@ from nerfro.kernels.compilation import compiled, compiled_parallel
 
 
 def signed_distance_grid(
-    mesh: TriangleMesh,
-    box: Float[np.ndarray, "2 3"],
-    resolution: int,
-    band: float,
-    crease_degrees: float = 30.0,
+    mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], resolution: int, band: float, crease_degrees: float = 30.0
 ) -> Float[np.ndarray, "X Y Z"]:
-    """Signed distance at the vertices of a grid, negative inside.
+    """Signed distance, world units, at the vertices (`resolution` a side) of a grid; negative inside.
 
     Within `band` voxels of the surface it is the distance to the nearest triangle, less the height of the smooth
     surface over that triangle, half the mean of the three corners' tangent planes: with p the nearest point, b its
@@ -32,14 +28,8 @@ def signed_distance_grid(
 
     which is exact to second order in the triangle's size for any curvature (a chord's tangents meet at twice its
     sagitta). So the facets of a finely tessellated curved surface do not show. Farther away the value is a lower bound
-    of the distance, at most sqrt(3) voxels short.
-
-    Args:
-        mesh: triangles, world units. Where it is not closed, what is inside is decided as in `occupancy_fraction`.
-        box: lower and upper corner of the grid, world units.
-        resolution: vertices a side.
-        band: half width of the exact zone, voxels.
-        crease_degrees: edges with larger angles stay sharp.
+    of the distance, at most sqrt(3) voxels short. Edges with angles above `crease_degrees` stay sharp. What is inside a
+    mesh that is not closed is decided as in `occupancy_fraction`.
     """
     origin = np.asarray(box[0], np.float64)
     spacing = (np.asarray(box[1], np.float64) - origin) / (resolution - 1)
@@ -143,8 +133,7 @@ def _narrow_band(triangles, normals, order, starts, origin, spacing, resolution,
                     if d < distance[i, j, k] and d <= reach:
                         distance[i, j, k] = d
                         total = 0.0
-                        for corner in range(3):
-                            b = b0 if corner == 0 else (b1 if corner == 1 else b2)
+                        for corner, b in enumerate((b0, b1, b2)):
                             total += b * (
                                 (t[corner, 0] - px) * normals[index, corner, 0]
                                 + (t[corner, 1] - py) * normals[index, corner, 1]

@@ -9,11 +9,10 @@ from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.files.cache import cached_arrays, content_hash
-from nerfro.geometry.interpolation import quadratic_spline, spline_coefficients
+from nerfro.geometry.interpolation import quadratic_spline, smooth, spline_coefficients
 from nerfro.geometry.intersection import MeshIntersector, Triangles
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.signed_distance import signed_distance_grid
-from nerfro.geometry.smoothing import smooth
 from nerfro.kernels.constants import constant
 from nerfro.media.base import lazy_buffer
 from nerfro.media.solid import Solid

@@ -11,11 +11,10 @@ from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.files.cache import cached_arrays, content_hash, load_arrays, save_arrays
-from nerfro.geometry.interpolation import trilinear
+from nerfro.geometry.interpolation import gradient, smooth, trilinear
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.occupancy import occupancy_fraction
 from nerfro.geometry.signed_distance import distance_to_set
-from nerfro.geometry.smoothing import gradient, smooth
 from nerfro.kernels.constants import constant
 from nerfro.media.base import Medium, lazy_buffer
 from nerfro.paths import resolve_path

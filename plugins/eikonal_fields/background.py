@@ -12,8 +12,7 @@ from torch import Tensor
 from nerfro.boundaries.base import Boundary
 from nerfro.fields.base import Field
 from nerfro.fields.selection import inside_box
-from nerfro.geometry.interpolation import trilinear
-from nerfro.geometry.smoothing import smooth
+from nerfro.geometry.interpolation import smooth, trilinear
 from nerfro.types import Exits, Radiance, Samples
 
 # Directions are looked up on the unit sphere in a grid over this cube.

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from nerfro.capture.boards import draw_tag, tag_grid, twelve_faces
-from nerfro.capture.printing import print_sheets
-from nerfro.capture.targets import TagTarget
+from nerfro.capture.targets import TagTarget, print_sheets
 from nerfro.errors import NerfroError
 
 
@@ -64,8 +63,6 @@ def test_tags_are_those_of_opencv() -> None:
 def test_detected_corners_are_those_of_the_drawing() -> None:
     cv2 = pytest.importorskip("cv2")
     pytest.importorskip("pupil_apriltags")
-    from nerfro.capture.targets import TagTarget
-
     for board in (twelve_faces(), tag_grid("tag36h11", 3, 4, 0.05)):
         face = board.faces[-1]
         drawn = np.pad(board.draw(face, 12), 36, constant_values=255)

@@ -11,7 +11,7 @@ import trimesh
 from scipy.ndimage import gaussian_filter1d
 
 from nerfro.errors import NerfroError
-from nerfro.geometry.smoothing import gradient, smooth
+from nerfro.geometry.interpolation import gradient, smooth
 from nerfro.media.voxel_grid import VoxelGrid
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
