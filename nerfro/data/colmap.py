@@ -63,11 +63,8 @@ class ColmapData(PosedImages):
             frames.append(Frame(image.name, path, find_mask(self.root, path), image.camera_to_world))
 
         def lenses(width: int, height: int) -> list[Lens]:
-            found = {}
-            for number in {image.camera for image in images}:
-                camera, where = model.cameras[number], f"{folder}: camera {number}"
-                found[number] = lens_of(camera, where).resized((camera.width, camera.height), (width, height), where)
-            return [found[image.camera] for image in images]
+            places = [(model.cameras[image.camera], f"{folder}: camera {image.camera}") for image in images]
+            return [lens_of(c, at).resized((c.width, c.height), (width, height), at) for c, at in places]
 
         return self.views(frames, lenses, "opencv", 0.9 * nearest, 1.1 * farthest)
 

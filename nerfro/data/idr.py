@@ -65,11 +65,9 @@ class IdrData(PosedImages):
             raise NerfroError(
                 f"{file} has {num_matrices} matrices world_mat_<i> for {len(images)} images; make them equal"
             )
-        poses, lenses = [], []
-        for i in range(len(images)):
-            pose, lens = decompose(self._projection(arrays, i, file), f"{file}: world_mat_{i}")
-            poses.append(pose)
-            lenses.append(lens)
+        projections = (self._projection(arrays, i, file) for i in range(len(images)))
+        cameras = [decompose(projection, f"{file}: world_mat_{i}") for i, projection in enumerate(projections)]
+        poses, lenses = zip(*cameras, strict=True)
         chosen = held_out(len(images), self.test_every, split, self.root)
         frames = [Frame(images[i].name, images[i], masks[i], poses[i]) for i in chosen]
         # Over all views, so that the splits agree.
@@ -78,12 +76,11 @@ class IdrData(PosedImages):
         return self.views(frames, lambda width, height: [lenses[i] for i in chosen], "opencv", nearest, farthest)
 
     def _projection(self, arrays: dict[str, np.ndarray], index: int, file: Path) -> Float[np.ndarray, "3 4"]:
-        names = [f"world_mat_{index}"] + ([f"scale_mat_{index}"] if self.world == "sphere" else [])
-        for name in names:
+        product = np.eye(4)
+        for name in [f"world_mat_{index}", f"scale_mat_{index}"][: 2 if self.world == "sphere" else 1]:
             if name not in arrays:
                 raise NerfroError(f"{file} has no '{name}'; every image needs one")
-        matrices = [parse_matrix(arrays[name], ((4, 4),), f"{file}: {name}") for name in names]
-        product = matrices[0] if len(matrices) == 1 else matrices[0] @ matrices[1]
+            product = product @ parse_matrix(arrays[name], ((4, 4),), f"{file}: {name}")
         return product[:3]
 
 

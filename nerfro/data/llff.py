@@ -76,16 +76,14 @@ class LlffData(PosedImages):
                 f"{folder / self.images} holds {len(files)} images but {folder / 'poses_bounds.npy'} has {len(poses)} "
                 "poses; they belong together by the order of names, so restore the images that were calibrated"
             )
-        mapped = map_poses(poses, transform)
-        chosen = (
-            held_out(len(files), self.test_every, split, self.root) if self.video is None else list(range(len(files)))
-        )
+        mapped, chosen = map_poses(poses, transform), list(range(len(files)))
+        if self.video is None:
+            chosen = held_out(len(files), self.test_every, split, self.root)
         frames = [Frame(files[i].name, files[i], find_mask(folder, files[i]), mapped[i]) for i in chosen]
 
         def lenses(width: int, height: int) -> list[Lens]:
             where = f"{folder / 'poses_bounds.npy'}"
-            full = [(w, h, Lens(f, f, 0.5 * w, 0.5 * h)) for h, w, f in sizes[chosen]]
-            return [lens.resized((w, h), (width, height), where) for w, h, lens in full]
+            return [Lens(f, f, 0.5 * w, 0.5 * h).resized((w, h), (width, height), where) for h, w, f in sizes[chosen]]
 
         return self.views(frames, lenses, "opengl", 0.9 * float(depths.min()), farthest)
 
@@ -98,9 +96,6 @@ def read_poses_bounds(
     Returns:
         Camera-to-world matrices with OpenGL axes (the file has down, right, back), least and greatest depth, and
         height, width and focal length in pixels, of each image.
-
-    Raises:
-        NerfroError: the file is missing or corrupt, or its numbers are no cameras.
     """
     if not path.is_file():
         raise NerfroError(f"{path} does not exist; make it with LLFF's imgs2poses.py, or use data=colmap directly")
@@ -125,14 +120,10 @@ def frame_transform(
     """The similarity from the file's world to the chosen frame, see `LlffData`; points go the way that cameras go.
 
     Sources: LLFF's load_llff_data; Eikonal Fields' load_llff.py.
-
-    Raises:
-        NerfroError: the optical axes are parallel, so that there is no sphere to look at.
     """
     if frame == "file":
         return np.eye(4)
-    length = _LLFF_BOUND_FACTOR * depths.min() if frame == "llff" else depths.max() - depths.min()
-    scale = 1 / length
+    scale = 1 / (_LLFF_BOUND_FACTOR * depths.min() if frame == "llff" else depths.max() - depths.min())
     transform = np.diag([scale, scale, scale, 1.0])
     transform = _recentre(map_poses(poses, transform)) @ transform
     if frame == "eikonal":

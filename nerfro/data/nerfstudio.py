@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
-from nerfro.data.base import Frame, Views
+from nerfro.data.base import Views
 from nerfro.data.frames import SPLITS, Lens, PosedImages, held_out
 from nerfro.data.image_files import Alpha
 from nerfro.data.masks import find_mask, find_usable
@@ -63,19 +63,17 @@ class NerfstudioData(PosedImages):
             return [_read_lens(v, width, height, name) for v, name in zip(values, names, strict=True)]
 
         frames = [manifest.frames[i] for i in chosen]
-        ignoring = [self._find_ignoring(manifest.frames[i], entries[i], n) for i, n in zip(chosen, names, strict=True)]
+        ignoring: list[Path | None] = []
+        for i, frame, name in zip(chosen, frames, names, strict=True):
+            stated = entries[i].get("mask_path")
+            if stated is not None and not isinstance(stated, str):
+                raise NerfroError(f"{name}: 'mask_path' must be text")
+            ignoring.append(None if stated is None else find_mask(self.root, frame.image, stated))
         views = self.views(frames, lenses, "opengl")
         if not any(ignoring):
             return views
         stored = views.cameras.width * self.downscale, views.cameras.height * self.downscale
         return replace(views, usable=find_usable([frame.image for frame in frames], ignoring, self.downscale, stored))
-
-    def _find_ignoring(self, frame: Frame, entry: Mapping[str, object], where: str) -> Path | None:
-        """The file of a frame's mask of pixels to ignore, if it states one."""
-        stated = entry.get("mask_path")
-        if stated is not None and not isinstance(stated, str):
-            raise NerfroError(f"{where}: 'mask_path' must be text")
-        return None if stated is None else find_mask(self.root, frame.image, stated)
 
     def _choose(self, manifest: Manifest, split: str) -> list[int]:
         """Numbers of the frames of a split."""

@@ -44,48 +44,39 @@ class NerrfData(PosedImages):
         captured = (self.root / "images").is_dir()
         images = _captured_images(self.root, split) if captured else _synthetic_images(self.root, split)
         frames, focals = [], []
-        for name, image, meta, mask in images:
+        for image, meta, mask in images:
             pose, focal = _read_meta(meta, captured)
-            frames.append(Frame(name, image, mask if mask.is_file() else None, pose))
+            frames.append(Frame(image.name, image, mask if mask.is_file() else None, pose))
             focals.append(focal)
 
         def lenses(width: int, height: int) -> list[Lens]:
-            if captured:
-                w, h = _EIKONAL_SIZE
-                full = [Lens(focal, focal, 0.5 * w, 0.5 * h) for focal in focals]
-                return [lens.resized((w, h), (width, height), f"{self.root / 'meta'}") for lens in full]
-            return [Lens.of_angle(_FIELD_OF_VIEW, width, height)] * len(frames)
+            if not captured:
+                return [Lens.of_angle(_FIELD_OF_VIEW, width, height)] * len(frames)
+            full = (Lens(focal, focal, 0.5 * _EIKONAL_SIZE[0], 0.5 * _EIKONAL_SIZE[1]) for focal in focals)
+            return [lens.resized(_EIKONAL_SIZE, (width, height), f"{self.root / 'meta'}") for lens in full]
 
         return self.views(frames, lenses, "opengl", farthest=3.0 if captured else 80.0)
 
 
-def _synthetic_images(root: Path, split: str) -> list[tuple[str, Path, Path, Path]]:
-    """Name, image, pose file and mask of each view of a split."""
+def _synthetic_images(root: Path, split: str) -> list[tuple[Path, Path, Path]]:
+    """Image, pose file and mask of each view of a split."""
     base = root.resolve().parent.parent
     numbers = sorted(int(path.stem[:-5]) for path in root.glob("*_0001.png") if path.stem[:-5].isdigit())
     chosen = [number for number in numbers if (number % 2 == 0) == (split == "train")]
     if not chosen:
         raise NerfroError(f"data.root={root} has no image <id>_0001.png of {'even' if split == 'train' else 'odd'} id")
+    masks = base / "mask" / root.resolve().name
     return [
-        (
-            f"{i}_0001.png",
-            root / f"{i}_0001.png",
-            base / "meta" / f"{i}_meta_0000.json",
-            base / "mask" / root.resolve().name / f"mask_{i}_0001.png",
-        )
-        for i in chosen
+        (root / f"{i}_0001.png", base / "meta" / f"{i}_meta_0000.json", masks / f"mask_{i}_0001.png") for i in chosen
     ]
 
 
-def _captured_images(root: Path, split: str) -> list[tuple[str, Path, Path, Path]]:
+def _captured_images(root: Path, split: str) -> list[tuple[Path, Path, Path]]:
     images = list_images(root / "images")
     images = images[:_EIKONAL_TRAIN] if split == "train" else images[_EIKONAL_TRAIN:]
     if not images:
         raise NerfroError(f"{root / 'images'} holds no more than the {_EIKONAL_TRAIN} images that are trained on")
-    return [
-        (image.name, image, root / "meta" / f"{image.stem}.json", root / "mask" / f"mask_{image.stem}.png")
-        for image in images
-    ]
+    return [(image, root / "meta" / f"{image.stem}.json", root / "mask" / f"mask_{image.stem}.png") for image in images]
 
 
 def _read_meta(path: Path, captured: bool) -> tuple[Float[np.ndarray, "3 4"], float]:
