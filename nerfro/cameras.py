@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int, Shaped
@@ -30,11 +31,7 @@ class Window(NamedTuple):
 
 
 def central_window(height: int, width: int, fraction: float) -> Window:
-    """The window of even sides around the centre of an image that spans `fraction` of each side.
-
-    Raises:
-        NerfroError: the fraction is outside (0, 1], or leaves no pixel.
-    """
+    """The window of even sides around the centre of an image that spans `fraction` of each side, in (0, 1]."""
     if not 0 < fraction <= 1:
         raise NerfroError(f"a central crop of {fraction} of the image is impossible; take a fraction in (0, 1]")
     if fraction == 1:
@@ -81,14 +78,15 @@ class Cameras:
         return self.camera_to_world.device
 
     def to(self, device: torch.device | str) -> Cameras:
-        tensors = {name: getattr(self, name).to(device) for name in ("camera_to_world", "fx", "fy", "cx", "cy")}
-        distortion = None if self.distortion is None else self.distortion.to(device)
-        return replace(self, **tensors, distortion=distortion)
+        return self._each(lambda tensor: tensor.to(device))
 
     def select(self, views: list[int]) -> Cameras:
         """Some of the cameras, in the order that is asked for."""
-        tensors = {name: getattr(self, name)[views] for name in ("camera_to_world", "fx", "fy", "cx", "cy")}
-        return replace(self, **tensors, distortion=None if self.distortion is None else self.distortion[views])
+        return self._each(lambda tensor: tensor[views])
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> Cameras:
+        changed: dict[str, Any] = {name: change(x) for name, x in vars(self).items() if torch.is_tensor(x)}
+        return replace(self, **changed)
 
     def crop(self, window: Window) -> Cameras:
         """The cameras of a window of each image: its pixel (0, 0) is pixel (top, left) of these cameras."""
@@ -167,14 +165,11 @@ class Cameras:
         return self._window_rays(view, Window(0, 0, self.height, self.width))
 
     def tile(self, size: int, generator: torch.Generator | None = None) -> Float[Tensor, "T T 3"]:
-        """Viewing directions of a random window of a random view.
+        """Unit viewing directions, in world space, of a random window of a random view.
 
         Args:
             size: side of the window in pixels; the image's shorter side where that is smaller.
             generator: source of randomness on the CPU.
-
-        Returns:
-            Unit directions in world space.
         """
         side = min(size, self.height, self.width)
         # Drawn on the CPU whatever the cameras' device: no synchronisation, and the same tile on every device.

@@ -71,14 +71,11 @@ def undistort(
     """
     ideal = points
     for _ in range(_NEWTON_STEPS):
-        distorted, (xx, xy, yy) = _unbind(distort(ideal, lens))
+        distorted, derivatives = distort(ideal, lens)
+        xx, xy, yy = derivatives.unbind(-1)
         error = points - distorted
         step_x = yy * error[:, 0] - xy * error[:, 1]
         step_y = xx * error[:, 1] - xy * error[:, 0]
         ideal = ideal + torch.stack([step_x, step_y], -1) / (xx * yy - xy * xy)[:, None]
-    _, (xx, xy, yy) = _unbind(distort(ideal, lens))
+    xx, xy, yy = distort(ideal, lens)[1].unbind(-1)
     return ideal, 1 / (xx * yy - xy * xy)
-
-
-def _unbind(result: tuple[Tensor, Tensor]) -> tuple[Tensor, tuple[Tensor, ...]]:
-    return result[0], result[1].unbind(-1)

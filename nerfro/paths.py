@@ -16,11 +16,7 @@ EMBEDDED_PREFIX = "embedded:"
 
 
 def resolve_path(location: str | Path) -> Path:
-    """Turn a configured location into a path; `embedded:torus/mesh.ply` names data that ships with nerfro.
-
-    Raises:
-        NerfroError: the embedded scene does not exist.
-    """
+    """Turn a configured location into a path; `embedded:torus/mesh.ply` names data that ships with nerfro."""
     location = str(location)
     if not location.startswith(EMBEDDED_PREFIX):
         return user_path(location)
@@ -34,11 +30,7 @@ def resolve_path(location: str | Path) -> Path:
 
 
 def user_path(location: str | Path) -> Path:
-    """A path that a user gave, `~` and `~name` written out.
-
-    Raises:
-        NerfroError: it can be no path, or nobody is called that.
-    """
+    """A path that a user gave, `~` and `~name` written out."""
     try:
         if "\0" in str(location):
             raise NerfroError(f"{str(location)!r} holds a zero byte, which no path can; give another")

@@ -19,13 +19,7 @@ _BESIDE = math.sqrt(0.5)
 def pixel_rays(
     cameras: Cameras, pixels: Int[Tensor, "R"], place: Float[Tensor, "R 2"] | Float[Tensor, "2"] | None = None
 ) -> Rays:
-    """Rays through pixels.
-
-    Args:
-        cameras: whose pixels.
-        pixels: as view * H * W + row * W + column.
-        place: where in the pixels, (x, y) in [0, 1); their centres by default.
-    """
+    """Rays through a place (x, y) in [0, 1) of pixels view * H * W + row * W + column, by default their centres."""
     width, height = cameras.width, cameras.height
     return cameras.rays(pixels // (height * width), pixels // width % height, pixels % width, place)
 
@@ -33,13 +27,7 @@ def pixel_rays(
 def part_rays(
     cameras: Cameras, pixels: Int[Tensor, "P"], side: int, place: Float[Tensor, "P K 2"] | None = None
 ) -> Rays:
-    """Rays through the K = side x side equal parts of pixels, those of each pixel together.
-
-    Args:
-        cameras, pixels: see `pixel_rays`.
-        side: parts in each direction.
-        place: where in the parts, in [0, 1); their centres by default.
-    """
+    """Rays through the K = side x side equal parts of pixels, those of each pixel together, at a place of each part."""
     ticks = torch.arange(side, device=pixels.device)
     corners = torch.cartesian_prod(ticks, ticks).view(-1, 2)
     places = (corners + (0.5 if place is None else place)) / side

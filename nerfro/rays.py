@@ -30,12 +30,11 @@ class Rays:
         return self.origins.shape[0]
 
     def __getitem__(self, index: slice | Tensor) -> Rays:
-        return Rays(self.origins[index], self.directions[index], self.radii[index], self.near[index], self.far[index])
+        return Rays(*(tensor[index] for tensor in vars(self).values()))
 
     def followed_by(self, other: Rays) -> Rays:
         """These rays and after them others."""
-        names = ("origins", "directions", "radii", "near", "far")
-        return Rays(*(torch.cat([getattr(self, name), getattr(other, name)]) for name in names))
+        return Rays(*(torch.cat(pair) for pair in zip(vars(self).values(), vars(other).values(), strict=True)))
 
     def to(self, device: torch.device | str) -> Rays:
-        return Rays(*(getattr(self, name).to(device) for name in ("origins", "directions", "radii", "near", "far")))
+        return Rays(*(tensor.to(device) for tensor in vars(self).values()))

@@ -18,14 +18,7 @@ from nerfro.data.pictures import Pictures
 
 @dataclass(frozen=True)
 class Frame:
-    """One posed image.
-
-    Attributes:
-        name: of the image, as the data set calls it.
-        image: the image's file.
-        mask: the silhouette's file, if there is one.
-        camera_to_world: rotation and centre, camera axes as in the data set.
-    """
+    """One posed image and its silhouette; its name and its camera's axes are those of the data set."""
 
     name: str
     image: Path
@@ -57,11 +50,7 @@ class Views:
         return len(self.names)
 
     def checked(self) -> Views:
-        """These views, of which every picture has been decoded once, and forgotten.
-
-        Raises:
-            NerfroError: one is truncated or corrupt.
-        """
+        """These views, of which every picture has been decoded once, to refuse what is corrupt, and forgotten."""
         for pictures in (self.images, self.masks):
             if isinstance(pictures, Pictures):
                 deque(pictures.all_levels(), maxlen=0)
@@ -69,11 +58,7 @@ class Views:
 
 
 class DataSource(ABC):
-    """A folder of posed images in some format.
-
-    Attributes:
-        root: the folder.
-    """
+    """A folder, `root`, of posed images in some format."""
 
     root: Path
 

@@ -3,30 +3,20 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
 
-from nerfro.data.base import DataSource, Views
-from nerfro.data.frames import Lens, check_options, load_views
+from nerfro.data.base import Views
+from nerfro.data.frames import Lens, PosedImages
+from nerfro.data.image_files import Alpha
 from nerfro.data.transforms import find_splits, is_number, read_manifest
 from nerfro.errors import NerfroError
-from nerfro.paths import resolve_path
 from nerfro.registry import register
 
 
 @register("data", "blender")
-class BlenderData(DataSource):
+class BlenderData(PosedImages):
     """Folder with transforms_{train,val,test}.json in Blender's (OpenGL) camera axes and one field of view.
 
-    Args:
-        root: the folder; `embedded:torus` is the scene that ships with nerfro.
-        near: arc length at which rays begin, world units.
-        far: arc length at which rays end, world units.
-        downscale: side of the blocks of pixels that are averaged into one.
-        alpha: `drop` ignores the images' transparency as the paper's authors do, `white` and `black` composite them
-            over that colour.
-
-    Raises:
-        NerfroError: an option is out of range.
+    The options are those of `PosedImages`; the paper's authors drop transparency. `embedded:torus` ships with nerfro.
     """
 
     def __init__(
@@ -35,11 +25,9 @@ class BlenderData(DataSource):
         near: float = 2.0,
         far: float = 6.0,
         downscale: int = 1,
-        alpha: Literal["drop", "white", "black"] = "drop",
+        alpha: Alpha = "drop",
     ) -> None:
-        check_options(near, far, downscale)
-        self.root = resolve_path(root)
-        self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
+        super().__init__(root, near, far, downscale, alpha)
 
     @property
     def splits(self) -> list[str]:
@@ -52,9 +40,5 @@ class BlenderData(DataSource):
             raise NerfroError(
                 f"{manifest.path}: camera_angle_x={angle!r} must be an angle between 0 and pi, in radians"
             )
-
-        def lenses(width: int, height: int) -> list[Lens]:
-            return [Lens.of_angle(angle, width, height)] * len(manifest.frames)
-
-        bounds = self.near, self.far
-        return load_views(manifest.frames, lenses, "opengl", bounds, self.downscale, self.alpha, manifest.size)
+        frames, size = manifest.frames, manifest.size
+        return self.views(frames, lambda w, h: [Lens.of_angle(angle, w, h)] * len(frames), "opengl", size=size)

@@ -3,42 +3,35 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.data.base import DataSource, Frame, Views
+from nerfro.data.base import Frame, Views
 from nerfro.data.colmap_model import ColmapCamera, ColmapModel, read_colmap
-from nerfro.data.frames import SPLITS, Lens, check_options, held_out, load_views, require_root
+from nerfro.data.frames import Lens, PosedImages, held_out
+from nerfro.data.image_files import Alpha
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
 from nerfro.lens import coefficients, opencv_coefficients
-from nerfro.paths import resolve_path
 from nerfro.registry import register
 
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "")
 
 
 @register("data", "colmap")
-class ColmapData(DataSource):
+class ColmapData(PosedImages):
     """Folder with images/ and a COLMAP model (sparse/0, text or binary), in the model's own world.
 
     Perspective cameras with any distortion that COLMAP has for them are read, fisheye lenses are refused. Images may
     have been resized after the reconstruction.
 
     Args:
-        root: the folder.
-        near: arc length at which rays begin, world units; none takes 0.9 of the distance of the nearest 3-D points.
-        far: arc length at which rays end, world units; none takes 1.1 of the distance of the farthest 3-D points.
-        downscale: side of the blocks of pixels that are averaged into one.
-        alpha: `drop` ignores the images' transparency, `white` and `black` composite them over that colour.
+        root, near, far, downscale, alpha: see `PosedImages`; bounds that are none take 0.9 and 1.1 of the distances of
+            the nearest and the farthest 3-D points.
         images: folder of the images within the root.
         model: folder of the model within the root; none looks for sparse/0, sparse, colmap/sparse/0 and the root.
         test_every: every such image by name, from the first, is for val and test.
-
-    Raises:
-        NerfroError: an option is out of range.
     """
 
     def __init__(
@@ -47,25 +40,20 @@ class ColmapData(DataSource):
         near: float | None = None,
         far: float | None = None,
         downscale: int = 1,
-        alpha: Literal["drop", "white", "black"] = "drop",
+        alpha: Alpha = "drop",
         images: str = "images",
         model: str | None = None,
         test_every: int = 8,
     ) -> None:
-        check_options(near, far, downscale)
-        self.root = resolve_path(root)
-        self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
+        super().__init__(root, near, far, downscale, alpha)
         self.images, self.model, self.test_every = images, model, test_every
 
-    @property
-    def splits(self) -> list[str]:
-        return SPLITS
-
     def load(self, split: str) -> Views:
-        require_root(self.root)
+        self.require(split)
         folder = self._model_folder()
         model = read_colmap(folder)
-        bounds = self._bounds(model, folder)
+        open_bounds = self.near is None or self.far is None
+        nearest, farthest = _distances(model, folder) if open_bounds else (0.0, 0.0)
         images = [model.images[i] for i in held_out(len(model.images), self.test_every, split, self.root)]
         frames = []
         for image in images:
@@ -75,13 +63,10 @@ class ColmapData(DataSource):
             frames.append(Frame(image.name, path, find_mask(self.root, path), image.camera_to_world))
 
         def lenses(width: int, height: int) -> list[Lens]:
-            found = {}
-            for number in {image.camera for image in images}:
-                camera, where = model.cameras[number], f"{folder}: camera {number}"
-                found[number] = lens_of(camera, where).resized((camera.width, camera.height), (width, height), where)
-            return [found[image.camera] for image in images]
+            places = [(model.cameras[image.camera], f"{folder}: camera {image.camera}") for image in images]
+            return [lens_of(c, at).resized((c.width, c.height), (width, height), at) for c, at in places]
 
-        return load_views(frames, lenses, "opencv", bounds, self.downscale, self.alpha)
+        return self.views(frames, lenses, "opencv", 0.9 * nearest, 1.1 * farthest)
 
     def _model_folder(self) -> Path:
         folders = [self.root / name for name in ((self.model,) if self.model is not None else _MODEL_FOLDERS)]
@@ -91,22 +76,9 @@ class ColmapData(DataSource):
         tried = ", ".join(map(str, folders))
         raise NerfroError(f"there is no COLMAP model (cameras.bin or .txt) in {tried}; set data.model to its folder")
 
-    def _bounds(self, model: ColmapModel, folder: Path) -> tuple[float, float]:
-        if self.near is not None and self.far is not None:
-            return self.near, self.far
-        nearest, farthest = _distances(model, folder)
-        near = 0.9 * nearest if self.near is None else self.near
-        far = 1.1 * farthest if self.far is None else self.far
-        check_options(near, far, self.downscale)
-        return near, far
-
 
 def lens_of(camera: ColmapCamera, where: str) -> Lens:
-    """The lens of a COLMAP camera, whose pixel coordinates are nerfro's.
-
-    Raises:
-        NerfroError: its model is not supported.
-    """
+    """The lens of a COLMAP camera of a supported model; COLMAP's pixel coordinates are nerfro's."""
     p = camera.params
     if camera.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
         lens = Lens(p[0], p[0], p[1], p[2], coefficients(p[3:]))

@@ -7,10 +7,11 @@ truncated points3D.bin; an index of 3-D points with their tracks is not needed h
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -48,13 +49,7 @@ class ColmapCamera:
 
 @dataclass(frozen=True)
 class ColmapImage:
-    """A registered image.
-
-    Attributes:
-        name: path of its file in the folder of images.
-        camera: number of its camera.
-        camera_to_world: rotation and centre, OpenCV axes.
-    """
+    """A registered image: its path in the folder of images, its camera's number and pose (OpenCV axes)."""
 
     name: str
     camera: int
@@ -71,12 +66,7 @@ class ColmapModel:
 
 
 def read_colmap(folder: Path) -> ColmapModel:
-    """Read a model; without a file of 3-D points, there are none.
-
-    Raises:
-        NerfroError: cameras or images are missing, a file is truncated or corrupt, an image's camera does not exist, or
-            two images have one name.
-    """
+    """Read and check a model; without a file of 3-D points, there are none."""
     suffix = next(
         (s for s in _READERS if all((folder / f"{part}{s}").is_file() for part in ("cameras", "images"))), None
     )
@@ -160,53 +150,46 @@ def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
         yield values[1:4]
 
 
-def _text_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Numbered lines that are no comments; empty ones count, for an image without features has one."""
+def _text_rows(
+    path: Path, form: str, kinds: tuple[Callable[[str], Any], ...], skip: int = 0
+) -> Iterator[tuple[str, list[Any]]]:
+    """Place and words, of their kinds, of lines that are no comments; so many lines after each of them are left out."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError as error:
         raise NerfroError(f"{path} is no text: corrupt? export it again") from error
-    return ((i, line.strip()) for i, line in enumerate(lines, 1) if not line.startswith("#"))
+    numbered = ((i, line.strip()) for i, line in enumerate(lines, 1) if not line.startswith("#"))
+    for i, line in numbered:
+        if not line:
+            continue
+        try:
+            words = [kind(word) for kind, word in zip(kinds, line.split(maxsplit=len(kinds) - 1), strict=True)]
+        except ValueError as error:
+            raise NerfroError(f"{path}, line {i} is not {form}: {line[:60]!r}") from error
+        yield f"{path}, line {i}", words
+        for _ in range(skip):
+            next(numbered, None)
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
-    for i, line in _text_lines(path):
-        if not line:
-            continue
-        where = f"{path}, line {i}"
-        words = line.split()
-        try:
-            number, width, height = int(words[0]), int(words[2]), int(words[3])
-            params = tuple(map(float, words[4:]))
-        except (IndexError, ValueError) as error:
-            raise NerfroError(f"{where} is not CAMERA_ID MODEL WIDTH HEIGHT PARAMS: {line[:60]!r}") from error
-        yield number, _camera(words[1], width, height, params, where)
+    kinds = (int, str, int, int, lambda words: tuple(map(float, words.split())))
+    form = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"
+    for where, (number, model, width, height, params) in _text_rows(path, form, kinds):
+        yield number, _camera(model, width, height, params, where)
 
 
 def _text_images(path: Path) -> Iterator[ColmapImage]:
-    lines = _text_lines(path)
-    for i, line in lines:
-        if not line:
-            continue
-        words = line.split(maxsplit=9)
-        try:
-            values = tuple(map(float, words[1:8]))
-            camera, name = int(words[8]), words[9]
-        except (IndexError, ValueError) as error:
-            raise NerfroError(f"{path}, line {i} is not IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from error
-        next(lines, None)  # its features
-        yield _image(name, values[:4], values[4:], camera, path)
+    kinds, form = (str, *[float] * 7, int, str), "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+    for _, (_, *pose, camera, name) in _text_rows(path, form, kinds, skip=1):  # its features, perhaps an empty line
+        yield _image(name, tuple(pose[:4]), tuple(pose[4:]), camera, path)
 
 
 def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
-    for i, line in _text_lines(path):
-        if not line:
-            continue
-        try:
-            x, y, z = map(float, line.split()[1:4])
-        except ValueError as error:
-            raise NerfroError(f"{path}, line {i} is not POINT3D_ID X Y Z ...: {line[:60]!r}") from error
-        yield x, y, z
+    def position(words: str) -> tuple[float, float, float]:
+        x, y, z = map(float, words.split()[:3])
+        return x, y, z
+
+    return (point for _, (_, point) in _text_rows(path, "POINT3D_ID X Y Z ...", (str, position)))
 
 
 def _camera(model: str, width: int, height: int, params: tuple[float, ...], where: str) -> ColmapCamera:

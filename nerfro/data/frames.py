@@ -12,15 +12,15 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from nerfro.cameras import Cameras, central_window
-from nerfro.data.base import Frame, Views
+from nerfro.data.base import DataSource, Frame, Views
 from nerfro.data.image_files import Alpha, read_rgb
 from nerfro.data.masks import find_masks
 from nerfro.data.pictures import Pictures
 from nerfro.errors import NerfroError
 from nerfro.lens import distort, undistort
+from nerfro.paths import resolve_path
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 SPLITS = ["train", "val", "test"]
@@ -48,15 +48,7 @@ class Lens:
         return cls(focal, focal, 0.5 * width, 0.5 * height)
 
     def resized(self, made_for: tuple[float, float], size: tuple[int, int], where: str) -> Lens:
-        """The lens for images that were resized after calibration.
-
-        Args:
-            made_for, size: width and height that the lens was calibrated for, and that the images have.
-            where: the lens's place in the data set, for errors.
-
-        Raises:
-            NerfroError: the proportions differ by more than the rounding to whole pixels explains.
-        """
+        """The lens for images of a width and height, resized after calibration without a change of proportions."""
         by_width, by_height = size[0] / made_for[0], size[1] / made_for[1]
         if abs(by_width - by_height) > 1.5 * max(1 / made_for[0], 1 / made_for[1]):
             raise NerfroError(
@@ -66,63 +58,82 @@ class Lens:
         return Lens(self.fx * by_width, self.fy * by_height, self.cx * by_width, self.cy * by_height, self.distortion)
 
 
-def load_views(
-    frames: Sequence[Frame],
-    lenses: Callable[[int, int], Sequence[Lens]],
-    axes: Literal["opengl", "opencv"],
-    bounds: tuple[float, float],
-    downscale: int,
-    alpha: Alpha,
-    size: tuple[int, int] | None = None,
-    crop: float = 1.0,
-) -> Views:
-    """Look at the frames' images and silhouettes, which are read when they are asked for, and set up their cameras.
+class PosedImages(DataSource):
+    """Image files with poses: what the built-in loaders share.
 
     Args:
-        frames: at least one.
-        lenses: the frames' lenses for a width and height of the images as stored.
-        axes: the camera axes of the poses: `opengl` (x right, y up, looks along -z) or `opencv` (y down, along +z).
-        bounds: arc lengths at which rays begin and end.
-        downscale: side of the blocks of pixels that are averaged.
-        alpha: what becomes of transparency, see `read_rgb`.
-        size: width and height of the images as stored, where the data set states them.
-        crop: share of each side that is kept, around the centre.
+        root: the folder.
+        near, far: arc lengths at which rays begin and end, world units; None where the data will tell.
+        downscale: side of the blocks of pixels that are averaged into one.
+        alpha: `drop` ignores the images' transparency, `white` and `black` composite them over that colour.
 
     Raises:
-        NerfroError: an image or mask is missing, no image or of the wrong size, `downscale` does not divide it, or a
-            lens has no inverse.
+        NerfroError: an option is out of range.
     """
-    files = [frame.image for frame in frames]
-    images = Pictures.of(files, lambda path: read_rgb(path, alpha), downscale, size, alpha != "drop", alpha)
-    (height, width), stored = images.shape, images.size[::-1]
-    masks = find_masks(files, [frame.mask for frame in frames], downscale, stored)
-    full = lenses(*stored)
-    poses = np.stack([frame.camera_to_world for frame in frames])
-    if axes == "opencv":
-        poses = poses * np.array([1.0, -1.0, -1.0, 1.0])
-    fx, fy, cx, cy = (
-        torch.tensor([float(getattr(lens, name)) / downscale for lens in full]) for name in ("fx", "fy", "cx", "cy")
-    )
-    distorted = any(lens.distortion is not None for lens in full)
-    distortion = torch.tensor([lens.distortion or (0.0,) * 9 for lens in full]) if distorted else None
-    cameras = Cameras(torch.from_numpy(poses).float(), fx, fy, cx, cy, width, height, *bounds, distortion)
-    _check_distortion(cameras, frames)
-    if crop < 1:
-        window = central_window(height, width, crop)
-        cameras, images, masks = cameras.crop(window), images.cut(window), masks and masks.cut(window)
-    return Views(cameras, images, masks, [frame.name for frame in frames], frames=frames)
+
+    def __init__(self, root: str, near: float | None, far: float | None, downscale: int, alpha: Alpha) -> None:
+        check_options(near, far, downscale)
+        self.root = resolve_path(root)
+        self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
+
+    @property
+    def splits(self) -> list[str]:
+        return SPLITS
+
+    def require(self, split: str) -> None:
+        """Refuse a root that is no folder, and an unknown split."""
+        require_root(self.root)
+        if split not in self.splits:
+            raise NerfroError(f"data.root={self.root} has no split '{split}'; it has {', '.join(self.splits)}")
+
+    def views(
+        self,
+        frames: Sequence[Frame],
+        lenses: Callable[[int, int], Sequence[Lens]],
+        axes: Literal["opengl", "opencv"],
+        nearest: float = 0.0,
+        farthest: float = math.inf,
+        size: tuple[int, int] | None = None,
+        crop: float = 1.0,
+    ) -> Views:
+        """Look at the frames' images and silhouettes, which are read when they are asked for, and set up their cameras.
+
+        Args:
+            frames: at least one.
+            lenses: the frames' lenses for a width and height of the images as stored.
+            axes: the camera axes of the poses: `opengl` (x right, y up, looks along -z) or `opencv` (y down, along +z).
+            nearest, farthest: what the data tell, in place of bounds that are None.
+            size: width and height of the images as stored, where the data set states them.
+            crop: share of each side that is kept, around the centre.
+
+        Raises:
+            NerfroError: an image or mask is missing, no image or of the wrong size, `downscale` does not divide it, or
+                a lens has no inverse.
+        """
+        near, far = nearest if self.near is None else self.near, farthest if self.far is None else self.far
+        check_options(near, far, self.downscale)
+        files, alpha, downscale = [frame.image for frame in frames], self.alpha, self.downscale
+        images = Pictures.of(files, lambda path: read_rgb(path, alpha), downscale, size, alpha != "drop", alpha)
+        (height, width), stored = images.shape, images.size[::-1]
+        masks = find_masks(files, [frame.mask for frame in frames], downscale, stored)
+        full = lenses(*stored)
+        poses = np.stack([frame.camera_to_world for frame in frames])
+        if axes == "opencv":
+            poses = poses * np.array([1.0, -1.0, -1.0, 1.0])
+        intrinsics = torch.tensor([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in full], dtype=torch.float64)
+        fx, fy, cx, cy = (intrinsics / downscale).float().unbind(-1)
+        distorted = any(lens.distortion is not None for lens in full)
+        distortion = torch.tensor([lens.distortion or (0.0,) * 9 for lens in full]) if distorted else None
+        cameras = Cameras(torch.from_numpy(poses).float(), fx, fy, cx, cy, width, height, near, far, distortion)
+        _check_distortion(cameras, frames)
+        if crop < 1:
+            window = central_window(height, width, crop)
+            cameras, images, masks = cameras.crop(window), images.cut(window), masks and masks.cut(window)
+        return Views(cameras, images, masks, [frame.name for frame in frames], frames=frames)
 
 
 def check_options(near: float | None, far: float | None, downscale: int) -> None:
-    """Check the options that all loaders share.
-
-    Args:
-        near, far: arc lengths at which rays begin and end; None where the data will tell.
-        downscale: side of the blocks of pixels that are averaged.
-
-    Raises:
-        NerfroError: one is out of range.
-    """
+    """Refuse options of `PosedImages` that are out of range."""
     known = (0.0 if near is None else near), (sys.float_info.max if far is None else far)
     if not 0 <= known[0] < known[1] < math.inf:  # also false for NaN
         raise NerfroError(f"data.near={near} and data.far={far} are no interval; take 0 <= near < far")
@@ -130,23 +141,8 @@ def check_options(near: float | None, far: float | None, downscale: int) -> None
         raise NerfroError(f"data.downscale={downscale} is not allowed; take 1 for full size, 2 for half, and so on")
 
 
-def check_split(split: str, root: Path) -> None:
-    """Check the name of a split of data that nerfro splits itself.
-
-    Raises:
-        NerfroError: it is unknown.
-    """
-    if split not in SPLITS:
-        raise NerfroError(f"data.root={root} has no split '{split}'; it has {', '.join(SPLITS)}")
-
-
 def held_out(num_views: int, every: int, split: str, root: Path) -> list[int]:
-    """The views of a split where the data has none: each `every`-th, from the first, is for val and test (LLFF).
-
-    Raises:
-        NerfroError: unknown split, `every` below 2, or too few views.
-    """
-    check_split(split, root)
+    """The views of a split where the data has none: each `every`-th, from the first, is for val and test (LLFF)."""
     if every < 2:
         raise NerfroError(f"data.test_every={every} leaves nothing to train on; take 2 or more")
     if num_views < 2:
@@ -155,11 +151,7 @@ def held_out(num_views: int, every: int, split: str, root: Path) -> list[int]:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The images of a folder by name, masks (`mask_*`) and hidden files left out.
-
-    Raises:
-        NerfroError: there is no such folder, or no image in it.
-    """
+    """The images of a folder by name, at least one; masks (`mask_*`) and hidden files are left out."""
     if not folder.is_dir():
         raise NerfroError(f"{folder} is not a folder; it should hold the images, see docs/data.md")
     images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
@@ -170,11 +162,7 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def require_root(root: Path) -> None:
-    """Check the folder of a data set.
-
-    Raises:
-        NerfroError: it does not exist.
-    """
+    """Refuse a data set's folder that does not exist."""
     if not root.is_dir():
         raise NerfroError(f"data.root={root} is not a folder; give the one that holds the data set")
 
@@ -182,15 +170,7 @@ def require_root(root: Path) -> None:
 def check_pose(
     matrix: Float[np.ndarray, "rows 4"], where: str, name: str = "transform_matrix"
 ) -> Float[np.ndarray, "3 4"]:
-    """The first three rows of a camera-to-world matrix.
-
-    Args:
-        matrix: of three or four rows.
-        where, name: the frame, and what the data set calls its matrix, for errors.
-
-    Raises:
-        NerfroError: it is no rotation and shift.
-    """
+    """The first three rows of a camera-to-world matrix, which must be a rotation and a shift."""
     rotation = matrix[:3, :3]
     error = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
@@ -209,10 +189,11 @@ def _check_distortion(cameras: Cameras, frames: Sequence[Frame]) -> None:
     if cameras.distortion is None:
         return
     share = torch.linspace(0, 1, 9, dtype=torch.float64)
-    border = torch.cartesian_prod(share, share)  # the inside as well: a fold may lie within
+    size = torch.tensor([cameras.width, cameras.height])
+    grid = torch.cartesian_prod(share, share) * size  # the inside as well: a fold may lie within
     for view, frame in enumerate(frames):
         fx, fy, cx, cy = (getattr(cameras, name)[view].double() for name in ("fx", "fy", "cx", "cy"))
-        points = _plane(border, cameras, fx, fy, cx, cy)
+        points = (grid - torch.stack([cx, cy])) / torch.stack([fx, fy])
         lens = cameras.distortion[view].double().expand(len(points), 9)
         ideal, area = undistort(points, lens)
         error = (distort(ideal, lens)[0] - points).norm(dim=-1) * fx
@@ -221,7 +202,3 @@ def _check_distortion(cameras: Cameras, frames: Sequence[Frame]) -> None:
                 f"{frame.name}: its lens distortion cannot be undone everywhere in the image; "
                 "check the coefficients and their order, or undistort the images first"
             )
-
-
-def _plane(share: Tensor, cameras: Cameras, fx: Tensor, fy: Tensor, cx: Tensor, cy: Tensor) -> Tensor:
-    return torch.stack([(share[:, 0] * cameras.width - cx) / fx, (share[:, 1] * cameras.height - cy) / fy], -1)

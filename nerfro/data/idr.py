@@ -9,37 +9,31 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
-from nerfro.data.base import DataSource, Frame, Views
-from nerfro.data.frames import SPLITS, Lens, check_options, held_out, list_images, load_views, require_root
+from nerfro.data.base import Frame, Views
+from nerfro.data.frames import Lens, PosedImages, held_out, list_images
+from nerfro.data.image_files import Alpha
 from nerfro.data.transforms import parse_matrix
 from nerfro.errors import NerfroError
 from nerfro.files.cache import load_arrays
-from nerfro.paths import resolve_path
 from nerfro.registry import register
 
 _MAX_SKEW = 1e-3
 
 
 @register("data", "idr")
-class IdrData(DataSource):
+class IdrData(PosedImages):
     """Folder with image/, mask/ and cameras_sphere.npz, as IDR, NeuS, NeTO and NEMTO have it.
 
     `world_mat_i` maps the world to pixels, `scale_mat_i` the unit sphere to the world. Masks belong to images in the
     order of names. Pixel centres are whole numbers there (NeuS, gen_rays_at), so half a pixel is added.
 
     Args:
-        root: the folder.
-        near: arc length at which rays begin; none takes where they enter the unit sphere at the earliest.
-        far: arc length at which rays end; none takes where they leave the unit sphere at the latest.
-        downscale: side of the blocks of pixels that are averaged into one.
-        alpha: `drop` ignores the images' transparency, `white` and `black` composite them over that colour.
+        root, near, far, downscale, alpha: see `PosedImages`; bounds that are none take where rays enter the unit sphere
+            at the earliest and leave it at the latest.
         cameras: name of the file of matrices.
         world: `sphere` is the frame in which the object lies in the unit sphere, `file` that of `world_mat` (of which
             `near` and `far` cannot be known).
         test_every: every such image by name, from the first, is for val and test.
-
-    Raises:
-        NerfroError: an option is out of range.
     """
 
     def __init__(
@@ -48,24 +42,18 @@ class IdrData(DataSource):
         near: float | None = None,
         far: float | None = None,
         downscale: int = 1,
-        alpha: Literal["drop", "white", "black"] = "drop",
+        alpha: Alpha = "drop",
         cameras: str = "cameras_sphere.npz",
         world: Literal["sphere", "file"] = "sphere",
         test_every: int = 8,
     ) -> None:
-        check_options(near, far, downscale)
+        super().__init__(root, near, far, downscale, alpha)
         if world == "file" and (near is None or far is None):
             raise NerfroError("data.world=file needs data.near and data.far, in units of that world")
-        self.root = resolve_path(root)
-        self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
         self.cameras, self.world, self.test_every = cameras, world, test_every
 
-    @property
-    def splits(self) -> list[str]:
-        return SPLITS
-
     def load(self, split: str) -> Views:
-        require_root(self.root)
+        self.require(split)
         images = list_images(_first_folder(self.root, ("image", "images", "rgb")))
         masks = _masks(self.root, len(images))
         file = self.root / self.cameras
@@ -77,39 +65,30 @@ class IdrData(DataSource):
             raise NerfroError(
                 f"{file} has {num_matrices} matrices world_mat_<i> for {len(images)} images; make them equal"
             )
-        poses, lenses = [], []
-        for i in range(len(images)):
-            pose, lens = decompose(self._projection(arrays, i, file), f"{file}: world_mat_{i}")
-            poses.append(pose)
-            lenses.append(lens)
+        projections = (self._projection(arrays, i, file) for i in range(len(images)))
+        cameras = [decompose(projection, f"{file}: world_mat_{i}") for i, projection in enumerate(projections)]
+        poses, lenses = zip(*cameras, strict=True)
         chosen = held_out(len(images), self.test_every, split, self.root)
         frames = [Frame(images[i].name, images[i], masks[i], poses[i]) for i in chosen]
         # Over all views, so that the splits agree.
         distance = np.linalg.norm(np.stack(poses)[:, :, 3], axis=-1)
-        near = max(float(distance.min()) - 1, 0.0) if self.near is None else self.near
-        far = float(distance.max()) + 1 if self.far is None else self.far
-        check_options(near, far, self.downscale)
-        return load_views(
-            frames, lambda width, height: [lenses[i] for i in chosen], "opencv", (near, far), self.downscale, self.alpha
-        )
+        nearest, farthest = max(float(distance.min()) - 1, 0.0), float(distance.max()) + 1
+        return self.views(frames, lambda width, height: [lenses[i] for i in chosen], "opencv", nearest, farthest)
 
     def _projection(self, arrays: dict[str, np.ndarray], index: int, file: Path) -> Float[np.ndarray, "3 4"]:
-        names = [f"world_mat_{index}"] + ([f"scale_mat_{index}"] if self.world == "sphere" else [])
-        for name in names:
+        product = np.eye(4)
+        for name in [f"world_mat_{index}", f"scale_mat_{index}"][: 2 if self.world == "sphere" else 1]:
             if name not in arrays:
                 raise NerfroError(f"{file} has no '{name}'; every image needs one")
-        matrices = [parse_matrix(arrays[name], ((4, 4),), f"{file}: {name}") for name in names]
-        product = matrices[0] if len(matrices) == 1 else matrices[0] @ matrices[1]
+            product = product @ parse_matrix(arrays[name], ((4, 4),), f"{file}: {name}")
         return product[:3]
 
 
 def decompose(projection: Float[np.ndarray, "3 4"], where: str) -> tuple[Float[np.ndarray, "3 4"], Lens]:
     """Camera-to-world matrix (OpenCV axes) and lens of a projection matrix that takes whole numbers as pixel centres.
 
-    By RQ factorisation; any factor of the matrix, and with it a uniform scale of the world, is immaterial.
-
-    Raises:
-        NerfroError: it is singular, or has skew.
+    By RQ factorisation; any factor of the matrix, and with it a uniform scale of the world, is immaterial. The matrix
+    must be regular and without skew.
     """
     square = projection[:, :3]
     determinant = np.linalg.det(square)

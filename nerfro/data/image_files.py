@@ -31,25 +31,14 @@ def to_levels(values: Float[np.ndarray, "H W *C"]) -> UInt16[np.ndarray, "H W *C
 
 
 def read_levels(path: Path) -> Levels:
-    """Read an image file with 8 or 16 bits per channel, whichever it has.
-
-    Returns:
-        Levels [H, W, C] of 8 or 16 bits; C is 1 (grey), 2 (grey, alpha), 3 (RGB) or 4 (RGBA).
-
-    Raises:
-        NerfroError: the file is missing, truncated, corrupt or not an image of 8 or 16 bits.
-    """
+    """Levels [H, W, C] of 8 or 16 bits, whichever a file has; C is 1 (grey), 2 (grey, alpha), 3 (RGB) or 4 (RGBA)."""
     with _naming(path):
         content = path.read_bytes()
         return decode_png16(content) if is_png16(content) else _read_8bit(content, path)
 
 
 def read_size(path: Path) -> tuple[int, int, int]:
-    """Width, height and bits per channel of an image file, from its header alone.
-
-    Raises:
-        NerfroError: the file is missing or no image.
-    """
+    """Width, height and bits per channel of an image file, from its header alone."""
     with _naming(path), path.open("rb") as file:
         start = file.read(29)
         if is_png16(start):
@@ -86,17 +75,10 @@ def _read_8bit(content: bytes, path: Path) -> UInt8[np.ndarray, "H W C"]:
 
 
 def read_rgb(path: Path, alpha: Alpha) -> Levels:
-    """Read an image's colours.
-
-    Args:
-        path: an image with or without transparency.
-        alpha: `drop` takes the colours as they are, `white` and `black` composite them over that colour.
+    """Read an image's colours: `drop` takes them as they are, `white` and `black` composite them over that colour.
 
     Returns:
         Levels [H, W, 3]; of 16 bits where colours were composited, else as the file has them.
-
-    Raises:
-        NerfroError: as `read_levels`.
     """
     levels = read_levels(path)
     num_colours = 1 if levels.shape[-1] < 3 else 3
@@ -108,11 +90,7 @@ def read_rgb(path: Path, alpha: Alpha) -> Levels:
 
 
 def read_mask(path: Path) -> Levels:
-    """Read the share [H, W] of each pixel that the object covers; a mask of levels 0 and 1 only is taken as labels.
-
-    Raises:
-        NerfroError: as `read_levels`.
-    """
+    """Read the share [H, W] of each pixel that the object covers; a mask of levels 0 and 1 only is taken as labels."""
     levels = read_levels(path)
     share = levels[..., : 1 if levels.shape[-1] < 3 else 3].max(-1)
     most = np.iinfo(levels.dtype).max
@@ -120,11 +98,7 @@ def read_mask(path: Path) -> Levels:
 
 
 def area_mean(values: Float[np.ndarray, "H W *C"], factor: int, path: Path) -> Float[np.ndarray, "h w *C"]:
-    """Mean of each block of factor x factor pixels.
-
-    Raises:
-        NerfroError: the factor does not divide the sides.
-    """
+    """Mean of each block of factor x factor pixels; the factor must divide the sides."""
     height, width = values.shape[:2]
     if height % factor or width % factor:
         allowed = [n for n in range(1, 33) if height % n == 0 and width % n == 0]

@@ -9,23 +9,12 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.data.base import DataSource, Views
-from nerfro.data.frames import (
-    SPLITS,
-    Frame,
-    Lens,
-    check_options,
-    check_pose,
-    check_split,
-    held_out,
-    list_images,
-    load_views,
-    require_root,
-)
+from nerfro.data.base import Frame, Views
+from nerfro.data.frames import Lens, PosedImages, check_pose, held_out, list_images, require_root
+from nerfro.data.image_files import Alpha
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
 from nerfro.files.cache import load_array
-from nerfro.paths import resolve_path
 from nerfro.registry import register
 
 # LLFF leaves a quarter of the nearest depth free in front of what it sees.
@@ -36,25 +25,20 @@ _EIKONAL_FAR = 2.0
 
 
 @register("data", "llff")
-class LlffData(DataSource):
+class LlffData(PosedImages):
     """Folder with images/ and poses_bounds.npy: images by name, one row of 17 numbers for each.
 
     Args:
-        root: the folder.
+        root, downscale, alpha: see `PosedImages`.
         near: arc length at which rays begin, in units of the chosen frame; none takes 0.9 of the file's least depth.
         far: arc length at which rays end; none takes the file's greatest depth (at most 2 for `frame=eikonal`, as its
             authors do), measured in the image's corner.
-        downscale: side of the blocks of pixels that are averaged into one.
-        alpha: `drop` ignores the images' transparency, `white` and `black` composite them over that colour.
         images: folder of the images within the root, such as images_8; intrinsics follow its images' size.
         frame: the world: `file` leaves it as it is, `llff` scales by 1 / (0.75 least depth) and recentres,
             `eikonal` scales by 1 / (greatest - least depth), recentres and spherifies, as Eikonal Fields does.
         video: folder within the root, with its own poses_bounds.npy in the same world, whose images are val and test;
             they are mapped with the transformation of the training images, all of which are then trained on.
         test_every: every such image, from the first, is for val and test, where there is no video.
-
-    Raises:
-        NerfroError: an option is out of range.
     """
 
     def __init__(
@@ -63,27 +47,24 @@ class LlffData(DataSource):
         near: float | None = None,
         far: float | None = None,
         downscale: int = 1,
-        alpha: Literal["drop", "white", "black"] = "drop",
+        alpha: Alpha = "drop",
         images: str = "images",
         frame: Literal["llff", "eikonal", "file"] = "llff",
         video: str | None = None,
         test_every: int = 8,
     ) -> None:
-        check_options(near, far, downscale)
-        self.root = resolve_path(root)
-        self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
+        super().__init__(root, near, far, downscale, alpha)
         self.images, self.frame, self.video, self.test_every = images, frame, video, test_every
 
-    @property
-    def splits(self) -> list[str]:
-        return SPLITS
-
     def load(self, split: str) -> Views:
-        require_root(self.root)
-        check_split(split, self.root)
+        self.require(split)
         poses, depths, sizes = read_poses_bounds(self.root / "poses_bounds.npy")
         transform = frame_transform(poses, depths, self.frame)
-        bounds = self._bounds(depths * np.cbrt(np.linalg.det(transform[:3, :3])), sizes)
+        # LLFF measures depths along the optical axis; the arc to the farthest one ends in the image's corner.
+        depths = depths * np.cbrt(np.linalg.det(transform[:3, :3]))
+        height, width, focal = sizes[0]
+        farthest = min(float(depths.max()), _EIKONAL_FAR if self.frame == "eikonal" else math.inf)
+        farthest *= math.hypot(1, 0.5 * width / focal, 0.5 * height / focal)
         folder = self.root
         if self.video is not None and split != "train":
             folder = self.root / self.video.replace("\\", "/")
@@ -95,30 +76,16 @@ class LlffData(DataSource):
                 f"{folder / self.images} holds {len(files)} images but {folder / 'poses_bounds.npy'} has {len(poses)} "
                 "poses; they belong together by the order of names, so restore the images that were calibrated"
             )
-        mapped = map_poses(poses, transform)
-        chosen = (
-            held_out(len(files), self.test_every, split, self.root) if self.video is None else list(range(len(files)))
-        )
+        mapped, chosen = map_poses(poses, transform), list(range(len(files)))
+        if self.video is None:
+            chosen = held_out(len(files), self.test_every, split, self.root)
         frames = [Frame(files[i].name, files[i], find_mask(folder, files[i]), mapped[i]) for i in chosen]
 
         def lenses(width: int, height: int) -> list[Lens]:
             where = f"{folder / 'poses_bounds.npy'}"
-            full = [(w, h, Lens(f, f, 0.5 * w, 0.5 * h)) for h, w, f in sizes[chosen]]
-            return [lens.resized((w, h), (width, height), where) for w, h, lens in full]
+            return [Lens(f, f, 0.5 * w, 0.5 * h).resized((w, h), (width, height), where) for h, w, f in sizes[chosen]]
 
-        return load_views(frames, lenses, "opengl", bounds, self.downscale, self.alpha)
-
-    def _bounds(self, depths: Float[np.ndarray, "V 2"], sizes: Float[np.ndarray, "V 3"]) -> tuple[float, float]:
-        """Arc lengths that contain the depths, which LLFF measures along the optical axis."""
-        far = float(depths.max())
-        if self.frame == "eikonal":
-            far = min(far, _EIKONAL_FAR)
-        height, width, focal = sizes[0]
-        far *= math.hypot(1, 0.5 * width / focal, 0.5 * height / focal)
-        near = 0.9 * float(depths.min()) if self.near is None else self.near
-        far = far if self.far is None else self.far
-        check_options(near, far, self.downscale)
-        return near, far
+        return self.views(frames, lenses, "opengl", 0.9 * float(depths.min()), farthest)
 
 
 def read_poses_bounds(
@@ -129,9 +96,6 @@ def read_poses_bounds(
     Returns:
         Camera-to-world matrices with OpenGL axes (the file has down, right, back), least and greatest depth, and
         height, width and focal length in pixels, of each image.
-
-    Raises:
-        NerfroError: the file is missing or corrupt, or its numbers are no cameras.
     """
     if not path.is_file():
         raise NerfroError(f"{path} does not exist; make it with LLFF's imgs2poses.py, or use data=colmap directly")
@@ -156,14 +120,10 @@ def frame_transform(
     """The similarity from the file's world to the chosen frame, see `LlffData`; points go the way that cameras go.
 
     Sources: LLFF's load_llff_data; Eikonal Fields' load_llff.py.
-
-    Raises:
-        NerfroError: the optical axes are parallel, so that there is no sphere to look at.
     """
     if frame == "file":
         return np.eye(4)
-    length = _LLFF_BOUND_FACTOR * depths.min() if frame == "llff" else depths.max() - depths.min()
-    scale = 1 / length
+    scale = 1 / (_LLFF_BOUND_FACTOR * depths.min() if frame == "llff" else depths.max() - depths.min())
     transform = np.diag([scale, scale, scale, 1.0])
     transform = _recentre(map_poses(poses, transform)) @ transform
     if frame == "eikonal":

@@ -14,7 +14,6 @@ from nerfro.data.image_files import Levels, read_levels, read_mask, read_size
 from nerfro.data.pictures import Pictures
 from nerfro.errors import NerfroError
 
-MASKS_FOLDER = "masks"
 _SPLIT_FOLDERS = ("train", "val", "test")
 
 _left_out: ContextVar[bool] = ContextVar("left_out", default=False)
@@ -41,10 +40,7 @@ def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None
     Args:
         root: the data set's folder.
         image: the image's file.
-        stated: path within the root that the data set itself gives, if it does.
-
-    Raises:
-        NerfroError: a stated file does not exist.
+        stated: path within the root that the data set itself gives, if it does; the file must exist.
     """
     if stated is not None:
         mask = root / stated.replace("\\", "/")
@@ -58,7 +54,7 @@ def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None
         if folder.parts and folder.parts[0] not in _SPLIT_FOLDERS:
             folders.append(Path(*folder.parts[1:]))
         for within in folders:
-            candidates += [root / MASKS_FOLDER / within / name for name in (f"{image.stem}.png", f"{image.name}.png")]
+            candidates += [root / "masks" / within / name for name in (f"{image.stem}.png", f"{image.name}.png")]
     return next((path for path in candidates if path.is_file()), None)
 
 
@@ -75,9 +71,6 @@ def find_masks(
 
     Returns:
         Share of each pixel that the object covers; None where there are no silhouettes.
-
-    Raises:
-        NerfroError: some images have a silhouette and others none, or one is no image or of another size.
     """
     if _left_out.get():
         return None
@@ -91,17 +84,8 @@ def find_usable(
 ) -> Pictures:
     """Masks that rule pixels out: black ones are ignored, white ones are used, grey ones by the nearer of the two.
 
-    Args:
-        images: the images' files.
-        masks: the masks' files, of all images.
-        downscale: side of the blocks of pixels that are averaged; a block is used if all of it is.
-        size: width and height of the images in pixels before downscaling.
-
-    Returns:
-        1 in the pixels that are used, less in all others.
-
-    Raises:
-        NerfroError: an image has no mask, or one that is corrupt, of another size, or leaves no pixel.
+    Arguments are those of `find_masks`; every image must have a mask that leaves a pixel. The result is 1 in the pixels
+    that are used, less in all others; a block of averaged pixels is used if all of it is.
     """
     usable = _of_files(images, masks, _read_usable, downscale, size)
     for image, mask, levels in zip(images, masks, usable.all_levels(), strict=True):

@@ -6,15 +6,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Literal
 
-from nerfro.data.base import DataSource, Frame, Views
-from nerfro.data.frames import SPLITS, Lens, check_options, check_split, held_out, load_views, require_root
+from nerfro.data.base import Views
+from nerfro.data.frames import SPLITS, Lens, PosedImages, held_out
+from nerfro.data.image_files import Alpha
 from nerfro.data.masks import find_mask, find_usable
-from nerfro.data.transforms import Manifest, find_splits, is_number, parse_manifest
+from nerfro.data.transforms import Manifest, find_splits, is_number, parse_manifest, read_manifest
 from nerfro.errors import NerfroError
 from nerfro.lens import coefficients
-from nerfro.paths import resolve_path
 from nerfro.registry import register
 
 # What `camera_model` may say for a perspective lens; they differ in which coefficients are zero.
@@ -22,7 +21,7 @@ _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL"
 
 
 @register("data", "nerfstudio")
-class NerfstudioData(DataSource):
+class NerfstudioData(PosedImages):
     """Folder with transforms.json (or transforms_{train,val,test}.json): OpenGL axes, intrinsics with distortion.
 
     Poses are taken as they are: the world is that of the file, not turned, centred and scaled as nerfstudio does when
@@ -30,30 +29,15 @@ class NerfstudioData(DataSource):
     trained on; a frame's silhouette of the refractive object is its `object_mask_path`.
 
     Args:
-        root: the folder.
-        near: arc length at which rays begin, world units.
-        far: arc length at which rays end, world units.
-        downscale: side of the blocks of pixels that are averaged into one.
-        alpha: `drop` ignores the images' transparency, `white` and `black` composite them over that colour.
+        root, near, far, downscale, alpha: see `PosedImages`.
         test_every: every such frame by name, from the first, is for val and test, where the file has no
             {train,val,test}_filenames.
-
-    Raises:
-        NerfroError: an option is out of range.
     """
 
     def __init__(
-        self,
-        root: str,
-        near: float,
-        far: float,
-        downscale: int = 1,
-        alpha: Literal["drop", "white", "black"] = "drop",
-        test_every: int = 10,
+        self, root: str, near: float, far: float, downscale: int = 1, alpha: Alpha = "drop", test_every: int = 10
     ) -> None:
-        check_options(near, far, downscale)
-        self.root = resolve_path(root)
-        self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
+        super().__init__(root, near, far, downscale, alpha)
         self.test_every = test_every
 
     @property
@@ -63,16 +47,13 @@ class NerfstudioData(DataSource):
         return list(find_splits(self.root))
 
     def load(self, split: str) -> Views:
-        require_root(self.root)
+        self.require(split)
         single = self.root / "transforms.json"
         if single.is_file():
             manifest = parse_manifest(single, "object_mask_path")
             chosen = self._choose(manifest, split)
         else:
-            files = find_splits(self.root)
-            if split not in files:
-                raise NerfroError(f"data.root={self.root} has no split '{split}'; it has {', '.join(files)}")
-            manifest = parse_manifest(files[split], "object_mask_path")
+            manifest = read_manifest(self.root, split, "object_mask_path")
             chosen = list(range(len(manifest.frames)))
         entries: list[Mapping[str, object]] = manifest.document["frames"]  # type: ignore[assignment]
         names = [f"{manifest.path}: '{manifest.frames[i].name}'" for i in chosen]
@@ -82,23 +63,20 @@ class NerfstudioData(DataSource):
             return [_read_lens(v, width, height, name) for v, name in zip(values, names, strict=True)]
 
         frames = [manifest.frames[i] for i in chosen]
-        ignoring = [self._find_ignoring(manifest.frames[i], entries[i], n) for i, n in zip(chosen, names, strict=True)]
-        views = load_views(frames, lenses, "opengl", (self.near, self.far), self.downscale, self.alpha)
+        ignoring: list[Path | None] = []
+        for i, frame, name in zip(chosen, frames, names, strict=True):
+            stated = entries[i].get("mask_path")
+            if stated is not None and not isinstance(stated, str):
+                raise NerfroError(f"{name}: 'mask_path' must be text")
+            ignoring.append(None if stated is None else find_mask(self.root, frame.image, stated))
+        views = self.views(frames, lenses, "opengl")
         if not any(ignoring):
             return views
         stored = views.cameras.width * self.downscale, views.cameras.height * self.downscale
         return replace(views, usable=find_usable([frame.image for frame in frames], ignoring, self.downscale, stored))
 
-    def _find_ignoring(self, frame: Frame, entry: Mapping[str, object], where: str) -> Path | None:
-        """The file of a frame's mask of pixels to ignore, if it states one."""
-        stated = entry.get("mask_path")
-        if stated is not None and not isinstance(stated, str):
-            raise NerfroError(f"{where}: 'mask_path' must be text")
-        return None if stated is None else find_mask(self.root, frame.image, stated)
-
     def _choose(self, manifest: Manifest, split: str) -> list[int]:
         """Numbers of the frames of a split."""
-        check_split(split, self.root)
         listed = {name: manifest.document.get(f"{name}_filenames") for name in SPLITS}
         by_name = sorted(range(len(manifest.frames)), key=lambda i: manifest.frames[i].name)
         if not any(listed.values()):

@@ -2,29 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.data.base import DataSource, Views
-from nerfro.data.frames import (
-    SPLITS,
-    Frame,
-    Lens,
-    check_options,
-    check_pose,
-    check_split,
-    list_images,
-    load_views,
-    require_root,
-)
-from nerfro.data.transforms import is_number, parse_matrix
+from nerfro.data.base import Frame, Views
+from nerfro.data.frames import Lens, PosedImages, check_pose, list_images
+from nerfro.data.image_files import Alpha
+from nerfro.data.transforms import is_number, parse_matrix, read_json
 from nerfro.errors import NerfroError
-from nerfro.paths import resolve_path
 from nerfro.registry import register
 
 # Constants of NeRRF's dataloader.py: the synthetic field of view, the size for which `f` is given, and its split.
@@ -34,7 +22,7 @@ _EIKONAL_TRAIN = 50
 
 
 @register("data", "nerrf")
-class NerrfData(DataSource):
+class NerrfData(PosedImages):
     """NeRRF's synthetic scenes, and its version of the Eikonal Fields scenes; OpenGL axes.
 
     Synthetic: `<id>_0001.png`, `../../meta/<id>_meta_0000.json` and `../../mask/<name of root>/mask_<id>_0001.png`;
@@ -43,90 +31,57 @@ class NerrfData(DataSource):
 
     Args:
         root: folder of a scene's images (synthetic), or the one that holds images/, meta/ and mask/.
-        near: arc length at which rays begin, world units.
-        far: arc length at which rays end, world units; none takes NeRRF's, 80 for synthetic scenes and 3 for others.
-        downscale: side of the blocks of pixels that are averaged into one.
-        alpha: `drop` ignores the images' transparency, `white` and `black` composite them over that colour.
-
-    Raises:
-        NerfroError: an option is out of range.
+        near, far, downscale, alpha: see `PosedImages`; `far` none takes NeRRF's, 80 for synthetic scenes, else 3.
     """
 
     def __init__(
-        self,
-        root: str,
-        near: float = 0.02,
-        far: float | None = None,
-        downscale: int = 1,
-        alpha: Literal["drop", "white", "black"] = "drop",
+        self, root: str, near: float = 0.02, far: float | None = None, downscale: int = 1, alpha: Alpha = "drop"
     ) -> None:
-        check_options(near, far, downscale)
-        self.root = resolve_path(root)
-        self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
-
-    @property
-    def splits(self) -> list[str]:
-        return SPLITS
+        super().__init__(root, near, far, downscale, alpha)
 
     def load(self, split: str) -> Views:
-        require_root(self.root)
-        check_split(split, self.root)
+        self.require(split)
         captured = (self.root / "images").is_dir()
         images = _captured_images(self.root, split) if captured else _synthetic_images(self.root, split)
         frames, focals = [], []
-        for name, image, meta, mask in images:
+        for image, meta, mask in images:
             pose, focal = _read_meta(meta, captured)
-            frames.append(Frame(name, image, mask if mask.is_file() else None, pose))
+            frames.append(Frame(image.name, image, mask if mask.is_file() else None, pose))
             focals.append(focal)
 
         def lenses(width: int, height: int) -> list[Lens]:
-            if captured:
-                w, h = _EIKONAL_SIZE
-                full = [Lens(focal, focal, 0.5 * w, 0.5 * h) for focal in focals]
-                return [lens.resized((w, h), (width, height), f"{self.root / 'meta'}") for lens in full]
-            return [Lens.of_angle(_FIELD_OF_VIEW, width, height)] * len(frames)
+            if not captured:
+                return [Lens.of_angle(_FIELD_OF_VIEW, width, height)] * len(frames)
+            full = (Lens(focal, focal, 0.5 * _EIKONAL_SIZE[0], 0.5 * _EIKONAL_SIZE[1]) for focal in focals)
+            return [lens.resized(_EIKONAL_SIZE, (width, height), f"{self.root / 'meta'}") for lens in full]
 
-        far = self.far if self.far is not None else 3.0 if captured else 80.0
-        return load_views(frames, lenses, "opengl", (self.near, far), self.downscale, self.alpha)
+        return self.views(frames, lenses, "opengl", farthest=3.0 if captured else 80.0)
 
 
-def _synthetic_images(root: Path, split: str) -> list[tuple[str, Path, Path, Path]]:
-    """Name, image, pose file and mask of each view of a split."""
+def _synthetic_images(root: Path, split: str) -> list[tuple[Path, Path, Path]]:
+    """Image, pose file and mask of each view of a split."""
     base = root.resolve().parent.parent
     numbers = sorted(int(path.stem[:-5]) for path in root.glob("*_0001.png") if path.stem[:-5].isdigit())
     chosen = [number for number in numbers if (number % 2 == 0) == (split == "train")]
     if not chosen:
         raise NerfroError(f"data.root={root} has no image <id>_0001.png of {'even' if split == 'train' else 'odd'} id")
+    masks = base / "mask" / root.resolve().name
     return [
-        (
-            f"{i}_0001.png",
-            root / f"{i}_0001.png",
-            base / "meta" / f"{i}_meta_0000.json",
-            base / "mask" / root.resolve().name / f"mask_{i}_0001.png",
-        )
-        for i in chosen
+        (root / f"{i}_0001.png", base / "meta" / f"{i}_meta_0000.json", masks / f"mask_{i}_0001.png") for i in chosen
     ]
 
 
-def _captured_images(root: Path, split: str) -> list[tuple[str, Path, Path, Path]]:
+def _captured_images(root: Path, split: str) -> list[tuple[Path, Path, Path]]:
     images = list_images(root / "images")
     images = images[:_EIKONAL_TRAIN] if split == "train" else images[_EIKONAL_TRAIN:]
     if not images:
         raise NerfroError(f"{root / 'images'} holds no more than the {_EIKONAL_TRAIN} images that are trained on")
-    return [
-        (image.name, image, root / "meta" / f"{image.stem}.json", root / "mask" / f"mask_{image.stem}.png")
-        for image in images
-    ]
+    return [(image, root / "meta" / f"{image.stem}.json", root / "mask" / f"mask_{image.stem}.png") for image in images]
 
 
 def _read_meta(path: Path, captured: bool) -> tuple[Float[np.ndarray, "3 4"], float]:
     """Pose and, for captured scenes, focal length in pixels."""
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise NerfroError(f"{path} cannot be read ({error.strerror}); every image needs its pose") from error
-    except ValueError as error:
-        raise NerfroError(f"{path} is not valid JSON ({error}): truncated? copy it again") from error
+    document = read_json(path, "every image needs its pose")
     for key in ["cam_world_pose", *(["f"] if captured else [])]:
         if not isinstance(document, dict) or key not in document:
             raise NerfroError(f"{path} has no '{key}'; see docs/data.md for the layout")

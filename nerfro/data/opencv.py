@@ -3,36 +3,28 @@
 from __future__ import annotations
 
 import warnings
-from typing import Literal
 
 import numpy as np
 
-from nerfro.data.base import DataSource, Views
-from nerfro.data.frames import Lens, check_options, load_views
+from nerfro.data.base import Views
+from nerfro.data.frames import Lens, PosedImages
+from nerfro.data.image_files import Alpha
 from nerfro.data.transforms import Manifest, find_splits, is_number, parse_matrix, read_manifest
 from nerfro.errors import NerfroError
 from nerfro.lens import opencv_coefficients
-from nerfro.paths import resolve_path
 from nerfro.registry import register
 
 
 @register("data", "opencv")
-class OpenCVData(DataSource):
+class OpenCVData(PosedImages):
     """Folder with transforms_{train,val,test}.json in OpenCV's camera axes and one 3x3 camera matrix.
 
     The matrix takes pixel (column, row) centres to be at (column + .5, row + .5), as the paper's authors do.
 
     Args:
-        root: the folder.
-        near: arc length at which rays begin, world units.
-        far: arc length at which rays end, world units.
-        downscale: side of the blocks of pixels that are averaged into one; the camera matrix is that of full size.
-        alpha: `drop` ignores the images' transparency as the paper's authors do, `white` and `black` composite them
-            over that colour.
+        root, near, far, downscale, alpha: see `PosedImages`; the camera matrix is that of full size, and the paper's
+            authors drop transparency.
         eval_crop: share of each side that is kept, around the centre, of the images of every split but train.
-
-    Raises:
-        NerfroError: an option is out of range.
     """
 
     def __init__(
@@ -41,14 +33,12 @@ class OpenCVData(DataSource):
         near: float = 0.2,
         far: float = 12.0,
         downscale: int = 1,
-        alpha: Literal["drop", "white", "black"] = "drop",
+        alpha: Alpha = "drop",
         eval_crop: float = 1.0,
     ) -> None:
-        check_options(near, far, downscale)
+        super().__init__(root, near, far, downscale, alpha)
         if not 0 < eval_crop <= 1:
             raise NerfroError(f"data.eval_crop={eval_crop} is not allowed; take a share in (0, 1], 1 for no crop")
-        self.root = resolve_path(root)
-        self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
         self.eval_crop = eval_crop
 
     @property
@@ -75,8 +65,8 @@ class OpenCVData(DataSource):
                 )
             return [lens] * len(manifest.frames)
 
-        bounds, crop = (self.near, self.far), 1.0 if split == "train" else self.eval_crop
-        return load_views(manifest.frames, lenses, "opencv", bounds, self.downscale, self.alpha, manifest.size, crop)
+        crop = 1.0 if split == "train" else self.eval_crop
+        return self.views(manifest.frames, lenses, "opencv", size=manifest.size, crop=crop)
 
 
 def _distortion(manifest: Manifest) -> tuple[float, ...] | None:

@@ -54,18 +54,11 @@ class Pictures:
         deep: bool = False,
         recipe: str = "",
     ) -> Pictures:
-        """Pictures whose headers agree.
+        """Pictures, at least one, whose headers agree on a size that `downscale` divides.
 
         Args:
-            files: at least one.
-            read: reader of one file.
-            downscale: side of the blocks of pixels that are averaged.
             expected_size: width and height in pixels as stored, where the data states them.
             deep: whether levels of 8 bits may become others of 16 when they are read.
-            recipe: what `read` does, see `Pictures`.
-
-        Raises:
-            NerfroError: a header cannot be read, has another size than expected or than the first, or does not divide.
         """
         width, height, bits = read_size(files[0])
         if expected_size is not None and expected_size != (width, height):
@@ -102,11 +95,7 @@ class Pictures:
         return (self[index] for index in range(len(self)))
 
     def levels(self, index: int) -> Levels:
-        """The levels of one picture, of type `dtype`.
-
-        Raises:
-            NerfroError: the file cannot be read, or has changed.
-        """
+        """The levels of one picture, of type `dtype`; a file that has changed is refused."""
         levels = self.read(self.files[index])
         if levels.shape[:2] != self.size:
             raise NerfroError(f"image {self.files[index]} has changed since it was looked at; start again")
@@ -120,11 +109,7 @@ class Pictures:
         return levels[top : top + height, left : left + width]
 
     def all_levels(self) -> Iterator[Levels]:
-        """The levels of all pictures in order, decoded side by side, a few ahead of the one that is asked for.
-
-        Raises:
-            NerfroError: as `levels`.
-        """
+        """The levels of all pictures in order, decoded side by side, a few ahead of the one that is asked for."""
         threads = min(os.cpu_count() or 1, _MOST_THREADS)
         # Decoding releases the interpreter's lock, so threads suffice.
         with ThreadPoolExecutor(threads) as pool:

@@ -7,16 +7,16 @@ import math
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.data.base import DataSource, Frame, Views
-from nerfro.data.frames import SPLITS, Lens, check_options, check_pose, check_split, load_views
+from nerfro.data.base import Frame, Views
+from nerfro.data.frames import SPLITS, Lens, PosedImages, check_pose
+from nerfro.data.image_files import Alpha
 from nerfro.data.transforms import parse_matrix
 from nerfro.errors import NerfroError
-from nerfro.paths import resolve_path
 from nerfro.registry import register
 
 # Constants of RefRef's refref_dataparser.py: horizontal field of view, half side of the scene's box, views of a split.
@@ -28,20 +28,14 @@ _COLUMNS = ["image", "mask", "transform_matrix"]
 
 
 @register("data", "refref")
-class RefRefData(DataSource):
+class RefRefData(PosedImages):
     """A scene of RefRef: rows of image, mask and pose (OpenGL axes), a hundred each for train, val and test.
 
     Args:
         root: folder with the scene's .parquet files, at any depth.
         scene: its name, such as cube_smcvx_ampoule; none where the folder holds one scene alone.
-        near: arc length at which rays begin, world units.
-        far: arc length at which rays end; none takes, from the farthest camera of all splits, the
+        near, far, downscale, alpha: see `PosedImages`; `far` none takes, from the farthest camera of all splits, the
             farthest corner of RefRef's box of side 14.6.
-        downscale: side of the blocks of pixels that are averaged into one.
-        alpha: `drop` ignores the images' transparency, `white` and `black` composite them over that colour.
-
-    Raises:
-        NerfroError: an option is out of range.
     """
 
     def __init__(
@@ -51,29 +45,21 @@ class RefRefData(DataSource):
         near: float = 0.2,
         far: float | None = None,
         downscale: int = 1,
-        alpha: Literal["drop", "white", "black"] = "drop",
+        alpha: Alpha = "drop",
     ) -> None:
-        check_options(near, far, downscale)
-        self.root, self.scene = resolve_path(root), scene
-        self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
-
-    @property
-    def splits(self) -> list[str]:
-        return SPLITS
+        super().__init__(root, near, far, downscale, alpha)
+        self.scene = scene
 
     def load(self, split: str) -> Views:
-        check_split(split, self.root)
+        self.require(split)
         files = self._files()
         first = SPLITS.index(split) * _VIEWS_PER_SPLIT
         rows = _read_rows(files, range(first, first + _VIEWS_PER_SPLIT), _COLUMNS)
-        far = _find_far(files) if self.far is None else self.far
+        farthest = _find_far(files) if self.far is None else 0.0
         folder = Path(tempfile.mkdtemp(dir=_unpacked().name))
         frames = [_unpack(row, number, folder, files[0]) for number, row in rows]
-
-        def lenses(width: int, height: int) -> list[Lens]:
-            return [Lens.of_angle(_CAMERA_ANGLE_X, width, height)] * len(frames)
-
-        views = load_views(frames, lenses, "opengl", (self.near, far), self.downscale, self.alpha)
+        lens = functools.partial(Lens.of_angle, _CAMERA_ANGLE_X)
+        views = self.views(frames, lambda w, h: [lens(w, h)] * len(frames), "opengl", farthest=farthest)
         return replace(views, frames=())  # their files go with this process
 
     def _files(self) -> list[Path]:

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import TypeGuard
+from typing import Any, TypeGuard
 
 import numpy as np
 from jaxtyping import Float
@@ -21,24 +21,14 @@ from nerfro.errors import NerfroError, first_of
 
 @dataclass(frozen=True)
 class Manifest:
-    """A parsed `transforms_<split>.json`.
-
-    Attributes:
-        path: of the file.
-        document: its content.
-        frames: its frames, at least one, checked.
-    """
+    """A parsed `transforms_<split>.json` and its checked frames, at least one."""
 
     path: Path
     document: Mapping[str, object]
     frames: list[Frame]
 
     def require(self, key: str, meaning: str) -> object:
-        """A value of the document.
-
-        Raises:
-            NerfroError: it is missing.
-        """
+        """A value that the document must have."""
         if key not in self.document:
             raise NerfroError(f"{self.path} has no '{key}' ({meaning}); add it")
         return self.document[key]
@@ -55,11 +45,7 @@ class Manifest:
 
 
 def find_splits(root: Path) -> dict[str, Path]:
-    """The transforms files of a folder by split; both `transforms_train.json` and `train_transforms.json` are found.
-
-    Raises:
-        NerfroError: the folder does not exist or holds none.
-    """
+    """The transforms files of a folder by split: `transforms_train.json` or `train_transforms.json`, at least one."""
     if not root.is_dir():
         raise NerfroError(f"data.root={root} is not a folder; give the one that holds transforms_train.json")
     found = {path.stem.removesuffix("_transforms"): path for path in root.glob("*_transforms.json")}
@@ -72,17 +58,12 @@ def find_splits(root: Path) -> dict[str, Path]:
     return {name: found[name] for name in sorted(found, key=lambda name: (rank.get(name, len(rank)), name))}
 
 
-def read_manifest(root: Path, split: str) -> Manifest:
-    """Read and check the transforms file of a split.
-
-    Raises:
-        NerfroError: there is no such split; the file is truncated or lacks a key; a frame has no image, a bad pose or
-            another frame's name.
-    """
+def read_manifest(root: Path, split: str, mask_key: str = "mask_path") -> Manifest:
+    """Read and check the transforms file of a split, see `parse_manifest`."""
     splits = find_splits(root)
     if split not in splits:
         raise NerfroError(f"data.root={root} has no split '{split}'; it has {', '.join(splits)}")
-    return parse_manifest(splits[split])
+    return parse_manifest(splits[split], mask_key)
 
 
 def parse_manifest(path: Path, mask_key: str = "mask_path") -> Manifest:
@@ -93,30 +74,34 @@ def parse_manifest(path: Path, mask_key: str = "mask_path") -> Manifest:
         mask_key: key of a frame's silhouette. Under another than the usual one, none is looked for beside the images.
 
     Raises:
-        NerfroError: as `read_manifest`.
+        NerfroError: the file is truncated or lacks a key; a frame has no image, a bad pose or another frame's name.
     """
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise NerfroError(f"{path} is not valid JSON ({error}): truncated? copy or export it again") from error
-    except OSError as error:
-        raise NerfroError(f"{path} cannot be read ({error.strerror}); check its permissions") from error
+    document = read_json(path, "check its permissions")
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list):
         raise NerfroError(f"{path} has no list 'frames'; see docs/data.md for the format")
     if not frames:
         raise NerfroError(f"{path} has an empty list 'frames'; a split needs at least one")
-    manifest = Manifest(path, document, [_read_frame(path, i, frame, mask_key) for i, frame in enumerate(frames)])
-    _check_names(manifest)
-    return manifest
+    read = [_read_frame(path, i, frame, mask_key) for i, frame in enumerate(frames)]
+    counts = Counter(frame.image for frame in read)  # by file: `r_0` and `r_0.png` are one image
+    repeated = list(dict.fromkeys(f"'{frame.name}'" for frame in read if counts[frame.image] > 1))
+    if repeated:
+        raise NerfroError(f"{path}: {first_of(repeated)} occurs in several frames; keep one of each")
+    return Manifest(path, document, read)
+
+
+def read_json(path: Path, unreadable: str) -> Any:
+    """The content of a JSON file; `unreadable` is what to tell the user of one that cannot be opened."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise NerfroError(f"{path} cannot be read ({error.strerror}); {unreadable}") from error
+    except ValueError as error:
+        raise NerfroError(f"{path} is not valid JSON ({error}): truncated? copy or export it again") from error
 
 
 def parse_matrix(value: object, shapes: tuple[tuple[int, int], ...], where: str) -> Float[np.ndarray, "rows columns"]:
-    """A matrix of finite numbers.
-
-    Raises:
-        NerfroError: it is not one, or has none of the shapes.
-    """
+    """A matrix of finite numbers of one of the shapes."""
     allowed = " or ".join(f"{rows}x{columns}" for rows, columns in shapes)
     try:
         matrix = np.array(value, dtype=np.float64)
@@ -165,12 +150,3 @@ def _find_image(root: Path, name: str, where: str) -> Path:
         if candidate.is_file():
             return candidate
     raise NerfroError(f"{where}: image {candidates[0]} does not exist; restore it or take the frame out")
-
-
-def _check_names(manifest: Manifest) -> None:
-    # By file: `r_0` and `r_0.png` are one image.
-    counts = Counter(frame.image for frame in manifest.frames)
-    repeated = list(dict.fromkeys(frame.name for frame in manifest.frames if counts[frame.image] > 1))
-    if repeated:
-        quoted = first_of([f"'{name}'" for name in repeated])
-        raise NerfroError(f"{manifest.path}: {quoted} occurs in several frames; keep one of each")

@@ -13,17 +13,12 @@ from nerfro.errors import NerfroError
 
 
 @contextlib.contextmanager
-def atomic_file(path: Path | str) -> Iterator[IO[bytes]]:
+def atomic_file(path: Path | str, advice: str = "free some space or choose another folder") -> Iterator[IO[bytes]]:
     """Open a file for writing of which a reader sees the old content or the new one, never a part of it.
 
-    What is written goes to a temporary file in the same folder, which takes the place of `path` in one step at the
-    end. When anything fails (a full disk, a missing permission), what was at `path` before is still there.
-
-    Args:
-        path: the file to write; missing parent folders are made.
-
-    Raises:
-        NerfroError: the file cannot be written.
+    What is written goes to a temporary file in the same folder, made if need be, which takes the place of `path` in one
+    step at the end. When anything fails (a full disk, a missing permission), what was at `path` before is still there,
+    and a NerfroError ends with the advice.
     """
     path = Path(path)
     temporary = None
@@ -34,14 +29,16 @@ def atomic_file(path: Path | str) -> Iterator[IO[bytes]]:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
-        # mkstemp makes files private to their owner; give this one the permissions of any other new file.
-        os.chmod(temporary, 0o666 & ~_umask())
+        # mkstemp makes files private to their owner; give this one the permissions of any other new file. The
+        # process's umask can only be read by setting it.
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(temporary, 0o666 & ~umask)
         os.replace(temporary, path)
         temporary = None
     except OSError as error:
         raise NerfroError(
-            f"cannot write {path}: {error.strerror or error}; what was there before is unchanged; "
-            "free some space or choose another folder"
+            f"cannot write {path}: {error.strerror or error}; what was there before is unchanged; {advice}"
         ) from error
     finally:
         if temporary is not None:
@@ -50,32 +47,13 @@ def atomic_file(path: Path | str) -> Iterator[IO[bytes]]:
 
 
 def write_atomically(path: Path | str, content: bytes | str) -> None:
-    """Write bytes, or text as UTF-8, whole or not at all (see `atomic_file`).
-
-    Raises:
-        NerfroError: the file cannot be written.
-    """
+    """Write bytes, or text as UTF-8, whole or not at all (see `atomic_file`)."""
     with atomic_file(path) as stream:
         stream.write(content.encode("utf-8") if isinstance(content, str) else content)
 
 
 def refuse_existing(files: Iterable[Path], overwrite: bool) -> None:
-    """Check that nothing would be replaced that should stay.
-
-    Args:
-        files: that are going to be written, or folders.
-        overwrite: whether they may be replaced.
-
-    Raises:
-        NerfroError: one exists, and `overwrite` is not set.
-    """
+    """Refuse to replace files, or folders, that are going to be written and exist, unless they may be replaced."""
     taken = [path for path in files if path.exists()]
     if taken and not overwrite:
         raise NerfroError(f"{taken[0]} exists; give another out=... or overwrite=true")
-
-
-def _umask() -> int:
-    # The process's umask can only be read by setting it.
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

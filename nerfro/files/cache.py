@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -32,51 +33,40 @@ def content_hash(*parts: np.ndarray | str | float | int | bool) -> str:
 
 
 def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write a compressed .npz so that the file is either complete or not there.
-
-    Raises:
-        NerfroError: the folder cannot be written or the disk is full; nothing that was there is lost.
-    """
+    """Write a compressed .npz so that the file is either complete or not there."""
     with atomic_file(path) as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read a .npz without executing pickled code.
-
-    Raises:
-        NerfroError: the file is missing, truncated or holds anything but plain arrays.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except FileNotFoundError as error:
-        raise NerfroError(f"{path} does not exist; check the path") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise NerfroError(f"{path} is not a readable .npz of plain arrays ({error}); make it again") from error
+    """Read a .npz of plain arrays without executing pickled code."""
+    with _reading(path, "is not a readable .npz of plain arrays", "make it again"), np.load(path) as file:
+        return {name: file[name] for name in file.files}
 
 
 def load_array(path: Path) -> np.ndarray:
-    """Read the numbers of a .npy without executing pickled code, in double precision.
-
-    Raises:
-        NerfroError: the file is missing, truncated or holds anything but an array of numbers.
-    """
-    try:
-        array = np.load(path, allow_pickle=False)
-    except FileNotFoundError as error:
-        raise NerfroError(f"{path} does not exist; check the path") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise NerfroError(f"{path} cannot be read ({error}); copy or export it again") from error
+    """Read the numbers of a .npy without executing pickled code, in double precision."""
+    with _reading(path, "cannot be read", "copy or export it again"):
+        array = np.load(path)
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
         raise NerfroError(f"{path} is not a .npy of numbers; copy or export it again")
     return array.astype(np.float64)
 
 
-Arrays = dict[str, np.ndarray]
+@contextlib.contextmanager
+def _reading(path: Path, trouble: str, advice: str) -> Iterator[None]:
+    """Errors within it that tell of a missing or damaged file name it."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise NerfroError(f"{path} does not exist; check the path") from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise NerfroError(f"{path} {trouble} ({error}); {advice}") from error
 
 
-def cached_arrays(key: str, compute: Callable[[], Arrays], enabled: bool = True) -> Arrays:
+def cached_arrays(
+    key: str, compute: Callable[[], dict[str, np.ndarray]], enabled: bool = True
+) -> dict[str, np.ndarray]:
     """Arrays from the cache, or computed and kept there; a damaged or unwritable cache costs time, never the result.
 
     Args:
@@ -93,8 +83,6 @@ def cached_arrays(key: str, compute: Callable[[], Arrays], enabled: bool = True)
         except NerfroError:
             path.unlink(missing_ok=True)
     arrays = compute()
-    try:
+    with contextlib.suppress(NerfroError):
         save_arrays(path, arrays)
-    except NerfroError:
-        return arrays
     return arrays

@@ -39,15 +39,7 @@ def fit(picture: Float[Tensor, "h w 3"] | None, width: int, height: int) -> Imag
 def sheet(
     pictures: Sequence[Float[Tensor, "h w 3"]], captions: Sequence[str], width: int, columns: int, title: str
 ) -> Image.Image:
-    """Pictures of one size in rows, each with a caption below it, under a title.
-
-    Args:
-        pictures: sRGB in [0, 1].
-        captions: as many.
-        width: of each picture in the sheet, pixels.
-        columns: at most so many pictures in a row.
-        title: above all.
-    """
+    """Pictures (sRGB) drawn `width` pixels wide in rows of at most `columns`, each over its caption, under a title."""
     columns, height = min(columns, len(pictures)), round(width * pictures[0].shape[0] / pictures[0].shape[1])
     pitch = height + LINE_HEIGHT + GAP
     whole = paper(columns * (width + GAP) - GAP, LINE_HEIGHT + -(-len(pictures) // columns) * pitch)
@@ -87,15 +79,7 @@ def magma(values: Float[Tensor, "H W"], limit: float) -> Float[Tensor, "H W 3"]:
 
     The scale is given and never fitted to the values, so that pictures can be compared.
 
-    Args:
-        values: non-negative numbers; those that are NaN become grey.
-        limit: value of the last colour, positive.
-
-    Returns:
-        sRGB in [0, 1], float32.
-
-    Raises:
-        NerfroError: if the limit is not positive.
+    Values are non-negative; those that are NaN become grey. Colours are sRGB, float32.
     """
     if not limit > 0:
         raise NerfroError(f"the limit of a colour scale must be positive, got {limit}")

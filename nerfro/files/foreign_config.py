@@ -16,13 +16,6 @@ def foreign_config(text: str, origin: Path) -> DictConfig:
     """Read a run's configuration as the plain values that nerfro.train writes.
 
     Nothing in it is resolved: `${oc.env:...}` would bring this machine's environment into a page that is shared.
-
-    Args:
-        text: YAML.
-        origin: file that holds it, for errors.
-
-    Raises:
-        NerfroError: it is no mapping, or a value is an interpolation.
     """
     try:
         config = OmegaConf.create(text)

@@ -15,18 +15,9 @@ from nerfro.files.atomic import atomic_file
 
 
 def to_8bit(rgb: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
-    """Clip to [0, 1] and round to the nearest of 256 levels.
+    """Clip finite sRGB values to [0, 1] and round to the nearest of 256 levels.
 
     Truncation instead of rounding would darken every picture by half a level.
-
-    Args:
-        rgb: sRGB values; what lies outside [0, 1] cannot be displayed and is clipped.
-
-    Returns:
-        Levels 0 to 255.
-
-    Raises:
-        NerfroError: if a value is NaN or infinite, or the tensor is not of floating point.
     """
     if not rgb.is_floating_point():
         raise NerfroError(f"expected sRGB values of floating point in [0, 1], got {rgb.dtype}; divide levels by 255")
@@ -45,15 +36,7 @@ def round_to_8bit(rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
 
 
 def save_png(path: Path | str, rgb: Float[Tensor, "H W 3"]) -> None:
-    """Write a picture as 8-bit sRGB PNG, rounded, whole or not at all.
-
-    Args:
-        path: the file to write; missing parent folders are made.
-        rgb: sRGB values, clipped to [0, 1].
-
-    Raises:
-        NerfroError: if the shape is not [H, W, 3], a value is not finite, or the file cannot be written.
-    """
+    """Write sRGB values, clipped to [0, 1] and rounded, as 8-bit PNG, whole or not at all."""
     if rgb.ndim != 3 or rgb.shape[-1] != 3:
         raise NerfroError(f"cannot write {path}: expected a picture [H, W, 3], got {list(rgb.shape)}")
     save_picture(path, Image.fromarray(to_8bit(rgb).cpu().numpy()))
@@ -66,17 +49,7 @@ def save_picture(path: Path | str, picture: Image.Image, optimize: bool = False)
 
 
 def load_png(path: Path | str) -> Float[Tensor, "H W 3"]:
-    """Read an 8-bit picture, as `save_png` wrote it.
-
-    Args:
-        path: an 8-bit grey or RGB picture, without transparency.
-
-    Returns:
-        sRGB values in [0, 1], float32, multiples of 1/255.
-
-    Raises:
-        NerfroError: if the file is missing, truncated, not a picture, not of 8 bits, or transparent.
-    """
+    """Read an 8-bit grey or RGB picture without transparency as float32 sRGB values, multiples of 1/255."""
     try:
         with Image.open(path) as image:
             if image.mode not in ("RGB", "L"):

@@ -49,11 +49,7 @@ def sample(rgb: Float[Tensor, "H W 3"], where: Float[Tensor, "P 3"], width: int)
 
 
 def load_lat_long(path: Path | str) -> Float[Tensor, "H 2*H 3"]:
-    """Read a lat-long picture as linear radiance; lamps of a .hdr or .exr are as bright as they are.
-
-    Raises:
-        NerfroError: the file is missing, not readable, of another format, or not twice as wide as high.
-    """
+    """Read a lat-long picture as linear radiance; lamps of a .hdr or .exr are as bright as they are."""
     path = Path(path)
     suffix = _format(path)
     if not path.is_file():
@@ -77,15 +73,7 @@ def load_lat_long(path: Path | str) -> Float[Tensor, "H 2*H 3"]:
 
 
 def save_lat_long(path: Path | str, radiance: Float[Tensor, "H 2*H 3"]) -> None:
-    """Write a lat-long picture: 8-bit sRGB for .png, clipped; radiance as it is for .hdr and .exr.
-
-    Args:
-        path: its ending chooses the format.
-        radiance: linear.
-
-    Raises:
-        NerfroError: another format, or the file cannot be written.
-    """
+    """Write linear radiance: as 8-bit sRGB, clipped, for .png; as it is for .hdr and .exr."""
     path = Path(path)
     suffix = _format(path)
     if suffix == ".png":

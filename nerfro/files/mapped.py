@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
-import tempfile
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
 
-from nerfro.errors import NerfroError
+from nerfro.files.atomic import atomic_file
 from nerfro.files.cache import cache_dir
 
 # Bytes of all mapped arrays together; those that have not been used for longest go first.
@@ -23,18 +22,12 @@ _ABANDONED_SECONDS = 86400.0
 def mapped_array(
     key: str, shape: tuple[int, ...], dtype: np.dtype, parts: Callable[[], Iterable[np.ndarray]]
 ) -> np.ndarray:
-    """An array of which only what is looked at is in memory, and that the system can drop again.
+    """An array of which only what is looked at is in memory; what is written to it stays in this process.
 
     Args:
         key: hash of all that the array depends on.
         shape, dtype: of the array.
         parts: makes its parts in order, along the first axis; called where there is no file yet.
-
-    Returns:
-        The array; what is written to it stays in this process.
-
-    Raises:
-        NerfroError: the file cannot be written.
     """
     path = cache_dir() / f"{_PREFIX}{key}.npy"
     with contextlib.suppress(OSError, ValueError, EOFError):  # not there, or damaged
@@ -42,27 +35,13 @@ def mapped_array(
         if array.shape == shape and array.dtype == dtype:
             os.utime(path)
             return array
-    temporary = None
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_file(path, "free some space, or set NERFRO_CACHE to another folder") as file:
         _make_room(path.parent, int(np.prod(shape)) * dtype.itemsize)
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=_PREFIX, suffix=".partial", delete=False) as file:
-            temporary = Path(file.name)
-            header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
-            np.lib.format.write_array_header_1_0(file, header)
-            for part in parts():
-                file.write(np.ascontiguousarray(part).data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-        return np.load(path, mmap_mode="c", allow_pickle=False)
-    except OSError as error:
-        raise NerfroError(
-            f"cannot write {path}: {error.strerror or error}; free some space, or set NERFRO_CACHE to another folder"
-        ) from error
-    finally:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
+        header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(file, header)
+        for part in parts():
+            file.write(np.ascontiguousarray(part).data)
+    return np.load(path, mmap_mode="c", allow_pickle=False)
 
 
 def _make_room(folder: Path, num_bytes: int) -> None:
@@ -70,7 +49,7 @@ def _make_room(folder: Path, num_bytes: int) -> None:
 
     A process that has a file mapped keeps it after it is removed.
     """
-    for partial in folder.glob(f"{_PREFIX}*.partial"):
+    for partial in folder.glob(f"*{_PREFIX}*.partial"):
         if time.time() - partial.stat().st_mtime > _ABANDONED_SECONDS:
             partial.unlink(missing_ok=True)
     files = sorted(folder.glob(f"{_PREFIX}*.npy"), key=lambda path: path.stat().st_mtime)

@@ -31,9 +31,8 @@ def encode(linear: np.ndarray) -> bytes:
     start = bytes((2, 2, width >> 8, width & 255))
     lines = []
     for line in pixels:
-        channels = (line[:, c].tobytes() for c in range(4))
-        runs = (bytes((len(part),)) + part for channel in channels for part in _split(channel, 128))
-        lines.append(start + b"".join(runs))
+        parts = (line[at : at + 128, channel].tobytes() for channel in range(4) for at in range(0, width, 128))
+        lines.append(start + b"".join(bytes((len(part),)) + part for part in parts))
     return header + b"".join(lines)
 
 
@@ -52,15 +51,14 @@ def decode(content: bytes) -> np.ndarray:
         raise ValueError(f"orientation {size[:40]!r}; only -Y H +X W is read")
     height, width = int(words[1]), int(words[3])
     encoded = _MIN_RUN_WIDTH <= width <= _MAX_RUN_WIDTH and body[:2] == b"\x02\x02" and body[2] < 128
-    pixels = _decode_runs(body, height, width) if encoded else _decode_flat(body, height, width)
+    if encoded:
+        pixels = _decode_runs(body, height, width)
+    elif len(body) >= 4 * height * width:
+        pixels = np.frombuffer(body, np.uint8, 4 * height * width).reshape(height, width, 4)
+    else:
+        raise ValueError("the file is cut short")
     scale = np.where(pixels[..., 3] > 0, np.ldexp(1.0, pixels[..., 3].astype(np.int32) - 136), 0)
     return ((pixels[..., :3] + 0.5) * scale[..., None]).astype(np.float32)
-
-
-def _decode_flat(body: bytes, height: int, width: int) -> np.ndarray:
-    if len(body) < 4 * height * width:
-        raise ValueError("the file is cut short")
-    return np.frombuffer(body, np.uint8, 4 * height * width).reshape(height, width, 4)
 
 
 def _decode_runs(body: bytes, height: int, width: int) -> np.ndarray:
@@ -85,7 +83,3 @@ def _decode_runs(body: bytes, height: int, width: int) -> np.ndarray:
                 column += count
                 at += 2 if repeated else 1 + count
     return pixels.transpose(0, 2, 1)
-
-
-def _split(data: bytes, length: int) -> list[bytes]:
-    return [data[i : i + length] for i in range(0, len(data), length)]
