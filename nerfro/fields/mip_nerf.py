@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from nerfro.allowed import Count, Natural
 from nerfro.fields.base import Field
 from nerfro.fields.cones import frustum_gaussians
 from nerfro.fields.encoding import integrated_positional_encoding, positional_encoding
@@ -22,12 +23,12 @@ class MipNerfField(Field):
 
     def __init__(
         self,
-        width: int = 256,
-        depth: int = 8,
+        width: Count = 256,
+        depth: Count = 8,
         skip: int = 5,
-        view_width: int = 128,
-        position_degree: int = 16,
-        direction_degree: int = 4,
+        view_width: Count = 128,
+        position_degree: Count = 16,
+        direction_degree: Natural = 4,
     ) -> None:
         super().__init__()
         self.position_degree, self.direction_degree = position_degree, direction_degree

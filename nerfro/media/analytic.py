@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.allowed import Positive
 from nerfro.media.base import Medium
 from nerfro.registry import register
 
@@ -28,7 +29,7 @@ class Vacuum(Medium):
 class Luneburg(Medium):
     """The Luneburg lens, n^2 = 2 - r^2 / R^2 for r < R: parallel rays meet in a point of its surface."""
 
-    def __init__(self, radius: float = 1.0) -> None:
+    def __init__(self, radius: Positive = 1.0) -> None:
         super().__init__()
         self.radius = radius
         self.register_buffer("box", torch.tensor([[-radius] * 3, [radius] * 3]), persistent=False)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.allowed import Natural, NotNegative, Positive, Range, corners_of_box
 from nerfro.errors import NerfroError
 from nerfro.files.cache import cached_arrays, content_hash
 from nerfro.geometry.interpolation import quadratic_spline, spline_coefficients
@@ -17,7 +20,7 @@ from nerfro.geometry.smoothing import smooth
 from nerfro.kernels.constants import constant
 from nerfro.media.base import lazy_buffer
 from nerfro.media.solid import Solid
-from nerfro.media.voxel_grid import check_box, check_margin
+from nerfro.media.voxel_grid import check_margin
 from nerfro.paths import resolve_path
 from nerfro.registry import register
 
@@ -49,16 +52,16 @@ class SdfGrid(Solid):
     def __init__(
         self,
         mesh: str,
-        ior: float = 1.5,
+        ior: Positive = 1.5,
         inner_meshes: list[str] = [],  # noqa: B006 (the registry reads and copies it)
-        inner_iors: list[float] = [],  # noqa: B006
-        resolution: int = 128,
+        inner_iors: list[Positive] = [],  # noqa: B006
+        resolution: Annotated[int, Range(at_least=4)] = 128,
         box_min: list[float] = [-1.5, -1.5, -1.5],  # noqa: B006
         box_max: list[float] = [1.5, 1.5, 1.5],  # noqa: B006
-        shell_voxels: float = 0.1,
-        crease_degrees: float = 30.0,
-        smoothing_size: int = 0,
-        smoothing_sigma: float = 1.0,
+        shell_voxels: Positive = 0.1,
+        crease_degrees: NotNegative = 30.0,
+        smoothing_size: Natural = 0,
+        smoothing_sigma: Positive = 1.0,
         accept_open_mesh: bool = False,
         cache: bool = True,
     ) -> None:
@@ -88,7 +91,7 @@ class SdfGrid(Solid):
                 f"medium.inner_meshes has {len(inner_meshes)} entries and medium.inner_iors {len(inner_iors)}; "
                 "give one index for each inner mesh"
             )
-        box = check_box(box_min, box_max, resolution)
+        box = corners_of_box(box_min, box_max)
         spacing = (box[1] - box[0]) / (resolution - 1)
         super().__init__([ior, *inner_iors], shell_voxels * float(spacing.min()))
         self.crease_degrees = crease_degrees

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from nerfro.allowed import NotNegative, Positive
 from nerfro.media.solid import Solid
 from nerfro.registry import register
 
@@ -18,7 +19,7 @@ _MARGIN = 0.05
 class Ball(Solid):
     """A ball around the origin."""
 
-    def __init__(self, radius: float = 0.8, ior: float = 1.5, shell: float = 0.002) -> None:
+    def __init__(self, radius: Positive = 0.8, ior: Positive = 1.5, shell: Positive = 0.002) -> None:
         """Make a ball.
 
         Args:
@@ -44,7 +45,11 @@ class RoundedBox(Solid):
     """A cube around the origin with rounded edges and corners."""
 
     def __init__(
-        self, half_side: float = 0.75, edge_radius: float = 0.08, ior: float = 1.52, shell: float = 0.002
+        self,
+        half_side: Positive = 0.75,
+        edge_radius: NotNegative = 0.08,
+        ior: Positive = 1.52,
+        shell: Positive = 0.002,
     ) -> None:
         """Make a rounded cube.
 
@@ -76,7 +81,9 @@ class RoundedBox(Solid):
 class Slab(Solid):
     """A plate across the z axis, as wide as its box."""
 
-    def __init__(self, thickness: float = 0.5, ior: float = 1.5, half_width: float = 2.0, shell: float = 0.002) -> None:
+    def __init__(
+        self, thickness: Positive = 0.5, ior: Positive = 1.5, half_width: Positive = 2.0, shell: Positive = 0.002
+    ) -> None:
         """Make a plate.
 
         Args:

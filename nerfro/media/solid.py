@@ -8,11 +8,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from nerfro.errors import NerfroError
+from nerfro.allowed import Positive, checked
 from nerfro.kernels.tolerances import MIN_COSINE, SAFE_SHARE, STEPS_PER_SHELL
 from nerfro.media.base import Medium
 
 
+@checked("medium")
 class Solid(Medium):
     """Bodies of constant index, bounded by the zero levels of signed distances; later bodies lie inside earlier ones.
 
@@ -27,17 +28,8 @@ class Solid(Medium):
 
     iors: Float[Tensor, "K"]
 
-    def __init__(self, iors: list[float], shell: float) -> None:
-        """Set what all solids share.
-
-        Raises:
-            NerfroError: an index or the width is not positive.
-        """
+    def __init__(self, iors: list[Positive], shell: Positive) -> None:
         super().__init__()
-        if not iors or not all(ior > 0 for ior in iors):
-            raise NerfroError(f"{iors} are no refractive indices; give positive numbers such as 1.5")
-        if not shell > 0:
-            raise NerfroError(f"a shell of half width {shell} is impossible; give a positive number")
         # Double precision: kernels ask for it, and a number without dimensions takes on the precision of what it meets.
         self.register_buffer("iors", torch.tensor(iors, dtype=torch.float64), persistent=False)
         self.shell = float(shell)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.allowed import Count, Natural, Positive, Range, corners_of_box
 from nerfro.errors import NerfroError
 from nerfro.files.cache import cached_arrays, content_hash, load_arrays, save_arrays
 from nerfro.geometry.interpolation import trilinear
@@ -43,13 +45,13 @@ class VoxelGrid(Medium):
     def __init__(
         self,
         mesh: str | None = None,
-        ior: float = 1.5,
-        resolution: int = 128,
+        ior: Positive = 1.5,
+        resolution: Annotated[int, Range(at_least=4)] = 128,
         box_min: list[float] = [-1.5, -1.5, -1.5],  # noqa: B006 (the registry reads and copies it)
         box_max: list[float] = [1.5, 1.5, 1.5],  # noqa: B006
-        smoothing_size: int = 9,
-        smoothing_sigma: float = 1.0,
-        subsamples: int = 4,
+        smoothing_size: Natural = 9,
+        smoothing_sigma: Positive = 1.0,
+        subsamples: Count = 4,
         accept_open_mesh: bool = False,
         cache: bool = True,
         grid: str | None = None,
@@ -59,7 +61,7 @@ class VoxelGrid(Medium):
         Args:
             mesh: closed triangle mesh in world units, any format trimesh reads.
             ior: refractive index inside the mesh.
-            resolution: grid vertices a side.
+            resolution: grid vertices a side; 64 to 512 are usual.
             box_min, box_max: corners of the grid, world units; the object needs a margin of air inside.
             smoothing_size: taps of the Gaussian kernel a side, odd; 0 for none.
             smoothing_sigma: standard deviation of the kernel, voxels.
@@ -78,7 +80,7 @@ class VoxelGrid(Medium):
             stored = _load_grid(resolve_path(grid))
             self._set(*stored)
             return
-        box = check_box(box_min, box_max, resolution)
+        box = corners_of_box(box_min, box_max)
         loaded = load_mesh(resolve_path(str(mesh)), accept_open_mesh)
         # One voxel for the sub-samples, one for the gradient's difference, and what the smoothing spreads.
         check_margin(loaded, box, resolution, 2 + smoothing_size // 2)
@@ -115,8 +117,6 @@ class VoxelGrid(Medium):
         return medium
 
     def _set(self, occupancy: Tensor, box: Tensor, ior: float, size: int, sigma: float) -> None:
-        if not ior > 0:
-            raise NerfroError(f"medium.ior={ior} is not a refractive index; give a positive number such as 1.5")
         if any(float(face.abs().max()) > 0 for face in _faces(occupancy)):
             raise NerfroError("the object touches the grid's border; enlarge medium.box_min and medium.box_max")
         self.ior, self.smoothing_size, self.smoothing_sigma = float(ior), int(size), float(sigma)
@@ -185,20 +185,6 @@ class VoxelGrid(Medium):
                 "smoothing": np.array([self.smoothing_size, self.smoothing_sigma]),
             },
         )
-
-
-def check_box(box_min: list[float], box_max: list[float], resolution: int) -> Float[np.ndarray, "2 3"]:
-    """Corners as an array.
-
-    Raises:
-        NerfroError: they are not a box, or the resolution is too small for a gradient.
-    """
-    box = np.array([box_min, box_max], np.float64) if len(box_min) == len(box_max) == 3 else np.zeros((2, 3))
-    if not (np.isfinite(box).all() and (box[1] > box[0]).all()):
-        raise NerfroError(f"box_min={box_min}, box_max={box_max} is no box; give three numbers each, min below max")
-    if resolution < 4:
-        raise NerfroError(f"medium.resolution={resolution} is too small; give at least 4 (64 to 512 are usual)")
-    return box
 
 
 def check_margin(mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], resolution: int, voxels: int) -> None:

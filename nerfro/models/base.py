@@ -13,11 +13,11 @@ from jaxtyping import Float
 from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 
+from nerfro.allowed import checked
 from nerfro.boundaries.base import Boundary
 from nerfro.camera.base import Camera
 from nerfro.camera.given import GivenCamera
 from nerfro.distributed import drawing_for
-from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.light import clipped_alike, to_srgb
 from nerfro.losses.base import Loss
@@ -55,6 +55,7 @@ class Parts:
     chunk_size: int = 8192
 
 
+@checked("model")
 class NerfModel(LightningModule, ABC):
     """Renders rays and learns from pixels; a model adds how many fields there are and where the boundary is asked.
 
@@ -62,15 +63,10 @@ class NerfModel(LightningModule, ABC):
         parts: what the model is composed of.
         fields: radiance field of each sampling level, or one for all.
         colour: what fields and boundary return and rays add up: `linear` radiance, or `srgb` as in the authors' code.
-
-    Raises:
-        NerfroError: another `colour`.
     """
 
     def __init__(self, parts: Parts, fields: list[Field], colour: Literal["linear", "srgb"] = "linear") -> None:
         super().__init__()
-        if colour not in ("linear", "srgb"):
-            raise NerfroError(f"model.colour={colour} is unknown; choose linear, or srgb as in the authors' code")
         self.colour = colour
         self.camera, self.medium = parts.camera, parts.medium
         self.path_sampler, self.point_sampler = parts.path_sampler, parts.point_sampler

@@ -9,9 +9,10 @@ from typing import Optional
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Timer
 
-from nerfro.errors import NerfroError
+from nerfro.allowed import Natural, NotNegative, Positive, checked
 
 
+@checked("optimizer")
 @dataclass
 class OptimizerConfig:
     """Adam with a log-linear learning rate and a sine warm-up (authors' code; mip-NeRF, section 4).
@@ -25,19 +26,14 @@ class OptimizerConfig:
         adam_epsilon: of Adam.
     """
 
-    learning_rate: float = 5e-4
-    final_learning_rate: float = 5e-6
-    boundary_learning_rate: Optional[float] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    medium_learning_rate: Optional[float] = None  # noqa: UP045
-    camera_learning_rate: Optional[float] = None  # noqa: UP045
-    warmup_steps: int = 2500
-    warmup_factor: float = 0.01
-    adam_epsilon: float = 1e-8
-
-    def __post_init__(self) -> None:
-        rates = [self.final_learning_rate, *map(self.rate, ("fields", "boundary", "medium", "camera"))]
-        if min(rates) <= 0 or self.warmup_steps < 0:
-            raise NerfroError(f"{self}: learning rates must be positive and warmup_steps not negative")
+    learning_rate: Positive = 5e-4
+    final_learning_rate: Positive = 5e-6
+    boundary_learning_rate: Optional[Positive] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    medium_learning_rate: Optional[Positive] = None  # noqa: UP045
+    camera_learning_rate: Optional[Positive] = None  # noqa: UP045
+    warmup_steps: Natural = 2500
+    warmup_factor: NotNegative = 0.01
+    adam_epsilon: Positive = 1e-8
 
     def rate(self, part: str) -> float:
         """Learning rate of a part at the beginning."""

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from nerfro.allowed import Count
 from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.kernels.tolerances import MIN_SEARCH_STEP
@@ -48,7 +49,7 @@ class SnellTrace:
 class Snell(PathSampler):
     """Exact refraction (Snell's law) and total reflection at the surface of a solid."""
 
-    def __init__(self, interface: Literal["sdf", "mesh"] = "sdf", max_events: int = 16) -> None:
+    def __init__(self, interface: Literal["sdf", "mesh"] = "sdf", max_events: Count = 16) -> None:
         """Choose the surface.
 
         Args:
@@ -57,8 +58,6 @@ class Snell(PathSampler):
             max_events: refractions and reflections of a ray, at most.
         """
         super().__init__()
-        if max_events < 1:
-            raise NerfroError(f"sampler.path.max_events={max_events} lets no ray in; give at least 2 (16 is usual)")
         self.interface = interface
         self.max_events = max_events
 

@@ -6,11 +6,12 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Optional
+from typing import Annotated, Any, Optional
 
 import numpy as np
 from omegaconf import MISSING, DictConfig
 
+from nerfro.allowed import Count, Natural, NotNegative, Positive, Range
 from nerfro.errors import NerfroError
 from nerfro.files.cache import load_array
 from nerfro.geometry.mesh import load_mesh
@@ -51,13 +52,13 @@ class BatchesConfig:
         divergence: see there.
     """
 
-    size: int = 1024
+    size: Count = 1024
     batching: str = "single_image"
     jitter: bool = False
-    precrop_steps: int = 0
+    precrop_steps: Natural = 0
     precrop_fraction: float = 0.5
-    supersample: int = 1
-    divergence: float = 8.0
+    supersample: Count = 1
+    divergence: NotNegative = 8.0
 
 
 @dataclass
@@ -75,12 +76,12 @@ class EvaluationConfig:
     """
 
     split: str = "test"
-    chunk_size: int = 8192
+    chunk_size: Count = 8192
     lpips_backbone: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     lpips_vgg_backbone: Optional[str] = None  # noqa: UP045
-    every: int = 500
-    supersample: int = 1
-    divergence: float = 0.0
+    every: Natural = 500
+    supersample: Count = 1
+    divergence: NotNegative = 0.0
 
 
 @dataclass
@@ -91,8 +92,8 @@ class CheckpointConfig:
         every_seconds, every_steps: interval.
     """
 
-    every_seconds: Optional[float] = 60.0  # noqa: UP045
-    every_steps: Optional[int] = None  # noqa: UP045
+    every_seconds: Optional[Positive] = 60.0  # noqa: UP045
+    every_steps: Optional[Count] = None  # noqa: UP045
 
 
 @dataclass
@@ -147,7 +148,7 @@ class TrainConfig:
     """
 
     name: str = "refractive"
-    seed: int = 0
+    seed: Annotated[int, Range(at_least=0, at_most=2**32 - 1)] = 0
     data: Any = MISSING
     camera: Any = MISSING
     medium: Any = MISSING
@@ -192,8 +193,6 @@ def build_model(config: DictConfig) -> NerfModel:
     Raises:
         NerfroError: a part is not registered or is configured wrongly.
     """
-    if config.evaluation.chunk_size < 1:
-        raise NerfroError(f"evaluation.chunk_size={config.evaluation.chunk_size} renders nothing; take 1 or more")
     losses = build_losses(config.loss)
     optimizer = OptimizerConfig(**config.optimizer)
     path_sampler = build(config.sampler.path)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from nerfro.allowed import Count, Natural, checked
 from nerfro.cameras import Cameras, Window, central_window
 from nerfro.data.base import Views
 from nerfro.data.pictures import Pictures
@@ -28,6 +29,7 @@ Tracer = Callable[[Rays, Tensor], Path]
 _STEP_OF_DIVIDED = 1 / 32
 
 
+@checked("batches")
 class RayBatches:
     """Random training pixels of every step, which depend on the seed and the step alone.
 
@@ -51,22 +53,13 @@ class RayBatches:
     def __init__(
         self,
         views: Views,
-        batch_size: int,
+        batch_size: Count,
         batching: Batching = "single_image",
-        seed: int = 0,
-        precrop_steps: int = 0,
+        seed: Natural = 0,
+        precrop_steps: Natural = 0,
         precrop_fraction: float = 0.5,
         jitter: bool = False,
     ) -> None:
-        if batching not in get_args(Batching):
-            raise NerfroError(f"batching={batching!r} is unknown; choose {' or '.join(map(repr, get_args(Batching)))}")
-        for name, value, least in (
-            ("batch_size", batch_size, 1),
-            ("seed", seed, 0),
-            ("precrop_steps", precrop_steps, 0),
-        ):
-            if value < least:
-                raise NerfroError(f"{name}={value} is too small; take {least} or more")
         if len(views) == 0:
             raise NerfroError("there are no training images; give at least one")
         self.batch_size, self.batching, self.seed = batch_size, batching, seed

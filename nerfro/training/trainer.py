@@ -70,13 +70,7 @@ def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.
 
 
 def prepare_process(seed: int) -> None:
-    """Set what this process computes with: the seed, how memory is given back, and what Lightning prints.
-
-    Raises:
-        NerfroError: the seed is out of range.
-    """
-    if not 0 <= seed < 2**32:
-        raise NerfroError(f"seed={seed} is no seed; give 0 to {2**32 - 1}")
+    """Set what this process computes with: the seed, how memory is given back, and what Lightning prints."""
     _quieten_lightning()
     keep_freed_memory()
     pl.seed_everything(seed, verbose=False)
