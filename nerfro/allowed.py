@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerfro.errors import NerfroError
 
-Class = TypeVar("Class", bound=type)
+Class = TypeVar("Class")
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,11 @@ NotNegative = Annotated[float, Range(at_least=0)]
 Share = Annotated[float, Range(more_than=0, less_than=1)]
 
 
-def checked(where: str) -> Callable[[Class], Class]:
+def checked(where: str) -> Callable[[type[Class]], type[Class]]:
     """Let a class refuse arguments that its constructor's annotations do not allow, with `where` before the message."""
 
-    def wrap(cls: Class) -> Class:
-        constructor = cls.__init__
+    def wrap(cls: type[Class]) -> type[Class]:
+        constructor = cls.__init__  # type: ignore[misc]
         signature, hints = inspect.signature(constructor), get_type_hints(constructor, include_extras=True)
 
         @functools.wraps(constructor)
@@ -62,7 +62,7 @@ def checked(where: str) -> Callable[[Class], Class]:
             check(f"{where}: ", hints, signature.bind(self, *arguments, **named).arguments)
             constructor(self, *arguments, **named)
 
-        cls.__init__ = init
+        cls.__init__ = init  # type: ignore[misc,method-assign]
         return cls
 
     return wrap
