@@ -125,11 +125,7 @@ def register(kind: str, name: str) -> Callable[[type[Part]], type[Part]]:
 
 
 def plugins(kind: str | None = None) -> list[Plugin]:
-    """All registered plugins (of one kind), by kind and name.
-
-    Raises:
-        NerfroError: unknown kind.
-    """
+    """All registered plugins (of one kind), by kind and name."""
     if kind is not None:
         _require_kind(kind)
     chosen = (p for p in _plugins.values() if kind in (None, p.kind))
@@ -137,11 +133,7 @@ def plugins(kind: str | None = None) -> list[Plugin]:
 
 
 def find(kind: str, name: str) -> Plugin:
-    """The plugin registered as `name`.
-
-    Raises:
-        NerfroError: there is none; the known names are listed.
-    """
+    """The plugin registered as `name`."""
     if (kind, name) not in _plugins:
         known = ", ".join(p.name for p in plugins(kind))
         raise NerfroError(f"no {kind} is called '{name}'; known: {known}")

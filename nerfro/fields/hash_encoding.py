@@ -60,9 +60,6 @@ def grid_levels(num_levels: int, base_resolution: int, finest_resolution: int, l
         num_levels: at least 1.
         base_resolution, finest_resolution: cells along the side of the coarsest and the finest level.
         log2_table_size: logarithm of the largest number of entries of a level.
-
-    Raises:
-        NerfroError: no level, a resolution below 1, a finest one below the base, or a table size out of 2^4 .. 2^24.
     """
     if num_levels < 1 or not 1 <= base_resolution <= finest_resolution:
         raise NerfroError(

@@ -75,9 +75,6 @@ def compile_networks(model: nn.Module, backend: str) -> None:
     Args:
         model: holds the networks; its weights and their names stay as they are.
         backend: of torch.compile, such as `inductor`.
-
-    Raises:
-        NerfroError: there is no such backend.
     """
     known = torch.compiler.list_backends(exclude_tags=())
     if backend not in known:

@@ -17,9 +17,6 @@ def spherical_harmonics(directions: Float[Tensor, "*batch 3"], num_bands: int) -
     Args:
         directions: unit vectors.
         num_bands: 1 to 4.
-
-    Raises:
-        NerfroError: a number of bands that is not implemented.
     """
     check_bands(num_bands)
     x, y, z = directions.unbind(-1)

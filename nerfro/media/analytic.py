@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from nerfro.allowed import Positive
-from nerfro.media.base import Medium
+from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.registry import register
 
 
@@ -19,9 +17,7 @@ class Vacuum(Medium):
         super().__init__()
         self.register_buffer("box", torch.zeros(2, 3), persistent=False)
 
-    def forward(
-        self, positions: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+    def forward(self, positions: Vectors) -> tuple[Scalars, Vectors]:
         return torch.ones_like(positions[..., 0]), torch.zeros_like(positions)
 
 
@@ -34,9 +30,7 @@ class Luneburg(Medium):
         self.radius = radius
         self.register_buffer("box", torch.tensor([[-radius] * 3, [radius] * 3]), persistent=False)
 
-    def forward(
-        self, positions: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+    def forward(self, positions: Vectors) -> tuple[Scalars, Vectors]:
         squared = (positions * positions).sum(-1) / self.radius**2
         inside = squared < 1
         n = torch.where(inside, 2 - squared, 1.0).sqrt()

@@ -18,7 +18,7 @@ from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.signed_distance import signed_distance_grid
 from nerfro.geometry.smoothing import smooth
 from nerfro.kernels.constants import constant
-from nerfro.media.base import lazy_buffer
+from nerfro.media.base import Scalars, Vectors, lazy_buffer
 from nerfro.media.solid import Solid
 from nerfro.media.voxel_grid import check_margin
 from nerfro.paths import resolve_path
@@ -35,6 +35,22 @@ _VERSION = 3
 @register("medium", "sdf_grid")
 class SdfGrid(Solid):
     """Bodies of constant index with the surfaces of meshes; thin shell for eikonal, sharp surface for snell.
+
+    Args:
+        mesh: closed triangle mesh of the outer body, world units, any format trimesh reads.
+        ior: refractive index inside the mesh.
+        inner_meshes: bodies inside it (a liquid, a bubble), each inside those before; opaque things do not belong
+            here, because rays do not bend on them.
+        inner_iors: their refractive indices.
+        resolution: grid vertices a side.
+        box_min, box_max: corners of the grid, world units; the object needs a margin of air inside.
+        shell_voxels: half width of the smooth interface that the Eikonal equation sees, voxels.
+        crease_degrees: edges with larger angles between their faces stay sharp.
+        smoothing_size, smoothing_sigma: Gaussian taps a side and standard deviation (voxels) that the distance is
+            smoothed with, for noisy silhouette hulls; size 0 for none. The kernel is of fourth order: it flattens
+            noise and keeps curvature.
+        accept_open_mesh: take meshes with holes; the majority of three axes decides what is inside.
+        cache: keep the distances in the cache folder.
 
     Attributes:
         distances: signed distance of each body at the grid's vertices.
@@ -65,27 +81,6 @@ class SdfGrid(Solid):
         accept_open_mesh: bool = False,
         cache: bool = True,
     ) -> None:
-        """Compute signed distances to meshes.
-
-        Args:
-            mesh: closed triangle mesh of the outer body, world units, any format trimesh reads.
-            ior: refractive index inside the mesh.
-            inner_meshes: bodies inside it (a liquid, a bubble), each inside those before; opaque things do not belong
-                here, because rays do not bend on them.
-            inner_iors: their refractive indices.
-            resolution: grid vertices a side.
-            box_min, box_max: corners of the grid, world units; the object needs a margin of air inside.
-            shell_voxels: half width of the smooth interface that the Eikonal equation sees, voxels.
-            crease_degrees: edges with larger angles between their faces stay sharp.
-            smoothing_size, smoothing_sigma: Gaussian taps a side and standard deviation (voxels) that the distance is
-                smoothed with, for noisy silhouette hulls; size 0 for none. The kernel is of fourth order: it flattens
-                noise and keeps curvature.
-            accept_open_mesh: take meshes with holes; the majority of three axes decides what is inside.
-            cache: keep the distances in the cache folder.
-
-        Raises:
-            NerfroError: a bad mesh, a bad box, an object without a margin, or indices that do not match the meshes.
-        """
         if len(inner_meshes) != len(inner_iors):
             raise NerfroError(
                 f"medium.inner_meshes has {len(inner_meshes)} entries and medium.inner_iors {len(inner_iors)}; "
@@ -117,8 +112,7 @@ class SdfGrid(Solid):
         Args:
             distances: of each body at the grid's vertices, negative inside; positive at the border.
             box: corners of the grid, world units.
-            iors: refractive index of each body; later bodies lie inside earlier ones.
-            shell: half width of the smooth interface that the Eikonal equation sees, world units.
+            iors, shell: see `Solid`.
         """
         medium = cls.__new__(cls)
         Solid.__init__(medium, iors, shell)
@@ -159,7 +153,7 @@ class SdfGrid(Solid):
         margin = 0.5 * torch.linalg.vector_norm(spacing) + 0.25 * spacing.min()
         return (nearest - margin).clamp(min=0).to(self.distances.device)
 
-    def clearance(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    def clearance(self, positions: Vectors) -> Scalars:
         """Distance to the nearest shell: a lower bound from the blocks, or where that is none the distance itself."""
         grid = self.coarse_clearance
         vertices = constant(self.coefficients.shape[1:], grid.device)
@@ -180,9 +174,7 @@ class SdfGrid(Solid):
         self.register_buffer("coefficients", coefficients, persistent=False)
         self.register_buffer("distances", distances, persistent=False)
 
-    def signed_distances(
-        self, positions: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
+    def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
         """Splines of the distances and their exact gradients."""
         splines = [quadratic_spline(coefficients, self.box, positions) for coefficients in self.coefficients]
         return torch.stack([phi for phi, _ in splines], -1), torch.stack([gradient for _, gradient in splines], -2)

@@ -19,7 +19,7 @@ from nerfro.geometry.occupancy import occupancy_fraction
 from nerfro.geometry.signed_distance import distance_to_set
 from nerfro.geometry.smoothing import gradient, smooth
 from nerfro.kernels.constants import constant
-from nerfro.media.base import Medium, lazy_buffer
+from nerfro.media.base import Medium, Scalars, Vectors, lazy_buffer
 from nerfro.paths import resolve_path
 from nerfro.registry import register
 
@@ -33,6 +33,18 @@ class VoxelGrid(Medium):
 
     n = 1 + (ior - 1) * smooth(occupancy); grad n is the central difference of n on the grid; both are interpolated
     trilinearly between the vertices, so the gradient that is returned is not the derivative of the n that is returned.
+
+    Args:
+        mesh: closed triangle mesh in world units, any format trimesh reads.
+        ior: refractive index inside the mesh.
+        resolution: grid vertices a side; 64 to 512 are usual.
+        box_min, box_max: corners of the grid, world units; the object needs a margin of air inside.
+        smoothing_size: taps of the Gaussian kernel a side, odd; 0 for none.
+        smoothing_sigma: standard deviation of the kernel, voxels.
+        subsamples: inside tests a side around each vertex.
+        accept_open_mesh: take a mesh with holes; the majority of three axes decides what is inside.
+        cache: keep the occupancy in the cache folder.
+        grid: file written by `save`, used with the box, index and smoothing it holds instead of all the above.
 
     Attributes:
         table: n and grad n (per world unit) at each vertex.
@@ -56,23 +68,6 @@ class VoxelGrid(Medium):
         cache: bool = True,
         grid: str | None = None,
     ) -> None:
-        """Voxelise a mesh, or load a grid.
-
-        Args:
-            mesh: closed triangle mesh in world units, any format trimesh reads.
-            ior: refractive index inside the mesh.
-            resolution: grid vertices a side; 64 to 512 are usual.
-            box_min, box_max: corners of the grid, world units; the object needs a margin of air inside.
-            smoothing_size: taps of the Gaussian kernel a side, odd; 0 for none.
-            smoothing_sigma: standard deviation of the kernel, voxels.
-            subsamples: inside tests a side around each vertex.
-            accept_open_mesh: take a mesh with holes; the majority of three axes decides what is inside.
-            cache: keep the occupancy in the cache folder.
-            grid: file written by `save`, used with the box, index and smoothing it holds instead of all the above.
-
-        Raises:
-            NerfroError: no or two sources, a bad mesh, a bad box, or an object without a margin.
-        """
         super().__init__()
         if (mesh is None) == (grid is None):
             raise NerfroError("medium=voxel_grid needs one source; set either medium.mesh or medium.grid")
@@ -139,9 +134,7 @@ class VoxelGrid(Medium):
         occupied = self.occupancy.nonzero()
         return self.box[0] + torch.stack([occupied.amin(0), occupied.amax(0)]) * self.spacing
 
-    def forward(
-        self, positions: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+    def forward(self, positions: Vectors) -> tuple[Scalars, Vectors]:
         """Refractive index and its gradient (per world unit), trilinear; n = 1 and grad n = 0 outside the box."""
         values = trilinear(self.table, self.box, positions)
         inside = ((positions >= self.box[0]) & (positions <= self.box[1])).all(-1)
@@ -161,16 +154,14 @@ class VoxelGrid(Medium):
         diagonal = float(torch.linalg.vector_norm(self.box[1] - self.box[0]))
         return torch.from_numpy(distance.clip(0, diagonal)).to(self.table)
 
-    def clearance(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    def clearance(self, positions: Vectors) -> Scalars:
         """Distance within which grad n is zero, for the cell that holds each point."""
         grid = self.clearance_grid
         cell = ((positions - self.box[0]) / self.spacing).floor().long()
         x, y, z = torch.minimum(cell.clamp(min=0), constant(grid.shape, grid.device) - 1).unbind(-1)
         return grid[x, y, z]
 
-    def step_length(
-        self, directions: Float[Tensor, "*batch 3"], gradients: Float[Tensor, "*batch 3"]
-    ) -> Float[Tensor, "*batch"]:
+    def step_length(self, directions: Vectors, gradients: Vectors) -> Scalars:
         """Half a voxel."""
         return (0.5 * self.spacing.min()).expand(directions.shape[:-1])
 
@@ -188,11 +179,7 @@ class VoxelGrid(Medium):
 
 
 def check_margin(mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], resolution: int, voxels: int) -> None:
-    """Refuse a mesh that does not leave so many voxels of air on each side of the box.
-
-    Raises:
-        NerfroError: with a box that would do.
-    """
+    """Refuse a mesh that does not leave so many voxels of air on each side of the box."""
     low, high = mesh.bounds
     margin = voxels * (box[1] - box[0]) / (resolution - 1)
     if (low - margin >= box[0]).all() and (high + margin <= box[1]).all():

@@ -28,7 +28,17 @@ _ROUNDING = 0.01
 
 @register("sampler/path", "eikonal")
 class Eikonal(PathSampler):
-    """Paths that solve the Eikonal equation: adaptive steps, or equal ones (the paper's: integrator=euler)."""
+    """Paths that solve the Eikonal equation: adaptive steps, or equal ones (the paper's: integrator=euler).
+
+    Args:
+        integrator: adaptive is a leapfrog that steps only where the index varies, jumps elsewhere and keeps few
+            vertices; the others take equal steps from near to far and keep them all. euler is the paper's,
+            leapfrog and rk4 hold |v| = n.
+        num_steps: vertices of a path of equal steps; the paper has 768.
+        tolerance: adaptive: distance of a path from its last tangent at which it gets a vertex, as a share of the
+            box's diagonal.
+        max_steps: adaptive: steps of a ray, at most; beyond them it goes straight on.
+    """
 
     def __init__(
         self,
@@ -37,17 +47,6 @@ class Eikonal(PathSampler):
         tolerance: Positive = 2e-4,
         max_steps: Count = 16384,
     ) -> None:
-        """Choose how to step.
-
-        Args:
-            integrator: adaptive is a leapfrog that steps only where the index varies, jumps elsewhere and keeps few
-                vertices; the others take equal steps from near to far and keep them all. euler is the paper's,
-                leapfrog and rk4 hold |v| = n.
-            num_steps: vertices of a path of equal steps; the paper has 768.
-            tolerance: adaptive: distance of a path from its last tangent at which it gets a vertex, as a share of the
-                box's diagonal.
-            max_steps: adaptive: steps of a ray, at most; beyond them it goes straight on.
-        """
         super().__init__()
         self.integrator, self.num_steps, self.tolerance, self.max_steps = integrator, num_steps, tolerance, max_steps
 

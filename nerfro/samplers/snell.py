@@ -47,19 +47,17 @@ class SnellTrace:
 
 @register("sampler/path", "snell")
 class Snell(PathSampler):
-    """Exact refraction (Snell's law) and total reflection at the surface of a solid."""
+    """Exact refraction (Snell's law) and total reflection at the surface of a solid.
+
+    Args:
+        interface: sdf is the zero level of the signed distance (smooth normals, tolerates noisy hulls);
+            mesh is the triangles themselves (sharp edges, vertex normals where the mesh is smooth).
+        max_events: refractions and reflections of a ray, at most.
+    """
 
     def __init__(self, interface: Literal["sdf", "mesh"] = "sdf", max_events: Count = 16) -> None:
-        """Choose the surface.
-
-        Args:
-            interface: sdf is the zero level of the signed distance (smooth normals, tolerates noisy hulls);
-                mesh is the triangles themselves (sharp edges, vertex normals where the mesh is smooth).
-            max_events: refractions and reflections of a ray, at most.
-        """
         super().__init__()
-        self.interface = interface
-        self.max_events = max_events
+        self.interface, self.max_events = interface, max_events
 
     @torch.no_grad()
     def forward(self, rays: Rays, medium: Medium) -> Path:
@@ -84,11 +82,7 @@ class Snell(PathSampler):
 
     @torch.no_grad()
     def trace(self, rays: Rays, medium: Medium) -> SnellTrace:
-        """Paths, the number of events on each, and which rays had too many.
-
-        Raises:
-            NerfroError: the medium has no surface, or not of the kind that was asked for.
-        """
+        """Paths, the number of events on each, and which rays had too many."""
         if isinstance(medium, Vacuum):
             none = torch.zeros(len(rays), dtype=torch.long, device=rays.near.device)
             return SnellTrace(straight_path(rays), none, none.bool())

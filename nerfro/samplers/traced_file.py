@@ -58,11 +58,7 @@ class TraceConfig:
 def make_rays(
     origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], medium: Medium, near: float, far: float | None
 ) -> Rays:
-    """Rays of the given range; without `far`, of one that leads all of them out of the medium's box.
-
-    Raises:
-        NerfroError: the range is empty.
-    """
+    """Rays of the given range; without `far`, of one that leads all of them out of the medium's box."""
     if far is None:
         centre, diagonal = medium.box.mean(0), float(torch.linalg.vector_norm(medium.box[1] - medium.box[0]))
         distance = float(torch.linalg.vector_norm(origins - centre, dim=-1).max())
@@ -85,11 +81,7 @@ def leave_box(path: Path, medium: Medium) -> tuple[Float[Tensor, "R 3"], Float[T
 
 
 def read_rays(file: FilePath) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
-    """Origins and unit directions from a file.
-
-    Raises:
-        NerfroError: an array is missing, of the wrong shape, not finite, or the directions are not unit vectors.
-    """
+    """Origins and unit directions from a file."""
     arrays = load_arrays(file)
     for name in ("origins", "directions"):
         if name not in arrays:

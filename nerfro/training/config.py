@@ -170,11 +170,7 @@ class TrainConfig:
 
 
 def build_losses(nodes: DictConfig) -> dict[str, Loss]:
-    """Build the training losses from `loss.<registered name>.<field>`.
-
-    Raises:
-        NerfroError: there is no loss, none is registered under a name, or a field is wrong.
-    """
+    """Build the training losses from `loss.<registered name>.<field>`."""
     if not nodes:
         raise NerfroError("there is no loss to train with; give one, such as +loss.photometric.weight=1")
     losses = {}
@@ -188,11 +184,7 @@ def build_losses(nodes: DictConfig) -> dict[str, Loss]:
 
 
 def build_model(config: DictConfig) -> NerfModel:
-    """Compose the model of a configuration (see `TrainConfig`); fills in `config.content` where it is left open.
-
-    Raises:
-        NerfroError: a part is not registered or is configured wrongly.
-    """
+    """Compose the model of a configuration (see `TrainConfig`); fills in `config.content` where it is left open."""
     losses = build_losses(config.loss)
     optimizer = OptimizerConfig(**config.optimizer)
     path_sampler = build(config.sampler.path)

@@ -22,9 +22,6 @@ class PixelStore:
 
     Args:
         images: all of one size; a tensor is kept as it is.
-
-    Raises:
-        NerfroError: a file is truncated or corrupt.
     """
 
     def __init__(self, images: Pictures | Float[Tensor, "V H W 3"]) -> None:

@@ -45,9 +45,6 @@ class RayBatches:
         precrop_steps: number of steps at first during which pixels come from the middle of the images.
         precrop_fraction: share of each side that this middle spans.
         jitter: send rays through a random place in each pixel (or part of one) instead of through its centre.
-
-    Raises:
-        NerfroError: an option is out of range, or an image (or its middle) has fewer usable pixels than a batch.
     """
 
     def __init__(
@@ -106,11 +103,7 @@ class RayBatches:
         self._pixels.forget()
 
     def share(self, rank: int, size: int) -> RayBatches:
-        """The sequence of process `rank` of `size`: an equal part of every batch, in its order.
-
-        Raises:
-            NerfroError: the batch has no equal parts.
-        """
+        """The sequence of process `rank` of `size`: an equal part of every batch, in its order."""
         if self.batch_size % size:
             raise NerfroError(
                 f"batches.size={self.batch_size} cannot be shared evenly by {size} processes; take a multiple of {size}"

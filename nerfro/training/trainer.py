@@ -24,11 +24,7 @@ from nerfro.training.run_folder import LAST_CHECKPOINT
 
 
 def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.Trainer:
-    """Lightning's Trainer with the callbacks that every run has.
-
-    Raises:
-        NerfroError: a field of the trainer, logger or checkpoint section is unknown or wrong.
-    """
+    """Lightning's Trainer with the callbacks that every run has."""
     if (config.checkpoint.every_seconds is None) == (config.checkpoint.every_steps is None):
         raise NerfroError("set one of checkpoint.every_seconds and checkpoint.every_steps, and the other to null")
     seconds, every = config.checkpoint.every_seconds, config.evaluation.every
