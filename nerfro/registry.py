@@ -57,22 +57,15 @@ Part = TypeVar("Part")
 
 @dataclass(frozen=True)
 class Plugin:
-    """A registered class and the configuration made of its constructor.
+    """A registered class and the configuration made of its constructor."""
 
-    Attributes:
-        kind, name: where it stands in the configuration, as in `sampler/path=eikonal`.
-        cls: the class.
-        config: dataclass of its configurable parameters, with `_target_`.
-        hints: annotations of the constructor's parameters, with what they allow (see `nerfro.allowed`).
-        parts: parameters that are not configuration; `build` is given them.
-    """
-
+    # Where it stands in the configuration, as in `sampler/path=eikonal`.
     kind: str
     name: str
     cls: type
-    config: type
-    hints: Mapping[str, Any]
-    parts: frozenset[str]
+    config: type  # dataclass of its configurable parameters, with `_target_`
+    hints: Mapping[str, Any]  # annotations of the constructor's parameters, with what they allow (see `nerfro.allowed`)
+    parts: frozenset[str]  # parameters that are not configuration; `build` is given them
 
     @property
     def target(self) -> str:
@@ -149,12 +142,7 @@ def fields_of_config(name: str) -> list[str] | None:
 def build(node: DictConfig | Mapping[str, object], **parts: object) -> Any:
     """Instantiate the registered class (or Lightning object) that a configuration node names.
 
-    Args:
-        node: configuration with `_target_`.
-        parts: arguments that are not configuration, such as a medium; a class is given those that it asks for.
-
-    Raises:
-        NerfroError: the target is not registered, or a field is unknown, missing or of the wrong type.
+    A class is given those of `parts` that it asks for.
     """
     node = node if isinstance(node, DictConfig) else OmegaConf.create(dict(node))
     target = node.get("_target_")

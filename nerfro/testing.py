@@ -41,12 +41,7 @@ class ContractError(AssertionError):
 
 
 def check(plugin: Plugin, fields: Mapping[str, object] | None = None) -> None:
-    """Check a registered plugin against the contract of its kind.
-
-    Args:
-        plugin: see `nerfro.registry.plugins`.
-        fields: configuration that differs from the defaults.
-    """
+    """Check a registered plugin against the contract of its kind."""
     _require(bool(plugin.summary), "the class has no docstring, which `python -m nerfro.plugins` shows")
     base, keeps_contract = _CONTRACTS[plugin.kind]
     part = build({"_target_": plugin.target, **(fields or {})}, parts=example_parts())

@@ -70,12 +70,7 @@ class RadianceMLP(nn.Module):
 
 
 def compile_networks(model: nn.Module, backend: str) -> None:
-    """Have torch.compile compile a model's networks in place, for any number of points.
-
-    Args:
-        model: holds the networks; its weights and their names stay as they are.
-        backend: of torch.compile, such as `inductor`.
-    """
+    """Have torch.compile compile a model's networks in place, for any number of points."""
     known = torch.compiler.list_backends(exclude_tags=())
     if backend not in known:
         raise NerfroError(f"compile={backend} is no backend of torch.compile here; there are {', '.join(known)}")

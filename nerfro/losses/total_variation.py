@@ -48,13 +48,7 @@ class TotalVariation(Loss):
 def direction_pairs(
     num: int, angle: float, device: torch.device | str
 ) -> tuple[Float[Tensor, "num 3"], Float[Tensor, "num 3"]]:
-    """Uniformly random unit directions, and for each another one in a random direction from it.
-
-    Args:
-        num: pairs.
-        angle: between the two, radians.
-        device: where to make them.
-    """
+    """Uniformly random unit directions, and for each another one `angle` radians from it, anywhere around."""
     first = normalize(torch.randn(num, 3, device=device), dim=-1)
     tangent = normalize(torch.linalg.cross(first, torch.randn(num, 3, device=device)), dim=-1)
     return first, math.cos(angle) * first + math.sin(angle) * tangent

@@ -32,13 +32,9 @@ _STEPS_PER_DIAGONAL = 512
 
 
 class Medium(nn.Module, ABC):
-    """Refractive index in space; outside its box n = 1 and grad n = 0.
+    """Refractive index in space; outside its box n = 1 and grad n = 0."""
 
-    Attributes:
-        box: lower and upper corner, world units.
-    """
-
-    box: Float[Tensor, "2 3"]
+    box: Float[Tensor, "2 3"]  # lower and upper corner, world units
 
     @abstractmethod
     def forward(self, positions: Vectors) -> tuple[Scalars, Vectors]:

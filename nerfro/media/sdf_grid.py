@@ -53,15 +53,13 @@ class SdfGrid(Solid):
         cache: keep the distances in the cache folder.
 
     Attributes:
-        distances: signed distance of each body at the grid's vertices.
-        coefficients: of the quadratic B-splines through them.
         meshes: the surfaces themselves; empty where the medium was made of distances.
-        vertices: where the meshes' vertices are now, one mesh after another, world units; a parameter where the
-            triangles are learned.
     """
 
-    distances: Float[Tensor, "K X Y Z"]
-    coefficients: Float[Tensor, "K X Y Z"]
+    distances: Float[Tensor, "K X Y Z"]  # signed distance of each body at the grid's vertices
+    coefficients: Float[Tensor, "K X Y Z"]  # of the quadratic B-splines through them
+    # Where the meshes' vertices are now, one mesh after another, world units; a parameter where the triangles are
+    # learned.
     vertices: Float[Tensor, "V 3"]
     _traced: tuple[Tensor, int, Triangles, MeshIntersector] | None = None
 
@@ -109,10 +107,7 @@ class SdfGrid(Solid):
     ) -> SdfGrid:
         """Make the medium of given signed distances.
 
-        Args:
-            distances: of each body at the grid's vertices, negative inside; positive at the border.
-            box: corners of the grid, world units.
-            iors, shell: see `Solid`.
+        They are of each body at the vertices of a grid over `box`, negative inside and positive at the border.
         """
         medium = cls.__new__(cls)
         Solid.__init__(medium, iors, shell)

@@ -22,11 +22,10 @@ class Solid(Medium):
     n <- n + (ior - n) S.
 
     Attributes:
-        iors: refractive index of each body; a parameter where it is learned.
         shell: half width w, world units.
     """
 
-    iors: Float[Tensor, "K"]
+    iors: Float[Tensor, "K"]  # refractive index of each body; a parameter where it is learned
 
     def __init__(self, iors: list[Positive], shell: Positive) -> None:
         super().__init__()

@@ -45,14 +45,10 @@ class VoxelGrid(Medium):
         accept_open_mesh: take a mesh with holes; the majority of three axes decides what is inside.
         cache: keep the occupancy in the cache folder.
         grid: file written by `save`, used with the box, index and smoothing it holds instead of all the above.
-
-    Attributes:
-        table: n and grad n (per world unit) at each vertex.
-        occupancy: fraction inside the mesh, before smoothing.
     """
 
-    table: Float[Tensor, "X Y Z 4"]
-    occupancy: Float[Tensor, "X Y Z"]
+    table: Float[Tensor, "X Y Z 4"]  # n and grad n (per world unit) at each vertex
+    occupancy: Float[Tensor, "X Y Z"]  # fraction inside the mesh, before smoothing
 
     def __init__(
         self,
@@ -100,11 +96,8 @@ class VoxelGrid(Medium):
     ) -> VoxelGrid:
         """Make the medium of given occupancy fractions.
 
-        Args:
-            occupancy: fraction of object at each vertex, 0 to 1; air at the border.
-            box: corners of the grid, world units.
-            ior: refractive index of the object.
-            size, sigma: taps a side and standard deviation (voxels) of the smoothing kernel.
+        They are of the vertices of a grid over `box`, 0 to 1, with air at the border; smoothed with `size` taps a side
+        and a standard deviation of `sigma` voxels.
         """
         medium = cls.__new__(cls)
         Medium.__init__(medium)

@@ -29,30 +29,19 @@ from nerfro.types import Batch, Path, Rays, Rendering
 
 @dataclass(frozen=True)
 class Parts:
-    """What a model is composed of.
+    """What a model is composed of."""
 
-    Attributes:
-        medium: refractive index.
-        path_sampler, point_sampler: how rays become paths and paths samples.
-        make_field: makes a new radiance field.
-        boundary: what lies beyond the volume.
-        losses: training losses by name.
-        optimizer: settings of Adam.
-        camera: what is believed of the training cameras.
-        seed: of all random draws in training.
-        chunk_size: rays rendered at once in evaluation, which bounds its memory.
-    """
-
-    medium: Medium
+    medium: Medium  # refractive index
+    # How rays become paths and paths samples.
     path_sampler: PathSampler
     point_sampler: PointSampler
-    make_field: Callable[[], Field]
-    boundary: Boundary
-    losses: Mapping[str, Loss]
-    optimizer: OptimizerConfig
-    camera: Camera = dataclasses.field(default_factory=GivenCamera)
-    seed: int = 0
-    chunk_size: int = 8192
+    make_field: Callable[[], Field]  # makes a new radiance field
+    boundary: Boundary  # what lies beyond the volume
+    losses: Mapping[str, Loss]  # training losses by name
+    optimizer: OptimizerConfig  # settings of Adam
+    camera: Camera = dataclasses.field(default_factory=GivenCamera)  # what is believed of the training cameras
+    seed: int = 0  # of all random draws in training
+    chunk_size: int = 8192  # rays rendered at once in evaluation, which bounds its memory
 
 
 @checked("model")
@@ -112,12 +101,7 @@ class NerfModel(LightningModule, ABC):
     def difference(self, radiance: Float[Tensor, "*batch 3"], rgb: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor]:
         """Prediction and target, both sRGB, for a loss to compare.
 
-        Args:
-            radiance: of pixels, as rendered.
-            rgb: of the same pixels in the photograph, sRGB in [0, 1].
-
-        Returns:
-            The prediction encoded, and the target; equal where both are brighter than a photograph can tell.
+        They are equal where both are brighter than a photograph can tell.
         """
         prediction = self.encode(radiance)
         return prediction, rgb if self.colour == "srgb" else clipped_alike(rgb, prediction)

@@ -151,15 +151,7 @@ def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int)
     """Leapfrog steps where the index varies, straight jumps elsewhere: the plain reference of the compiled kernel.
 
     A vertex is kept where the path has left the tangent of the last one by `tolerance`, and at the start of jumps.
-
-    Args:
-        rays: in world space.
-        medium: any.
-        tolerance: world units.
-        max_steps: steps and jumps of a ray, at most.
-
-    Returns:
-        Paths, and whether a ray met the limit; such a ray goes straight on.
+    Lengths are in world units. Also returned is whether a ray met the limit; such a ray goes straight on.
     """
     vertices = _NewVertices(rays, tolerance)
     state, refracted, exceeded = _march(rays, medium, max_steps, vertices)

@@ -32,17 +32,11 @@ _ROOT_ITERATIONS = 60
 
 @dataclass(frozen=True)
 class SnellTrace:
-    """Paths and what happened on them.
+    """Paths and what happened on them."""
 
-    Attributes:
-        path: minimal polylines, a vertex for each event beside near and far.
-        num_events: refractions and total reflections of each ray.
-        exceeded: whether a ray met the limit of events; such a ray goes straight on from there.
-    """
-
-    path: Path
-    num_events: Int[Tensor, "R"]
-    exceeded: Bool[Tensor, "R"]
+    path: Path  # minimal polylines, a vertex for each event beside near and far
+    num_events: Int[Tensor, "R"]  # refractions and total reflections of each ray
+    exceeded: Bool[Tensor, "R"]  # whether a ray met the limit of events; such a ray goes straight on from there
 
 
 @register("sampler/path", "snell")

@@ -35,16 +35,8 @@ class RayBatches:
 
     A run that stops and resumes therefore sees the batches that it would have seen.
 
-    Args:
-        views: posed images, of which the usable pixels are drawn; their tensors' device is where batches are made, see
-            `to`.
-        batch_size: number of pixels in a batch.
-        batching: `single_image` draws different pixels of one random image, `all_images` draws each pixel anew from
-            all images.
-        seed: of the sequence.
-        precrop_steps: number of steps at first during which pixels come from the middle of the images.
-        precrop_fraction: share of each side that this middle spans.
-        jitter: send rays through a random place in each pixel (or part of one) instead of through its centre.
+    The options are those of `training.config.BatchesConfig`. Batches are made on the device of the views' tensors, of
+    their usable pixels.
     """
 
     def __init__(
@@ -88,11 +80,8 @@ class RayBatches:
     def traced(self, trace: Tracer, side: int = 1, divergence: float = 8.0) -> RayBatches:
         """The sequence with the paths of its rays, more than one for pixels for which one does not stand.
 
-        Args:
-            trace: paths of the rays of views, without gradients.
-            side: rays in each direction of a divided pixel; 1 divides none.
-            divergence: pixels are divided whose ray leaves in another direction than the one beside it, by this many
-                pixel angles or more; see `pixel_parts.divergence`.
+        Pixels are divided whose ray leaves in another direction than the one beside it, by `divergence` pixel angles or
+        more (see `pixel_parts.divergence`), into `side` rays in each direction; 1 divides none.
         """
         traced = copy.copy(self)
         traced._trace, traced._side, traced._divergence = trace, side, divergence
