@@ -18,6 +18,7 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from nerfro.allowed import check_settings
 from nerfro.errors import NerfroError
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover, fields_of_config
@@ -43,6 +44,7 @@ def entry_point(
         @functools.wraps(task)
         def job(config: DictConfig) -> None:
             with errors_in_one_line():  # inside the job too, or Hydra prints a line of its own first
+                check_settings(config, schema)
                 task(config)
 
         @functools.wraps(task)

@@ -27,6 +27,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from torch import nn
 
+from nerfro.allowed import check, checked
 from nerfro.errors import NerfroError
 from nerfro.paths import PLUGINS_DIR
 
@@ -56,22 +57,15 @@ Part = TypeVar("Part")
 
 @dataclass(frozen=True)
 class Plugin:
-    """A registered class and the configuration made of its constructor.
+    """A registered class and the configuration made of its constructor."""
 
-    Attributes:
-        kind, name: where it stands in the configuration, as in `sampler/path=eikonal`.
-        cls: the class.
-        config: dataclass of its configurable parameters, with `_target_`.
-        choices: allowed values of the parameters that were annotated with `Literal`.
-        parts: parameters that are not configuration; `build` is given them.
-    """
-
+    # Where it stands in the configuration, as in `sampler/path=eikonal`.
     kind: str
     name: str
     cls: type
-    config: type
-    choices: Mapping[str, tuple[object, ...]]
-    parts: frozenset[str]
+    config: type  # dataclass of its configurable parameters, with `_target_`
+    hints: Mapping[str, Any]  # annotations of the constructor's parameters, with what they allow (see `nerfro.allowed`)
+    parts: frozenset[str]  # parameters that are not configuration; `build` is given them
 
     @property
     def target(self) -> str:
@@ -88,8 +82,8 @@ class Plugin:
             if field.name == "_target_":
                 continue
             default = field.default_factory() if callable(field.default_factory) else field.default
-            choices = self.choices.get(field.name)
-            kind = " | ".join(map(str, choices)) if choices else _type_name(field.type)
+            hint = self.hints[field.name]
+            kind = " | ".join(map(str, get_args(hint))) if get_origin(hint) is Literal else _type_name(field.type)
             yield field.name, kind, "required" if default is MISSING else default
 
 
@@ -101,7 +95,7 @@ def register(kind: str, name: str) -> Callable[[type[Part]], type[Part]]:
     """Make a class available as option `name` of `kind`; its constructor's signature becomes its configuration.
 
     Parameters annotated with int, float, bool, str, their optional, list and dict forms or `Literal` are configuration;
-    any other parameter is a part that `build` is given.
+    any other parameter is a part that `build` is given. What annotations do not allow is refused (`nerfro.allowed`).
 
     Raises:
         NerfroError: unknown kind, or the name is taken.
@@ -118,17 +112,13 @@ def register(kind: str, name: str) -> Callable[[type[Part]], type[Part]]:
         plugin = _make_plugin(kind, name, cls)
         _plugins[kind, name] = plugin
         ConfigStore.instance().store(group=kind, name=name, node=plugin.config, provider="nerfro")
-        return cls
+        return checked(f"{kind}={name}")(cls)
 
     return add
 
 
 def plugins(kind: str | None = None) -> list[Plugin]:
-    """All registered plugins (of one kind), by kind and name.
-
-    Raises:
-        NerfroError: unknown kind.
-    """
+    """All registered plugins (of one kind), by kind and name."""
     if kind is not None:
         _require_kind(kind)
     chosen = (p for p in _plugins.values() if kind in (None, p.kind))
@@ -136,11 +126,7 @@ def plugins(kind: str | None = None) -> list[Plugin]:
 
 
 def find(kind: str, name: str) -> Plugin:
-    """The plugin registered as `name`.
-
-    Raises:
-        NerfroError: there is none; the known names are listed.
-    """
+    """The plugin registered as `name`."""
     if (kind, name) not in _plugins:
         known = ", ".join(p.name for p in plugins(kind))
         raise NerfroError(f"no {kind} is called '{name}'; known: {known}")
@@ -156,12 +142,7 @@ def fields_of_config(name: str) -> list[str] | None:
 def build(node: DictConfig | Mapping[str, object], **parts: object) -> Any:
     """Instantiate the registered class (or Lightning object) that a configuration node names.
 
-    Args:
-        node: configuration with `_target_`.
-        parts: arguments that are not configuration, such as a medium; a class is given those that it asks for.
-
-    Raises:
-        NerfroError: the target is not registered, or a field is unknown, missing or of the wrong type.
+    A class is given those of `parts` that it asks for.
     """
     node = node if isinstance(node, DictConfig) else OmegaConf.create(dict(node))
     target = node.get("_target_")
@@ -214,11 +195,7 @@ def configure(plugin: Plugin, node: DictConfig | Mapping[str, object]) -> dict[s
         known = ", ".join(name for name, _, _ in plugin.fields()) or "none"
         raise NerfroError(f"{where}: {_first_line(error)}; its fields: {known}") from error
     values = {str(key): value for key, value in typing.cast(dict, settled).items() if key != "_target_"}
-    for name, allowed in plugin.choices.items():
-        if values[name] not in allowed:
-            raise NerfroError(
-                f"{where}: {name}={values[name]!r} is not allowed; choose {', '.join(map(repr, allowed))}"
-            )
+    check(f"{where}: ", plugin.hints, values)
     return values
 
 
@@ -279,10 +256,9 @@ def _import_plugin(module: str, where: str) -> None:
 
 
 def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
-    constructor = cls.__init__  # type: ignore[misc]
+    constructor = inspect.unwrap(cls.__init__)  # type: ignore[misc]
     hints = typing.get_type_hints(constructor)
     fields: list[tuple[str, Any, Any]] = []
-    choices: dict[str, tuple[object, ...]] = {}
     parts: set[str] = set()
     # Classes without a constructor of their own have no configuration; nn.Module's takes anything.
     own = constructor not in (object.__init__, nn.Module.__init__)
@@ -291,7 +267,6 @@ def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
             raise NerfroError(f"{kind}={name}: its constructor takes *{parameter.name}; name every parameter instead")
         hint = hints.get(parameter.name)
         if get_origin(hint) is Literal:
-            choices[parameter.name] = get_args(hint)
             hint = type(get_args(hint)[0])
         config_type = _config_type(hint)
         if config_type is None:
@@ -301,7 +276,8 @@ def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
     target = f"{cls.__module__}.{cls.__qualname__}"
     fields.append(("_target_", str, dataclasses.field(default=target)))
     config = dataclasses.make_dataclass(f"{cls.__name__}Config", fields, kw_only=True)
-    return Plugin(kind, name, cls, config, choices, frozenset(parts))
+    allowing = typing.get_type_hints(constructor, include_extras=True)
+    return Plugin(kind, name, cls, config, allowing, frozenset(parts))
 
 
 def _config_type(hint: Any) -> Any:

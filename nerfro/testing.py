@@ -15,6 +15,7 @@ from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.camera.base import Camera
 from nerfro.cameras import Cameras
+from nerfro.data.base import DataSource
 from nerfro.fields.base import Field
 from nerfro.fields.nerf import NerfField
 from nerfro.losses.base import Loss
@@ -40,17 +41,12 @@ class ContractError(AssertionError):
 
 
 def check(plugin: Plugin, fields: Mapping[str, object] | None = None) -> None:
-    """Check a registered plugin against the contract of its kind.
-
-    Args:
-        plugin: see `nerfro.registry.plugins`.
-        fields: configuration that differs from the defaults.
-
-    Raises:
-        ContractError: the contract is broken.
-    """
+    """Check a registered plugin against the contract of its kind."""
     _require(bool(plugin.summary), "the class has no docstring, which `python -m nerfro.plugins` shows")
-    _CONTRACTS[plugin.kind](plugin, dict(fields or {}))
+    base, keeps_contract = _CONTRACTS[plugin.kind]
+    part = build({"_target_": plugin.target, **(fields or {})}, parts=example_parts())
+    _require(isinstance(part, base), f"a {plugin.kind} derives from {base.__module__}.{base.__name__}")
+    keeps_contract(part)
 
 
 def example_rays(num_rays: int = NUM_RAYS) -> Rays:
@@ -93,13 +89,7 @@ def example_batch() -> Batch:
     return Batch(example_rays(), view, torch.full((NUM_RAYS, 3), 0.5), cameras)
 
 
-def _make(plugin: Plugin, fields: dict[str, object], **parts: object) -> Any:
-    return build({"_target_": plugin.target, **fields}, **parts)
-
-
-def _check_medium(plugin: Plugin, fields: dict[str, object]) -> None:
-    medium = _make(plugin, fields)
-    _require(isinstance(medium, Medium), "a medium derives from nerfro.media.base.Medium")
+def _check_medium(medium: Medium) -> None:
     low, high = medium.box
     points = low + torch.rand(200, 3) * (high - low)
     ior, gradient = medium(points)
@@ -109,16 +99,12 @@ def _check_medium(plugin: Plugin, fields: dict[str, object]) -> None:
     _require(bool((ior == 1).all()) and bool((gradient == 0).all()), "outside the box n = 1 and grad n = 0")
 
 
-def _check_camera(plugin: Plugin, fields: dict[str, object]) -> None:
-    camera = _make(plugin, fields)
-    _require(isinstance(camera, Camera), "a camera part derives from nerfro.camera.base.Camera")
+def _check_camera(camera: Camera) -> None:
     rays = camera(example_rays(), torch.arange(NUM_RAYS) % 2)
     _require(rays.origins.shape == (NUM_RAYS, 3) and _unit(rays.directions), "forward returns unit rays")
 
 
-def _check_path_sampler(plugin: Plugin, fields: dict[str, object]) -> None:
-    sampler = _make(plugin, fields)
-    _require(isinstance(sampler, PathSampler), "a path sampler derives from nerfro.samplers.base.PathSampler")
+def _check_path_sampler(sampler: PathSampler) -> None:
     rays = example_rays()
     path = sampler(rays, Ball())
     num_vertices = path.s.shape[1]
@@ -137,9 +123,7 @@ def _check_path_sampler(plugin: Plugin, fields: dict[str, object]) -> None:
     )
 
 
-def _check_point_sampler(plugin: Plugin, fields: dict[str, object]) -> None:
-    sampler = _make(plugin, fields)
-    _require(isinstance(sampler, PointSampler), "a point sampler derives from nerfro.samplers.base.PointSampler")
+def _check_point_sampler(sampler: PointSampler) -> None:
     path = example_path()
     for training in (True, False):
         sampler.train(training)
@@ -168,9 +152,7 @@ def _check_samples(samples: Samples, path: Path) -> None:
     _require(torch.allclose(samples.positions, expected, atol=1e-3), "positions lie on the path at arc length s")
 
 
-def _check_field(plugin: Plugin, fields: dict[str, object]) -> None:
-    field = _make(plugin, fields)
-    _require(isinstance(field, Field), "a field derives from nerfro.fields.base.Field")
+def _check_field(field: Field) -> None:
     samples = example_samples()
     radiance = field(samples)
     _require(radiance.density.shape == samples.s.shape, "density is [R, N]")
@@ -181,9 +163,7 @@ def _check_field(plugin: Plugin, fields: dict[str, object]) -> None:
     _require_gradients(field)
 
 
-def _check_boundary(plugin: Plugin, fields: dict[str, object]) -> None:
-    boundary = _make(plugin, fields)
-    _require(isinstance(boundary, Boundary), "a boundary derives from nerfro.boundaries.base.Boundary")
+def _check_boundary(boundary: Boundary) -> None:
     directions = torch.nn.functional.normalize(torch.randn(4, 5, 3), dim=-1)
     rgb = boundary(Exits(directions))
     _require(rgb.shape == directions.shape, "forward keeps all leading axes: [..., 3] -> [..., 3]")
@@ -195,18 +175,14 @@ def _check_boundary(plugin: Plugin, fields: dict[str, object]) -> None:
         _require_gradients(boundary)
 
 
-def _check_loss(plugin: Plugin, fields: dict[str, object]) -> None:
-    loss = _make(plugin, fields)
-    _require(isinstance(loss, Loss), "a loss derives from nerfro.losses.base.Loss")
+def _check_loss(loss: Loss) -> None:
     rendering = example_rendering()
-    value = loss([rendering, rendering], example_batch(), _example_model())
+    value = loss([rendering, rendering], example_batch(), RefractiveModel(example_parts()))
     _require(value.shape == (), "a loss is a scalar")
     _require(bool(value.isfinite()), "a loss is finite")
 
 
-def _check_model(plugin: Plugin, fields: dict[str, object]) -> None:
-    model = _make(plugin, fields, parts=example_parts())
-    _require(isinstance(model, NerfModel), "a model derives from nerfro.models.base.NerfModel")
+def _check_model(model: NerfModel) -> None:
     renderings = model(example_rays())
     _require(len(renderings) >= 1, "forward returns a rendering for each level")
     _require(renderings[-1].rgb.shape == (NUM_RAYS, 3), "rgb is [R, 3]")
@@ -214,8 +190,7 @@ def _check_model(plugin: Plugin, fields: dict[str, object]) -> None:
     _require_gradients(model.fields)
 
 
-def _check_data(plugin: Plugin, fields: dict[str, object]) -> None:
-    source = _make(plugin, fields)
+def _check_data(source: DataSource) -> None:
     for split in source.splits:
         views = source.load(split)
         size = (views.cameras.height, views.cameras.width)
@@ -227,16 +202,16 @@ def _check_data(plugin: Plugin, fields: dict[str, object]) -> None:
         )
 
 
-_CONTRACTS: dict[str, Callable[[Plugin, dict[str, object]], None]] = {
-    "camera": _check_camera,
-    "medium": _check_medium,
-    "sampler/path": _check_path_sampler,
-    "sampler/points": _check_point_sampler,
-    "field": _check_field,
-    "boundary": _check_boundary,
-    "loss": _check_loss,
-    "model": _check_model,
-    "data": _check_data,
+_CONTRACTS: dict[str, tuple[type, Callable[[Any], None]]] = {
+    "camera": (Camera, _check_camera),
+    "medium": (Medium, _check_medium),
+    "sampler/path": (PathSampler, _check_path_sampler),
+    "sampler/points": (PointSampler, _check_point_sampler),
+    "field": (Field, _check_field),
+    "boundary": (Boundary, _check_boundary),
+    "loss": (Loss, _check_loss),
+    "model": (NerfModel, _check_model),
+    "data": (DataSource, _check_data),
 }
 
 
@@ -251,10 +226,6 @@ def example_parts() -> Parts:
         losses={"photometric": Photometric()},
         optimizer=OptimizerConfig(),
     )
-
-
-def _example_model() -> NerfModel:
-    return RefractiveModel(example_parts())
 
 
 def _unit(directions: torch.Tensor) -> bool:

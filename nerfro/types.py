@@ -26,30 +26,23 @@ class Path:
     Light that splits takes several polylines of one ray, each complete from the camera on; rendering adds up what they
     bring. A straight ray is a path of two vertices. Rows with fewer vertices than others repeat their last one (s and
     all).
-
-    Attributes:
-        positions: vertices.
-        directions: unit direction in which each vertex is left.
-        s: arc length from the camera at each vertex, non-decreasing. s[:, 0] is near; s[:, -1] is far, or more where
-            the object is left later.
-        exit_directions: unit direction in which the polyline leaves the bounded volume.
-        refracted: whether the polyline met the medium (n not 1) at all.
-        radii: pixel cone radius at unit distance, carried along from the rays.
-        ray: the ray that each polyline belongs to, non-decreasing, every ray with one polyline at least; by default
-            each ray has one.
-        throughput: linear factor of the light that the polyline brings; 1 by default. Those of a ray sum to at most 1.
-        body: innermost body of the medium in which each vertex is left, numbered from 1; 0 in air, or where the index
-            varies continuously.
     """
 
-    positions: Float[Tensor, "P S 3"]
-    directions: Float[Tensor, "P S 3"]
+    positions: Float[Tensor, "P S 3"]  # vertices
+    directions: Float[Tensor, "P S 3"]  # unit direction in which each vertex is left
+    # Arc length from the camera at each vertex, non-decreasing. s[:, 0] is near; s[:, -1] is far, or more where
+    # the object is left later.
     s: Float[Tensor, "P S"]
-    exit_directions: Float[Tensor, "P 3"]
-    refracted: Bool[Tensor, "P"]
-    radii: Float[Tensor, "P"]
+    exit_directions: Float[Tensor, "P 3"]  # unit direction in which the polyline leaves the bounded volume
+    refracted: Bool[Tensor, "P"]  # whether the polyline met the medium (n not 1) at all
+    radii: Float[Tensor, "P"]  # pixel cone radius at unit distance, carried along from the rays
+    # The ray that each polyline belongs to, non-decreasing, every ray with one polyline at least; by default each
+    # ray has one.
     ray: Int[Tensor, "P"] = None  # type: ignore[assignment]  # filled in below
+    # Linear factor of the light that the polyline brings; 1 by default. Those of a ray sum to at most 1.
     throughput: Float[Tensor, "P 3"] = None  # type: ignore[assignment]
+    # Innermost body of the medium in which each vertex is left, numbered from 1; 0 in air, or where the index
+    # varies continuously.
     body: Int[Tensor, "P S"] = None  # type: ignore[assignment]
     _splits: bool = field(init=False, repr=False)
     _dims: bool = field(init=False, repr=False)
@@ -113,11 +106,7 @@ class Path:
         )  # fmt: skip
 
     def exits(self, directions: Float[Tensor, "P 3"] | None = None) -> Exits:
-        """Where light comes from beyond all vertices: the last straight run of each polyline.
-
-        Args:
-            directions: in which it is looked for instead of the exit directions.
-        """
+        """Where light comes from beyond all vertices: the last straight run of each polyline."""
         turns = (self.directions[:, 1:] != self.directions[:, :-1]).any(-1)
         last = (turns * torch.arange(1, self.s.shape[1], device=self.s.device)).amax(-1)
         start = self.positions.gather(1, last[:, None, None].expand(-1, 1, 3))[:, 0]
@@ -201,19 +190,15 @@ class Path:
 
 @dataclass(frozen=True)
 class Exits:
-    """What a boundary is asked: lines on which light arrives from far away. Leading axes may have any form.
+    """What a boundary is asked: lines on which light arrives from far away. Leading axes may have any form."""
 
-    Attributes:
-        directions: unit directions in which light is looked for, pointing away from the volume.
-        positions: where these lines begin: at the last event of a path, or at the camera where there is none; None
-            asks for what is seen from the middle of all.
-        radii: of the pixel's cone at unit distance along the line; 0 where nothing is known of it.
-        ray: the ray that each line belongs to, see `Path`; None where each is one of its own.
-    """
-
-    directions: Float[Tensor, "*batch 3"]
+    directions: Float[Tensor, "*batch 3"]  # unit directions in which light is looked for, pointing away from the volume
+    # Where these lines begin: at the last event of a path, or at the camera where there is none; None asks for
+    # what is seen from the middle of all.
     positions: Float[Tensor, "*batch 3"] | None = None
+    # Of the pixel's cone at unit distance along the line; 0 where nothing is known of it.
     radii: Float[Tensor, "*batch"] | float = 0.0
+    # The ray that each line belongs to, see `Path`; None where each is one of its own.
     ray: Int[Tensor, "*batch"] | None = None
 
 
@@ -222,20 +207,13 @@ class Samples:
     """Samples of the radiance field along a path; sample i stands for the interval from edges[i] to edges[i + 1].
 
     Point samples (NeRF) lie at the start of their interval, cone samples (mip-NeRF) in its middle.
-
-    Attributes:
-        positions: where the field is asked.
-        directions: unit direction of the path there.
-        s: arc length from the camera.
-        edges: interval bounds in arc length.
-        radii: pixel cone radius at unit distance.
     """
 
-    positions: Float[Tensor, "R N 3"]
-    directions: Float[Tensor, "R N 3"]
-    s: Float[Tensor, "R N"]
-    edges: Float[Tensor, "R N+1"]
-    radii: Float[Tensor, "R"]
+    positions: Float[Tensor, "R N 3"]  # where the field is asked
+    directions: Float[Tensor, "R N 3"]  # unit direction of the path there
+    s: Float[Tensor, "R N"]  # arc length from the camera
+    edges: Float[Tensor, "R N+1"]  # interval bounds in arc length
+    radii: Float[Tensor, "R"]  # pixel cone radius at unit distance
 
     @classmethod
     def along(cls, path: Path, s: Float[Tensor, "R N"], edges: Float[Tensor, "R N+1"]) -> Samples:
@@ -259,24 +237,16 @@ class Radiance:
 
 @dataclass(frozen=True)
 class Rendering:
-    """One sampling level of rendered rays (paper, Eqn. volrendBd).
+    """One sampling level of rendered rays (paper, Eqn. volrendBd)."""
 
-    Attributes:
-        rgb: radiance of each ray, boundary term included, of all its polylines together. Linear, and unbounded above;
-            sRGB where the model adds up sRGB (`NerfModel.colour`).
-        weights: contribution of each sample to its polyline.
-        transmittance: what is left at the end of the polyline, T_{N+1}.
-        boundary_rgb: radiance of the boundary in the leaving direction, C'(d_N).
-        samples: the samples that were rendered.
-        path: the polylines that they lie on.
-    """
-
+    # Radiance of each ray, boundary term included, of all its polylines together. Linear, and unbounded above;
+    # sRGB where the model adds up sRGB (`NerfModel.colour`).
     rgb: Float[Tensor, "R 3"]
-    weights: Float[Tensor, "P N"]
-    transmittance: Float[Tensor, "P"]
-    boundary_rgb: Float[Tensor, "P 3"]
+    weights: Float[Tensor, "P N"]  # contribution of each sample to its polyline
+    transmittance: Float[Tensor, "P"]  # what is left at the end of the polyline, T_{N+1}
+    boundary_rgb: Float[Tensor, "P 3"]  # radiance of the boundary in the leaving direction, C'(d_N)
     samples: Samples
-    path: Path
+    path: Path  # the polylines that they lie on
 
     @property
     def opacity(self) -> Float[Tensor, "R"]:
@@ -298,31 +268,18 @@ class Rendering:
 
 @dataclass(frozen=True)
 class Batch:
-    """Training pixels: first those that have one ray, then those that are divided, all rays of each together.
+    """Training pixels: first those that have one ray, then those that are divided, all rays of each together."""
 
-    Attributes:
-        rays: of the pixels, as the data's cameras give them.
-        view: number of the training view that each ray belongs to.
-        rgb: colour of the pixel that each ray belongs to (sRGB in [0, 1]).
-        cameras: all training cameras, for losses that ask for further directions.
-        num_whole: number of pixels that have one ray; all by default.
-        rays_per_pixel: of the divided ones.
-        rows: which rows of the whole batch these are, where several processes share it.
-        num_rows: of the whole batch.
-        path: of the rays, without gradients, where they are traced already.
-        index: the pixel that each ray belongs to: `view * H * W + row * W + column`.
-    """
-
-    rays: Rays
-    view: Int[Tensor, "R"]
-    rgb: Float[Tensor, "R 3"]
-    cameras: Cameras
-    num_whole: int | None = None
-    rays_per_pixel: int = 1
-    rows: Int[Tensor, "R"] | None = None
-    num_rows: int | None = None
-    path: Path | None = None
-    index: Int[Tensor, "R"] | None = None
+    rays: Rays  # of the pixels, as the data's cameras give them
+    view: Int[Tensor, "R"]  # number of the training view that each ray belongs to
+    rgb: Float[Tensor, "R 3"]  # colour of the pixel that each ray belongs to (sRGB in [0, 1])
+    cameras: Cameras  # all training cameras, for losses that ask for further directions
+    num_whole: int | None = None  # number of pixels that have one ray; all by default
+    rays_per_pixel: int = 1  # of the divided ones
+    rows: Int[Tensor, "R"] | None = None  # which rows of the whole batch these are, where several processes share it
+    num_rows: int | None = None  # of the whole batch
+    path: Path | None = None  # of the rays, without gradients, where they are traced already
+    index: Int[Tensor, "R"] | None = None  # the pixel that each ray belongs to: `view * H * W + row * W + column`
 
     def of_pixels(self, rgb: Float[Tensor, "R 3"]) -> Float[Tensor, "P 3"]:
         """Radiance (or colour) of pixels from that of their rays: its mean."""

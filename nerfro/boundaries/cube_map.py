@@ -21,13 +21,9 @@ from nerfro.kernels.constants import constant
 
 @dataclass(frozen=True)
 class CubeLevels:
-    """Where the texels of each level lie in one list; within a level ordered by face, row and column.
+    """Where the texels of each level lie in one list; within a level ordered by face, row and column."""
 
-    Attributes:
-        resolutions: texels along a face's side.
-    """
-
-    resolutions: tuple[int, ...]
+    resolutions: tuple[int, ...]  # texels along a face's side
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -103,12 +99,7 @@ def lookup(
     """Bilinear lookups of all levels, summed; continuous over the whole sphere.
 
     Differentiable in the texels and, between their centres, in the coordinates.
-
-    Args:
-        face, coordinates: where to look, see `project`.
-        texels: of all levels.
-        padded: `padded_texels` of all levels, flattened one after the other.
-        levels: where the texels lie.
+    `padded` are the `padded_texels` of all levels, flattened one after the other.
     """
     padded_sizes = [6 * (n + 2) ** 2 for n in levels.resolutions]
     padded_offsets = tuple(sum(padded_sizes[:level]) for level in range(len(levels)))

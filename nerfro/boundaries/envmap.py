@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from nerfro.allowed import Count
 from nerfro.boundaries import cube_map
 from nerfro.boundaries.base import Boundary
 from nerfro.errors import NerfroError
@@ -37,12 +38,12 @@ class EnvironmentMap(Boundary):
 
     def __init__(
         self,
-        resolutions: list[int] = (4, 8, 16, 32, 64, 128, 256),  # type: ignore[assignment]
+        resolutions: list[Count] = (4, 8, 16, 32, 64, 128, 256),  # type: ignore[assignment]
         image: str | None = None,
     ) -> None:
         super().__init__()
-        if len(resolutions) == 0 or min(resolutions) < 1:
-            raise NerfroError(f"boundary=envmap: resolutions={list(resolutions)}; give one or more, each at least 1")
+        if len(resolutions) == 0:
+            raise NerfroError("boundary=envmap: resolutions is empty; give one or more")
         self.levels = cube_map.CubeLevels(tuple(resolutions))
         self.texels = nn.Parameter(torch.zeros(self.levels.num_texels, 3))
         padded = torch.cat([cube_map.padded_texels(n).flatten() for n in resolutions])

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from nerfro.allowed import Positive, corners_of_box
 from nerfro.boundaries.base import Boundary
-from nerfro.errors import NerfroError
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.registry import register
@@ -54,7 +54,7 @@ class NearField(Boundary):
         self,
         box_min: list[float] = (-1.0, -1.0, -1.0),  # type: ignore[assignment]
         box_max: list[float] = (1.0, 1.0, 1.0),  # type: ignore[assignment]
-        radius: float | None = None,
+        radius: Positive | None = None,
         num_samples: int = 32,
         num_bins: int = 96,
         grid_resolution: int = 64,
@@ -68,14 +68,7 @@ class NearField(Boundary):
         precision: Literal["bfloat16", "float32"] = "bfloat16",
     ) -> None:
         super().__init__()
-        if len(box_min) != 3 or len(box_max) != 3 or not all(a < b for a, b in zip(box_min, box_max, strict=True)):
-            raise NerfroError(
-                f"boundary=near_field: box from {list(box_min)} to {list(box_max)} is empty; "
-                "give three numbers each, box_min below box_max"
-            )
-        if radius is not None and radius <= 0:
-            raise NerfroError(f"boundary=near_field: radius={radius} must be positive")
-        self.register_buffer("box", torch.tensor([list(box_min), list(box_max)]), persistent=False)
+        self.register_buffer("box", torch.from_numpy(corners_of_box(box_min, box_max)).float(), persistent=False)
         self.radius = float((self.box[1] - self.box[0]).norm()) if radius is None else radius
         low, high = [-_CONTRACTED] * 3, [_CONTRACTED] * 3
         self.field = HashGridField(

@@ -15,9 +15,4 @@ class Camera(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, rays: Rays, view: Int[Tensor, "R"]) -> Rays:
-        """The rays of views as they are believed to be, given those of the data's cameras.
-
-        Args:
-            rays: in world space.
-            view: number of the training view that each ray belongs to.
-        """
+        """The rays of views as they are believed to be, given those of the data's cameras."""

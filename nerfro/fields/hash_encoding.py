@@ -30,16 +30,11 @@ class GridLevels:
     """Where each level's vertices lie in one table, coarse to fine.
 
     A level whose (resolution + 1)^3 vertices fit into `size` entries is dense; a finer one is hashed.
-
-    Attributes:
-        resolutions: cells along the unit cube's side.
-        sizes: entries of the table; a power of two where hashed.
-        offsets: first entry.
     """
 
-    resolutions: tuple[int, ...]
-    sizes: tuple[int, ...]
-    offsets: tuple[int, ...]
+    resolutions: tuple[int, ...]  # cells along the unit cube's side
+    sizes: tuple[int, ...]  # entries of the table; a power of two where hashed
+    offsets: tuple[int, ...]  # first entry
 
     @property
     def num_entries(self) -> int:
@@ -54,16 +49,7 @@ class GridLevels:
 
 
 def grid_levels(num_levels: int, base_resolution: int, finest_resolution: int, log2_table_size: int) -> GridLevels:
-    """Levels in geometric progression of resolution (Eqns. 2 and 3).
-
-    Args:
-        num_levels: at least 1.
-        base_resolution, finest_resolution: cells along the side of the coarsest and the finest level.
-        log2_table_size: logarithm of the largest number of entries of a level.
-
-    Raises:
-        NerfroError: no level, a resolution below 1, a finest one below the base, or a table size out of 2^4 .. 2^24.
-    """
+    """Levels in geometric progression of resolution (Eqns. 2 and 3)."""
     if num_levels < 1 or not 1 <= base_resolution <= finest_resolution:
         raise NerfroError(
             f"hash grid of {num_levels} levels from {base_resolution} to {finest_resolution} cells: take 1 or more "
@@ -85,14 +71,7 @@ def hash_encode(
     """Trilinearly interpolated features of every level, side by side.
 
     Differentiable in the table and, within a cell, in the positions.
-
-    Args:
-        positions: in the unit cube; what lies outside is clamped to it.
-        table: features of all levels' vertices.
-        levels: where they lie.
-
-    Returns:
-        Features in the table's precision, those of a level next to each other.
+    Positions are of the unit cube; what lies outside is clamped to it.
     """
     index, weight = _vertices(positions.to(table.dtype), levels)
     # index_select, because its gradient is one index_add: indexing with brackets would sort all indices first.

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.errors import NerfroError
+from nerfro.allowed import Count, Positive, Range, corners_of_box
 from nerfro.fields import hash_encoding
 from nerfro.fields import spherical_harmonics as harmonics
 from nerfro.fields.base import Field
@@ -50,26 +50,20 @@ class HashGridField(Field):
         self,
         box_min: list[float] = (-1.0, -1.0, -1.0),  # type: ignore[assignment]
         box_max: list[float] = (1.0, 1.0, 1.0),  # type: ignore[assignment]
-        num_levels: int = 12,
-        base_resolution: int = 16,
-        finest_resolution: int = 256,
-        log2_table_size: int = 15,
-        width: int = 64,
-        direction_bands: int = 4,
-        initial_depth: float = 0.1,
+        num_levels: Count = 12,
+        base_resolution: Count = 16,
+        finest_resolution: Count = 256,
+        log2_table_size: Annotated[int, Range(at_least=4, at_most=24)] = 15,
+        width: Count = 64,
+        direction_bands: Annotated[int, Range(at_least=1, at_most=harmonics.MAX_BANDS)] = 4,
+        initial_depth: Positive = 0.1,
         precision: Literal["bfloat16", "float32"] = "bfloat16",
     ) -> None:
         super().__init__()
-        if len(box_min) != 3 or len(box_max) != 3 or not all(a < b for a, b in zip(box_min, box_max, strict=True)):
-            raise NerfroError(
-                f"field=hash_grid: box from {list(box_min)} to {list(box_max)} is empty; "
-                "give three numbers each, box_min below box_max"
-            )
-        if width < 1 or initial_depth <= 0:
-            raise NerfroError(f"field=hash_grid: width={width} and initial_depth={initial_depth} must be positive")
-        self.register_buffer("box_min", torch.tensor(list(box_min)), persistent=False)
-        self.register_buffer("box_max", torch.tensor(list(box_max)), persistent=False)
-        self.side = max(b - a for a, b in zip(box_min, box_max, strict=True))
+        box = corners_of_box(box_min, box_max)
+        self.register_buffer("box_min", torch.from_numpy(box[0]).float(), persistent=False)
+        self.register_buffer("box_max", torch.from_numpy(box[1]).float(), persistent=False)
+        self.side = float((box[1] - box[0]).max())
         self.initial_density = initial_depth / self.side
         self.direction_bands, self.precision = direction_bands, precision
         self.levels = hash_encoding.grid_levels(num_levels, base_resolution, finest_resolution, log2_table_size)

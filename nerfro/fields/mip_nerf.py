@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.allowed import Count, Natural
 from nerfro.fields.base import Field
-from nerfro.fields.cones import frustum_gaussians
 from nerfro.fields.encoding import integrated_positional_encoding, positional_encoding
 from nerfro.fields.mlp import RadianceMLP
 from nerfro.registry import register
@@ -22,12 +25,12 @@ class MipNerfField(Field):
 
     def __init__(
         self,
-        width: int = 256,
-        depth: int = 8,
+        width: Count = 256,
+        depth: Count = 8,
         skip: int = 5,
-        view_width: int = 128,
-        position_degree: int = 16,
-        direction_degree: int = 4,
+        view_width: Count = 128,
+        position_degree: Count = 16,
+        direction_degree: Natural = 4,
     ) -> None:
         super().__init__()
         self.position_degree, self.direction_degree = position_degree, direction_degree
@@ -39,3 +42,21 @@ class MipNerfField(Field):
         position = integrated_positional_encoding(mean, variance, 0, self.position_degree)
         direction = positional_encoding(samples.directions, 0, self.direction_degree)
         return Radiance(*self.mlp(position, direction))
+
+
+def frustum_gaussians(samples: Samples) -> tuple[Float[Tensor, "R N 3"], Float[Tensor, "R N 3"]]:
+    """Mean and diagonal covariance of the frustum that each sample's interval cuts out of its pixel's cone.
+
+    mip-NeRF's Eqn. 7 and 16 in their numerically stable form. On a bent path the cone follows the local direction and
+    widens with arc length, which neglects the focusing by the medium.
+    """
+    near, far = samples.edges[:, :-1], samples.edges[:, 1:]
+    mu, half = 0.5 * (near + far), 0.5 * (far - near)
+    denominator = 3 * mu**2 + half**2
+    shift = 2 * mu * half**2 / denominator
+    along = half**2 / 3 - (4 / 15) * half**4 * (12 * mu**2 - half**2) / denominator**2
+    across = samples.radii[:, None] ** 2 * (mu**2 / 4 + (5 / 12) * half**2 - (4 / 15) * half**4 / denominator)
+    mean = samples.positions + (mu + shift - samples.s)[..., None] * samples.directions
+    squared = samples.directions**2
+    variance = along[..., None] * squared + across[..., None] * (1 - squared)
+    return mean, variance

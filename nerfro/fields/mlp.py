@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nerfro.allowed import Count, checked
 from nerfro.errors import NerfroError
 
 # Colours reach a little beyond [0, 1], so that black and white need no infinite activation (mip-NeRF's code).
@@ -17,16 +18,15 @@ RGB_PADDING = 1e-3
 _BLACK = -4.0
 
 
+@checked("MLP")
 class SkipMLP(nn.Module):
     """ReLU layers; the input is concatenated again to the output of layer `skip` (counted from 1).
 
     Weights are Glorot-uniform and biases zero, as in the authors' code.
     """
 
-    def __init__(self, num_inputs: int, width: int, depth: int, skip: int) -> None:
+    def __init__(self, num_inputs: int, width: Count, depth: Count, skip: int) -> None:
         super().__init__()
-        if width < 1 or depth < 1:
-            raise NerfroError(f"an MLP of width {width} and depth {depth} is empty; take 1 or more of each")
         self.skip = skip
         inputs = [num_inputs] + [width + num_inputs * (i == skip) for i in range(1, depth)]
         self.layers = nn.ModuleList(glorot_linear(n, width) for n in inputs)
@@ -70,15 +70,7 @@ class RadianceMLP(nn.Module):
 
 
 def compile_networks(model: nn.Module, backend: str) -> None:
-    """Have torch.compile compile a model's networks in place, for any number of points.
-
-    Args:
-        model: holds the networks; its weights and their names stay as they are.
-        backend: of torch.compile, such as `inductor`.
-
-    Raises:
-        NerfroError: there is no such backend.
-    """
+    """Have torch.compile compile a model's networks in place, for any number of points."""
     known = torch.compiler.list_backends(exclude_tags=())
     if backend not in known:
         raise NerfroError(f"compile={backend} is no backend of torch.compile here; there are {', '.join(known)}")

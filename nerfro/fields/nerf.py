@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from math import inf
-from operator import lt
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.errors import NerfroError
+from nerfro.allowed import Count, Natural, Positive, corners_of_box
 from nerfro.fields.base import Field
 from nerfro.fields.encoding import positional_encoding
 from nerfro.fields.mlp import RadianceMLP
@@ -29,32 +28,25 @@ class NerfField(Field):
         normalise: length in world units that counts as one before encoding; 1 leaves positions as they are.
         box_min, box_max: opposite corners of the content's bounds, world units. Samples outside are not evaluated;
             nothing is there. Infinite ones have every sample evaluated, as the authors do.
-
-    Raises:
-        NerfroError: the box is empty.
     """
 
     box: Float[Tensor, "2 3"]
 
     def __init__(
         self,
-        width: int = 256,
-        depth: int = 8,
+        width: Count = 256,
+        depth: Count = 8,
         skip: int = 5,
-        view_width: int = 128,
-        position_degree: int = 10,
-        direction_degree: int = 4,
-        normalise: float = 1.0,
+        view_width: Count = 128,
+        position_degree: Natural = 10,
+        direction_degree: Natural = 4,
+        normalise: Positive = 1.0,
         box_min: list[float] = (-inf, -inf, -inf),  # type: ignore[assignment]
         box_max: list[float] = (inf, inf, inf),  # type: ignore[assignment]
     ) -> None:
         super().__init__()
-        if len(box_min) != 3 or len(box_max) != 3 or not all(map(lt, box_min, box_max)):
-            raise NerfroError(
-                f"field=nerf: box from {list(box_min)} to {list(box_max)} is empty; "
-                "give three numbers each, box_min below box_max"
-            )
-        self.register_buffer("box", torch.tensor([list(box_min), list(box_max)]), persistent=False)
+        box = corners_of_box(box_min, box_max, bounded=False)
+        self.register_buffer("box", torch.from_numpy(box).float(), persistent=False)
         self.everywhere = not self.box.isfinite().any()
         self.position_degree, self.direction_degree, self.normalise = position_degree, direction_degree, normalise
         num_position, num_direction = 3 * (1 + 2 * position_degree), 3 * (1 + 2 * direction_degree)

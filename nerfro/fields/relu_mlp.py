@@ -24,10 +24,7 @@ def relu_mlp(
 ) -> Float[Tensor, "P O"]:
     """Linear layers without biases, with ReLU between them.
 
-    Args:
-        inputs: one row for each point; or several tensors, whose columns are taken side by side.
-        weights: [outputs, inputs] of each layer.
-        dtype: of the products, the activations and the result.
+    Several inputs are taken side by side; weights are [outputs, inputs], and `dtype` is that of the products.
     """
     parts = [inputs] if isinstance(inputs, Tensor) else inputs
     with torch.autocast("cpu", enabled=False):

@@ -17,11 +17,6 @@ def evaluate_selected(decoder: Decoder, samples: Samples, selected: Bool[Tensor,
     """Evaluate `decoder` at the selected samples alone; elsewhere density and colour are zero.
 
     On a GPU the number of selected samples is waited for, one synchronisation with the host.
-
-    Args:
-        decoder: asked once, with the selected samples in one list in the order of `samples`; possibly an empty one.
-        samples: R rays of N samples.
-        selected: where to evaluate.
     """
     index = selected.flatten().nonzero().squeeze(1)
     positions = samples.positions.flatten(0, 1).index_select(0, index)

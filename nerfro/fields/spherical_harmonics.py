@@ -12,15 +12,7 @@ MAX_BANDS = 4
 
 
 def spherical_harmonics(directions: Float[Tensor, "*batch 3"], num_bands: int) -> Float[Tensor, "*batch K"]:
-    """The K = num_bands^2 orthonormal real harmonics of degree 0 to num_bands - 1, order -l to l within a degree.
-
-    Args:
-        directions: unit vectors.
-        num_bands: 1 to 4.
-
-    Raises:
-        NerfroError: a number of bands that is not implemented.
-    """
+    """The K = num_bands^2 orthonormal real harmonics of degree 0 to num_bands - 1, order -l to l within a degree."""
     check_bands(num_bands)
     x, y, z = directions.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z

@@ -16,9 +16,6 @@ def keep_freed_memory() -> bool:
     anew, one page fault and 4 KiB of zeros at a time, which can cost more than the arithmetic. The price is that memory
     once used stays with the process until it ends. Little may be left for long among tensors of ever different sizes:
     no gap would fit the next one, and the process would grow.
-
-    Returns:
-        Whether the allocator is glibc's and has accepted it. Others are left alone.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt

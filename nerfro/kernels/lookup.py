@@ -16,24 +16,18 @@ from nerfro.kernels.tolerances import BEYOND_BOX, SAFE_SHARE
 
 
 class MediumGrid(NamedTuple):
-    """A medium on a grid, as kernels see it. What is None has another type, for which kernels are compiled anew.
+    """A medium on a grid, as kernels see it. What is None has another type, for which kernels are compiled anew."""
 
-    Attributes:
-        values: index and gradient at the grid's vertices [X, Y, Z, 4] (`media.voxel_grid`); or coefficients of the
-            bodies' splines [K, X, Y, Z] (`media.sdf_grid`).
-        clearance: of blocks of cells.
-        iors: index of each body; None where the values are the index itself.
-        shell: half width of the bodies' smooth interface, world units.
-        low, high: corners of the grid, world units.
-        inverse_spacing, inverse_block: cells and blocks a world unit.
-    """
-
+    # Index and gradient at the grid's vertices [X, Y, Z, 4] (`media.voxel_grid`); or coefficients of the bodies'
+    # splines [K, X, Y, Z] (`media.sdf_grid`).
     values: Float[np.ndarray, "..."]
-    clearance: Float[np.ndarray, "x y z"]
-    iors: Float[np.ndarray, "K"] | None
-    shell: float
+    clearance: Float[np.ndarray, "x y z"]  # of blocks of cells
+    iors: Float[np.ndarray, "K"] | None  # index of each body; None where the values are the index itself
+    shell: float  # half width of the bodies' smooth interface, world units
+    # Corners of the grid, world units.
     low: Float[np.ndarray, "3"]
     high: Float[np.ndarray, "3"]
+    # Cells and blocks a world unit.
     inverse_spacing: Float[np.ndarray, "3"]
     inverse_block: Float[np.ndarray, "3"]
 

@@ -8,8 +8,8 @@ from typing import Protocol
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nerfro.allowed import Natural, NotNegative, checked
 from nerfro.boundaries.base import Boundary
-from nerfro.errors import NerfroError
 from nerfro.types import Batch, Rendering
 
 
@@ -25,6 +25,7 @@ class Model(Protocol):
     ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]: ...
 
 
+@checked("loss")
 class Loss(nn.Module, ABC):
     """A term of the training objective, weighted by `weight` once `start` steps are done, ramped in over `ramp` steps.
 
@@ -32,15 +33,10 @@ class Loss(nn.Module, ABC):
         weight: final weight.
         start: number of optimiser steps during which the weight is zero.
         ramp: number of steps after that over which it grows linearly.
-
-    Raises:
-        NerfroError: a negative weight or number of steps.
     """
 
-    def __init__(self, weight: float = 1.0, start: int = 0, ramp: int = 0) -> None:
+    def __init__(self, weight: NotNegative = 1.0, start: Natural = 0, ramp: Natural = 0) -> None:
         super().__init__()
-        if weight < 0 or start < 0 or ramp < 0:
-            raise NerfroError(f"loss weight={weight} start={start} ramp={ramp}: none may be negative; 0 switches off")
         self.weight, self.start, self.ramp = weight, start, ramp
 
     def weight_at(self, step: int) -> float:

@@ -36,10 +36,6 @@ def distortion(weights: Float[Tensor, "R N"], edges: Float[Tensor, "R N+1"]) -> 
     sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 (e_{i+1} - e_i), with interval midpoints m (mip-NeRF 360, Eqn. 15). The
     double sum takes linear time: midpoints ascend, so it is twice the sum over i of w_i (m_i W_i - M_i), where W_i and
     M_i are the sums of w_j and w_j m_j over j < i.
-
-    Args:
-        weights: of the intervals.
-        edges: interval bounds, ascending.
     """
     midpoints = 0.5 * (edges[:, 1:] + edges[:, :-1])
     # Distances count, not places: from the middle of the path there is less cancellation between the two sums.

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.errors import NerfroError
+from nerfro.allowed import Range
 from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
 from nerfro.types import Batch, Exits, Rendering
@@ -19,10 +21,10 @@ class Smoothness(Loss):
         tile_size: side in pixels of a random window of a random training view, whose directions are the tile.
     """
 
-    def __init__(self, weight: float = 1.0, start: int = 2500, ramp: int = 0, tile_size: int = 128) -> None:
+    def __init__(
+        self, weight: float = 1.0, start: int = 2500, ramp: int = 0, tile_size: Annotated[int, Range(at_least=2)] = 128
+    ) -> None:
         super().__init__(weight, start, ramp)
-        if tile_size < 2:
-            raise NerfroError(f"loss.smoothness.tile_size={tile_size} has no neighbours; take 2 or more")
         self.tile_size = tile_size
 
     def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:

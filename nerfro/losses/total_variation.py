@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerfro.errors import NerfroError
+from nerfro.allowed import Count, Range
 from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
 from nerfro.types import Batch, Exits, Rendering
@@ -28,14 +29,14 @@ class TotalVariation(Loss):
     """
 
     def __init__(
-        self, weight: float = 1e-3, start: int = 0, ramp: int = 0, num_directions: int = 1024, angle: float = 0.7
+        self,
+        weight: float = 1e-3,
+        start: int = 0,
+        ramp: int = 0,
+        num_directions: Count = 1024,
+        angle: Annotated[float, Range(more_than=0, less_than=90)] = 0.7,
     ) -> None:
         super().__init__(weight, start, ramp)
-        if num_directions < 1 or not 0 < angle < 90:
-            raise NerfroError(
-                f"loss=total_variation: num_directions={num_directions} and angle={angle}; "
-                "take at least 1 direction and an angle between 0 and 90 degrees"
-            )
         self.num_directions, self.angle = num_directions, angle
 
     def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
@@ -47,13 +48,7 @@ class TotalVariation(Loss):
 def direction_pairs(
     num: int, angle: float, device: torch.device | str
 ) -> tuple[Float[Tensor, "num 3"], Float[Tensor, "num 3"]]:
-    """Uniformly random unit directions, and for each another one in a random direction from it.
-
-    Args:
-        num: pairs.
-        angle: between the two, radians.
-        device: where to make them.
-    """
+    """Uniformly random unit directions, and for each another one `angle` radians from it, anywhere around."""
     first = normalize(torch.randn(num, 3, device=device), dim=-1)
     tangent = normalize(torch.linalg.cross(first, torch.randn(num, 3, device=device)), dim=-1)
     return first, math.cos(angle) * first + math.sin(angle) * tangent

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from nerfro.media.base import Medium
+from nerfro.allowed import Positive
+from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.registry import register
 
 
@@ -18,9 +17,7 @@ class Vacuum(Medium):
         super().__init__()
         self.register_buffer("box", torch.zeros(2, 3), persistent=False)
 
-    def forward(
-        self, positions: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+    def forward(self, positions: Vectors) -> tuple[Scalars, Vectors]:
         return torch.ones_like(positions[..., 0]), torch.zeros_like(positions)
 
 
@@ -28,14 +25,12 @@ class Vacuum(Medium):
 class Luneburg(Medium):
     """The Luneburg lens, n^2 = 2 - r^2 / R^2 for r < R: parallel rays meet in a point of its surface."""
 
-    def __init__(self, radius: float = 1.0) -> None:
+    def __init__(self, radius: Positive = 1.0) -> None:
         super().__init__()
         self.radius = radius
         self.register_buffer("box", torch.tensor([[-radius] * 3, [radius] * 3]), persistent=False)
 
-    def forward(
-        self, positions: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+    def forward(self, positions: Vectors) -> tuple[Scalars, Vectors]:
         squared = (positions * positions).sum(-1) / self.radius**2
         inside = squared < 1
         n = torch.where(inside, 2 - squared, 1.0).sqrt()

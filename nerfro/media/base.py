@@ -10,6 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+Scalars = Float[Tensor, "*batch"]
+Vectors = Float[Tensor, "*batch 3"]
+
 
 class lazy_buffer:  # noqa: N801 (used like functools.cached_property)
     """A tensor computed when it is first asked for, and kept as a buffer: it moves to other devices with its module."""
@@ -29,18 +32,12 @@ _STEPS_PER_DIAGONAL = 512
 
 
 class Medium(nn.Module, ABC):
-    """Refractive index in space; outside its box n = 1 and grad n = 0.
+    """Refractive index in space; outside its box n = 1 and grad n = 0."""
 
-    Attributes:
-        box: lower and upper corner, world units.
-    """
-
-    box: Float[Tensor, "2 3"]
+    box: Float[Tensor, "2 3"]  # lower and upper corner, world units
 
     @abstractmethod
-    def forward(
-        self, positions: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+    def forward(self, positions: Vectors) -> tuple[Scalars, Vectors]:
         """Refractive index and its gradient (per world unit)."""
 
     @property
@@ -48,13 +45,11 @@ class Medium(nn.Module, ABC):
         """Corners of the object's own bounds, world units: what lies inside it lies in here."""
         return self.box
 
-    def clearance(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    def clearance(self, positions: Vectors) -> Scalars:
         """Distance around each point of the box within which the index surely does not vary; 0 where unknown."""
         return torch.zeros_like(positions[..., 0])
 
-    def step_length(
-        self, directions: Float[Tensor, "*batch 3"], gradients: Float[Tensor, "*batch 3"]
-    ) -> Float[Tensor, "*batch"]:
+    def step_length(self, directions: Vectors, gradients: Vectors) -> Scalars:
         """Arc length of a step that resolves the medium, for a ray of that unit direction where grad n is as given."""
         diagonal = torch.linalg.vector_norm(self.box[1] - self.box[0])
         return (diagonal / _STEPS_PER_DIAGONAL).expand(directions.shape[:-1])

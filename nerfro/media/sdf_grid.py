@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.allowed import Natural, NotNegative, Positive, Range, corners_of_box
 from nerfro.errors import NerfroError
 from nerfro.files.cache import cached_arrays, content_hash
 from nerfro.geometry.interpolation import quadratic_spline, smooth, spline_coefficients
@@ -14,9 +17,9 @@ from nerfro.geometry.intersection import MeshIntersector, Triangles
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.signed_distance import signed_distance_grid
 from nerfro.kernels.constants import constant
-from nerfro.media.base import lazy_buffer
+from nerfro.media.base import Scalars, Vectors, lazy_buffer
 from nerfro.media.solid import Solid
-from nerfro.media.voxel_grid import check_box, check_margin
+from nerfro.media.voxel_grid import check_margin
 from nerfro.paths import resolve_path
 from nerfro.registry import register
 
@@ -32,62 +35,55 @@ _VERSION = 3
 class SdfGrid(Solid):
     """Bodies of constant index with the surfaces of meshes; thin shell for eikonal, sharp surface for snell.
 
+    Args:
+        mesh: closed triangle mesh of the outer body, world units, any format trimesh reads.
+        ior: refractive index inside the mesh.
+        inner_meshes: bodies inside it (a liquid, a bubble), each inside those before; opaque things do not belong
+            here, because rays do not bend on them.
+        inner_iors: their refractive indices.
+        resolution: grid vertices a side.
+        box_min, box_max: corners of the grid, world units; the object needs a margin of air inside.
+        shell_voxels: half width of the smooth interface that the Eikonal equation sees, voxels.
+        crease_degrees: edges with larger angles between their faces stay sharp.
+        smoothing_size, smoothing_sigma: Gaussian taps a side and standard deviation (voxels) that the distance is
+            smoothed with, for noisy silhouette hulls; size 0 for none. The kernel is of fourth order: it flattens
+            noise and keeps curvature.
+        accept_open_mesh: take meshes with holes; the majority of three axes decides what is inside.
+        cache: keep the distances in the cache folder.
+
     Attributes:
-        distances: signed distance of each body at the grid's vertices.
-        coefficients: of the quadratic B-splines through them.
         meshes: the surfaces themselves; empty where the medium was made of distances.
-        vertices: where the meshes' vertices are now, one mesh after another, world units; a parameter where the
-            triangles are learned.
     """
 
-    distances: Float[Tensor, "K X Y Z"]
-    coefficients: Float[Tensor, "K X Y Z"]
+    distances: Float[Tensor, "K X Y Z"]  # signed distance of each body at the grid's vertices
+    coefficients: Float[Tensor, "K X Y Z"]  # of the quadratic B-splines through them
+    # Where the meshes' vertices are now, one mesh after another, world units; a parameter where the triangles are
+    # learned.
     vertices: Float[Tensor, "V 3"]
     _traced: tuple[Tensor, int, Triangles, MeshIntersector] | None = None
 
     def __init__(
         self,
         mesh: str,
-        ior: float = 1.5,
+        ior: Positive = 1.5,
         inner_meshes: list[str] = [],  # noqa: B006 (the registry reads and copies it)
-        inner_iors: list[float] = [],  # noqa: B006
-        resolution: int = 128,
+        inner_iors: list[Positive] = [],  # noqa: B006
+        resolution: Annotated[int, Range(at_least=4)] = 128,
         box_min: list[float] = [-1.5, -1.5, -1.5],  # noqa: B006
         box_max: list[float] = [1.5, 1.5, 1.5],  # noqa: B006
-        shell_voxels: float = 0.1,
-        crease_degrees: float = 30.0,
-        smoothing_size: int = 0,
-        smoothing_sigma: float = 1.0,
+        shell_voxels: Positive = 0.1,
+        crease_degrees: NotNegative = 30.0,
+        smoothing_size: Natural = 0,
+        smoothing_sigma: Positive = 1.0,
         accept_open_mesh: bool = False,
         cache: bool = True,
     ) -> None:
-        """Compute signed distances to meshes.
-
-        Args:
-            mesh: closed triangle mesh of the outer body, world units, any format trimesh reads.
-            ior: refractive index inside the mesh.
-            inner_meshes: bodies inside it (a liquid, a bubble), each inside those before; opaque things do not belong
-                here, because rays do not bend on them.
-            inner_iors: their refractive indices.
-            resolution: grid vertices a side.
-            box_min, box_max: corners of the grid, world units; the object needs a margin of air inside.
-            shell_voxels: half width of the smooth interface that the Eikonal equation sees, voxels.
-            crease_degrees: edges with larger angles between their faces stay sharp.
-            smoothing_size, smoothing_sigma: Gaussian taps a side and standard deviation (voxels) that the distance is
-                smoothed with, for noisy silhouette hulls; size 0 for none. The kernel is of fourth order: it flattens
-                noise and keeps curvature.
-            accept_open_mesh: take meshes with holes; the majority of three axes decides what is inside.
-            cache: keep the distances in the cache folder.
-
-        Raises:
-            NerfroError: a bad mesh, a bad box, an object without a margin, or indices that do not match the meshes.
-        """
         if len(inner_meshes) != len(inner_iors):
             raise NerfroError(
                 f"medium.inner_meshes has {len(inner_meshes)} entries and medium.inner_iors {len(inner_iors)}; "
                 "give one index for each inner mesh"
             )
-        box = check_box(box_min, box_max, resolution)
+        box = corners_of_box(box_min, box_max)
         spacing = (box[1] - box[0]) / (resolution - 1)
         super().__init__([ior, *inner_iors], shell_voxels * float(spacing.min()))
         self.crease_degrees = crease_degrees
@@ -110,11 +106,7 @@ class SdfGrid(Solid):
     ) -> SdfGrid:
         """Make the medium of given signed distances.
 
-        Args:
-            distances: of each body at the grid's vertices, negative inside; positive at the border.
-            box: corners of the grid, world units.
-            iors: refractive index of each body; later bodies lie inside earlier ones.
-            shell: half width of the smooth interface that the Eikonal equation sees, world units.
+        They are of each body at the vertices of a grid over `box`, negative inside and positive at the border.
         """
         medium = cls.__new__(cls)
         Solid.__init__(medium, iors, shell)
@@ -155,7 +147,7 @@ class SdfGrid(Solid):
         margin = 0.5 * torch.linalg.vector_norm(spacing) + 0.25 * spacing.min()
         return (nearest - margin).clamp(min=0).to(self.distances.device)
 
-    def clearance(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    def clearance(self, positions: Vectors) -> Scalars:
         """Distance to the nearest shell: a lower bound from the blocks, or where that is none the distance itself."""
         grid = self.coarse_clearance
         vertices = constant(self.coefficients.shape[1:], grid.device)
@@ -176,9 +168,7 @@ class SdfGrid(Solid):
         self.register_buffer("coefficients", coefficients, persistent=False)
         self.register_buffer("distances", distances, persistent=False)
 
-    def signed_distances(
-        self, positions: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
+    def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
         """Splines of the distances and their exact gradients."""
         splines = [quadratic_spline(coefficients, self.box, positions) for coefficients in self.coefficients]
         return torch.stack([phi for phi, _ in splines], -1), torch.stack([gradient for _, gradient in splines], -2)

@@ -7,6 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from nerfro.allowed import NotNegative, Positive
+from nerfro.media.base import Vectors
 from nerfro.media.solid import Solid
 from nerfro.registry import register
 
@@ -16,24 +18,20 @@ _MARGIN = 0.05
 
 @register("medium", "ball")
 class Ball(Solid):
-    """A ball around the origin."""
+    """A ball around the origin.
 
-    def __init__(self, radius: float = 0.8, ior: float = 1.5, shell: float = 0.002) -> None:
-        """Make a ball.
+    Args:
+        radius: world units.
+        ior, shell: see `Solid`.
+    """
 
-        Args:
-            radius: world units.
-            ior: refractive index.
-            shell: half width of the smooth interface that the Eikonal equation sees, world units.
-        """
+    def __init__(self, radius: Positive = 0.8, ior: Positive = 1.5, shell: Positive = 0.002) -> None:
         super().__init__([ior], shell)
         self.radius = radius
         side = radius * (1 + _MARGIN) + shell
         self.register_buffer("box", torch.tensor([[-side] * 3, [side] * 3]), persistent=False)
 
-    def signed_distances(
-        self, positions: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch 1"], Float[Tensor, "*batch 1 3"]]:
+    def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
         """|x| - R and x / |x|."""
         distance = torch.linalg.vector_norm(positions, dim=-1, keepdim=True)
         return distance - self.radius, functional.normalize(positions, dim=-1)[..., None, :]
@@ -41,27 +39,27 @@ class Ball(Solid):
 
 @register("medium", "rounded_box")
 class RoundedBox(Solid):
-    """A cube around the origin with rounded edges and corners."""
+    """A cube around the origin with rounded edges and corners.
+
+    Args:
+        half_side: from the centre to a face, world units.
+        edge_radius: of the rounding, world units.
+        ior, shell: see `Solid`.
+    """
 
     def __init__(
-        self, half_side: float = 0.75, edge_radius: float = 0.08, ior: float = 1.52, shell: float = 0.002
+        self,
+        half_side: Positive = 0.75,
+        edge_radius: NotNegative = 0.08,
+        ior: Positive = 1.52,
+        shell: Positive = 0.002,
     ) -> None:
-        """Make a rounded cube.
-
-        Args:
-            half_side: from the centre to a face, world units.
-            edge_radius: of the rounding, world units.
-            ior: refractive index.
-            shell: half width of the smooth interface that the Eikonal equation sees, world units.
-        """
         super().__init__([ior], shell)
         self.half_side, self.edge_radius = half_side, edge_radius
         side = half_side * (1 + _MARGIN) + shell
         self.register_buffer("box", torch.tensor([[-side] * 3, [side] * 3]), persistent=False)
 
-    def signed_distances(
-        self, positions: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch 1"], Float[Tensor, "*batch 1 3"]]:
+    def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
         """|max(q, 0)| + min(max q, 0) - r with q = |x| - (a - r): the distance to a smaller cube, less the radius."""
         q = positions.abs() - (self.half_side - self.edge_radius)
         outward = q.clamp(min=0)
@@ -74,25 +72,23 @@ class RoundedBox(Solid):
 
 @register("medium", "slab")
 class Slab(Solid):
-    """A plate across the z axis, as wide as its box."""
+    """A plate across the z axis, as wide as its box.
 
-    def __init__(self, thickness: float = 0.5, ior: float = 1.5, half_width: float = 2.0, shell: float = 0.002) -> None:
-        """Make a plate.
+    Args:
+        thickness: along z, world units.
+        half_width: half side of the box along x and y, world units.
+        ior, shell: see `Solid`.
+    """
 
-        Args:
-            thickness: along z, world units.
-            ior: refractive index.
-            half_width: half side of the box along x and y, world units.
-            shell: half width of the smooth interface that the Eikonal equation sees, world units.
-        """
+    def __init__(
+        self, thickness: Positive = 0.5, ior: Positive = 1.5, half_width: Positive = 2.0, shell: Positive = 0.002
+    ) -> None:
         super().__init__([ior], shell)
         self.thickness = thickness
         corner = torch.tensor([half_width, half_width, thickness * (0.5 + _MARGIN) + shell])
         self.register_buffer("box", torch.stack([-corner, corner]), persistent=False)
 
-    def signed_distances(
-        self, positions: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch 1"], Float[Tensor, "*batch 1 3"]]:
+    def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
         """|z| - h / 2 and the sign of z."""
         z = positions[..., 2:]
         normal = torch.cat([torch.zeros_like(positions[..., :2]), z.sign()], -1)

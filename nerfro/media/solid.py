@@ -8,11 +8,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from nerfro.errors import NerfroError
+from nerfro.allowed import Positive, checked
 from nerfro.kernels.tolerances import MIN_COSINE, SAFE_SHARE, STEPS_PER_SHELL
-from nerfro.media.base import Medium
+from nerfro.media.base import Medium, Scalars, Vectors
 
 
+@checked("medium")
 class Solid(Medium):
     """Bodies of constant index, bounded by the zero levels of signed distances; later bodies lie inside earlier ones.
 
@@ -21,31 +22,19 @@ class Solid(Medium):
     n <- n + (ior - n) S.
 
     Attributes:
-        iors: refractive index of each body; a parameter where it is learned.
         shell: half width w, world units.
     """
 
-    iors: Float[Tensor, "K"]
+    iors: Float[Tensor, "K"]  # refractive index of each body; a parameter where it is learned
 
-    def __init__(self, iors: list[float], shell: float) -> None:
-        """Set what all solids share.
-
-        Raises:
-            NerfroError: an index or the width is not positive.
-        """
+    def __init__(self, iors: list[Positive], shell: Positive) -> None:
         super().__init__()
-        if not iors or not all(ior > 0 for ior in iors):
-            raise NerfroError(f"{iors} are no refractive indices; give positive numbers such as 1.5")
-        if not shell > 0:
-            raise NerfroError(f"a shell of half width {shell} is impossible; give a positive number")
         # Double precision: kernels ask for it, and a number without dimensions takes on the precision of what it meets.
         self.register_buffer("iors", torch.tensor(iors, dtype=torch.float64), persistent=False)
         self.shell = float(shell)
 
     @abstractmethod
-    def signed_distances(
-        self, positions: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
+    def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
         """Signed distance to each body's surface, negative inside, and its gradient; a lower bound far away will do."""
 
     @staticmethod
@@ -61,9 +50,7 @@ class Solid(Medium):
             n = torch.where(inside[..., body], ior, n)
         return n
 
-    def forward(
-        self, positions: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+    def forward(self, positions: Vectors) -> tuple[Scalars, Vectors]:
         """Index of the smooth shells and its exact gradient."""
         phi, normals = self.signed_distances(positions)
         in_box = ((positions >= self.box[0]) & (positions <= self.box[1])).all(-1)
@@ -76,14 +63,12 @@ class Solid(Medium):
             n = n + (ior - n) * step[..., 0]
         return torch.where(in_box, n, 1.0), torch.where(in_box[..., None], gradient, 0.0)
 
-    def clearance(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    def clearance(self, positions: Vectors) -> Scalars:
         """Most of the distance to the nearest shell."""
         phi, _ = self.signed_distances(positions)
         return (SAFE_SHARE * phi.abs().amin(-1) - self.shell).clamp(min=0)
 
-    def step_length(
-        self, directions: Float[Tensor, "*batch 3"], gradients: Float[Tensor, "*batch 3"]
-    ) -> Float[Tensor, "*batch"]:
+    def step_length(self, directions: Vectors, gradients: Vectors) -> Scalars:
         """The shell's width over `STEPS_PER_SHELL`, longer for slanting rays."""
         slope = torch.linalg.vector_norm(gradients, dim=-1)
         # Where there is no gradient there is no normal either; dividing by it would make gradients nan.

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.allowed import Count, Natural, Positive, Range, corners_of_box
 from nerfro.errors import NerfroError
 from nerfro.files.cache import cached_arrays, content_hash, load_arrays, save_arrays
 from nerfro.geometry.interpolation import gradient, smooth, trilinear
@@ -16,7 +18,7 @@ from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.occupancy import occupancy_fraction
 from nerfro.geometry.signed_distance import distance_to_set
 from nerfro.kernels.constants import constant
-from nerfro.media.base import Medium, lazy_buffer
+from nerfro.media.base import Medium, Scalars, Vectors, lazy_buffer
 from nerfro.paths import resolve_path
 from nerfro.registry import register
 
@@ -31,45 +33,36 @@ class VoxelGrid(Medium):
     n = 1 + (ior - 1) * smooth(occupancy); grad n is the central difference of n on the grid; both are interpolated
     trilinearly between the vertices, so the gradient that is returned is not the derivative of the n that is returned.
 
-    Attributes:
-        table: n and grad n (per world unit) at each vertex.
-        occupancy: fraction inside the mesh, before smoothing.
+    Args:
+        mesh: closed triangle mesh in world units, any format trimesh reads.
+        ior: refractive index inside the mesh.
+        resolution: grid vertices a side; 64 to 512 are usual.
+        box_min, box_max: corners of the grid, world units; the object needs a margin of air inside.
+        smoothing_size: taps of the Gaussian kernel a side, odd; 0 for none.
+        smoothing_sigma: standard deviation of the kernel, voxels.
+        subsamples: inside tests a side around each vertex.
+        accept_open_mesh: take a mesh with holes; the majority of three axes decides what is inside.
+        cache: keep the occupancy in the cache folder.
+        grid: file written by `save`, used with the box, index and smoothing it holds instead of all the above.
     """
 
-    table: Float[Tensor, "X Y Z 4"]
-    occupancy: Float[Tensor, "X Y Z"]
+    table: Float[Tensor, "X Y Z 4"]  # n and grad n (per world unit) at each vertex
+    occupancy: Float[Tensor, "X Y Z"]  # fraction inside the mesh, before smoothing
 
     def __init__(
         self,
         mesh: str | None = None,
-        ior: float = 1.5,
-        resolution: int = 128,
+        ior: Positive = 1.5,
+        resolution: Annotated[int, Range(at_least=4)] = 128,
         box_min: list[float] = [-1.5, -1.5, -1.5],  # noqa: B006 (the registry reads and copies it)
         box_max: list[float] = [1.5, 1.5, 1.5],  # noqa: B006
-        smoothing_size: int = 9,
-        smoothing_sigma: float = 1.0,
-        subsamples: int = 4,
+        smoothing_size: Natural = 9,
+        smoothing_sigma: Positive = 1.0,
+        subsamples: Count = 4,
         accept_open_mesh: bool = False,
         cache: bool = True,
         grid: str | None = None,
     ) -> None:
-        """Voxelise a mesh, or load a grid.
-
-        Args:
-            mesh: closed triangle mesh in world units, any format trimesh reads.
-            ior: refractive index inside the mesh.
-            resolution: grid vertices a side.
-            box_min, box_max: corners of the grid, world units; the object needs a margin of air inside.
-            smoothing_size: taps of the Gaussian kernel a side, odd; 0 for none.
-            smoothing_sigma: standard deviation of the kernel, voxels.
-            subsamples: inside tests a side around each vertex.
-            accept_open_mesh: take a mesh with holes; the majority of three axes decides what is inside.
-            cache: keep the occupancy in the cache folder.
-            grid: file written by `save`, used with the box, index and smoothing it holds instead of all the above.
-
-        Raises:
-            NerfroError: no or two sources, a bad mesh, a bad box, or an object without a margin.
-        """
         super().__init__()
         if (mesh is None) == (grid is None):
             raise NerfroError("medium=voxel_grid needs one source; set either medium.mesh or medium.grid")
@@ -77,7 +70,7 @@ class VoxelGrid(Medium):
             stored = _load_grid(resolve_path(grid))
             self._set(*stored)
             return
-        box = check_box(box_min, box_max, resolution)
+        box = corners_of_box(box_min, box_max)
         loaded = load_mesh(resolve_path(str(mesh)), accept_open_mesh)
         # One voxel for the sub-samples, one for the gradient's difference, and what the smoothing spreads.
         check_margin(loaded, box, resolution, 2 + smoothing_size // 2)
@@ -102,11 +95,8 @@ class VoxelGrid(Medium):
     ) -> VoxelGrid:
         """Make the medium of given occupancy fractions.
 
-        Args:
-            occupancy: fraction of object at each vertex, 0 to 1; air at the border.
-            box: corners of the grid, world units.
-            ior: refractive index of the object.
-            size, sigma: taps a side and standard deviation (voxels) of the smoothing kernel.
+        They are of the vertices of a grid over `box`, 0 to 1, with air at the border; smoothed with `size` taps a side
+        and a standard deviation of `sigma` voxels.
         """
         medium = cls.__new__(cls)
         Medium.__init__(medium)
@@ -114,8 +104,6 @@ class VoxelGrid(Medium):
         return medium
 
     def _set(self, occupancy: Tensor, box: Tensor, ior: float, size: int, sigma: float) -> None:
-        if not ior > 0:
-            raise NerfroError(f"medium.ior={ior} is not a refractive index; give a positive number such as 1.5")
         if any(float(face.abs().max()) > 0 for face in _faces(occupancy)):
             raise NerfroError("the object touches the grid's border; enlarge medium.box_min and medium.box_max")
         self.ior, self.smoothing_size, self.smoothing_sigma = float(ior), int(size), float(sigma)
@@ -138,9 +126,7 @@ class VoxelGrid(Medium):
         occupied = self.occupancy.nonzero()
         return self.box[0] + torch.stack([occupied.amin(0), occupied.amax(0)]) * self.spacing
 
-    def forward(
-        self, positions: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+    def forward(self, positions: Vectors) -> tuple[Scalars, Vectors]:
         """Refractive index and its gradient (per world unit), trilinear; n = 1 and grad n = 0 outside the box."""
         values = trilinear(self.table, self.box, positions)
         inside = ((positions >= self.box[0]) & (positions <= self.box[1])).all(-1)
@@ -160,16 +146,14 @@ class VoxelGrid(Medium):
         diagonal = float(torch.linalg.vector_norm(self.box[1] - self.box[0]))
         return torch.from_numpy(distance.clip(0, diagonal)).to(self.table)
 
-    def clearance(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    def clearance(self, positions: Vectors) -> Scalars:
         """Distance within which grad n is zero, for the cell that holds each point."""
         grid = self.clearance_grid
         cell = ((positions - self.box[0]) / self.spacing).floor().long()
         x, y, z = torch.minimum(cell.clamp(min=0), constant(grid.shape, grid.device) - 1).unbind(-1)
         return grid[x, y, z]
 
-    def step_length(
-        self, directions: Float[Tensor, "*batch 3"], gradients: Float[Tensor, "*batch 3"]
-    ) -> Float[Tensor, "*batch"]:
+    def step_length(self, directions: Vectors, gradients: Vectors) -> Scalars:
         """Half a voxel."""
         return (0.5 * self.spacing.min()).expand(directions.shape[:-1])
 
@@ -186,26 +170,8 @@ class VoxelGrid(Medium):
         )
 
 
-def check_box(box_min: list[float], box_max: list[float], resolution: int) -> Float[np.ndarray, "2 3"]:
-    """Corners as an array.
-
-    Raises:
-        NerfroError: they are not a box, or the resolution is too small for a gradient.
-    """
-    box = np.array([box_min, box_max], np.float64) if len(box_min) == len(box_max) == 3 else np.zeros((2, 3))
-    if not (np.isfinite(box).all() and (box[1] > box[0]).all()):
-        raise NerfroError(f"box_min={box_min}, box_max={box_max} is no box; give three numbers each, min below max")
-    if resolution < 4:
-        raise NerfroError(f"medium.resolution={resolution} is too small; give at least 4 (64 to 512 are usual)")
-    return box
-
-
 def check_margin(mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], resolution: int, voxels: int) -> None:
-    """Refuse a mesh that does not leave so many voxels of air on each side of the box.
-
-    Raises:
-        NerfroError: with a box that would do.
-    """
+    """Refuse a mesh that does not leave so many voxels of air on each side of the box."""
     low, high = mesh.bounds
     margin = voxels * (box[1] - box[0]) / (resolution - 1)
     if (low - margin >= box[0]).all() and (high + margin <= box[1]).all():

@@ -13,11 +13,11 @@ from jaxtyping import Float
 from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 
+from nerfro.allowed import checked
 from nerfro.boundaries.base import Boundary
 from nerfro.camera.base import Camera
 from nerfro.camera.given import GivenCamera
 from nerfro.distributed import drawing_for
-from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.light import clipped_alike, to_srgb
 from nerfro.losses.base import Loss
@@ -29,32 +29,22 @@ from nerfro.types import Batch, Path, Rays, Rendering
 
 @dataclass(frozen=True)
 class Parts:
-    """What a model is composed of.
+    """What a model is composed of."""
 
-    Attributes:
-        medium: refractive index.
-        path_sampler, point_sampler: how rays become paths and paths samples.
-        make_field: makes a new radiance field.
-        boundary: what lies beyond the volume.
-        losses: training losses by name.
-        optimizer: settings of Adam.
-        camera: what is believed of the training cameras.
-        seed: of all random draws in training.
-        chunk_size: rays rendered at once in evaluation, which bounds its memory.
-    """
-
-    medium: Medium
+    medium: Medium  # refractive index
+    # How rays become paths and paths samples.
     path_sampler: PathSampler
     point_sampler: PointSampler
-    make_field: Callable[[], Field]
-    boundary: Boundary
-    losses: Mapping[str, Loss]
-    optimizer: OptimizerConfig
-    camera: Camera = dataclasses.field(default_factory=GivenCamera)
-    seed: int = 0
-    chunk_size: int = 8192
+    make_field: Callable[[], Field]  # makes a new radiance field
+    boundary: Boundary  # what lies beyond the volume
+    losses: Mapping[str, Loss]  # training losses by name
+    optimizer: OptimizerConfig  # settings of Adam
+    camera: Camera = dataclasses.field(default_factory=GivenCamera)  # what is believed of the training cameras
+    seed: int = 0  # of all random draws in training
+    chunk_size: int = 8192  # rays rendered at once in evaluation, which bounds its memory
 
 
+@checked("model")
 class NerfModel(LightningModule, ABC):
     """Renders rays and learns from pixels; a model adds how many fields there are and where the boundary is asked.
 
@@ -62,15 +52,10 @@ class NerfModel(LightningModule, ABC):
         parts: what the model is composed of.
         fields: radiance field of each sampling level, or one for all.
         colour: what fields and boundary return and rays add up: `linear` radiance, or `srgb` as in the authors' code.
-
-    Raises:
-        NerfroError: another `colour`.
     """
 
     def __init__(self, parts: Parts, fields: list[Field], colour: Literal["linear", "srgb"] = "linear") -> None:
         super().__init__()
-        if colour not in ("linear", "srgb"):
-            raise NerfroError(f"model.colour={colour} is unknown; choose linear, or srgb as in the authors' code")
         self.colour = colour
         self.camera, self.medium = parts.camera, parts.medium
         self.path_sampler, self.point_sampler = parts.path_sampler, parts.point_sampler
@@ -116,12 +101,7 @@ class NerfModel(LightningModule, ABC):
     def difference(self, radiance: Float[Tensor, "*batch 3"], rgb: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor]:
         """Prediction and target, both sRGB, for a loss to compare.
 
-        Args:
-            radiance: of pixels, as rendered.
-            rgb: of the same pixels in the photograph, sRGB in [0, 1].
-
-        Returns:
-            The prediction encoded, and the target; equal where both are brighter than a photograph can tell.
+        They are equal where both are brighter than a photograph can tell.
         """
         prediction = self.encode(radiance)
         return prediction, rgb if self.colour == "srgb" else clipped_alike(rgb, prediction)

@@ -9,35 +9,24 @@ from typing import Optional
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Timer
 
-from nerfro.errors import NerfroError
+from nerfro.allowed import Natural, NotNegative, Positive, checked
 
 
+@checked("optimizer")
 @dataclass
 class OptimizerConfig:
-    """Adam with a log-linear learning rate and a sine warm-up (authors' code; mip-NeRF, section 4).
+    """Adam with a log-linear learning rate and a sine warm-up (authors' code; mip-NeRF, section 4)."""
 
-    Attributes:
-        learning_rate, final_learning_rate: at the beginning and the end of the run.
-        boundary_learning_rate, medium_learning_rate, camera_learning_rate: of the other parts that learn, at the
-            beginning, decaying in proportion; none for the same.
-        warmup_steps: length of the warm-up; 0 for none.
-        warmup_factor: factor of the learning rate at its first step.
-        adam_epsilon: of Adam.
-    """
-
-    learning_rate: float = 5e-4
-    final_learning_rate: float = 5e-6
-    boundary_learning_rate: Optional[float] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    medium_learning_rate: Optional[float] = None  # noqa: UP045
-    camera_learning_rate: Optional[float] = None  # noqa: UP045
-    warmup_steps: int = 2500
-    warmup_factor: float = 0.01
-    adam_epsilon: float = 1e-8
-
-    def __post_init__(self) -> None:
-        rates = [self.final_learning_rate, *map(self.rate, ("fields", "boundary", "medium", "camera"))]
-        if min(rates) <= 0 or self.warmup_steps < 0:
-            raise NerfroError(f"{self}: learning rates must be positive and warmup_steps not negative")
+    # At the beginning and the end of the run.
+    learning_rate: Positive = 5e-4
+    final_learning_rate: Positive = 5e-6
+    # Of the other parts that learn, at the beginning, decaying in proportion; none for the same.
+    boundary_learning_rate: Optional[Positive] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    medium_learning_rate: Optional[Positive] = None  # noqa: UP045
+    camera_learning_rate: Optional[Positive] = None  # noqa: UP045
+    warmup_steps: Natural = 2500  # length of the warm-up; 0 for none
+    warmup_factor: NotNegative = 0.01  # factor of the learning rate at its first step
+    adam_epsilon: Positive = 1e-8  # of Adam
 
     def rate(self, part: str) -> float:
         """Learning rate of a part at the beginning."""
@@ -46,13 +35,7 @@ class OptimizerConfig:
 
 
 def learning_rate_factor(step: int, progress: float, config: OptimizerConfig) -> float:
-    """Factor of the initial learning rates: log-linear decay times mip-NeRF's sine warm-up.
-
-    Args:
-        step: optimiser steps done.
-        progress: share of the run that is done, in [0, 1].
-        config: rates and warm-up.
-    """
+    """Factor of the initial learning rates: log-linear decay times mip-NeRF's sine warm-up."""
     factor = (config.final_learning_rate / config.learning_rate) ** progress
     if config.warmup_steps > 0:
         ascent = math.sin(0.5 * math.pi * min(step / config.warmup_steps, 1.0))

@@ -13,13 +13,9 @@ from nerfro.types import Path, Rays, Rendering, Samples
 
 
 class PathSampler(nn.Module, ABC):
-    """Bends rays into paths: traced without gradients, and refined where something learns from them.
+    """Bends rays into paths: traced without gradients, and refined where something learns from them."""
 
-    Attributes:
-        needs_medium: whether it asks the medium at all; if not, none is built.
-    """
-
-    needs_medium = True
+    needs_medium = True  # whether it asks the medium at all; if not, none is built
 
     @abstractmethod
     def forward(self, rays: Rays, medium: Medium) -> Path:
@@ -29,10 +25,6 @@ class PathSampler(nn.Module, ABC):
         """The traced path with gradients by what bends it, and the same values; asked where something of that learns.
 
         Silhouettes that move, and events that appear or go, have no gradients.
-
-        Args:
-            path: of these rays through this medium, as `forward` traced it.
-            rays, medium: may want gradients.
         """
         return path
 
@@ -45,21 +37,13 @@ class PointSampler(nn.Module, ABC):
     """Chooses arc lengths on a path; random in training (by `Path.rand`), the same every time in evaluation.
 
     `Samples.along` asks the path for positions and directions there.
-
-    Attributes:
-        num_levels: how often the path is sampled, each level guided by the rendering of the one before.
     """
 
-    num_levels: int
+    num_levels: int  # how often the path is sampled, each level guided by the rendering of the one before
 
     @abstractmethod
     def forward(self, path: Path, previous: Rendering | None) -> Samples:
         """Sample the path, first without and then with the previous level's rendering."""
 
     def after_step(self, step: int, fields: Sequence[Field]) -> None:
-        """Learn from the radiance fields after a training step, if the sampler remembers anything of them.
-
-        Args:
-            step: optimiser steps done.
-            fields: one for each level, or one for all.
-        """
+        """Learn from the radiance fields after a training step, if the sampler remembers anything of them."""

@@ -26,14 +26,7 @@ _CAPACITY = 18
 def snell_on_grid(
     rays: Rays, medium: SdfGrid, min_step: float, max_events: int
 ) -> tuple[Path, Int[Tensor, "R"], Bool[Tensor, "R"]]:
-    """`samplers.snell.trace_interfaces` by the compiled kernel.
-
-    Args:
-        rays: on the CPU.
-        medium: signed distances on a grid.
-        min_step: shortest step of the search, as a share of the box's shortest side.
-        max_events: refractions and reflections, at most.
-    """
+    """`samplers.snell.trace_interfaces` by the compiled kernel."""
     from nerfro.samplers.snell_cpu import trace_snell
 
     solids = _for_kernels(medium)
@@ -46,15 +39,7 @@ def snell_on_grid(
 def eikonal_on_grid(
     rays: Rays, medium: VoxelGrid | SdfGrid, step: float, tolerance: float, max_steps: int
 ) -> tuple[Path, Bool[Tensor, "R"]]:
-    """`samplers.eikonal.march_adaptive` by the compiled kernel.
-
-    Args:
-        rays: on the CPU.
-        medium: either kind of grid.
-        step: arc length of a step across the shell or through the grid, world units.
-        tolerance: distance from its last tangent at which a path gets a vertex, world units.
-        max_steps: steps of a ray, at most.
-    """
+    """`samplers.eikonal.march_adaptive` by the compiled kernel."""
     from nerfro.samplers.eikonal_cpu import march_adaptive
 
     settings = (_for_kernels(medium), step, tolerance, max_steps)

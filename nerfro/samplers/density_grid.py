@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.allowed import Count, Range, Share, corners_of_box
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.registry import register
@@ -43,28 +45,19 @@ class DensityGridSampler(PointSampler):
 
     def __init__(
         self,
-        num_samples: int = 32,
-        num_bins: int = 96,
+        num_samples: Count = 32,
+        num_bins: Annotated[int, Range(at_least=2)] = 96,
         box_min: list[float] = (-1.0, -1.0, -1.0),  # type: ignore[assignment]
         box_max: list[float] = (1.0, 1.0, 1.0),  # type: ignore[assignment]
-        resolution: int = 64,
-        uniform: float = 0.2,
-        every: int = 16,
-        decay: float = 0.9,
+        resolution: Annotated[int, Range(at_least=2)] = 64,
+        uniform: Share = 0.2,
+        every: Count = 16,
+        decay: Share = 0.9,
     ) -> None:
         super().__init__()
-        if num_samples < 1 or num_bins < 2 or resolution < 2 or every < 1:
-            raise NerfroError(
-                f"sampler/points=density_grid: num_samples={num_samples} num_bins={num_bins} resolution={resolution} "
-                f"every={every}; take at least 1, 2, 2 and 1"
-            )
-        if not 0 < uniform < 1 or not 0 < decay < 1:
-            raise NerfroError(
-                f"sampler/points=density_grid: uniform={uniform} decay={decay}; take both between 0 and 1"
-            )
         self.num_samples, self.num_bins, self.resolution = num_samples, num_bins, resolution
         self.uniform, self.every, self.decay = uniform, every, decay
-        self.register_buffer("box", torch.tensor([list(box_min), list(box_max)]), persistent=False)
+        self.register_buffer("box", torch.from_numpy(corners_of_box(box_min, box_max)).float(), persistent=False)
         self.register_buffer("density", torch.zeros(resolution, resolution, resolution))
 
     def forward(self, path: Path, previous: Rendering | None) -> Samples:

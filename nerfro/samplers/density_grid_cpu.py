@@ -42,16 +42,9 @@ def _segment(s, vertex, at):
 def draw(positions, directions, s, low, high, density, u, num_bins, floor):
     """Edges and midpoints of samples drawn in proportion to the weights that the density gives, plus a floor.
 
-    Args:
-        positions, directions, s: vertices of the paths, [R, S, 3], [R, S, 3], [R, S].
-        low, high: corners of the grid's box, [3].
-        density: of each cell, [C, C, C].
-        u: places in the cumulative distribution, ascending on each ray, [R, N + 1].
-        num_bins: places along each path at which the density is asked.
-        floor: weight that every bin has beside its share, which sums to one.
-
-    Returns:
-        Edges [R, N + 1], arc lengths [R, N], positions and directions [R, N, 3] of the samples.
+    `u` are places in the cumulative distribution, ascending on each ray [R, N + 1]; `floor` is the weight that every
+    bin has beside its share, which sums to one. Returns edges [R, N + 1], arc lengths [R, N], positions and directions
+    [R, N, 3].
     """
     num_rays, num_edges = u.shape
     cells = density.shape[0]

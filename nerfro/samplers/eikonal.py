@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from nerfro.errors import NerfroError
+from nerfro.allowed import Count, Positive, Range
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.kernels.tolerances import MIN_TURN, REACHED, STEPS_PER_SHELL
 from nerfro.media.base import Medium
@@ -28,40 +28,27 @@ _ROUNDING = 0.01
 
 @register("sampler/path", "eikonal")
 class Eikonal(PathSampler):
-    """Paths that solve the Eikonal equation: adaptive steps, or equal ones (the paper's: integrator=euler)."""
+    """Paths that solve the Eikonal equation: adaptive steps, or equal ones (the paper's: integrator=euler).
+
+    Args:
+        integrator: adaptive is a leapfrog that steps only where the index varies, jumps elsewhere and keeps few
+            vertices; the others take equal steps from near to far and keep them all. euler is the paper's,
+            leapfrog and rk4 hold |v| = n.
+        num_steps: vertices of a path of equal steps; the paper has 768.
+        tolerance: adaptive: distance of a path from its last tangent at which it gets a vertex, as a share of the
+            box's diagonal.
+        max_steps: adaptive: steps of a ray, at most; beyond them it goes straight on.
+    """
 
     def __init__(
         self,
         integrator: Literal["adaptive", "euler", "leapfrog", "rk4"] = "adaptive",
-        num_steps: int = 768,
-        tolerance: float = 2e-4,
-        max_steps: int = 16384,
+        num_steps: Annotated[int, Range(at_least=2)] = 768,
+        tolerance: Positive = 2e-4,
+        max_steps: Count = 16384,
     ) -> None:
-        """Choose how to step.
-
-        Args:
-            integrator: adaptive is a leapfrog that steps only where the index varies, jumps elsewhere and keeps few
-                vertices; the others take equal steps from near to far and keep them all. euler is the paper's,
-                leapfrog and rk4 hold |v| = n.
-            num_steps: vertices of a path of equal steps.
-            tolerance: adaptive: distance of a path from its last tangent at which it gets a vertex, as a share of the
-                box's diagonal.
-            max_steps: adaptive: steps of a ray, at most; beyond them it goes straight on.
-
-        Raises:
-            NerfroError: a number is out of range.
-        """
         super().__init__()
-        if num_steps < 2:
-            raise NerfroError(f"sampler.path.num_steps={num_steps} makes no path; give at least 2 (the paper: 768)")
-        if not (tolerance > 0 and max_steps > 0):
-            raise NerfroError(
-                f"sampler.path.tolerance={tolerance}, max_steps={max_steps} must be positive; 2e-4 and 16384 are usual"
-            )
-        self.integrator = integrator
-        self.num_steps = num_steps
-        self.tolerance = tolerance
-        self.max_steps = max_steps
+        self.integrator, self.num_steps, self.tolerance, self.max_steps = integrator, num_steps, tolerance, max_steps
 
     @torch.no_grad()
     def forward(self, rays: Rays, medium: Medium) -> Path:
@@ -164,15 +151,7 @@ def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int)
     """Leapfrog steps where the index varies, straight jumps elsewhere: the plain reference of the compiled kernel.
 
     A vertex is kept where the path has left the tangent of the last one by `tolerance`, and at the start of jumps.
-
-    Args:
-        rays: in world space.
-        medium: any.
-        tolerance: world units.
-        max_steps: steps and jumps of a ray, at most.
-
-    Returns:
-        Paths, and whether a ray met the limit; such a ray goes straight on.
+    Lengths are in world units. Also returned is whether a ray met the limit; such a ray goes straight on.
     """
     vertices = _NewVertices(rays, tolerance)
     state, refracted, exceeded = _march(rays, medium, max_steps, vertices)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.allowed import Count, NotNegative, Range
 from nerfro.errors import NerfroError
 from nerfro.registry import register
 from nerfro.samplers.base import PointSampler
@@ -24,7 +25,7 @@ class Hierarchical(PointSampler):
 
     Args:
         num_coarse: coarse samples, N_c.
-        num_fine: fine samples, N_f.
+        num_fine: fine samples, N_f; `stratified` has none.
         union: render the sorted union of both (NeRF, the paper) or the fine ones alone (mip-NeRF).
         blur: filter the coarse weights with mip-NeRF's max-blur first.
         padding: weight added to every bin before drawing; mip-NeRF's is 0.01, the authors' code has 0.
@@ -35,25 +36,18 @@ class Hierarchical(PointSampler):
 
     def __init__(
         self,
-        num_coarse: int = 64,
-        num_fine: int = 128,
+        num_coarse: Annotated[int, Range(at_least=4)] = 64,
+        num_fine: Count = 128,
         union: bool = True,
         blur: bool = False,
-        padding: float = 0.0,
+        padding: NotNegative = 0.0,
         draw: Literal["arc_length", "vertices"] = "arc_length",
         cast: Literal["points", "cones"] = "points",
-        offset: float = 0.5,
+        offset: Annotated[float, Range(at_least=0, less_than=1)] = 0.5,
         box_min: list[float] = (),  # type: ignore[assignment]
         box_max: list[float] = (),  # type: ignore[assignment]
     ) -> None:
         super().__init__()
-        if num_coarse < 4 or num_fine < 1:
-            raise NerfroError(
-                f"sampler/points: num_coarse={num_coarse} num_fine={num_fine}; take at least 4 and 1, "
-                "or sampler/points=stratified for no fine samples"
-            )
-        if padding < 0:
-            raise NerfroError(f"sampler/points: padding={padding} is negative; 0 switches it off")
         if cast == "cones" and union:
             raise NerfroError("sampler/points: cones are not merged with coarse ones; set union=false")
         self.coarse = Stratified(num_coarse, draw, cast, offset, box_min, box_max)

@@ -19,16 +19,11 @@ Index = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 class RayState(NamedTuple):
-    """Where rays are.
+    """Where rays are."""
 
-    Attributes:
-        positions: world units.
-        velocities: v, direction times refractive index.
-        n, gradients: the medium there.
-    """
-
-    positions: Float[Tensor, "R 3"]
-    velocities: Float[Tensor, "R 3"]
+    positions: Float[Tensor, "R 3"]  # world units
+    velocities: Float[Tensor, "R 3"]  # v, direction times refractive index
+    # The medium there.
     n: Float[Tensor, "R"]
     gradients: Float[Tensor, "R 3"]
 

@@ -20,14 +20,8 @@ def snell_on_mesh(rays: Rays, medium: SdfGrid, max_events: int) -> tuple[Path, I
     """Follow rays from triangle to triangle.
 
     Whether a ray is in a body is known from how often it crossed its surface, not from the triangles' orientation.
-
-    Args:
-        rays: in world space; they are traced on the CPU, in double precision.
-        medium: with meshes; its signed distance says which rays begin inside.
-        max_events: refractions and reflections, at most.
-
-    Returns:
-        Paths, the number of events on each, and whether a ray met the limit.
+    Rays are traced on the CPU, in double precision; the signed distance says which begin inside. Returned are paths,
+    the number of events on each, and whether a ray met the limit.
     """
     triangles, scene = medium.traced_triangles()
     iors = torch.cat([torch.ones(1), medium.iors.detach().cpu()]).double()

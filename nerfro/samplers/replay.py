@@ -103,12 +103,6 @@ def replay(path: Path, rays: Rays, medium: Medium, meet: Meet) -> Path:
 
     Event by event the ray goes on to the surface, and there Snell's law holds, or reflection where the trace reflected.
     Derivatives are taken at the traced vertices, and every value stays that of the trace.
-
-    Args:
-        path: traced, with the body in which each vertex is left.
-        rays: that were traced.
-        medium: that bent them.
-        meet: how a surface is found again, `meet_solid` or `meet_triangles`.
     """
     x, d, s = start_of(path, rays)
     num_paths, num_vertices = path.s.shape
@@ -186,10 +180,6 @@ def meet_triangles(triangles: Triangles, scene: MeshIntersector) -> Meet:
     """Meet the triangles that rays have hit, on the CPU and in double precision.
 
     A triangle that is not found again, as in a gap of rounding between two, is replaced by a fixed plane.
-
-    Args:
-        triangles: with gradients.
-        scene: of the same triangles.
     """
 
     def meet(x: Tensor, d: Tensor, length: Tensor, body: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from nerfro.allowed import Count
 from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.kernels.tolerances import MIN_SEARCH_STEP
@@ -31,36 +32,26 @@ _ROOT_ITERATIONS = 60
 
 @dataclass(frozen=True)
 class SnellTrace:
-    """Paths and what happened on them.
+    """Paths and what happened on them."""
 
-    Attributes:
-        path: minimal polylines, a vertex for each event beside near and far.
-        num_events: refractions and total reflections of each ray.
-        exceeded: whether a ray met the limit of events; such a ray goes straight on from there.
-    """
-
-    path: Path
-    num_events: Int[Tensor, "R"]
-    exceeded: Bool[Tensor, "R"]
+    path: Path  # minimal polylines, a vertex for each event beside near and far
+    num_events: Int[Tensor, "R"]  # refractions and total reflections of each ray
+    exceeded: Bool[Tensor, "R"]  # whether a ray met the limit of events; such a ray goes straight on from there
 
 
 @register("sampler/path", "snell")
 class Snell(PathSampler):
-    """Exact refraction (Snell's law) and total reflection at the surface of a solid."""
+    """Exact refraction (Snell's law) and total reflection at the surface of a solid.
 
-    def __init__(self, interface: Literal["sdf", "mesh"] = "sdf", max_events: int = 16) -> None:
-        """Choose the surface.
+    Args:
+        interface: sdf is the zero level of the signed distance (smooth normals, tolerates noisy hulls);
+            mesh is the triangles themselves (sharp edges, vertex normals where the mesh is smooth).
+        max_events: refractions and reflections of a ray, at most.
+    """
 
-        Args:
-            interface: sdf is the zero level of the signed distance (smooth normals, tolerates noisy hulls);
-                mesh is the triangles themselves (sharp edges, vertex normals where the mesh is smooth).
-            max_events: refractions and reflections of a ray, at most.
-        """
+    def __init__(self, interface: Literal["sdf", "mesh"] = "sdf", max_events: Count = 16) -> None:
         super().__init__()
-        if max_events < 1:
-            raise NerfroError(f"sampler.path.max_events={max_events} lets no ray in; give at least 2 (16 is usual)")
-        self.interface = interface
-        self.max_events = max_events
+        self.interface, self.max_events = interface, max_events
 
     @torch.no_grad()
     def forward(self, rays: Rays, medium: Medium) -> Path:
@@ -85,11 +76,7 @@ class Snell(PathSampler):
 
     @torch.no_grad()
     def trace(self, rays: Rays, medium: Medium) -> SnellTrace:
-        """Paths, the number of events on each, and which rays had too many.
-
-        Raises:
-            NerfroError: the medium has no surface, or not of the kind that was asked for.
-        """
+        """Paths, the number of events on each, and which rays had too many."""
         if isinstance(medium, Vacuum):
             none = torch.zeros(len(rays), dtype=torch.long, device=rays.near.device)
             return SnellTrace(straight_path(rays), none, none.bool())

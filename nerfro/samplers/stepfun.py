@@ -31,13 +31,8 @@ def invert_cdf(
 ) -> Float[Tensor, "R N"]:
     """Inverse transform sampling of a step function (paper, Eqn. hierarchical).
 
-    Args:
-        edges: interval bounds, ascending.
-        weights: non-negative weight of each interval; need not be normalised.
-        u: positions in the cumulative distribution, in [0, 1).
-
-    Returns:
-        Arc lengths, ascending where u is; constant density inside each interval.
+    Weights need not be normalised; `u` are positions in the cumulative distribution, in [0, 1). Arc lengths ascend
+    where u does; density is constant inside each interval.
     """
     num_bins = weights.shape[-1]
     total = weights.sum(-1, keepdim=True)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.allowed import Range
 from nerfro.errors import NerfroError
 from nerfro.registry import register
 from nerfro.samplers.base import PointSampler
@@ -35,18 +36,14 @@ class Stratified(PointSampler):
 
     def __init__(
         self,
-        num_samples: int = 64,
+        num_samples: Annotated[int, Range(at_least=2)] = 64,
         draw: Literal["arc_length", "vertices"] = "arc_length",
         cast: Literal["points", "cones"] = "points",
-        offset: float = 0.5,
+        offset: Annotated[float, Range(at_least=0, less_than=1)] = 0.5,
         box_min: list[float] = (),  # type: ignore[assignment]
         box_max: list[float] = (),  # type: ignore[assignment]
     ) -> None:
         super().__init__()
-        if num_samples < 2:
-            raise NerfroError(f"sampler/points: num_samples={num_samples} is too few; take 2 or more")
-        if not 0 <= offset < 1:
-            raise NerfroError(f"sampler/points: offset={offset} is outside [0, 1)")
         if cast == "cones" and draw == "vertices":
             raise NerfroError("sampler/points: cones have no vertices to draw; set draw=arc_length")
         if len(box_min) != len(box_max) or len(box_min) not in (0, 3) or (box_min and draw == "vertices"):

@@ -32,37 +32,26 @@ class TraceSamplerConfig:
 
 @dataclass
 class TraceConfig:
-    """What `python -m nerfro.trace` is asked.
+    """What `python -m nerfro.trace` is asked."""
 
-    Attributes:
-        medium, sampler: what is traced, and how (options of the groups `medium` and `sampler/path`).
-        rays: .npz with `origins` and `directions` [R, 3], world units and unit directions.
-        out: .npz that is written, with `exit_positions` and `exit_directions` [R, 3], `path_lengths` and `hit` [R].
-        near: arc length at which paths begin.
-        far: arc length at which paths end, or where they have left the medium's box if that is later; by default all
-            end where they leave it.
-        plot: whether to draw some of the paths and the object beside `out`, as .png.
-        overwrite: whether `out`, and the drawing, may be replaced.
-    """
-
+    # What is traced, and how (options of the groups `medium` and `sampler/path`).
     medium: Any = MISSING
     sampler: TraceSamplerConfig = dataclasses.field(default_factory=TraceSamplerConfig)
-    rays: str = MISSING
+    rays: str = MISSING  # .npz with `origins` and `directions` [R, 3], world units and unit directions
+    # .npz that is written, with `exit_positions` and `exit_directions` [R, 3], `path_lengths` and `hit` [R].
     out: str = MISSING
-    near: float = 0.0
+    near: float = 0.0  # arc length at which paths begin
+    # Arc length at which paths end, or where they have left the medium's box if that is later; by default all end
+    # where they leave it.
     far: Optional[float] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    plot: bool = False
-    overwrite: bool = False
+    plot: bool = False  # whether to draw some of the paths and the object beside `out`, as .png
+    overwrite: bool = False  # whether `out`, and the drawing, may be replaced
 
 
 def make_rays(
     origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], medium: Medium, near: float, far: float | None
 ) -> Rays:
-    """Rays of the given range; without `far`, of one that leads all of them out of the medium's box.
-
-    Raises:
-        NerfroError: the range is empty.
-    """
+    """Rays of the given range; without `far`, of one that leads all of them out of the medium's box."""
     if far is None:
         centre, diagonal = medium.box.mean(0), float(torch.linalg.vector_norm(medium.box[1] - medium.box[0]))
         distance = float(torch.linalg.vector_norm(origins - centre, dim=-1).max())
@@ -85,11 +74,7 @@ def leave_box(path: Path, medium: Medium) -> tuple[Float[Tensor, "R 3"], Float[T
 
 
 def read_rays(file: FilePath) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
-    """Origins and unit directions from a file.
-
-    Raises:
-        NerfroError: an array is missing, of the wrong shape, not finite, or the directions are not unit vectors.
-    """
+    """Origins and unit directions from a file."""
     arrays = load_arrays(file)
     for name in ("origins", "directions"):
         if name not in arrays:

@@ -148,11 +148,7 @@ class StopOnSignal(Callback):
 
 
 class ConfigInCheckpoint(Callback):
-    """Puts the resolved configuration into every checkpoint, so that the file alone tells how to rebuild the model.
-
-    Args:
-        config: as YAML.
-    """
+    """Puts the resolved configuration into every checkpoint, so that the file alone tells how to rebuild the model."""
 
     def __init__(self, config: str) -> None:
         self._config = config

@@ -6,11 +6,12 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Optional
+from typing import Annotated, Any, Optional
 
 import numpy as np
 from omegaconf import MISSING, DictConfig
 
+from nerfro.allowed import Count, Natural, NotNegative, Positive, Range
 from nerfro.errors import NerfroError
 from nerfro.files.cache import load_array
 from nerfro.geometry.mesh import load_mesh
@@ -25,136 +26,91 @@ from nerfro.registry import build, configure, find
 
 @dataclass
 class SamplerConfig:
-    """How rays become paths and paths samples.
+    """How rays become paths and paths samples."""
 
-    Attributes:
-        path: plugin of kind `sampler/path`.
-        points: plugin of kind `sampler/points`.
-    """
-
-    path: Any = MISSING
-    points: Any = MISSING
+    path: Any = MISSING  # plugin of kind `sampler/path`
+    points: Any = MISSING  # plugin of kind `sampler/points`
 
 
 @dataclass
 class BatchesConfig:
-    """Which pixels are trained on.
+    """Which pixels are trained on."""
 
-    Attributes:
-        size: pixels of a step.
-        batching: pixels of `single_image` at a time, or of `all_images`.
-        jitter: draw each ray anywhere inside its pixel instead of through its centre.
-        precrop_steps: number of first steps that see only the central window of the images.
-        precrop_fraction: side of that window.
-        supersample: rays in each direction of a pixel whose ray leaves `divergence` pixels or more away from the ray
-            beside it; 1 gives all pixels one ray.
-        divergence: see there.
-    """
-
-    size: int = 1024
-    batching: str = "single_image"
-    jitter: bool = False
-    precrop_steps: int = 0
-    precrop_fraction: float = 0.5
-    supersample: int = 1
-    divergence: float = 8.0
+    size: Count = 1024  # pixels of a step
+    batching: str = "single_image"  # pixels of `single_image` at a time, or of `all_images`
+    jitter: bool = False  # draw each ray anywhere inside its pixel instead of through its centre
+    precrop_steps: Natural = 0  # number of first steps that see only the central window of the images
+    precrop_fraction: float = 0.5  # side of that window
+    # Rays in each direction of a pixel whose ray leaves `divergence` pixels or more away from the ray beside it;
+    # 1 gives all pixels one ray.
+    supersample: Count = 1
+    divergence: NotNegative = 8.0
 
 
 @dataclass
 class EvaluationConfig:
-    """How a trained model is evaluated.
+    """How a trained model is evaluated."""
 
-    Attributes:
-        split: of the data.
-        chunk_size: rays rendered at once; bounds the memory.
-        lpips_backbone: file of AlexNet weights; none looks in torch's hub cache and then on the network.
-        lpips_vgg_backbone: file of VGG-16 weights; none looks in torch's hub cache only.
-        every: steps between two looks at one validation image while training; 0 for never.
-        supersample: rays along each side of a pixel that is supersampled, see `divergence`; 1 for one central ray.
-        divergence: supersample pixels whose ray leaves this many pixels or more away from the one beside it; 0 for all.
-    """
-
-    split: str = "test"
-    chunk_size: int = 8192
+    split: str = "test"  # of the data
+    chunk_size: Count = 8192  # rays rendered at once; bounds the memory
+    # File of AlexNet weights; none looks in torch's hub cache and then on the network.
     lpips_backbone: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    # File of VGG-16 weights; none looks in torch's hub cache only.
     lpips_vgg_backbone: Optional[str] = None  # noqa: UP045
-    every: int = 500
-    supersample: int = 1
-    divergence: float = 0.0
+    every: Natural = 500  # steps between two looks at one validation image while training; 0 for never
+    # Rays along each side of a pixel that is supersampled, see `divergence`; 1 for one central ray.
+    supersample: Count = 1
+    # Supersample pixels whose ray leaves this many pixels or more away from the one beside it; 0 for all.
+    divergence: NotNegative = 0.0
 
 
 @dataclass
 class CheckpointConfig:
-    """When a checkpoint is written while training; one of the two. The last one is kept.
+    """When a checkpoint is written while training; one of the two. The last one is kept."""
 
-    Attributes:
-        every_seconds, every_steps: interval.
-    """
-
-    every_seconds: Optional[float] = 60.0  # noqa: UP045
-    every_steps: Optional[int] = None  # noqa: UP045
+    every_seconds: Optional[Positive] = 60.0  # noqa: UP045
+    every_steps: Optional[Count] = None  # noqa: UP045
 
 
 @dataclass
 class ContentConfig:
-    """The box outside of which there is nothing but the boundary, for fields and samplers that stay inside one.
+    """The box outside of which there is nothing but the boundary, for fields and samplers that stay inside one."""
 
-    Attributes:
-        box_min, box_max: its corners, world units; none takes the bounds of the object.
-        box_file: .npy of the box's centre and half sides [2, 3] instead, as Eikonal Fields stores it.
-    """
-
+    # Its corners, world units; none takes the bounds of the object.
     box_min: Optional[list[float]] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     box_max: Optional[list[float]] = None  # noqa: UP045
+    # .npy of the box's centre and half sides [2, 3] instead, as Eikonal Fields stores it.
     box_file: Optional[str] = None  # noqa: UP045
 
 
 @dataclass
 class AuthorsConfig:
-    """What the authors of the paper set for a scene, taken up by the `paper_*` experiments alone.
+    """What the authors of the paper set for a scene, taken up by the `paper_*` experiments alone."""
 
-    Attributes:
-        resolution: vertices a side of the index grid.
-        smoothing_size, smoothing_sigma: taps and standard deviation (voxels) of its smoothing.
-        num_steps: Eikonal steps, N_c x N_e.
-        boundary_weight: of the boundary regulariser.
-        max_steps: iterations.
-    """
-
-    resolution: int = 512
+    resolution: int = 512  # vertices a side of the index grid
+    # Taps and standard deviation (voxels) of its smoothing.
     smoothing_size: int = 9
     smoothing_sigma: float = 1.0
-    num_steps: int = 768
-    boundary_weight: float = 0.025
-    max_steps: int = 200_000
+    num_steps: int = 768  # Eikonal steps, N_c x N_e
+    boundary_weight: float = 0.025  # of the boundary regulariser
+    max_steps: int = 200_000  # iterations
 
 
 @dataclass
 class TrainConfig:
-    """Everything that `python -m nerfro.train` composes from conf/train.yaml.
+    """Everything that `python -m nerfro.train` composes from conf/train.yaml."""
 
-    Attributes:
-        name: of the experiment; names the run folder.
-        seed: of initialisation and of all random draws.
-        data, camera, medium, field, boundary, model: one plugin of that kind.
-        sampler: path and point sampler.
-        loss: fields of each training loss, by the loss's registered name.
-        content, authors, optimizer, batches, evaluation, checkpoint: see there.
-        trainer, logger: Lightning objects.
-        ckpt_path: checkpoint to go on from, or `last` for the newest of this experiment.
-        compile: backend of torch.compile for the networks, such as inductor or cudagraphs on a GPU; none runs them as
-            they are. Compiling takes a minute or more at the start.
-    """
-
-    name: str = "refractive"
-    seed: int = 0
+    name: str = "refractive"  # of the experiment; names the run folder
+    seed: Annotated[int, Range(at_least=0, at_most=2**32 - 1)] = 0  # of initialisation and of all random draws
+    # data, camera, medium, field, boundary, model: one plugin of that kind.
     data: Any = MISSING
     camera: Any = MISSING
     medium: Any = MISSING
-    sampler: SamplerConfig = dataclasses.field(default_factory=SamplerConfig)
+    sampler: SamplerConfig = dataclasses.field(default_factory=SamplerConfig)  # path and point sampler
     field: Any = MISSING
     boundary: Any = MISSING
     model: Any = MISSING
+    # Fields of each training loss, by the loss's registered name.
     loss: dict[str, Any] = dataclasses.field(default_factory=dict)
     content: ContentConfig = dataclasses.field(default_factory=ContentConfig)
     authors: AuthorsConfig = dataclasses.field(default_factory=AuthorsConfig)
@@ -162,18 +118,18 @@ class TrainConfig:
     batches: BatchesConfig = dataclasses.field(default_factory=BatchesConfig)
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
     checkpoint: CheckpointConfig = dataclasses.field(default_factory=CheckpointConfig)
+    # Lightning objects.
     trainer: Any = MISSING
     logger: Any = None
+    # Checkpoint to go on from, or `last` for the newest of this experiment.
     ckpt_path: Optional[str] = None  # noqa: UP045
+    # Backend of torch.compile for the networks, such as inductor or cudagraphs on a GPU; none runs them as they
+    # are. Compiling takes a minute or more at the start.
     compile: Optional[str] = None  # noqa: UP045
 
 
 def build_losses(nodes: DictConfig) -> dict[str, Loss]:
-    """Build the training losses from `loss.<registered name>.<field>`.
-
-    Raises:
-        NerfroError: there is no loss, none is registered under a name, or a field is wrong.
-    """
+    """Build the training losses from `loss.<registered name>.<field>`."""
     if not nodes:
         raise NerfroError("there is no loss to train with; give one, such as +loss.photometric.weight=1")
     losses = {}
@@ -187,13 +143,7 @@ def build_losses(nodes: DictConfig) -> dict[str, Loss]:
 
 
 def build_model(config: DictConfig) -> NerfModel:
-    """Compose the model of a configuration (see `TrainConfig`); fills in `config.content` where it is left open.
-
-    Raises:
-        NerfroError: a part is not registered or is configured wrongly.
-    """
-    if config.evaluation.chunk_size < 1:
-        raise NerfroError(f"evaluation.chunk_size={config.evaluation.chunk_size} renders nothing; take 1 or more")
+    """Compose the model of a configuration (see `TrainConfig`); fills in `config.content` where it is left open."""
     losses = build_losses(config.loss)
     optimizer = OptimizerConfig(**config.optimizer)
     path_sampler = build(config.sampler.path)

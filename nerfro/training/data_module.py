@@ -22,11 +22,6 @@ class RayDataModule(LightningDataModule):
 
     Lightning fetches data a step early. It is given the numbers of the steps, and each step's batch when it begins: so
     paths that bend in a medium that learns bend in it as it is then.
-
-    Args:
-        batches: of training pixels.
-        validation: views to look at while training, or None.
-        every: steps between two looks, by which the views are rotated.
     """
 
     def __init__(self, batches: RayBatches, validation: Views | None, every: int) -> None:
@@ -73,9 +68,6 @@ class OneAhead:
     """Has a thread make what is asked for next, on a core that waits. It makes the same as it would when it is asked.
 
     The thread keeps to one core, and kernels leave Python and Numba's threads to others (`kernels.compilation`).
-
-    Args:
-        make: makes the batch of a step; a function of the step alone.
     """
 
     def __init__(self, make: Callable[[int], Batch]) -> None:

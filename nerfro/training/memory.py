@@ -25,14 +25,6 @@ def require_memory(model: NerfModel, rays: Rays, device: torch.device) -> str:
     """What a run will need at most, in one line.
 
     A few rays are rendered, and what autograd keeps of them is counted: it grows with rays, and is most of what does.
-
-    Args:
-        model: on the CPU, as all that has been read so far.
-        rays: of a training batch, on the CPU.
-        device: to train on.
-
-    Raises:
-        NerfroError: it is more than there is.
     """
     kept = _kept_bytes(model, rays[:: max(len(rays) // _PROBED_RAYS, 1)])
     state = sum(tensor.nbytes for tensor in model.state_dict().values())

@@ -18,14 +18,7 @@ _MAPPED_FROM = 2**30
 
 
 class PixelStore:
-    """Colours by the number of their pixel, view * H * W + row * W + column; they become numbers when they are drawn.
-
-    Args:
-        images: all of one size; a tensor is kept as it is.
-
-    Raises:
-        NerfroError: a file is truncated or corrupt.
-    """
+    """Colours by the number of their pixel, view * H * W + row * W + column; they become numbers when they are drawn."""
 
     def __init__(self, images: Pictures | Float[Tensor, "V H W 3"]) -> None:
         self._resident = None if isinstance(images, Tensor) else _resident(images)

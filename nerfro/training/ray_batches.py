@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from nerfro.allowed import Count, Natural, checked
 from nerfro.cameras import Cameras, Window, central_window
 from nerfro.data.base import Views
 from nerfro.data.pictures import Pictures
@@ -28,45 +29,26 @@ Tracer = Callable[[Rays, Tensor], Path]
 _STEP_OF_DIVIDED = 1 / 32
 
 
+@checked("batches")
 class RayBatches:
     """Random training pixels of every step, which depend on the seed and the step alone.
 
     A run that stops and resumes therefore sees the batches that it would have seen.
 
-    Args:
-        views: posed images, of which the usable pixels are drawn; their tensors' device is where batches are made, see
-            `to`.
-        batch_size: number of pixels in a batch.
-        batching: `single_image` draws different pixels of one random image, `all_images` draws each pixel anew from
-            all images.
-        seed: of the sequence.
-        precrop_steps: number of steps at first during which pixels come from the middle of the images.
-        precrop_fraction: share of each side that this middle spans.
-        jitter: send rays through a random place in each pixel (or part of one) instead of through its centre.
-
-    Raises:
-        NerfroError: an option is out of range, or an image (or its middle) has fewer usable pixels than a batch.
+    The options are those of `training.config.BatchesConfig`. Batches are made on the device of the views' tensors, of
+    their usable pixels.
     """
 
     def __init__(
         self,
         views: Views,
-        batch_size: int,
+        batch_size: Count,
         batching: Batching = "single_image",
-        seed: int = 0,
-        precrop_steps: int = 0,
+        seed: Natural = 0,
+        precrop_steps: Natural = 0,
         precrop_fraction: float = 0.5,
         jitter: bool = False,
     ) -> None:
-        if batching not in get_args(Batching):
-            raise NerfroError(f"batching={batching!r} is unknown; choose {' or '.join(map(repr, get_args(Batching)))}")
-        for name, value, least in (
-            ("batch_size", batch_size, 1),
-            ("seed", seed, 0),
-            ("precrop_steps", precrop_steps, 0),
-        ):
-            if value < least:
-                raise NerfroError(f"{name}={value} is too small; take {least} or more")
         if len(views) == 0:
             raise NerfroError("there are no training images; give at least one")
         self.batch_size, self.batching, self.seed = batch_size, batching, seed
@@ -98,11 +80,8 @@ class RayBatches:
     def traced(self, trace: Tracer, side: int = 1, divergence: float = 8.0) -> RayBatches:
         """The sequence with the paths of its rays, more than one for pixels for which one does not stand.
 
-        Args:
-            trace: paths of the rays of views, without gradients.
-            side: rays in each direction of a divided pixel; 1 divides none.
-            divergence: pixels are divided whose ray leaves in another direction than the one beside it, by this many
-                pixel angles or more; see `pixel_parts.divergence`.
+        Pixels are divided whose ray leaves in another direction than the one beside it, by `divergence` pixel angles or
+        more (see `pixel_parts.divergence`), into `side` rays in each direction; 1 divides none.
         """
         traced = copy.copy(self)
         traced._trace, traced._side, traced._divergence = trace, side, divergence
@@ -113,11 +92,7 @@ class RayBatches:
         self._pixels.forget()
 
     def share(self, rank: int, size: int) -> RayBatches:
-        """The sequence of process `rank` of `size`: an equal part of every batch, in its order.
-
-        Raises:
-            NerfroError: the batch has no equal parts.
-        """
+        """The sequence of process `rank` of `size`: an equal part of every batch, in its order."""
         if self.batch_size % size:
             raise NerfroError(
                 f"batches.size={self.batch_size} cannot be shared evenly by {size} processes; take a multiple of {size}"

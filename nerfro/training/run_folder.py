@@ -31,11 +31,7 @@ _PACKAGES = ("nerfro", "torch", "lightning", "hydra-core", "torchmetrics", "nump
 
 
 def claim(folder: Path, resumed: bool, needed_bytes: int) -> None:
-    """Make a run folder, or refuse one that would be overwritten or whose disk is full.
-
-    Raises:
-        NerfroError: the folder holds another run, or too little space is free.
-    """
+    """Make a run folder, or refuse one that would be overwritten or whose disk is full."""
     if (folder / LAST_CHECKPOINT).exists() and not resumed:
         raise NerfroError(
             f"{folder} already holds a run; go on with it (ckpt_path=last) or choose another folder (hydra.run.dir=...)"
@@ -79,11 +75,7 @@ def record(folder: Path, config: DictConfig) -> None:
 
 
 def find_checkpoint(ckpt_path: str | None, folder: Path) -> Path | None:
-    """The checkpoint to go on from: a file, or for `last` that of this folder, else the newest beside it.
-
-    Raises:
-        NerfroError: there is none.
-    """
+    """The checkpoint to go on from: a file, or for `last` that of this folder, else the newest beside it."""
     if ckpt_path is None:
         return None
     if ckpt_path != "last":
@@ -102,11 +94,7 @@ def find_checkpoint(ckpt_path: str | None, folder: Path) -> Path | None:
 
 
 def load_checkpoint(path: Path) -> tuple[dict[str, Any], DictConfig]:
-    """Read a checkpoint without executing pickled code, and the configuration that it was trained with.
-
-    Raises:
-        NerfroError: missing, truncated, or not written by nerfro.
-    """
+    """Read a checkpoint without executing pickled code, and the configuration that it was trained with."""
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         config = foreign_config(checkpoint["nerfro_config"], path)
@@ -121,11 +109,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], DictConfig]:
 
 
 def restore(checkpoint: dict, config: DictConfig) -> NerfModel:
-    """The trained model of a checkpoint.
-
-    Raises:
-        NerfroError: the weights do not fit the configuration.
-    """
+    """The trained model of a checkpoint."""
     model = build_model(config)
     try:
         model.load_state_dict(checkpoint["state_dict"])
@@ -138,11 +122,7 @@ def restore(checkpoint: dict, config: DictConfig) -> NerfModel:
 
 
 def require_same_configuration(path: Path, trained: DictConfig, wanted: DictConfig) -> None:
-    """Refuse to go on from a checkpoint of another configuration.
-
-    Raises:
-        NerfroError: the first field that differs is named, with both values.
-    """
+    """Refuse to go on from a checkpoint of another configuration."""
     old, new = settings(trained, RESUMING), settings(wanted, RESUMING)
     key = first_difference(old, new)
     if key is not None:

@@ -52,15 +52,10 @@ class State(str, Enum):
 
 @dataclass(frozen=True)
 class Identity:
-    """What a cell computes: two cells with equal identities have equal results, up to the machine.
+    """What a cell computes: two cells with equal identities have equal results, up to the machine."""
 
-    Attributes:
-        settings: of the resolved configuration those that make the result, by their full names.
-        data: hash of the files in the data's folder.
-    """
-
-    settings: Mapping[str, Any]
-    data: str
+    settings: Mapping[str, Any]  # of the resolved configuration those that make the result, by their full names
+    data: str  # hash of the files in the data's folder
 
     @classmethod
     def of(cls, config: DictConfig) -> Identity:
@@ -78,19 +73,12 @@ class Identity:
 
 @dataclass(frozen=True)
 class Cell:
-    """One training run of a sweep.
+    """One training run of a sweep."""
 
-    Attributes:
-        overrides: that make its configuration, its folder included.
-        folder: where it lies.
-        identity: of its configuration and data; None where it is refused.
-        refusal: why it cannot be run, else None.
-    """
-
-    overrides: list[str]
-    folder: Path
-    identity: Identity | None
-    refusal: str | None
+    overrides: list[str]  # that make its configuration, its folder included
+    folder: Path  # where it lies
+    identity: Identity | None  # of its configuration and data; None where it is refused
+    refusal: str | None  # why it cannot be run, else None
 
     def look(self) -> tuple[State, str]:
         """How far it has come, and why it failed or is refused."""
@@ -119,12 +107,7 @@ def scene_name(root: str) -> str:
 
 
 def folder_name(config: DictConfig, swept: Sequence[str]) -> str:
-    """Name of a cell's folder: experiment, scene and seed, and what else is swept over.
-
-    Args:
-        config: of the cell.
-        swept: overrides `key=value` that tell it from other cells.
-    """
+    """Name of a cell's folder: experiment, scene and seed, and what else is swept over."""
     others = [override for override in swept if override.split("=", 1)[0] not in _NAMED_BY_THEMSELVES]
     short = [f"{key.lstrip('+').rpartition('.')[2]}={value}" for key, _, value in (o.partition("=") for o in others)]
     name = "-".join([config.name, scene_name(config.data.root), f"seed{config.seed}", *short])
@@ -135,9 +118,6 @@ class CellTask:
     """Runs a cell where a launcher has put it, and records how it ended; a failure ends here and not the sweep.
 
     A cell that was stopped before goes on from its checkpoint.
-
-    Args:
-        task: trains and evaluates a configuration.
     """
 
     def __init__(self, task: Callable[[DictConfig], None]) -> None:

@@ -24,11 +24,7 @@ from nerfro.training.run_folder import LAST_CHECKPOINT
 
 
 def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.Trainer:
-    """Lightning's Trainer with the callbacks that every run has.
-
-    Raises:
-        NerfroError: a field of the trainer, logger or checkpoint section is unknown or wrong.
-    """
+    """Lightning's Trainer with the callbacks that every run has."""
     if (config.checkpoint.every_seconds is None) == (config.checkpoint.every_steps is None):
         raise NerfroError("set one of checkpoint.every_seconds and checkpoint.every_steps, and the other to null")
     seconds, every = config.checkpoint.every_seconds, config.evaluation.every
@@ -70,13 +66,7 @@ def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.
 
 
 def prepare_process(seed: int) -> None:
-    """Set what this process computes with: the seed, how memory is given back, and what Lightning prints.
-
-    Raises:
-        NerfroError: the seed is out of range.
-    """
-    if not 0 <= seed < 2**32:
-        raise NerfroError(f"seed={seed} is no seed; give 0 to {2**32 - 1}")
+    """Set what this process computes with: the seed, how memory is given back, and what Lightning prints."""
     _quieten_lightning()
     keep_freed_memory()
     pl.seed_everything(seed, verbose=False)

@@ -156,8 +156,10 @@ def test_state_restores_the_sky() -> None:
 
 
 def test_bad_settings_and_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(NerfroError, match="at least 1"):
+    with pytest.raises(NerfroError, match="give one or more"):
         EnvironmentMap([])
+    with pytest.raises(NerfroError, match=r"resolutions=\[4, 0\] is not allowed; take at least 1"):
+        EnvironmentMap([4, 0])
     with pytest.raises(NerfroError, match="does not exist"):
         EnvironmentMap(image=str(tmp_path / "none.hdr"))
     with pytest.raises(NerfroError, match="allowed are"):

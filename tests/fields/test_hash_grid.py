@@ -175,9 +175,9 @@ def test_field_learns_a_coloured_ball() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"box_min": [0.0, 0, 0], "box_max": [1.0, 0, 1]}, "box_min below box_max"),
+        ({"box_min": [0.0, 0, 0], "box_max": [1.0, 0, 1]}, "min below max"),
         ({"box_min": [0.0, 0]}, "three numbers"),
-        ({"width": 0}, "must be positive"),
+        ({"width": 0}, "width=0 is not allowed; take at least 1"),
     ],
 )
 def test_impossible_fields_are_refused(settings: dict, message: str) -> None:

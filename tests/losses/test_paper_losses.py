@@ -141,10 +141,10 @@ def test_weight_without_a_ramp_steps_to_its_value() -> None:
 
 @pytest.mark.parametrize("option", ["weight", "start", "ramp"])
 def test_negative_schedules_are_refused(option: str) -> None:
-    with pytest.raises(NerfroError, match="none may be negative; 0 switches off"):
+    with pytest.raises(NerfroError, match=f"{option}=-1 is not allowed; take at least 0"):
         Photometric(**{option: -1})
 
 
 def test_tile_without_neighbours_is_refused() -> None:
-    with pytest.raises(NerfroError, match="tile_size=1 has no neighbours"):
+    with pytest.raises(NerfroError, match="tile_size=1 is not allowed; take at least 2"):
         Smoothness(tile_size=1)

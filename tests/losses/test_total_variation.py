@@ -53,5 +53,5 @@ def test_descending_it_flattens_a_sky() -> None:
 
 
 def test_impossible_settings_are_refused() -> None:
-    with pytest.raises(NerfroError, match="between 0 and 90"):
+    with pytest.raises(NerfroError, match="more than 0 and less than 90"):
         TotalVariation(angle=0.0)

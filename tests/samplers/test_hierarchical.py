@@ -119,9 +119,9 @@ def test_cones_are_redrawn_between_edges() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"num_coarse": 3}, "take at least 4 and 1, or sampler/points=stratified"),
-        ({"num_fine": 0}, "take at least 4 and 1"),
-        ({"padding": -0.1}, "padding=-0.1 is negative"),
+        ({"num_coarse": 3}, "num_coarse=3 is not allowed; take at least 4"),
+        ({"num_fine": 0}, "num_fine=0 is not allowed; take at least 1"),
+        ({"padding": -0.1}, "padding=-0.1 is not allowed; take at least 0"),
         ({"cast": "cones"}, "set union=false"),
     ],
 )

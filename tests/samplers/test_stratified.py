@@ -101,8 +101,8 @@ def test_cone_samples_lie_on_the_path_at_their_middles() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"num_samples": 1}, "num_samples=1 is too few; take 2 or more"),
-        ({"offset": 1.0}, r"offset=1.0 is outside \[0, 1\)"),
+        ({"num_samples": 1}, "num_samples=1 is not allowed; take at least 2"),
+        ({"offset": 1.0}, "offset=1.0 is not allowed; take at least 0 and less than 1"),
         ({"cast": "cones", "draw": "vertices"}, "cones have no vertices to draw; set draw=arc_length"),
     ],
 )

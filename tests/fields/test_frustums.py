@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from nerfro.fields.cones import frustum_gaussians
+from nerfro.fields.mip_nerf import frustum_gaussians
 from nerfro.samplers.straight import straight_path
 from nerfro.samplers.stratified import cone_samples
 from nerfro.testing import example_path

@@ -1,0 +1,121 @@
+"""What a parameter or setting may be, said once, in its annotation: `Annotated[int, Range(at_least=1)]`, or `Count`."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import math
+import types
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+from jaxtyping import Float
+from omegaconf import DictConfig, OmegaConf
+
+from nerfro.errors import NerfroError
+
+Class = TypeVar("Class")
+
+
+@dataclass(frozen=True)
+class Range:
+    """Finite numbers from one end to the other; an end that is not given allows all on its side."""
+
+    at_least: float | None = None
+    more_than: float | None = None
+    at_most: float | None = None
+    less_than: float | None = None
+
+    def __contains__(self, number: float) -> bool:
+        return (
+            math.isfinite(number)
+            and (self.at_least is None or number >= self.at_least)
+            and (self.more_than is None or number > self.more_than)
+            and (self.at_most is None or number <= self.at_most)
+            and (self.less_than is None or number < self.less_than)
+        )
+
+    def __str__(self) -> str:
+        ends = dataclasses.asdict(self).items()
+        return " and ".join(f"{word.replace('_', ' ')} {end}" for word, end in ends if end is not None)
+
+
+Count = Annotated[int, Range(at_least=1)]
+Natural = Annotated[int, Range(at_least=0)]
+Positive = Annotated[float, Range(more_than=0)]
+NotNegative = Annotated[float, Range(at_least=0)]
+Share = Annotated[float, Range(more_than=0, less_than=1)]
+
+
+def checked(where: str) -> Callable[[type[Class]], type[Class]]:
+    """Let a class refuse arguments that its constructor's annotations do not allow, with `where` before the message."""
+
+    def wrap(cls: type[Class]) -> type[Class]:
+        constructor = cls.__init__  # type: ignore[misc]
+        signature, hints = inspect.signature(constructor), get_type_hints(constructor, include_extras=True)
+
+        @functools.wraps(constructor)
+        def init(self: Any, *arguments: Any, **named: Any) -> None:
+            check(f"{where}: ", hints, signature.bind(self, *arguments, **named).arguments)
+            constructor(self, *arguments, **named)
+
+        cls.__init__ = init  # type: ignore[misc,method-assign]
+        return cls
+
+    return wrap
+
+
+def check_settings(config: DictConfig, schema: type, prefix: str = "") -> None:
+    """Refuse settings that the annotations of a configuration's dataclass, or of one inside it, do not allow."""
+    hints = get_type_hints(schema, include_extras=True)
+    settings = {name: config[name] for name in hints if not OmegaConf.is_missing(config, name)}
+    check(prefix, hints, settings)
+    for name, value in settings.items():
+        if dataclasses.is_dataclass(hints[name]):
+            check_settings(value, hints[name], f"{prefix}{name}.")
+
+
+def check(where: str, hints: Mapping[str, Any], values: Mapping[str, Any]) -> None:
+    """Refuse the first value that its annotation does not allow.
+
+    Raises:
+        NerfroError: the value, and what is allowed.
+    """
+    for name, value in values.items():
+        reason = _refusal(value, hints.get(name))
+        if reason is not None:
+            raise NerfroError(f"{where}{name}={value!r} is not allowed; {reason}")
+
+
+def corners_of_box(
+    box_min: Sequence[float], box_max: Sequence[float], bounded: bool = True
+) -> Float[np.ndarray, "2 3"]:
+    """The corners of a box as an array.
+
+    Raises:
+        NerfroError: not three numbers each, the first below the second, and finite ones where it is `bounded`.
+    """
+    box = np.array([box_min, box_max], np.float64) if len(box_min) == len(box_max) == 3 else np.zeros((2, 3))
+    if not (box[1] > box[0]).all() or (bounded and not np.isfinite(box).all()):
+        raise NerfroError(
+            f"box_min={list(box_min)}, box_max={list(box_max)} is no box; give three numbers each, min below max"
+        )
+    return box
+
+
+def _refusal(value: Any, hint: Any) -> str | None:
+    origin, hints = get_origin(hint), get_args(hint)
+    if value is None:
+        return None
+    if origin is Literal:
+        return None if value in hints else f"choose {', '.join(map(repr, hints))}"
+    if origin is Annotated:
+        return f"take {hints[1]}" if isinstance(hints[1], Range) and value not in hints[1] else None
+    if origin in (list, tuple) and isinstance(value, Sequence):
+        return next((reason for each in value if (reason := _refusal(each, hints[0]))), None)
+    if origin in (Union, types.UnionType):
+        return next((reason for each in hints if (reason := _refusal(value, each))), None)
+    return None
