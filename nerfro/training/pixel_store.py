@@ -18,7 +18,7 @@ _MAPPED_FROM = 2**30
 
 
 class PixelStore:
-    """Colours by the number of their pixel, view * H * W + row * W + column; they become numbers when they are drawn."""
+    """Colours by the number of their pixel, view * H * W + row * W + column; numbers only when they are drawn."""
 
     def __init__(self, images: Pictures | Float[Tensor, "V H W 3"]) -> None:
         self._resident = None if isinstance(images, Tensor) else _resident(images)
