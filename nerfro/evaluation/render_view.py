@@ -35,9 +35,11 @@ def render_view(model: NerfModel, cameras: Cameras, view: int, supersampling: Su
     size = cameras.height * cameras.width
     pixels = torch.arange(view * size, (view + 1) * size, device=cameras.device)
     beside = [model.path_sampler(rays_beside(cameras, some), model.medium) for some in pixels.split(model.chunk_size)]
-    exits = torch.cat([path.exit_directions for path in beside])
+    exits = torch.cat([path.first_of_ray(path.exit_directions) for path in beside])
     angles = divergence(cameras, pixels, rendered.exit_directions, exits)
     chosen = (angles >= supersampling.divergence).nonzero()[:, 0]
+    if len(chosen) == 0:
+        return rendered
     radiance, num_parts = rendered.radiance.clone(), supersampling.side**2
     for some in chosen.split(max(1, model.chunk_size // num_parts)):
         parts = model.render(part_rays(cameras, pixels[some], supersampling.side)).radiance

@@ -1,0 +1,29 @@
+"""Pixels with several rays: only those need them beside which rays part."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from nerfro.evaluation.render_view import Supersampling, render_view
+from nerfro.media.shapes import Ball
+from nerfro.models.refractive import RefractiveModel
+from nerfro.samplers.snell import Snell
+from nerfro.testing import example_batch, example_parts
+
+
+def test_straight_rays_part_nowhere_and_need_one_ray_a_pixel() -> None:
+    model, cameras = RefractiveModel(example_parts()).eval(), example_batch().cameras
+    once, divided = (render_view(model, cameras, 0, Supersampling(side, 1.5)) for side in (1, 3))
+    assert torch.equal(divided.radiance, once.radiance)
+
+
+def test_pixels_are_divided_at_the_rim_of_a_ball() -> None:
+    parts = replace(example_parts(), medium=Ball(), path_sampler=Snell())
+    model, cameras = RefractiveModel(parts).eval(), example_batch().cameras
+    for parameter in model.fields.parameters():
+        torch.nn.init.normal_(parameter, std=0.5)
+    once, divided = (render_view(model, cameras, 0, Supersampling(side, 8.0)).radiance for side in (1, 3))
+    differs = (once != divided).any(-1)
+    assert 0 < differs.float().mean() < 0.5
