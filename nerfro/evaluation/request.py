@@ -11,6 +11,7 @@ from typing import Optional
 import torch
 from omegaconf import DictConfig
 
+from nerfro.allowed import Count, NotNegative
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing
 from nerfro.paths import user_path
@@ -23,10 +24,10 @@ class EvaluateConfig:
     checkpoint: Optional[str] = None  # file written by nerfro.train, to render and score
     split: str = "test"  # of the data to render
     root: Optional[str] = None  # folder of the data, if it has moved since training
-    chunk_size: Optional[int] = None  # rays rendered at once, which bounds the memory; the trained one by default
+    chunk_size: Optional[Count] = None  # rays rendered at once, which bounds the memory; the trained one by default
     # Rays per pixel (see docs/experiments.md); as trained by default.
-    supersample: Optional[int] = None
-    divergence: Optional[float] = None
+    supersample: Optional[Count] = None
+    divergence: Optional[NotNegative] = None
     predictions: Optional[str] = None  # folder of pictures to score, instead of a checkpoint
     references: Optional[str] = None  # folder of pictures of the same names, compared with `predictions`
     # Folder of masks of the same names; by default those that lie with the references, or their transparency.

@@ -6,6 +6,7 @@ steps. The size is stated in each test.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -50,7 +51,8 @@ def _trace(rays: Rays, squared: Squared, integrator: str, dtype: torch.dtype = t
     """Trace in the given precision; the vertices come back in double."""
     path = march_uniform(to(rays, dtype), FunctionMedium(squared), INTEGRATORS[integrator], NUM_STEPS + 1)
     assert path.positions.dtype == dtype
-    return Path(*(t.double() if t.is_floating_point() else t for t in vars(path).values()))
+    values = (getattr(path, field.name) for field in dataclasses.fields(path))
+    return Path(*(t.double() if t.is_floating_point() else t for t in values))
 
 
 # --- layers: n sin(theta) is conserved ---
