@@ -51,7 +51,7 @@ def _trace(rays: Rays, squared: Squared, integrator: str, dtype: torch.dtype = t
     """Trace in the given precision; the vertices come back in double."""
     path = march_uniform(to(rays, dtype), FunctionMedium(squared), INTEGRATORS[integrator], NUM_STEPS + 1)
     assert path.positions.dtype == dtype
-    values = (getattr(path, field.name) for field in dataclasses.fields(path))
+    values = (getattr(path, field.name) for field in dataclasses.fields(path) if field.init)
     return Path(*(t.double() if t.is_floating_point() else t for t in values))
 
 
