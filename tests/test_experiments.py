@@ -140,7 +140,8 @@ def test_ablation_without_regulariser_keeps_the_skybox() -> None:
 def test_the_fair_baseline_differs_from_the_baseline_in_its_sky_and_its_bounds_alone() -> None:
     plain, sky = composed("+experiment=mipnerf"), composed("+experiment=mipnerf_sky")
     differing = {key for key in plain if plain[key] != sky[key]}
-    assert differing == {"name", "boundary", "sampler", "loss"}
+    assert differing == {"name", "boundary", "sampler", "loss", "model"}
+    assert sky.model == {**plain.model, "colour": "linear"}, "the sky's radiance is linear"
     assert sky.loss == {**plain.loss, "total_variation": composed().loss.total_variation}, "it belongs to the sky"
     assert plain.sampler.path == sky.sampler.path
     bounds = {"box_min", "box_max"}
