@@ -34,7 +34,8 @@ def render_view(model: NerfModel, cameras: Cameras, view: int, supersampling: Su
         return rendered
     size = cameras.height * cameras.width
     pixels = torch.arange(view * size, (view + 1) * size, device=cameras.device)
-    beside = [model.path_sampler(rays_beside(cameras, some), model.medium) for some in pixels.split(model.chunk_size)]
+    with torch.inference_mode():
+        beside = [model.trace(rays_beside(cameras, some)) for some in pixels.split(model.chunk_size)]
     exits = torch.cat([path.first_of_ray(path.exit_directions) for path in beside])
     angles = divergence(cameras, pixels, rendered.exit_directions, exits)
     chosen = (angles >= supersampling.divergence).nonzero()[:, 0]

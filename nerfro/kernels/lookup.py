@@ -194,8 +194,20 @@ def put_vertex(positions, directions, s, count, x, y, z, dx, dy, dz, length):
 
 
 @compiled
-def repeat_last(positions, directions, s, count):
-    """Fill a row of polylines with its last vertex."""
+def put_end(positions, directions, s, count, low, high, bent, x, y, z, dx, dy, dz, length, far):
+    """Fill the row with the last vertex, at far; a bent path has left the box by then, if need be later."""
+    ahead = far - length
+    if bent:
+        ahead = max(ahead, distance_out(low, high, x, y, z, dx, dy, dz))
+    count = put_vertex(
+        positions, directions, s, count, x + ahead * dx, y + ahead * dy, z + ahead * dz, dx, dy, dz, length + ahead
+    )
+    _repeat_last(positions, directions, s, min(count, s.shape[0]))
+    return count
+
+
+@compiled
+def _repeat_last(positions, directions, s, count):
     for i in range(count, s.shape[0]):
         positions[i] = positions[count - 1]
         directions[i] = directions[count - 1]

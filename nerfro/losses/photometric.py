@@ -28,10 +28,10 @@ class Photometric(Loss):
         self.coarse = coarse
 
     def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
-        value = torch.zeros((), device=batch.rgb.device)
+        value, target = torch.zeros((), device=batch.rgb.device), batch.of_pixels(batch.rgb)
         for rendering, factor in zip(renderings, [self.coarse] * (len(renderings) - 1) + [1.0], strict=True):
             radiance = batch.of_pixels(_teaching(rendering, batch))
-            value = value + factor * mse_loss(*model.difference(radiance, batch.of_pixels(batch.rgb)))
+            value = value + factor * mse_loss(*model.difference(radiance, target))
         return value
 
 

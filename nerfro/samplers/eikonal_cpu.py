@@ -14,9 +14,8 @@ from nerfro.kernels.compilation import compiled, compiled_parallel, inlined
 from nerfro.kernels.lookup import (
     block_clearance,
     box_span,
-    distance_out,
+    put_end,
     put_vertex,
-    repeat_last,
     solid_clearance,
     solid_index,
     voxel_index,
@@ -257,14 +256,7 @@ def _march_ray(medium, origin, direction, near, far, step, tolerance, max_steps,
                 break
         if (dx - kdx) ** 2 + (dy - kdy) ** 2 + (dz - kdz) ** 2 > MIN_TURN:
             count = put_vertex(positions, directions, lengths, count, x, y, z, dx, dy, dz, s)
-    # A bent path ends outside the box, however long it is; far bounds what lies beyond.
-    jump = end - s
-    if refracted:
-        jump = max(jump, distance_out(low, high, x, y, z, dx, dy, dz))
-    count = put_vertex(
-        positions, directions, lengths, count, x + jump * dx, y + jump * dy, z + jump * dz, dx, dy, dz, s + jump
-    )
-    repeat_last(positions, directions, lengths, min(count, len(lengths)))
+    count = put_end(*row, count, low, high, refracted, x, y, z, dx, dy, dz, s, end)
     return count, refracted, exceeded
 
 

@@ -14,9 +14,8 @@ from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.lookup import (
     block_clearance,
     box_span,
-    distance_out,
+    put_end,
     put_vertex,
-    repeat_last,
     spline_value,
     spline_value_gradient,
 )
@@ -178,14 +177,7 @@ def _trace_ray(solids, origin, direction, near, far, min_step, max_events, row, 
             if count < len(bodies):
                 bodies[count] = _innermost(inside)
             count = put_vertex(positions, directions, lengths, count, x, y, z, dx, dy, dz, s)
-    # A bent path ends outside the box, however long it is; far bounds what lies beyond.
-    jump = end - s
-    if events > 0:
-        jump = max(jump, distance_out(solids.low, solids.high, x, y, z, dx, dy, dz))
-    count = put_vertex(
-        positions, directions, lengths, count, x + jump * dx, y + jump * dy, z + jump * dz, dx, dy, dz, s + jump
-    )
-    repeat_last(positions, directions, lengths, min(count, len(bodies)))
+    count = put_end(*row, count, solids.low, solids.high, events > 0, x, y, z, dx, dy, dz, s, end)
     return count, events, exceeded
 
 
