@@ -36,5 +36,6 @@ class Rays:
         """These rays and after them others."""
         return Rays(*(torch.cat(pair) for pair in zip(vars(self).values(), vars(other).values(), strict=True)))
 
-    def to(self, device: torch.device | str) -> Rays:
-        return Rays(*(tensor.to(device) for tensor in vars(self).values()))
+    def to(self, where_or_what: torch.device | str | torch.dtype) -> Rays:
+        """The same rays on another device, or in another precision."""
+        return Rays(*(tensor.to(where_or_what) for tensor in vars(self).values()))

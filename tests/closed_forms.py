@@ -36,11 +36,6 @@ def make_rays(origins: list | Tensor, directions: list | Tensor, near: float, fa
     return Rays(o, d, 0 * ones, near * ones, far * ones)
 
 
-def to(rays: Rays, dtype: torch.dtype) -> Rays:
-    """The same rays in another precision."""
-    return Rays(*(t.to(dtype) for t in (rays.origins, rays.directions, rays.radii, rays.near, rays.far)))
-
-
 def beam(heights: Tensor, far: float = 9.0) -> Rays:
     """Parallel rays along +x at the given heights in y."""
     origins = torch.stack([torch.full_like(heights, -3), heights, 0 * heights], -1)

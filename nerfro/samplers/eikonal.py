@@ -165,8 +165,7 @@ def replay_adaptive(path: Path, rays: Rays, medium: Medium, max_steps: int) -> P
 
     In double precision, as the compiled kernel computes. The states of all steps are kept for the backward pass.
     """
-    names = ("origins", "directions", "radii", "near", "far")
-    precise = Rays(*(path.of_ray(getattr(rays, name)).double() for name in names))
+    precise = rays[path.ray].to(torch.float64)
     vertices = _KnownVertices(path)
     state, _, _ = _march(precise, medium, max_steps, vertices)
     rows = torch.arange(len(precise), device=path.s.device)

@@ -31,7 +31,6 @@ from tests.closed_forms import (
     luneburg,
     make_rays,
     sech_fibre,
-    to,
 )
 
 NUM_STEPS = 256
@@ -49,7 +48,7 @@ LEVELS = pytest.mark.parametrize(
 
 def _trace(rays: Rays, squared: Squared, integrator: str, dtype: torch.dtype = torch.float64) -> Path:
     """Trace in the given precision; the vertices come back in double."""
-    path = march_uniform(to(rays, dtype), FunctionMedium(squared), INTEGRATORS[integrator], NUM_STEPS + 1)
+    path = march_uniform(rays.to(dtype), FunctionMedium(squared), INTEGRATORS[integrator], NUM_STEPS + 1)
     assert path.positions.dtype == dtype
     values = (getattr(path, field.name) for field in dataclasses.fields(path) if field.init)
     return Path(*(t.double() if t.is_floating_point() else t for t in values))
@@ -232,7 +231,7 @@ def test_leapfrog_follows_the_parabola_of_linear_n_squared_to_rounding(dtype: to
     g = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
     medium = FunctionMedium(lambda x: (2 + x @ g.to(x), g.to(x).expand_as(x)))
     rays = make_rays([[0, 0, 0]], [[0.2, 0.9, 0.1]], 0, 3)
-    path = march_uniform(to(rays, dtype), medium, INTEGRATORS["leapfrog"], 12)
+    path = march_uniform(rays.to(dtype), medium, INTEGRATORS["leapfrog"], 12)
     p0 = rays.directions[0] * math.sqrt(2)
     # x = p0 sigma + g sigma^2 / 4: sigma from the component across g, the rest must follow.
     across = torch.linalg.cross(g, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))

@@ -16,7 +16,7 @@ from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.samplers.eikonal import Eikonal, march_adaptive, march_uniform
 from nerfro.samplers.integrators import INTEGRATORS
 from nerfro.types import Rays
-from tests.closed_forms import FunctionMedium, angle, make_rays, to
+from tests.closed_forms import FunctionMedium, angle, make_rays
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 
@@ -99,7 +99,7 @@ def test_rays_that_miss_are_two_vertices() -> None:
 
 
 def test_vacuum_bends_nothing() -> None:
-    rays = to(make_rays(torch.randn(5, 3), torch.randn(5, 3), 0.1, 3), torch.float32)
+    rays = make_rays(torch.randn(5, 3), torch.randn(5, 3), 0.1, 3).to(torch.float32)
     path = Eikonal()(rays, Vacuum())
     torch.testing.assert_close(path.exit_directions, rays.directions)
     assert path.s.shape == (5, 2)
@@ -183,7 +183,7 @@ def test_paths_of_different_capacity_agree() -> None:
 
 def test_a_camera_inside_the_glass_sees_out() -> None:
     _, solid = _grids()
-    rays = to(make_rays([[0.0, 0.65, 0.0]], [[0, 1, 0]], 0.0, 4), torch.float32)
+    rays = make_rays([[0.0, 0.65, 0.0]], [[0, 1, 0]], 0.0, 4).to(torch.float32)
     path = Eikonal()(rays, solid)
     torch.testing.assert_close(path.exit_directions, rays.directions)
 

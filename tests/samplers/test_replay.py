@@ -23,7 +23,7 @@ from nerfro.samplers.replay import smallest_cosine
 from nerfro.samplers.snell import Snell, trace_interfaces
 from nerfro.samplers.straight import Straight
 from nerfro.types import Path, Rays
-from tests.closed_forms import beam, make_rays, to
+from tests.closed_forms import beam, make_rays
 
 BOX = torch.tensor([[-1.2] * 3, [1.2] * 3], dtype=torch.float64)
 STEADY = 0.15
@@ -202,7 +202,7 @@ def _voxels() -> VoxelGrid:
 def test_values_are_the_traced_ones_and_gradients_finite(
     sampler: PathSampler, make: Callable[[FilePath], Medium], tmp_path: FilePath
 ) -> None:
-    rays, medium = to(_rays(300), torch.float32), make(tmp_path).float()
+    rays, medium = _rays(300).to(torch.float32), make(tmp_path).float()
     rays.origins.requires_grad_()
     path = sampler(rays, medium)
     assert not path.positions.requires_grad
