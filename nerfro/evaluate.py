@@ -37,11 +37,11 @@ def _evaluate_checkpoint(config: DictConfig) -> Path:
     folder = free_folder(config, path.parent.parent / f"evaluate_{config.split}")
     if config.root is not None:
         trained.data.root = config.root
-    for name in ("chunk_size", "lpips_backbone", "lpips_vgg_backbone", "supersample", "divergence"):
+    for name in ("chunk_size", "lpips_backbone", "lpips_vgg_backbone", "supersample", "divergence", "contrast"):
         if config[name] is not None:
             trained.evaluation[name] = config[name]
     wanted = trained.evaluation
-    supersampling = Supersampling(wanted.supersample, wanted.divergence)
+    supersampling = Supersampling(wanted.supersample, wanted.divergence, wanted.get("contrast"))
     device = find_device(config.device)
     views = build(trained.data).load(config.split).checked()
     model = restore(checkpoint, trained).to(device)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Float, Int
@@ -38,6 +39,20 @@ def rays_beside(cameras: Cameras, pixels: Int[Tensor, "R"], place: Float[Tensor,
     """Rays one pixel beside those of `pixel_rays`, to see where neighbours part."""
     centre = torch.full((2,), 0.5, device=pixels.device)
     return pixel_rays(cameras, pixels, (centre if place is None else place) + _BESIDE)
+
+
+def contrast(
+    colours: Callable[[Int[Tensor, "R"]], Float[Tensor, "R 3"]], cameras: Cameras, pixels: Int[Tensor, "R"]
+) -> Float[Tensor, "R"]:
+    """Largest difference of a channel between pixels and the four around them; `colours` gives those of pixels."""
+    height, width = cameras.height, cameras.width
+    row, column = pixels // width % height, pixels % width
+    own = colours(pixels)
+    largest = torch.zeros_like(own[:, 0])
+    for step, exists in ((-1, column > 0), (1, column < width - 1), (-width, row > 0), (width, row < height - 1)):
+        other = colours(torch.where(exists, pixels + step, pixels))
+        largest = torch.maximum(largest, (other - own).abs().amax(-1))
+    return largest
 
 
 def divergence(

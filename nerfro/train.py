@@ -48,7 +48,9 @@ def main(config: DictConfig) -> None:
     wanted, training = config.batches, source.load("train")
     precrop = wanted.precrop_steps, wanted.precrop_fraction
     batches = RayBatches(training, wanted.size, wanted.batching, config.seed, *precrop, wanted.jitter)
-    supersampling = Supersampling(config.evaluation.supersample, config.evaluation.divergence)
+    supersampling = Supersampling(
+        config.evaluation.supersample, config.evaluation.divergence, config.evaluation.contrast
+    )
     lpips = find_lpips_networks(config.evaluation.lpips_backbone, config.evaluation.lpips_vgg_backbone)
     model = build_model(config)
     if checkpoint is not None:

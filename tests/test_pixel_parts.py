@@ -16,7 +16,7 @@ from nerfro.data.base import Views
 from nerfro.distributed import drawing_for, rand_rays
 from nerfro.media.analytic import Vacuum
 from nerfro.media.shapes import Ball, RoundedBox
-from nerfro.pixel_parts import divergence, part_rays, pixel_rays, rays_beside
+from nerfro.pixel_parts import contrast, divergence, part_rays, pixel_rays, rays_beside
 from nerfro.samplers.snell import Snell
 from nerfro.samplers.straight import Straight
 from nerfro.training.ray_batches import RayBatches
@@ -158,6 +158,20 @@ def test_jittered_parts_stay_inside_their_parts_and_fill_them(views: Views) -> N
     assert offset.max() < 1 + 1e-3
     assert torch.allclose(offset.mean(0), torch.tensor(0.5), atol=4 * 12**-0.5 * len(offset) ** -0.5)
     assert torch.allclose(offset.std(0), torch.tensor(12**-0.5), atol=0.02)
+
+
+def test_contrast_is_the_largest_step_to_a_neighbour(cameras: Cameras) -> None:
+    images = torch.rand(NUM_VIEWS, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(2))
+    pixels = torch.arange(NUM_VIEWS * HEIGHT * WIDTH)
+    flat = images.view(-1, 3)
+    expected = torch.zeros(NUM_VIEWS, HEIGHT, WIDTH)
+    for row, column in np.ndindex(HEIGHT, WIDTH):
+        around = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
+        for r, c in around:
+            if 0 <= r < HEIGHT and 0 <= c < WIDTH:
+                step = (images[:, r, c] - images[:, row, column]).abs().amax(-1)
+                expected[:, row, column] = torch.maximum(expected[:, row, column], step)
+    assert torch.equal(contrast(lambda some: flat[some], cameras, pixels), expected.flatten())
 
 
 def test_where_nothing_bends_no_pixel_is_divided(views: Views) -> None:

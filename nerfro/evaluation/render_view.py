@@ -9,7 +9,7 @@ import torch
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.models.base import NerfModel, RenderedRays
-from nerfro.pixel_parts import divergence, part_rays, rays_beside
+from nerfro.pixel_parts import contrast, divergence, part_rays, rays_beside
 
 
 @dataclass(frozen=True)
@@ -19,6 +19,8 @@ class Supersampling:
     side: int = 1  # rays in each direction; a chosen pixel costs side^2 more rays
     # Pixels are chosen whose ray leaves so many pixel angles or more (`pixel_parts.divergence`) from the one beside it.
     divergence: float = 0.0
+    # And pixels whose colour differs from that of a neighbour by so much (sRGB): fine texture, edges of things inside.
+    contrast: float | None = None
 
     def __post_init__(self) -> None:
         if self.side < 1 or self.divergence < 0:
@@ -38,7 +40,11 @@ def render_view(model: NerfModel, cameras: Cameras, view: int, supersampling: Su
         beside = [model.trace(rays_beside(cameras, some)) for some in pixels.split(model.chunk_size)]
     exits = torch.cat([path.first_of_ray(path.exit_directions) for path in beside])
     angles = divergence(cameras, pixels, rendered.exit_directions, exits)
-    chosen = (angles >= supersampling.divergence).nonzero()[:, 0]
+    divided = angles >= supersampling.divergence
+    if supersampling.contrast is not None:
+        shown = model.encode(rendered.radiance).clamp(0, 1)
+        divided |= contrast(lambda some: shown[some - pixels[0]], cameras, pixels) >= supersampling.contrast
+    chosen = divided.nonzero()[:, 0]
     if len(chosen) == 0:
         return rendered
     radiance, num_parts = rendered.radiance.clone(), supersampling.side**2

@@ -11,7 +11,7 @@ from typing import Optional
 import torch
 from omegaconf import DictConfig
 
-from nerfro.allowed import Count, NotNegative
+from nerfro.allowed import Count, NotNegative, Positive
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing
 from nerfro.paths import user_path
@@ -28,6 +28,7 @@ class EvaluateConfig:
     # Rays per pixel (see docs/experiments.md); as trained by default.
     supersample: Optional[Count] = None
     divergence: Optional[NotNegative] = None
+    contrast: Optional[Positive] = None
     predictions: Optional[str] = None  # folder of pictures to score, instead of a checkpoint
     references: Optional[str] = None  # folder of pictures of the same names, compared with `predictions`
     # Folder of masks of the same names; by default those that lie with the references, or their transparency.
@@ -52,7 +53,7 @@ def require_one_task(config: DictConfig) -> None:
         raise NerfroError(f"predictions={config.predictions} are compared with what? give references=DIR")
     others: tuple[str, ...]
     if config.checkpoint is None:
-        task, others = "predictions", ("split", "root", "chunk_size", "supersample", "divergence")
+        task, others = "predictions", ("split", "root", "chunk_size", "supersample", "divergence", "contrast")
     else:
         task, others = "checkpoint", ("references", "masks", "alpha")
     for name in others:

@@ -62,6 +62,8 @@ class EvaluationConfig:
     supersample: Count = 1
     # Supersample pixels whose ray leaves this many pixels or more away from the one beside it; 0 for all.
     divergence: NotNegative = 0.0
+    # And pixels whose colour differs from a neighbour's by this much (sRGB); none for no others.
+    contrast: Optional[Positive] = None  # noqa: UP045
 
 
 @dataclass

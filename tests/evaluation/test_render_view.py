@@ -27,3 +27,21 @@ def test_pixels_are_divided_at_the_rim_of_a_ball() -> None:
     once, divided = (render_view(model, cameras, 0, Supersampling(side, 8.0)).radiance for side in (1, 3))
     differs = (once != divided).any(-1)
     assert 0 < differs.float().mean() < 0.5
+
+
+def test_pixels_of_much_contrast_are_divided_where_no_ray_bends() -> None:
+    model, cameras = RefractiveModel(example_parts()).eval(), example_batch().cameras
+    for parameter in model.fields.parameters():
+        torch.nn.init.normal_(parameter, std=0.5)
+    once = render_view(model, cameras, 0, Supersampling(1))
+    shown = model.encode(once.radiance).clamp(0, 1).view(cameras.height, cameras.width, 3)
+    threshold = 0.02
+    steps = [(shown.diff(dim=axis).abs().amax(-1) >= threshold) for axis in (0, 1)]
+    expected = torch.zeros(cameras.height, cameras.width, dtype=torch.bool)
+    expected[:-1] |= steps[0]
+    expected[1:] |= steps[0]
+    expected[:, :-1] |= steps[1]
+    expected[:, 1:] |= steps[1]
+    assert 0 < expected.float().mean() < 1
+    divided = render_view(model, cameras, 0, Supersampling(3, 1.5, threshold))
+    assert torch.equal((divided.radiance != once.radiance).any(-1), expected.flatten())
