@@ -11,16 +11,15 @@ from nerfro.evaluation.error_maps import write_error_sheet
 from nerfro.evaluation.folders import match_folders
 from nerfro.evaluation.lpips import find_lpips_networks
 from nerfro.evaluation.metrics import ImageMetrics
-from nerfro.evaluation.render_view import Supersampling
 from nerfro.evaluation.request import EvaluateConfig, find_device, free_folder, require_one_task
 from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.score_tables import report
 from nerfro.evaluation.scoring import score_folders, score_views
 from nerfro.files.images import load_png
 from nerfro.paths import user_path
-from nerfro.registry import build
 from nerfro.training.callbacks import Throughput
-from nerfro.training.run_folder import load_checkpoint, restore
+from nerfro.training.load import scene_of
+from nerfro.training.run_folder import load_checkpoint
 
 
 @entry_point("evaluate", EvaluateConfig)
@@ -40,15 +39,13 @@ def _evaluate_checkpoint(config: DictConfig) -> Path:
     for name in ("chunk_size", "lpips_backbone", "lpips_vgg_backbone", "supersample", "divergence", "contrast"):
         if config[name] is not None:
             trained.evaluation[name] = config[name]
-    wanted = trained.evaluation
-    supersampling = Supersampling(wanted.supersample, wanted.divergence, wanted.get("contrast"))
-    device = find_device(config.device)
-    views = build(trained.data).load(config.split).checked()
-    model = restore(checkpoint, trained).to(device)
+    scene = scene_of(checkpoint, trained, find_device(config.device))
+    views = scene.views(config.split).checked()
     # Checkpoints from before there was LPIPS over VGG-16 lack the option.
-    networks, reasons = find_lpips_networks(wanted.lpips_backbone, wanted.get("lpips_vgg_backbone"))
+    backbones = trained.evaluation.lpips_backbone, trained.evaluation.get("lpips_vgg_backbone")
+    networks, reasons = find_lpips_networks(*backbones)
     metrics = ImageMetrics(networks, reasons, config.protocol == "8bit", prefix=config.split)
-    result = score_views(model, views, metrics, folder, supersampling)
+    result = score_views(scene.model, views, metrics, folder, scene.supersampling)
     for index, view in enumerate(result.views):
         prediction = load_png(folder / "images" / f"{view.name}.png")
         write_error_sheet(folder, view.name, prediction, views.images[index], networks)

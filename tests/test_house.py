@@ -12,7 +12,7 @@ from nerfro.paths import PACKAGE_DIR
 
 # From above to below: a package imports what follows it, and itself.
 ORDER = (
-    "commands", "testing", "report", "training", "evaluation", "scenes", "capture", "models", "losses", "boundaries",
+    "commands", "testing", "report", "training", "view", "evaluation", "scenes", "capture", "models", "losses", "boundaries",
     "camera", "samplers", "fields", "media", "data", "geometry", "kernels", "files", "core",
 )  # fmt: skip
 FILES = {
@@ -43,8 +43,13 @@ def is_command(module: str) -> bool:
 
 
 def room(module: str) -> str:
-    """The package of a module; top-level modules are commands, `testing` (for authors of plugins) or the core."""
-    name = module.split(".")[1] if "." in module else "core"
+    """The package of a module; top-level modules are commands, `testing` (for authors of plugins) or the core.
+
+    `nerfro` itself stands with the commands: it hands on what is for everybody, imported when it is asked for.
+    """
+    if module == "nerfro":
+        return "commands"
+    name = module.split(".")[1]
     if (PACKAGE_DIR / name).is_dir() or name == "testing":
         return name
     return "commands" if is_command(module) else "core"

@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nerfro.errors import NerfroError
+
 Scalars = Float[Tensor, "*batch"]
 Vectors = Float[Tensor, "*batch 3"]
 
@@ -39,6 +41,15 @@ class Medium(nn.Module, ABC):
     @abstractmethod
     def forward(self, positions: Vectors) -> tuple[Scalars, Vectors]:
         """Refractive index and its gradient (per world unit)."""
+
+    @property
+    def indices(self) -> Float[Tensor, "K"]:
+        """Refractive index of each body; of none where the index is not that of bodies."""
+        return torch.empty(0)
+
+    def with_indices(self, indices: Float[Tensor, "K"]) -> Medium:
+        """The same bodies of another index."""
+        raise NerfroError(f"the index of {type(self).__name__} cannot be changed; take a medium of bodies")
 
     @property
     def content_box(self) -> Float[Tensor, "2 3"]:

@@ -11,6 +11,7 @@ from torch import Tensor
 from nerfro.allowed import Positive, checked
 from nerfro.kernels.tolerances import MIN_COSINE, SAFE_SHARE, STEPS_PER_SHELL
 from nerfro.media.base import Medium, Scalars, Vectors
+from nerfro.variants import variant
 
 
 @checked("medium")
@@ -32,6 +33,13 @@ class Solid(Medium):
         # Double precision: kernels ask for it, and a number without dimensions takes on the precision of what it meets.
         self.register_buffer("iors", torch.tensor(iors, dtype=torch.float64), persistent=False)
         self.shell = float(shell)
+
+    @property
+    def indices(self) -> Float[Tensor, "K"]:
+        return self.iors.detach()
+
+    def with_indices(self, indices: Float[Tensor, "K"]) -> Solid:
+        return variant(self, iors=indices.to(self.iors))
 
     @abstractmethod
     def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:

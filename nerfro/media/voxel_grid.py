@@ -116,6 +116,14 @@ class VoxelGrid(Medium):
         self.register_buffer("table", table, persistent=False)
 
     @property
+    def indices(self) -> Float[Tensor, "K"]:
+        return torch.tensor([self.ior])
+
+    def with_indices(self, indices: Float[Tensor, "K"]) -> VoxelGrid:
+        smoothing = self.smoothing_size, self.smoothing_sigma
+        return self.from_occupancy(self.occupancy.cpu(), self.box.cpu(), float(indices), *smoothing).to(self.box.device)
+
+    @property
     def spacing(self) -> Float[Tensor, "3"]:
         """Distance between neighbouring vertices, world units."""
         return (self.box[1] - self.box[0]) / (constant(self.table.shape[:3], self.box.device) - 1)

@@ -24,6 +24,7 @@ from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.models.optimizer import OptimizerConfig, learning_rate_factor, training_progress
 from nerfro.samplers.base import PathSampler, PointSampler
+from nerfro.samplers.surface_normals import first_normals
 from nerfro.types import Batch, Path, Rays, Rendering
 
 
@@ -174,17 +175,22 @@ class NerfModel(LightningModule, ABC):
 
     def _render_chunk(self, rays: Rays) -> tuple[Tensor, ...]:
         rendering = self(rays)[-1]
-        return rendering.rgb, rendering.depth, rendering.opacity, rendering.exit_directions
+        normals = first_normals(rendering.path, self.medium)
+        return rendering.rgb, rendering.depth, rendering.opacity, rendering.exit_directions, normals
 
 
 @dataclass(frozen=True)
 class RenderedRays:
-    """What evaluation keeps: radiance as the model adds it up, expected arc length, opacity and leaving direction."""
+    """What evaluation keeps: radiance as the model adds it up, expected arc length, opacity and leaving direction.
+
+    And the unit normal where the ray first meets the surface; zero where it does not.
+    """
 
     radiance: Float[Tensor, "R 3"]
     depth: Float[Tensor, "R"]
     opacity: Float[Tensor, "R"]
     exit_directions: Float[Tensor, "R 3"]
+    normals: Float[Tensor, "R 3"]
 
 
 def psnr(prediction: Tensor, target: Tensor) -> Float[Tensor, ""]:

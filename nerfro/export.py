@@ -1,0 +1,28 @@
+"""`python -m nerfro.export checkpoint=... what=mesh out=FILE`: write a trained scene for other programs."""
+
+from __future__ import annotations
+
+from omegaconf import DictConfig
+
+from nerfro.cli import entry_point
+from nerfro.files.atomic import refuse_existing
+from nerfro.paths import user_path
+from nerfro.training.load import load
+from nerfro.view.exports import EXPORTS, ExportConfig
+
+
+@entry_point("export", ExportConfig)
+def main(config: DictConfig) -> None:
+    """Refuse what cannot be written, load the scene, write, print."""
+    export = EXPORTS[config.what]
+    out = user_path(config.out)
+    export.check_name(out)
+    refuse_existing([out], config.overwrite)
+    scene = load(config.checkpoint, config.device, config.root)
+    if config.sky is not None:
+        scene = scene.with_(sky=config.sky)
+    print(f"{export.write(scene, out, config)}; wrote {out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,42 @@
+"""A run's trained scene: the one way from a checkpoint to pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+
+from nerfro.evaluation.render_view import Supersampling
+from nerfro.evaluation.request import find_device
+from nerfro.paths import user_path
+from nerfro.registry import build, discover
+from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint, restore
+from nerfro.view.scene import Scene
+
+
+def load(run: str | Path, device: str = "auto", root: str | Path | None = None) -> Scene:
+    """The trained scene of a run.
+
+    Args:
+        run: folder of the run, or one of its checkpoints.
+        device: `cpu`, `cuda`, or `auto` for a GPU if there is one.
+        root: folder of the data, if it has moved since training.
+
+    Raises:
+        NerfroError: there is no readable checkpoint, or something that it was trained with is gone.
+    """
+    discover()
+    path = user_path(run)
+    checkpoint, config = load_checkpoint(path / LAST_CHECKPOINT if path.is_dir() else path)
+    if root is not None:
+        config.data.root = str(root)
+    return scene_of(checkpoint, config, find_device(device))
+
+
+def scene_of(checkpoint: dict[str, Any], config: DictConfig, device: torch.device) -> Scene:
+    """The scene of a checkpoint and its configuration, of which the data and how it is evaluated may have changed."""
+    wanted = config.evaluation
+    model = restore(checkpoint, config).to(device)
+    return Scene(model, build(config.data), Supersampling(wanted.supersample, wanted.divergence, wanted.get("contrast")), config.name)

@@ -1,0 +1,163 @@
+"""A trained scene: render it from anywhere, look at its parts, and change them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from tqdm import tqdm
+
+from nerfro.cameras import Cameras
+from nerfro.data.base import DataSource, Views
+from nerfro.errors import NerfroError
+from nerfro.evaluation.render_view import Supersampling, render_view
+from nerfro.files import lat_long
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.light import to_linear
+from nerfro.models.base import NerfModel
+from nerfro.paths import user_path
+from nerfro.types import Exits
+from nerfro.variants import variant
+from nerfro.view.changes import with_absorption, with_indices, with_sky, without_glass, without_inside
+from nerfro.view.surface import surface_of
+
+# Rows of the sky that `Scene.sky` is drawn with: the default environment map's finest texels.
+SKY_HEIGHT = 512
+
+
+class RenderedViews(NamedTuple):
+    """Pictures of V cameras, on the CPU. It unpacks in this order: `rgb, depth, opacity, normals, exits, radiance`."""
+
+    rgb: Float[Tensor, "V H W 3"]  # sRGB in [0, 1]
+    # Expected arc length along the bent ray of what is inside, world units; the path's end where nothing is.
+    depth: Float[Tensor, "V H W"]
+    opacity: Float[Tensor, "V H W"]  # of what is inside, 0 to 1
+    normals: Float[Tensor, "V H W 3"]  # of the surface where it is first met, towards the camera; zero beside the glass
+    exit_directions: Float[Tensor, "V H W 3"]  # unit directions in which rays leave for the sky
+    radiance: Float[Tensor, "V H W 3"]  # linear, unbounded above
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A trained model with the data that it was trained on; `nerfro.load` makes one of a run.
+
+    Attributes:
+        model: the radiance field, glass and sky, in evaluation.
+        source: the data set.
+        supersampling: rays a pixel, as the run was evaluated.
+        name: of the experiment.
+    """
+
+    model: NerfModel
+    source: DataSource
+    supersampling: Supersampling = Supersampling()  # noqa: RUF009 (frozen)
+    name: str = ""
+
+    def views(self, split: str = "test") -> Views:
+        """Cameras, photographs and masks of a split of the data."""
+        return self.source.load(split)
+
+    def cameras(self, split: str = "test") -> Cameras:
+        """The cameras of a split of the data, on the scene's device."""
+        return self.views(split).cameras.to(self.model.device)
+
+    def render(
+        self,
+        cameras: Cameras,
+        supersampling: Supersampling | None = None,
+        chunk_size: int | None = None,
+        progress: bool = False,
+    ) -> RenderedViews:
+        """Render each camera, in chunks that bound the memory.
+
+        Args:
+            cameras: on any device; see `nerfro.cameras.Cameras` for their axes.
+            supersampling: rays a pixel, as the run was evaluated by default; `Supersampling()` gives each pixel one.
+            chunk_size: rays rendered at once, as the run was evaluated by default.
+            progress: whether to show a bar with the time that is left.
+        """
+        scene = self if chunk_size is None else replace(self, model=variant(self.model, chunk_size=chunk_size))
+        views = tqdm(range(len(cameras)), unit="view", desc="render", disable=not progress, dynamic_ncols=True)
+        rendered = [scene._render_view(cameras, view, supersampling or self.supersampling) for view in views]
+        return RenderedViews(*(torch.stack(parts) for parts in zip(*rendered, strict=True)))
+
+    def _render_view(self, cameras: Cameras, view: int, supersampling: Supersampling) -> tuple[Tensor, ...]:
+        found = render_view(self.model, cameras.to(self.model.device), view, supersampling)
+        rgb = self.model.encode(found.radiance).clamp(0, 1)
+        radiance = to_linear(found.radiance) if self.model.colour == "srgb" else found.radiance
+        values = rgb, found.depth, found.opacity, found.normals, found.exit_directions, radiance
+        return tuple(value.float().cpu().view(cameras.height, cameras.width, *value.shape[1:]) for value in values)
+
+    @property
+    def sky(self) -> Float[Tensor, "512 1024 3"]:
+        """What is seen beyond the volume, from its middle: linear radiance, lat-long, z up (see `files.lat_long`)."""
+        return self.sky_of_height(SKY_HEIGHT)
+
+    @torch.inference_mode()
+    def sky_of_height(self, height: int) -> Float[Tensor, "H 2*H 3"]:
+        """`sky` with another number of rows."""
+        directions = lat_long.directions(height).to(self.model.device)
+        rows = [self.model.boundary(Exits(some)) for some in directions.split(max(1, self.model.chunk_size // height))]
+        sky = torch.cat(rows).float().cpu()
+        return to_linear(sky.clamp(min=0)) if self.model.colour == "srgb" else sky
+
+    @property
+    def surface(self) -> list[TriangleMesh]:
+        """The surfaces on which rays bend, the outer body's first; world units."""
+        return surface_of(self.model.medium, getattr(self.model.path_sampler, "interface", "sdf") == "mesh")
+
+    @property
+    def ior(self) -> Float[Tensor, "K"]:
+        """Refractive index of each body, the outer one's first; none without bodies."""
+        return self.model.medium.indices.cpu()
+
+    @property
+    def bounds(self) -> Float[Tensor, "2 3"]:
+        """Corners of the box around the glass, or around all that the field holds where there is no glass."""
+        medium = self.model.medium
+        box = medium.content_box.float().cpu()
+        if (box[1] > box[0]).all():
+            return box
+        sampled = getattr(self.model.point_sampler, "box", None)
+        if sampled is None:
+            raise NerfroError("the run knows no bounds of an object: it has neither a medium nor a box of its content")
+        return sampled.float().cpu()
+
+    def with_(
+        self,
+        sky: str | Path | Float[Tensor, "H 2*H 3"] | None = None,
+        ior: float | Sequence[float] | Tensor | None = None,
+        absorption: Sequence[float] | Tensor | None = None,
+        glass: bool = True,
+        inside: bool = True,
+    ) -> Scene:
+        """The scene with some parts changed; it shares all others with this one, which stays as it is.
+
+        Args:
+            sky: lat-long picture of linear radiance, or its file (.hdr, .exr, .png, .jpg), instead of the sky.
+            ior: index of the outer body, or of each.
+            absorption: of red, green and blue in the outer body, or in each [K, 3], per world unit.
+            glass: False takes the glass away: all rays are straight.
+            inside: False takes away what is inside.
+
+        Raises:
+            NerfroError: the model has no such part.
+        """
+        model = self.model
+        if sky is not None:
+            picture = sky if isinstance(sky, Tensor) else lat_long.load_lat_long(user_path(sky))
+            model = with_sky(model, picture)
+        if ior is not None:
+            model = with_indices(model, torch.as_tensor(ior))
+        if absorption is not None:
+            model = with_absorption(model, torch.as_tensor(absorption))
+        if not glass:
+            model = without_glass(model)
+        if not inside:
+            model = without_inside(model)
+        return replace(self, model=model)
