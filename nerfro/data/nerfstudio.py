@@ -60,7 +60,7 @@ class NerfstudioData(PosedImages):
 
         def lenses(width: int, height: int) -> list[Lens]:
             values = [{**manifest.document, **entries[i]} for i in chosen]
-            return [_read_lens(v, width, height, name) for v, name in zip(values, names, strict=True)]
+            return [read_lens(v, width, height, name) for v, name in zip(values, names, strict=True)]
 
         frames = [manifest.frames[i] for i in chosen]
         ignoring: list[Path | None] = []
@@ -94,7 +94,7 @@ class NerfstudioData(PosedImages):
         return [known[name] for name in tidy]
 
 
-def _read_lens(values: Mapping[str, object], width: int, height: int, where: str) -> Lens:
+def read_lens(values: Mapping[str, object], width: int, height: int, where: str) -> Lens:
     """The lens of a frame from its own keys, and the file's where it has none."""
     model = values.get("camera_model", "OPENCV")
     if model not in _PERSPECTIVE:

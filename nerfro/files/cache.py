@@ -13,6 +13,7 @@ import numpy as np
 
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import atomic_file
+from nerfro.paths import user_path
 
 
 def cache_dir() -> Path:
@@ -30,6 +31,11 @@ def content_hash(*parts: np.ndarray | str | float | int | bool) -> str:
         else:
             digest.update(f"{type(part).__name__}:{part!r};".encode())
     return digest.hexdigest()[:32]
+
+
+def file_hash(path: Path | str) -> str:
+    """Hexadecimal hash of a file's content."""
+    return hashlib.sha256(user_path(path).read_bytes()).hexdigest()[:32]
 
 
 def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:

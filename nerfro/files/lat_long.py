@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import torch
@@ -19,6 +18,7 @@ from torch import Tensor
 from nerfro.errors import NerfroError
 from nerfro.files import radiance_hdr
 from nerfro.files.atomic import write_atomically
+from nerfro.files.exr import encode_exr, load_exr
 from nerfro.files.images import save_png
 from nerfro.light import to_linear, to_srgb
 
@@ -58,7 +58,7 @@ def load_lat_long(path: Path | str) -> Float[Tensor, "H 2*H 3"]:
         if suffix == ".hdr":
             rgb = radiance_hdr.decode(path.read_bytes())
         elif suffix == ".exr":
-            rgb = np.array(_mitsuba().Bitmap(str(path)), np.float32)[..., :3]
+            rgb = load_exr(path)[..., :3]
         else:
             with Image.open(path) as image:
                 rgb = to_linear(np.array(image.convert("RGB")) / 255)
@@ -83,7 +83,7 @@ def save_lat_long(path: Path | str, radiance: Float[Tensor, "H 2*H 3"]) -> None:
     if suffix == ".hdr":
         write_atomically(path, radiance_hdr.encode(linear))
     elif suffix == ".exr":
-        write_atomically(path, _exr(linear))
+        write_atomically(path, encode_exr(linear))
     else:
         raise NerfroError(f"a sky is not written as {suffix}, which loses detail; use .png, .hdr or .exr")
 
@@ -93,22 +93,3 @@ def _format(path: Path) -> str:
     if suffix not in _FORMATS:
         raise NerfroError(f"the sky {path} ends in '{suffix}'; allowed are {', '.join(_FORMATS)}")
     return suffix
-
-
-def _exr(linear: Float[np.ndarray, "H W 3"]) -> bytes:
-    mitsuba = _mitsuba()
-    stream = mitsuba.MemoryStream()
-    mitsuba.Bitmap(linear).write(stream, mitsuba.Bitmap.FileFormat.OpenEXR)
-    return stream.raw_buffer()
-
-
-def _mitsuba() -> ModuleType:
-    try:
-        import mitsuba
-    except ImportError as error:
-        raise NerfroError(
-            "OpenEXR files need Mitsuba: pip install 'nerfro[synthesize]', or convert the sky to .hdr or .png"
-        ) from error
-    if mitsuba.variant() is None:
-        mitsuba.set_variant("scalar_rgb")
-    return mitsuba

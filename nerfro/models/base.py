@@ -19,7 +19,7 @@ from nerfro.camera.base import Camera
 from nerfro.camera.given import GivenCamera
 from nerfro.distributed import drawing_for
 from nerfro.fields.base import Field
-from nerfro.light import clipped_alike, to_srgb
+from nerfro.light import clipped_alike, to_linear, to_srgb
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.models.optimizer import OptimizerConfig, learning_rate_factor, training_progress
@@ -98,6 +98,10 @@ class NerfModel(LightningModule, ABC):
     def encode(self, radiance: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """What rays add up to, as sRGB; not clipped, so that what is too bright keeps its gradient."""
         return radiance if self.colour == "srgb" else to_srgb(radiance)
+
+    def linear(self, radiance: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """What fields, boundary and rays have, as linear radiance."""
+        return to_linear(radiance.clamp(min=0)) if self.colour == "srgb" else radiance
 
     def difference(self, radiance: Float[Tensor, "*batch 3"], rgb: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor]:
         """Prediction and target, both sRGB, for a loss to compare.

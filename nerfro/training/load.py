@@ -28,11 +28,16 @@ def load(run: str | Path, device: str = "auto", root: str | Path | None = None) 
         NerfroError: there is no readable checkpoint, or something that it was trained with is gone.
     """
     discover()
-    path = user_path(run)
-    checkpoint, config = load_checkpoint(path / LAST_CHECKPOINT if path.is_dir() else path)
+    checkpoint, config = load_checkpoint(checkpoint_of(run))
     if root is not None:
         config.data.root = str(root)
     return scene_of(checkpoint, config, find_device(device))
+
+
+def checkpoint_of(run: str | Path) -> Path:
+    """The checkpoint that a run is named by: the file itself, or the last one of a run folder."""
+    path = user_path(run)
+    return path / LAST_CHECKPOINT if path.is_dir() else path
 
 
 def scene_of(checkpoint: dict[str, Any], config: DictConfig, device: torch.device) -> Scene:

@@ -18,7 +18,6 @@ from nerfro.errors import NerfroError
 from nerfro.evaluation.render_view import Supersampling, render_view
 from nerfro.files import lat_long
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.light import to_linear
 from nerfro.models.base import NerfModel
 from nerfro.paths import user_path
 from nerfro.types import Exits
@@ -89,7 +88,7 @@ class Scene:
     def _render_view(self, cameras: Cameras, view: int, supersampling: Supersampling) -> tuple[Tensor, ...]:
         found = render_view(self.model, cameras.to(self.model.device), view, supersampling)
         rgb = self.model.encode(found.radiance).clamp(0, 1)
-        radiance = to_linear(found.radiance) if self.model.colour == "srgb" else found.radiance
+        radiance = self.model.linear(found.radiance)
         values = rgb, found.depth, found.opacity, found.normals, found.exit_directions, radiance
         return tuple(value.float().cpu().view(cameras.height, cameras.width, *value.shape[1:]) for value in values)
 
@@ -103,8 +102,7 @@ class Scene:
         """`sky` with another number of rows."""
         directions = lat_long.directions(height).to(self.model.device)
         rows = [self.model.boundary(Exits(some)) for some in directions.split(max(1, self.model.chunk_size // height))]
-        sky = torch.cat(rows).float().cpu()
-        return to_linear(sky.clamp(min=0)) if self.model.colour == "srgb" else sky
+        return self.model.linear(torch.cat(rows).float()).cpu()
 
     @property
     def surface(self) -> list[TriangleMesh]:

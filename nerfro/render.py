@@ -1,0 +1,39 @@
+"""`python -m nerfro.render checkpoint=... path=orbit out=DIR`: pictures and films of a trained scene, from anywhere."""
+
+from __future__ import annotations
+
+from omegaconf import DictConfig
+
+from nerfro.cli import entry_point
+from nerfro.files.cache import file_hash
+from nerfro.paths import CONF_DIR, user_path
+from nerfro.training.load import checkpoint_of, load
+from nerfro.view.film import write_film
+from nerfro.view.frames import Rendering, render_frames
+from nerfro.view.layers import LAYERS
+from nerfro.view.render_request import RenderConfig, check_request, checkpoints, find_shots, labels, prepared
+from nerfro.view.sweep import read_sweep
+
+
+@entry_point("render", RenderConfig, CONF_DIR / "render")
+def main(config: DictConfig) -> None:
+    """Refuse what cannot be rendered, load the scenes, render the frames that are missing, make films of them."""
+    check_request(config)
+    sweep = None if config.sweep is None else read_sweep(config.sweep)
+    runs = checkpoints(config)
+    scenes = [prepared(config, load(run, config.device, config.root)) for run in runs]
+    shots = find_shots(config, scenes[0])
+    rendering = Rendering(scenes, labels(config), LAYERS[config.what], sweep)
+    read = [*map(checkpoint_of, runs), *([] if config.sky is None else [config.sky]), *([] if sweep is None else sweep.files)]
+    request = (config.what, config.sweep, rendering.labels, scenes[0].supersampling, *map(file_hash, read))
+    folder = user_path(config.out)
+    files = render_frames(rendering, shots, folder, f".{config.format}", request, config.overwrite)
+    print(f"{len(files)} frames: {files[0]}")
+    for kind in config.film if shots.film and config.format == "png" else ():
+        film = folder / f"film.{kind}"
+        write_film(film, files, config.seconds)
+        print(f"film: {film}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,76 @@
+"""Cameras of other programs: nerfstudio's camera paths, and transforms.json."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from nerfro.cameras import Cameras
+from nerfro.data.frames import Lens, check_pose
+from nerfro.data.nerfstudio import read_lens
+from nerfro.data.transforms import is_number, parse_matrix, read_json
+from nerfro.errors import NerfroError
+from nerfro.view.camera_paths import Surroundings
+
+
+def read_cameras(file: Path, around: Surroundings) -> Cameras:
+    """Cameras of a file, in the world of the training data; where it tells no resolution they have that of the data.
+
+    Read are nerfstudio's camera paths (`camera_path`, with a pose and a vertical field of view in each place) and files
+    as `transforms.json` (`frames`, with poses and intrinsics, of which no picture is needed).
+
+    Raises:
+        NerfroError: the file is neither, or anything in it is missing or no number.
+    """
+    document = read_json(file, "check the path")
+    if isinstance(document, dict) and isinstance(document.get("camera_path"), list):
+        size = ("render_width", "render_height")
+        places, pose_key, lens_of = document["camera_path"], "camera_to_world", _lens_of_path
+    elif isinstance(document, dict) and isinstance(document.get("frames"), list):
+        size, places, pose_key, lens_of = ("w", "h"), document["frames"], "transform_matrix", read_lens
+    else:
+        raise NerfroError(f"{file} has neither 'camera_path' nor 'frames'; give nerfstudio's camera path, or transforms")
+    if not places:
+        raise NerfroError(f"{file} has no cameras; give one or more")
+    width, height = (_pixels(document, key, default, file) for key, default in
+                     zip(size, (around.camera.width, around.camera.height), strict=True))  # fmt: skip
+    poses, lenses = [], []
+    for number, place in enumerate(places):
+        where = f"{file}: camera {number}"
+        if not isinstance(place, dict) or pose_key not in place:
+            raise NerfroError(f"{where} has no '{pose_key}'; add it")
+        flat = np.asarray(place[pose_key], dtype=object)
+        matrix = flat.reshape(-1, 4).tolist() if flat.size in (12, 16) else place[pose_key]
+        poses.append(check_pose(parse_matrix(matrix, ((3, 4), (4, 4)), where), where, pose_key))
+        lenses.append(lens_of({**document, **place}, width, height, where))
+    intrinsics = torch.tensor([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in lenses])
+    distorted = any(lens.distortion is not None for lens in lenses)
+    cameras = Cameras(
+        torch.from_numpy(np.stack(poses)).float(), *intrinsics.unbind(-1), width, height,
+        around.camera.near, around.camera.far,
+        torch.tensor([lens.distortion or (0.0,) * 9 for lens in lenses]) if distorted else None,
+    )  # fmt: skip
+    return around.bounded(cameras)
+
+
+def _lens_of_path(place: Mapping[str, Any], width: int, height: int, where: str) -> Lens:
+    angle = place.get("fov")
+    if place.get("camera_type", "perspective") != "perspective":
+        raise NerfroError(f"{where}: camera_type={place['camera_type']!r} is not supported; take perspective")
+    if not is_number(angle) or not 0 < angle < 180:
+        raise NerfroError(f"{where}: fov={angle!r} must be the vertical field of view, between 0 and 180 degrees")
+    lens = Lens.of_angle(math.radians(angle), height, height)
+    return replace(lens, cx=0.5 * width)
+
+
+def _pixels(document: Mapping[str, Any], key: str, default: int, file: Path) -> int:
+    value = document.get(key, default)
+    if not is_number(value) or value < 1:
+        raise NerfroError(f"{file}: {key}={value!r} must be a number of pixels")
+    return int(value)
