@@ -8,16 +8,15 @@ from nerfro.cli import entry_point
 from nerfro.files.atomic import refuse_existing
 from nerfro.paths import user_path
 from nerfro.training.load import load
-from nerfro.view.exports import EXPORTS, ExportConfig
+from nerfro.view.exports import ExportConfig, find_export
 
 
 @entry_point("export", ExportConfig)
 def main(config: DictConfig) -> None:
     """Refuse what cannot be written, load the scene, write, print."""
-    export = EXPORTS[config.what]
     out = user_path(config.out)
-    export.check_name(out)
-    refuse_existing([out], config.overwrite)
+    export = find_export(config.what, out)
+    refuse_existing(export.files(out), config.overwrite)
     scene = load(config.checkpoint, config.device, config.root)
     if config.sky is not None:
         scene = scene.with_(sky=config.sky)

@@ -24,7 +24,7 @@ def main(config: DictConfig) -> None:
     scenes = [prepared(config, load(run, config.device, config.root)) for run in runs]
     shots = find_shots(config, scenes[0])
     rendering = Rendering(scenes, labels(config), LAYERS[config.what], sweep)
-    read = [*map(checkpoint_of, runs), *([] if config.sky is None else [config.sky]), *([] if sweep is None else sweep.files)]
+    read = [*map(checkpoint_of, runs), *([config.sky] if config.sky else []), *(sweep.files if sweep else [])]
     request = (config.what, config.sweep, rendering.labels, scenes[0].supersampling, *map(file_hash, read))
     folder = user_path(config.out)
     files = render_frames(rendering, shots, folder, f".{config.format}", request, config.overwrite)

@@ -214,6 +214,8 @@ class Samples:
     s: Float[Tensor, "R N"]  # arc length from the camera
     edges: Float[Tensor, "R N+1"]  # interval bounds in arc length
     radii: Float[Tensor, "R"]  # pixel cone radius at unit distance
+    # Where the field is worth asking; it holds next to nothing elsewhere. None for all.
+    occupied: Bool[Tensor, "R N"] | None = None
 
     @classmethod
     def along(cls, path: Path, s: Float[Tensor, "R N"], edges: Float[Tensor, "R N+1"]) -> Samples:

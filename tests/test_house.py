@@ -12,8 +12,8 @@ from nerfro.paths import PACKAGE_DIR
 
 # From above to below: a package imports what follows it, and itself.
 ORDER = (
-    "commands", "testing", "report", "training", "view", "evaluation", "scenes", "capture", "models", "losses", "boundaries",
-    "camera", "samplers", "fields", "media", "data", "geometry", "kernels", "files", "core",
+    "commands", "testing", "report", "training", "view", "evaluation", "scenes", "capture", "models", "losses",
+    "boundaries", "camera", "samplers", "fields", "media", "data", "geometry", "kernels", "files", "core",
 )  # fmt: skip
 FILES = {
     ".".join(("nerfro", *file.relative_to(PACKAGE_DIR).with_suffix("").parts)).removesuffix(".__init__"): file

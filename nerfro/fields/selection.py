@@ -14,10 +14,12 @@ Decoder = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 def evaluate_selected(decoder: Decoder, samples: Samples, selected: Bool[Tensor, "R N"]) -> Radiance:
-    """Evaluate `decoder` at the selected samples alone; elsewhere density and colour are zero.
+    """Evaluate `decoder` at the selected samples that may be occupied; elsewhere density and colour are zero.
 
     On a GPU the number of selected samples is waited for, one synchronisation with the host.
     """
+    if samples.occupied is not None:
+        selected = selected & samples.occupied
     index = selected.flatten().nonzero().squeeze(1)
     positions = samples.positions.flatten(0, 1).index_select(0, index)
     directions = samples.directions.flatten(0, 1).index_select(0, index)

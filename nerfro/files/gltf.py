@@ -38,9 +38,7 @@ def encode_glb(meshes: Sequence[GltfMesh]) -> bytes:
 
     def add(values: np.ndarray, target: int) -> int:
         content = np.ascontiguousarray(values).tobytes()
-        views.append(
-            {"buffer": 0, "byteOffset": sum(map(len, chunks)), "byteLength": len(content), "target": target}
-        )
+        views.append({"buffer": 0, "byteOffset": sum(map(len, chunks)), "byteLength": len(content), "target": target})
         chunks.append(content)
         kind = _FLOAT if values.dtype == np.float32 else _UNSIGNED_INT
         accessor = {"bufferView": len(views) - 1, "componentType": kind, "count": len(values)}

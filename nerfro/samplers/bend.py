@@ -60,9 +60,7 @@ def bend(
         raise NerfroError("origins and directions must be finite numbers, and no direction zero; correct them")
     low, high = load_mesh(resolve_path(mesh)).bounds
     air = (high - low).max() * _AIR / (resolution - 1 - 2 * _AIR)
-    medium = SdfGrid(
-        str(mesh), ior, resolution=resolution, box_min=(low - air).tolist(), box_max=(high + air).tolist()
-    )
+    medium = SdfGrid(str(mesh), ior, resolution=resolution, box_min=(low - air).tolist(), box_max=(high + air).tolist())
     rays = make_rays(starts, functional.normalize(towards, dim=-1), medium, 0.0, None)
     path = Snell(interface)(rays, medium)
     positions, path_lengths = leave_box(path, medium)

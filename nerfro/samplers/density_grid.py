@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated
 
 import torch
@@ -18,6 +19,9 @@ from nerfro.samplers.base import PointSampler
 from nerfro.samplers.stepfun import invert_cdf, spread_uniform
 from nerfro.samplers.stratified import cone_samples
 from nerfro.types import Path, Rendering, Samples
+
+# Remembered optical depth below which a sample of a picture is not worth asking the field.
+_EMPTY = 0.005
 
 
 @register("sampler/points", "density_grid")
@@ -64,6 +68,8 @@ class DensityGridSampler(PointSampler):
         with torch.no_grad():
             u = spread_uniform(path, self.num_samples + 1, self.training)
             samples = self.draw_compiled(path, u) if path.s.device.type == "cpu" else self.draw(path, u)
+        if self.training:  # the field may have grown since the grid has looked
+            samples = replace(samples, occupied=None)
         # The kernel has found positions too; they are asked of the path only where it has gradients to give.
         return Samples.along(path, samples.s, samples.edges) if path.positions.requires_grad else samples
 
@@ -75,7 +81,8 @@ class DensityGridSampler(PointSampler):
         positions, _ = path.at(0.5 * (edges[:, 1:] + edges[:, :-1]))
         weights, _ = volume_weights(self.lookup(positions), edges[:, 1:] - edges[:, :-1])
         share = weights / weights.sum(-1, keepdim=True).clamp(min=1e-6)
-        return cone_samples(path, invert_cdf(edges, share + self._floor, u))
+        samples = cone_samples(path, invert_cdf(edges, share + self._floor, u))
+        return replace(samples, occupied=self.lookup(samples.positions) * samples.deltas >= _EMPTY)
 
     def draw_compiled(self, path: Path, u: Float[Tensor, "R N+1"]) -> Samples:
         """The same as `draw`, on the CPU.
@@ -99,9 +106,10 @@ class DensityGridSampler(PointSampler):
             u.contiguous().numpy(),
             self.num_bins,
             self._floor,
+            _EMPTY,
         )
-        edges, s, positions, directions = (torch.from_numpy(array) for array in drawn)
-        return Samples(positions, directions, s, edges, path.radii)
+        edges, s, positions, directions, occupied = (torch.from_numpy(array) for array in drawn)
+        return Samples(positions, directions, s, edges, path.radii, occupied)
 
     @property
     def _floor(self) -> float:

@@ -39,12 +39,12 @@ def _segment(s, vertex, at):
 
 
 @compiled_parallel
-def draw(positions, directions, s, low, high, density, u, num_bins, floor):
+def draw(positions, directions, s, low, high, density, u, num_bins, floor, empty):
     """Edges and midpoints of samples drawn in proportion to the weights that the density gives, plus a floor.
 
     `u` are places in the cumulative distribution, ascending on each ray [R, N + 1]; `floor` is the weight that every
     bin has beside its share, which sums to one. Returns edges [R, N + 1], arc lengths [R, N], positions and directions
-    [R, N, 3].
+    [R, N, 3], and whether the optical depth there is `empty` or more [R, N].
     """
     num_rays, num_edges = u.shape
     cells = density.shape[0]
@@ -52,6 +52,7 @@ def draw(positions, directions, s, low, high, density, u, num_bins, floor):
     middles = np.empty((num_rays, num_edges - 1), np.float32)
     points = np.empty((num_rays, num_edges - 1, 3), np.float32)
     headings = np.empty((num_rays, num_edges - 1, 3), np.float32)
+    occupied = np.empty((num_rays, num_edges - 1), np.bool_)
     for ray in prange(num_rays):
         first, last = _span(positions[ray], directions[ray], s[ray], low, high)
         width = (last - first) / num_bins
@@ -89,8 +90,13 @@ def draw(positions, directions, s, low, high, density, u, num_bins, floor):
             at = 0.5 * (edges[ray, sample] + edges[ray, sample + 1])
             vertex = _segment(s[ray], vertex, at)
             middles[ray, sample] = at
+            cell = 0
             for axis in range(3):
                 slope = directions[ray, vertex, axis]
-                points[ray, sample, axis] = positions[ray, vertex, axis] + (at - s[ray, vertex]) * slope
+                here = positions[ray, vertex, axis] + (at - s[ray, vertex]) * slope
+                points[ray, sample, axis] = here
                 headings[ray, sample, axis] = slope
-    return edges, middles, points, headings
+                place = int((here - low[axis]) / (high[axis] - low[axis]) * cells)
+                cell = cell * cells + min(max(place, 0), cells - 1)
+            occupied[ray, sample] = density.flat[cell] * (edges[ray, sample + 1] - edges[ray, sample]) >= empty
+    return edges, middles, points, headings, occupied

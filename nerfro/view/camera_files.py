@@ -35,7 +35,9 @@ def read_cameras(file: Path, around: Surroundings) -> Cameras:
     elif isinstance(document, dict) and isinstance(document.get("frames"), list):
         size, places, pose_key, lens_of = ("w", "h"), document["frames"], "transform_matrix", read_lens
     else:
-        raise NerfroError(f"{file} has neither 'camera_path' nor 'frames'; give nerfstudio's camera path, or transforms")
+        raise NerfroError(
+            f"{file} has neither 'camera_path' nor 'frames'; give nerfstudio's camera path, or transforms"
+        )
     if not places:
         raise NerfroError(f"{file} has no cameras; give one or more")
     width, height = (_pixels(document, key, default, file) for key, default in

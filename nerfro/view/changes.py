@@ -11,6 +11,7 @@ from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.light import to_srgb
 from nerfro.media.analytic import Vacuum
+from nerfro.media.solid import Solid
 from nerfro.models.base import NerfModel
 from nerfro.samplers.straight import Straight
 from nerfro.types import Radiance, Samples
@@ -41,11 +42,16 @@ def with_indices(model: NerfModel, ior: Float[Tensor, "*K"]) -> NerfModel:
 
 def with_absorption(model: NerfModel, absorption: Float[Tensor, "*K 3"]) -> NerfModel:
     """The model with other absorption coefficients: three for each body, or for the outer body."""
+    if not (isinstance(model.medium, Solid) and hasattr(model.medium, "absorption")):
+        raise NerfroError(f"{type(model.medium).__name__} absorbs no light: it has no bodies of constant absorption")
+    given = _of_bodies(model, absorption, absorption_of(model), "absorption")
+    return variant(model, medium=variant(model.medium, _absorption=given.to(model.device)))
+
+
+def absorption_of(model: NerfModel) -> Float[Tensor, "K 3"]:
+    """Absorption of red, green and blue in each body, per world unit, on the CPU; 0 where all are clear."""
     known = getattr(model.medium, "absorption", None)
-    if not isinstance(known, Tensor):
-        raise NerfroError("the run's medium absorbs no light; train with a medium that has absorption to change it")
-    given = _of_bodies(model, absorption, known.detach(), "absorption")
-    return variant(model, medium=variant(model.medium, absorption=given.to(known)))
+    return torch.zeros(len(model.medium.indices), 3) if known is None else known.detach().float().cpu()
 
 
 def without_glass(model: NerfModel) -> NerfModel:

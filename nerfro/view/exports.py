@@ -1,4 +1,4 @@
-"""What a trained scene can be written as, and for which options it asks."""
+"""What a trained scene can be written as, and what is asked about it."""
 
 # ruff: noqa: UP045 - OmegaConf on Python 3.10 wants Optional
 
@@ -7,13 +7,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Optional
+from typing import Optional
 
 from omegaconf import MISSING, DictConfig
 
 from nerfro.allowed import Count, Positive
 from nerfro.errors import NerfroError
-from nerfro.view.scene import Scene
+from nerfro.files.cache import save_arrays
+from nerfro.files.lat_long import save_lat_long
+from nerfro.view.meshes import write_mesh
+from nerfro.view.mitsuba_scene import files_beside, write_mitsuba
+from nerfro.view.points import write_points
+from nerfro.view.scene import SKY_HEIGHT, Scene
+from nerfro.view.volume import RESOLUTION, bake, find_half_depth
 
 
 @dataclass
@@ -21,16 +27,18 @@ class ExportConfig:
     """What `python -m nerfro.export` is asked."""
 
     checkpoint: str = MISSING  # run folder, or a checkpoint in it
-    what: str = MISSING  # one of `EXPORTS`
-    out: str = MISSING  # file that is written
-    # Grid vertices a side of the inside, or rows of the sky; by default as fine as the model.
+    what: str = MISSING  # mesh, points, sky, volume or mitsuba
+    out: str = MISSING  # file that is written; its ending says in which format
+    # Grid vertices along the longest side of the inside, or rows of the sky.
     resolution: Optional[Count] = None
-    # Optical depth along one cell from which the inside counts as solid, for meshes and points.
-    level: Positive = 0.5
+    # Inside is solid where half the light is lost within this length, world units; by default a hundredth of the
+    # object's longest side.
+    half_depth: Optional[Positive] = None
+    count: Count = 200_000  # of points
     sky: Optional[str] = None  # lat-long picture that replaces the sky (.hdr, .exr, .png, .jpg)
     root: Optional[str] = None  # folder of the data, if it has moved since training
     device: str = "auto"  # `cpu`, `cuda`, or `auto` for a GPU if there is one
-    overwrite: bool = False  # whether `out` may be replaced
+    overwrite: bool = False  # whether `out`, and what lies beside it, may be replaced
 
 
 @dataclass(frozen=True)
@@ -39,20 +47,51 @@ class Export:
 
     suffixes: tuple[str, ...]  # of the file's name
     write: Callable[[Scene, Path, DictConfig], str]  # writes the file and says in a few words what it holds
+    files: Callable[[Path], list[Path]] = lambda out: [out]  # all that it writes
 
-    def check_name(self, out: Path) -> None:
-        """Refuse a name that is not that of such a file."""
-        if out.suffix.lower() not in self.suffixes:
-            raise NerfroError(f"out={out} must end in {' or '.join(self.suffixes)}, for that is what is written")
+
+def find_export(what: str, out: Path) -> Export:
+    """The writer of what is asked for.
+
+    Raises:
+        NerfroError: it is unknown, or the file's name does not end as such files do.
+    """
+    if what not in EXPORTS:
+        raise NerfroError(f"what={what} is not known; choose {', '.join(EXPORTS)}")
+    export = EXPORTS[what]
+    if out.suffix.lower() not in export.suffixes:
+        raise NerfroError(f"out={out} must end in {' or '.join(export.suffixes)}, for that is what is written")
+    return export
+
+
+def _mesh(scene: Scene, out: Path, config: DictConfig) -> str:
+    return write_mesh(scene, out, config.resolution or RESOLUTION, find_half_depth(scene, config.half_depth))
+
+
+def _points(scene: Scene, out: Path, config: DictConfig) -> str:
+    return write_points(scene, out, config.count)
 
 
 def _sky(scene: Scene, out: Path, config: DictConfig) -> str:
-    from nerfro.files.lat_long import save_lat_long
-    from nerfro.view.scene import SKY_HEIGHT
-
     sky = scene.sky_of_height(config.resolution or SKY_HEIGHT)
     save_lat_long(out, sky)
-    return f"the sky, {sky.shape[1]}x{sky.shape[0]} pixels of linear radiance"
+    return f"the sky: {sky.shape[1]}x{sky.shape[0]} pixels, lat-long, z up"
 
 
-EXPORTS = {"sky": Export((".hdr", ".exr", ".png"), _sky)}
+def _volume(scene: Scene, out: Path, config: DictConfig) -> str:
+    volume = bake(scene, config.resolution or RESOLUTION)
+    save_arrays(out, {name: value.numpy() for name, value in vars(volume).items()})
+    return f"the inside: {'x'.join(map(str, volume.density.shape))} vertices with density and linear rgb"
+
+
+def _mitsuba(scene: Scene, out: Path, config: DictConfig) -> str:
+    return write_mitsuba(scene, out, config.resolution or RESOLUTION, find_half_depth(scene, config.half_depth))
+
+
+EXPORTS = {
+    "mesh": Export((".glb", ".ply"), _mesh),
+    "points": Export((".ply",), _points),
+    "sky": Export((".hdr", ".exr", ".png"), _sky),
+    "volume": Export((".npz",), _volume),
+    "mitsuba": Export((".xml",), _mitsuba, files_beside),
+}

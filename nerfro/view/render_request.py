@@ -7,7 +7,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Annotated, Any, Optional
 
 import torch
@@ -58,7 +57,9 @@ class RenderConfig:
     out: str = MISSING  # folder of the frames and films; an interrupted rendering goes on where it was
     format: str = "png"  # of the frames; exr for values as they are: linear radiance, world units, unit vectors
     film: list[str] = dataclasses.field(default_factory=lambda: ["mp4"])  # mp4, gif, both or none of them
-    labels: Optional[list[str]] = None  # written above pictures that are side by side; by default the run folders' names
+    labels: Optional[list[str]] = (
+        None  # written above pictures that are side by side; by default the run folders' names
+    )
     root: Optional[str] = None  # folder of the data, if it has moved since training
     device: str = "auto"  # `cpu`, `cuda`, or `auto` for a GPU if there is one
     overwrite: bool = False  # whether other frames in `out` may be replaced
@@ -125,9 +126,7 @@ def prepared(config: DictConfig, scene: Scene) -> Scene:
     side = known.side if config.supersample is None else config.supersample
     apart = known.divergence if config.divergence is None else config.divergence
     chunk_size = config.chunk_size or scene.model.chunk_size
-    scene = replace(
-        scene, model=variant(scene.model, chunk_size=chunk_size), supersampling=Supersampling(side, apart)
-    )
+    scene = replace(scene, model=variant(scene.model, chunk_size=chunk_size), supersampling=Supersampling(side, apart))
     return scene if config.sky is None else scene.with_(sky=config.sky)
 
 

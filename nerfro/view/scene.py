@@ -97,12 +97,16 @@ class Scene:
         """What is seen beyond the volume, from its middle: linear radiance, lat-long, z up (see `files.lat_long`)."""
         return self.sky_of_height(SKY_HEIGHT)
 
-    @torch.inference_mode()
     def sky_of_height(self, height: int) -> Float[Tensor, "H 2*H 3"]:
         """`sky` with another number of rows."""
-        directions = lat_long.directions(height).to(self.model.device)
-        rows = [self.model.boundary(Exits(some)) for some in directions.split(max(1, self.model.chunk_size // height))]
-        return self.model.linear(torch.cat(rows).float()).cpu()
+        return self.seen_beyond(lat_long.directions(height).view(-1, 3)).view(height, 2 * height, 3)
+
+    @torch.inference_mode()
+    def seen_beyond(self, directions: Float[Tensor, "D 3"]) -> Float[Tensor, "D 3"]:
+        """Linear radiance from beyond the volume in unit directions, as seen from its middle; on the CPU."""
+        model = self.model
+        parts = directions.to(model.device).split(model.chunk_size)
+        return model.linear(torch.cat([model.boundary(Exits(part)) for part in parts]).float()).cpu()
 
     @property
     def surface(self) -> list[TriangleMesh]:

@@ -57,9 +57,7 @@ def _distances(medium: Solid) -> Float[Tensor, "K X Y Z"]:
     counts = medium.coefficients.shape[1:] if isinstance(medium, SdfGrid) else [_RESOLUTION] * 3
     box = medium.box.cpu()
     axes = [torch.linspace(float(low), float(high), n) for low, high, n in zip(*box, counts, strict=True)]
-    slabs = [
-        medium.signed_distances(torch.cartesian_prod(x[None], *axes[1:]).to(medium.box))[0].cpu() for x in axes[0]
-    ]
+    slabs = [medium.signed_distances(torch.cartesian_prod(x[None], *axes[1:]).to(medium.box))[0].cpu() for x in axes[0]]
     return torch.stack(slabs).view(*counts, -1).movedim(-1, 0)
 
 

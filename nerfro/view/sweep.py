@@ -17,7 +17,6 @@ from nerfro.paths import user_path
 from nerfro.view.scene import Scene
 
 
-
 @dataclass(frozen=True)
 class Sweep:
     """Something that changes over a film."""

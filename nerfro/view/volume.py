@@ -32,11 +32,6 @@ class Volume:
     rgb: Float[Tensor, "X Y Z 3"]  # linear radiance, the mean of what is seen along the three axes; 0 in empty space
     box: Float[Tensor, "2 3"]  # corners, world units
 
-    @property
-    def cell(self) -> float:
-        """Longest side of a cell, world units."""
-        return float(((self.box[1] - self.box[0]) / (torch.tensor(self.density.shape) - 1)).max())
-
 
 @torch.inference_mode()
 def bake(scene: Scene, resolution: int = RESOLUTION) -> Volume:
@@ -71,6 +66,11 @@ def ask(
     directions = directions.to(positions)
     found = field(Samples(positions[:, None], directions[:, None], nothing, edges, nothing[:, 0]))
     return found.density[:, 0].float(), found.rgb[:, 0].float()
+
+
+def find_half_depth(scene: Scene, given: float | None) -> float:
+    """The length that `solid_surface` goes by: the given one, or a hundredth of the object's longest side."""
+    return float((scene.bounds[1] - scene.bounds[0]).max()) / 100 if given is None else given
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,67 @@
+"""Points on what is inside, where bent rays of the training cameras meet it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from tqdm import tqdm
+
+from nerfro.errors import NerfroError
+from nerfro.files.images import to_8bit
+from nerfro.files.ply import write_ply
+from nerfro.light import to_srgb
+from nerfro.pixel_parts import pixel_rays
+from nerfro.view.scene import Scene
+from nerfro.view.volume import ask
+
+# Rays of which less light than this stops inside tell of nothing.
+_SOLID = 0.5
+# Rays are drawn until there are enough points, but no more than so many for each.
+_PATIENCE = 100
+
+
+def write_points(scene: Scene, out: Path, count: int) -> str:
+    """Write points with colours (8-bit sRGB) as .ply."""
+    positions, radiance = find_points(scene, count)
+    colours = to_8bit(to_srgb(radiance)).numpy()
+    columns = dict(zip(("red", "green", "blue"), colours.T, strict=True))
+    write_ply(out, positions.numpy(), None, columns)
+    return f"{len(positions)} points inside"
+
+
+@torch.inference_mode()
+def find_points(scene: Scene, count: int, seed: int = 0) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
+    """Where rays of random training pixels lose most of their light, world units, and its linear radiance.
+
+    Rays are followed through the glass, so that points lie where things are, and not where they seem to be.
+
+    Raises:
+        NerfroError: the rays meet nothing.
+    """
+    model, cameras = scene.model, scene.cameras("train")
+    generator = torch.Generator().manual_seed(seed)
+    positions: list[Tensor] = []
+    radiance: list[Tensor] = []
+    found = 0
+    with tqdm(total=count, unit="point", unit_scale=True, desc="export", dynamic_ncols=True) as progress:
+        for _ in range(max(1, _PATIENCE * count // model.chunk_size)):
+            pixels = torch.randint(len(cameras) * cameras.height * cameras.width, (model.chunk_size,),
+                                   generator=generator)  # fmt: skip
+            rendering = model(pixel_rays(cameras, pixels.to(model.device)))[-1]
+            heaviest = rendering.weights.argmax(-1, keepdim=True)
+            # Of light that splits, the main path alone.
+            hit = rendering.path.first_of_ray(rendering.weights.sum(-1) > _SOLID)
+            where, towards = rendering.path.at(rendering.samples.s.gather(1, heaviest))
+            where, towards = (rendering.path.first_of_ray(values[:, 0])[hit] for values in (where, towards))
+            positions.append(where.cpu())
+            radiance.append(model.linear(ask(model.fields[-1], where, towards)[1]).cpu())
+            found += len(where)
+            progress.update(min(len(where), count - progress.n))
+            if found >= count:
+                break
+    if not found:
+        raise NerfroError("no ray of the training cameras loses half its light inside; there are no points to write")
+    return torch.cat(positions)[:count], torch.cat(radiance)[:count]

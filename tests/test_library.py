@@ -1,0 +1,99 @@
+"""`import nerfro` as a library: a run from its folder, and the optics alone."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+import nerfro
+import nerfro.export
+import nerfro.render
+from nerfro.errors import NerfroError
+from nerfro.files.images import load_png
+
+
+def test_importing_nerfro_imports_nothing_heavy() -> None:
+    source = "import sys, nerfro; print(*(m for m in ('torch', 'numpy', 'numba', 'hydra') if m in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == "", done.stderr
+
+
+def test_what_is_not_there_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="has no attribute 'lod'"):
+        _ = nerfro.lod
+    assert {"Scene", "bend", "load"} <= set(nerfro.__all__)
+
+
+def test_a_run_is_loaded_rendered_and_exported(
+    train_here: Callable[..., Any],
+    tiny_default_run: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run = tmp_path / "run"
+    finished = train_here(*tiny_default_run, "trainer.max_steps=3", f"hydra.run.dir={run}")
+    assert finished.code == 0, finished.err
+    scene = nerfro.load(run, device="cpu")
+    cameras = scene.cameras("test")
+    rgb, depth, opacity, normals, exits, radiance = scene.render(cameras)
+    num, height, width = len(cameras), cameras.height, cameras.width
+    assert rgb.shape == normals.shape == exits.shape == radiance.shape == (num, height, width, 3)
+    assert depth.shape == opacity.shape == (num, height, width)
+    assert rgb.min() >= 0
+    assert rgb.max() <= 1
+    for view in range(num):
+        written = load_png(run / "images" / f"test_{view:03d}.png")
+        torch.testing.assert_close(written, rgb[view], atol=0.5 / 255 + 1e-6, rtol=0)
+    assert float(scene.ior) == 1.5
+    with pytest.raises(NerfroError, match=r"checkpoint .* does not exist"):
+        nerfro.load(tmp_path / "gone")
+
+    for command, arguments in (
+        (nerfro.render, ["path=orbit", "frames=2", "resolution=8", f"out={tmp_path / 'O'}"]),
+        (nerfro.export, ["what=sky", "resolution=8", f"out={tmp_path / 'sky.hdr'}"]),
+    ):
+        monkeypatch.setattr(sys, "argv", ["-", f"checkpoint={run}/checkpoints/last.ckpt", "device=cpu", *arguments])
+        command.main()
+    for name in ("O/frame_0000.png", "O/frame_0001.png", "O/film.mp4", "sky.hdr"):
+        assert (tmp_path / name).stat().st_size > 0
+    with pytest.raises(SystemExit):
+        nerfro.export.main()
+
+
+@pytest.mark.parametrize("interface", ["mesh", "sdf"])
+def test_bending_at_a_ball_is_as_in_closed_form(interface: str, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("NERFRO_CACHE", str(tmp_path / "cache"))
+    trimesh.creation.icosphere(5, 0.8).export(tmp_path / "ball.ply")
+    heights = np.linspace(-0.7, 0.7, 15)
+    origins = np.stack([0 * heights - 4, heights, 0 * heights], -1)
+    bent = nerfro.bend(tmp_path / "ball.ply", 1.5, origins, np.tile([[2.0, 0, 0]], (15, 1)), interface, 64)
+    deviation = 2 * (np.arcsin(heights / 0.8) - np.arcsin(heights / 1.2))
+    expected = np.stack([np.cos(deviation), -np.sin(deviation), 0 * heights], -1)
+    np.testing.assert_allclose(bent.directions.numpy(), expected, atol=5e-3)
+    assert bent.hit.all()
+    # What is left on the way to the box is on the line that leaves the ball.
+    beyond = torch.linalg.vector_norm(bent.positions, dim=-1)
+    assert (beyond > 0.8).all()
+    assert (bent.lengths > 4 - 0.8).all()
+
+
+@pytest.mark.parametrize(
+    ("rays", "message"),
+    [
+        (([[0, 0, 0]], [[0, 0, 0]]), "no direction zero"),
+        (([[0, 0, math.nan]], [[1, 0, 0]]), "must be finite"),
+        (([0, 0, 0], [1, 0, 0]), "must both be"),
+    ],
+)
+def test_rays_that_are_none_are_refused(rays: tuple, message: str, tmp_path: Path) -> None:
+    with pytest.raises(NerfroError, match=message):
+        nerfro.bend(tmp_path / "ball.ply", 1.5, *rays)

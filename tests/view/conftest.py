@@ -1,0 +1,74 @@
+"""A scene in closed form: a coloured ball inside a ball of glass, under a smooth sky."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.cameras import Cameras
+from nerfro.data.base import DataSource, Views
+from nerfro.fields.base import Field
+from nerfro.files import lat_long
+from nerfro.media.shapes import Ball
+from nerfro.models.base import Parts
+from nerfro.models.optimizer import OptimizerConfig
+from nerfro.models.refractive import RefractiveModel
+from nerfro.samplers.snell import Snell
+from nerfro.samplers.stratified import Stratified
+from nerfro.scenes.viewpoints import look_at_origin
+from nerfro.types import Radiance, Samples
+from nerfro.view.scene import Scene
+
+RADIUS, INSIDE_RADIUS, INSIDE_CENTRE, IOR = 0.8, 0.3, (0.1, 0.0, 0.05), 1.3
+
+
+class SolidBall(Field):
+    """Nearly opaque, of a colour that depends on the place alone."""
+
+    def forward(self, samples: Samples) -> Radiance:
+        offset = samples.positions - torch.tensor(INSIDE_CENTRE)
+        inside = torch.linalg.vector_norm(offset, dim=-1) < INSIDE_RADIUS
+        return Radiance(500.0 * inside, colour(samples.positions))
+
+
+def colour(positions: torch.Tensor) -> torch.Tensor:
+    return 0.4 + 0.5 * positions
+
+
+def sky_of(directions: torch.Tensor) -> torch.Tensor:
+    return 0.5 + 0.4 * directions
+
+
+class Photographs(DataSource):
+    """Cameras around the origin, and black pictures."""
+
+    splits = ("train", "test")  # type: ignore[assignment]
+
+    def load(self, split: str) -> Views:
+        places = [(4, 0, 1), (0, 4, 0.5), (-3, 2, -1)] if split == "test" else [(4, 0, 0), (0, -4, 0), (-2, 2, 2.8)]
+        poses = np.stack([look_at_origin(np.array(place, float))[:3] for place in places])
+        size = 32
+        focal = torch.full((len(places),), 0.5 * size / math.tan(0.5 * 0.7))
+        middle = torch.full_like(focal, 0.5 * size)
+        cameras = Cameras(torch.from_numpy(poses).float(), focal, focal, middle, middle, size, size, near=2.0, far=6.0)
+        return Views(cameras, torch.zeros(len(places), size, size, 3), None, [f"r_{i}" for i in range(len(places))])
+
+
+@pytest.fixture
+def scene() -> Scene:
+    sky = EnvironmentMap([64])
+    sky.set_lat_long(sky_of(lat_long.directions(128)))
+    parts = Parts(
+        medium=Ball(RADIUS, IOR),
+        path_sampler=Snell(),
+        point_sampler=Stratified(num_samples=256),
+        make_field=SolidBall,
+        boundary=sky,
+        losses={},
+        optimizer=OptimizerConfig(),
+    )
+    return Scene(RefractiveModel(parts).eval(), Photographs())

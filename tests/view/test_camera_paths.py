@@ -1,0 +1,111 @@
+"""Cameras that fly around an object, and those of other programs."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerfro.errors import NerfroError
+from nerfro.view.camera_files import read_cameras
+from nerfro.view.camera_paths import PATHS, Flight, Surroundings, fly
+from nerfro.view.scene import Scene
+
+CENTRE = torch.tensor([0.5, -0.2, 0.1])
+
+
+@pytest.fixture
+def around(scene: Scene) -> Surroundings:
+    return Surroundings.of(scene.cameras("train"), torch.stack([CENTRE - 1, CENTRE + 1]))
+
+
+@pytest.mark.parametrize("name", sorted(PATHS))
+def test_all_cameras_look_at_the_middle_upright(name: str, around: Surroundings) -> None:
+    cameras = fly(around, name, Flight(30, 20, 5.0), 16)
+    pixels, depth = cameras.project(CENTRE[None])
+    torch.testing.assert_close(pixels[:, 0], torch.full((16, 2), 16.0), atol=1e-3, rtol=0)
+    assert (depth > 0).all()
+    rotation = cameras.camera_to_world[:, :, :3]
+    torch.testing.assert_close(rotation.mT @ rotation, torch.eye(3).expand(16, 3, 3), atol=1e-5, rtol=0)
+    assert (torch.linalg.det(rotation) > 0).all()
+    assert (rotation[:, 2, 1] > 0).all(), "the picture's up is the world's"
+    torch.testing.assert_close(rotation[:, 2, 0], torch.zeros(16), atol=1e-5, rtol=0)
+    # Rays begin before the object and end behind it.
+    distances = (cameras.camera_to_world[:, :, 3] - CENTRE).norm(dim=-1)
+    assert cameras.near <= distances.min() - around.distance + around.camera.near + 1e-4
+    assert cameras.far >= distances.max() - around.distance + around.camera.far - 1e-4
+
+
+def test_an_orbit_is_a_circle_that_does_not_repeat_its_beginning(around: Surroundings) -> None:
+    cameras = fly(around, "orbit", Flight(0, 30, 5.0), 8)
+    offsets = cameras.camera_to_world[:, :, 3] - CENTRE
+    torch.testing.assert_close(offsets.norm(dim=-1), torch.full((8,), 5.0))
+    torch.testing.assert_close(offsets[:, 2], torch.full((8,), 5 * math.sin(math.radians(30))))
+    torch.testing.assert_close(offsets.sum(0)[:2], torch.zeros(2), atol=1e-5, rtol=0)
+    steps = (offsets.roll(-1, 0) - offsets).norm(dim=-1)
+    torch.testing.assert_close(steps, steps[:1].expand(8), atol=1e-5, rtol=0)
+
+
+def test_a_dolly_comes_nearer_and_a_spiral_rises(around: Surroundings) -> None:
+    near = fly(around, "dolly", Flight(0, 0, 4.0), 5).camera_to_world[:, :, 3] - CENTRE
+    torch.testing.assert_close(near.norm(dim=-1)[[0, -1]], torch.tensor([6.0, 3.0]))
+    heights = (fly(around, "spiral", Flight(0, 40, 4.0), 9).camera_to_world[:, :, 3] - CENTRE)[:, 2]
+    assert (heights.diff() > 0).all()
+    torch.testing.assert_close(heights[0], -heights[-1])
+
+
+def test_up_is_what_is_up_in_the_photographs(scene: Scene) -> None:
+    cameras = scene.cameras("train")
+    turn = torch.tensor([[1.0, 0, 0], [0, 0.0, 1], [0, -1, 0]])  # z to y
+    turned = cameras._each(lambda values: turn @ values if values.ndim == 3 else values)
+    found = Surroundings.of(turned, torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    torch.testing.assert_close(found.up, torch.tensor([0.0, 1.0, 0.0]))
+
+
+def test_nerfstudios_camera_path_is_read(around: Surroundings, tmp_path: Path) -> None:
+    pose = torch.eye(4)
+    pose[:3, 3] = torch.tensor([0.0, 0.0, 4.0])
+    places = [{"camera_to_world": pose.flatten().tolist(), "fov": fov, "aspect": 2} for fov in (40, 60)]
+    document = {"camera_type": "perspective", "render_height": 50, "render_width": 100, "camera_path": places}
+    (tmp_path / "path.json").write_text(json.dumps(document))
+    cameras = read_cameras(tmp_path / "path.json", around)
+    assert (cameras.width, cameras.height, len(cameras)) == (100, 50, 2)
+    # The top edge is half the vertical field of view above the middle.
+    for view, fov in enumerate((40, 60)):
+        top = torch.tensor([[0.0, 4 * math.tan(math.radians(fov / 2)), 0.0]])
+        pixels, _ = cameras.select([view]).project(top)
+        torch.testing.assert_close(pixels[0, 0], torch.tensor([50.0, 0.0]), atol=1e-3, rtol=0)
+
+
+def test_transforms_are_read_without_their_pictures(around: Surroundings, tmp_path: Path) -> None:
+    pose = torch.eye(4)
+    pose[2, 3] = 3.0
+    frames = [{"file_path": "gone.png", "transform_matrix": pose.tolist()}]
+    document = {"fl_x": 80.0, "fl_y": 82.0, "cx": 31.0, "cy": 17.0, "w": 64, "h": 36, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    cameras = read_cameras(tmp_path / "transforms.json", around)
+    found = [float(value) for value in (cameras.fx, cameras.fy, cameras.cx, cameras.cy)]
+    assert (found, cameras.width, cameras.height) == ([80, 82, 31, 17], 64, 36)
+    torch.testing.assert_close(cameras.camera_to_world[0], pose[:3])
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [
+        ({}, "neither 'camera_path' nor 'frames'"),
+        ({"camera_path": []}, "has no cameras"),
+        ({"camera_path": [{"fov": 40}]}, "camera 0 has no 'camera_to_world'"),
+        ({"camera_path": [{"fov": 400, "camera_to_world": torch.eye(4).flatten().tolist()}]}, "fov=400 must be"),
+        ({"camera_path": [{"fov": 40, "camera_to_world": [1, 2]}]}, "camera 0 has shape 2"),
+        ({"frames": [{"transform_matrix": (2 * torch.eye(4)).tolist()}], "fl_x": 3}, "is no rotation"),
+        ({"frames": [{"transform_matrix": torch.eye(4).tolist()}]}, "has neither 'fl_x'"),
+    ],
+)
+def test_damaged_cameras_are_refused(document: dict, message: str, around: Surroundings, tmp_path: Path) -> None:
+    (tmp_path / "path.json").write_text(json.dumps(document))
+    with pytest.raises(NerfroError, match=message) as refused:
+        read_cameras(tmp_path / "path.json", around)
+    assert "\n" not in str(refused.value)

@@ -1,0 +1,174 @@
+"""Every export is read back by another program's reader, and shows the scene that was written."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from omegaconf import OmegaConf
+
+from nerfro.errors import NerfroError
+from nerfro.light import to_srgb
+from nerfro.view.exports import ExportConfig, find_export
+from nerfro.view.scene import Scene
+from tests.view.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, colour, sky_of
+
+CELL = 2 * RADIUS / 47
+
+
+def write(scene: Scene, what: str, out: Path, **options: object) -> str:
+    config = OmegaConf.structured(ExportConfig(checkpoint="-", what=what, out=str(out)))
+    return find_export(what, out).write(scene, out, OmegaConf.merge(config, {"resolution": 48, **options}))
+
+
+def chunks(file: Path) -> tuple[dict, bytes]:
+    """JSON and binary part of a .glb (glTF 2.0, section 4.4), read without a library."""
+    content = file.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", content)
+    assert (magic, version, length) == (b"glTF", 2, len(content))
+    size, kind = struct.unpack_from("<I4s", content, 12)
+    assert kind == b"JSON"
+    assert size % 4 == 0
+    binary_size, kind = struct.unpack_from("<I4s", content, 20 + size)
+    assert kind == b"BIN\0"
+    assert 28 + size + binary_size == len(content)
+    return json.loads(content[20 : 20 + size]), content[28 + size :]
+
+
+def test_glb_holds_glass_as_glass_and_the_inside_as_light(scene: Scene, tmp_path: Path) -> None:
+    write(scene, "mesh", tmp_path / "ball.glb")
+    loaded = trimesh.load(tmp_path / "ball.glb")
+    glass, inside = (loaded.geometry[name] for name in ("glass_0", "inside"))
+    assert glass.is_watertight
+    np.testing.assert_allclose(np.linalg.norm(glass.vertices, axis=1), RADIUS, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(inside.vertices - INSIDE_CENTRE, axis=1), INSIDE_RADIUS, atol=CELL)
+    document, _ = chunks(tmp_path / "ball.glb")
+    materials = {material["name"]: material for material in document["materials"]}
+    extensions = materials["glass 0"]["extensions"]
+    assert extensions["KHR_materials_transmission"] == {"transmissionFactor": 1.0}
+    assert extensions["KHR_materials_ior"]["ior"] == pytest.approx(IOR)
+    assert extensions["KHR_materials_volume"]["thicknessFactor"] == pytest.approx(2 * RADIUS, rel=1e-3)
+    assert "KHR_materials_unlit" in materials["inside"]["extensions"]
+    assert set(document["extensionsUsed"]) == {name for m in materials.values() for name in m["extensions"]}
+    # The world's z is up in the file, where y is.
+    lifted = loaded.graph.get("inside")[0][:3, :3] @ INSIDE_CENTRE
+    np.testing.assert_allclose(lifted, [INSIDE_CENTRE[0], INSIDE_CENTRE[2], -INSIDE_CENTRE[1]], atol=1e-6)
+
+
+def test_glb_is_laid_out_as_the_specification_asks(scene: Scene, tmp_path: Path) -> None:
+    write(scene, "mesh", tmp_path / "ball.glb")
+    document, binary = chunks(tmp_path / "ball.glb")
+    assert document["asset"]["version"] == "2.0"
+    end = 0
+    for view in document["bufferViews"]:
+        assert view["byteOffset"] == end
+        assert view["byteOffset"] % 4 == 0
+        end += view["byteLength"]
+    assert end == document["buffers"][0]["byteLength"] == len(binary)
+
+    def values(number: int) -> np.ndarray:
+        accessor = document["accessors"][number]
+        view = document["bufferViews"][accessor["bufferView"]]
+        kind = {5126: "<f4", 5125: "<u4"}[accessor["componentType"]]
+        flat = np.frombuffer(binary, kind, view["byteLength"] // 4, view["byteOffset"])
+        return flat.reshape(accessor["count"], {"SCALAR": 1, "VEC3": 3}[accessor["type"]])
+
+    for mesh in document["meshes"]:
+        (primitive,) = mesh["primitives"]
+        named = {name: values(number) for name, number in primitive["attributes"].items()}
+        places, faces = named["POSITION"], values(primitive["indices"])[:, 0]
+        accessor = document["accessors"][primitive["attributes"]["POSITION"]]
+        np.testing.assert_allclose([accessor["min"], accessor["max"]], [places.min(0), places.max(0)])
+        assert faces.max() < len(places)
+        assert {len(column) for column in named.values()} == {len(places)}
+        np.testing.assert_allclose(np.linalg.norm(named["NORMAL"], axis=1), 1, atol=1e-5)
+        # Counter-clockwise seen from outside, where normals point.
+        a, b, c = places[faces.reshape(-1, 3)].swapaxes(0, 1)
+        assert ((np.cross(b - a, c - a) * named["NORMAL"][faces.reshape(-1, 3)[:, 0]]).sum(-1) > -1e-9).mean() > 0.99
+        if "COLOR_0" in named:
+            np.testing.assert_allclose(named["COLOR_0"], colour(torch.from_numpy(places)), atol=1e-4)
+
+
+def test_ply_holds_both_with_colours(scene: Scene, tmp_path: Path) -> None:
+    write(scene, "mesh", tmp_path / "ball.ply")
+    loaded = trimesh.load(tmp_path / "ball.ply", process=False)
+    alpha = loaded.visual.vertex_colors[:, 3]
+    glass, inside = loaded.vertices[alpha < 255], loaded.vertices[alpha == 255]
+    np.testing.assert_allclose(np.linalg.norm(glass, axis=1), RADIUS, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(inside - INSIDE_CENTRE, axis=1), INSIDE_RADIUS, atol=CELL)
+    expected = 255 * to_srgb(colour(torch.from_numpy(np.asarray(inside))))
+    np.testing.assert_allclose(loaded.visual.vertex_colors[alpha == 255, :3], expected, atol=1)
+
+
+def test_points_lie_where_things_are_and_not_where_they_seem_to_be(scene: Scene, tmp_path: Path) -> None:
+    assert "500 points" in write(scene, "points", tmp_path / "points.ply", count=500)
+    loaded = trimesh.load(tmp_path / "points.ply")
+    assert len(loaded.vertices) == 500
+    spacing = 4 / 256
+    distances = np.linalg.norm(loaded.vertices - INSIDE_CENTRE, axis=1)
+    assert np.abs(distances - INSIDE_RADIUS).max() < spacing
+    expected = 255 * to_srgb(colour(torch.from_numpy(np.asarray(loaded.vertices))))
+    np.testing.assert_allclose(loaded.colors[:, :3], expected, atol=1)
+
+
+def test_points_of_nothing_are_refused(scene: Scene, tmp_path: Path) -> None:
+    with pytest.raises(NerfroError, match="no ray of the training cameras loses half its light inside"):
+        write(scene.with_(inside=False), "points", tmp_path / "points.ply", count=1)
+
+
+@pytest.mark.parametrize("suffix", [".hdr", ".exr"])
+def test_the_sky_is_read_by_mitsuba(scene: Scene, suffix: str, tmp_path: Path) -> None:
+    mitsuba = pytest.importorskip("mitsuba")
+    mitsuba.set_variant("scalar_rgb")
+    write(scene, "sky", tmp_path / f"sky{suffix}")
+    picture = np.array(mitsuba.Bitmap(str(tmp_path / f"sky{suffix}")))[..., :3]
+    assert picture.shape == (48, 96, 3)
+    polar, azimuth = math.pi * 10.5 / 48, math.pi - 2 * math.pi * 20.5 / 96
+    towards = [math.sin(polar) * math.cos(azimuth), math.sin(polar) * math.sin(azimuth), math.cos(polar)]
+    np.testing.assert_allclose(picture[10, 20], sky_of(torch.tensor(towards)), atol=6e-3)
+
+
+def test_the_volume_is_the_field_at_the_vertices_of_a_grid(scene: Scene, tmp_path: Path) -> None:
+    write(scene, "volume", tmp_path / "inside.npz")
+    with np.load(tmp_path / "inside.npz") as file:
+        density, rgb, box = (file[name] for name in ("density", "rgb", "box"))
+    assert density.shape == (48, 48, 48)
+    places = np.stack(np.meshgrid(*np.linspace(*box, 48).T, indexing="ij"), -1)
+    inside = np.linalg.norm(places - INSIDE_CENTRE, axis=-1) < INSIDE_RADIUS
+    np.testing.assert_array_equal(density, 500.0 * inside)
+    np.testing.assert_allclose(rgb[inside], colour(torch.from_numpy(places[inside])), atol=1e-5)
+
+
+@pytest.mark.slow
+def test_mitsuba_renders_the_same_picture(scene: Scene, tmp_path: Path) -> None:
+    mitsuba = pytest.importorskip("mitsuba")
+    from nerfro.scenes.path_tracer import load_mitsuba
+
+    load_mitsuba()
+    write(scene, "mitsuba", tmp_path / "ball.xml")
+    loaded = mitsuba.load_file(str(tmp_path / "ball.xml"))
+    assert len(loaded.sensors()) == len(scene.cameras())
+    for view in range(2):
+        linear = np.array(mitsuba.render(loaded, sensor=view, spp=64))[..., :3]
+        picture = to_srgb(torch.from_numpy(linear)).clamp(0, 1)
+        ours = scene.render(scene.cameras().select([view])).rgb[0]
+        assert -10 * torch.log10((picture - ours).square().mean()) > 25
+
+
+@pytest.mark.parametrize(
+    ("what", "name", "message"),
+    [
+        ("fog", "a.glb", "what=fog is not known; choose mesh"),
+        ("mesh", "a.obj", "must end in .glb or .ply"),
+        ("volume", "a.vdb", "must end in .npz"),
+    ],
+)
+def test_unknown_exports_and_endings_are_refused(what: str, name: str, message: str) -> None:
+    with pytest.raises(NerfroError, match=message):
+        find_export(what, Path(name))

@@ -1,0 +1,190 @@
+"""`python -m nerfro.render`: its frames and films, what it goes on with, and what it refuses."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import nerfro.render
+from nerfro.evaluation.render_view import Supersampling
+from nerfro.files.lat_long import save_lat_long
+from nerfro.view.scene import Scene
+
+
+@pytest.fixture
+def render(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str]]:
+    """The entry point in this process, on the scene in closed form; exit code and what it printed."""
+    (tmp_path / "a.ckpt").write_bytes(b"scene")
+    monkeypatch.setattr(nerfro.render, "load", lambda run, device, root: scene)
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: str) -> tuple[int, str]:
+        common = ["checkpoint=a.ckpt", "out=O", "resolution=16", "supersample=1"]
+        monkeypatch.setattr(sys, "argv", ["nerfro.render", *common, *arguments])
+        code = 0
+        try:
+            nerfro.render.main()
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 1
+        printed = capsys.readouterr()
+        return code, printed.err if code else printed.out
+
+    return run
+
+
+def read(path: str) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image).astype(float)
+
+
+def frames_of_film(path: str) -> list[np.ndarray]:
+    """Frames by OpenCV's decoder, as RGB."""
+    film, frames = cv2.VideoCapture(path), []
+    while True:
+        there, frame = film.read()
+        if not there:
+            return frames
+        frames.append(frame[..., ::-1].astype(float))
+
+
+def psnr(one: np.ndarray, other: np.ndarray) -> float:
+    return float(-10 * np.log10(((one - other) / 255).__pow__(2).mean()))
+
+
+def test_an_orbit_becomes_frames_and_films(render: Callable[..., tuple[int, str]]) -> None:
+    code, out = render("path=orbit", "frames=4", "seconds=2", "film=[mp4,gif]", "resolution=[34,25]")
+    assert code == 0, out
+    stills = [read(f"O/frame_{number:04d}.png") for number in range(4)]
+    assert {still.shape for still in stills} == {(25, 34, 3)}
+    film = frames_of_film("O/film.mp4")
+    assert [frame.shape for frame in film] == [(26, 34, 3)] * 4
+    for frame, still in zip(film, stills, strict=True):
+        assert psnr(frame[:25], still) > 22  # colours are stored at half the resolution
+    assert cv2.VideoCapture("O/film.mp4").get(cv2.CAP_PROP_FPS) == pytest.approx(2)
+    with Image.open("O/film.gif") as gif:
+        assert (gif.n_frames, gif.info["duration"], gif.info["loop"]) == (4, 500, 0)
+        gif.seek(3)
+        assert psnr(np.asarray(gif.convert("RGB"), float), stills[3]) > 25
+
+
+def test_an_interrupted_rendering_goes_on_and_another_is_not_mixed_in(render: Callable[..., tuple[int, str]]) -> None:
+    assert render("path=arc", "frames=3")[0] == 0
+    whole = read("O/frame_0001.png")
+    Path("O/frame_0001.png").unlink()
+    kept = Path("O/frame_0000.png").stat().st_mtime_ns
+    code, out = render("path=arc", "frames=3")
+    assert code == 0, out
+    assert "2 of 3 frames are there already" in out
+    assert Path("O/frame_0000.png").stat().st_mtime_ns == kept
+    np.testing.assert_array_equal(read("O/frame_0001.png"), whole)
+    code, err = render("path=arc", "frames=3", "azimuth=40")
+    assert code == 1
+    assert "frame_0000.png shows something else; give another out=... or overwrite=true" in err
+    assert render("path=arc", "frames=3", "azimuth=40", "overwrite=true")[0] == 0
+    assert not np.array_equal(read("O/frame_0001.png"), whole)
+
+
+def test_test_views_are_those_of_the_scene(render: Callable[..., tuple[int, str]], scene: Scene) -> None:
+    assert render("views=test", "resolution=null")[0] == 0
+    ours = scene.render(scene.cameras(), Supersampling()).rgb
+    for view in range(3):
+        np.testing.assert_allclose(read(f"O/test_{view:03d}.png"), 255 * ours[view], atol=0.51)
+    assert not Path("O/film.mp4").exists()
+
+
+def test_a_still_from_numbers_shows_what_lies_there(render: Callable[..., tuple[int, str]]) -> None:
+    assert render("position=[0,0,5]", "target=[0,0,0]", "fov=10", "what=inside", "resolution=8")[0] == 0
+    # The ball's top is at z = 0.35, and its colour is 0.4 + 0.5 of the place.
+    linear = np.array([0.4, 0.4, 0.4 + 0.5 * 0.34])
+    middle = read("O/frame_0000.png")[4, 4] / 255
+    np.testing.assert_allclose(middle, 1.055 * linear ** (1 / 2.4) - 0.055, atol=0.06)
+
+
+@pytest.mark.parametrize("what", ["depth", "normals", "opacity", "exits", "glass", "inside", "sky"])
+def test_every_layer_is_drawn_and_written_as_it_is(what: str, render: Callable, scene: Scene) -> None:
+    mitsuba = pytest.importorskip("mitsuba")
+    mitsuba.set_variant("scalar_rgb")
+    assert render("views=test:1", f"what={what}")[0] == 0
+    code, err = render("views=test:1", f"what={what}", "format=exr")
+    assert code == 0, err
+    values = np.array(mitsuba.Bitmap("O/test_001.exr"))
+    camera = scene.cameras().select([1]).resized(16, 16)
+    parts = {"glass": {"inside": False}, "inside": {"glass": False}, "sky": {"inside": False, "glass": False}}
+    rendered = scene.with_(**parts.get(what, {})).render(camera, Supersampling())
+    name = {"exits": "exit_directions"}.get(what, what if what not in parts else "radiance")
+    np.testing.assert_allclose(values.reshape(16, 16, -1), getattr(rendered, name)[0].view(16, 16, -1), atol=1e-5)
+    shown = read("O/test_001.png")
+    assert shown.shape == (16, 16, 3)
+    assert shown.std() > 5
+
+
+def test_a_sweep_of_the_index_goes_from_air_to_glass(render: Callable[..., tuple[int, str]], scene: Scene) -> None:
+    assert render("views=test:0", "frames=3", "sweep=medium.ior:1.0:1.6")[0] == 0
+    camera = scene.cameras().select([0]).resized(16, 16)
+    for frame, ior in enumerate((1.0, 1.3, 1.6)):
+        expected = scene.with_(ior=ior).render(camera, Supersampling()).rgb[0]
+        np.testing.assert_allclose(read(f"O/frame_{frame:04d}.png"), 255 * expected, atol=0.51)
+    assert len(frames_of_film("O/film.mp4")) == 3
+
+
+def test_skies_turn_into_each_other_and_one_replaces_the_scenes(render: Callable[..., tuple[int, str]]) -> None:
+    save_lat_long("dark.hdr", torch.full((8, 16, 3), 0.1))
+    save_lat_long("light.hdr", torch.full((16, 32, 3), 0.5))
+    assert render("views=test:0", "what=sky", "frames=3", "sweep=sky:dark.hdr,light.hdr")[0] == 0
+    for frame, linear in enumerate((0.1, 0.3, 0.5)):
+        expected = 255 * (1.055 * linear ** (1 / 2.4) - 0.055)
+        np.testing.assert_allclose(read(f"O/frame_{frame:04d}.png"), expected, atol=2)
+    assert render("views=test:0", "what=sky", "sky=light.hdr", "out=P")[0] == 0
+    np.testing.assert_allclose(read("P/test_000.png"), 255 * (1.055 * 0.5 ** (1 / 2.4) - 0.055), atol=2)
+
+
+def test_runs_stand_side_by_side_under_their_names(render: Callable[..., tuple[int, str]], scene: Scene) -> None:
+    Path("b.ckpt").write_bytes(b"another")
+    code, err = render("checkpoint=[a.ckpt,b.ckpt]", "labels=[one,two]", "views=test:0", "resolution=64")
+    assert code == 0, err
+    both = read("O/test_000.png")
+    alone = scene.render(scene.cameras().select([0]).resized(64, 64), Supersampling()).rgb[0]
+    for left in (0, both.shape[1] - 64):
+        np.testing.assert_allclose(both[-64:, left : left + 64], 255 * alone, atol=0.51)
+        assert both[:-64, left : left + 64].min() < 100, "a label in ink"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "from where is it seen? give one of path=orbit"),
+        (["path=orbit", "views=test"], "from where is it seen?"),
+        (["path=loop"], "path=loop is not known; give orbit, spiral, arc, dolly"),
+        (["path=nowhere.json"], "nowhere.json cannot be read"),
+        (["views=test:9"], "test has views 0 to 2"),
+        (["position=[1,2]"], "position=[1.0, 2.0] is no point"),
+        (["target=[0,0,0]", "views=test"], "is for a still"),
+        (["views=test", "what=heat"], "what=heat is not allowed; choose one of rgb, depth"),
+        (["views=test", "format=bmp"], "format=bmp is not allowed; choose one of png, exr"),
+        (["path=orbit", "film=[avi]"], "film=['avi'] is not allowed; give some of mp4, gif"),
+        (["views=test", "resolution=[1,2,3]"], "resolution=[1, 2, 3] is not allowed"),
+        (["views=test", "resolution=0"], "resolution=0 is not allowed"),
+        (["views=test", "sweep=medium.ior:1"], "sweep=medium.ior:1 is not known; give medium.ior:FROM:TO"),
+        (["views=test", "sweep=sky:a.hdr"], "needs two skies or more"),
+        (["views=test", "checkpoint=[a.ckpt,a.ckpt]", "labels=[one]"], "1 labels for 2 runs"),
+        (["views=test", "sky=gone.hdr"], "the sky gone.hdr does not exist"),
+        (["path=orbit", "fov=190"], "fov=190.0 is not allowed; take more than 0 and less than 180"),
+    ],
+)
+def test_what_cannot_be_rendered_is_refused_in_one_line(
+    arguments: list[str], message: str, render: Callable[..., tuple[int, str]]
+) -> None:
+    code, err = render(*arguments)
+    assert code == 1
+    assert message in err
+    assert err.count("\n") == 1
+    assert not Path("O").exists()

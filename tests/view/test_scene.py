@@ -1,0 +1,143 @@
+"""A scene is rendered as in closed form, and its parts are changed without changing it."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from nerfro.errors import NerfroError
+from nerfro.evaluation.render_view import Supersampling
+from nerfro.files import lat_long
+from nerfro.view.scene import Scene
+from tests.view.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, colour, sky_of
+
+
+def rays_of(scene: Scene) -> tuple[torch.Tensor, torch.Tensor]:
+    rays = scene.cameras().image_rays(0)
+    return rays.origins, rays.directions
+
+
+def exact_exits(origins: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Impact parameter of rays at the ball, and the direction in which they leave it, by Snell's law twice."""
+    towards = -(origins * directions).sum(-1, keepdim=True)
+    nearest = origins + towards * directions
+    impact = nearest.norm(dim=-1)
+    sine = (impact / RADIUS).clamp(max=1)
+    deviation = 2 * (torch.asin(sine) - torch.asin(sine / IOR))[:, None]
+    inwards = -nearest / impact[:, None].clamp(min=1e-9)
+    return impact, torch.cos(deviation) * directions + torch.sin(deviation) * inwards
+
+
+def test_glass_bends_as_in_closed_form_and_shows_the_sky_behind(scene: Scene) -> None:
+    origins, directions = rays_of(scene)
+    impact, exits = exact_exits(origins, directions)
+    rendered = scene.with_(inside=False).render(scene.cameras().select([0]))
+    assert rendered.rgb.shape == (1, 32, 32, 3)
+    hit = (impact < 0.95 * RADIUS).view(32, 32)
+    torch.testing.assert_close(rendered.exit_directions[0][hit], exits.view(32, 32, 3)[hit], atol=2e-4, rtol=0)
+    torch.testing.assert_close(rendered.radiance[0][hit], sky_of(exits).view(32, 32, 3)[hit], atol=2e-3, rtol=0)
+    missed = (impact > 1.05 * RADIUS).view(32, 32)
+    torch.testing.assert_close(
+        rendered.exit_directions[0][missed], directions.view(32, 32, 3)[missed], atol=1e-6, rtol=0
+    )
+    assert not rendered.opacity.any()
+
+
+def test_normals_are_those_of_the_first_surface(scene: Scene) -> None:
+    origins, directions = rays_of(scene)
+    towards = -(origins * directions).sum(-1)
+    impact = (origins + towards[:, None] * directions).norm(dim=-1)
+    first = origins + (towards - (RADIUS**2 - impact**2).clamp(min=0).sqrt())[:, None] * directions
+    normals = scene.render(scene.cameras().select([0])).normals[0].view(-1, 3)
+    hit = impact < 0.95 * RADIUS
+    torch.testing.assert_close(normals[hit], (first / RADIUS)[hit], atol=2e-4, rtol=0)
+    assert not normals[impact > 1.05 * RADIUS].any()
+
+
+def test_without_glass_things_lie_where_straight_rays_meet_them(scene: Scene) -> None:
+    origins, directions = rays_of(scene)
+    offset = origins - torch.tensor(INSIDE_CENTRE)
+    towards = -(offset * directions).sum(-1)
+    impact = (offset + towards[:, None] * directions).norm(dim=-1)
+    depth = towards - (INSIDE_RADIUS**2 - impact**2).clamp(min=0).sqrt()
+    rendered = scene.with_(glass=False).render(scene.cameras().select([0]))
+    hit = impact < 0.9 * INSIDE_RADIUS
+    spacing = 4 / 256
+    assert (rendered.depth[0].view(-1) - depth)[hit].abs().max() < spacing
+    assert rendered.opacity[0].view(-1)[hit].min() > 0.99
+    places = origins + depth[:, None] * directions
+    torch.testing.assert_close(rendered.radiance[0].view(-1, 3)[hit], colour(places)[hit], atol=spacing, rtol=0)
+    assert not rendered.normals.any()
+
+
+def test_glass_of_the_index_of_air_is_no_glass(scene: Scene) -> None:
+    camera = scene.cameras().select([1])
+    air, nothing = scene.with_(ior=1.0).render(camera), scene.with_(glass=False).render(camera)
+    torch.testing.assert_close(air.rgb, nothing.rgb, atol=1e-5, rtol=0)
+
+
+def test_a_changed_scene_leaves_the_first_as_it_was(scene: Scene) -> None:
+    camera = scene.cameras().select([0])
+    before = scene.render(camera).rgb
+    changed = scene.with_(ior=1.7, sky=torch.full((8, 16, 3), 0.2))
+    assert float(changed.ior[0]) == pytest.approx(1.7)
+    assert float(scene.ior[0]) == pytest.approx(IOR)
+    assert (changed.render(camera).rgb - before).abs().max() > 0.1
+    assert torch.equal(scene.render(camera).rgb, before)
+    assert changed.model.fields is scene.model.fields, "what is not changed is shared"
+
+
+def test_the_sky_is_read_and_replaced_as_linear_radiance(scene: Scene, tmp_path) -> None:
+    torch.testing.assert_close(scene.sky, sky_of(lat_long.directions(512)), atol=5e-3, rtol=0)
+    # A lamp that no picture of eight bits could hold.
+    sky = torch.full((64, 128, 3), 0.25)
+    sky[:32] = 3.0
+    lat_long.save_lat_long(tmp_path / "lamp.hdr", sky)
+    changed = scene.with_(sky=tmp_path / "lamp.hdr", glass=False, inside=False)
+    rendered = changed.render(scene.cameras().select([0]))
+    up = rendered.exit_directions[..., 2]
+    assert (rendered.radiance[up > 0.1] - 3).abs().max() < 0.05
+    assert (rendered.radiance[up < -0.1] - 0.25).abs().max() < 0.01
+    assert rendered.rgb.max() == 1
+
+
+def test_pictures_do_not_depend_on_chunks_and_carry_their_supersampling(scene: Scene) -> None:
+    camera = scene.cameras().select([2])
+    whole, pieces = scene.render(camera), scene.render(camera, chunk_size=100)
+    for one, other in zip(whole, pieces, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
+    fine = scene.render(camera.resized(96, 96)).radiance
+    mean = fine.view(1, 32, 3, 32, 3, 3).mean((2, 4))
+    parts = scene.render(camera, Supersampling(3)).radiance
+    torch.testing.assert_close(parts, mean, atol=1e-5, rtol=1e-5)
+
+
+def test_the_surface_is_that_of_the_ball_with_its_normals(scene: Scene) -> None:
+    (mesh,) = scene.surface
+    assert mesh.is_closed
+    assert abs(torch.from_numpy(mesh.vertices).norm(dim=-1) - RADIUS).max() < 1e-4
+    cosine = (torch.from_numpy(mesh.normals) * torch.from_numpy(mesh.triangles) / RADIUS).sum(-1)
+    assert float(cosine.min()) > math.cos(math.radians(0.1))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sky": torch.zeros(4, 4, 3)}, "is no lat-long picture"),
+        ({"sky": "/nowhere.hdr"}, "does not exist"),
+        ({"ior": [1.2, 1.3]}, "ior=.* is not allowed"),
+        ({"ior": float("nan")}, "ior=.* is not allowed"),
+        ({"glass": False, "ior": 1.4}, None),
+    ],
+)
+def test_what_a_scene_cannot_be_is_refused_in_one_line(scene: Scene, changes: dict, message: str | None) -> None:
+    if message is None:
+        assert len(scene.with_(**changes).ior) == 0
+        with pytest.raises(NerfroError, match="no bodies on which rays bend"):
+            scene.with_(glass=False).with_(ior=1.4)
+        return
+    with pytest.raises(NerfroError, match=message) as refused:
+        scene.with_(**changes)
+    assert "\n" not in str(refused.value)
