@@ -18,7 +18,7 @@ from torch import Tensor
 from nerfro.errors import NerfroError
 from nerfro.files import radiance_hdr
 from nerfro.files.atomic import write_atomically
-from nerfro.files.exr import encode_exr, load_exr
+from nerfro.files.exr import load_exr, save_exr
 from nerfro.files.images import save_png
 from nerfro.light import to_linear, to_srgb
 
@@ -83,7 +83,7 @@ def save_lat_long(path: Path | str, radiance: Float[Tensor, "H 2*H 3"]) -> None:
     if suffix == ".hdr":
         write_atomically(path, radiance_hdr.encode(linear))
     elif suffix == ".exr":
-        write_atomically(path, encode_exr(linear))
+        save_exr(path, linear)
     else:
         raise NerfroError(f"a sky is not written as {suffix}, which loses detail; use .png, .hdr or .exr")
 

@@ -44,4 +44,7 @@ def scene_of(checkpoint: dict[str, Any], config: DictConfig, device: torch.devic
     """The scene of a checkpoint and its configuration, of which the data and how it is evaluated may have changed."""
     wanted = config.evaluation
     model = restore(checkpoint, config).to(device)
-    return Scene(model, build(config.data), Supersampling(wanted.supersample, wanted.divergence, wanted.get("contrast")), config.name)
+    corners = [config.content.box_min, config.content.box_max]  # which the model has settled
+    content = None if None in corners else torch.tensor([list(corner) for corner in corners])
+    supersampling = Supersampling(wanted.supersample, wanted.divergence, wanted.get("contrast"))
+    return Scene(model, build(config.data), supersampling, config.name, content)

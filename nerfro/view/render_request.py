@@ -132,25 +132,27 @@ def prepared(config: DictConfig, scene: Scene) -> Scene:
 
 def find_shots(config: DictConfig, scene: Scene) -> Shots:
     """The cameras that are asked for, at their resolution."""
-    around = Surroundings.of(scene.cameras("train"), scene.bounds)
-    if config.views is not None:
-        shots = _views(config.views, scene)
-    elif config.position is not None:
-        target = around.centre if config.target is None else torch.tensor(list(config.target))
-        shots = Shots(around.looking(torch.tensor([list(config.position)]), target), ["frame_0000"], False)
-    elif config.path in PATHS:
-        start = Flight(config.azimuth, config.elevation, config.distance or around.distance)
-        cameras = fly(around, config.path, start, config.frames)
-        shots = Shots(cameras, _numbered("frame", len(cameras), 4), len(cameras) > 1)
-    else:
-        cameras = read_cameras(user_path(config.path), around)
-        shots = Shots(cameras, _numbered("frame", len(cameras), 4), len(cameras) > 1)
+    shots = _views(config.views, scene) if config.views is not None else _flight(config, scene)
     cameras = shots.cameras
     if config.fov is not None:
         focal = torch.full_like(cameras.fx, 0.5 * cameras.width / math.tan(0.5 * math.radians(config.fov)))
         cameras = replace(cameras, fx=focal, fy=focal * cameras.fy / cameras.fx)
-    shots = replace(shots, cameras=cameras.resized(*_size(config, cameras.width, cameras.height)))
+    shots = replace(shots, cameras=_sized(cameras, *_size(config, cameras.width, cameras.height)))
     return shots if config.sweep is None else shots.over_time(config.frames)
+
+
+def _flight(config: DictConfig, scene: Scene) -> Shots:
+    """A still, or a path around the object or of a file."""
+    around = Surroundings.of(scene.cameras("train"), scene.bounds)
+    if config.position is not None:
+        target = around.centre if config.target is None else torch.tensor(list(config.target))
+        cameras = around.looking(torch.tensor([list(config.position)]), target)
+    elif config.path in PATHS:
+        start = Flight(config.azimuth, config.elevation, config.distance or around.distance)
+        cameras = fly(around, config.path, start, config.frames)
+    else:
+        cameras = read_cameras(user_path(config.path), around)
+    return Shots(cameras, _numbered("frame", len(cameras), 4), len(cameras) > 1)
 
 
 def _views(given: str, scene: Scene) -> Shots:
@@ -162,6 +164,16 @@ def _views(given: str, scene: Scene) -> Shots:
     if not number.isdecimal() or int(number) >= len(cameras):
         raise NerfroError(f"views={given}: {split} has views 0 to {len(cameras) - 1}; give one of these numbers")
     return Shots(cameras.select([int(number)]), [names[int(number)]], False)
+
+
+def _sized(cameras: Cameras, width: int, height: int) -> Cameras:
+    """Cameras of another resolution: as wide an angle, square pixels, and more or less of it above and below."""
+    scale = width / cameras.width
+    cx, cy = (scale * (c - 0.5 * n) for c, n in ((cameras.cx, cameras.width), (cameras.cy, cameras.height)))
+    return replace(
+        cameras, width=width, height=height, fx=scale * cameras.fx, fy=scale * cameras.fy,
+        cx=cx + 0.5 * width, cy=cy + 0.5 * height,
+    )  # fmt: skip
 
 
 def _size(config: DictConfig, width: int, height: int) -> tuple[int, int]:

@@ -50,12 +50,14 @@ class Scene:
         source: the data set.
         supersampling: rays a pixel, as the run was evaluated.
         name: of the experiment.
+        content: corners of the box outside of which the field holds nothing, world units, where it has one.
     """
 
     model: NerfModel
     source: DataSource
     supersampling: Supersampling = Supersampling()  # noqa: RUF009 (frozen)
     name: str = ""
+    content: Float[Tensor, "2 3"] | None = None
 
     def views(self, split: str = "test") -> Views:
         """Cameras, photographs and masks of a split of the data."""
@@ -121,14 +123,12 @@ class Scene:
     @property
     def bounds(self) -> Float[Tensor, "2 3"]:
         """Corners of the box around the glass, or around all that the field holds where there is no glass."""
-        medium = self.model.medium
-        box = medium.content_box.float().cpu()
+        box = self.model.medium.content_box.float().cpu()
         if (box[1] > box[0]).all():
             return box
-        sampled = getattr(self.model.point_sampler, "box", None)
-        if sampled is None:
-            raise NerfroError("the run knows no bounds of an object: it has neither a medium nor a box of its content")
-        return sampled.float().cpu()
+        if self.content is None:
+            raise NerfroError("it is not known where the object is: the run has neither glass nor content.box_min")
+        return self.content
 
     def with_(
         self,

@@ -35,8 +35,9 @@ class Volume:
 
 @torch.inference_mode()
 def bake(scene: Scene, resolution: int = RESOLUTION) -> Volume:
-    """The field of a scene over the bounds of its glass, with `resolution` vertices along the longest side."""
-    field, box, device = scene.model.fields[-1], scene.bounds, scene.model.device
+    """All that the field of a scene holds, with `resolution` vertices along the longest side of its box."""
+    box = scene.bounds if scene.content is None else scene.content
+    field, device = scene.model.fields[-1], scene.model.device
     sides = box[1] - box[0]
     counts = ((resolution - 1) * sides / sides.max()).ceil().long() + 1
     axes = [torch.linspace(float(a), float(b), int(n)) for a, b, n in zip(*box, counts, strict=True)]

@@ -7,7 +7,9 @@ import math
 import struct
 from pathlib import Path
 
+import cv2
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 import trimesh
@@ -123,11 +125,12 @@ def test_points_of_nothing_are_refused(scene: Scene, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".hdr", ".exr"])
-def test_the_sky_is_read_by_mitsuba(scene: Scene, suffix: str, tmp_path: Path) -> None:
-    mitsuba = pytest.importorskip("mitsuba")
-    mitsuba.set_variant("scalar_rgb")
+def test_the_sky_is_read_by_other_programs(scene: Scene, suffix: str, tmp_path: Path) -> None:
     write(scene, "sky", tmp_path / f"sky{suffix}")
-    picture = np.array(mitsuba.Bitmap(str(tmp_path / f"sky{suffix}")))[..., :3]
+    if suffix == ".exr":
+        picture = OpenEXR.File(str(tmp_path / "sky.exr")).channels()["RGB"].pixels
+    else:
+        picture = cv2.imread(str(tmp_path / "sky.hdr"), cv2.IMREAD_UNCHANGED)[..., ::-1]
     assert picture.shape == (48, 96, 3)
     polar, azimuth = math.pi * 10.5 / 48, math.pi - 2 * math.pi * 20.5 / 96
     towards = [math.sin(polar) * math.cos(azimuth), math.sin(polar) * math.sin(azimuth), math.cos(polar)]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 from PIL import Image
@@ -111,12 +112,10 @@ def test_a_still_from_numbers_shows_what_lies_there(render: Callable[..., tuple[
 
 @pytest.mark.parametrize("what", ["depth", "normals", "opacity", "exits", "glass", "inside", "sky"])
 def test_every_layer_is_drawn_and_written_as_it_is(what: str, render: Callable, scene: Scene) -> None:
-    mitsuba = pytest.importorskip("mitsuba")
-    mitsuba.set_variant("scalar_rgb")
     assert render("views=test:1", f"what={what}")[0] == 0
     code, err = render("views=test:1", f"what={what}", "format=exr")
     assert code == 0, err
-    values = np.array(mitsuba.Bitmap("O/test_001.exr"))
+    (values,) = (channel.pixels for channel in OpenEXR.File("O/test_001.exr").channels().values())
     camera = scene.cameras().select([1]).resized(16, 16)
     parts = {"glass": {"inside": False}, "inside": {"glass": False}, "sky": {"inside": False, "glass": False}}
     rendered = scene.with_(**parts.get(what, {})).render(camera, Supersampling())
