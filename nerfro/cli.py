@@ -28,7 +28,7 @@ EXIT_BROKEN_PIPE = 141  # as a shell tells of a program that SIGPIPE ended
 
 
 def entry_point(
-    config_name: str, schema: type, config_dir: Path = CONF_DIR
+    config_name: str, schema: type, config_dir: Path = CONF_DIR, verbatim: tuple[str, ...] = ()
 ) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
     """Decorate `main(cfg)` so that it is composed from <config_dir>/<config_name>.yaml, checked against a dataclass.
 
@@ -38,6 +38,7 @@ def entry_point(
         config_name: file in `config_dir`, without extension.
         schema: dataclass of the root.
         config_dir: conf/, or a folder in it whose entry point must not see the groups of conf/.
+        verbatim: keys of texts that may have commas, which Hydra would take for several values.
     """
 
     def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
@@ -54,6 +55,7 @@ def entry_point(
             with errors_in_one_line():
                 ConfigStore.instance().store(name=f"{config_name}_schema", node=schema, provider="nerfro")
                 discover()
+                sys.argv[1:] = [_quoted(argument, verbatim) for argument in sys.argv[1:]]
                 hydra.main(version_base="1.3", config_path=str(config_dir), config_name=config_name)(job)()
 
         return run
@@ -99,6 +101,14 @@ def in_one_line(error: Exception) -> str | None:
     if isinstance(error, OSError):
         return f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}"
     return None
+
+
+def _quoted(argument: str, keys: tuple[str, ...]) -> str:
+    """An override of one of some keys, with its value as a quoted text."""
+    key, _, value = argument.partition("=")
+    if key not in keys or "," not in value or value[0] in "\"'":
+        return argument
+    return f"{key}='{value}'"
 
 
 def _not_parsed(override: str) -> str:

@@ -15,7 +15,7 @@ from nerfro.view.render_request import RenderConfig, check_request, checkpoints,
 from nerfro.view.sweep import read_sweep
 
 
-@entry_point("render", RenderConfig, CONF_DIR / "render")
+@entry_point("render", RenderConfig, CONF_DIR / "render", verbatim=("sweep",))
 def main(config: DictConfig) -> None:
     """Refuse what cannot be rendered, load the scenes, render the frames that are missing, make films of them."""
     check_request(config)

@@ -11,8 +11,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from nerfro import __version__
-
 _FLOAT, _UNSIGNED_INT, _TRIANGLES = 5126, 5125, 4
 _VERTICES, _INDICES = 34962, 34963  # targets of buffer views
 _TYPES = {1: "SCALAR", 3: "VEC3"}
@@ -61,7 +59,7 @@ def encode_glb(meshes: Sequence[GltfMesh]) -> bytes:
     turn = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
     numbers = range(len(meshes))
     document = {
-        "asset": {"version": "2.0", "generator": f"nerfro {__version__}"},
+        "asset": {"version": "2.0", "generator": "nerfro"},
         "scene": 0,
         "scenes": [{"nodes": [len(meshes)]}],
         "nodes": [

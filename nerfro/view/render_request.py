@@ -37,7 +37,7 @@ class RenderConfig:
     seconds: Positive = 5.0  # that the film lasts
     # Where the path begins: degrees around the object and above it, and world units from its middle.
     azimuth: float = 0.0
-    elevation: Annotated[float, Range(at_least=-90, at_most=90)] = 20.0
+    elevation: Annotated[float, Range(at_least=-90, at_most=90)] = 10.0
     distance: Optional[Positive] = None  # by default the photographs'
     views: Optional[str] = None  # cameras of a split of the data, as `test`, or one of them, as `test:3`
     # A still: where the camera is and what it looks at, by default the object's middle; world units.

@@ -45,7 +45,7 @@ def _meshes(triangles: Triangles) -> list[TriangleMesh]:
 
 def _zero_level(medium: Solid, body: int, values: Float[Tensor, "X Y Z"]) -> TriangleMesh:
     """Marching cubes, and a step of Newton's method for each vertex: the grid's own interpolation is not linear."""
-    mesh = level_set(values, medium.box.cpu(), 0.0)
+    mesh = level_set(-values, medium.box.cpu(), 0.0)
     vertices = torch.from_numpy(mesh.vertices).to(medium.box)
     phi, gradient = (found[:, body] for found in medium.signed_distances(vertices))
     vertices = vertices - phi[:, None] * gradient / gradient.square().sum(-1, keepdim=True).clamp(min=1e-6)

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
+from tqdm import tqdm
 
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
@@ -43,9 +44,8 @@ def bake(scene: Scene, resolution: int = RESOLUTION) -> Volume:
     axes = [torch.linspace(float(a), float(b), int(n)) for a, b, n in zip(*box, counts, strict=True)]
     positions = torch.cartesian_prod(*axes)
     above = torch.tensor([0.0, 0.0, -1.0])
-    density = torch.cat(
-        [ask(field, some.to(device), above.expand_as(some))[0].cpu() for some in positions.split(_POINTS_AT_ONCE)]
-    )
+    blocks = tqdm(positions.split(_POINTS_AT_ONCE), unit="block", desc="bake", dynamic_ncols=True)
+    density = torch.cat([ask(field, some.to(device), above.expand_as(some))[0].cpu() for some in blocks])
     cell = float((sides / (counts - 1)).max())
     seen = (density * cell > _UNSEEN).nonzero()[:, 0]
     rgb = torch.zeros(len(positions), 3)

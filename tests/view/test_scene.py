@@ -65,7 +65,8 @@ def test_without_glass_things_lie_where_straight_rays_meet_them(scene: Scene) ->
     rendered = scene.with_(glass=False).render(scene.cameras().select([0]))
     hit = impact < 0.9 * INSIDE_RADIUS
     spacing = 4 / 256
-    assert (rendered.depth[0].view(-1) - depth)[hit].abs().max() < spacing
+    # A sample lies at the start of its interval, whose middle is the depth.
+    assert (rendered.depth[0].view(-1) - depth)[hit].abs().max() < 1.5 * spacing
     assert rendered.opacity[0].view(-1)[hit].min() > 0.99
     places = origins + depth[:, None] * directions
     torch.testing.assert_close(rendered.radiance[0].view(-1, 3)[hit], colour(places)[hit], atol=spacing, rtol=0)
@@ -96,7 +97,7 @@ def test_the_sky_is_read_and_replaced_as_linear_radiance(scene: Scene, tmp_path)
     sky[:32] = 3.0
     lat_long.save_lat_long(tmp_path / "lamp.hdr", sky)
     changed = scene.with_(sky=tmp_path / "lamp.hdr", glass=False, inside=False)
-    rendered = changed.render(scene.cameras().select([0]))
+    rendered = changed.render(scene.cameras().select([0, 2]))
     up = rendered.exit_directions[..., 2]
     assert (rendered.radiance[up > 0.1] - 3).abs().max() < 0.05
     assert (rendered.radiance[up < -0.1] - 0.25).abs().max() < 0.01
