@@ -39,7 +39,7 @@ def encode_glb(meshes: Sequence[GltfMesh]) -> bytes:
         views.append({"buffer": 0, "byteOffset": sum(map(len, chunks)), "byteLength": len(content), "target": target})
         chunks.append(content)
         kind = _FLOAT if values.dtype == np.float32 else _UNSIGNED_INT
-        accessor = {"bufferView": len(views) - 1, "componentType": kind, "count": len(values)}
+        accessor: dict[str, Any] = {"bufferView": len(views) - 1, "componentType": kind, "count": len(values)}
         accessor["type"] = _TYPES[1 if values.ndim == 1 else values.shape[1]]
         accessors.append(accessor)
         return len(accessors) - 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,11 +29,12 @@ def read_cameras(file: Path, around: Surroundings) -> Cameras:
         NerfroError: the file is neither, or anything in it is missing or no number.
     """
     document = read_json(file, "check the path")
+    lens_of: Callable[[Mapping[str, Any], int, int, str], Lens] = read_lens
     if isinstance(document, dict) and isinstance(document.get("camera_path"), list):
         size = ("render_width", "render_height")
         places, pose_key, lens_of = document["camera_path"], "camera_to_world", _lens_of_path
     elif isinstance(document, dict) and isinstance(document.get("frames"), list):
-        size, places, pose_key, lens_of = ("w", "h"), document["frames"], "transform_matrix", read_lens
+        size, places, pose_key = ("w", "h"), document["frames"], "transform_matrix"
     else:
         raise NerfroError(
             f"{file} has neither 'camera_path' nor 'frames'; give nerfstudio's camera path, or transforms"
@@ -51,14 +52,12 @@ def read_cameras(file: Path, around: Surroundings) -> Cameras:
         matrix = flat.reshape(-1, 4).tolist() if flat.size in (12, 16) else place[pose_key]
         poses.append(check_pose(parse_matrix(matrix, ((3, 4), (4, 4)), where), where, pose_key))
         lenses.append(lens_of({**document, **place}, width, height, where))
-    intrinsics = torch.tensor([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in lenses])
+    fx, fy, cx, cy = torch.tensor([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in lenses]).unbind(-1)
     distorted = any(lens.distortion is not None for lens in lenses)
-    cameras = Cameras(
-        torch.from_numpy(np.stack(poses)).float(), *intrinsics.unbind(-1), width, height,
-        around.camera.near, around.camera.far,
-        torch.tensor([lens.distortion or (0.0,) * 9 for lens in lenses]) if distorted else None,
-    )  # fmt: skip
-    return around.bounded(cameras)
+    distortion = torch.tensor([lens.distortion or (0.0,) * 9 for lens in lenses]) if distorted else None
+    pose = torch.from_numpy(np.stack(poses)).float()
+    near, far = around.camera.near, around.camera.far
+    return around.bounded(Cameras(pose, fx, fy, cx, cy, width, height, near, far, distortion))
 
 
 def _lens_of_path(place: Mapping[str, Any], width: int, height: int, where: str) -> Lens:

@@ -90,19 +90,14 @@ def _glass(name: str, ior: float, absorption: Float[np.ndarray, "3"], thickness:
 
 
 def _write_ply(out: Path, glass: list[TriangleMesh], solid: ColouredMesh | None) -> None:
-    parts = [(*with_normals(mesh), None) for mesh in glass]
+    parts = [with_normals(mesh) for mesh in glass]
+    rgba = [np.tile(np.array(_GLASS_RGBA, np.uint8), (len(vertices), 1)) for vertices, _, _ in parts]
     if solid is not None:
+        parts.append((solid.mesh.vertices, solid.mesh.faces, solid.normals.numpy()))
         colours = to_8bit(to_srgb(solid.radiance)).numpy()
-        parts.append((solid.mesh.vertices, solid.mesh.faces, solid.normals.numpy(), colours))
-    offsets = np.cumsum([0, *(len(vertices) for vertices, *_ in parts)])
-    rgba = []
-    for vertices, _, _, colours in parts:
-        shown = np.tile(np.array(_GLASS_RGBA, np.uint8), (len(vertices), 1))
-        if colours is not None:
-            shown[:, :3], shown[:, 3] = colours, 255
-        rgba.append(shown)
-    normals = np.concatenate([normals for _, _, normals, _ in parts])
-    columns = dict(zip(("nx", "ny", "nz"), normals.T, strict=True))
+        rgba.append(np.pad(colours, ((0, 0), (0, 1)), constant_values=255))
+    offsets = np.cumsum([0, *(len(vertices) for vertices, _, _ in parts)])
+    faces = np.concatenate([faces + offset for (_, faces, _), offset in zip(parts, offsets, strict=False)])
+    columns = dict(zip(("nx", "ny", "nz"), np.concatenate([normals for _, _, normals in parts]).T, strict=True))
     columns |= zip(("red", "green", "blue", "alpha"), np.concatenate(rgba).T, strict=True)
-    faces = np.concatenate([faces + offset for (_, faces, _, _), offset in zip(parts, offsets, strict=False)])
-    write_ply(out, np.concatenate([vertices for vertices, *_ in parts]), faces, columns)
+    write_ply(out, np.concatenate([vertices for vertices, _, _ in parts]), faces, columns)

@@ -57,7 +57,7 @@ def find_points(scene: Scene, count: int, seed: int = 0) -> tuple[Float[Tensor, 
             where, towards = rendering.path.at(rendering.samples.s.gather(1, heaviest))
             where, towards = (rendering.path.first_of_ray(values[:, 0])[hit] for values in (where, towards))
             positions.append(where.cpu())
-            radiance.append(model.linear(ask(model.fields[-1], where, towards)[1]).cpu())
+            radiance.append(model.linear(ask(scene.field, where, towards)[1]).cpu())
             found += len(where)
             progress.update(min(len(where), count - progress.n))
             if found >= count:

@@ -16,6 +16,7 @@ from nerfro.cameras import Cameras
 from nerfro.data.base import DataSource, Views
 from nerfro.errors import NerfroError
 from nerfro.evaluation.render_view import Supersampling, render_view
+from nerfro.fields.base import Field
 from nerfro.files import lat_long
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.models.base import NerfModel
@@ -114,6 +115,12 @@ class Scene:
     def surface(self) -> list[TriangleMesh]:
         """The surfaces on which rays bend, the outer body's first; world units."""
         return surface_of(self.model.medium, getattr(self.model.path_sampler, "interface", "sdf") == "mesh")
+
+    @property
+    def field(self) -> Field:
+        """The radiance field that the finest sampling level asks."""
+        finest: Field = self.model.fields[-1]  # type: ignore[assignment]
+        return finest
 
     @property
     def ior(self) -> Float[Tensor, "K"]:

@@ -38,7 +38,7 @@ class Volume:
 def bake(scene: Scene, resolution: int = RESOLUTION) -> Volume:
     """All that the field of a scene holds, with `resolution` vertices along the longest side of its box."""
     box = scene.bounds if scene.content is None else scene.content
-    field, device = scene.model.fields[-1], scene.model.device
+    field, device = scene.field, scene.model.device
     sides = box[1] - box[0]
     counts = ((resolution - 1) * sides / sides.max()).ceil().long() + 1
     axes = [torch.linspace(float(a), float(b), int(n)) for a, b, n in zip(*box, counts, strict=True)]
@@ -104,7 +104,7 @@ def solid_surface(scene: Scene, volume: Volume, half_depth: float) -> ColouredMe
     gradients = torch.stack(torch.gradient(padded.clamp(min=1e-3 * level).log()), -1) / spacing
     normals = -functional.normalize(trilinear(gradients, box, vertices), dim=-1)
     radiance = [
-        ask(scene.model.fields[-1], places.to(scene.model.device), towards)[1].cpu()
+        ask(scene.field, places.to(scene.model.device), towards)[1].cpu()
         for places, towards in zip(vertices.split(_POINTS_AT_ONCE), (-normals).split(_POINTS_AT_ONCE), strict=True)
     ]
     return ColouredMesh(mesh, normals, scene.model.linear(torch.cat(radiance)))
