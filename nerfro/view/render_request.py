@@ -15,7 +15,6 @@ from omegaconf import MISSING, DictConfig, ListConfig
 from nerfro.allowed import Count, NotNegative, Positive, Range
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
-from nerfro.evaluation.render_view import Supersampling
 from nerfro.paths import user_path
 from nerfro.variants import variant
 from nerfro.view.camera_files import read_cameras
@@ -53,6 +52,7 @@ class RenderConfig:
     # Rays per pixel (see docs/experiments.md); as trained by default.
     supersample: Optional[Count] = None
     divergence: Optional[NotNegative] = None
+    contrast: Optional[Positive] = None
     chunk_size: Optional[Count] = None  # rays rendered at once, which bounds the memory; as trained by default
     out: str = MISSING  # folder of the frames and films; an interrupted rendering goes on where it was
     format: str = "png"  # of the frames; exr for values as they are: linear radiance, world units, unit vectors
@@ -122,11 +122,10 @@ def labels(config: DictConfig) -> list[str]:
 
 def prepared(config: DictConfig, scene: Scene) -> Scene:
     """A loaded scene as it is to be rendered: rays a pixel and at once, and its sky."""
-    known = scene.supersampling
-    side = known.side if config.supersample is None else config.supersample
-    apart = known.divergence if config.divergence is None else config.divergence
-    chunk_size = config.chunk_size or scene.model.chunk_size
-    scene = replace(scene, model=variant(scene.model, chunk_size=chunk_size), supersampling=Supersampling(side, apart))
+    wanted = {"side": config.supersample, "divergence": config.divergence, "contrast": config.contrast}
+    rays = replace(scene.supersampling, **{name: value for name, value in wanted.items() if value is not None})
+    model = variant(scene.model, chunk_size=config.chunk_size or scene.model.chunk_size)
+    scene = replace(scene, model=model, supersampling=rays)
     return scene if config.sky is None else scene.with_(sky=config.sky)
 
 
