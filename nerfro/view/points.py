@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from tqdm import tqdm
 
@@ -21,6 +21,9 @@ from nerfro.view.volume import ask
 _SOLID = 0.5
 # Rays are drawn until there are enough points, but no more than so many for each.
 _PATIENCE = 100
+# A point is alone where its neighbour of this number is so many times as far away as those of others.
+_NEIGHBOURS, _ALONE = 16, 3.0
+_SPARE = 1.2  # points that are looked for, for each that is wanted: some are alone
 
 
 def write_points(scene: Scene, out: Path, count: int) -> str:
@@ -60,8 +63,19 @@ def find_points(scene: Scene, count: int, seed: int = 0) -> tuple[Float[Tensor, 
             radiance.append(model.linear(ask(scene.field, where, towards)[1]).cpu())
             found += len(where)
             progress.update(min(len(where), count - progress.n))
-            if found >= count:
+            if found >= _SPARE * count:
                 break
     if not found:
         raise NerfroError("no ray of the training cameras loses half its light inside; there are no points to write")
-    return torch.cat(positions)[:count], torch.cat(radiance)[:count]
+    dense = _in_company(torch.cat(positions))
+    return torch.cat(positions)[dense][:count], torch.cat(radiance)[dense][:count]
+
+
+def _in_company(positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
+    """Which points have neighbours as others have; the rest is what the field invents to explain edges of glass."""
+    from scipy.spatial import cKDTree
+
+    if len(positions) <= _NEIGHBOURS:
+        return torch.ones(len(positions), dtype=torch.bool)
+    distance = torch.from_numpy(cKDTree(positions.numpy()).query(positions.numpy(), [_NEIGHBOURS + 1])[0][:, 0])
+    return distance <= _ALONE * distance.median()

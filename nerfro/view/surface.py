@@ -16,6 +16,8 @@ from nerfro.media.solid import Solid
 
 # Vertices a side of the grid on which the distance of a body that has no mesh is asked.
 _RESOLUTION = 128
+# Triangles of a separate part that is left out, as a share of those of the largest.
+_CRUMB = 0.02
 
 
 @torch.no_grad()
@@ -75,3 +77,18 @@ def level_set(values: Float[Tensor, "X Y Z"], box: Float[Tensor, "2 3"], level: 
     spacing = (box[1] - box[0]).double().numpy() / (np.array(volume.shape) - 1)
     vertices, faces, _, _ = marching_cubes(volume, level, gradient_direction="ascent")
     return TriangleMesh(vertices * spacing + box[0].double().numpy(), faces.astype(np.int64))
+
+
+def without_crumbs(mesh: TriangleMesh) -> TriangleMesh:
+    """The mesh without its small separate parts: what a field invents to explain edges and reflections of glass."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    size = len(mesh.vertices)
+    first, second = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
+    joined = coo_array((np.ones(len(first), np.int8), (first, second)), (size, size))
+    _, part = connected_components(joined, directed=False)
+    counts = np.bincount(part[mesh.faces[:, 0]], minlength=part.max() + 1)
+    faces = mesh.faces[counts[part[mesh.faces[:, 0]]] >= _CRUMB * counts.max()]
+    used, index = np.unique(faces, return_inverse=True)
+    return TriangleMesh(mesh.vertices[used], index.reshape(-1, 3))

@@ -17,7 +17,7 @@ from nerfro.geometry.interpolation import trilinear
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.types import Samples
 from nerfro.view.scene import Scene
-from nerfro.view.surface import level_set
+from nerfro.view.surface import level_set, without_crumbs
 
 RESOLUTION = 128
 # Optical depth along a cell below which nobody sees its colour.
@@ -87,6 +87,8 @@ class ColouredMesh:
 def solid_surface(scene: Scene, volume: Volume, half_depth: float) -> ColouredMesh:
     """Marching cubes around what is solid: where half the light is lost within `half_depth` world units.
 
+    Small parts apart from the rest are left out.
+
     Raises:
         NerfroError: nothing inside is that dense.
     """
@@ -97,7 +99,7 @@ def solid_surface(scene: Scene, volume: Volume, half_depth: float) -> ColouredMe
     box = volume.box + torch.stack([-spacing, spacing])
     try:
         # The logarithm is nearer to linear across a surface than a density that doubles from cell to cell.
-        mesh = level_set(padded.clamp(min=1e-3 * level).log(), box, math.log(level))
+        mesh = without_crumbs(level_set(padded.clamp(min=1e-3 * level).log(), box, math.log(level)))
     except NerfroError as error:
         raise NerfroError(f"nothing inside is so dense that half the light is lost within {half_depth:g}") from error
     vertices = torch.from_numpy(mesh.vertices).float()

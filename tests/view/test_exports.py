@@ -16,9 +16,11 @@ import trimesh
 from omegaconf import OmegaConf
 
 from nerfro.errors import NerfroError
+from nerfro.geometry.mesh import TriangleMesh
 from nerfro.light import to_srgb
 from nerfro.view.exports import ExportConfig, find_export
 from nerfro.view.scene import Scene
+from nerfro.view.surface import without_crumbs
 from tests.view.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, colour, sky_of
 
 CELL = 2.12 * RADIUS / 47  # of the box with its margin of air
@@ -118,6 +120,15 @@ def test_points_lie_where_things_are_and_not_where_they_seem_to_be(scene: Scene,
     assert np.abs(distances - INSIDE_RADIUS).max() < spacing
     expected = 255 * to_srgb(colour(torch.from_numpy(np.asarray(loaded.vertices))))
     np.testing.assert_allclose(loaded.colors[:, :3], expected, atol=1)
+
+
+def test_crumbs_are_left_out() -> None:
+    large, small = trimesh.creation.icosphere(4, 1.0), trimesh.creation.icosphere(0, 0.1).apply_translation([3, 0, 0])
+    both = trimesh.util.concatenate([small, large])
+    kept = without_crumbs(TriangleMesh(np.asarray(both.vertices), np.asarray(both.faces)))
+    assert len(kept.faces) == len(large.faces)
+    assert np.linalg.norm(kept.vertices, axis=1).max() < 1.01
+    assert trimesh.Trimesh(kept.vertices, kept.faces).volume == pytest.approx(large.volume)
 
 
 def test_points_of_nothing_are_refused(scene: Scene, tmp_path: Path) -> None:
