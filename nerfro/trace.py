@@ -50,7 +50,7 @@ def main(config: DictConfig) -> None:
         rich.print(f"{num_exceeded} rays met the limit of {sampler.max_events} events and go straight on from there")
     if config.plot:
         shown = torch.linspace(0, len(rays) - 1, min(len(rays), _PLOTTED_RAYS)).round().long()
-        draw_paths(path[shown], medium, out.with_suffix(".png"))
+        draw_paths(path.of_rays(shown), medium, out.with_suffix(".png"))
         rich.print(f"drew {len(shown)} of them in {out.with_suffix('.png')}")
 
 

@@ -49,6 +49,7 @@ class SdfGrid(Solid):
             smoothed with, for noisy silhouette hulls; size 0 for none. The kernel is of fourth order: it flattens
             noise and keeps curvature.
         accept_open_mesh: take meshes with holes; the majority of three axes decides what is inside.
+        absorption, learn_absorption: of the bodies' light, see `Solid`; for snell alone.
         cache: keep the distances in the cache folder.
 
     Attributes:
@@ -76,6 +77,8 @@ class SdfGrid(Solid):
         smoothing_size: Natural = 0,
         smoothing_sigma: Positive = 1.0,
         accept_open_mesh: bool = False,
+        absorption: list[NotNegative] = [],  # noqa: B006
+        learn_absorption: bool = False,
         cache: bool = True,
     ) -> None:
         if len(inner_meshes) != len(inner_iors):
@@ -85,7 +88,7 @@ class SdfGrid(Solid):
             )
         box = corners_of_box(box_min, box_max)
         spacing = (box[1] - box[0]) / (resolution - 1)
-        super().__init__([ior, *inner_iors], shell_voxels * float(spacing.min()))
+        super().__init__([ior, *inner_iors], shell_voxels * float(spacing.min()), absorption, learn_absorption)
         self.crease_degrees = crease_degrees
         self.meshes = [load_mesh(resolve_path(path), accept_open_mesh) for path in (mesh, *inner_meshes)]
         band = _BAND + smoothing_size

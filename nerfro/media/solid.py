@@ -6,11 +6,17 @@ from abc import abstractmethod
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.functional import softplus
 
-from nerfro.allowed import Positive, checked
+from nerfro.allowed import NotNegative, Positive, checked
+from nerfro.errors import NerfroError
 from nerfro.kernels.tolerances import MIN_COSINE, SAFE_SHARE, STEPS_PER_SHELL
 from nerfro.media.base import Medium, Scalars, Vectors
+from nerfro.types import Path
+
+# Absorption per world unit from which learning starts: what is inside must not be explained by it at first.
+_ALMOST_CLEAR = 0.02
 
 
 @checked("medium")
@@ -21,17 +27,60 @@ class Solid(Medium):
     a cubic step of the signed distance phi: S = t^2 (3 - 2 t), t = (1 - phi / w) / 2. Body after body,
     n <- n + (ior - n) S.
 
-    Attributes:
+    Args:
+        iors: refractive index of each body.
         shell: half width w, world units.
+        absorption: of red, green and blue per world unit, of each body after the others; one number for all of them,
+            none for clear bodies.
+        learn_absorption: whether it is learned, from there or from almost nothing.
     """
 
     iors: Float[Tensor, "K"]  # refractive index of each body; a parameter where it is learned
+    _absorption: Float[Tensor, "K 3"] | None  # or, where it is learned, what softplus makes it of
 
-    def __init__(self, iors: list[Positive], shell: Positive) -> None:
+    def __init__(
+        self,
+        iors: list[Positive],
+        shell: Positive,
+        absorption: list[NotNegative] = (),  # type: ignore[assignment]
+        learn_absorption: bool = False,
+    ) -> None:
         super().__init__()
+        if len(absorption) not in (0, 1, 3 * len(iors)):
+            raise NerfroError(
+                f"medium.absorption={list(absorption)} has {len(absorption)} numbers; give red, green and blue of each "
+                f"body ({3 * len(iors)} numbers), or one for all"
+            )
+        given = torch.tensor(list(absorption) or [0.0], dtype=torch.float32).expand(3 * len(iors)).view(-1, 3)
+        if learn_absorption:
+            self._absorption = nn.Parameter(given.clamp(min=_ALMOST_CLEAR).expm1().log())
+        else:
+            self.register_buffer("_absorption", given if given.any() else None, persistent=False)
         # Double precision: kernels ask for it, and a number without dimensions takes on the precision of what it meets.
         self.register_buffer("iors", torch.tensor(iors, dtype=torch.float64), persistent=False)
         self.shell = float(shell)
+
+    @property
+    def absorption(self) -> Float[Tensor, "K 3"] | None:
+        """Of each body, for each colour channel, per world unit; None where all are clear."""
+        return softplus(self._absorption) if isinstance(self._absorption, nn.Parameter) else self._absorption
+
+    def tinted(self, path: Path) -> Path:
+        of_bodies = self.absorption
+        if of_bodies is None:
+            return path
+        of_all = torch.cat([torch.zeros_like(of_bodies[:1]), of_bodies]).to(path.s)
+        return path.changed(absorption=of_all[path.body.long()])
+
+    def bending_parameters(self) -> list[nn.Parameter]:
+        return [parameter for parameter in self.parameters() if parameter is not self._absorption]
+
+    def learned(self) -> dict[str, float]:
+        if not isinstance(self._absorption, nn.Parameter):
+            return {}
+        values = softplus(self._absorption.detach())
+        names = [f"absorption_{body + 1}_{colour}" for body in range(len(values)) for colour in ("red", "green", "blue")]
+        return dict(zip(names, values.flatten().tolist(), strict=True))
 
     @abstractmethod
     def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
