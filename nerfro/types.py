@@ -112,9 +112,7 @@ class Path:
     ) -> Path:
         """The same polylines through other vertices, as a refinement makes them."""
         changed = {} if throughput is None else {"throughput": throughput}
-        return self.changed(
-            positions=positions, directions=directions, s=s, exit_directions=exit_directions, **changed
-        )
+        return self.changed(positions=positions, directions=directions, s=s, exit_directions=exit_directions, **changed)
 
     def changed(self, **tensors: Tensor) -> Path:
         """The same polylines with some other tensors."""
@@ -286,7 +284,9 @@ class Rendering:
     rgb: Float[Tensor, "R 3"]
     weights: Float[Tensor, "P N"]  # contribution of each sample to its polyline
     transmittance: Float[Tensor, "P"]  # what is left at the end of the polyline, T_{N+1}
-    boundary_rgb: Float[Tensor, "P 3"]  # radiance of the boundary in the leaving direction, C'(d_N), as seen through glass
+    boundary_rgb: Float[
+        Tensor, "P 3"
+    ]  # radiance of the boundary in the leaving direction, C'(d_N), as seen through glass
     samples: Samples
     path: Path  # the polylines that they lie on
 

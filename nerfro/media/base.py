@@ -52,6 +52,11 @@ class Medium(nn.Module, ABC):
         """Of each body, for each colour channel, per world unit; None where nothing absorbs."""
         return None
 
+    @property
+    def disperses(self) -> bool:
+        """Whether the index depends on the wavelength."""
+        return False
+
     def tinted(self, path: Path) -> Path:
         """The path with the absorption of the bodies that it crosses."""
         return path

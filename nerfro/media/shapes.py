@@ -22,7 +22,7 @@ class Ball(Solid):
 
     Args:
         radius: world units.
-        ior, shell, absorption, learn_absorption: see `Solid`.
+        ior, shell, absorption, learn_absorption, abbe: see `Solid`.
     """
 
     def __init__(
@@ -32,8 +32,9 @@ class Ball(Solid):
         shell: Positive = 0.002,
         absorption: list[NotNegative] = (),  # type: ignore[assignment]
         learn_absorption: bool = False,
+        abbe: list[Positive] = (),  # type: ignore[assignment]
     ) -> None:
-        super().__init__([ior], shell, absorption, learn_absorption)
+        super().__init__([ior], shell, absorption, learn_absorption, abbe)
         self.radius = radius
         side = radius * (1 + _MARGIN) + shell
         self.register_buffer("box", torch.tensor([[-side] * 3, [side] * 3]), persistent=False)
@@ -51,7 +52,7 @@ class RoundedBox(Solid):
     Args:
         half_side: from the centre to a face, world units.
         edge_radius: of the rounding, world units.
-        ior, shell, absorption, learn_absorption: see `Solid`.
+        ior, shell, absorption, learn_absorption, abbe: see `Solid`.
     """
 
     def __init__(
@@ -62,8 +63,9 @@ class RoundedBox(Solid):
         shell: Positive = 0.002,
         absorption: list[NotNegative] = (),  # type: ignore[assignment]
         learn_absorption: bool = False,
+        abbe: list[Positive] = (),  # type: ignore[assignment]
     ) -> None:
-        super().__init__([ior], shell, absorption, learn_absorption)
+        super().__init__([ior], shell, absorption, learn_absorption, abbe)
         self.half_side, self.edge_radius = half_side, edge_radius
         side = half_side * (1 + _MARGIN) + shell
         self.register_buffer("box", torch.tensor([[-side] * 3, [side] * 3]), persistent=False)
@@ -86,7 +88,7 @@ class Slab(Solid):
     Args:
         thickness: along z, world units.
         half_width: half side of the box along x and y, world units.
-        ior, shell, absorption, learn_absorption: see `Solid`.
+        ior, shell, absorption, learn_absorption, abbe: see `Solid`.
     """
 
     def __init__(
@@ -97,8 +99,9 @@ class Slab(Solid):
         shell: Positive = 0.002,
         absorption: list[NotNegative] = (),  # type: ignore[assignment]
         learn_absorption: bool = False,
+        abbe: list[Positive] = (),  # type: ignore[assignment]
     ) -> None:
-        super().__init__([ior], shell, absorption, learn_absorption)
+        super().__init__([ior], shell, absorption, learn_absorption, abbe)
         self.thickness = thickness
         corner = torch.tensor([half_width, half_width, thickness * (0.5 + _MARGIN) + shell])
         self.register_buffer("box", torch.stack([-corner, corner]), persistent=False)

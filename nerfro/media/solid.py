@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from abc import abstractmethod
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,6 +19,11 @@ from nerfro.types import Path
 
 # Absorption per world unit from which learning starts: what is inside must not be explained by it at first.
 _ALMOST_CLEAR = 0.02
+# Wavelengths of the lines d, F and C, nm.
+_FRAUNHOFER = (587.56, 486.13, 656.27)
+
+
+Self = TypeVar("Self", bound="Solid")  # typing has it from Python 3.11 on
 
 
 @checked("medium")
@@ -33,6 +40,8 @@ class Solid(Medium):
         absorption: of red, green and blue per world unit, of each body after the others; one number for all of them,
             none for clear bodies.
         learn_absorption: whether it is learned, from there or from almost nothing.
+        abbe: Abbe number of each body, or one for all, where the index depends on the wavelength; the indices are then
+            those of the d line, 587.6 nm.
     """
 
     iors: Float[Tensor, "K"]  # refractive index of each body; a parameter where it is learned
@@ -44,8 +53,12 @@ class Solid(Medium):
         shell: Positive,
         absorption: list[NotNegative] = (),  # type: ignore[assignment]
         learn_absorption: bool = False,
+        abbe: list[Positive] = (),  # type: ignore[assignment]
     ) -> None:
         super().__init__()
+        if len(abbe) not in (0, 1, len(iors)):
+            raise NerfroError(f"medium.abbe={list(abbe)} has {len(abbe)} numbers; give one for each body, or for all")
+        self.abbe = list(abbe)
         if len(absorption) not in (0, 1, 3 * len(iors)):
             raise NerfroError(
                 f"medium.absorption={list(absorption)} has {len(absorption)} numbers; give red, green and blue of each "
@@ -65,6 +78,23 @@ class Solid(Medium):
         """Of each body, for each colour channel, per world unit; None where all are clear."""
         return softplus(self._absorption) if isinstance(self._absorption, nn.Parameter) else self._absorption
 
+    @property
+    def disperses(self) -> bool:
+        return bool(self.abbe)
+
+    def at_wavelength(self: Self, wavelength: float) -> Self:
+        """The same bodies with their indices at a wavelength, nm; gradients reach the indices that they are made of.
+
+        Cauchy's two terms: n(w) = n_d + B (1 / w^2 - 1 / w_d^2), with B from Abbe's V = (n_d - 1) / (n_F - n_C).
+        """
+        line_d, line_f, line_c = (line**-2 for line in _FRAUNHOFER)
+        per_unit = (wavelength**-2 - line_d) / (line_f - line_c) / self.iors.new_tensor(self.abbe)
+        seen = copy.copy(self)
+        seen._buffers, seen._parameters = dict(self._buffers), dict(self._parameters)
+        seen._parameters.pop("iors", None)
+        seen._buffers["iors"] = self.iors + (self.iors - 1) * per_unit
+        return seen
+
     def tinted(self, path: Path) -> Path:
         of_bodies = self.absorption
         if of_bodies is None:
@@ -79,7 +109,9 @@ class Solid(Medium):
         if not isinstance(self._absorption, nn.Parameter):
             return {}
         values = softplus(self._absorption.detach())
-        names = [f"absorption_{body + 1}_{colour}" for body in range(len(values)) for colour in ("red", "green", "blue")]
+        names = [
+            f"absorption_{body + 1}_{colour}" for body in range(len(values)) for colour in ("red", "green", "blue")
+        ]
         return dict(zip(names, values.flatten().tolist(), strict=True))
 
     @abstractmethod

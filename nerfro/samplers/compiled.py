@@ -72,7 +72,9 @@ def _rows(
     for i, column in enumerate(chosen):
         if column.ndim > 1:
             missing = max(width - column.shape[1], 0)
-            chosen[i] = np.concatenate([column, np.repeat(column[:, -1:], missing, 1)], 1) if missing else column[:, :width]
+            chosen[i] = (
+                np.concatenate([column, np.repeat(column[:, -1:], missing, 1)], 1) if missing else column[:, :width]
+            )
     return valid.nonzero()[0], chosen
 
 

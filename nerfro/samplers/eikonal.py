@@ -54,8 +54,8 @@ class Eikonal(PathSampler):
     @torch.no_grad()
     def forward(self, rays: Rays, medium: Medium) -> Path:
         """Trace every ray from near to far; adaptive paths do not end before they have left the medium's box."""
-        if medium.absorption is not None:
-            raise NerfroError("medium.absorption needs paths that know their bodies; take sampler/path=snell")
+        if medium.absorption is not None or medium.disperses:
+            raise NerfroError("medium.absorption and medium.abbe need sharp surfaces; take sampler/path=snell")
         on_cpu = rays.origins.device.type == "cpu"
         if self.integrator != "adaptive":
             if on_cpu and isinstance(medium, VoxelGrid):

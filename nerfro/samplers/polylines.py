@@ -74,7 +74,10 @@ class Polylines:
         ray: Int[Tensor, "R"] | None = None,
         weight: Float[Tensor, "R"] | None = None,
     ) -> Path:
-        """The finished paths; shorter rows repeat their last vertex. Where rays split: the ray and share of each row."""
+        """The finished paths; shorter rows repeat their last vertex.
+
+        Where rays split, `ray` and `weight` are the ray of each row and its share.
+        """
         capacity = int(self.counts.max()) if len(self.counts) else 2
         index = torch.arange(capacity, device=self.counts.device).minimum(self.counts[:, None] - 1)
         vertices = self._vertices.gather(1, index[..., None].expand(-1, -1, 7))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from nerfro.allowed import Count, Share
+from nerfro.allowed import Count, Positive, Share
 from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.kernels.tolerances import MIN_SEARCH_STEP
@@ -18,6 +17,7 @@ from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
 from nerfro.registry import register
+from nerfro.samplers.bands import SnellTrace, refined_in_bands, traced_in_bands
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.branching import ONE_PATH, Branching, Event
 from nerfro.samplers.compiled import snell_on_grid
@@ -31,15 +31,6 @@ from nerfro.types import Path, Rays
 _ROOT_ITERATIONS = 60
 
 
-@dataclass(frozen=True)
-class SnellTrace:
-    """Paths and what happened on each polyline."""
-
-    path: Path  # minimal polylines, a vertex for each event beside near and far
-    num_events: Int[Tensor, "P"]  # refractions and reflections
-    exceeded: Bool[Tensor, "P"]  # whether it met the limit of events; it goes straight on from there
-
-
 @register("sampler/path", "snell")
 class Snell(PathSampler):
     """Exact refraction (Snell's law) and reflection (total, or Fresnel's share) at the surface of a solid.
@@ -48,6 +39,8 @@ class Snell(PathSampler):
         branches: none transmits all light that is not totally reflected, as the paper does; first adds the reflection
             at a ray's first surface; all adds every reflection.
         least_weight: share of a ray's light below which a branch is not followed; what remains takes its weight.
+        wavelengths: at which rays are bent where the medium disperses, nm: as many for each of red, green and blue, one
+            colour's after another's.
         interface: sdf is the zero level of the signed distance (smooth normals, tolerates noisy hulls);
             mesh is the triangles themselves (sharp edges, vertex normals where the mesh is smooth).
         max_events: refractions and reflections of a ray, at most.
@@ -59,8 +52,14 @@ class Snell(PathSampler):
         max_events: Count = 16,
         branches: Literal["none", "first", "all"] = "none",
         least_weight: Share = 0.02,
+        wavelengths: list[Positive] = (610.0, 550.0, 465.0),  # type: ignore[assignment]
     ) -> None:
         super().__init__()
+        if len(wavelengths) == 0 or len(wavelengths) % 3:
+            raise NerfroError(
+                f"sampler.path.wavelengths={list(wavelengths)} is not allowed; give as many for each of red, green, blue"
+            )
+        self.wavelengths = list(wavelengths)
         self.interface, self.max_events = interface, max_events
         self.branching = Branching({"none": 0, "first": 1, "all": max_events}[branches], least_weight)
 
@@ -74,6 +73,11 @@ class Snell(PathSampler):
 
         They are unbounded at grazing and critical angles: leave out paths whose `smallest_cosine` is below 0.15.
         """
+        if isinstance(medium, Solid) and medium.disperses:
+            return refined_in_bands(path, rays, self._seen(medium), self._refine)
+        return self._refine(path, rays, medium)
+
+    def _refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
         if self.interface == "mesh" and isinstance(medium, SdfGrid):
             meet = meet_triangles(medium.triangles(), medium.traced_triangles()[1])
         elif isinstance(medium, Solid):
@@ -81,6 +85,12 @@ class Snell(PathSampler):
         else:
             return straight_path(rays[path.ray])
         return replay(path, rays, medium, meet, self.branching)
+
+    def _seen(self, medium: Solid) -> list[Solid]:
+        """The medium at each wavelength."""
+        if self.interface == "mesh" and isinstance(medium, SdfGrid):
+            medium.traced_triangles()  # made before they are shared
+        return [medium.at_wavelength(wavelength) for wavelength in self.wavelengths]
 
     def releases_python(self, medium: Medium) -> bool:
         return self.interface == "sdf" and isinstance(medium, SdfGrid)
@@ -93,6 +103,11 @@ class Snell(PathSampler):
             return SnellTrace(straight_path(rays), none, none.bool())
         if not isinstance(medium, Solid):
             raise NerfroError("sampler/path=snell needs a medium with a surface; take medium=sdf_grid, or path=eikonal")
+        if medium.disperses:
+            return traced_in_bands(rays, self._seen(medium), self._trace)
+        return self._trace(rays, medium)
+
+    def _trace(self, rays: Rays, medium: Solid) -> SnellTrace:
         if self.interface == "mesh":
             if not isinstance(medium, SdfGrid) or not medium.meshes:
                 raise NerfroError("sampler.path.interface=mesh needs a medium made of a mesh; take medium=sdf_grid")

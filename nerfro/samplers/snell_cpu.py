@@ -241,9 +241,7 @@ def _trace_ray(solids, origin, direction, near, far, min_step, max_events, num_s
 
 
 @compiled_parallel
-def trace_snell(
-    origins, directions, near, far, solids, min_step, max_events, num_splits, least_weight, capacity, room
-):
+def trace_snell(origins, directions, near, far, solids, min_step, max_events, num_splits, least_weight, capacity, room):
     """Polylines of all rays, which may split at their first events (`samplers.branching`).
 
     Returns:
