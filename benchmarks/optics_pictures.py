@@ -14,15 +14,16 @@ from matplotlib.figure import Figure
 from tracing import BOX, N_BALL, RADIUS, angles, euler, exits, grid_distances, make_rays, view
 
 from nerfro.evaluation.path_plot import plot_paths
+from nerfro.files import lat_long
 from nerfro.light import to_srgb
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball, RoundedBox
 from nerfro.media.voxel_grid import VoxelGrid
+from nerfro.paths import ASSETS_DIR
 from nerfro.pixel_parts import part_rays
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.snell import Snell
-from nerfro.scenes.torus import sky
 from nerfro.types import Path as RayPath
 from nerfro.types import Rays
 
@@ -101,11 +102,11 @@ def cube_of_distances(**options: list[float]) -> SdfGrid:
 
 def picture(sampler: Snell, medium: SdfGrid, side: int = 200, parts: int = 3) -> np.ndarray:
     """The medium under the sky of the scene `torus`, several rays a pixel, sRGB."""
-    cameras = view().resized(side, side)
+    cameras, radiance_of_sky = view().resized(side, side), lat_long.load_lat_long(ASSETS_DIR / "torus" / "sky.png")
     radiance = []
     for pixels in torch.arange(side * side).split(8192):
         path = medium.tinted(sampler(part_rays(cameras, pixels, parts), medium))
-        light = torch.from_numpy(sky(path.exit_directions.double().numpy())).float()
+        light = lat_long.sample(radiance_of_sky, path.exit_directions, width=4096)
         if path.absorbs:
             light = light * path.transmitted(path.far[:, None])[:, 0]
         radiance.append(path.per_ray(light).view(-1, parts**2, 3).mean(1))

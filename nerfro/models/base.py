@@ -73,7 +73,7 @@ class NerfModel(LightningModule, ABC):
         return self.render_path(self.trace(rays))
 
     def trace(self, rays: Rays, path: Path | None = None) -> Path:
-        """Paths of rays, or the given ones, tinted by the medium; with gradients by what bends them where that learns."""
+        """Paths of rays, or the given ones, tinted by the medium; with gradients by what bends and learns."""
         path = self.path_sampler(rays, self.medium) if path is None else path
         path = self.path_sampler.refine(path, rays, self.medium) if self.paths_learn else path
         return self.medium.tinted(path)

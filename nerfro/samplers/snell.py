@@ -57,7 +57,7 @@ class Snell(PathSampler):
         super().__init__()
         if len(wavelengths) == 0 or len(wavelengths) % 3:
             raise NerfroError(
-                f"sampler.path.wavelengths={list(wavelengths)} is not allowed; give as many for each of red, green, blue"
+                f"sampler.path.wavelengths={list(wavelengths)} is not allowed; give as many for red, green, blue"
             )
         self.wavelengths = list(wavelengths)
         self.interface, self.max_events = interface, max_events

@@ -158,24 +158,27 @@ def _trace_ray(solids, origin, direction, near, far, min_step, max_events, num_s
     x, y, z = origin[0] + s * dx, origin[1] + s * dy, origin[2] + s * dz
     count = put_vertex(positions[0], directions[0], lengths[0], 0, x, y, z, dx, dy, dz, s)
     enter, leave = box_span(solids.low, solids.high, x, y, z, dx, dy, dz)
-    meets = enter < leave and leave > 0.0 and enter < end - s
-    inside = np.zeros(solids.values.shape[0], np.bool_)
+    if not (enter < leave and leave > 0.0 and enter < end - s):
+        weights[0], events[0], exceeded[0] = 1.0, 0, False
+        return 1, put_end(
+            positions[0], directions[0], lengths[0], count, solids.low, solids.high, False, x, y, z, dx, dy, dz, s, end
+        )
+    jump = max(enter, 0.0)
+    x, y, z, s = x + jump * dx, y + jump * dy, z + jump * dz, s + jump
+    inside = np.empty(solids.values.shape[0], np.bool_)
+    for body in range(len(inside)):
+        value = spline_value(solids.values[body], solids.low, solids.inverse_spacing, x, y, z)
+        inside[body] = value < 0.0
+    bodies[0, 0] = _innermost(inside)
     # Parts of the light that are followed later, the last one first: it shares most of the polyline before it.
     waiting = np.empty((num_splits, 8))
     waiting_numbers = np.empty((num_splits, 2), np.int64)
     waiting_inside = np.empty((num_splits, len(inside)), np.bool_)
-    if meets:
-        jump = max(enter, 0.0)
-        x, y, z, s = x + jump * dx, y + jump * dy, z + jump * dz, s + jump
-        for body in range(len(inside)):
-            value = spline_value(solids.values[body], solids.low, solids.inverse_spacing, x, y, z)
-            inside[body] = value < 0.0
-        bodies[0, 0] = _innermost(inside)
     num_events, weight, num_waiting, polyline, most = 0, 1.0, 0, 0, 0
     while True:
         row = min(polyline, room - 1)  # rows beyond the room are counted, not kept
         too_many = False
-        while meets:
+        while True:
             hit, before, after = _surface_ahead(solids, inside, x, y, z, dx, dy, dz, min_step)
             if hit < 0:
                 break
