@@ -284,9 +284,8 @@ class Rendering:
     rgb: Float[Tensor, "R 3"]
     weights: Float[Tensor, "P N"]  # contribution of each sample to its polyline
     transmittance: Float[Tensor, "P"]  # what is left at the end of the polyline, T_{N+1}
-    boundary_rgb: Float[
-        Tensor, "P 3"
-    ]  # radiance of the boundary in the leaving direction, C'(d_N), as seen through glass
+    # Radiance of the boundary in the leaving direction, C'(d_N), as the glass tints it.
+    boundary_rgb: Float[Tensor, "P 3"]
     samples: Samples
     path: Path  # the polylines that they lie on
 

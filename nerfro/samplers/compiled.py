@@ -69,12 +69,8 @@ def _rows(
     room = columns[0].shape[1]
     valid = np.arange(room) < counts[:, None]
     chosen = [column[:, 0] if room == 1 and valid.all() else column[valid] for column in columns]
-    for i, column in enumerate(chosen):
-        if column.ndim > 1:
-            missing = max(width - column.shape[1], 0)
-            chosen[i] = (
-                np.concatenate([column, np.repeat(column[:, -1:], missing, 1)], 1) if missing else column[:, :width]
-            )
+    last = np.minimum(np.arange(width), columns[0].shape[2] - 1)  # shorter rows repeat their last vertex
+    chosen = [column if column.ndim == 1 else column[:, last] for column in chosen]
     return valid.nonzero()[0], chosen
 
 
