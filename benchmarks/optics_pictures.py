@@ -1,4 +1,4 @@
-"""The pictures of docs/optics.md: `python benchmarks/optics_pictures.py`, about a minute."""
+"""The pictures of docs/optics.md: `python benchmarks/optics_pictures.py`, about two minutes."""
 
 from __future__ import annotations
 
@@ -11,13 +11,17 @@ import torch
 import trimesh
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from tracing import BOX, N_BALL, RADIUS, angles, euler, exits, grid_distances, make_rays
+from tracing import BOX, N_BALL, RADIUS, angles, euler, exits, grid_distances, make_rays, view
 
 from nerfro.evaluation.path_plot import plot_paths
+from nerfro.files import lat_long
+from nerfro.light import to_srgb
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball, RoundedBox
 from nerfro.media.voxel_grid import VoxelGrid
+from nerfro.paths import ASSETS_DIR
+from nerfro.pixel_parts import part_rays
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.snell import Snell
 from nerfro.types import Path as RayPath
@@ -28,17 +32,86 @@ IMAGES = Path(__file__).resolve().parent.parent / "docs" / "images"
 
 
 def main() -> None:
-    """Draw both pictures."""
+    """Draw all pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--folder", type=Path, default=IMAGES)
-    folder = parser.parse_args().folder
+    parser.add_argument("--light", action="store_true", help="only those of light that splits, is absorbed, disperses")
+    arguments = parser.parse_args()
+    folder = arguments.folder
     torch.set_grad_enabled(False)
+    if arguments.light:
+        draw_light(folder)
+        return
     with tempfile.TemporaryDirectory() as temporary:
         mesh = Path(temporary) / "ball.ply"
         trimesh.creation.icosphere(6, RADIUS).export(mesh)
         voxels = VoxelGrid(str(mesh), N_BALL, RESOLUTION, cache=False)
     draw_paths(voxels, folder / "optics_paths.png")
     draw_errors(voxels, folder / "optics_error.png")
+    draw_light(folder)
+
+
+def draw_light(folder: Path) -> None:
+    """Light that splits, is absorbed and disperses: paths, and an empty cube under the torus scene's sky."""
+    heights = np.linspace(-0.7, 0.7, 7)
+    beam = make_rays(np.stack([0 * heights - 4, heights, 0 * heights], -1), np.tile([[1.0, 0, 0]], (7, 1)), 0.0, 12.0)
+    tilt = np.radians(33)
+    slanted = np.array([[np.cos(tilt), np.sin(tilt), 0.0]])
+    into_cube = make_rays(-4 * slanted + 0.1, slanted, 0.0, 12.0)
+    splitting = Snell(branches="all", least_weight=0.002)
+    clear, green, flint = (
+        cube_of_distances(**options)
+        for options in ({}, {"absorption": [1.2, 0.25, 0.8]}, {"abbe": [8.0]})  # type: ignore[arg-type]
+    )
+    ball = Ball(RADIUS, N_BALL).double()
+    pictures: dict[str, tuple[RayPath, Medium, dict[str, np.ndarray]]] = {
+        "optics_branches.png": (splitting(beam, ball), ball, {
+            "one path": picture(Snell(), clear),
+            "first reflection, F and 1 - F": picture(Snell(branches="first"), clear),
+            "all branches of 2 % or more": picture(Snell(branches="all"), clear),
+        }),
+        "optics_tint.png": (Snell(branches="all")(into_cube, clear), clear, {
+            "clear": picture(Snell(branches="all"), clear),
+            "absorption 1.2, 0.25, 0.8": picture(Snell(branches="all"), green),
+        }),
+        "optics_dispersion.png": (Snell()(into_cube, flint), flint, {
+            "one index": picture(Snell(branches="all"), clear),
+            "Abbe number 8, three bands": picture(Snell(branches="all"), flint),
+            "the same, nine bands": picture(
+                Snell(branches="all", wavelengths=[640, 610, 580, 565, 545, 525, 490, 465, 440]), flint
+            ),
+        }),
+    }  # fmt: skip
+    for name, (path, medium, shown) in pictures.items():
+        figure = Figure(figsize=(3.6 * (1 + len(shown)), 3.9), layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = figure.subplots(1, 1 + len(shown))
+        plot_paths(axes[0], path, medium)
+        for panel, (title, image) in zip(axes[1:], shown.items(), strict=True):
+            panel.imshow(image, interpolation="nearest")
+            panel.set_title(title)
+            panel.axis("off")
+        figure.savefig(folder / name, dpi=90)
+
+
+def cube_of_distances(**options: list[float]) -> SdfGrid:
+    """A rounded cube of glass on a grid, for the compiled kernel."""
+    values = grid_distances(RoundedBox(0.7, 0.1).double(), 128)
+    return SdfGrid.from_distances(values, BOX, [1.5], 0.02, **options)
+
+
+def picture(sampler: Snell, medium: SdfGrid, side: int = 200, parts: int = 3) -> np.ndarray:
+    """The medium under the sky of the scene `torus`, several rays a pixel, sRGB."""
+    cameras, radiance_of_sky = view().resized(side, side), lat_long.load_lat_long(ASSETS_DIR / "torus" / "sky.png")
+    radiance = []
+    for pixels in torch.arange(side * side).split(8192):
+        path = medium.tinted(sampler(part_rays(cameras, pixels, parts), medium))
+        light = lat_long.sample(radiance_of_sky, path.exit_directions, width=4096)
+        if path.absorbs:
+            light = light * path.transmitted(path.far[:, None])[:, 0]
+        radiance.append(path.per_ray(light).view(-1, parts**2, 3).mean(1))
+    middle = slice(side // 5, side - side // 5)
+    return to_srgb(torch.cat(radiance)).clamp(0, 1).view(side, side, 3)[middle, middle].numpy()
 
 
 def draw_paths(voxels: VoxelGrid, file: Path) -> None:

@@ -1,5 +1,7 @@
 """How exact and how fast rays are traced: `python benchmarks/tracing.py`, about five minutes on two cores.
 
+`--branches` prints the last table alone.
+
 Prints the tables of docs/benchmarks.md as Markdown. Every error is against a closed form or an independent tracer,
 every speed is the best of several passes that alternate between the samplers, in one process.
 """
@@ -44,6 +46,7 @@ def main() -> None:
     """Print all tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--resolution", type=int, default=256, help="of the signed-distance grids")
+    parser.add_argument("--branches", action="store_true", help="only what light that splits costs")
     parser.add_argument("--euler-resolution", type=int, default=512, help="of the paper's voxel grid (authors: 512)")
     arguments = parser.parse_args()
     torch.set_grad_enabled(False)
@@ -52,6 +55,11 @@ def main() -> None:
         sphere = trimesh.creation.icosphere(6, RADIUS)
         sphere.export(ball)
         rounded_cube_mesh().export(cube)
+        if arguments.branches:
+            solids = {"sphere": (ball, N_BALL), "cube": (cube, N_CUBE)}
+            branches({name: SdfGrid(str(mesh), n, resolution=arguments.resolution, cache=False)
+                      for name, (mesh, n) in solids.items()})  # fmt: skip
+            return
         print(f"{torch.get_num_threads()} threads; ball of {len(sphere.faces)} faces\n")
         start = time.perf_counter()
         voxels = VoxelGrid(str(ball), N_BALL, arguments.euler_resolution, cache=False)
@@ -66,6 +74,7 @@ def main() -> None:
         cube_errors(mesh_cube, arguments.resolution)
         coarse = VoxelGrid(str(ball), N_BALL, arguments.resolution, cache=False)
         speed([voxels, coarse], {"sphere": mesh_ball, "cube": mesh_cube})
+        branches({"sphere": mesh_ball, "cube": mesh_cube})
     print("\nGPU: not measured, there was none.")
 
 
@@ -180,6 +189,31 @@ def speed(baselines: list[VoxelGrid], solids: dict[str, SdfGrid]) -> None:
             print(
                 f"| {scene} | {name} | {1e3 * seconds:.0f} | {rate:.2f} | {ratio:.1f}x | {limit} | {met} |", flush=True
             )
+
+
+def branches(solids: dict[str, SdfGrid]) -> None:
+    """What it costs to follow light that splits, over the same rays."""
+    print(f"\n### Light that splits, all {SIDE}x{SIDE} rays of a view\n")
+    print("| object | branches, least weight | paths a ray that meets the object | ms | against one path |")
+    print("|---|---|---|---|---|")
+    rays = view().image_rays(0)
+    chunks = [rays[first : first + CHUNK] for first in range(0, len(rays), CHUNK)]
+    ways = {"none": Snell(), "first, 0.02": Snell(branches="first")}
+    ways |= {f"all, {least}": Snell(branches="all", least_weight=least) for least in (0.05, 0.02, 0.005)}
+    for scene, solid in solids.items():
+        best = dict.fromkeys(ways, math.inf)
+        for _ in range(4):
+            for name, sampler in ways.items():
+                start = time.perf_counter()
+                for chunk in chunks:
+                    sampler(chunk, solid)
+                best[name] = min(best[name], time.perf_counter() - start)
+        for name, sampler in ways.items():
+            met = torch.cat([path.ray[path.refracted] + CHUNK * i for i, path in
+                             enumerate(sampler(chunk, solid) for chunk in chunks)])  # fmt: skip
+            ratio = best[name] / best["none"]
+            paths = len(met) / len(met.unique())
+            print(f"| {scene} | {name} | {paths:.2f} | {1e3 * best[name]:.0f} | {ratio:.2f}x |", flush=True)
 
 
 def exits(sampler: Eikonal | Snell, medium: torch.nn.Module) -> Trace:

@@ -4,6 +4,7 @@
     python benchmarks/training.py curve                       # their losses over 200 steps
     python benchmarks/training.py profile refractive          # where a step's milliseconds go
     python benchmarks/training.py paths                       # what live tracing costs of a step; see docs for one core
+    python benchmarks/training.py branches                    # what light that splits costs of a step
     python benchmarks/training.py budget 00:00:05:00          # default preset and paper's recipe, given the same time
     python benchmarks/training.py view RUN/checkpoints/last.ckpt   # rendering a 400x400 view
 
@@ -63,6 +64,7 @@ def main() -> None:
     profiled.add_argument("experiment")
     profiled.add_argument("--steps", type=int, default=20)
     parts.add_parser("paths")
+    parts.add_parser("branches")
     budget = parts.add_parser("budget")
     budget.add_argument("time")
     view = parts.add_parser("view")
@@ -77,6 +79,7 @@ def main() -> None:
         "curve": lambda: report_curve(arguments.steps, arguments.rays),
         "profile": lambda: report_profile(arguments.experiment, arguments.steps),
         "paths": report_paths,
+        "branches": report_branches,
         "budget": lambda: report_budget(arguments.time),
         "view": lambda: report_view(arguments.checkpoint),
     }
@@ -273,6 +276,30 @@ def report_paths(turns: int = 6, num_steps: int = 11) -> None:
     for name, measured in seconds.items():
         wall, processor = np.median(measured, 0)
         print(f"| {name} | {1e3 * wall:.1f} | {wall / base - 1:+.1%} | {1e3 * processor:.1f} |")
+
+
+def report_branches(turns: int = 3, num_steps: int = 9) -> None:
+    """A step of the default preset with and without light that splits, and with a tint that learns, in turns."""
+    of_path = "sampler.path.branches"
+    ways = {
+        "none (`refractive`)": Training("+experiment=refractive"),
+        "first": Training("+experiment=refractive", f"{of_path}=first"),
+        "all": Training("+experiment=refractive", f"{of_path}=all"),
+        "all, and the tint learns (`glass`)": Training("+experiment=glass"),
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    for turn in range(turns + 1):
+        for name, training in ways.items():
+            steps = training.run(num_steps).seconds[1:]
+            if turn > 0:  # the first one compiles and allocates
+                seconds[name].append(float(np.median(steps)))
+    base = np.median(seconds["none (`refractive`)"])
+    print("| default preset, branches | paths a training ray | ms a step | against one path |\n|---|---|---|---|")
+    for name, training in ways.items():
+        path = training.batches.batch(0).path
+        assert path is not None
+        median = float(np.median(seconds[name]))
+        print(f"| {name} | {len(path.ray) / path.num_rays:.2f} | {1e3 * median:.1f} | {median / base:.2f}x |")
 
 
 def label(stack: ExitStack, owner: object, method: str, name: str) -> None:

@@ -36,21 +36,24 @@ def main(config: DictConfig) -> None:
     else:
         path, num_exceeded = sampler(rays, medium), 0
     positions, lengths = (path.exit_positions, path.far) if config.far is not None else leave_box(path, medium)
-    save_arrays(
-        out,
-        {
-            "exit_positions": positions.numpy(),
-            "exit_directions": path.exit_directions.numpy(),
-            "path_lengths": lengths.numpy(),
-            "hit": path.refracted.numpy(),
-        },
+    arrays = {
+        "exit_positions": positions,
+        "exit_directions": path.exit_directions,
+        "path_lengths": lengths,
+        "hit": path.refracted,
+    }
+    if path.splits:
+        arrays |= {"ray": path.ray, "throughput": path.throughput}
+    save_arrays(out, {name: tensor.numpy() for name, tensor in arrays.items()})
+    split = f" on {len(path.ray)} paths" if path.splits else ""
+    rich.print(
+        f"{len(rays)} rays traced{split}, {int(path.first_of_ray(path.refracted).sum())} met the object; wrote {out}"
     )
-    rich.print(f"{len(rays)} rays traced, {int(path.refracted.sum())} met the object; wrote {out}")
     if num_exceeded:
-        rich.print(f"{num_exceeded} rays met the limit of {sampler.max_events} events and go straight on from there")
+        rich.print(f"{num_exceeded} paths met the limit of {sampler.max_events} events and go straight on from there")
     if config.plot:
         shown = torch.linspace(0, len(rays) - 1, min(len(rays), _PLOTTED_RAYS)).round().long()
-        draw_paths(path[shown], medium, out.with_suffix(".png"))
+        draw_paths(path.of_rays(shown), medium, out.with_suffix(".png"))
         rich.print(f"drew {len(shown)} of them in {out.with_suffix('.png')}")
 
 

@@ -44,43 +44,57 @@ class Path:
     # Innermost body of the medium in which each vertex is left, numbered from 1; 0 in air, or where the index
     # varies continuously.
     body: Int[Tensor, "P S"] = None  # type: ignore[assignment]
-    _splits: bool = field(init=False, repr=False)
-    _dims: bool = field(init=False, repr=False)
+    # Absorption of the body in which each vertex is left, for each colour channel, per world unit; 0 by default.
+    absorption: Float[Tensor, "P S 3"] = None  # type: ignore[assignment]
+    # Number of the wavelength at which the polyline is bent, where the index depends on it; 0 by default.
+    band: Int[Tensor, "P"] = None  # type: ignore[assignment]
+    # Which of these were given. Known here, so that the ordinary path is neither summed up nor weighted, bit for bit.
+    _given: frozenset[str] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        def fill(name: str, value: object) -> None:
-            object.__setattr__(self, name, value)
+        zero = self.s.new_zeros(())
+        defaults = {
+            "ray": lambda: torch.arange(len(self.s), device=self.s.device),
+            "throughput": lambda: (zero + 1).expand(len(self.s), 3),
+            "body": lambda: zero.to(torch.int8).expand(self.s.shape),
+            "absorption": lambda: zero.expand(*self.s.shape, 3),
+            "band": lambda: zero.to(torch.int8).expand(len(self.s)),
+        }
+        missing = [name for name in defaults if getattr(self, name) is None]
+        object.__setattr__(self, "_given", frozenset(defaults) - frozenset(missing))
+        for name in missing:
+            object.__setattr__(self, name, defaults[name]())
 
-        # Known here, so that the ordinary path is neither summed up nor weighted, bit for bit.
-        fill("_splits", self.ray is not None)
-        fill("_dims", self.throughput is not None)
-        if self.ray is None:
-            fill("ray", torch.arange(len(self.s), device=self.s.device))
-        if self.throughput is None:
-            fill("throughput", self.s.new_ones(()).expand(len(self.s), 3))
-        if self.body is None:
-            fill("body", torch.zeros((), dtype=torch.int8, device=self.s.device).expand(self.s.shape))
+    @property
+    def splits(self) -> bool:
+        """Whether rays may have several polylines."""
+        return "ray" in self._given
+
+    @property
+    def absorbs(self) -> bool:
+        """Whether it may cross bodies that absorb."""
+        return "absorption" in self._given
 
     @property
     def num_rays(self) -> int:
         """Number of rays; of as many polylines where none splits."""
-        return int(self.ray[-1]) + 1 if self._splits and len(self.ray) else len(self.ray)
+        return int(self.ray[-1]) + 1 if self.splits and len(self.ray) else len(self.ray)
 
     def per_ray(self, values: Float[Tensor, "P *C"]) -> Float[Tensor, "R *C"]:
         """What the polylines of each ray bring together: the sum of their values, each times its throughput."""
-        if self._dims:
+        if "throughput" in self._given:
             values = values * (self.throughput if values.ndim > 1 else self.throughput.mean(-1))
-        if not self._splits:
+        if not self.splits:
             return values
         return values.new_zeros(self.num_rays, *values.shape[1:]).index_add(0, self.ray, values)
 
     def of_ray(self, values: Shaped[Tensor, "R *C"]) -> Shaped[Tensor, "P *C"]:
         """The value of its ray for each polyline."""
-        return values[self.ray] if self._splits else values
+        return values[self.ray] if self.splits else values
 
     def first_of_ray(self, values: Shaped[Tensor, "P *C"]) -> Shaped[Tensor, "R *C"]:
         """The value of its first polyline, the main one, for each ray."""
-        if not self._splits:
+        if not self.splits:
             return values
         return values[torch.searchsorted(self.ray, torch.arange(self.num_rays, device=self.ray.device))]
 
@@ -97,13 +111,31 @@ class Path:
         throughput: Float[Tensor, "P 3"] | None = None,
     ) -> Path:
         """The same polylines through other vertices, as a refinement makes them."""
-        ray = self.ray if self._splits else None
-        if throughput is None and self._dims:
-            throughput = self.throughput
-        return Path(
-            positions, directions, s, exit_directions, self.refracted, self.radii,
-            ray, throughput, self.body,  # type: ignore[arg-type]
-        )  # fmt: skip
+        changed = {} if throughput is None else {"throughput": throughput}
+        return self.changed(positions=positions, directions=directions, s=s, exit_directions=exit_directions, **changed)
+
+    def changed(self, **tensors: Tensor) -> Path:
+        """The same polylines with some other tensors."""
+        return Path(**(self._tensors() | tensors))
+
+    def to(self, like: Tensor) -> Path:
+        """The same polylines on the device and in the precision of a tensor."""
+        tensors = self._tensors().items()
+        return Path(**{name: t.to(like) if t.is_floating_point() else t.to(like.device) for name, t in tensors})
+
+    def _tensors(self) -> dict[str, Tensor]:
+        """What the path was made of."""
+        names = (*_OF_ALL_PATHS, *sorted(self._given))
+        return {name: getattr(self, name) for name in names}
+
+    def transmitted(self, s: Float[Tensor, "P N"]) -> Float[Tensor, "P N 3"]:
+        """Share of light that comes from arc lengths `s` through what absorbs before them (Beer-Lambert), linear."""
+        of_runs = self.absorption[:, :-1] * self.s.diff(dim=1)[..., None]
+        depth = torch.cat([torch.zeros_like(of_runs[:, :1]), of_runs.cumsum(1)], 1)
+        vertex = self._vertex_before(s)
+        index = vertex[..., None].expand(-1, -1, 3)
+        since = (s - self.s.gather(1, vertex))[..., None]
+        return torch.exp(-(depth.gather(1, index) + self.absorption.gather(1, index) * since))
 
     def exits(self, directions: Float[Tensor, "P 3"] | None = None) -> Exits:
         """Where light comes from beyond all vertices: the last straight run of each polyline."""
@@ -111,7 +143,7 @@ class Path:
         last = (turns * torch.arange(1, self.s.shape[1], device=self.s.device)).amax(-1)
         start = self.positions.gather(1, last[:, None, None].expand(-1, 1, 3))[:, 0]
         directions = self.exit_directions if directions is None else directions
-        return Exits(directions, start, self.radii, self.ray if self._splits else None)
+        return Exits(directions, start, self.radii, self.ray if self.splits else None)
 
     @property
     def near(self) -> Float[Tensor, "R"]:
@@ -127,23 +159,27 @@ class Path:
 
     def __getitem__(self, index: slice | Tensor) -> Path:
         """Some of the polylines, each as that of a ray of its own."""
+        return Path(**{name: tensor[index] for name, tensor in self._tensors().items() if name != "ray"})
 
-        def of(name: str) -> Tensor:
-            chosen: Tensor = getattr(self, name)[index]
-            return chosen
-
-        return Path(
-            of("positions"), of("directions"), of("s"), of("exit_directions"), of("refracted"), of("radii"),
-            throughput=of("throughput") if self._dims else None, body=of("body"),  # type: ignore[arg-type]
-        )  # fmt: skip
+    def of_rays(self, rows: Int[Tensor, "C"]) -> Path:
+        """Some of the rays, with all their polylines."""
+        if not self.splits:
+            return self[rows]
+        counts = torch.bincount(self.ray, minlength=self.num_rays)
+        first, num = (counts.cumsum(0) - counts)[rows], counts[rows]
+        ray = torch.arange(len(rows), device=rows.device).repeat_interleave(num)
+        place = torch.arange(len(ray), device=rows.device) - (num.cumsum(0) - num)[ray]
+        return self[first[ray] + place].changed(ray=ray)
 
     def followed_by(self, other: Path) -> Path:
-        """These paths and after them those of another; of rays that do not split."""
+        """The polylines of these rays and after them those of others."""
         num_vertices = max(self.s.shape[1], other.s.shape[1])
 
         def joined(name: str) -> Tensor:
             parts: list[Tensor] = [getattr(part, name) for part in (self, other)]
-            if name in ("positions", "directions", "s", "body"):
+            if name == "ray":
+                parts[1] = parts[1] + self.num_rays
+            if name in _OF_VERTICES:
                 missing = [num_vertices - p.shape[1] for p in parts]
                 parts = [
                     torch.cat([p, p[:, -1:].expand(-1, m, *p.shape[2:])], 1)
@@ -151,10 +187,7 @@ class Path:
                 ]
             return torch.cat(parts)
 
-        return Path(
-            joined("positions"), joined("directions"), joined("s"), joined("exit_directions"), joined("refracted"),
-            joined("radii"), body=joined("body"),
-        )  # fmt: skip
+        return Path(**{name: joined(name) for name in self._tensors() | other._tensors()})
 
     def span(self, box: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
         """Arc lengths between which the path runs inside a box, from its first entry to its last exit.
@@ -179,13 +212,20 @@ class Path:
         The vertex before `s` is the last one strictly before it, as in the authors' code, so a sample that lies on a
         vertex has the direction of the segment that leads to it.
         """
-        # searchsorted needs contiguous rows of its own; both calls are free for tensors that already are.
-        vertex = torch.searchsorted(self.s.contiguous(), s.contiguous(), side="left") - 1
-        vertex = vertex.clamp(min=0)
+        vertex = self._vertex_before(s)
         index = vertex[..., None].expand(-1, -1, 3)
         directions = self.directions.gather(1, index)
         positions = self.positions.gather(1, index) + directions * (s - self.s.gather(1, vertex))[..., None]
         return positions, directions
+
+    def _vertex_before(self, s: Float[Tensor, "P N"]) -> Int[Tensor, "P N"]:
+        # searchsorted needs contiguous rows of its own; both calls are free for tensors that already are.
+        vertex = torch.searchsorted(self.s.detach().contiguous(), s.detach().contiguous(), side="left") - 1
+        return vertex.clamp(min=0)
+
+
+_OF_ALL_PATHS = ("positions", "directions", "s", "exit_directions", "refracted", "radii")
+_OF_VERTICES = frozenset({"positions", "directions", "s", "body", "absorption"})
 
 
 @dataclass(frozen=True)
@@ -246,7 +286,8 @@ class Rendering:
     rgb: Float[Tensor, "R 3"]
     weights: Float[Tensor, "P N"]  # contribution of each sample to its polyline
     transmittance: Float[Tensor, "P"]  # what is left at the end of the polyline, T_{N+1}
-    boundary_rgb: Float[Tensor, "P 3"]  # radiance of the boundary in the leaving direction, C'(d_N)
+    # Radiance of the boundary in the leaving direction, C'(d_N), as the glass tints it.
+    boundary_rgb: Float[Tensor, "P 3"]
     samples: Samples
     path: Path  # the polylines that they lie on
 

@@ -138,3 +138,22 @@ def test_existing_results_are_replaced_on_request_alone(trace: Callable[..., str
     assert (tmp_path / name).read_text() == "precious"
     assert "40 rays traced" in trace("plot=true", "overwrite=true")
     assert (tmp_path / name).read_bytes() != b"precious"
+
+
+def test_every_path_of_a_ray_that_splits_is_written(trace: Callable[..., str], tmp_path: Path) -> None:
+    heights, exact = _write_rays(tmp_path / "rays.npz")
+    assert "40 rays traced on " in trace("medium.ior=1.5", "sampler.path.branches=all", "plot=true")
+    with np.load(tmp_path / "out.npz") as out:
+        rows = out["ray"]
+        assert len(rows) == len(out["exit_directions"]) > 60
+        weights = np.bincount(rows, out["throughput"][:, 0])
+        np.testing.assert_allclose(weights, 1, atol=1e-5)
+        main = np.flatnonzero(np.diff(rows, prepend=-1))
+        inner = np.abs(heights) < 0.7
+        np.testing.assert_allclose(out["exit_directions"][main][inner], exact[inner], atol=1e-2)
+        # The last path of a ray is the reflection at its first surface.
+        mirrored = out["exit_directions"][np.append(main[1:], len(rows)) - 1]
+        normal = np.stack([-np.sqrt(0.64 - heights[inner] ** 2), heights[inner], 0 * heights[inner]], -1) / 0.8
+        expected = np.array([1.0, 0, 0]) - 2 * normal[:, :1] * normal
+        np.testing.assert_allclose(mirrored[inner], expected, atol=2e-2)
+    assert (tmp_path / "out.png").exists()

@@ -47,20 +47,24 @@ def _draw(path: Path, medium: Medium, dpi: int = 150) -> FigureCanvasAgg:
 def plot_paths(axes: Axes, path: Path, medium: Medium, colour: str = "tab:red") -> None:
     """Draw paths, projected on the plane in which they spread most, over the refractive index in that plane.
 
-    The plane goes through the centre of the medium's box. Rays outside it are drawn by their projection.
+    The plane goes through the centre of the medium's box. Rays outside it are drawn by their projection. Light that
+    splits is the fainter the less of it there is.
     """
     vertices = path.positions.detach().cpu()
     centre = medium.box.mean(0).to(vertices)
-    across, up = _plane(vertices, centre)
+    across, up = _plane(path.first_of_ray(vertices), centre)
     half = (0.5 + _MARGIN) * float((medium.box[1] - medium.box[0]).max())
     steps = torch.linspace(-half, half, _RESOLUTION).to(centre)
     points = centre + steps[None, :, None] * across + steps[:, None, None] * up
     n = torch.cat([medium(rows)[0].cpu() for rows in points.to(medium.box).split(50)])
     extent = (-half, half, -half, half)
     axes.imshow(n, cmap="Blues", vmin=1, vmax=2 * float(n.max()) - 1, extent=extent, origin="lower")
-    for positions in vertices:
+    for positions, share in zip(vertices, path.throughput.cpu(), strict=True):
         flat = positions - centre
-        axes.plot(flat @ across, flat @ up, color=colour, linewidth=0.8)
+        # Weak light is faint, but seen; where colours part, each is drawn in its own.
+        strength = float(share.max())
+        drawn = colour if float(share.min()) == strength else tuple((share / strength).tolist())
+        axes.plot(flat @ across, flat @ up, color=drawn, linewidth=0.8, alpha=0.15 + 0.85 * strength**0.5)
     axes.set_xlim(-half, half)
     axes.set_ylim(-half, half)
     axes.set_aspect("equal")

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfro.errors import NerfroError
+from nerfro.types import Path
 
 Scalars = Float[Tensor, "*batch"]
 Vectors = Float[Tensor, "*batch 3"]
@@ -55,6 +56,28 @@ class Medium(nn.Module, ABC):
     def content_box(self) -> Float[Tensor, "2 3"]:
         """Corners of the object's own bounds, world units: what lies inside it lies in here."""
         return self.box
+
+    @property
+    def absorption(self) -> Tensor | None:
+        """Of each body, for each colour channel, per world unit; None where nothing absorbs."""
+        return None
+
+    @property
+    def disperses(self) -> bool:
+        """Whether the index depends on the wavelength."""
+        return False
+
+    def tinted(self, path: Path) -> Path:
+        """The path with the absorption of the bodies that it crosses."""
+        return path
+
+    def bending_parameters(self) -> list[nn.Parameter]:
+        """What paths depend on, of all that learns."""
+        return list(self.parameters())
+
+    def learned(self) -> dict[str, float]:
+        """Physical quantities that learn, by names for the log."""
+        return {}
 
     def clearance(self, positions: Vectors) -> Scalars:
         """Distance around each point of the box within which the index surely does not vary; 0 where unknown."""

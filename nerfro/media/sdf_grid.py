@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -49,6 +49,7 @@ class SdfGrid(Solid):
             smoothed with, for noisy silhouette hulls; size 0 for none. The kernel is of fourth order: it flattens
             noise and keeps curvature.
         accept_open_mesh: take meshes with holes; the majority of three axes decides what is inside.
+        absorption, learn_absorption, abbe: tint and dispersion, see `Solid`; for snell alone.
         cache: keep the distances in the cache folder.
 
     Attributes:
@@ -76,6 +77,9 @@ class SdfGrid(Solid):
         smoothing_size: Natural = 0,
         smoothing_sigma: Positive = 1.0,
         accept_open_mesh: bool = False,
+        absorption: list[NotNegative] = [],  # noqa: B006
+        learn_absorption: bool = False,
+        abbe: list[Positive] = [],  # noqa: B006
         cache: bool = True,
     ) -> None:
         if len(inner_meshes) != len(inner_iors):
@@ -85,7 +89,8 @@ class SdfGrid(Solid):
             )
         box = corners_of_box(box_min, box_max)
         spacing = (box[1] - box[0]) / (resolution - 1)
-        super().__init__([ior, *inner_iors], shell_voxels * float(spacing.min()))
+        shell = shell_voxels * float(spacing.min())
+        super().__init__([ior, *inner_iors], shell, absorption, learn_absorption, abbe)
         self.crease_degrees = crease_degrees
         self.meshes = [load_mesh(resolve_path(path), accept_open_mesh) for path in (mesh, *inner_meshes)]
         band = _BAND + smoothing_size
@@ -102,14 +107,20 @@ class SdfGrid(Solid):
 
     @classmethod
     def from_distances(
-        cls, distances: Float[Tensor, "K X Y Z"], box: Float[Tensor, "2 3"], iors: list[float], shell: float
+        cls,
+        distances: Float[Tensor, "K X Y Z"],
+        box: Float[Tensor, "2 3"],
+        iors: list[float],
+        shell: float,
+        **glass: Any,
     ) -> SdfGrid:
         """Make the medium of given signed distances.
 
-        They are of each body at the vertices of a grid over `box`, negative inside and positive at the border.
+        They are of each body at the vertices of a grid over `box`, negative inside and positive at the border; `glass`
+        is what else `Solid` takes.
         """
         medium = cls.__new__(cls)
-        Solid.__init__(medium, iors, shell)
+        Solid.__init__(medium, iors, shell, **glass)
         medium.meshes = []
         medium._set(distances, box)
         return medium
@@ -118,6 +129,10 @@ class SdfGrid(Solid):
     def content_box(self) -> Float[Tensor, "2 3"]:
         """Bounds of the outer mesh; the grid's box where there is none."""
         return torch.from_numpy(self.meshes[0].bounds).float() if self.meshes else self.box
+
+    def at_wavelength(self, wavelength: float) -> SdfGrid:
+        self.coarse_clearance  # noqa: B018 (made before it is shared)
+        return super().at_wavelength(wavelength)
 
     @torch.no_grad()
     def traced_triangles(self) -> tuple[Triangles, MeshIntersector]:

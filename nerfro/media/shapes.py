@@ -22,11 +22,19 @@ class Ball(Solid):
 
     Args:
         radius: world units.
-        ior, shell: see `Solid`.
+        ior, shell, absorption, learn_absorption, abbe: see `Solid`.
     """
 
-    def __init__(self, radius: Positive = 0.8, ior: Positive = 1.5, shell: Positive = 0.002) -> None:
-        super().__init__([ior], shell)
+    def __init__(
+        self,
+        radius: Positive = 0.8,
+        ior: Positive = 1.5,
+        shell: Positive = 0.002,
+        absorption: list[NotNegative] = (),  # type: ignore[assignment]
+        learn_absorption: bool = False,
+        abbe: list[Positive] = (),  # type: ignore[assignment]
+    ) -> None:
+        super().__init__([ior], shell, absorption, learn_absorption, abbe)
         self.radius = radius
         side = radius * (1 + _MARGIN) + shell
         self.register_buffer("box", torch.tensor([[-side] * 3, [side] * 3]), persistent=False)
@@ -44,7 +52,7 @@ class RoundedBox(Solid):
     Args:
         half_side: from the centre to a face, world units.
         edge_radius: of the rounding, world units.
-        ior, shell: see `Solid`.
+        ior, shell, absorption, learn_absorption, abbe: see `Solid`.
     """
 
     def __init__(
@@ -53,8 +61,11 @@ class RoundedBox(Solid):
         edge_radius: NotNegative = 0.08,
         ior: Positive = 1.52,
         shell: Positive = 0.002,
+        absorption: list[NotNegative] = (),  # type: ignore[assignment]
+        learn_absorption: bool = False,
+        abbe: list[Positive] = (),  # type: ignore[assignment]
     ) -> None:
-        super().__init__([ior], shell)
+        super().__init__([ior], shell, absorption, learn_absorption, abbe)
         self.half_side, self.edge_radius = half_side, edge_radius
         side = half_side * (1 + _MARGIN) + shell
         self.register_buffer("box", torch.tensor([[-side] * 3, [side] * 3]), persistent=False)
@@ -77,13 +88,20 @@ class Slab(Solid):
     Args:
         thickness: along z, world units.
         half_width: half side of the box along x and y, world units.
-        ior, shell: see `Solid`.
+        ior, shell, absorption, learn_absorption, abbe: see `Solid`.
     """
 
     def __init__(
-        self, thickness: Positive = 0.5, ior: Positive = 1.5, half_width: Positive = 2.0, shell: Positive = 0.002
+        self,
+        thickness: Positive = 0.5,
+        ior: Positive = 1.5,
+        half_width: Positive = 2.0,
+        shell: Positive = 0.002,
+        absorption: list[NotNegative] = (),  # type: ignore[assignment]
+        learn_absorption: bool = False,
+        abbe: list[Positive] = (),  # type: ignore[assignment]
     ) -> None:
-        super().__init__([ior], shell)
+        super().__init__([ior], shell, absorption, learn_absorption, abbe)
         self.thickness = thickness
         corner = torch.tensor([half_width, half_width, thickness * (0.5 + _MARGIN) + shell])
         self.register_buffer("box", torch.stack([-corner, corner]), persistent=False)

@@ -3,15 +3,27 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.functional import softplus
 
-from nerfro.allowed import Positive, checked
+from nerfro.allowed import NotNegative, Positive, checked
+from nerfro.errors import NerfroError
 from nerfro.kernels.tolerances import MIN_COSINE, SAFE_SHARE, STEPS_PER_SHELL
 from nerfro.media.base import Medium, Scalars, Vectors
+from nerfro.types import Path
 from nerfro.variants import variant
+
+# Absorption per world unit from which learning starts: what is inside must not be explained by it at first.
+_ALMOST_CLEAR = 0.02
+# Wavelengths of the lines d, F and C, nm.
+_FRAUNHOFER = (587.56, 486.13, 656.27)
+
+
+Self = TypeVar("Self", bound="Solid")  # typing has it from Python 3.11 on
 
 
 @checked("medium")
@@ -22,14 +34,41 @@ class Solid(Medium):
     a cubic step of the signed distance phi: S = t^2 (3 - 2 t), t = (1 - phi / w) / 2. Body after body,
     n <- n + (ior - n) S.
 
-    Attributes:
+    Args:
+        iors: refractive index of each body.
         shell: half width w, world units.
+        absorption: of red, green and blue per world unit, of each body after the others; one number for all of them,
+            none for clear bodies.
+        learn_absorption: whether it is learned, from there or from almost nothing.
+        abbe: Abbe number of each body, or one for all, where the index depends on the wavelength; the indices are then
+            those of the d line, 587.6 nm.
     """
 
     iors: Float[Tensor, "K"]  # refractive index of each body; a parameter where it is learned
+    _absorption: Float[Tensor, "K 3"] | None  # or, where it is learned, what softplus makes it of
 
-    def __init__(self, iors: list[Positive], shell: Positive) -> None:
+    def __init__(
+        self,
+        iors: list[Positive],
+        shell: Positive,
+        absorption: list[NotNegative] = (),  # type: ignore[assignment]
+        learn_absorption: bool = False,
+        abbe: list[Positive] = (),  # type: ignore[assignment]
+    ) -> None:
         super().__init__()
+        if len(abbe) not in (0, 1, len(iors)):
+            raise NerfroError(f"medium.abbe={list(abbe)} has {len(abbe)} numbers; give one for each body, or for all")
+        self.abbe = list(abbe)
+        if len(absorption) not in (0, 1, 3 * len(iors)):
+            raise NerfroError(
+                f"medium.absorption={list(absorption)} has {len(absorption)} numbers; give red, green and blue of each "
+                f"body ({3 * len(iors)} numbers), or one for all"
+            )
+        given = torch.tensor(list(absorption) or [0.0], dtype=torch.float32).expand(3 * len(iors)).view(-1, 3)
+        if learn_absorption:
+            self._absorption = nn.Parameter(given.clamp(min=_ALMOST_CLEAR).expm1().log())
+        else:
+            self.register_buffer("_absorption", given if given.any() else None, persistent=False)
         # Double precision: kernels ask for it, and a number without dimensions takes on the precision of what it meets.
         self.register_buffer("iors", torch.tensor(iors, dtype=torch.float64), persistent=False)
         self.shell = float(shell)
@@ -40,6 +79,43 @@ class Solid(Medium):
 
     def with_indices(self, indices: Float[Tensor, "K"]) -> Solid:
         return variant(self, iors=indices.to(self.iors))
+
+    @property
+    def absorption(self) -> Float[Tensor, "K 3"] | None:
+        """Of each body, for each colour channel, per world unit; None where all are clear."""
+        return softplus(self._absorption) if isinstance(self._absorption, nn.Parameter) else self._absorption
+
+    @property
+    def disperses(self) -> bool:
+        return bool(self.abbe)
+
+    def at_wavelength(self: Self, wavelength: float) -> Self:
+        """The same bodies with their indices at a wavelength, nm; gradients reach the indices that they are made of.
+
+        Cauchy's two terms: n(w) = n_d + B (1 / w^2 - 1 / w_d^2), with B from Abbe's V = (n_d - 1) / (n_F - n_C).
+        """
+        line_d, line_f, line_c = (line**-2 for line in _FRAUNHOFER)
+        per_unit = (wavelength**-2 - line_d) / (line_f - line_c) / self.iors.new_tensor(self.abbe)
+        return variant(self, iors=self.iors + (self.iors - 1) * per_unit)
+
+    def tinted(self, path: Path) -> Path:
+        of_bodies = self.absorption
+        if of_bodies is None:
+            return path
+        of_all = torch.cat([torch.zeros_like(of_bodies[:1]), of_bodies]).to(path.s)
+        return path.changed(absorption=of_all[path.body.long()])
+
+    def bending_parameters(self) -> list[nn.Parameter]:
+        return [parameter for parameter in self.parameters() if parameter is not self._absorption]
+
+    def learned(self) -> dict[str, float]:
+        if not isinstance(self._absorption, nn.Parameter):
+            return {}
+        values = softplus(self._absorption.detach())
+        names = [
+            f"absorption_{body + 1}_{colour}" for body in range(len(values)) for colour in ("red", "green", "blue")
+        ]
+        return dict(zip(names, values.flatten().tolist(), strict=True))
 
     @abstractmethod
     def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:

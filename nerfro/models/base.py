@@ -74,15 +74,16 @@ class NerfModel(LightningModule, ABC):
         return self.render_path(self.trace(rays))
 
     def trace(self, rays: Rays, path: Path | None = None) -> Path:
-        """Paths of rays, or the ones given; with gradients by what bends them where that learns."""
+        """Paths of rays, or the given ones, tinted by the medium; with gradients by what bends and learns."""
         path = self.path_sampler(rays, self.medium) if path is None else path
-        return self.path_sampler.refine(path, rays, self.medium) if self.paths_learn else path
+        path = self.path_sampler.refine(path, rays, self.medium) if self.paths_learn else path
+        return self.medium.tinted(path)
 
     @property
     def paths_learn(self) -> bool:
         """Whether paths change while training: then none may be traced before the step that needs it."""
-        bending = (self.camera, self.medium, self.path_sampler)
-        return torch.is_grad_enabled() and any(p.requires_grad for part in bending for p in part.parameters())
+        bending = [*self.camera.parameters(), *self.medium.bending_parameters(), *self.path_sampler.parameters()]
+        return torch.is_grad_enabled() and any(parameter.requires_grad for parameter in bending)
 
     def parameter_groups(self) -> dict[str, tuple[list[nn.Parameter], float]]:
         """All that learns: parameters and initial learning rate by name. A model that adds parameters adds a group."""
@@ -125,6 +126,8 @@ class NerfModel(LightningModule, ABC):
         shown = self.encode(batch.of_pixels(renderings[-1].rgb.detach())).clamp(0, 1)
         self.log("train/psnr", psnr(shown, batch.of_pixels(batch.rgb)), prog_bar=True)
         self.log("loss/total", total)
+        for name, value in self.medium.learned().items():
+            self.log(f"medium/{name}", value)
         return total
 
     def on_train_batch_start(self, batch: Batch, batch_index: int) -> None:

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerfro.kernels.arrays import arrays
+from nerfro.samplers.branching import Branching
 from nerfro.types import Path, Rays
 
 if TYPE_CHECKING:
@@ -21,19 +22,56 @@ if TYPE_CHECKING:
 # Vertices that a first attempt has room for; the few rays that need more are traced again. Those of many reflections
 # are slow, so there is room for all that is usual.
 _CAPACITY = 18
+# Polylines of a ray that a first attempt has room for.
+_ROOM = 8
 
 
 def snell_on_grid(
-    rays: Rays, medium: SdfGrid, min_step: float, max_events: int
-) -> tuple[Path, Int[Tensor, "R"], Bool[Tensor, "R"]]:
+    rays: Rays, medium: SdfGrid, min_step: float, max_events: int, branching: Branching
+) -> tuple[Path, Int[Tensor, "P"], Bool[Tensor, "P"]]:
     """`samplers.snell.trace_interfaces` by the compiled kernel."""
     from nerfro.samplers.snell_cpu import trace_snell
 
     solids = _for_kernels(medium)
-    settings = (solids, min_step * float((solids.high - solids.low).min()), max_events)
-    (*vertices, body), (events, exceeded) = _with_enough_vertices(rays, trace_snell, settings, 4)
+    shortest = float((solids.high - solids.low).min())
+    settings = (solids, min_step * shortest, max_events, branching.num_events, branching.least_weight)
+    of_rays, room = _ray_arrays(rays), _ROOM if branching.num_events else 1
+    *columns, counts = trace_snell(*of_rays, *settings, _CAPACITY, room)
+    kept, needed = (counts <= (room, _CAPACITY)).all(1), counts.max(0, initial=1)
+    width = max(int(needed[1]), 2)
+    parts = [_rows(columns, np.where(kept, counts[:, 0], 0), width)]
+    if not kept.all():
+        rest = (~kept).nonzero()[0]
+        *columns, counts = trace_snell(*(array[rest] for array in of_rays), *settings, width, int(needed[0]))
+        ray, columns = _rows(columns, counts[:, 0], width)
+        parts.append((rest[ray], columns))
+    ray = np.concatenate([ray for ray, _ in parts])
+    order = slice(None) if len(parts) == 1 else np.argsort(ray, kind="stable")
+    together = zip(*(columns for _, columns in parts), strict=True)
+    columns = [each[0] if len(each) == 1 else np.concatenate(each)[order] for each in together]
+    *vertices, body, weight, events, exceeded = columns
     num_events = torch.from_numpy(events)
-    return _path(rays, vertices, num_events > 0, body), num_events, torch.from_numpy(exceeded)
+    split = (torch.from_numpy(ray[order]), torch.from_numpy(weight)) if branching.num_events else (None, None)
+    return _path(rays, vertices, num_events > 0, body, *split), num_events, torch.from_numpy(exceeded)
+
+
+def _rows(
+    columns: Sequence[np.ndarray], counts: Int[np.ndarray, "R"], width: int
+) -> tuple[Int[np.ndarray, "P"], list[np.ndarray]]:
+    """The ray of each polyline that is there, and the arrays of these polylines, with `width` vertices.
+
+    Args:
+        columns: arrays [R, B, ...], or with an axis of vertices [R, B, V, ...] which comes before positions' and
+            directions' three.
+        counts: polylines of each ray, B at most.
+        width: number of vertices.
+    """
+    room = columns[0].shape[1]
+    valid = np.arange(room) < counts[:, None]
+    chosen = [column[:, 0] if room == 1 and valid.all() else column[valid] for column in columns]
+    last = np.minimum(np.arange(width), columns[0].shape[2] - 1)  # shorter rows repeat their last vertex
+    chosen = [column if column.ndim == 1 else column[:, last] for column in chosen]
+    return valid.nonzero()[0], chosen
 
 
 def eikonal_on_grid(
@@ -117,7 +155,19 @@ def _for_kernels(medium: VoxelGrid | SdfGrid) -> MediumGrid:
     return MediumGrid(values, clearance, None, 0.0, low, high, inverse_spacing, inverse_spacing)
 
 
-def _path(rays: Rays, vertices: Sequence[np.ndarray], refracted: Tensor, body: np.ndarray | None = None) -> Path:
+def _path(
+    rays: Rays,
+    vertices: Sequence[np.ndarray],
+    refracted: Tensor,
+    body: np.ndarray | None = None,
+    ray: Tensor | None = None,
+    weight: Tensor | None = None,
+) -> Path:
     arrays = [*vertices] if body is None else [*vertices, body]
     positions, directions, s, *bodies = (torch.from_numpy(np.ascontiguousarray(array)) for array in arrays)
-    return Path(positions, directions, s, directions[:, -1], refracted, rays.radii, body=bodies[0] if bodies else None)  # type: ignore[arg-type]
+    radii = rays.radii if ray is None else rays.radii[ray]
+    throughput = None if weight is None else weight[:, None].expand(-1, 3)
+    return Path(
+        positions, directions, s, directions[:, -1], refracted, radii,
+        ray, throughput, bodies[0] if bodies else None,  # type: ignore[arg-type]
+    )  # fmt: skip

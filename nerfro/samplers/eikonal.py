@@ -9,6 +9,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from nerfro.allowed import Count, Positive, Range
+from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.kernels.tolerances import MIN_TURN, REACHED, STEPS_PER_SHELL
 from nerfro.media.base import Medium
@@ -53,6 +54,8 @@ class Eikonal(PathSampler):
     @torch.no_grad()
     def forward(self, rays: Rays, medium: Medium) -> Path:
         """Trace every ray from near to far; adaptive paths do not end before they have left the medium's box."""
+        if medium.absorption is not None or medium.disperses:
+            raise NerfroError("medium.absorption and medium.abbe need sharp surfaces; take sampler/path=snell")
         on_cpu = rays.origins.device.type == "cpu"
         if self.integrator != "adaptive":
             if on_cpu and isinstance(medium, VoxelGrid):

@@ -8,20 +8,23 @@ from torch import Tensor
 
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.sdf_grid import SdfGrid
+from nerfro.samplers.branching import Branching, Event
 from nerfro.samplers.polylines import Polylines
-from nerfro.samplers.snell_law import refract
+from nerfro.samplers.snell_law import reflectance, refract
 from nerfro.types import Path, Rays
 
 # A new ray starts this share of the box's diagonal ahead, beyond the rounding of Embree's single precision.
 _OFFSET = 1e-6
 
 
-def snell_on_mesh(rays: Rays, medium: SdfGrid, max_events: int) -> tuple[Path, Int[Tensor, "R"], Bool[Tensor, "R"]]:
+def snell_on_mesh(
+    rays: Rays, medium: SdfGrid, max_events: int, branching: Branching
+) -> tuple[Path, Int[Tensor, "P"], Bool[Tensor, "P"]]:
     """Follow rays from triangle to triangle.
 
     Whether a ray is in a body is known from how often it crossed its surface, not from the triangles' orientation.
     Rays are traced on the CPU, in double precision; the signed distance says which begin inside. Returned are paths,
-    the number of events on each, and whether a ray met the limit.
+    the number of events on each polyline, and whether it met the limit.
     """
     triangles, scene = medium.traced_triangles()
     iors = torch.cat([torch.ones(1), medium.iors.detach().cpu()]).double()
@@ -40,6 +43,7 @@ def snell_on_mesh(rays: Rays, medium: SdfGrid, max_events: int) -> tuple[Path, I
     lines.append(rows, x, d, s, medium.innermost(inside))
     num_events, exceeded = torch.zeros_like(rows), torch.zeros(len(rays), dtype=torch.bool)
     last_face = torch.full_like(rows, -1)
+    weight, ray = torch.ones_like(s), rows
     offset = _OFFSET * float(torch.linalg.vector_norm(box[1] - box[0]))
     start = torch.zeros_like(s)
     while len(active):
@@ -59,24 +63,34 @@ def snell_on_mesh(rays: Rays, medium: SdfGrid, max_events: int) -> tuple[Path, I
         over = visible & (num_events[active] >= max_events)
         exceeded[active] = over
         hit = x[active] + length[:, None] * d[active]
-        turned, reflected = refract(d[active], triangles.normal(hit, face), n_before, n_after)
+        normal = triangles.normal(hit, face)
+        turned, reflected = refract(d[active], normal, n_before, n_after)
         reflected &= visible
         keep = ~over
-        active, face, hit, length = active[keep], face[keep], hit[keep], length[keep]
-        visible, reflected = visible[keep], reflected[keep]
-        inside[active] = torch.where(reflected[:, None], inside[active], flipped[keep])
+        active, face, hit, length, visible = active[keep], face[keep], hit[keep], length[keep], visible[keep]
+        turned, reflected, flipped = turned[keep], reflected[keep], flipped[keep]
+        if branching.num_events:
+            normal, n_before, n_after = normal[keep], n_before[keep], n_after[keep]
+            share = torch.where(visible, reflectance(d[active], normal, n_before, n_after), 0.0)
+            event = Event(branching, active, weight, num_events, share, reflected)
+            retry = event.row[retry]
+            state = (x, d, s, inside, num_events, exceeded, weight, ray, start, last_face)
+            x, d, s, inside, num_events, exceeded, weight, ray, start, last_face = (v[event.source] for v in state)
+            lines.take(event.source)
+            met = (face, hit, length, visible, flipped, normal, n_before, n_after)
+            face, hit, length, visible, flipped, normal, n_before, n_after = (v[event.place] for v in met)
+            active, reflected = event.active, event.reflected
+            weight[active] *= event.factor
+            turned, _ = refract(d[active], normal, n_before, n_after, reflected)
+        inside[active] = torch.where(reflected[:, None], inside[active], flipped)
         x[active], s[active], last_face[active] = hit, s[active] + length, face
         start[active] = offset
-        d[active] = torch.where(visible[:, None], turned[keep], d[active])
+        d[active] = torch.where(visible[:, None], turned, d[active])
         num_events[active] += visible
         bent = active[visible]
         lines.append(bent, x[bent], d[bent], s[bent], medium.innermost(inside[bent]))
         active = torch.cat([active, retry])
-    lines.append_ends(far, box, num_events > 0, x, d, s)
-    path = lines.path(rays, num_events > 0)
-    like = rays.origins
-    path = Path(
-        path.positions.to(like), path.directions.to(like), path.s.to(like), path.exit_directions.to(like),
-        path.refracted.to(device), rays.radii, body=path.body.to(device),
-    )  # fmt: skip
+    lines.append_ends(far[ray], box, num_events > 0, x, d, s)
+    split = (ray, weight) if branching.num_events else (None, None)
+    path = lines.path(rays, num_events > 0, *split).to(rays.origins)
     return path, num_events.to(device), exceeded.to(device)

@@ -49,6 +49,10 @@ class Polylines:
         self._bodies[rows, self.counts[rows]] = bodies.to(torch.int8) if isinstance(bodies, Tensor) else bodies
         self.counts[rows] += 1
 
+    def take(self, rows: Int[Tensor, "T"]) -> None:
+        """Go on with these rows in the place of all, some more than once."""
+        self._vertices, self._bodies, self.counts = self._vertices[rows], self._bodies[rows], self.counts[rows]
+
     def append_ends(
         self,
         far: Float[Tensor, "R"],
@@ -63,13 +67,25 @@ class Polylines:
         rows = torch.arange(len(s), device=s.device)
         self.append(rows, positions + ahead[:, None] * directions, directions, s + ahead)
 
-    def path(self, rays: Rays, refracted: Bool[Tensor, "R"]) -> Path:
-        """The finished paths; shorter rows repeat their last vertex."""
+    def path(
+        self,
+        rays: Rays,
+        refracted: Bool[Tensor, "R"],
+        ray: Int[Tensor, "R"] | None = None,
+        weight: Float[Tensor, "R"] | None = None,
+    ) -> Path:
+        """The finished paths; shorter rows repeat their last vertex.
+
+        Where rays split, `ray` and `weight` are the ray of each row and its share.
+        """
         capacity = int(self.counts.max()) if len(self.counts) else 2
         index = torch.arange(capacity, device=self.counts.device).minimum(self.counts[:, None] - 1)
         vertices = self._vertices.gather(1, index[..., None].expand(-1, -1, 7))
         directions = vertices[..., 3:6]
         bodies = self._bodies.gather(1, index)
+        radii = rays.radii if ray is None else rays.radii[ray]
+        throughput = None if weight is None else weight.to(directions)[:, None].expand(-1, 3)
         return Path(
-            vertices[..., :3], directions, vertices[..., 6], directions[:, -1], refracted, rays.radii, body=bodies
-        )
+            vertices[..., :3], directions, vertices[..., 6], directions[:, -1], refracted, radii,
+            ray, throughput, bodies,  # type: ignore[arg-type]
+        )  # fmt: skip

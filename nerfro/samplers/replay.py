@@ -20,8 +20,9 @@ from torch.nn import functional
 from nerfro.geometry.intersection import MeshIntersector, Triangles
 from nerfro.media.base import Medium
 from nerfro.media.solid import Solid
+from nerfro.samplers.branching import ONE_PATH, Branching
 from nerfro.samplers.polylines import distance_to_end
-from nerfro.samplers.snell_law import refract
+from nerfro.samplers.snell_law import reflectance, refract
 from nerfro.types import Path, Rays
 
 # Cosine between ray and normal below which a surface's distance is no longer divided by it: gradients stay finite.
@@ -98,8 +99,8 @@ def start_of(path: Path, rays: Rays) -> tuple[Float[Tensor, "P 3"], Float[Tensor
     return origins + s[:, None] * d, d, s
 
 
-def replay(path: Path, rays: Rays, medium: Medium, meet: Meet) -> Path:
-    """Paths of refractions and reflections with gradients by rays, indices and surfaces.
+def replay(path: Path, rays: Rays, medium: Medium, meet: Meet, branching: Branching = ONE_PATH) -> Path:
+    """Paths of refractions and reflections, and their throughput, with gradients by rays, indices and surfaces.
 
     Event by event the ray goes on to the surface, and there Snell's law holds, or reflection where the trace reflected.
     Derivatives are taken at the traced vertices, and every value stays that of the trace.
@@ -109,6 +110,7 @@ def replay(path: Path, rays: Rays, medium: Medium, meet: Meet) -> Path:
     rows, column = torch.arange(num_paths, device=s.device), torch.zeros_like(path.ray)
     vertices: list[Vertices] = [(rows, column, x, d, s)]
     happens, indices = events(path), indices_of(medium, path.s)
+    weight = torch.ones_like(s)
     for i in range(1, num_vertices - 1):
         rows = happens[:, i].nonzero().squeeze(1)
         if not len(rows):
@@ -121,10 +123,30 @@ def replay(path: Path, rays: Rays, medium: Medium, meet: Meet) -> Path:
         length = path.s[rows, i] - path.s[rows, i - 1]
         length, normal = meet(old_x, old_d, length, torch.where(reflected, 0, torch.maximum(before, after)), normal)
         turned, _ = refract(old_d, normal, indices[before], indices[after], reflected)
+        if i <= branching.num_events and isinstance(medium, Solid):
+            with torch.no_grad():
+                across = torch.where(reflected, _beyond(medium, old_x, old_d, length), after)
+            share = reflectance(old_d, normal, indices[before], indices[across])
+            splits, _ = branching.decide(weight[rows].detach(), share.detach(), torch.full_like(rows, i - 1))
+            factor = torch.where(splits, torch.where(reflected, share, 1 - share), 1.0)
+            weight = weight.index_copy(0, rows, weight[rows] * factor)
         vertex = old_x + length[:, None] * old_d, turned, old_s + length
         vertices.append((rows, torch.full_like(rows, i), *vertex))
         x, d, s = (old.index_copy(0, rows, new) for old, new in zip((x, d, s), vertex, strict=True))
-    return assembled(path, rays, medium, vertices, (x, d, s))
+    replayed = assembled(path, rays, medium, vertices, (x, d, s))
+    if not branching.num_events:
+        return replayed
+    relative = (weight / weight.detach())[:, None]
+    return replayed.changed(throughput=with_gradient(path.throughput, path.throughput * relative))
+
+
+def _beyond(
+    medium: Solid, x: Float[Tensor, "R 3"], d: Float[Tensor, "R 3"], length: Float[Tensor, "R"]
+) -> Int[Tensor, "R"]:
+    """Body beyond the surface that rays from x meet after a length, though they may be reflected there."""
+    inside = medium.signed_distances(x + 0.5 * length[:, None] * d)[0] < 0
+    body = medium.signed_distances(x + length[:, None] * d)[0].abs().argmin(-1, keepdim=True)
+    return medium.innermost(inside.scatter(1, body, ~inside.gather(1, body)))
 
 
 def assembled(

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from nerfro.allowed import Count
+from nerfro.allowed import Count, Positive, Share
 from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.kernels.tolerances import MIN_SEARCH_STEP
@@ -18,40 +17,51 @@ from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
 from nerfro.registry import register
+from nerfro.samplers.bands import SnellTrace, refined_in_bands, traced_in_bands
 from nerfro.samplers.base import PathSampler
+from nerfro.samplers.branching import ONE_PATH, Branching, Event
 from nerfro.samplers.compiled import snell_on_grid
 from nerfro.samplers.mesh_interfaces import snell_on_mesh
 from nerfro.samplers.polylines import Polylines
 from nerfro.samplers.replay import meet_solid, meet_triangles, replay
-from nerfro.samplers.snell_law import refract
+from nerfro.samplers.snell_law import reflectance, refract
 from nerfro.samplers.straight import straight_path
 from nerfro.types import Path, Rays
 
 _ROOT_ITERATIONS = 60
 
 
-@dataclass(frozen=True)
-class SnellTrace:
-    """Paths and what happened on them."""
-
-    path: Path  # minimal polylines, a vertex for each event beside near and far
-    num_events: Int[Tensor, "R"]  # refractions and total reflections of each ray
-    exceeded: Bool[Tensor, "R"]  # whether a ray met the limit of events; such a ray goes straight on from there
-
-
 @register("sampler/path", "snell")
 class Snell(PathSampler):
-    """Exact refraction (Snell's law) and total reflection at the surface of a solid.
+    """Exact refraction (Snell's law) and reflection (total, or Fresnel's share) at the surface of a solid.
 
     Args:
+        branches: none transmits all light that is not totally reflected, as the paper does; first adds the reflection
+            at a ray's first surface; all adds every reflection.
+        least_weight: share of a ray's light below which a branch is not followed; what remains takes its weight.
+        wavelengths: at which rays are bent where the medium disperses, nm: as many for each of red, green and blue, one
+            colour's after another's.
         interface: sdf is the zero level of the signed distance (smooth normals, tolerates noisy hulls);
             mesh is the triangles themselves (sharp edges, vertex normals where the mesh is smooth).
         max_events: refractions and reflections of a ray, at most.
     """
 
-    def __init__(self, interface: Literal["sdf", "mesh"] = "sdf", max_events: Count = 16) -> None:
+    def __init__(
+        self,
+        interface: Literal["sdf", "mesh"] = "sdf",
+        max_events: Count = 16,
+        branches: Literal["none", "first", "all"] = "none",
+        least_weight: Share = 0.02,
+        wavelengths: list[Positive] = (610.0, 550.0, 465.0),  # type: ignore[assignment]
+    ) -> None:
         super().__init__()
+        if len(wavelengths) == 0 or len(wavelengths) % 3:
+            raise NerfroError(
+                f"sampler.path.wavelengths={list(wavelengths)} is not allowed; give as many for red, green, blue"
+            )
+        self.wavelengths = list(wavelengths)
         self.interface, self.max_events = interface, max_events
+        self.branching = Branching({"none": 0, "first": 1, "all": max_events}[branches], least_weight)
 
     @torch.no_grad()
     def forward(self, rays: Rays, medium: Medium) -> Path:
@@ -63,13 +73,24 @@ class Snell(PathSampler):
 
         They are unbounded at grazing and critical angles: leave out paths whose `smallest_cosine` is below 0.15.
         """
+        if isinstance(medium, Solid) and medium.disperses:
+            return refined_in_bands(path, rays, self._seen(medium), self._refine)
+        return self._refine(path, rays, medium)
+
+    def _refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
         if self.interface == "mesh" and isinstance(medium, SdfGrid):
             meet = meet_triangles(medium.triangles(), medium.traced_triangles()[1])
         elif isinstance(medium, Solid):
             meet = meet_solid(medium)
         else:
             return straight_path(rays[path.ray])
-        return replay(path, rays, medium, meet)
+        return replay(path, rays, medium, meet, self.branching)
+
+    def _seen(self, medium: Solid) -> list[Solid]:
+        """The medium at each wavelength."""
+        if self.interface == "mesh" and isinstance(medium, SdfGrid):
+            medium.traced_triangles()  # made before they are shared
+        return [medium.at_wavelength(wavelength) for wavelength in self.wavelengths]
 
     def releases_python(self, medium: Medium) -> bool:
         return self.interface == "sdf" and isinstance(medium, SdfGrid)
@@ -82,16 +103,23 @@ class Snell(PathSampler):
             return SnellTrace(straight_path(rays), none, none.bool())
         if not isinstance(medium, Solid):
             raise NerfroError("sampler/path=snell needs a medium with a surface; take medium=sdf_grid, or path=eikonal")
+        if medium.disperses:
+            return traced_in_bands(rays, self._seen(medium), self._trace)
+        return self._trace(rays, medium)
+
+    def _trace(self, rays: Rays, medium: Solid) -> SnellTrace:
         if self.interface == "mesh":
             if not isinstance(medium, SdfGrid) or not medium.meshes:
                 raise NerfroError("sampler.path.interface=mesh needs a medium made of a mesh; take medium=sdf_grid")
-            return SnellTrace(*snell_on_mesh(rays, medium, self.max_events))
+            return SnellTrace(*snell_on_mesh(rays, medium, self.max_events, self.branching))
         if isinstance(medium, SdfGrid) and rays.origins.device.type == "cpu":
-            return SnellTrace(*snell_on_grid(rays, medium, MIN_SEARCH_STEP, self.max_events))
-        return SnellTrace(*trace_interfaces(rays, medium, self.max_events))
+            return SnellTrace(*snell_on_grid(rays, medium, MIN_SEARCH_STEP, self.max_events, self.branching))
+        return SnellTrace(*trace_interfaces(rays, medium, self.max_events, self.branching))
 
 
-def trace_interfaces(rays: Rays, medium: Solid, max_events: int) -> tuple[Path, Int[Tensor, "R"], Bool[Tensor, "R"]]:
+def trace_interfaces(
+    rays: Rays, medium: Solid, max_events: int, branching: Branching = ONE_PATH
+) -> tuple[Path, Int[Tensor, "P"], Bool[Tensor, "P"]]:
     """Follow rays from surface to surface of any solid: the plain reference of the compiled kernel.
 
     Surfaces are found by sphere tracing: the signed distance is a step that cannot jump over them. A change of sign
@@ -107,6 +135,7 @@ def trace_interfaces(rays: Rays, medium: Solid, max_events: int) -> tuple[Path, 
     lines.append(rows, x, d, s, medium.innermost(in_box & (medium.signed_distances(x)[0] < 0)))
     num_events = torch.zeros_like(rows)
     exceeded = torch.zeros_like(rows, dtype=torch.bool)
+    weight, ray = torch.ones_like(s), rows
     active = rows[(enter < leave) & (leave > 0) & (enter < rays.far - s)]
     jump = enter[active].clamp(min=0)
     x[active] += jump[:, None] * d[active]
@@ -132,11 +161,22 @@ def trace_interfaces(rays: Rays, medium: Solid, max_events: int) -> tuple[Path, 
         normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
         turned, reflected = refract(d[active], normal, n_before, n_after)
         reflected &= visible
-        length = torch.where(reflected, before, after)
         keep = ~over
-        active, length, turned = active[keep], length[keep], turned[keep]
-        visible, reflected = visible[keep], reflected[keep]
-        inside[active] = torch.where(reflected[:, None], inside[active], flipped[keep])
+        met = (active, before, after, flipped, normal, n_before, n_after, visible, turned, reflected)
+        active, before, after, flipped, normal, n_before, n_after, visible, turned, reflected = (v[keep] for v in met)
+        if branching.num_events:
+            share = torch.where(visible, reflectance(d[active], normal, n_before, n_after), 0.0)
+            event = Event(branching, active, weight, num_events, share, reflected)
+            state = (x, d, s, inside, num_events, exceeded, weight, ray)
+            x, d, s, inside, num_events, exceeded, weight, ray = (values[event.source] for values in state)
+            lines.take(event.source)
+            met = (before, after, flipped, normal, n_before, n_after, visible)
+            before, after, flipped, normal, n_before, n_after, visible = (v[event.place] for v in met)
+            active, reflected = event.active, event.reflected
+            weight[active] *= event.factor
+            turned, _ = refract(d[active], normal, n_before, n_after, reflected)
+        length = torch.where(reflected, before, after)
+        inside[active] = torch.where(reflected[:, None], inside[active], flipped)
         x[active] += length[:, None] * d[active]
         s[active] += length
         d[active] = torch.where(visible[:, None], turned, d[active])
@@ -144,8 +184,9 @@ def trace_interfaces(rays: Rays, medium: Solid, max_events: int) -> tuple[Path, 
         bent = active[visible]
         lines.append(bent, x[bent], d[bent], s[bent], medium.innermost(inside[bent]))
     refracted = num_events > 0
-    lines.append_ends(rays.far, medium.box, refracted, x, d, s)
-    return lines.path(rays, refracted), num_events, exceeded
+    lines.append_ends(rays.far[ray], medium.box, refracted, x, d, s)
+    split = (ray, weight) if branching.num_events else (None, None)
+    return lines.path(rays, refracted, *split), num_events, exceeded
 
 
 def _search(

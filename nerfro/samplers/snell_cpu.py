@@ -134,22 +134,50 @@ def _turned(dx, dy, dz, nx, ny, nz, ratio):
 
 
 @compiled
-def _trace_ray(solids, origin, direction, near, far, min_step, max_events, row, bodies):
-    """One ray's vertices into its row: their number, the number of events, and whether there were too many."""
-    positions, directions, lengths = row
+def _mirrored(dx, dy, dz, nx, ny, nz, ratio):
+    """Direction after reflection at a surface with a gradient of any length, and Fresnel's share of it."""
+    norm = math.sqrt(nx * nx + ny * ny + nz * nz)
+    nx, ny, nz = nx / norm, ny / norm, nz / norm
+    cosine = -(nx * dx + ny * dy + nz * dz)
+    mx, my, mz = dx + 2.0 * cosine * nx, dy + 2.0 * cosine * ny, dz + 2.0 * cosine * nz
+    norm = math.sqrt(mx * mx + my * my + mz * mz)
+    cosine = abs(cosine)
+    beyond = math.sqrt(max(1.0 - ratio * ratio * (1.0 - cosine * cosine), 0.0))
+    across = (ratio * cosine - beyond) / (ratio * cosine + beyond)
+    within = (cosine - ratio * beyond) / (cosine + ratio * beyond)
+    return mx / norm, my / norm, mz / norm, 0.5 * (across * across + within * within)
+
+
+@compiled
+def _trace_ray(solids, origin, direction, near, far, min_step, max_events, num_splits, least_weight, rows):
+    """One ray's polylines into its rows: their number, and the largest number of vertices."""
+    positions, directions, lengths, bodies, weights, events, exceeded = rows
+    room = lengths.shape[0]
     dx, dy, dz = float(direction[0]), float(direction[1]), float(direction[2])
     s, end = float(near), float(far)
     x, y, z = origin[0] + s * dx, origin[1] + s * dy, origin[2] + s * dz
-    count, events, exceeded = put_vertex(positions, directions, lengths, 0, x, y, z, dx, dy, dz, s), 0, False
+    count = put_vertex(positions[0], directions[0], lengths[0], 0, x, y, z, dx, dy, dz, s)
     enter, leave = box_span(solids.low, solids.high, x, y, z, dx, dy, dz)
-    if enter < leave and leave > 0.0 and enter < end - s:
-        jump = max(enter, 0.0)
-        x, y, z, s = x + jump * dx, y + jump * dy, z + jump * dz, s + jump
-        inside = np.empty(solids.values.shape[0], np.bool_)
-        for body in range(len(inside)):
-            value = spline_value(solids.values[body], solids.low, solids.inverse_spacing, x, y, z)
-            inside[body] = value < 0.0
-        bodies[0] = _innermost(inside)
+    if not (enter < leave and leave > 0.0 and enter < end - s):
+        weights[0], events[0], exceeded[0] = 1.0, 0, False
+        return 1, put_end(
+            positions[0], directions[0], lengths[0], count, solids.low, solids.high, False, x, y, z, dx, dy, dz, s, end
+        )
+    jump = max(enter, 0.0)
+    x, y, z, s = x + jump * dx, y + jump * dy, z + jump * dz, s + jump
+    inside = np.empty(solids.values.shape[0], np.bool_)
+    for body in range(len(inside)):
+        value = spline_value(solids.values[body], solids.low, solids.inverse_spacing, x, y, z)
+        inside[body] = value < 0.0
+    bodies[0, 0] = _innermost(inside)
+    # Parts of the light that are followed later, the last one first: it shares most of the polyline before it.
+    waiting = np.empty((num_splits, 8))
+    waiting_numbers = np.empty((num_splits, 2), np.int64)
+    waiting_inside = np.empty((num_splits, len(inside)), np.bool_)
+    num_events, weight, num_waiting, polyline, most = 0, 1.0, 0, 0, 0
+    while True:
+        row = min(polyline, room - 1)  # rows beyond the room are counted, not kept
+        too_many = False
         while True:
             hit, before, after = _surface_ahead(solids, inside, x, y, z, dx, dy, dz, min_step)
             if hit < 0:
@@ -160,49 +188,89 @@ def _trace_ray(solids, origin, direction, near, far, min_step, max_events, row, 
             if n_before == n_after:
                 x, y, z, s = x + after * dx, y + after * dy, z + after * dz, s + after
                 continue
-            if events >= max_events:
-                exceeded = True
+            if num_events >= max_events:
+                too_many = True
                 break
-            events += 1
             _, nx, ny, nz = spline_value_gradient(
                 solids.values[hit], solids.low, solids.inverse_spacing,
                 x + after * dx, y + after * dy, z + after * dz,
             )  # fmt: skip
             tx, ty, tz, reflected = _turned(dx, dy, dz, nx, ny, nz, n_before / n_after)
+            if num_events < num_splits and not reflected:
+                mx, my, mz, share = _mirrored(dx, dy, dz, nx, ny, nz, n_before / n_after)
+                if weight * min(share, 1.0 - share) >= least_weight:
+                    waiting[num_waiting, 0] = x + before * dx
+                    waiting[num_waiting, 1] = y + before * dy
+                    waiting[num_waiting, 2] = z + before * dz
+                    waiting[num_waiting, 3], waiting[num_waiting, 4], waiting[num_waiting, 5] = mx, my, mz
+                    waiting[num_waiting, 6], waiting[num_waiting, 7] = s + before, weight * share
+                    waiting_numbers[num_waiting, 0], waiting_numbers[num_waiting, 1] = count, num_events + 1
+                    waiting_inside[num_waiting] = inside
+                    waiting_inside[num_waiting, hit] = not inside[hit]
+                    num_waiting += 1
+                    weight *= 1.0 - share
+                elif share > 0.5:
+                    tx, ty, tz, reflected = mx, my, mz, True
+            num_events += 1
             if reflected:
                 inside[hit] = not inside[hit]
                 after = before
             x, y, z, s = x + after * dx, y + after * dy, z + after * dz, s + after
             dx, dy, dz = tx, ty, tz
-            if count < len(bodies):
-                bodies[count] = _innermost(inside)
-            count = put_vertex(positions, directions, lengths, count, x, y, z, dx, dy, dz, s)
-    count = put_end(*row, count, solids.low, solids.high, events > 0, x, y, z, dx, dy, dz, s, end)
-    return count, events, exceeded
+            if count < lengths.shape[1]:
+                bodies[row, count] = _innermost(inside)
+            count = put_vertex(positions[row], directions[row], lengths[row], count, x, y, z, dx, dy, dz, s)
+        count = put_end(
+            positions[row], directions[row], lengths[row], count, solids.low, solids.high, num_events > 0,
+            x, y, z, dx, dy, dz, s, end,
+        )  # fmt: skip
+        weights[row], events[row], exceeded[row] = weight, num_events, too_many
+        polyline, most = polyline + 1, max(most, count)
+        if num_waiting == 0:
+            return polyline, most
+        num_waiting -= 1
+        x, y, z = waiting[num_waiting, 0], waiting[num_waiting, 1], waiting[num_waiting, 2]
+        dx, dy, dz = waiting[num_waiting, 3], waiting[num_waiting, 4], waiting[num_waiting, 5]
+        s, weight = waiting[num_waiting, 6], waiting[num_waiting, 7]
+        count, num_events = waiting_numbers[num_waiting, 0], waiting_numbers[num_waiting, 1]
+        inside[:] = waiting_inside[num_waiting]
+        before_row, row = row, min(polyline, room - 1)
+        for i in range(min(count, lengths.shape[1])):
+            positions[row, i], directions[row, i] = positions[before_row, i], directions[before_row, i]
+            lengths[row, i], bodies[row, i] = lengths[before_row, i], bodies[before_row, i]
+        if count < lengths.shape[1]:
+            bodies[row, count] = _innermost(inside)
+        count = put_vertex(positions[row], directions[row], lengths[row], count, x, y, z, dx, dy, dz, s)
 
 
 @compiled_parallel
-def trace_snell(origins, directions, near, far, solids, min_step, max_events, capacity):
-    """Polylines of all rays.
+def trace_snell(origins, directions, near, far, solids, min_step, max_events, num_splits, least_weight, capacity, room):
+    """Polylines of all rays, which may split at their first events (`samplers.branching`).
 
     Returns:
-        positions [R, V, 3], directions [R, V, 3], s [R, V]: with V the capacity, in the rays' precision.
-        bodies [R, V]: number of the body in which each vertex is left, see `types.Path`.
-        counts [R]: vertices of each path, more than the capacity where it did not suffice.
-        events [R]: refractions and reflections of each ray.
-        exceeded [R]: whether a ray met the limit of events; it goes straight on from there.
+        positions [R, B, V, 3], directions [R, B, V, 3], s [R, B, V]: with V the capacity and B the room for a ray's
+            polylines, in the rays' precision.
+        bodies [R, B, V]: number of the body in which each vertex is left, see `types.Path`.
+        weights [R, B]: share of the ray's light.
+        events [R, B]: refractions and reflections.
+        exceeded [R, B]: whether the limit of events was met; the polyline goes straight on from there.
+        counts [R, 2]: polylines of each ray and the most vertices of one, more than B and V where these do not suffice.
     """
     num_rays = origins.shape[0]
-    out_positions = np.empty((num_rays, capacity, 3), origins.dtype)
-    out_directions = np.empty((num_rays, capacity, 3), origins.dtype)
-    out_s = np.empty((num_rays, capacity), origins.dtype)
-    bodies = np.zeros((num_rays, capacity), np.int8)
-    counts = np.empty(num_rays, np.int64)
-    events = np.empty(num_rays, np.int64)
-    exceeded = np.empty(num_rays, np.bool_)
+    out_positions = np.empty((num_rays, room, capacity, 3), origins.dtype)
+    out_directions = np.empty((num_rays, room, capacity, 3), origins.dtype)
+    out_s = np.empty((num_rays, room, capacity), origins.dtype)
+    bodies = np.zeros((num_rays, room, capacity), np.int8)
+    weights = np.empty((num_rays, room), origins.dtype)
+    events = np.empty((num_rays, room), np.int64)
+    exceeded = np.empty((num_rays, room), np.bool_)
+    counts = np.empty((num_rays, 2), np.int64)
     for ray in prange(num_rays):
-        row = (out_positions[ray], out_directions[ray], out_s[ray])
-        counts[ray], events[ray], exceeded[ray] = _trace_ray(
-            solids, origins[ray], directions[ray], near[ray], far[ray], min_step, max_events, row, bodies[ray]
-        )
-    return out_positions, out_directions, out_s, bodies, counts, events, exceeded
+        rows = (
+            out_positions[ray], out_directions[ray], out_s[ray], bodies[ray], weights[ray], events[ray], exceeded[ray]
+        )  # fmt: skip
+        counts[ray] = _trace_ray(
+            solids, origins[ray], directions[ray], near[ray], far[ray],
+            min_step, max_events, num_splits, least_weight, rows,
+        )  # fmt: skip
+    return out_positions, out_directions, out_s, bodies, weights, events, exceeded, counts

@@ -1,4 +1,4 @@
-"""Snell's law."""
+"""Snell's law, and Fresnel's."""
 
 from __future__ import annotations
 
@@ -40,3 +40,24 @@ def refract(
     scale = torch.where(reflected, 1.0, ratio)
     after = scale[..., None] * directions + along[..., None] * normals
     return after / torch.linalg.vector_norm(after, dim=-1, keepdim=True), reflected
+
+
+def reflectance(
+    directions: Float[Tensor, "R 3"],
+    normals: Float[Tensor, "R 3"],
+    n_before: Float[Tensor, "R"],
+    n_after: Float[Tensor, "R"],
+) -> Float[Tensor, "R"]:
+    """Share of unpolarised light that a surface reflects, by Fresnel's equations; 1 under total reflection.
+
+    With r = n_before / n_after and cosines c, c': ((r c - c') / (r c + c'))^2 and ((c - r c') / (c + r c'))^2 are those
+    of light polarised across and in the plane of incidence; their mean is returned. Arguments as for `refract`.
+    """
+    cosine = (directions * normals).sum(-1).abs()
+    ratio = n_before / n_after
+    squared = 1 - ratio**2 * (1 - cosine**2)
+    total = squared <= 0
+    beyond = torch.where(total, 1.0, squared).sqrt()
+    across = (ratio * cosine - beyond) / (ratio * cosine + beyond)
+    within = (cosine - ratio * beyond) / (cosine + ratio * beyond)
+    return torch.where(total, 1.0, 0.5 * (across.square() + within.square()))

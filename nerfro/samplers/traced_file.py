@@ -38,7 +38,8 @@ class TraceConfig:
     medium: Any = MISSING
     sampler: TraceSamplerConfig = dataclasses.field(default_factory=TraceSamplerConfig)
     rays: str = MISSING  # .npz with `origins` and `directions` [R, 3], world units and unit directions
-    # .npz that is written, with `exit_positions` and `exit_directions` [R, 3], `path_lengths` and `hit` [R].
+    # .npz that is written, with `exit_positions` and `exit_directions` [R, 3], `path_lengths` and `hit` [R]. Where rays
+    # split there is a row for each path, and also its `ray` (row in `rays`) and `throughput` [P, 3].
     out: str = MISSING
     near: float = 0.0  # arc length at which paths begin
     # Arc length at which paths end, or where they have left the medium's box if that is later; by default all end

@@ -118,7 +118,8 @@ class DataSet(ABC):
             raise NerfroError(f"'{self.folder}' exists and is no data set of ours; choose another folder with out=DIR")
         versions = {name: importlib.metadata.version(name) for name in ("mitsuba", "drjit", "numpy")}
         versions |= {"python": platform.python_version(), "variant": mitsuba.variant()}
-        meta = {"scene": self.config.scene, "ior": self.scene.ior, "tint": list(self.scene.tint), **self.FACTS}
+        meta = {"scene": self.config.scene, "ior": self.scene.ior, "tint": list(self.scene.tint)}
+        meta |= {"absorption": list(self.scene.absorption), **self.FACTS}
         _write_json(self.folder / self.META, {**meta, "settings": settings, "versions": versions})
 
     def missing(self, planned: list[Planned]) -> list[Planned]:
@@ -249,7 +250,8 @@ class Photographs(DataSet):
 
 def fingerprint(scene: Scene) -> str:
     """A short hash of a scene, so that pictures of an older model are not mixed in."""
-    digest = hashlib.sha256(repr((scene.ior, scene.tint)).encode())
+    material = (scene.ior, scene.tint, *([scene.absorption] if any(scene.absorption) else []))
+    digest = hashlib.sha256(repr(material).encode())
     for surface in (scene.glass, scene.interior):
         for array in (surface.vertices, surface.faces, surface.normals, surface.colours):
             if array is not None:

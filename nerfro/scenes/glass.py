@@ -1,21 +1,26 @@
-"""A Mitsuba material that transmits, or reflects totally, and does nothing in between."""
+"""Mitsuba materials of glass: what it transmits, reflects and absorbs."""
 
 from __future__ import annotations
 
 import functools
 
 PLUGIN = "transmitting_glass"
+EMBEDDED = "embedded_in_glass"
 
 
 @functools.cache
-def register_transmitting_glass(variant: str) -> None:
-    """Register the BSDF `transmitting_glass` for a Mitsuba variant, which must be the active one: its base class is.
+def register_materials(variant: str) -> None:
+    """Register two BSDFs for a Mitsuba variant, which must be the active one: their base class is.
 
-    A ray that meets the surface below the critical angle is transmitted as Snell's law says and keeps its radiance:
-    there is no partial Fresnel reflection, and no scaling by n^2, which cancels anyway as both ends of every path lie
-    in air. Above the critical angle it is reflected totally. That is the paper's image formation: one path per ray.
+    `transmitting_glass`: a ray that meets the surface below the critical angle is transmitted as Snell's law says and
+    keeps its radiance: there is no partial Fresnel reflection, and no scaling by n^2, which cancels anyway as both ends
+    of every path lie in air. Above the critical angle it is reflected totally. That is the paper's image formation: one
+    path per ray. With `fresnel` it reflects Fresnel's share, as Mitsuba's dielectric does.
+    Parameters: `ior` (float, inside over outside), `tint` (linear RGB factor per transmission), `fresnel` (bool), and
+    `absorption` (RGB per world unit), by which light is attenuated that comes through the body to its surface.
 
-    Parameters of the plugin: `ior` (float, inside over outside) and `tint` (linear RGB factor per transmission).
+    `embedded_in_glass`: the nested BSDF of a thing inside the body, attenuated likewise (`absorption`). Together the
+    two attenuate every run of a path inside the body, each where it ends.
     """
     import drjit as dr
     import mitsuba as mi
@@ -25,6 +30,8 @@ def register_transmitting_glass(variant: str) -> None:
             super().__init__(properties)
             self.ior = mi.Float(properties.get("ior", 1.5))
             self.tint = mi.Color3f(properties.get("tint", mi.ScalarColor3f(1.0)))
+            self.absorption = mi.Color3f(properties.get("absorption", mi.ScalarColor3f(0.0)))
+            self.fresnel = bool(properties.get("fresnel", False))
             sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
             reflection = mi.BSDFFlags.DeltaReflection | sides
             transmission = mi.BSDFFlags.DeltaTransmission | sides | mi.BSDFFlags.NonSymmetric
@@ -32,19 +39,24 @@ def register_transmitting_glass(variant: str) -> None:
             self.m_flags = reflection | transmission
 
         def sample(self, context, interaction, sample1, sample2, active=True):
-            _, cos_transmitted, eta, inverse_eta = mi.fresnel(mi.Frame3f.cos_theta(interaction.wi), self.ior)
+            cosine = mi.Frame3f.cos_theta(interaction.wi)
+            share, cos_transmitted, eta, inverse_eta = mi.fresnel(cosine, self.ior)
             total = cos_transmitted == 0  # mi.fresnel returns the cosine 0 above the critical angle
+            share = dr.select(total, mi.Float(1.0), share if self.fresnel else mi.Float(0.0))
+            reflected = sample1 < share
             sampled = mi.BSDFSample3f()
             sampled.wo = dr.select(
-                total, mi.reflect(interaction.wi), mi.refract(interaction.wi, cos_transmitted, inverse_eta)
+                reflected, mi.reflect(interaction.wi), mi.refract(interaction.wi, cos_transmitted, inverse_eta)
             )
-            sampled.pdf = mi.Float(1.0)
-            sampled.eta = dr.select(total, mi.Float(1.0), eta)
-            sampled.sampled_component = dr.select(total, mi.UInt32(0), mi.UInt32(1))
+            sampled.pdf = dr.select(reflected, share, 1.0 - share)
+            sampled.eta = dr.select(reflected, mi.Float(1.0), eta)
+            sampled.sampled_component = dr.select(reflected, mi.UInt32(0), mi.UInt32(1))
             sampled.sampled_type = dr.select(
-                total, mi.UInt32(+mi.BSDFFlags.DeltaReflection), mi.UInt32(+mi.BSDFFlags.DeltaTransmission)
+                reflected, mi.UInt32(+mi.BSDFFlags.DeltaReflection), mi.UInt32(+mi.BSDFFlags.DeltaTransmission)
             )
-            value = dr.select(total, mi.Color3f(1.0), self.tint)
+            # The surface is seen from within where the ray has come through the body.
+            depth = dr.select(cosine < 0, interaction.t, 0.0)
+            value = dr.select(reflected, mi.Color3f(1.0), self.tint) * dr.exp(-self.absorption * depth)
             return sampled, mi.Spectrum(value) & active
 
         def eval(self, context, interaction, wo, active=True):
@@ -59,4 +71,33 @@ def register_transmitting_glass(variant: str) -> None:
         def to_string(self) -> str:
             return f"TransmittingGlass[ior={self.ior}, tint={self.tint}]"
 
+    class EmbeddedInGlass(mi.BSDF):
+        def __init__(self, properties: mi.Properties) -> None:
+            super().__init__(properties)
+            self.absorption = mi.Color3f(properties.get("absorption", mi.ScalarColor3f(0.0)))
+            self.nested = properties["nested"]
+            self.m_components = [self.nested.flags(index) for index in range(self.nested.component_count())]
+            self.m_flags = self.nested.flags()
+
+        def _through(self, interaction):
+            return mi.Spectrum(dr.exp(-self.absorption * interaction.t))
+
+        def sample(self, context, interaction, sample1, sample2, active=True):
+            sampled, value = self.nested.sample(context, interaction, sample1, sample2, active)
+            return sampled, value * self._through(interaction)
+
+        def eval(self, context, interaction, wo, active=True):
+            return self.nested.eval(context, interaction, wo, active) * self._through(interaction)
+
+        def pdf(self, context, interaction, wo, active=True):
+            return self.nested.pdf(context, interaction, wo, active)
+
+        def eval_pdf(self, context, interaction, wo, active=True):
+            value, pdf = self.nested.eval_pdf(context, interaction, wo, active)
+            return value * self._through(interaction), pdf
+
+        def to_string(self) -> str:
+            return f"EmbeddedInGlass[absorption={self.absorption}, {self.nested}]"
+
     mi.register_bsdf(PLUGIN, TransmittingGlass)
+    mi.register_bsdf(EMBEDDED, EmbeddedInGlass)

@@ -12,7 +12,7 @@ import numpy as np
 
 from nerfro.errors import NerfroError
 from nerfro.light import to_linear
-from nerfro.scenes.glass import PLUGIN, register_transmitting_glass
+from nerfro.scenes.glass import EMBEDDED, PLUGIN, register_materials
 from nerfro.scenes.scene import Panel, Scene
 from nerfro.scenes.skies import Sky
 from nerfro.scenes.surface import Surface
@@ -49,7 +49,7 @@ def load_mitsuba(variant: str = "auto") -> ModuleType:
             if variant == "auto" and name == "scalar_rgb":
                 warnings.warn(f"rendering without LLVM, some seventy times slower; {_GET_LLVM}", stacklevel=2)
             mitsuba.set_variant(name)
-            register_transmitting_glass(name)
+            register_materials(name)
             return mitsuba
     raise NerfroError(
         f"Mitsuba variant '{variant}' does not run on this machine; {_GET_LLVM}, or take variant=scalar_rgb"
@@ -97,11 +97,16 @@ class PathTracer:
     def __init__(self, scene: Scene, fresnel: bool, camera: Pinhole, variant: str = "auto") -> None:
         self.mitsuba = mi = load_mitsuba(variant)
         self.camera = camera
-        glass: dict = {"type": PLUGIN, "ior": scene.ior, "tint": mi.ScalarColor3f(*scene.tint)}
-        if fresnel:
+        absorption = {"absorption": mi.ScalarColor3f(*scene.absorption)}
+        glass: dict = {"type": PLUGIN, "ior": scene.ior, "tint": mi.ScalarColor3f(*scene.tint), "fresnel": fresnel}
+        glass |= absorption
+        absorbs = any(scene.absorption)
+        if fresnel and not absorbs:
             tint = {"type": "rgb", "value": list(scene.tint)}
             glass = {"type": "dielectric", "int_ior": scene.ior, "ext_ior": 1.0, "specular_transmittance": tint}
         paint = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
+        if absorbs:
+            paint = {"type": EMBEDDED, "nested": paint, **absorption}
         surroundings = {f"panel_{number}": _panel(mi, panel) for number, panel in enumerate(scene.panels)}
         if scene.sky is not None:
             # Two texels per pixel of the background.

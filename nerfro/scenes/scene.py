@@ -64,6 +64,7 @@ class Scene:
         panels: flat things at finite distance around the object.
         tint: linear factor per colour channel on each crossing of the glass surface. Absorption along the path is not
             part of the paper's image formation, so tinted glass is tinted at its surface.
+        absorption: of the glass, for each colour channel, per world unit of the path in it (Beer-Lambert).
         aim: what a photographer looks at.
     """
 
@@ -73,4 +74,5 @@ class Scene:
     sky: Sky | None
     panels: tuple[Panel, ...] = ()
     tint: Vector = (1.0, 1.0, 1.0)
+    absorption: Vector = (0.0, 0.0, 0.0)
     aim: Vector = (0.0, 0.0, 0.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from omegaconf import MISSING, DictConfig, OmegaConf
@@ -40,6 +40,7 @@ class SynthesizeConfig:
     photographs: int = MISSING
     noise: float = MISSING
     fresnel: bool = MISSING
+    absorption: list[float] = MISSING
     seed: int = MISSING
     sky_height: int = MISSING
     extras: bool = MISSING
@@ -76,7 +77,11 @@ def synthesize(config: DictConfig) -> tuple[Scene, Path]:
         value = OmegaConf.select(config, name)
         if value < least:
             raise NerfroError(f"{name}={value} is too small; give {least} or more")
-    scene, folder = build_scene(config.scene, config.resolution), user_path(config.out)
+    absorption = tuple(config.absorption)
+    if len(absorption) != 3 or not all(0 <= value < float("inf") for value in absorption):
+        raise NerfroError(f"absorption={list(absorption)} is not allowed; give red, green and blue, at least 0 each")
+    scene = replace(build_scene(config.scene, config.resolution), absorption=absorption)
+    folder = user_path(config.out)
     mitsuba = load_mitsuba(config.variant)  # before anything is cleared that could not be rendered again
     data = (dataset.Photographs if config.scene in CAPTURES else dataset.Views)(config, scene, folder)
     data.prepare(mitsuba)

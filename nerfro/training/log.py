@@ -67,7 +67,7 @@ class TrainingLog(Callback):
         }
         if not isinstance(pl_module.medium, Vacuum):
             shown = torch.linspace(0, len(rays) - 1, min(_NUM_PATHS, len(rays))).long().to(rays.origins.device)
-            pictures["val/paths"] = picture_of_paths(renderings[-1].path[shown], pl_module.medium)
+            pictures["val/paths"] = picture_of_paths(renderings[-1].path.of_rays(shown), pl_module.medium)
         for logger in loggers:
             _log_pictures(logger, pictures, trainer.global_step)
             for level, rendering in enumerate(renderings):

@@ -157,7 +157,7 @@ class RayBatches:
             rays_per_pixel=several,
             rows=torch.cat([first_row[whole], rows.flatten()]),
             num_rows=int(num_rays.sum()),
-            path=path[whole].followed_by(self._trace(parts, view_of_part)),
+            path=path.of_rays(whole).followed_by(self._trace(parts, view_of_part)),
             index=index,
         )
 

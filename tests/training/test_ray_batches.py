@@ -11,6 +11,8 @@ import torch
 from nerfro.cameras import Cameras
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
+from nerfro.media.shapes import Ball
+from nerfro.samplers.snell import Snell
 from nerfro.training.ray_batches import RayBatches
 
 NUM_VIEWS, HEIGHT, WIDTH = 5, 12, 16
@@ -260,3 +262,18 @@ def test_making_a_batch_never_waits_for_the_device(views):
 def test_option_out_of_range_is_refused(views, options, message):
     with pytest.raises(NerfroError, match=message):
         RayBatches(views, **options)
+
+
+def test_batches_hold_all_polylines_of_their_rays(views):
+    medium, sampler = Ball(), Snell(branches="all")
+    towards = replace(views.cameras, camera_to_world=views.cameras.camera_to_world.clone())
+    towards.camera_to_world[..., 3] = 3 * towards.camera_to_world[..., 2]  # all look at the ball
+    views = replace(views, cameras=towards)
+    batches = RayBatches(views, 60, "all_images", seed=1).traced(lambda rays, view: sampler(rays, medium), 2, 8.0)
+    batch = batches.batch(3)
+    assert 0 < batch.num_whole < 60
+    assert batch.path.num_rays == len(batch.rays)
+    again = sampler(batch.rays, medium)
+    assert len(again.ray) > 1.5 * len(batch.rays)
+    for name in ("ray", "exit_directions", "throughput"):
+        torch.testing.assert_close(getattr(batch.path, name), getattr(again, name))

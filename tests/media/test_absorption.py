@@ -1,0 +1,85 @@
+"""Tint along paths: Beer-Lambert in closed form, what is seen through it, what learns, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from nerfro.errors import NerfroError
+from nerfro.media.shapes import Ball
+from nerfro.models.refractive import RefractiveModel
+from nerfro.rendering import composite
+from nerfro.samplers.eikonal import Eikonal
+from nerfro.samplers.snell import Snell
+from nerfro.samplers.stratified import point_samples
+from nerfro.testing import example_parts, example_rays
+from nerfro.types import Path, Radiance
+from tests.closed_forms import beam
+
+SIGMA = [0.3, 1.0, 2.5]
+
+
+def _path(heights: list[float]) -> Path:
+    medium = Ball(0.8, 1.5, absorption=SIGMA).double()
+    return medium.tinted(Snell()(beam(torch.tensor(heights, dtype=torch.float64)), medium))
+
+
+def test_what_lies_behind_a_ball_is_attenuated_by_its_chord() -> None:
+    heights = torch.tensor([0.0, 0.3, 0.7, 0.9], dtype=torch.float64)
+    path = _path(heights.tolist())
+    chord = torch.where(heights < 0.8, 1.6 * (1 - (heights / 1.2).square()).sqrt(), 0.0)
+    expected = torch.exp(-chord[:, None] * torch.tensor(SIGMA, dtype=torch.float64))
+    torch.testing.assert_close(path.transmitted(path.far[:, None])[:, 0], expected)
+    assert (expected[-1] == 1).all()
+
+
+def test_what_lies_inside_is_attenuated_by_the_glass_before_it() -> None:
+    path = _path([0.0])
+    # From 3 units before the middle to the surface; then 0.5 in glass; then behind the ball.
+    s = torch.tensor([[1.0, 2.2, 2.7, 3.8, 5.0]], dtype=torch.float64)
+    depth = torch.tensor([0, 0, 0.5, 1.6, 1.6], dtype=torch.float64)
+    expected = torch.exp(-depth[:, None] * torch.tensor(SIGMA, dtype=torch.float64))
+    torch.testing.assert_close(path.transmitted(s)[0], expected)
+    samples = point_samples(path, s)
+    density = torch.tensor([[0.0, 0, 1e6, 0, 0]], dtype=torch.float64)
+    seen = composite(samples, Radiance(density, torch.ones(1, 5, 3)), torch.ones(1, 3), path)
+    torch.testing.assert_close(seen.rgb, expected[None, 2], rtol=1e-6, atol=0)
+    empty = composite(samples, Radiance(0 * density, torch.ones(1, 5, 3)), torch.ones(1, 3), path)
+    torch.testing.assert_close(empty.rgb, expected[None, -1], rtol=1e-6, atol=0)
+
+
+def test_a_reflection_past_the_ball_is_not_tinted() -> None:
+    medium = Ball(0.8, 1.5, absorption=SIGMA).double()
+    path = medium.tinted(Snell(branches="first")(beam(torch.tensor([0.5]).double()), medium))
+    through, reflected = path.transmitted(path.far[:, None])[:, 0]
+    assert (through < 0.9).all()
+    assert (reflected == 1).all()
+
+
+def test_absorption_learns_without_tracing_again() -> None:
+    model = RefractiveModel(replace(example_parts(), medium=Ball(learn_absorption=True), path_sampler=Snell()))
+    assert not model.paths_learn, "paths may be traced ahead"
+    parameters, _ = model.parameter_groups()["medium"]
+    assert [tuple(parameter.shape) for parameter in parameters] == [(1, 3)]
+    with torch.no_grad():
+        path = model.trace(example_rays())
+    renderings = model.render_path(model.trace(example_rays(), path))
+    (gradient,) = torch.autograd.grad(renderings[-1].rgb.sum(), parameters)
+    assert (gradient != 0).all()
+    assert set(model.medium.learned()) == {f"absorption_1_{colour}" for colour in ("red", "green", "blue")}
+    assert max(model.medium.learned().values()) == pytest.approx(0.02)
+
+
+def test_absorption_is_given_for_all_bodies_or_for_each() -> None:
+    torch.testing.assert_close(Ball(absorption=[0.4]).absorption, torch.full((1, 3), 0.4))
+    assert Ball().absorption is None
+    start = Ball(absorption=SIGMA, learn_absorption=True).absorption
+    torch.testing.assert_close(start, torch.tensor([SIGMA]))
+    with pytest.raises(NerfroError, match="red, green and blue of each body"):
+        Ball(absorption=[0.1, 0.2])
+    with pytest.raises(NerfroError, match="absorption"):
+        Ball(absorption=[-0.1])
+    with pytest.raises(NerfroError, match="path=snell"):
+        Eikonal()(example_rays(), Ball(absorption=[0.1]))

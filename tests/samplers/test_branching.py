@@ -1,0 +1,253 @@
+"""Light that splits at surfaces: energy, closed forms, the three tracers against each other, derivatives of shares."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path as FilePath
+
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+from nerfro.errors import NerfroError
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.shapes import Ball, RoundedBox, Slab
+from nerfro.media.solid import Solid
+from nerfro.samplers import compiled
+from nerfro.samplers.replay import smallest_cosine
+from nerfro.samplers.snell import Snell, trace_interfaces
+from nerfro.samplers.snell_law import reflectance
+from nerfro.types import Path, Rays
+from tests.closed_forms import beam, make_rays
+
+BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
+
+
+def _bundle(num: int = 300) -> Rays:
+    generator = torch.Generator().manual_seed(2)
+    directions = torch.nn.functional.normalize(torch.randn(num, 3, generator=generator), dim=-1)
+    targets = 1.6 * torch.rand(num, 3, generator=generator) - 0.8
+    return make_rays(targets - 3 * directions, directions, 0.5, 6.0)
+
+
+def _nested_grid(size: int = 40) -> SdfGrid:
+    axis = torch.linspace(-1.5, 1.5, size)
+    p = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    centre = torch.tensor([0.2, 0.1, 0])
+    return SdfGrid.from_distances(
+        torch.stack([p.norm(dim=-1) - 0.8, (p - centre).norm(dim=-1) - 0.4]), BOX, [1.5, 1.2], 0.02
+    )
+
+
+def _nested_mesh(folder: FilePath) -> SdfGrid:
+    outer, inner = trimesh.creation.icosphere(3, 0.8), trimesh.creation.icosphere(3, 0.4)
+    inner.apply_translation([0.2, 0.1, 0])
+    outer.export(folder / "outer.ply")
+    inner.export(folder / "inner.ply")
+    return SdfGrid(
+        str(folder / "outer.ply"), 1.5, [str(folder / "inner.ply")], [1.2], resolution=32, cache=False
+    ).double()
+
+
+def _fresnel(cosine: Tensor, n: float) -> Tensor:
+    """Fresnel's share from air into glass, in the form of tangents and sines (r_s = -sin(i - t) / sin(i + t), ...)."""
+    i = torch.acos(cosine)
+    t = torch.asin(i.sin() / n)
+    return 0.5 * (((i - t).sin() / (i + t).sin()).square() + ((i - t).tan() / (i + t).tan()).square())
+
+
+def _weights(path: Path) -> Tensor:
+    return path.throughput[:, 0].double()
+
+
+def test_reflectance_is_fresnels_both_ways() -> None:
+    angles = torch.tensor([0.01, 0.3, 0.8, 1.2, 1.5], dtype=torch.float64)
+    d = torch.stack([angles.sin(), 0 * angles, angles.cos()], -1)
+    normal = torch.tensor([0.0, 0, 1]).double().expand_as(d)
+    ones = torch.ones_like(angles)
+    entering = reflectance(d, normal, ones, 1.5 * ones)
+    torch.testing.assert_close(entering, _fresnel(angles.cos(), 1.5))
+    inside = torch.asin(angles.sin() / 1.5)
+    back = torch.stack([inside.sin(), 0 * inside, inside.cos()], -1)
+    torch.testing.assert_close(reflectance(back, -normal, 1.5 * ones, ones), entering)
+    assert float(reflectance(d[3:4], normal[3:4], 1.5 * ones[:1], ones[:1])) == 1
+    # 4.0, 8.9, 25, 61 percent at 0, 60, 75, 85 degrees.
+    degrees = torch.tensor([0.0, 60, 75, 85]).double().deg2rad()
+    d = torch.stack([degrees.sin(), 0 * degrees, degrees.cos()], -1)
+    percent = 100 * reflectance(d, normal[:4], ones[:4], 1.5 * ones[:4])
+    torch.testing.assert_close(percent, torch.tensor([4.0, 8.9, 25.3, 61.3]).double(), atol=0.1, rtol=0)
+
+
+@pytest.mark.parametrize("branches", ["first", "all"])
+def test_weights_of_a_ray_sum_to_one(branches: str, tmp_path: FilePath) -> None:
+    rays = _bundle()
+    media = [(Snell, _nested_grid()), (Snell, RoundedBox().double()), (Snell, _nested_mesh(tmp_path))]
+    for interface, (_, medium) in zip(("sdf", "sdf", "mesh"), media, strict=True):
+        sampler = Snell(interface, branches=branches)  # type: ignore[arg-type]
+        trace = sampler.trace(rays, medium)
+        total = trace.path.per_ray(torch.ones(len(trace.path.s), 3, dtype=torch.float64))
+        torch.testing.assert_close(total, torch.ones(len(rays), 3).double(), atol=1e-5, rtol=0)
+        assert (_weights(trace.path) >= 0.0199).all()
+        counts = torch.bincount(trace.path.ray)
+        assert counts[trace.path.first_of_ray(trace.path.refracted)].float().mean() > (
+            1.8 if branches == "first" else 2
+        )
+        assert (counts[~trace.path.first_of_ray(trace.path.refracted)] == 1).all()
+
+
+@pytest.mark.parametrize(("n", "reflected", "refracted"), [(1.5, 9.2, 83.6), (1.33, 6.6, 88.2)])
+def test_shares_of_a_ball_seen_whole(n: float, reflected: float, refracted: float) -> None:
+    share = (torch.arange(4000, dtype=torch.float64) + 0.5) / 4000
+    heights = 0.8 * share.sqrt()  # equal areas of the disc
+    trace = Snell(branches="all", least_weight=1e-9).trace(beam(heights), Ball(0.8, n).double())
+    weights = _weights(trace.path)
+    fresnel = _fresnel((1 - share).sqrt(), n)
+    first, twice = (weights[trace.num_events == count] for count in (1, 2))
+    torch.testing.assert_close(first, fresnel, atol=1e-7, rtol=0)
+    torch.testing.assert_close(twice, (1 - fresnel).square(), atol=1e-7, rtol=0)
+    assert 100 * float(first.mean()) == pytest.approx(reflected, abs=0.05)
+    assert 100 * float(twice.mean()) == pytest.approx(refracted, abs=0.05)
+    # One more reflection inside takes F (1 - F)^2.
+    once_inside = weights[trace.num_events == 3]
+    torch.testing.assert_close(once_inside, fresnel * (1 - fresnel).square(), atol=1e-7, rtol=0)
+
+
+@pytest.mark.parametrize("n", [1.33, 1.52])
+def test_a_slab_transmits_the_sum_over_its_bounces(n: float) -> None:
+    rays = make_rays([[0.1, 0.2, -2.0]], [[0, 0, 1]], 0.5, 4.0)
+    path = Snell(branches="all", least_weight=1e-12).trace(rays, Slab(0.5, n).double()).path
+    through = path.exit_directions[:, 2] > 0
+    assert float(_weights(path)[through].sum()) == pytest.approx(2 * n / (n * n + 1), abs=1e-6)
+
+
+def test_the_rainbow_is_a_branch_of_the_tracer() -> None:
+    n = 1.333
+    i = torch.linspace(0.9, 1.2, 3001, dtype=torch.float64)
+    trace = Snell(branches="all", least_weight=1e-4).trace(beam(0.8 * i.sin()), Ball(0.8, n).double())
+    bow = trace.path.exit_directions[trace.num_events == 3]
+    deviation = torch.atan2(-bow[:, 1], bow[:, 0]) % (2 * math.pi)
+    torch.testing.assert_close(deviation, 2 * i - 4 * torch.asin(i.sin() / n) + math.pi)
+    assert float(i[int(deviation.argmin())].cos()) == pytest.approx(math.sqrt((n * n - 1) / 3), abs=1e-4)
+
+
+def test_compiled_branches_are_those_of_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    medium, rays = _nested_grid(), _bundle(400)
+    sampler = Snell(branches="all", least_weight=0.005)
+    fast = sampler.trace(rays, medium)
+    # The same with too little room for polylines and vertices at first.
+    assert torch.bincount(fast.path.ray).max() > 4
+    monkeypatch.setattr(compiled, "_ROOM", 2)
+    monkeypatch.setattr(compiled, "_CAPACITY", 5)
+    again = sampler.trace(rays, medium)
+    for name in ("ray", "positions", "directions", "s", "body", "throughput", "radii"):
+        assert torch.equal(getattr(again.path, name), getattr(fast.path, name))
+    assert torch.equal(again.num_events, fast.num_events)
+    path, num_events, exceeded = trace_interfaces(rays, medium.double(), 16, sampler.branching)
+    # Rays that graze a surface, or split just or just not, differ by rounding.
+    same = torch.bincount(fast.path.ray) == torch.bincount(path.ray)
+    assert same.float().mean() > 0.98
+    one, other = same[fast.path.ray], same[path.ray]
+    assert torch.equal(fast.num_events[one], num_events[other])
+    assert torch.equal(fast.exceeded[one], exceeded[other])
+    torch.testing.assert_close(fast.path.throughput[one], path.throughput[other], atol=1e-5, rtol=0)
+    error = (fast.path.exit_directions[one] - path.exit_directions[other]).norm(dim=-1)
+    assert error.median() < 1e-6
+    assert error.quantile(0.95) < 1e-4
+
+
+def test_triangles_split_light_as_the_surface_does(tmp_path: FilePath) -> None:
+    medium = _nested_mesh(tmp_path)
+    heights = torch.linspace(-0.5, 0.5, 21).double()
+    on_mesh, on_grid = (Snell(kind, branches="all").trace(beam(heights), medium) for kind in ("mesh", "sdf"))  # type: ignore[arg-type]
+    same = torch.bincount(on_mesh.path.ray) == torch.bincount(on_grid.path.ray)
+    assert same.float().mean() > 0.8
+    weights = [_weights(trace.path)[same[trace.path.ray]] for trace in (on_mesh, on_grid)]
+    torch.testing.assert_close(*weights, atol=0.01, rtol=0)
+
+
+def test_the_first_polyline_is_the_one_that_is_transmitted() -> None:
+    rays, medium = _bundle(), _nested_grid()
+    single, split = Snell()(rays, medium), Snell(branches="all")(rays, medium)
+    first = split.first_of_ray(split.exit_directions)
+    same = (first - single.exit_directions).norm(dim=-1) < 1e-6
+    # At grazing rays, less than 2 % pass: they are reflected whole.
+    assert same.float().mean() > 0.95
+    assert torch.equal(Snell(branches="first", least_weight=0.6)(rays, medium).ray, torch.arange(len(rays)))
+
+
+def test_what_is_too_light_is_added_to_the_rest() -> None:
+    heights = torch.tensor([0.0, 0.6, 0.799]).double()
+    path = Snell(branches="all", least_weight=0.1)(beam(heights), Ball(0.8, 1.5).double())
+    assert torch.bincount(path.ray).tolist() == [1, 1, 2]
+    grazing = _weights(path)[-2:]
+    assert float(grazing[1]) == pytest.approx(float(_fresnel((1 - (heights[-1:] / 0.8) ** 2).sqrt(), 1.5)))
+    for least in (0.3, 0.03, 0.003):
+        counts = torch.bincount(Snell(branches="all", least_weight=least)(_bundle(), Ball().double()).ray)
+        assert counts.max() <= 1 / least
+
+
+@pytest.mark.parametrize("least_weight", [0.0, 1.0])
+def test_least_weights_are_shares(least_weight: float) -> None:
+    with pytest.raises(NerfroError, match="least_weight"):
+        Snell(branches="all", least_weight=least_weight)
+
+
+@pytest.mark.parametrize("what", ["index", "origin"])
+def test_replayed_shares_have_the_derivatives_of_traced_ones(what: str) -> None:
+    rays, sampler = _bundle(60), Snell(branches="all", least_weight=1e-3)
+
+    def traced(step: Tensor) -> tuple[Path, Rays, Solid]:
+        medium = NestedBalls()
+        medium.iors = medium.iors + (step if what == "index" else 0)
+        moved = Rays(rays.origins + (step if what == "origin" else 0), *list(vars(rays).values())[1:])
+        with torch.no_grad():
+            path, _, _ = trace_interfaces(moved, medium, 16, sampler.branching)
+        return path, moved, medium
+
+    def refined(step: Tensor) -> Tensor:
+        return sampler.refine(*traced(step)).throughput[:, 0]
+
+    zero = torch.zeros((), dtype=torch.float64)
+    found = torch.autograd.functional.jvp(refined, zero, torch.ones_like(zero))[1]
+    h = 1e-6
+    sides = [traced(torch.tensor(sign * h).double())[0] for sign in (1, -1)]
+    path, _, medium = traced(zero)
+    assert all(torch.equal(side.ray, path.ray) for side in sides)
+    expected = (sides[0].throughput - sides[1].throughput)[:, 0] / (2 * h)
+    steady = smallest_cosine(path, medium) > 0.15
+    assert steady.sum() > 100
+    torch.testing.assert_close(found[steady], expected[steady], rtol=1e-4, atol=1e-7)
+    assert float(expected[steady].abs().max()) > 0.05
+
+
+class NestedBalls(Solid):
+    """A ball in a ball in closed form."""
+
+    box = BOX.double()
+
+    def __init__(self) -> None:
+        super().__init__([1.5, 1.2], 0.02)
+
+    def signed_distances(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        centres = torch.tensor([[0, 0, 0], [0.2, 0.1, 0]], dtype=torch.float64)
+        offsets = positions[..., None, :] - centres
+        distances = torch.linalg.vector_norm(offsets, dim=-1)
+        return distances - torch.tensor([0.8, 0.4], dtype=torch.float64), offsets / distances[..., None]
+
+
+# --- rays with all their polylines ---
+
+
+def test_rays_are_chosen_and_joined_with_all_their_polylines() -> None:
+    path = Snell(branches="all")(_bundle(20), Ball().double())
+    rows = torch.tensor([7, 2, 2, 11])
+    chosen = path.of_rays(rows)
+    assert chosen.num_rays == 4
+    for place, ray in enumerate(rows.tolist()):
+        assert torch.equal(chosen.positions[chosen.ray == place], path.positions[path.ray == ray])
+        assert torch.equal(chosen.throughput[chosen.ray == place], path.throughput[path.ray == ray])
+    both = chosen.followed_by(Snell()(_bundle(3), Ball().double()))
+    assert both.num_rays == 7
+    assert both.ray[-3:].tolist() == [4, 5, 6]
+    torch.testing.assert_close(both.per_ray(torch.ones(len(both.s), 3).double()), torch.ones(7, 3).double())

@@ -1,0 +1,132 @@
+"""Colours that part: Cauchy's index, the rainbow and a prism in closed form, and bands as rays of one colour."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path as FilePath
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from nerfro.errors import NerfroError
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.shapes import Ball, RoundedBox
+from nerfro.media.solid import Solid
+from nerfro.samplers.eikonal import Eikonal
+from nerfro.samplers.snell import Snell
+from nerfro.types import Rays
+from tests.closed_forms import angle, beam, make_rays
+from tests.samplers.test_snell import _prism
+
+# Water: n_d and Abbe's number.
+WATER = 1.333, 55.8
+
+
+def cauchy(n: float, abbe: float, wavelength: float) -> float:
+    """A + B / w^2 through n_d, with n_F - n_C = (n_d - 1) / V."""
+    b = (n - 1) / abbe / (486.13**-2 - 656.27**-2)
+    return n - b / 587.56**2 + b / wavelength**2
+
+
+def _rays(num: int = 60) -> Rays:
+    generator = torch.Generator().manual_seed(3)
+    directions = torch.nn.functional.normalize(torch.randn(num, 3, generator=generator), dim=-1)
+    targets = 2 * torch.rand(num, 3, generator=generator) - 1
+    return make_rays(targets - 3 * directions, directions, 0.5, 6.0)
+
+
+def test_the_index_is_cauchys() -> None:
+    medium = Ball(0.8, 1.52, abbe=[60.0]).double()
+    lines = {name: float(medium.at_wavelength(w).iors[0]) for name, w in (("d", 587.56), ("F", 486.13), ("C", 656.27))}
+    assert lines["d"] == pytest.approx(1.52, abs=1e-12)
+    assert 0.52 / (lines["F"] - lines["C"]) == pytest.approx(60, rel=1e-9)
+    assert float(medium.at_wavelength(400).iors[0]) == pytest.approx(cauchy(1.52, 60, 400), abs=1e-12)
+    assert float(medium.iors[0]) == 1.52, "and the medium itself stays"
+
+
+@pytest.mark.parametrize(("wavelength", "degrees"), [(680.0, 42.4), (400.0, 40.6)])
+def test_the_primary_rainbow_has_its_colours_at_its_angles(wavelength: float, degrees: float) -> None:
+    n = cauchy(*WATER, wavelength)
+    i = math.acos(math.sqrt((n * n - 1) / 3)) + 1e-3 * torch.linspace(-1, 1, 201, dtype=torch.float64)
+    medium = Ball(0.8, WATER[0], abbe=[WATER[1]]).double()
+    sampler = Snell(branches="all", least_weight=1e-3, wavelengths=[wavelength, 500, 500])
+    trace = sampler.trace(beam(0.8 * i.sin()), medium)
+    bow = trace.path.exit_directions[(trace.num_events == 3) & (trace.path.band == 0)]
+    # It returns to where the light came from, 180 degrees less the deviation.
+    back = torch.atan2(bow[:, 1].abs(), -bow[:, 0])
+    torch.testing.assert_close(back, 4 * torch.asin(i.sin() / n) - 2 * i, atol=1e-9, rtol=0)
+    least = math.acos(math.sqrt((n * n - 1) / 3))
+    assert float(back.max()) == pytest.approx(4 * math.asin(math.sin(least) / n) - 2 * least, abs=1e-6)
+    assert math.degrees(float(back.max())) == pytest.approx(degrees, abs=0.05)
+
+
+def test_a_prism_parts_colours_as_its_formula(tmp_path: FilePath) -> None:
+    apex, n, abbe = math.radians(50), 1.5, 40.0
+    _prism(apex, 0.9).export(tmp_path / "prism.ply")
+    medium = SdfGrid(str(tmp_path / "prism.ply"), n, resolution=48, abbe=[abbe], cache=False)
+    i = math.radians(45)
+    direction = np.array([[math.cos(i - apex / 2), math.sin(i - apex / 2), 0.0]])
+    target = np.array([-0.225 * math.tan(apex / 2) * 2, 0.0, 0.1])
+    wavelengths = [700.0, 610.0, 550.0, 500.0, 450.0, 400.0]
+    path = Snell("mesh", wavelengths=wavelengths)(make_rays(target - 2 * direction, direction, 0.5, 9.0), medium)
+    measured = torch.deg2rad(angle(path.exit_directions, torch.tensor(direction))).tolist()
+    assert path.band.tolist() == [0, 1, 2, 3, 4, 5]
+    for found, wavelength in zip(measured, wavelengths, strict=True):
+        index, s = cauchy(n, abbe, wavelength), math.sin(i)
+        expected = i + math.asin(math.sin(apex) * math.sqrt(index**2 - s**2) - math.cos(apex) * s) - apex
+        assert found == pytest.approx(expected, abs=1e-7)
+    assert measured == sorted(measured)
+    # Two bands for each of red, green and blue.
+    half, none = 0.5, 0.0
+    assert path.throughput.tolist() == [[half, none, none]] * 2 + [[none, half, none]] * 2 + [[none, none, half]] * 2
+
+
+@pytest.mark.parametrize("branches", ["none", "all"])
+def test_every_band_is_traced_as_a_ray_of_its_colour(branches: str) -> None:
+    rays, sampler = _rays(), Snell(branches=branches)  # type: ignore[arg-type]
+    medium = RoundedBox(abbe=[30.0]).double()
+    path = sampler(rays, medium)
+    total = path.per_ray(torch.ones(len(path.s), 3).double())
+    torch.testing.assert_close(total, torch.ones_like(total))
+    assert (torch.bincount(path.ray)[~path.first_of_ray(path.refracted)] == 1).all()
+    for band, wavelength in enumerate(sampler.wavelengths):
+        single = sampler(rays, RoundedBox(ior=cauchy(1.52, 30, wavelength)).double())
+        mine = path[(path.band == band) & path.refracted]
+        alone = single[single.refracted]
+        torch.testing.assert_close(mine.exit_directions, alone.exit_directions, atol=1e-9, rtol=0)
+        torch.testing.assert_close(mine.throughput[:, band], alone.throughput[:, 0], atol=1e-9, rtol=0)
+
+
+def test_bands_bring_their_gradients_to_the_one_index() -> None:
+    def exits(step: Tensor, refine: bool) -> Tensor:
+        medium: Solid = Ball(abbe=[30.0]).double()
+        medium.iors = medium.iors + step
+        with torch.no_grad():
+            path = sampler(rays, medium)
+        path = sampler.refine(path, rays, medium) if refine else path
+        return path.exit_directions
+
+    rays, sampler = beam(torch.linspace(-0.6, 0.6, 7).double()), Snell()
+    zero = torch.zeros((), dtype=torch.float64)
+    found = torch.autograd.functional.jvp(lambda step: exits(step, True), zero, torch.ones_like(zero))[1]
+    expected = (exits(zero + 1e-6, False) - exits(zero - 1e-6, False)) / 2e-6
+    torch.testing.assert_close(found, expected, atol=1e-8, rtol=1e-6)
+    assert found.shape == (21, 3)
+
+
+def test_an_index_that_learns_keeps_its_abbe_number() -> None:
+    medium = Ball(abbe=[30.0])
+    medium.iors = nn.Parameter(medium.iors)
+    (gradient,) = torch.autograd.grad(medium.at_wavelength(450).iors.sum(), medium.iors)
+    assert float(gradient) == pytest.approx((cauchy(1.6, 30, 450) - cauchy(1.5, 30, 450)) / 0.1)
+
+
+def test_what_cannot_be_dispersed_is_refused() -> None:
+    with pytest.raises(NerfroError, match="one for each body"):
+        Ball(abbe=[30.0, 40.0])
+    with pytest.raises(NerfroError, match="wavelengths"):
+        Snell(wavelengths=[500.0, 600.0])
+    with pytest.raises(NerfroError, match="path=snell"):
+        Eikonal()(_rays(2), Ball(abbe=[30.0]))
