@@ -102,7 +102,8 @@ def load_points(path: Path) -> Float[np.ndarray, "P 3"]:
     import trimesh
 
     try:
-        return np.asarray(trimesh.load(path, process=False).vertices, np.float64).reshape(-1, 3)  # type: ignore[union-attr]
+        loaded: Any = trimesh.load(path, process=False)
+        return np.asarray(loaded.vertices, np.float64).reshape(-1, 3)
     except Exception as error:  # trimesh's readers raise whatever their parsers do
         raise NerfroError(
             f"{path} holds no points that can be read ({error}); export it again, or take it out"

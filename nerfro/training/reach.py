@@ -7,6 +7,7 @@ import torch
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.cli import warn
 from nerfro.errors import NerfroError
+from nerfro.fields.base import Field
 from nerfro.models.base import NerfModel
 from nerfro.types import Batch
 
@@ -21,8 +22,9 @@ def require_reach(model: NerfModel, batch: Batch) -> None:
     Raises:
         NerfroError: every ray of the batch passes the field's box.
     """
-    bounds = model.fields[0].bounds
-    if bounds is None:
+    field = model.fields[0]
+    assert isinstance(field, Field)
+    if (bounds := field.bounds) is None:
         return
     path = model.trace(batch.rays, batch.path)
     enters, leaves = path.span(bounds.to(path.s))
