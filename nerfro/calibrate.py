@@ -12,8 +12,9 @@ from rich.progress import track
 from nerfro.capture.calibrate_options import CalibrateConfig, check_options, make_target
 from nerfro.capture.calibrated_data import FILES, ray_range, relative, split_views, write_calibrated
 from nerfro.capture.calibration import Calibration, calibrate
+from nerfro.capture.model_import import import_model
 from nerfro.capture.photographs import list_photographs, luminance, outside
-from nerfro.capture.reconstruction import find_model, import_model
+from nerfro.capture.reconstruction import Making, find_model
 from nerfro.capture.targets import Target, print_sheets
 from nerfro.cli import entry_point, warn
 from nerfro.data.masks import find_mask
@@ -40,7 +41,8 @@ def main(config: DictConfig) -> None:
     masks = [find_mask(out, out / relative(image, out)) for image in images]
     refuse_existing([out / name for name in FILES], config.overwrite)
     if target is None:
-        model = find_model(config.model, images, masks, out / "sparse", config.lens, given, config.overwrite)
+        making = Making(config.lens, given, config.pairs, config.threads)
+        model = find_model(config.reconstruction, images, masks, out / "sparse", making, config.overwrite)
         calibration, points = import_model(model, images, size)
         quads, seen = [], points
     else:
@@ -74,7 +76,7 @@ def _write_board(target: Target | None, out: Path, overwrite: bool) -> None:
 def _report(calibration: Calibration, feature: str, may_distort: bool) -> None:
     print("\n".join(calibration.lines(feature)))
     lens = calibration.intrinsics
-    if calibration.mean_error > _GOOD_ERROR and may_distort:
+    if calibration.mean_error > _GOOD_ERROR and may_distort and not lens.distortion:
         warn("the error is large; a lens that distorts wants lens=radial or lens=opencv")
     if lens.focal_deviation is not None and lens.focal_deviation > _GOOD_FOCAL * lens.matrix[0, 0]:
         warn("the focal length is uncertain; photograph the board also at a slant, and from near and far")

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from nerfro.capture.mask_files import (
     MaskConfig,
@@ -23,7 +21,8 @@ from nerfro.capture.mask_files import (
     save_mask,
     stored_size,
 )
-from nerfro.capture.masking import grab, outline_region, propagate
+from nerfro.capture.masking import Found, grab, outline_region, propagate
+from nerfro.capture.outline_hull import AGREES
 from nerfro.capture.targets import opencv
 from nerfro.cli import entry_point, warn
 from nerfro.data.base import Frame
@@ -33,8 +32,6 @@ from nerfro.paths import EMBEDDED_PREFIX
 from nerfro.registry import build
 
 _SHEET = "masks.png"
-# The hull is coarse and a little too large; a mask that overlaps this much less with it than is usual is pointed out.
-_DOUBTFUL = 0.9
 
 
 @entry_point("mask", MaskConfig)
@@ -48,7 +45,7 @@ def main(config: DictConfig) -> None:
     cameras, images, frames = load_all(source)
     outlined = {find_frame(name, frames): outline for name, outline in outlines.items()}
     kept = {} if config.overwrite else {i: frame.mask for i, frame in enumerate(frames) if frame.mask is not None}
-    check_start(frames, outlined, kept)
+    check_start(frames, outlined, kept, config.hull_only)
     opencv()  # told now, if it is missing, and not after the hull
     size = cameras.width, cameras.height
     done = {view: read_resized(mask, size) for view, mask in kept.items()}
@@ -60,31 +57,35 @@ def main(config: DictConfig) -> None:
             raise NerfroError(f"{frames[view].name}: nothing is in the outline or the mask; draw it around the object")
     missing = len(frames) - len(done)
     print(f"{len(kept)} masks exist, {len(outlined)} outlines are given; {missing} views are cut out by the hull")
-    with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()) as progress:
-        task = progress.add_task("cutting out", total=2 * missing)
-        masks, overlaps = propagate(images, cameras, done, lambda count: progress.update(task, completed=count))
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns) as progress:
+        task = progress.add_task("cutting out", total=missing)
+        found = propagate(images, cameras, done, config.hull_only, lambda: progress.advance(task))
     made = [view for view in range(len(frames)) if view not in kept]
     for view in made:
-        save_mask(frames[view], masks[view])
-    save_picture(source.root / _SHEET, mask_sheet(images, frames, masks, overlaps))
-    _report(frames, overlaps, made, source.root / _SHEET)
+        save_mask(frames[view], found.masks[view])
+    save_picture(source.root / _SHEET, mask_sheet(images, frames, found))
+    _report(frames, found)
+    print(f"wrote {len(made)} masks beside their images (mask_*.png), and {source.root / _SHEET}: look at it")
+    print("correct wrong masks in any paint program, or delete them, outline one of them, and run this again")
     given = [text for text in HydraConfig.get().overrides.task if text.startswith(("data=", "data."))]
     if not any(text.startswith("data=") for text in given):
         given = ["data=opencv", *given]
     print(f"next: {shlex.join(['python', '-m', 'nerfro.preprocess', *given, 'medium.ior=1.33'])}")
 
 
-def _report(frames: list[Frame], overlaps: Mapping[int, float], made: list[int], sheet: Path) -> None:
-    print("overlap (intersection over union) of each mask with the hull of the others:")
-    worst_first = sorted(overlaps, key=lambda view: overlaps[view])
-    for view in worst_first:
-        print(f"  {overlaps[view]:.4f}  {frames[view].name}")
-    limit = _DOUBTFUL * float(np.median(list(overlaps.values()) or [0.0]))
-    bad = [frames[view].name for view in worst_first if overlaps[view] < limit]
-    if bad:
-        warn(f"overlap much less than is usual: {first_of(bad)}; look at them first")
-    print(f"wrote {len(made)} masks beside their images (mask_*.png), and {sheet}: look at it")
-    print("correct wrong masks in any paint program, or delete them, outline one of them, and run this again")
+def _report(frames: list[Frame], found: Found) -> None:
+    if found.overlaps:
+        print("overlap (intersection over union) of what GrabCut finds with the hull of the others:")
+    for view in sorted(found.overlaps, key=lambda view: found.overlaps[view]):
+        taken = ", so the hull is taken" if view in found.by_hull else ""
+        print(f"  {found.overlaps[view]:.4f}  {frames[view].name}{taken}")
+    doubtful = [frames[view].name for view in found.by_hull if view in found.overlaps]
+    if doubtful:
+        warn(
+            f"{len(doubtful)} of {len(frames)} views: GrabCut and the hull overlap by less than {AGREES} "
+            f"({first_of(doubtful)}); their masks are the hull's, which is a little too large: look at them first"
+        )
 
 
 if __name__ == "__main__":

@@ -12,10 +12,12 @@ from jaxtyping import Float
 from omegaconf import DictConfig
 
 from nerfro.capture.overlays import contact_sheet
-from nerfro.capture.pose_conventions import GOOD_OVERLAP, overlap, require_consistent_poses
+from nerfro.capture.pose_conventions import GOOD_OVERLAP, better_wrong_masks, overlap, require_consistent_poses
 from nerfro.capture.preprocess_options import MESH, REPORT, SHEET, PreprocessConfig, claim, train_command
 from nerfro.capture.surface import make_mesh, read_silhouettes
+from nerfro.capture.visual_hull import Silhouettes
 from nerfro.cli import entry_point, warn
+from nerfro.data.masks import masked_views
 from nerfro.errors import first_of
 from nerfro.files.atomic import write_atomically
 from nerfro.files.images import save_picture
@@ -32,7 +34,7 @@ def main(config: DictConfig) -> None:
     """Carve, fit, compare with the masks, and say how to train; whatever can be refused is refused before that."""
     mesh = None if config.mesh is None else load_mesh(resolve_path(config.mesh))
     folder = claim(config)
-    views = build(config.data).load(config.split)
+    views = masked_views(build(config.data).load(config.split))
     box = None if config.box_min is None else np.array([config.box_min, config.box_max], np.float64)
     silhouettes = read_silhouettes(views, box is not None)
     require_consistent_poses(silhouettes, views.names, config.wrong_masks)
@@ -42,6 +44,7 @@ def main(config: DictConfig) -> None:
         location, written = str(folder / MESH), [MESH, *written]
     overlaps = overlap(mesh, silhouettes, _MAX_PIXELS)
     _report(overlaps, views.names)
+    _warn_of_bad(overlaps, views.names, silhouettes, config)
     # Pictures and figures first: they help to find out what is wrong with a mesh that the medium then refuses.
     save_picture(folder / SHEET, contact_sheet(views, mesh, overlaps, _MAX_PIXELS))
     each = dict(zip(views.names, (round(float(x), 4) for x in overlaps), strict=True))
@@ -61,9 +64,19 @@ def _report(overlaps: Float[np.ndarray, "V"], names: list[str]) -> None:
         print(f"  {value:.4f}  {name}")
     worst = int(overlaps.argmin())
     print(f"  {overlaps.mean():.4f}  mean; {overlaps[worst]:.4f} lowest, {names[worst]}")
+
+
+def _warn_of_bad(
+    overlaps: Float[np.ndarray, "V"], names: list[str], silhouettes: Silhouettes, config: DictConfig
+) -> None:
     bad = [names[view] for view in np.argsort(overlaps, kind="stable") if overlaps[view] < GOOD_OVERLAP]
-    if bad:
-        warn(f"overlaps below {GOOD_OVERLAP}: {first_of(bad)}; look at {SHEET}, and correct their masks or poses")
+    if not bad:
+        return
+    better = better_wrong_masks(silhouettes, config.wrong_masks) if config.mesh is None else None
+    advice = (
+        "" if better is None else f"; where few masks are wrong, the others make a better hull: wrong_masks={better}"
+    )
+    warn(f"overlaps below {GOOD_OVERLAP}: {first_of(bad)}; look at {SHEET}, and correct their masks or poses{advice}")
 
 
 if __name__ == "__main__":

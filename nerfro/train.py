@@ -24,6 +24,7 @@ from nerfro.training.config import TrainConfig, build_model
 from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.memory import require_memory
 from nerfro.training.ray_batches import RayBatches
+from nerfro.training.reach import require_reach
 from nerfro.training.run_folder import (
     LAST_CHECKPOINT,
     claim,
@@ -61,7 +62,9 @@ def main(config: DictConfig) -> None:
     trainer = make_trainer(config, folder, [throughput, interruption, *viewer])
     batches = batches.share(trainer.global_rank, trainer.world_size)
     batches = traced(batches, model, config)
-    memory = require_memory(model, batches.batch(0).rays, trainer.strategy.root_device)
+    first = batches.batch(0)
+    require_reach(model, first)
+    memory = require_memory(model, first.rays, trainer.strategy.root_device)
     if trainer.is_global_zero:
         claim(folder, checkpoint is not None, needed_bytes(model))
         record(folder, config)

@@ -158,3 +158,38 @@ def test_user_sees_one_line_and_exit_code_one(module: str, override: str, words:
     assert line.startswith("nerfro: error: ")
     assert words in line
     assert not [path for path in tmp_path.rglob("*") if path.is_file()], "nothing is written"
+
+
+def test_a_field_that_rays_miss_is_told_before_training(
+    train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path
+) -> None:
+    sky = "boundary=skybox", "boundary.width=8"
+    run = [text for text in tiny_run if text not in sky]
+    run += ["trainer.max_steps=1", "evaluation.every=0", "boundary=constant"]
+    away = ["field.box_min=[50,50,50]", "field.box_max=[51,51,51]"]
+    finished = train_here(*run, *away, f"hydra.run.dir={tmp_path / 'away'}")
+    assert finished.code == 1
+    assert "no ray of the training views meets the field's box from [50.0, 50.0, 50.0]" in finished.err
+    assert "set content.box_min" in finished.err
+    assert not list((tmp_path / "away").rglob("*"))
+    small = ["field.box_min=[-0.3,-0.3,-0.3]", "field.box_max=[0.3,0.3,0.3]"]
+    finished = train_here(*run, *small, f"hydra.run.dir={tmp_path / 'small'}")
+    assert finished.code == 0
+    assert "% of the rays pass the field's box from [-0.3, -0.3, -0.3]" in finished.out
+    whole = ["field.box_min=[-9,-9,-9]", "field.box_max=[9,9,9]"]
+    assert "pass the field's box" not in train_here(*run, *whole, f"hydra.run.dir={tmp_path / 'whole'}").out
+
+
+def test_straight_rays_without_an_object_ask_for_the_box(
+    train_here: Callable[..., Any], tiny_scene: Path, tiny_default_run: list[str], tmp_path: Path
+) -> None:
+    root = tmp_path / "data"
+    shutil.copytree(tiny_scene, root)
+    (root / "mesh.ply").unlink()
+    own = [f"data.root={root}", "sampler/path=straight", "trainer.max_steps=1", f"hydra.run.dir={tmp_path / 'run'}"]
+    finished = train_here(*tiny_default_run, *own)
+    assert finished.code == 1
+    assert "content.box_min=[X,Y,Z]" in finished.err
+    assert finished.err.count("\n") == 1
+    box = ["content.box_min=[-1,-1,-1]", "content.box_max=[1,1,1]", "evaluation.every=0"]
+    assert train_here(*tiny_default_run, *own, *box).code == 0

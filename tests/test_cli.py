@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Optional, get_type_hints
 
 import pytest
 import yaml
@@ -15,7 +18,8 @@ from hydra.errors import OverrideParseException
 
 from nerfro.cli import in_one_line
 from nerfro.errors import NerfroError
-from nerfro.paths import resolve_path, user_path
+from nerfro.paths import CONF_DIR, PACKAGE_DIR, resolve_path, user_path
+from nerfro.registry import KINDS
 from nerfro.training import callbacks
 
 
@@ -92,3 +96,16 @@ def test_progress_begins_with_the_step(monkeypatch: pytest.MonkeyPatch, capsys: 
     assert last.startswith("train  25%|")
     assert "| step 250 ETA " in last
     assert last.endswith("0 rays/s train PSNR 20.00 val PSNR 19.00")
+
+
+@pytest.mark.parametrize("module", sorted(path.stem for path in PACKAGE_DIR.glob("*.py")))
+def test_no_option_is_called_like_a_group_of_options(module: str) -> None:
+    """Hydra would take `model=FOLDER` for the choice of a group's member."""
+    source = (PACKAGE_DIR / f"{module}.py").read_text(encoding="utf-8")
+    found = re.search(r'@entry_point\("\w+", (\w+)\)', source)
+    if found is None:
+        pytest.skip("no command that sees conf/")
+    hints = get_type_hints(getattr(importlib.import_module(f"nerfro.{module}"), found[1]))
+    groups = {path.name for path in CONF_DIR.iterdir() if path.is_dir()} | set(KINDS)
+    values = {name for name, hint in hints.items() if hint in (str, Optional[str], int, float, bool)}  # noqa: UP045
+    assert values & groups == set()

@@ -201,3 +201,30 @@ def test_options_out_of_range(preprocess: Callable[..., str]) -> None:
     assert "give both box_min and box_max" in preprocess("box_min=[0,0,0]")
     assert "is no box" in preprocess("box_min=[0,0,0]", "box_max=[1,1,0]")
     assert "add out=FOLDER" in preprocess("data.root=embedded:torus")
+
+
+def test_a_hull_needs_masks_of_some_views_only(preprocess: Callable[..., str], capture: Path) -> None:
+    for view in range(0, NUM_VIEWS, 2):
+        (capture / "masks" / "train" / f"r_{view}.png").unlink()
+    printed = preprocess()
+    assert "12 of 24 images have no mask (r_0.png, r_2.png, r_4.png and 9 more)" in printed
+    assert len(json.loads((capture / "overlaps.json").read_text())["views"]) == 12
+    assert abs(np.linalg.norm(load_mesh(capture / "mesh.ply").vertices - CENTRE, axis=1).mean() - RADIUS) < 0.05
+
+
+def test_disagreeing_masks_name_the_number_that_may_be_wrong(preprocess: Callable[..., str], capture: Path) -> None:
+    def cut(mask: np.ndarray) -> np.ndarray:  # something stands in front of the object's side
+        mask[:, int(np.quantile(np.flatnonzero(mask.any(0)), 0.7)) :] = 0
+        return mask
+
+    _change_masks(capture, cut, 1)
+    printed = preprocess()
+    assert "overlaps below 0.9" in printed
+    told = re.search(r"wrong_masks=(\d)", printed)
+    assert told is not None
+    before = json.loads((capture / "overlaps.json").read_text())["views"]
+    again = preprocess(f"wrong_masks={told[1]}", "overwrite=true")
+    assert "wrong_masks=" not in again
+    after = json.loads((capture / "overlaps.json").read_text())["views"]
+    whole = [f"train/r_{view}" for view in range(1, NUM_VIEWS)]
+    assert np.mean([after[name] for name in whole]) > np.mean([before[name] for name in whole]) + 0.01

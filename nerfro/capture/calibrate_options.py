@@ -8,6 +8,7 @@ from typing import Optional
 import numpy as np
 from omegaconf import DictConfig
 
+from nerfro.allowed import Count
 from nerfro.capture.boards import LAYOUTS, tag_grid, twelve_faces
 from nerfro.capture.calibration import Intrinsics
 from nerfro.capture.targets import CharucoTarget, TagTarget, Target
@@ -18,6 +19,7 @@ _ALLOWED = {
     "board": ("twelve_faces", "grid"),
     "lens": ("pinhole", "radial", "opencv"),
     "family": (*LAYOUTS, None),
+    "pairs": ("sequential", "all", None),
 }
 
 
@@ -37,7 +39,10 @@ class CalibrateConfig:
         marker: side of a ChArUco marker in the same unit; by default half a square.
         dictionary: of the ChArUco markers.
         write_board: write the board to print, board.pdf and board_*.png, into `out`, and nothing else without images.
-        model: folder of a COLMAP model; by default `images`/../sparse/0 or /sparse, and made anew where there is none.
+        reconstruction: folder of a COLMAP model; by default `images`/../sparse/0 or /sparse; made where there is none.
+        pairs: of images that COLMAP matches: `sequential`, each with the ten next by name and ever fewer beyond, or
+            `all`; by default sequential where the names count.
+        threads: that COLMAP may take; by default one for each core.
         lens: what is estimated beside focal lengths and principal point: `pinhole` nothing, as in the paper; `radial`
             k1 and k2; `opencv` k1, k2, p1 and p2.
         intrinsics: fx, fy, cx, cy in pixels from the image's corner, for a lens that is known; nothing is estimated.
@@ -57,7 +62,9 @@ class CalibrateConfig:
     marker: Optional[float] = None  # noqa: UP045
     dictionary: str = "6X6_250"
     write_board: bool = False
-    model: Optional[str] = None  # noqa: UP045
+    reconstruction: Optional[str] = None  # noqa: UP045
+    pairs: Optional[str] = None  # noqa: UP045
+    threads: Optional[Count] = None  # noqa: UP045
     lens: str = "pinhole"
     intrinsics: Optional[list[float]] = None  # noqa: UP045
     distortion: Optional[list[float]] = None  # noqa: UP045

@@ -16,6 +16,8 @@ from omegaconf import MISSING, OmegaConf
 from PIL import Image
 
 from nerfro.cameras import Cameras
+from nerfro.capture.masking import Found
+from nerfro.capture.outline_hull import FEWEST_VIEWS
 from nerfro.capture.targets import opencv
 from nerfro.data.base import DataSource, Frame
 from nerfro.data.image_files import read_mask, to_unit
@@ -37,11 +39,14 @@ class MaskConfig:
         data: the views (options of the group `data`); those of all splits get masks.
         outlines: by the image's name, a box [left, top, right, bottom] around the object or a rough polygon
             [[column, row], ...], pixels; or a JSON file that holds these.
+        hull_only: take the masks that exist, three at least, and project their hull into all other views; nothing is
+            cut out by colours.
         overwrite: make masks that exist anew, from the outlines alone; else they are kept and show the way.
     """
 
     data: Any = MISSING
     outlines: Any = None
+    hull_only: bool = False
     overwrite: bool = False
 
 
@@ -112,12 +117,19 @@ def find_frame(name: str, frames: list[Frame]) -> int:
     return found[0]
 
 
-def check_start(frames: list[Frame], outlined: Mapping[int, object], kept: Mapping[int, object]) -> None:
+def check_start(
+    frames: list[Frame], outlined: Mapping[int, object], kept: Mapping[int, object], hull_only: bool
+) -> None:
     """Refuse where there is nothing to start from, nothing to do, or no place for a mask."""
     if not outlined and not kept:
         raise NerfroError(
             "there is no mask to start from; give the outline of the object in an image, as in "
             f"outlines={{{frames[0].name}:[LEFT,TOP,RIGHT,BOTTOM]}}"
+        )
+    if hull_only and len(outlined) + len(kept) < FEWEST_VIEWS:
+        raise NerfroError(
+            f"hull_only=true takes masks or outlines of {FEWEST_VIEWS} images or more, from all sides; there are "
+            f"{len(outlined) + len(kept)}"
         )
     for view in outlined:
         if view in kept:
@@ -132,8 +144,10 @@ def check_start(frames: list[Frame], outlined: Mapping[int, object], kept: Mappi
 
 
 def mask_file(frame: Frame) -> Path:
-    """Where a frame's mask is, or goes."""
-    return frame.mask or frame.image.with_name(f"mask_{frame.image.stem}.png")
+    """Where a frame's mask goes: to where it is, unless that is a JPEG."""
+    if frame.mask is not None and frame.mask.suffix == ".png":
+        return frame.mask
+    return frame.image.with_name(f"mask_{frame.image.stem}.png")
 
 
 def stored_size(frame: Frame) -> tuple[int, int]:
@@ -162,16 +176,17 @@ def save_mask(frame: Frame, mask: Bool[np.ndarray, "H W"]) -> None:
 def mask_sheet(
     images: list[UInt8[np.ndarray, "H W 3"]],
     frames: list[Frame],
-    masks: Mapping[int, Bool[np.ndarray, "H W"]],
-    overlaps: Mapping[int, float],
+    found: Found,
 ) -> Image.Image:
     """All views with their masks, darkened outside; the doubtful first, those that were given last."""
-    order = sorted(range(len(images)), key=lambda view: overlaps.get(view, 2.0))
+    told = {view: f"{overlap:.3f}" for view, overlap in found.overlaps.items()}
+    told |= {view: f"{told.get(view, '')} hull".strip() for view in found.by_hull}
+    order = sorted(range(len(images)), key=lambda view: (view not in told, found.overlaps.get(view, 0.0)))
     stride = max(1, images[0].shape[1] // (2 * _TILE))
     pictures, captions = [], []
     for view in order:
-        inside, image = (torch.from_numpy(array[::stride, ::stride]) for array in (masks[view], images[view]))
+        inside, image = (torch.from_numpy(array[::stride, ::stride]) for array in (found.masks[view], images[view]))
         pictures.append(torch.where(inside[..., None], image / 255, image / 1020 + torch.tensor(_OUTSIDE) / 255))
-        label = f"{overlaps[view]:.3f}" if view in overlaps else "given"
-        captions.append(f"{label}  {frames[view].name[-_NAME_LENGTH:]}")
-    return sheet(pictures, captions, _TILE, _COLUMNS, "overlap with the hull of the others; outside the mask is dark")
+        captions.append(f"{told.get(view, 'given')}  {frames[view].name[-_NAME_LENGTH:]}")
+    legend = "overlap of GrabCut with the hull, and whose mask is the hull's; outside the mask is dark"
+    return sheet(pictures, captions, _TILE, _COLUMNS, legend)

@@ -1,36 +1,25 @@
-"""Silhouettes by GrabCut, led from view to view by the visual hull of those that are done."""
+"""Silhouettes by GrabCut and by the visual hull of those that agree."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, UInt8
 from numpy.typing import ArrayLike
-from scipy.ndimage import binary_closing, binary_fill_holes, label
+from scipy.ndimage import binary_fill_holes, label
 
 from nerfro.cameras import Cameras
+from nerfro.capture.outline_hull import AGREES, FEWEST_VIEWS, MAX_SIDE, OutlineHull
 from nerfro.capture.targets import opencv
-from nerfro.capture.visual_hull import Silhouettes, find_box, nearest_point
 from nerfro.errors import NerfroError
 
 _ITERATIONS = 5
-# GrabCut sees the object and its surroundings in at most so many pixels along the longer side.
-_MAX_SIDE = 480
-# The surroundings that it learns the background from, as a share of the region's longer side.
+# The surroundings that GrabCut learns the background from, as a share of the region's longer side.
 _SURROUNDINGS = 0.4
 # How far the object may reach beyond the projected hull, and what is surely object within it, shares of its diameter.
 _REACH, _CORE = 0.06, 0.2
-_GRID = 56
-# The box is found anew until so many views are done.
-_SETTLED = 8
-# Share of the views that may be wrong about any point of space.
-_WRONG_SHARE = 0.1
-# GrabCut that keeps less than this of the projected hull has failed.
-_LEAST_KEPT = 0.3
-# From one view the depth is only known from where the cameras look; the box is so many times larger.
-_UNCERTAIN = 1.6
 
 
 def grab(
@@ -52,7 +41,7 @@ def grab(
     margin = int(_SURROUNDINGS * max(np.ptp(rows), np.ptp(columns))) + 4
     window = tuple(slice(max(0, one[0] - margin), one[-1] + 1 + margin) for one in (rows, columns))
     height, width = likely[window].shape
-    scale = min(1.0, _MAX_SIDE / max(height, width))
+    scale = min(1.0, MAX_SIDE / max(height, width))
     small = max(1, round(width * scale)), max(1, round(height * scale))
 
     def shrink(region: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -94,124 +83,78 @@ def outline_region(
     return region > 0, _grown(region > 0, _REACH)
 
 
+@dataclass(frozen=True)
+class Found:
+    """Silhouettes by view, and for each that was not given:
+
+    Attributes:
+        overlaps: of GrabCut's mask with the hull of the others (intersection over union).
+        by_hull: views whose mask is the hull's, since the two do not agree, or since the hull alone is wanted.
+    """
+
+    masks: dict[int, Bool[np.ndarray, "H W"]]
+    overlaps: dict[int, float]
+    by_hull: list[int]
+
+
 def propagate(
     images: Sequence[UInt8[np.ndarray, "H W 3"]],
     cameras: Cameras,
-    done: Mapping[int, Bool[np.ndarray, "H W"]],
-    progress: Callable[[int], None] = lambda count: None,
-) -> tuple[dict[int, Bool[np.ndarray, "H W"]], dict[int, float]]:
+    given: Mapping[int, Bool[np.ndarray, "H W"]],
+    hull_only: bool = False,
+    progress: Callable[[], None] = lambda: None,
+) -> Found:
     """Find the object in all views from its silhouettes in some, at least one.
 
-    The next view is always one that looks from nearly where a done one does. After all have had their turn, those that
-    were not given are cut out once more, each from the hull of all others. `progress` counts the cuts, two a view.
+    Those that are given lead. Where they are fewer than three, GrabCut adds the nearest views that look from elsewhere:
+    each is cut out from the hull of those before, and leads if the hull with it still looks like all their masks. Then
+    every view is cut out from the hull of the leading others. Where the two do not agree, the mask is the hull's: of
+    all masks that agree.
 
-    Returns:
-        Silhouettes of all views, and for each that was not given its overlap (intersection over union) with the hull of
-        the others.
+    Args:
+        hull_only: have no mask cut out; the views that lead are those given.
+        progress: called once for each view that was not given.
 
     Raises:
-        NerfroError: no other view shows what the given silhouettes show.
+        NerfroError: too few views show what the given silhouettes show.
     """
-    masks = dict(done)
-    hull = _Hull(cameras, masks)
-    wanted = [view for view in range(len(images)) if view not in masks]
-    count = 0
-    while len(masks) < len(images):
-        view = _nearest_view(cameras, hull.centre, [v for v in wanted if v not in masks], list(masks))
-        region = hull.seen_from(view)
-        found = grab(images[view], region, _grown(region, _REACH))
-        masks[view] = found if found.sum() >= _LEAST_KEPT * region.sum() else region
-        if len(masks) <= _SETTLED:
-            hull = _Hull(cameras, masks)
-        else:
-            hull.add(view, masks[view])
-        progress(count := count + 1)
-    if wanted and not any(masks[view].any() for view in wanted):
-        raise NerfroError("what is outlined is seen in no other image; draw the outline around the whole object")
-    hull = _Hull(cameras, masks)
-    refined, overlaps = {}, {}
-    for view in wanted:
-        region = hull.seen_from(view)
-        if not region.any():  # the others contradict each other here; what was found stays
-            region = masks[view]
+    wanted = [view for view in range(len(images)) if view not in given]
+    outlines = OutlineHull(cameras, given)
+    if len(given) < FEWEST_VIEWS:
+        _lead(images, outlines)
+    if wanted and len(outlines) < FEWEST_VIEWS:
+        raise NerfroError(
+            f"{len(outlines)} of {len(images)} views agree on a shape, {FEWEST_VIEWS} are needed: what is "
+            "outlined is not found in other images by its colours; outline the whole object in more views, or bring "
+            "masks, from all sides"
+        )
+    common = outlines.hull()
+    if wanted and common is None:
+        raise NerfroError("no point lies inside the masks that are given: correct them, or the poses")
+    found, overlaps = {}, {}
+    for view in wanted if not hull_only else []:
+        region = outlines.seen_from(view, outlines.hull(without=view) if view in outlines else common)
         core = _distance(region) > _CORE * _diameter(region)
-        found = grab(images[view], region, _grown(region, _REACH), core)
-        refined[view] = found if found.sum() >= _LEAST_KEPT * region.sum() else region
-        overlaps[view] = float((found & region).sum() / max(1, (found | region).sum()))
-        progress(count := count + 1)
-    return masks | refined, overlaps
+        cut = grab(images[view], region, _grown(region, _REACH), core)
+        either = (cut | region).sum()
+        overlaps[view] = float((cut & region).sum() / either) if either else 1.0
+        if overlaps[view] >= AGREES:
+            found[view] = cut
+        progress()
+    by_hull = [view for view in wanted if view not in found]
+    hull = OutlineHull(cameras, {**given, **found}).hull() if found else common
+    for view in by_hull:
+        found[view] = outlines.seen_from(view, hull)
+    return Found({**given, **found}, overlaps, by_hull)
 
 
-class _Hull:
-    """Points of a grid, and which views say that each is not object."""
-
-    def __init__(self, cameras: Cameras, masks: Mapping[int, Bool[np.ndarray, "H W"]]) -> None:
-        self.cameras = cameras
-        masks = {view: mask for view, mask in masks.items() if mask.any()}  # a view without the object says nothing
-        box = _find_box(cameras, masks)
-        self.centre = box.mean(0)
-        axes = [torch.linspace(float(box[0][a]), float(box[1][a]), _GRID) for a in range(3)]
-        self.points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-        self.voxel = float(axes[0][1] - axes[0][0])
-        self.outside: dict[int, Bool[np.ndarray, "P"]] = {}
-        self.count = np.zeros(len(self.points), np.int32)
-        for view, mask in masks.items():
-            self.add(view, mask)
-
-    def add(self, view: int, mask: Bool[np.ndarray, "H W"]) -> None:
-        if not mask.any():
-            return
-        silhouettes = Silhouettes.of(self.cameras.select([view]), torch.from_numpy(mask[None]).float())
-        inside, width, _ = silhouettes.depth_inside(0, self.points)
-        # A little generous, for thin parts lie between the grid's points.
-        self.outside[view] = (inside * width < -0.3 * self.voxel).numpy()
-        self.count += self.outside[view]
-
-    def seen_from(self, view: int) -> Bool[np.ndarray, "H W"]:
-        """The silhouette of what the other views leave over."""
-        own = self.outside.get(view)
-        num_others = len(self.outside) - (own is not None)
-        inside = (self.count if own is None else self.count - own) <= int(_WRONG_SHARE * num_others)
-        camera = self.cameras.select([view])
-        region = np.zeros((camera.height, camera.width), bool)
-        points = self.points[torch.from_numpy(inside)]
-        pixels, depth = (values[0] for values in camera.project(points))
-        pixels, depth = pixels[depth > 0], depth[depth > 0]
-        if len(depth) == 0:
-            return region
-        # The grid's points are drawn into pixels of a voxel's width, which then have no gaps.
-        step = int(np.clip(np.ceil(self.voxel * float(camera.fx) / float(depth.min())), 1, max(region.shape)))
-        coarse = np.zeros((-(-camera.height // step), -(-camera.width // step)), bool)
-        column, row = (pixels / step).floor().long().T
-        framed = (column >= 0) & (column < coarse.shape[1]) & (row >= 0) & (row < coarse.shape[0])
-        coarse[row[framed].numpy(), column[framed].numpy()] = True
-        coarse = binary_fill_holes(binary_closing(np.pad(coarse, 2)))[2:-2, 2:-2]
-        return np.kron(coarse, np.ones((step, step), bool))[: camera.height, : camera.width]
-
-
-def _find_box(cameras: Cameras, masks: Mapping[int, Bool[np.ndarray, "H W"]]) -> Float[np.ndarray, "2 3"]:
-    views = sorted(masks)
-    chosen = cameras.select(views)
-    inside = torch.from_numpy(np.stack([masks[view] for view in views]))
-    if len(views) > 1:
-        return find_box(Silhouettes.of(chosen, inside.float()))
-    rows, columns = torch.nonzero(inside[0], as_tuple=True)
-    middle = torch.tensor([float(rows.float().mean())]), torch.tensor([float(columns.float().mean())])
-    ray = chosen.rays(torch.zeros(1, dtype=torch.long), *middle)
-    origin, direction = ray.origins[0].double().numpy(), ray.directions[0].double().numpy()
-    # Cameras look at the object, more or less.
-    poses = cameras.camera_to_world.double().numpy()
-    target = nearest_point(poses[:, :, 3], -poses[:, :, 2])
-    distance = max(float((target - origin) @ direction), 1e-3 * float(np.linalg.norm(target - origin)))
-    pixels = max(float(np.ptp(rows)), float(np.ptp(columns))) + 1
-    half_side = _UNCERTAIN * 0.5 * pixels * distance / float(chosen.fx)
-    return np.stack([origin + distance * direction - half_side, origin + distance * direction + half_side])
-
-
-def _nearest_view(cameras: Cameras, centre: Float[np.ndarray, "3"], wanted: list[int], done: list[int]) -> int:
-    towards = cameras.camera_to_world[:, :, 3].double().numpy() - centre
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    return wanted[int((towards[wanted] @ towards[done].T).max(1).argmax())]
+def _lead(images: Sequence[UInt8[np.ndarray, "H W 3"]], outlines: OutlineHull) -> None:
+    """Add views that look from elsewhere, as long as all agree."""
+    refused: list[int] = []
+    while (view := outlines.next_view(refused)) is not None:
+        region = outlines.seen_from(view, outlines.hull())
+        if not outlines.add_if_agreed(view, grab(images[view], region, _grown(region, _REACH))):
+            refused.append(view)
 
 
 def _diameter(region: Bool[np.ndarray, "H W"]) -> float:

@@ -20,6 +20,8 @@ _COARSE_VOXELS, _COARSE_PIXELS = 48, 64
 GOOD_OVERLAP = 0.9
 # A coarse hull may miss a mask's outline by this many of the pixels that it is looked at in.
 _SLACK = 1.5
+# One wrong view needs so many; an agreement is clearly better by this much.
+_VOTES, _CLEARLY = 6, 0.005
 
 # What a file's poses could have been, as what has to be done to them as they were read; most frequent mistakes first.
 # `turn` is applied to the camera's axes (x right, y up, z back), `inverse` to the whole matrix before.
@@ -79,19 +81,32 @@ def require_consistent_poses(silhouettes: Silhouettes, names: list[str], wrong_m
             f"{state}; the poses are in another convention: with {_ALTERNATIVES[best][0]} they agree to "
             f"{scores[best]:.0%}; correct transform_matrix, or choose the data= format that fits"
         )
-    for allowed in (1, 2, 4, 8):
-        if wrong_masks < allowed <= max(1, len(names) // 8):
-            each = coarse_agreement(silhouettes, allowed)
-            if np.median(each) >= GOOD_OVERLAP:
-                odd = [names[view] for view in np.argsort(each, kind="stable")[:allowed]]
-                raise NerfroError(
-                    f"{state}, but not if {allowed} views may be wrong; look at the masks and poses of "
-                    f"{', '.join(odd)}, and correct them or set wrong_masks={allowed}"
-                )
+    for allowed in _numbers_of_wrong_masks(len(names), wrong_masks):
+        each = coarse_agreement(silhouettes, allowed)
+        if np.median(each) >= GOOD_OVERLAP:
+            odd = [names[view] for view in np.argsort(each, kind="stable")[:allowed]]
+            raise NerfroError(
+                f"{state}, but not if {allowed} views may be wrong; look at the masks and poses of "
+                f"{', '.join(odd)}, and correct them or set wrong_masks={allowed}"
+            )
     raise NerfroError(
         f"{state}, and no usual misreading of the poses explains it; check that masks, images and poses belong "
         "together and that the object did not move between the views"
     )
+
+
+def better_wrong_masks(silhouettes: Silhouettes, wrong_masks: int) -> int | None:
+    """The number of views that may be wrong with which a coarse hull looks most like the masks; None if now it does."""
+    tried = [wrong_masks, *_numbers_of_wrong_masks(len(silhouettes), wrong_masks)]
+    agreements = [float(coarse_agreement(silhouettes, allowed).mean()) for allowed in tried]
+    best = next(i for i, agreement in enumerate(agreements) if agreement >= max(agreements) - _CLEARLY)
+    return tried[best] if agreements[best] > agreements[0] + _CLEARLY else None
+
+
+def _numbers_of_wrong_masks(num_views: int, more_than: int) -> list[int]:
+    """1, 2, 4, ... as far as most views can still outvote them."""
+    most = max(1, num_views // _VOTES)
+    return [number for number in sorted({2**power for power in range(8)} | {most}) if more_than < number <= most]
 
 
 def _changed(silhouettes: Silhouettes, inverse: bool, turn: _Turn) -> Silhouettes:

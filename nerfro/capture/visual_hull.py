@@ -16,6 +16,7 @@ from torch import Tensor
 from nerfro.cameras import Cameras
 from nerfro.capture.silhouettes import frame_pixels, outline_distance
 from nerfro.errors import NerfroError
+from nerfro.geometry.lines import nearest_point
 from nerfro.geometry.mesh import TriangleMesh, merge_vertices
 
 # Each level halves the voxels and looks only at those near the surface of the level before.
@@ -96,17 +97,23 @@ class Silhouettes:
         return torch.where(num_seen < _MIN_VIEWS, far, largest[-1])
 
 
+def centre_lines(silhouettes: Silhouettes) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"]]:
+    """Origins and unit directions of the lines through the centres of masks, none of them empty."""
+    cameras, inside = silhouettes.cameras, silhouettes.masks > 0.5
+    rows, columns = torch.arange(cameras.height) + 0.5, torch.arange(cameras.width) + 0.5
+    count = inside.sum((1, 2))
+    row, column = (inside.sum(2) * rows).sum(1) / count, (inside.sum(1) * columns).sum(1) / count
+    rays = cameras.rays(torch.arange(len(cameras)), row - 0.5, column - 0.5)
+    return rays.origins.double().numpy(), rays.directions.double().numpy()
+
+
 def find_box(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np.ndarray, "2 3"]:
     """A cube around the object: where the lines through the masks' centres meet, and as wide as the widest mask there.
 
     No mask is empty. The `wrong_masks` widest ones are passed over.
     """
     cameras, inside = silhouettes.cameras, silhouettes.masks > 0.5
-    rows, columns = torch.arange(cameras.height) + 0.5, torch.arange(cameras.width) + 0.5
-    count = inside.sum((1, 2))
-    row, column = (inside.sum(2) * rows).sum(1) / count, (inside.sum(1) * columns).sum(1) / count
-    rays = cameras.rays(torch.arange(len(cameras)), row - 0.5, column - 0.5)
-    centre = nearest_point(rays.origins.double().numpy(), rays.directions.double().numpy())
+    centre = nearest_point(*centre_lines(silhouettes))
     pixels, depth = cameras.project(torch.from_numpy(centre[None]).float())
     radii = []
     for view in range(len(cameras)):
@@ -116,25 +123,6 @@ def find_box(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np.ndarray
         radii.append(float(reach * depth[view, 0].abs() / (0.5 * (cameras.fx[view] + cameras.fy[view]))))
     half_side = 1.1 * sorted(radii)[-1 - min(wrong_masks, len(radii) - 1)]
     return np.stack([centre - half_side, centre + half_side])
-
-
-def nearest_point(origins: Float[np.ndarray, "V 3"], directions: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "3"]:
-    """The point of the least sum of distances to lines, by reweighted least squares: a few stray lines do not count."""
-    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    weights = np.ones(len(origins))
-    point = origins.mean(0)
-    for _ in range(20):
-        # Where all lines are parallel, any depth will do: the one nearest the cameras' centres.
-        system = (weights[:, None, None] * across).sum(0) + 1e-9 * weights.sum() * np.eye(3)
-        point = np.linalg.solve(
-            system,
-            (weights[:, None] * np.einsum("vij,vj->vi", across, origins)).sum(0)
-            + 1e-9 * weights.sum() * origins.mean(0),
-        )
-        distance = np.linalg.norm(np.einsum("vij,vj->vi", across, point - origins), axis=1)
-        weights = 1 / np.maximum(distance, 1e-3 * np.median(distance) + 1e-12)
-        weights /= weights.max()
-    return point
 
 
 def carve_grid(

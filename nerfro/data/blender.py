@@ -24,7 +24,7 @@ class BlenderData(PosedImages):
         root: str = "embedded:torus",
         near: float = 2.0,
         far: float = 6.0,
-        downscale: int = 1,
+        downscale: float = 1,
         alpha: Alpha = "drop",
     ) -> None:
         super().__init__(root, near, far, downscale, alpha)

@@ -39,7 +39,7 @@ class ColmapData(PosedImages):
         root: str,
         near: float | None = None,
         far: float | None = None,
-        downscale: int = 1,
+        downscale: float = 1,
         alpha: Alpha = "drop",
         images: str = "images",
         model: str | None = None,

@@ -15,14 +15,13 @@ from jaxtyping import Float
 
 from nerfro.cameras import Cameras, central_window
 from nerfro.data.base import DataSource, Frame, Views
-from nerfro.data.image_files import Alpha, read_rgb
+from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb
 from nerfro.data.masks import find_masks
 from nerfro.data.pictures import Pictures
 from nerfro.errors import NerfroError
 from nerfro.lens import distort, undistort
 from nerfro.paths import resolve_path
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 SPLITS = ["train", "val", "test"]
 
 _ROTATION_TOLERANCE = 1e-3
@@ -64,14 +63,15 @@ class PosedImages(DataSource):
     Args:
         root: the folder.
         near, far: arc lengths at which rays begin and end, world units; None where the data will tell.
-        downscale: side of the blocks of pixels that are averaged into one.
+        downscale: how many times smaller pictures become, any number from 1 on; each pixel is the mean of what it
+            covers, and the lens follows.
         alpha: `drop` ignores the images' transparency, `white` and `black` composite them over that colour.
 
     Raises:
         NerfroError: an option is out of range.
     """
 
-    def __init__(self, root: str, near: float | None, far: float | None, downscale: int, alpha: Alpha) -> None:
+    def __init__(self, root: str, near: float | None, far: float | None, downscale: float, alpha: Alpha) -> None:
         check_options(near, far, downscale)
         self.root = resolve_path(root)
         self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
@@ -107,21 +107,21 @@ class PosedImages(DataSource):
             crop: share of each side that is kept, around the centre.
 
         Raises:
-            NerfroError: an image or mask is missing, no image or of the wrong size, `downscale` does not divide it, or
-                a lens has no inverse.
+            NerfroError: an image or mask is missing, no image or of the wrong size, or a lens has no inverse.
         """
         near, far = nearest if self.near is None else self.near, farthest if self.far is None else self.far
         check_options(near, far, self.downscale)
-        files, alpha, downscale = [frame.image for frame in frames], self.alpha, self.downscale
-        images = Pictures.of(files, lambda path: read_rgb(path, alpha), downscale, size, alpha != "drop", alpha)
+        files, alpha = [frame.image for frame in frames], self.alpha
+        images = Pictures.of(files, lambda path: read_rgb(path, alpha), self.downscale, size, alpha != "drop", alpha)
         (height, width), stored = images.shape, images.size[::-1]
-        masks = find_masks(files, [frame.mask for frame in frames], downscale, stored)
+        masks = find_masks(files, [frame.mask for frame in frames], self.downscale, stored)
         full = lenses(*stored)
         poses = np.stack([frame.camera_to_world for frame in frames])
         if axes == "opencv":
             poses = poses * np.array([1.0, -1.0, -1.0, 1.0])
         intrinsics = torch.tensor([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in full], dtype=torch.float64)
-        fx, fy, cx, cy = (intrinsics / downscale).float().unbind(-1)
+        smaller = torch.tensor([width / stored[0], height / stored[1]], dtype=torch.float64).repeat(2)
+        fx, fy, cx, cy = (intrinsics * smaller).float().unbind(-1)
         distorted = any(lens.distortion is not None for lens in full)
         distortion = torch.tensor([lens.distortion or (0.0,) * 9 for lens in full]) if distorted else None
         cameras = Cameras(torch.from_numpy(poses).float(), fx, fy, cx, cy, width, height, near, far, distortion)
@@ -132,13 +132,13 @@ class PosedImages(DataSource):
         return Views(cameras, images, masks, [frame.name for frame in frames], frames=frames)
 
 
-def check_options(near: float | None, far: float | None, downscale: int) -> None:
+def check_options(near: float | None, far: float | None, downscale: float) -> None:
     """Refuse options of `PosedImages` that are out of range."""
     known = (0.0 if near is None else near), (sys.float_info.max if far is None else far)
     if not 0 <= known[0] < known[1] < math.inf:  # also false for NaN
         raise NerfroError(f"data.near={near} and data.far={far} are no interval; take 0 <= near < far")
-    if downscale < 1:
-        raise NerfroError(f"data.downscale={downscale} is not allowed; take 1 for full size, 2 for half, and so on")
+    if not 1 <= downscale < math.inf:
+        raise NerfroError(f"data.downscale={downscale:g} is not allowed; take 1 for full size, 2 for half, or 2.5")
 
 
 def held_out(num_views: int, every: int, split: str, root: Path) -> list[int]:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from nerfro.data.base import Frame, Views
 from nerfro.data.frames import Lens, PosedImages, held_out, list_images
-from nerfro.data.image_files import Alpha
+from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha
 from nerfro.data.transforms import parse_matrix
 from nerfro.errors import NerfroError
 from nerfro.files.cache import load_arrays
@@ -41,7 +41,7 @@ class IdrData(PosedImages):
         root: str,
         near: float | None = None,
         far: float | None = None,
-        downscale: int = 1,
+        downscale: float = 1,
         alpha: Alpha = "drop",
         cameras: str = "cameras_sphere.npz",
         world: Literal["sphere", "file"] = "sphere",
@@ -116,7 +116,7 @@ def _masks(root: Path, num_images: int) -> list[Path] | list[None]:
     folder = _first_folder(root, ("mask", "masks"))
     if not folder.is_dir():
         return [None] * num_images
-    masks = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".png")
+    masks = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
     if len(masks) != num_images:
         raise NerfroError(f"{folder} holds {len(masks)} masks for {num_images} images; give all of them one, or none")
     return masks

@@ -12,10 +12,12 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 from PIL import Image, UnidentifiedImageError
+from scipy.sparse import csr_array
 
 from nerfro.errors import NerfroError
 from nerfro.files.png16 import decode_png16, is_png16
 
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 Alpha = Literal["drop", "white", "black"]
 Levels = UInt8[np.ndarray, "H W *C"] | UInt16[np.ndarray, "H W *C"]
 
@@ -97,16 +99,33 @@ def read_mask(path: Path) -> Levels:
     return np.where(share > 0, most, 0).astype(levels.dtype) if share.max() < 1.5 / 255 * most else share
 
 
-def area_mean(values: Float[np.ndarray, "H W *C"], factor: int, path: Path) -> Float[np.ndarray, "h w *C"]:
-    """Mean of each block of factor x factor pixels; the factor must divide the sides."""
+def downscaled(size: tuple[int, int], factor: float) -> tuple[int, int]:
+    """The size (two sides) of a picture that is made smaller by a factor of 1 or more, in whole pixels."""
+    first, second = (max(1, round(side / factor)) for side in size)
+    return first, second
+
+
+def area_mean(values: Float[np.ndarray, "H W *C"], size: tuple[int, int]) -> Float[np.ndarray, "h w *C"]:
+    """The whole picture in a size (height, width) no larger than its own.
+
+    A pixel is the mean of what it covers; pixels that it covers in part count by that part.
+    """
     height, width = values.shape[:2]
-    if height % factor or width % factor:
-        allowed = [n for n in range(1, 33) if height % n == 0 and width % n == 0]
-        raise NerfroError(
-            f"data.downscale={factor} does not divide the {width}x{height} pixels of {path}; "
-            f"choose one of {', '.join(map(str, allowed))}"
-        )
-    if factor == 1:
+    if size == (height, width):
         return values
-    blocks = values.reshape(height // factor, factor, width // factor, factor, *values.shape[2:])
-    return blocks.mean((1, 3), dtype=np.float32)
+    channels = values.shape[2:]
+    if height % size[0] == 0 and width % size[1] == 0:
+        blocks = values.reshape(size[0], height // size[0], size[1], width // size[1], *channels)
+        return blocks.mean((1, 3), dtype=np.float32)
+    rows = (_coverage(height, size[0]) @ values.reshape(height, -1)).reshape(size[0], width, -1)
+    columns = _coverage(width, size[1]) @ rows.swapaxes(0, 1).reshape(width, -1)
+    mean = columns.reshape(size[1], size[0], *channels).swapaxes(0, 1)
+    return mean.clip(0, 1).astype(np.float32)
+
+
+def _coverage(count: int, fewer: int) -> csr_array:
+    """The share [fewer, count] of each of `fewer` equal pieces of a line that each of `count` equal ones covers."""
+    edges = np.union1d(np.arange(count + 1) / count, np.arange(fewer + 1) / fewer)
+    middle, length = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
+    places = (middle * fewer).astype(int), (middle * count).astype(int)
+    return csr_array((length * fewer, places), shape=(fewer, count))

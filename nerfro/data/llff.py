@@ -46,7 +46,7 @@ class LlffData(PosedImages):
         root: str,
         near: float | None = None,
         far: float | None = None,
-        downscale: int = 1,
+        downscale: float = 1,
         alpha: Alpha = "drop",
         images: str = "images",
         frame: Literal["llff", "eikonal", "file"] = "llff",

@@ -5,16 +5,21 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from nerfro.cli import warn
+from nerfro.data.base import Views
 from nerfro.data.image_files import Levels, read_levels, read_mask, read_size
 from nerfro.data.pictures import Pictures
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, first_of
 
 _SPLIT_FOLDERS = ("train", "val", "test")
+# Of masks, the better kept ones first; cameras and networks write either case.
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
 _left_out: ContextVar[bool] = ContextVar("left_out", default=False)
 
@@ -35,7 +40,8 @@ def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None
     Looked for in this order, `<stem>` the image's name without extension and `<folder>` its folder within the root:
     the stated path; `mask_<stem>.png` beside the image; `masks/<folder>/<stem>.png` or `<stem>.<extension>.png`
     (COLMAP's form) in the root, also without the folder's first part unless that is a split's (`images/a.jpg` has
-    `masks/a.png`, but `train/a.png` has only `masks/train/a.png`, for `test/a.png` is another picture).
+    `masks/a.png`, but `train/a.png` has only `masks/train/a.png`, for `test/a.png` is another picture). JPEG will do
+    where there is no PNG.
 
     Args:
         root: the data set's folder.
@@ -47,26 +53,27 @@ def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None
         if not mask.is_file():
             raise NerfroError(f"mask {mask} of {image} does not exist; restore it or take its path out of the data set")
         return mask
-    candidates = [image.with_name(f"mask_{image.stem}.png")]
+    candidates = [image.with_name(f"mask_{image.stem}{suffix}") for suffix in _SUFFIXES]
     if image.is_relative_to(root):
         folder = image.relative_to(root).parent
         folders = [folder]
         if folder.parts and folder.parts[0] not in _SPLIT_FOLDERS:
             folders.append(Path(*folder.parts[1:]))
         for within in folders:
-            candidates += [root / "masks" / within / name for name in (f"{image.stem}.png", f"{image.name}.png")]
+            names = [*(f"{image.stem}{suffix}" for suffix in _SUFFIXES), f"{image.name}.png"]
+            candidates += [root / "masks" / within / name for name in names]
     return next((path for path in candidates if path.is_file()), None)
 
 
 def find_masks(
-    images: Sequence[Path], masks: Sequence[Path | None], downscale: int, size: tuple[int, int]
+    images: Sequence[Path], masks: Sequence[Path | None], downscale: float, size: tuple[int, int]
 ) -> Pictures | None:
     """The silhouettes of images; where they have no files, the images' transparency, if they have any.
 
     Args:
         images: the images' files.
-        masks: the silhouettes' files, of all images or of none.
-        downscale: side of the blocks of pixels that are averaged.
+        masks: the silhouettes' files. Where only some images have one, the user is told, and none is taken.
+        downscale: how many times smaller they become.
         size: width and height of the images in pixels before downscaling.
 
     Returns:
@@ -74,13 +81,33 @@ def find_masks(
     """
     if _left_out.get():
         return None
-    if any(masks):
+    bare = [image.name for image, mask in zip(images, masks, strict=True) if mask is None]
+    if 0 < len(bare) < len(images):
+        told = f"{len(bare)} of {len(images)} images have no mask ({first_of(bare)})"
+        warn(f"{told}: a hull is made of the others, and nothing is scored on the object alone")
+        return None
+    if not bare:
         return _of_files(images, masks, read_mask, downscale, size)
     return Pictures.of(images, _read_alpha, downscale) if _is_transparent(images[0]) else None
 
 
+def masked_views(views: Views) -> Views:
+    """The views that have masks, where some have none."""
+    chosen = [i for i, frame in enumerate(views.frames) if frame.mask is not None]
+    if views.masks is not None or not chosen or not isinstance(views.images, Pictures):
+        return views
+    frames, pictures = [views.frames[i] for i in chosen], views.images
+    files = [frame.image for frame in frames]
+    masks = find_masks(files, [frame.mask for frame in frames], pictures.downscale, pictures.size[::-1])
+    assert masks is not None
+    images = replace(pictures, files=files)
+    if pictures.window is not None:
+        masks = masks.cut(pictures.window)
+    return Views(views.cameras.select(chosen), images, masks, [views.names[i] for i in chosen], frames=frames)
+
+
 def find_usable(
-    images: Sequence[Path], masks: Sequence[Path | None], downscale: int, size: tuple[int, int]
+    images: Sequence[Path], masks: Sequence[Path | None], downscale: float, size: tuple[int, int]
 ) -> Pictures:
     """Masks that rule pixels out: black ones are ignored, white ones are used, grey ones by the nearer of the two.
 
@@ -90,9 +117,9 @@ def find_usable(
     usable = _of_files(images, masks, _read_usable, downscale, size)
     for image, mask, levels in zip(images, masks, usable.all_levels(), strict=True):
         if levels.max() < np.iinfo(levels.dtype).max:
-            blocks = f" in blocks of {downscale}x{downscale}" if downscale > 1 else ""
+            smaller = f" at data.downscale={downscale:g}" if downscale > 1 else ""
             raise NerfroError(
-                f"mask {mask} rules out all pixels of {image}{blocks}: black is ignored, white is used; "
+                f"mask {mask} rules out all pixels of {image}{smaller}: black is ignored, white is used; "
                 "is it inverted? Correct it or take the frame out"
             )
     return usable
@@ -102,7 +129,7 @@ def _of_files(
     images: Sequence[Path],
     masks: Sequence[Path | None],
     read: Callable[[Path], Levels],
-    downscale: int,
+    downscale: float,
     size: tuple[int, int],
 ) -> Pictures:
     files = [mask for mask in masks if mask is not None]

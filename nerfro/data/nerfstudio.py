@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
+from typing import Literal
+
+import numpy as np
 
 from nerfro.data.base import Views
+from nerfro.data.bounds import find_bounds
 from nerfro.data.frames import SPLITS, Lens, PosedImages, held_out
-from nerfro.data.image_files import Alpha
+from nerfro.data.image_files import Alpha, read_size
 from nerfro.data.masks import find_mask, find_usable
 from nerfro.data.transforms import Manifest, find_splits, is_number, parse_manifest, read_manifest
 from nerfro.errors import NerfroError
+from nerfro.geometry.mesh import load_points
 from nerfro.lens import coefficients
 from nerfro.registry import register
+
+_SINGLE, _MASK_KEY = "transforms.json", "object_mask_path"
 
 # What `camera_model` may say for a perspective lens; they differ in which coefficients are zero.
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
@@ -29,32 +37,45 @@ class NerfstudioData(PosedImages):
     trained on; a frame's silhouette of the refractive object is its `object_mask_path`.
 
     Args:
-        root, near, far, downscale, alpha: see `PosedImages`.
+        root, near, far, downscale, alpha: see `PosedImages`; bounds that are none hold the file's sparse points
+            (`ply_file_path`) in view, or, where it has none, what the cameras look at: see `find_bounds`.
+        missing: whether frames whose image does not exist are left out with a warning (`skip`) or refused.
         test_every: every such frame by name, from the first, is for val and test, where the file has no
             {train,val,test}_filenames.
     """
 
     def __init__(
-        self, root: str, near: float, far: float, downscale: int = 1, alpha: Alpha = "drop", test_every: int = 10
+        self,
+        root: str,
+        near: float | None = None,
+        far: float | None = None,
+        downscale: float = 1,
+        alpha: Alpha = "drop",
+        missing: Literal["skip", "refuse"] = "skip",
+        test_every: int = 10,
     ) -> None:
         super().__init__(root, near, far, downscale, alpha)
-        self.test_every = test_every
+        self.skip_missing, self.test_every = missing == "skip", test_every
 
     @property
     def splits(self) -> list[str]:
-        if (self.root / "transforms.json").is_file():
-            return SPLITS
-        return list(find_splits(self.root))
+        return SPLITS if self._is_single else list(find_splits(self.root))
+
+    @property
+    def _is_single(self) -> bool:
+        return (self.root / _SINGLE).is_file()
+
+    def _manifest(self, split: str) -> Manifest:
+        return self._whole if self._is_single else read_manifest(self.root, split, _MASK_KEY, self.skip_missing)
+
+    @functools.cached_property
+    def _whole(self) -> Manifest:
+        return parse_manifest(self.root / _SINGLE, _MASK_KEY, self.skip_missing)
 
     def load(self, split: str) -> Views:
         self.require(split)
-        single = self.root / "transforms.json"
-        if single.is_file():
-            manifest = parse_manifest(single, "object_mask_path")
-            chosen = self._choose(manifest, split)
-        else:
-            manifest = read_manifest(self.root, split, "object_mask_path")
-            chosen = list(range(len(manifest.frames)))
+        manifest = self._manifest(split)
+        chosen = self._choose(manifest, split) if self._is_single else list(range(len(manifest.frames)))
         entries: list[Mapping[str, object]] = manifest.document["frames"]  # type: ignore[assignment]
         names = [f"{manifest.path}: '{manifest.frames[i].name}'" for i in chosen]
 
@@ -69,11 +90,21 @@ class NerfstudioData(PosedImages):
             if stated is not None and not isinstance(stated, str):
                 raise NerfroError(f"{name}: 'mask_path' must be text")
             ignoring.append(None if stated is None else find_mask(self.root, frame.image, stated))
-        views = self.views(frames, lenses, "opengl")
+        views = self.views(frames, lenses, "opengl", *self._bounds(split))
         if not any(ignoring):
             return views
-        stored = views.cameras.width * self.downscale, views.cameras.height * self.downscale
-        return replace(views, usable=find_usable([frame.image for frame in frames], ignoring, self.downscale, stored))
+        files, stored = [frame.image for frame in frames], read_size(frames[0].image)[:2]
+        return replace(views, usable=find_usable(files, ignoring, self.downscale, stored))
+
+    def _bounds(self, split: str) -> tuple[float, float]:
+        """Near and far where they are not given, of the training cameras for all splits."""
+        if self.near is not None and self.far is not None:
+            return self.near, self.far
+        manifest = self._manifest("train" if "train" in self.splits else split)
+        points, file = np.empty((0, 3)), manifest.document.get("ply_file_path")
+        if isinstance(file, str) and (self.root / file).is_file():
+            points = load_points(self.root / file)
+        return find_bounds(np.stack([frame.camera_to_world for frame in manifest.frames]), points)
 
     def _choose(self, manifest: Manifest, split: str) -> list[int]:
         """Numbers of the frames of a split."""

@@ -35,7 +35,7 @@ class NerrfData(PosedImages):
     """
 
     def __init__(
-        self, root: str, near: float = 0.02, far: float | None = None, downscale: int = 1, alpha: Alpha = "drop"
+        self, root: str, near: float = 0.02, far: float | None = None, downscale: float = 1, alpha: Alpha = "drop"
     ) -> None:
         super().__init__(root, near, far, downscale, alpha)
 

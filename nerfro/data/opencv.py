@@ -32,7 +32,7 @@ class OpenCVData(PosedImages):
         root: str,
         near: float = 0.2,
         far: float = 12.0,
-        downscale: int = 1,
+        downscale: float = 1,
         alpha: Alpha = "drop",
         eval_crop: float = 1.0,
     ) -> None:

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.cameras import Window
-from nerfro.data.image_files import Levels, area_mean, read_size, to_levels, to_unit
+from nerfro.data.image_files import Levels, area_mean, downscaled, read_size, to_levels, to_unit
 from nerfro.errors import NerfroError
 
 # Files that are decoded at once, and with them the memory that decoding takes.
@@ -31,7 +31,7 @@ class Pictures:
         read: reader of one file; threads call it side by side.
         size: height and width in pixels as stored.
         dtype: of the levels: 16 bits where a file has them, or where levels are means.
-        downscale: side of the blocks of pixels that are averaged.
+        downscale: how many times smaller they become, 1 or more.
         recipe: what `read` does with a file, in words that change when it does something else.
         window: the part that is kept, or None for all of it.
     """
@@ -40,7 +40,7 @@ class Pictures:
     read: Callable[[Path], Levels]
     size: tuple[int, int]
     dtype: np.dtype
-    downscale: int = 1
+    downscale: float = 1
     recipe: str = ""
     window: Window | None = None
 
@@ -49,12 +49,12 @@ class Pictures:
         cls,
         files: Sequence[Path],
         read: Callable[[Path], Levels],
-        downscale: int = 1,
+        downscale: float = 1,
         expected_size: tuple[int, int] | None = None,
         deep: bool = False,
         recipe: str = "",
     ) -> Pictures:
-        """Pictures, at least one, whose headers agree on a size that `downscale` divides.
+        """Pictures, at least one, whose headers agree on a size.
 
         Args:
             expected_size: width and height in pixels as stored, where the data states them.
@@ -74,7 +74,6 @@ class Pictures:
                     "all images of a split must have one size"
                 )
             bits = max(bits, depth)
-        area_mean(np.zeros((height, width), np.uint8), downscale, files[0])  # refuses what does not divide
         dtype = np.dtype(np.uint16 if deep or bits > 8 or downscale > 1 else np.uint8)
         return cls(files, read, (height, width), dtype, downscale, recipe)
 
@@ -83,7 +82,7 @@ class Pictures:
         """Height and width in pixels of what `pictures[i]` returns."""
         if self.window is not None:
             return self.window.height, self.window.width
-        return self.size[0] // self.downscale, self.size[1] // self.downscale
+        return downscaled(self.size, self.downscale)
 
     def __len__(self) -> int:
         return len(self.files)
@@ -100,7 +99,7 @@ class Pictures:
         if levels.shape[:2] != self.size:
             raise NerfroError(f"image {self.files[index]} has changed since it was looked at; start again")
         if self.downscale > 1:
-            levels = to_levels(area_mean(to_unit(levels), self.downscale, self.files[index]))
+            levels = to_levels(area_mean(to_unit(levels), downscaled(self.size, self.downscale)))
         if levels.dtype != self.dtype:
             levels = levels.astype(np.uint16) * 257  # 255 becomes 65535, and every level the same share of it
         if self.window is None:

@@ -44,7 +44,7 @@ class RefRefData(PosedImages):
         scene: str | None = None,
         near: float = 0.2,
         far: float | None = None,
-        downscale: int = 1,
+        downscale: float = 1,
         alpha: Alpha = "drop",
     ) -> None:
         super().__init__(root, near, far, downscale, alpha)

@@ -13,8 +13,10 @@ from typing import Any, TypeGuard
 import numpy as np
 from jaxtyping import Float
 
+from nerfro.cli import warn
 from nerfro.data.base import Frame
-from nerfro.data.frames import IMAGE_SUFFIXES, SPLITS, check_pose
+from nerfro.data.frames import SPLITS, check_pose
+from nerfro.data.image_files import IMAGE_SUFFIXES
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError, first_of
 
@@ -58,20 +60,21 @@ def find_splits(root: Path) -> dict[str, Path]:
     return {name: found[name] for name in sorted(found, key=lambda name: (rank.get(name, len(rank)), name))}
 
 
-def read_manifest(root: Path, split: str, mask_key: str = "mask_path") -> Manifest:
+def read_manifest(root: Path, split: str, mask_key: str = "mask_path", skip_missing: bool = False) -> Manifest:
     """Read and check the transforms file of a split, see `parse_manifest`."""
     splits = find_splits(root)
     if split not in splits:
         raise NerfroError(f"data.root={root} has no split '{split}'; it has {', '.join(splits)}")
-    return parse_manifest(splits[split], mask_key)
+    return parse_manifest(splits[split], mask_key, skip_missing)
 
 
-def parse_manifest(path: Path, mask_key: str = "mask_path") -> Manifest:
+def parse_manifest(path: Path, mask_key: str = "mask_path", skip_missing: bool = False) -> Manifest:
     """Read and check a transforms file.
 
     Args:
         path: of the file.
         mask_key: key of a frame's silhouette. Under another than the usual one, none is looked for beside the images.
+        skip_missing: leave frames out whose image does not exist, and say so in one line.
 
     Raises:
         NerfroError: the file is truncated or lacks a key; a frame has no image, a bad pose or another frame's name.
@@ -82,6 +85,9 @@ def parse_manifest(path: Path, mask_key: str = "mask_path") -> Manifest:
         raise NerfroError(f"{path} has no list 'frames'; see docs/data.md for the format")
     if not frames:
         raise NerfroError(f"{path} has an empty list 'frames'; a split needs at least one")
+    if skip_missing:
+        frames = _with_images(path, frames)
+        document = {**document, "frames": frames}
     read = [_read_frame(path, i, frame, mask_key) for i, frame in enumerate(frames)]
     counts = Counter(frame.image for frame in read)  # by file: `r_0` and `r_0.png` are one image
     repeated = list(dict.fromkeys(f"'{frame.name}'" for frame in read if counts[frame.image] > 1))
@@ -121,6 +127,17 @@ def is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
+def _with_images(path: Path, frames: list) -> list:
+    """The frames but for those whose image does not exist; what is wrong with others is told when they are read."""
+    names = [frame.get("file_path") if isinstance(frame, dict) else None for frame in frames]
+    missing = [isinstance(name, str) and _existing_image(path.parent, name) is None for name in names]
+    if all(missing) or not any(missing):
+        return frames
+    told = first_of([str(name) for name, gone in zip(names, missing, strict=True) if gone])
+    warn(f"{path}: {sum(missing)} of {len(frames)} frames have no image and are skipped: {told}")
+    return [frame for frame, gone in zip(frames, missing, strict=True) if not gone]
+
+
 def _read_frame(path: Path, index: int, entry: object, mask_key: str) -> Frame:
     where = f"{path}: frame {index}"
     if not isinstance(entry, dict):
@@ -135,18 +152,20 @@ def _read_frame(path: Path, index: int, entry: object, mask_key: str) -> Frame:
     name = PurePosixPath(entry["file_path"].replace("\\", "/")).as_posix()
     where += f" ('{name}')"
     pose = check_pose(parse_matrix(entry["transform_matrix"], ((4, 4), (3, 4)), f"{where}: transform_matrix"), where)
-    image = _find_image(path.parent, name, where)
+    image = _existing_image(path.parent, name)
+    if image is None:
+        missing = _candidates(path.parent, name)[0]
+        raise NerfroError(f"{where}: image {missing} does not exist; restore it or take the frame out")
     looked_for = mask_key == "mask_path" or stated is not None
     return Frame(name, image, find_mask(path.parent, image, stated) if looked_for else None, pose)
 
 
-def _find_image(root: Path, name: str, where: str) -> Path:
-    """The image file of a `file_path` with or without extension."""
-    if PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES:
-        candidates = [root / name]
-    else:
-        candidates = [root / f"{name}{suffix}" for suffix in IMAGE_SUFFIXES]
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
-    raise NerfroError(f"{where}: image {candidates[0]} does not exist; restore it or take the frame out")
+def _candidates(root: Path, name: str) -> list[Path]:
+    """Where the image of a `file_path` may be, with or without extension."""
+    name = name.replace("\\", "/")
+    known = PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES
+    return [root / name] if known else [root / f"{name}{suffix}" for suffix in IMAGE_SUFFIXES]
+
+
+def _existing_image(root: Path, name: str) -> Path | None:
+    return next((path for path in _candidates(root, name) if path.is_file()), None)

@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.data.frames import IMAGE_SUFFIXES
-from nerfro.data.image_files import Alpha, read_rgb, to_unit
+from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb, to_unit
 from nerfro.data.masks import find_mask, find_masks
 from nerfro.errors import NerfroError
 from nerfro.evaluation.regions import object_pixels

@@ -73,6 +73,10 @@ class HashGridField(Field):
         self.density_mlp = _mlp(hash_encoding.NUM_FEATURES * num_levels, width, 1, _GEOMETRY_FEATURES)
         self.colour_mlp = _mlp(_GEOMETRY_FEATURES + num_harmonics, width, 2, 3)
 
+    @property
+    def bounds(self) -> Float[Tensor, "2 3"]:
+        return torch.stack([self.box_min, self.box_max])
+
     def forward(self, samples: Samples) -> Radiance:
         return evaluate_selected(self.decode, samples, inside_box(samples.positions, self.box_min, self.box_max))
 

@@ -52,6 +52,10 @@ class NerfField(Field):
         num_position, num_direction = 3 * (1 + 2 * position_degree), 3 * (1 + 2 * direction_degree)
         self.mlp = RadianceMLP(num_position, num_direction, width, depth, skip, view_width)
 
+    @property
+    def bounds(self) -> Float[Tensor, "2 3"] | None:
+        return None if self.everywhere else self.box
+
     def forward(self, samples: Samples) -> Radiance:
         if self.everywhere:
             return Radiance(*self.decode(samples.positions, samples.directions))

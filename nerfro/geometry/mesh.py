@@ -97,6 +97,19 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
     return mesh
 
 
+def load_points(path: Path) -> Float[np.ndarray, "P 3"]:
+    """The points of a cloud, of any format trimesh reads."""
+    import trimesh
+
+    try:
+        loaded: Any = trimesh.load(path, process=False)
+        return np.asarray(loaded.vertices, np.float64).reshape(-1, 3)
+    except Exception as error:  # trimesh's readers raise whatever their parsers do
+        raise NerfroError(
+            f"{path} holds no points that can be read ({error}); export it again, or take it out"
+        ) from error
+
+
 def merge_vertices(
     vertices: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],

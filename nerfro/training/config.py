@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Optional
 
 import numpy as np
-from omegaconf import MISSING, DictConfig
+from omegaconf import MISSING, DictConfig, OmegaConf
 
 from nerfro.allowed import Count, Natural, NotNegative, Positive, Range
 from nerfro.errors import NerfroError
@@ -183,8 +183,25 @@ def _settle_content(config: DictConfig, medium: Medium) -> None:
         # Straight rays need no medium, but a baseline is told where the object is, as ours is.
         box = load_mesh(resolve_path(config.medium.mesh), accept_open_mesh=True).bounds.tolist()
     else:
+        _require_no_box(config)
         return
     config.content.box_min, config.content.box_max = ([round(x, 6) for x in corner] for corner in box)
+
+
+def _require_no_box(config: DictConfig) -> None:
+    """Refuse parts that stay inside the content's box where nothing says where that is."""
+    for name, node in (
+        ("field", config.field),
+        ("sampler/points", config.sampler.points),
+        ("boundary", config.boundary),
+    ):
+        written = OmegaConf.to_container(node, resolve=False)
+        if isinstance(written, dict) and "content.box" in str(written.get("box_min")):
+            mesh = f", and medium.mesh={config.medium.mesh} does not exist" if "mesh" in config.medium else ""
+            raise NerfroError(
+                f"{name} stays inside a box, and straight rays know no object to take it from{mesh}; give "
+                "content.box_min=[X,Y,Z] content.box_max=[X,Y,Z] in world units, around what shall be seen sharply"
+            )
 
 
 def _read_box(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -22,7 +22,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from nerfro.cli import in_one_line
-from nerfro.data.frames import IMAGE_SUFFIXES
+from nerfro.data.image_files import IMAGE_SUFFIXES
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.paths import EMBEDDED_PREFIX, resolve_path

@@ -143,7 +143,10 @@ def test_a_mask_in_the_corner_is_told_in_one_line(
     mask[rows, columns] = 255
     Image.fromarray(mask).save(capture / "photos" / "mask_p_1.png")
     printed = command("mask", f"data.root={capture}")
-    assert "is seen in no other image; draw the outline around the whole object" in printed or "look at it" in printed
+    assert (
+        "what is outlined is not found in other images by its colours; outline the whole object" in printed
+        or "look at it" in printed
+    )
 
 
 def test_mistakes_are_told_in_one_line(capture: Path, command: Callable[..., str]) -> None:
@@ -156,3 +159,55 @@ def test_mistakes_are_told_in_one_line(capture: Path, command: Callable[..., str
     assert "cannot be read" in command("mask", root, "outlines=nothing.json")
     assert "ships with nerfro" in command("mask", "data=blender", "data.root=embedded:torus")
     assert not list((capture / "photos").glob("mask_*"))
+
+
+def write_capture(root: Path, photographs: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Path:
+    """All photographs as training views."""
+    (root / "photos").mkdir(parents=True)
+    frames = []
+    for view, (picture, _, pose) in enumerate(photographs):
+        Image.fromarray(picture).save(root / "photos" / f"p_{view}.png")
+        frames.append({"file_path": f"photos/p_{view}.png", "transform_matrix": [*pose.tolist(), [0, 0, 0, 1]]})
+    matrix = [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
+    (root / "transforms_train.json").write_text(json.dumps({"cam_mat": matrix, "frames": frames}))
+    return root
+
+
+def test_a_neighbour_that_looks_from_the_same_place_does_not_lead(
+    photographs: list, tmp_path: Path, command: Callable[..., str]
+) -> None:
+    """Lines through the centres of two such masks meet anywhere, behind the cameras too."""
+    picture, mask, pose = photographs[1]
+    beside = np.roll(picture, -2, 1), np.roll(mask, -2, 1), pose.copy()
+    beside[2][:, 3] += 0.004 * pose[:, 0]  # as if the ball were behind the cameras
+    root = write_capture(tmp_path, [*photographs, beside])
+    box = str(box_around(mask, 3)).replace(" ", "")
+    printed = command("mask", f"data.root={root}", f"outlines={{p_1:{box}}}")
+    assert "wrote 15 masks" in printed
+    overlaps = [overlap(read(root, view), mask) for view, (_, mask, _) in enumerate([*photographs, beside])]
+    assert np.mean(overlaps) > 0.9, overlaps
+
+
+def scrambled(photographs: list, generator: np.random.Generator) -> list:
+    """The same views, whose colours say nothing about the object."""
+    return [(np.uint8(generator.integers(0, 256, (HEIGHT, WIDTH, 3))), mask, pose) for _, mask, pose in photographs]
+
+
+@pytest.mark.parametrize("hull_only", [False, True])
+def test_the_hull_is_taken_where_colours_say_something_else(
+    hull_only: bool, photographs: list, tmp_path: Path, command: Callable[..., str]
+) -> None:
+    root = write_capture(tmp_path, scrambled(photographs, np.random.default_rng(0)))
+    for view in range(0, NUM_VIEWS, 2):
+        Image.fromarray(np.uint8(255 * photographs[view][1])).save(root / "photos" / f"mask_p_{view}.png")
+    printed = command("mask", f"data.root={root}", f"hull_only={str(hull_only).lower()}")
+    overlaps = [overlap(read(root, view), photographs[view][1]) for view in range(1, NUM_VIEWS, 2)]
+    assert min(overlaps) > 0.85, overlaps
+    assert ("so the hull is taken" in printed) == (not hull_only)
+    assert ("GrabCut and the hull overlap by less than 0.85" in printed) == (not hull_only)
+
+
+def test_a_hull_alone_takes_three_masks(capture: Path, photographs: list, command: Callable[..., str]) -> None:
+    for view in (0, 5):
+        Image.fromarray(np.uint8(255 * photographs[view][1])).save(capture / "photos" / f"mask_p_{view}.png")
+    assert "hull_only=true takes masks or outlines of 3" in command("mask", f"data.root={capture}", "hull_only=true")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,9 @@ pytest.importorskip("pycolmap")
 
 import pycolmap
 
-from nerfro.capture import reconstruction
+from nerfro.capture import model_import, reconstruction
+from nerfro.capture.model_import import loosest_group
+from nerfro.capture.reconstruction import count_order, sequential_pairs
 from nerfro.capture.targets import Sheet
 from tests.capture.photographs import angle, look_at, photograph
 
@@ -113,3 +116,84 @@ def test_a_model_is_made_where_there_is_none(tmp_path: Path, command: Callable[.
     for name in truth:
         turns = [poses["p_0.png"][:, :3].T @ poses[name][:, :3] for poses in (found, truth)]
         assert angle(turns[0], turns[1]) < 0.5
+
+
+def synthesized(folder: Path, camera: tuple[str, list[float]], noise: float) -> list[str]:
+    """A model of six images of 30 points in a folder, and blank images beside it; their names."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs = options.num_cameras_per_rig = 1
+    options.num_frames_per_rig, options.num_points3D = 6, 30
+    options.camera_model_id, options.camera_params = getattr(pycolmap.CameraModelId, camera[0]), camera[1]
+    model = pycolmap.synthesize_dataset(options)
+    generator = np.random.default_rng(0)
+    for point in model.points3D.values():
+        point.xyz = point.xyz + generator.normal(0, noise, 3)
+    (folder / "model").mkdir(parents=True)
+    model.write_text(folder / "model")
+    (folder / "images").mkdir()
+    names = [image.name for image in model.images.values()]
+    for name in names:
+        Image.fromarray(np.zeros((768, 1024, 3), np.uint8)).save(folder / "images" / name)
+    return names
+
+
+@pytest.mark.parametrize(
+    ("camera", "advised"),
+    [(("RADIAL", [1280.0, 512, 384, 0.05, 0.0]), False), (("SIMPLE_PINHOLE", [1280.0, 512, 384]), True)],
+)
+def test_a_model_is_named_and_a_lens_that_distorts_is_not_advised_to(
+    camera: tuple[str, list[float]], advised: bool, tmp_path: Path, command: Callable[..., str]
+) -> None:
+    names = synthesized(tmp_path, camera, 0.02)
+    own = [f"images={tmp_path / 'images'}", f"out={tmp_path / 'out'}", "target=colmap"]
+    printed = command("calibrate", *own, f"reconstruction={tmp_path / 'model'}", "test_every=3")
+    report = json.loads((tmp_path / "out" / "calibration.json").read_text())
+    assert set(report["images"]) == set(names)
+    assert np.mean([image["error"] for image in report["images"].values()]) > 0.7
+    assert ("lens=radial" in printed) == advised
+
+
+def test_names_that_count() -> None:
+    assert count_order([f"IMG_{number}.JPG" for number in range(7039, 7136, 3)]) == list(range(33))
+    assert count_order([f"p_{number}.png" for number in (1, 10, 11, 2, 3, 4, 5, 6, 7, 8, 9)]) == [
+        0,
+        *range(3, 11),
+        1,
+        2,
+    ]
+    assert count_order(["left.png", "right.png"]) is None
+    assert count_order(["a_1.png", "b_2.png", "a_3.png"]) is None
+    assert count_order(["20240101.png", "20260730.png", "20260731.png", "20260801.png"]) is None
+
+
+def test_a_sequence_is_matched_with_its_neighbours_and_ever_fewer_beyond() -> None:
+    pairs = sequential_pairs(range(40))
+    assert len(pairs) == len(set(pairs)) == sum(40 - stride for stride in (*range(1, 11), 16, 32))
+    assert {abs(i - j) for i, j in pairs} == {*range(1, 11), 16, 32}
+    assert sequential_pairs([2, 0, 1]) == [(2, 0), (0, 1), (2, 1)]
+
+
+@pytest.mark.parametrize(("bridges", "warned"), [(12, True), (200, False)])
+def test_groups_that_hang_together_by_few_points_are_named(
+    bridges: int, warned: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    generator = np.random.default_rng(0)
+    seen = np.zeros((10, 800 + bridges), bool)
+    seen[:6, :500] = generator.random((6, 500)) < 0.5
+    seen[6:, 500:800] = generator.random((4, 300)) < 0.5
+    seen[5:7, 800:] = True
+    if warned:
+        assert loosest_group(seen) == ([6, 7, 8, 9], bridges)
+    images = [
+        SimpleNamespace(
+            name=f"p_{i}",
+            has_pose=True,
+            points2D=[SimpleNamespace(point3D_id=int(p), has_point3D=lambda: True) for p in np.flatnonzero(row)],
+        )
+        for i, row in enumerate(seen)
+    ]
+    model = SimpleNamespace(images=dict(enumerate(images)), points3D=dict.fromkeys(range(seen.shape[1])))
+    model_import._warn_of_loose_groups(model)
+    told = capsys.readouterr().out
+    assert ("p_6, p_7, p_8 and 1 more: placed by 12 points" in told) == warned
+    assert warned == bool(told)

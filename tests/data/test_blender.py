@@ -177,10 +177,6 @@ FRAME = r"transforms_train\.json: frame 1 \('train/r_1'\)"
             r"\('train/no'\): image .*no\.png does not exist",
         ),
         (lambda d: d["frames"][1].update(mask_path="no.png"), r"mask .*no\.png of .*r_1\.png does not exist"),
-        (
-            lambda d: d["frames"][1].update(mask_path="train/r_0.png"),
-            r"2 of 3 images have no mask \(.*r_0\.png is the first\) but others",
-        ),
         (lambda d: d.update(w=9, h=6), r"r_0\.png has 8x6 pixels where 9x6 are expected"),
         (lambda d: d.update(w="wide", h=6), "w='wide' and h=6 must be numbers of pixels"),
         (set_pose(0, 3, math.nan), FRAME + ": transform_matrix holds NaN or infinite numbers"),

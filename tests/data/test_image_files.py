@@ -10,7 +10,7 @@ import tifffile
 from PIL import Image
 
 from nerfro.data import image_files
-from nerfro.data.image_files import area_mean, to_unit
+from nerfro.data.image_files import _coverage, area_mean, downscaled, to_unit
 from nerfro.errors import NerfroError
 
 
@@ -92,7 +92,7 @@ def test_mask_of_labels_and_coloured_mask_mark_the_object(save):
 @pytest.mark.parametrize("factor", [1, 2, 3, 6])
 def test_downscaling_is_the_mean_over_each_block(factor):
     values = np.random.default_rng(0).random((12, 18, 3), dtype=np.float32)
-    small = area_mean(values, factor, Path("image.png"))
+    small = area_mean(values, downscaled((12, 18), factor))
     assert small.shape == (12 // factor, 18 // factor, 3)
     for i in range(small.shape[0]):
         for j in range(small.shape[1]):
@@ -100,9 +100,26 @@ def test_downscaling_is_the_mean_over_each_block(factor):
             np.testing.assert_allclose(small[i, j], block.reshape(-1, 3).mean(0), rtol=1e-6)
 
 
-def test_factor_that_does_not_divide_names_those_that_do():
-    with pytest.raises(NerfroError, match=r"downscale=4 does not divide the 18x12 .* choose one of 1, 2, 3, 6"):
-        area_mean(np.zeros((12, 18)), 4, Path("image.png"))
+@pytest.mark.parametrize("factor", [1.2, 1.7, 2.5, 4, 5, 11.9, 40])
+def test_any_factor_is_the_mean_over_the_area_of_a_pixel(factor):
+    values = np.random.default_rng(0).random((12, 18, 3), dtype=np.float32)
+    small = area_mean(values, downscaled((12, 18), factor))
+    height, width = small.shape[:2]
+    assert height == max(1, round(12 / factor))
+    # Each pixel in so many parts that both sizes' edges lie between them: blocks of whole parts.
+    parts = np.kron(values.astype(np.float64), np.ones((height, width, 1)))
+    expected = parts.reshape(height, 12, width, 18, 3).mean((1, 3))
+    np.testing.assert_allclose(small, expected, atol=1e-6)
+
+
+def test_factors_beside_a_whole_one_lead_to_it():
+    values = np.random.default_rng(0).random((12, 18), dtype=np.float32)
+    np.testing.assert_allclose(_mixed(values, (6, 9)), area_mean(values, (6, 9)), atol=1e-6)
+
+
+def _mixed(values, size):
+    """By the sparse product alone."""
+    return (_coverage(values.shape[0], size[0]) @ values) @ _coverage(values.shape[1], size[1]).T
 
 
 @pytest.mark.parametrize("kept", [0, 20, 60, 150])

@@ -64,7 +64,21 @@ def test_transparency_is_a_silhouette_where_there_are_no_files(tmp_path: Path) -
     torch.testing.assert_close(torch.stack(list(share)), torch.tensor([[[0.5, 0.8]], [[1.0, 1.0]]]))
 
 
-def test_masks_of_some_images_only_are_refused(tmp_path: Path) -> None:
+def test_masks_of_some_images_only_are_told_and_left(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     image = _touch(tmp_path / "a.png")
-    with pytest.raises(NerfroError, match=r"1 of 2 images have no mask \(.*a\.png is the first\)"):
-        find_masks([image, image], [None, image], 1, (4, 2))
+    assert find_masks([image, image], [None, image], 1, (4, 2)) is None
+    assert "1 of 2 images have no mask (a.png)" in capsys.readouterr().out
+
+
+def test_jpeg_masks_are_read(tmp_path: Path) -> None:
+    image, mask = _touch(tmp_path / "images" / "a.JPG"), tmp_path / "masks" / "a.JPG"
+    mask.parent.mkdir()
+    levels = np.zeros((32, 32), np.uint8)
+    levels[8:24, 8:16] = 255
+    Image.fromarray(levels).save(mask, "JPEG")
+    assert find_mask(tmp_path, image) == mask
+    share = find_masks([image], [mask], 1, (32, 32))
+    assert share is not None
+    np.testing.assert_array_equal(share[0].numpy() > 0.5, levels > 0)
+    png = _touch(mask.with_suffix(".png"))
+    assert find_mask(tmp_path, image) == png

@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 
 from nerfro.data.base import Views
@@ -202,3 +203,53 @@ def test_missing_things_are_named(write, tmp_path):
     (root / "transforms.json").write_text('{"frames": [')
     with pytest.raises(NerfroError, match="truncated"):
         load(root)
+
+
+def test_frames_without_an_image_are_skipped_in_one_line_or_refused(write, capsys):
+    root = write(6)
+    for i in (1, 4):
+        (root / f"images/f_{i}.png").unlink()
+    source = NerfstudioData(str(root), near=0.5, far=9.0, test_every=4)
+    assert [name[-7:] for name in source.load("train").names] == ["f_2.png", "f_3.png", "f_5.png"]
+    assert [name[-7:] for name in source.load("test").names] == ["f_0.png"]
+    assert capsys.readouterr().out.count("2 of 6 frames have no image and are skipped: ./images/f_4.png, ") == 1
+    with pytest.raises(NerfroError, match=r"image .*images/f_4\.png does not exist"):
+        load(root, missing="refuse")
+    for i in range(6):
+        (root / f"images/f_{i}.png").unlink(missing_ok=True)
+    with pytest.raises(NerfroError, match=r"f_5\.png does not exist"):
+        load(root)
+
+
+def test_near_and_far_are_found_from_the_cameras(write):
+    # They look at about the origin from a distance of 3.
+    cameras = NerfstudioData(str(write(12))).load("train").cameras
+    assert 0 < cameras.near < 1
+    assert 5 < cameras.far < 7
+    given = NerfstudioData(str(write(12)), far=4.0).load("test").cameras
+    assert (given.near, given.far) == (cameras.near, 4.0)
+
+
+def test_near_and_far_hold_the_sparse_points_where_there_are_any(write):
+    root = write(12, top=SHARED | {"ply_file_path": "sparse_pc.ply"})
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    points *= 0.2 / np.linalg.norm(points, axis=1, keepdims=True)
+    trimesh.PointCloud(points).export(root / "sparse_pc.ply")
+    cameras = NerfstudioData(str(root)).load("train").cameras
+    assert cameras.near == pytest.approx(0.9 * 2.8, rel=0.03)
+    assert cameras.far == pytest.approx(1.1 * 3.2, rel=0.03)
+    (root / "sparse_pc.ply").write_bytes(b"ply?")
+    with pytest.raises(NerfroError, match=r"sparse_pc\.ply holds no points"):
+        NerfstudioData(str(root)).load("train")
+
+
+def test_cameras_that_look_nowhere_in_common_ask_for_near_and_far(write):
+    def outwards(i):
+        pose = camera_to_world(i, "opengl")
+        pose[:3, :3] = pose[:3, :3] @ np.diag([-1.0, 1.0, -1.0])  # turned round
+        return {"transform_matrix": pose.tolist()}
+
+    root = write(12, frame=outwards)
+    with pytest.raises(NerfroError, match=r"data\.near and data\.far cannot be found"):
+        NerfstudioData(str(root)).load("train")
+    assert load(root).cameras.near == 0.5

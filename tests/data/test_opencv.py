@@ -140,3 +140,23 @@ def test_wrong_distortion_is_refused(write_opencv, edit_transforms, dist):
     edit_transforms(root, lambda document: document.update(dist=dist))
     with pytest.raises(NerfroError, match="must be 4, 5 or 8 numbers in OpenCV's order"):
         OpenCVData(str(root)).load("train")
+
+
+@pytest.mark.parametrize("downscale", [1.3, 2.5, 5])
+def test_any_downscale_keeps_the_directions(write_opencv, downscale):
+    root = str(write_opencv())
+    full, small = OpenCVData(root).load("train"), OpenCVData(root, downscale=downscale).load("train")
+    height, width = small.images[0].shape[:2]
+    assert (
+        (small.cameras.height, small.cameras.width)
+        == (height, width)
+        == tuple(max(1, round(side / downscale)) for side in full.images[0].shape[:2])
+    )
+    # A pixel of the small picture covers this much of the full one, and the whole picture is there.
+    share = torch.tensor([full.cameras.width / width, full.cameras.height / height])
+    rays = small.cameras.image_rays(0)
+    seen = full.cameras.project(rays.origins + 3 * rays.directions)[0][0]
+    row, column = np.divmod(np.arange(height * width), width)
+    torch.testing.assert_close(
+        seen, torch.tensor(np.stack([column + 0.5, row + 0.5], 1)).float() * share, atol=1e-3, rtol=0
+    )
