@@ -65,4 +65,3 @@ class Contracted:
         run = (torch.searchsorted(self.marks, place.contiguous().double()) - 1).clamp(0, last)
         begin, passing, aside, mark = (x.gather(1, run) for x in (self.begin, self.passing, self.aside, self.marks))
         return passing + world_length(begin + place - mark, aside, self.radius)
-

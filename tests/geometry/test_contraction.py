@@ -41,7 +41,9 @@ def test_shrinkage_is_that_of_lengths_on_lines_from_the_centre() -> None:
     distance = torch.linspace(0.1, 20, 50, dtype=torch.float64)
     ends = [contract(CENTRE + (distance + h)[:, None] * directions, CENTRE, RADIUS) for h in (-1e-5, 1e-5)]
     found = (ends[1] - ends[0]).norm(dim=-1) / 2e-5
-    torch.testing.assert_close(shrinkage(CENTRE + distance[:, None] * directions, CENTRE, RADIUS), found, rtol=1e-5, atol=0)
+    torch.testing.assert_close(
+        shrinkage(CENTRE + distance[:, None] * directions, CENTRE, RADIUS), found, rtol=1e-5, atol=0
+    )
 
 
 @pytest.mark.parametrize("aside", ASIDE.tolist())

@@ -104,5 +104,5 @@ def test_a_box_covers_nothing_else_and_needs_no_cameras() -> None:
 
 
 def test_unknown_spaces_are_refused() -> None:
-    with pytest.raises(NerfroError, match="content.space=some is not allowed; choose box, all"):
+    with pytest.raises(NerfroError, match="space=some is not allowed; choose box, all"):
         of_all_space(space="some")
