@@ -90,9 +90,9 @@ class HashGridField(Field):
     def forward(self, samples: Samples) -> Radiance:
         if self.radius is None:
             return evaluate_selected(self.decode, samples, inside_box(samples.positions, self.box_min, self.box_max))
-        centre, positions = 0.5 * (self.box_min + self.box_max), samples.positions.flatten(0, 1)
-        density, rgb = self.decode(contract(positions, centre, self.radius), samples.directions.flatten(0, 1))
-        density = density * shrinkage(positions, centre, self.radius)
+        positions = samples.positions.flatten(0, 1)
+        density, rgb = self.decode(contract(positions, self.centre, self.radius), samples.directions.flatten(0, 1))
+        density = density * shrinkage(positions, self.centre, self.radius)
         return Radiance(density.view(samples.s.shape), rgb.view(samples.positions.shape))
 
     def before_step(self, progress: float) -> None:
@@ -105,8 +105,22 @@ class HashGridField(Field):
         """Density, per length there, and colour at positions within the box, which are contracted with a `radius`."""
         geometry = self.apply_mlp(self.density_mlp, self.encode(positions))
         raw = self.apply_mlp(self.colour_mlp, geometry, self.encode_directions(directions))
-        density = self.initial_density * torch.exp(geometry[:, 0].float().clamp(max=_MAX_EXPONENT))
-        return density, radiance(raw)
+        return self._to_density(geometry), radiance(raw)
+
+    def density(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
+        if self.radius is None:
+            density = self._to_density(self.apply_mlp(self.density_mlp, self.encode(positions)))
+            return torch.where(inside_box(positions, self.box_min, self.box_max), density, 0.0)
+        places = contract(positions, self.centre, self.radius)
+        density = self._to_density(self.apply_mlp(self.density_mlp, self.encode(places)))
+        return density * shrinkage(positions, self.centre, self.radius)
+
+    @property
+    def centre(self) -> Float[Tensor, "3"]:
+        return 0.5 * (self.box_min + self.box_max)
+
+    def _to_density(self, geometry: Float[Tensor, "P G"]) -> Float[Tensor, "P"]:
+        return self.initial_density * torch.exp(geometry[:, 0].float().clamp(max=_MAX_EXPONENT))
 
     def encode(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P F"]:
         """Hash encoding in single precision, compiled on the CPU."""

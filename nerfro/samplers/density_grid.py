@@ -42,7 +42,8 @@ class DensityGridSampler(PointSampler):
         resolution: cells of the grid along each side.
         uniform: share of the samples that are spread evenly.
         every: steps between two looks at the field.
-        decay: factor of the remembered density at each look.
+        looks: share of the cells that are looked at then, drawn at random.
+        decay: factor of a cell's remembered density at each look.
     """
 
     num_levels = 1
@@ -60,11 +61,12 @@ class DensityGridSampler(PointSampler):
         resolution: Annotated[int, Range(at_least=2)] = 64,
         uniform: Share = 0.2,
         every: Count = 16,
+        looks: Share = 1 / 16,
         decay: Share = 0.9,
     ) -> None:
         super().__init__()
         self.num_samples, self.num_bins, self.resolution = num_samples, num_bins, resolution
-        self.uniform, self.every, self.decay = uniform, every, decay
+        self.uniform, self.every, self.looks, self.decay = uniform, every, looks, decay
         self.radius, self.near = radius, near
         box = torch.from_numpy(corners_of_box(box_min, box_max)).float()
         self.register_buffer("box", box if radius is None else contracted_box(box, radius), persistent=False)
@@ -147,12 +149,12 @@ class DensityGridSampler(PointSampler):
 
     @torch.no_grad()
     def after_step(self, step: int, fields: Sequence[Field]) -> None:
-        """Look at a random sixteenth of the cells, at a random place in each."""
+        """Look at some of the cells, at a random place in each."""
         if step % self.every:
             return
         num_cells = self.resolution**3
         device = self.density.device
-        cells = torch.randint(num_cells, (num_cells // 16,), device=device)
+        cells = torch.randint(num_cells, (int(num_cells * self.looks),), device=device)
         corners = torch.stack(
             [cells // self.resolution**2, cells // self.resolution % self.resolution, cells % self.resolution], dim=-1
         )
@@ -167,18 +169,8 @@ class DensityGridSampler(PointSampler):
     def _look(self, field: Field, places: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
         """A field's density at places of the grid."""
         if self.radius is None:
-            return field_density(field, places)
+            return field.density(places)
         positions = expand(places, self.centre, self.radius)
         outside = (places - self.centre).norm(dim=-1) >= 2 * self.radius  # corners in which no place of the world lies
-        return torch.where(
-            outside, 0.0, field_density(field, positions) / shrinkage(positions, self.centre, self.radius)
-        )
-
-
-def field_density(field: Field, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
-    """A field's density at points, seen from above; density does not depend on the direction."""
-    directions = torch.zeros_like(positions)
-    directions[:, 2] = -1
-    s = torch.zeros(len(positions), 1, device=positions.device)
-    samples = Samples(positions[:, None], directions[:, None], s, torch.cat([s, s], dim=1), s[:, 0])
-    return field(samples).density[:, 0].float()
+        density = field.density(positions) / shrinkage(positions, self.centre, self.radius)
+        return torch.where(outside, 0.0, density)

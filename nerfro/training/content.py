@@ -21,8 +21,11 @@ from nerfro.media.base import Medium
 from nerfro.paths import resolve_path
 from nerfro.registry import build
 
-# Samples begin at this share of the cameras' usual distance from what they look at.
-_NEAR_SHARE = 0.1
+# The ball's radius, of the cameras' usual distance from what they look at: what they look at is finest.
+_RADIUS_SHARE = 0.5
+# Samples begin at this share of the nearest camera's distance. Few rays cross what is close before a camera, so that
+# what is learned there explains its photograph and no other.
+_NEAR_SHARE = 0.3
 # Cells of the finest grid; memory bounds them above.
 _FEWEST_CELLS, _MOST_CELLS = 128, 4096
 # Below this share of cameras' directions across it, a place is not told by where optical axes meet.
@@ -93,7 +96,7 @@ def _settle_ball(content: DictConfig, cameras: Cameras) -> None:
     else:
         middle = np.mean([list(content.box_min), list(content.box_max)], axis=0)
     distances = np.linalg.norm(centres - middle, axis=1)
-    radius = float(np.median(distances)) if content.radius is None else content.radius
+    radius = _RADIUS_SHARE * float(np.median(distances)) if content.radius is None else content.radius
     if not radius > 0:
         raise NerfroError("content: the cameras stand where they look; give content.radius, in units of the poses")
     content.radius = float(f"{radius:.4g}")
@@ -101,7 +104,7 @@ def _settle_ball(content: DictConfig, cameras: Cameras) -> None:
         corners = middle + np.array([[-1.0], [1.0]]) * radius
         content.box_min, content.box_max = ([float(f"{x:.6g}") for x in corner] for corner in corners)
     if content.near is None:
-        content.near = float(f"{_NEAR_SHARE * np.median(distances):.4g}")
+        content.near = float(f"{_NEAR_SHARE * distances.min():.4g}")
     if content.cells is None:
         pixel = np.median(distances / cameras.fx.double().cpu().numpy())
         content.cells = int(np.clip(math.ceil(4 * radius / pixel), _FEWEST_CELLS, _MOST_CELLS))

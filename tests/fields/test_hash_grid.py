@@ -220,3 +220,9 @@ def test_levels_appear_coarse_before_fine() -> None:
     assert not field.table.grad[first:].any()
     assert "shown" in field.state_dict()
     assert "shown" not in all_of_them.state_dict()
+
+
+@pytest.mark.parametrize("radius", [None, 0.8])
+def test_density_alone_is_that_of_samples(radius: float | None) -> None:
+    field, samples = make_field(radius=radius), make_samples()
+    assert torch.equal(field.density(samples.positions.flatten(0, 1)), field(samples).density.flatten())

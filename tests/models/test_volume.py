@@ -72,12 +72,12 @@ def scores(space: dict, boundary: Boundary, num_steps: int = 150) -> list[float]
         **space, num_levels=6, base_resolution=8, finest_resolution=64, log2_table_size=14, width=32, initial_depth=3.0,
         direction_bands=1,
     )  # fmt: skip
-    sampler = DensityGridSampler(24, 48, **space, resolution=32)
+    sampler = DensityGridSampler(24, 48, **space, near=0.3, resolution=32, every=4, decay=0.6)
     parameters = [*field.parameters(), *boundary.parameters()]
     optimizer = torch.optim.Adam(parameters, eps=1e-15)
     for step in range(num_steps):
         sampler.after_step(step, [field])
-        optimizer.param_groups[0]["lr"] = 2e-2 * 0.1 ** (step / num_steps)
+        optimizer.param_groups[0]["lr"] = 4e-2 * 0.1 ** (step / num_steps)
         chosen = torch.randint(len(target), (512,))
         loss = (rendered(path[chosen], sampler, field, boundary) - target[chosen]).square().mean()
         optimizer.zero_grad()
@@ -93,6 +93,6 @@ def scores(space: dict, boundary: Boundary, num_steps: int = 150) -> list[float]
 def test_a_volume_learns_a_room_and_what_stands_before_the_glass_where_a_box_under_a_sky_cannot() -> None:
     volume = scores(SPACE, Nothing())
     sky = scores({"box_min": [-0.85] * 3, "box_max": [0.85] * 3}, EnvironmentMap([4, 8, 16, 32]))
-    assert volume[0] > sky[0] + 3
-    assert volume[1] > sky[1] + 2, "behind the glass"
-    assert volume[2] > sky[2] + 2.5, "a box holds what is in it, and the toy stands before it"
+    assert volume[0] > sky[0] + 6
+    assert volume[1] > sky[1] + 5, "behind the glass"
+    assert volume[2] > sky[2] + 5, "a box holds what is in it, and the toy stands before it"

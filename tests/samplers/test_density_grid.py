@@ -9,7 +9,7 @@ from torch import nn
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.geometry.contraction import contracted_length, shrinkage
-from nerfro.samplers.density_grid import DensityGridSampler, field_density
+from nerfro.samplers.density_grid import DensityGridSampler
 from nerfro.samplers.stepfun import spread_uniform
 from nerfro.testing import example_path
 from nerfro.types import Path, Radiance, Samples
@@ -99,7 +99,7 @@ def test_grid_remembers_the_field_it_looked_at() -> None:
     points = torch.rand(500, 3) * 2 - 1
     away = (points.norm(dim=-1) - RADIUS).abs() > 0.15
     remembered = sampler.lookup(points)[away]
-    torch.testing.assert_close(remembered, field_density(DenseBall(), points)[away])
+    torch.testing.assert_close(remembered, DenseBall().density(points)[away])
 
 
 def test_grid_travels_with_the_checkpoint() -> None:
