@@ -21,6 +21,7 @@ from nerfro.fields.mlp import compile_networks
 from nerfro.registry import build
 from nerfro.training.callbacks import StopOnSignal, Throughput
 from nerfro.training.config import TrainConfig, build_model
+from nerfro.training.content import describe
 from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.memory import require_memory
 from nerfro.training.ray_batches import RayBatches
@@ -54,7 +55,7 @@ def main(config: DictConfig) -> None:
         config.evaluation.supersample, config.evaluation.divergence, config.evaluation.contrast
     )
     lpips = find_lpips_networks(config.evaluation.lpips_backbone, config.evaluation.lpips_vgg_backbone)
-    model = build_model(config)
+    model = build_model(config, training.cameras)
     if checkpoint is not None:
         require_same_configuration(checkpoint, load_checkpoint(checkpoint)[1], config)
     throughput, interruption = Throughput(), StopOnSignal()
@@ -68,7 +69,8 @@ def main(config: DictConfig) -> None:
     if trainer.is_global_zero:
         claim(folder, checkpoint is not None, needed_bytes(model))
         record(folder, config)
-        print(f"nerfro: {config.name} on {config.data.root} -> {folder}\n{memory}", flush=True)
+        space = describe(config.content)
+        print(f"nerfro: {config.name} on {config.data.root} -> {folder}\n{space}{memory}", flush=True)
     if config.compile is not None:
         compile_networks(model, config.compile)
 

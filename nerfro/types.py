@@ -256,6 +256,10 @@ class Samples:
     radii: Float[Tensor, "R"]  # pixel cone radius at unit distance
     # Where the field is worth asking; it holds next to nothing elsewhere. None for all.
     occupied: Bool[Tensor, "R N"] | None = None
+    # World lengths in which the density at a sample stands for the optical depth of its interval, where that is wide
+    # and space is contracted in it; None for the intervals' own.
+    lengths: Float[Tensor, "R N"] | None = None
+    measure: Float[Tensor, "R N+1"] | None = None  # the intervals' bounds in contracted length, where space is
 
     @classmethod
     def along(cls, path: Path, s: Float[Tensor, "R N"], edges: Float[Tensor, "R N+1"]) -> Samples:
@@ -266,7 +270,8 @@ class Samples:
 
     @property
     def deltas(self) -> Float[Tensor, "R N"]:
-        return self.edges[:, 1:] - self.edges[:, :-1]
+        """Length by which the density of each sample is multiplied, world units."""
+        return self.lengths if self.lengths is not None else self.edges[:, 1:] - self.edges[:, :-1]
 
 
 @dataclass(frozen=True)
@@ -299,7 +304,8 @@ class Rendering:
     def depth(self) -> Float[Tensor, "R"]:
         """Expected arc length of the samples that were hit; the main polyline's end where nothing was."""
         weight = self.opacity
-        centres = 0.5 * (self.samples.edges[:, 1:] + self.samples.edges[:, :-1])
+        edges = self.samples.edges
+        centres = self.samples.s if self.samples.lengths is not None else 0.5 * (edges[:, 1:] + edges[:, :-1])
         depth = self.path.per_ray((self.weights * centres).sum(-1)) / weight.clamp(min=1e-6)
         return torch.where(weight > 1e-6, depth, self.path.first_of_ray(self.path.far))
 

@@ -148,8 +148,7 @@ def test_from_photographs_to_a_table(
         *printed_command("train on it", printed),
         *("trainer.max_steps=80", "trainer.max_time=null", "trainer.accelerator=cpu", "logger=none"),
         *("data.downscale=10", "batches.size=512", "evaluation.supersample=1"),
-        *(f"{part}.num_levels=6" for part in ("field", "boundary")),
-        *(f"{part}.log2_table_size=13" for part in ("field", "boundary")),
+        *("field.num_levels=6", "field.log2_table_size=13"),
         f"hydra.run.dir={run_folder}",
     )
     assert finished.code == 0, finished.err

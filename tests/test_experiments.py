@@ -48,7 +48,7 @@ def shrunk(config: DictConfig) -> list[str]:
     small: dict[str, dict[str, int]] = {
         "medium": {"resolution": 32, "smoothing_size": 3},
         "field": {"width": 8, "view_width": 8, "num_levels": 2, "log2_table_size": 8},
-        "boundary": {"width": 8, "num_levels": 2, "log2_table_size": 8, "num_samples": 8, "grid_resolution": 16},
+        "boundary": {"width": 8},
         "evaluation": {"supersample": 1},
         "loss.smoothness": {"tile_size": 4},
         "sampler.path": {"num_steps": 48},

@@ -16,6 +16,3 @@ class Boundary(nn.Module, ABC):
     @abstractmethod
     def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
         """Linear radiance, not negative and unbounded above; a sky needs the exits' directions alone."""
-
-    def after_step(self, step: int) -> None:
-        """Called after a training step, with the number of optimiser steps done, for boundaries that keep a record."""

@@ -15,6 +15,7 @@ from nerfro.fields import spherical_harmonics as harmonics
 from nerfro.fields.base import Field
 from nerfro.fields.mlp import radiance
 from nerfro.fields.selection import evaluate_selected, inside_box
+from nerfro.geometry.contraction import contract, contracted_box, shrinkage
 from nerfro.registry import register
 from nerfro.types import Radiance, Samples
 
@@ -30,26 +31,33 @@ class HashGridField(Field):
     """Hash encoding, a density MLP and a colour MLP that sees the direction (Instant-NGP, sections 3 and 5.4).
 
     Density is exponential: exp(raw) scaled so that at the start a ray across the box has an optical depth of about
-    `initial_depth`. Samples outside the box are not evaluated; nothing is there.
+    `initial_depth`. Samples outside the box are not evaluated; nothing is there. With a `radius` the field covers all
+    of space, contracted beyond a ball (mip-NeRF 360, Eqn. 10), and the cube around contracted space is its box.
 
     Args:
         box_min, box_max: opposite corners of the content's bounds, world units.
+        radius: of a ball around the box's middle, world units, in which details are finest; beyond, they become coarser
+            in proportion to the distance. None if there is nothing outside the box.
         num_levels: of the encoding, with 2 features each.
         base_resolution, finest_resolution: cells along the box's longest side.
         log2_table_size: logarithm of the largest number of entries of a level.
         width: of the hidden layers.
         direction_bands: bands of spherical harmonics that encode the direction; 1 makes colour independent of it.
         initial_depth: optical depth of the untrained field along the box's longest side.
+        fading_in: share of the training during which levels appear one after the other, coarse before fine; 0 for all
+            at once. What few rays see is then first explained as simply as can be.
         precision: of the MLPs' matrix products; `float32` for processors without bfloat16 units.
     """
 
     box_min: Float[Tensor, "3"]
     box_max: Float[Tensor, "3"]
+    shown: Float[Tensor, "L"]
 
     def __init__(
         self,
         box_min: list[float] = (-1.0, -1.0, -1.0),  # type: ignore[assignment]
         box_max: list[float] = (1.0, 1.0, 1.0),  # type: ignore[assignment]
+        radius: Positive | None = None,
         num_levels: Count = 12,
         base_resolution: Count = 16,
         finest_resolution: Count = 256,
@@ -57,16 +65,22 @@ class HashGridField(Field):
         width: Count = 64,
         direction_bands: Annotated[int, Range(at_least=1, at_most=harmonics.MAX_BANDS)] = 4,
         initial_depth: Positive = 0.1,
+        fading_in: Annotated[float, Range(at_least=0, less_than=1)] = 0.0,
         precision: Literal["bfloat16", "float32"] = "bfloat16",
     ) -> None:
         super().__init__()
-        box = corners_of_box(box_min, box_max)
-        self.register_buffer("box_min", torch.from_numpy(box[0]).float(), persistent=False)
-        self.register_buffer("box_max", torch.from_numpy(box[1]).float(), persistent=False)
+        box = torch.from_numpy(corners_of_box(box_min, box_max))
+        self.radius, box = radius, box if radius is None else contracted_box(box, radius)
+        self.register_buffer("box_min", box[0].float(), persistent=False)
+        self.register_buffer("box_max", box[1].float(), persistent=False)
         self.side = float((box[1] - box[0]).max())
         self.initial_density = initial_depth / self.side
         self.direction_bands, self.precision = direction_bands, precision
         self.levels = hash_encoding.grid_levels(num_levels, base_resolution, finest_resolution, log2_table_size)
+        self.fading_in = fading_in
+        # How much of each level is seen; kept with the weights, which mean nothing without it.
+        shown = torch.ones(num_levels) if fading_in == 0 else _shown(num_levels, 0.0)
+        self.register_buffer("shown", shown, persistent=fading_in > 0)
         self.table = nn.Parameter(torch.empty(self.levels.num_entries, hash_encoding.NUM_FEATURES))
         nn.init.uniform_(self.table, -1e-4, 1e-4)
         num_harmonics = harmonics.spherical_harmonics(torch.zeros(1, 3), direction_bands).shape[-1]
@@ -78,16 +92,39 @@ class HashGridField(Field):
         return torch.stack([self.box_min, self.box_max])
 
     def forward(self, samples: Samples) -> Radiance:
-        return evaluate_selected(self.decode, samples, inside_box(samples.positions, self.box_min, self.box_max))
+        if self.radius is None:
+            return evaluate_selected(self.decode, samples, inside_box(samples.positions, self.box_min, self.box_max))
+        positions = samples.positions.flatten(0, 1)
+        density, rgb = self.decode(contract(positions, self.centre, self.radius), samples.directions.flatten(0, 1))
+        density = density * shrinkage(positions, self.centre, self.radius)
+        return Radiance(density.view(samples.s.shape), rgb.view(samples.positions.shape))
+
+    def before_step(self, progress: float) -> None:
+        if self.fading_in > 0:
+            self.shown.copy_(_shown(len(self.levels), progress / self.fading_in))
 
     def decode(
         self, positions: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]
     ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P 3"]]:
-        """Density and colour at positions within the box."""
+        """Density, per length there, and colour at positions within the box, which are contracted with a `radius`."""
         geometry = self.apply_mlp(self.density_mlp, self.encode(positions))
         raw = self.apply_mlp(self.colour_mlp, geometry, self.encode_directions(directions))
-        density = self.initial_density * torch.exp(geometry[:, 0].float().clamp(max=_MAX_EXPONENT))
-        return density, radiance(raw)
+        return self._to_density(geometry), radiance(raw)
+
+    def density(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
+        if self.radius is None:
+            density = self._to_density(self.apply_mlp(self.density_mlp, self.encode(positions)))
+            return torch.where(inside_box(positions, self.box_min, self.box_max), density, 0.0)
+        places = contract(positions, self.centre, self.radius)
+        density = self._to_density(self.apply_mlp(self.density_mlp, self.encode(places)))
+        return density * shrinkage(positions, self.centre, self.radius)
+
+    @property
+    def centre(self) -> Float[Tensor, "3"]:
+        return 0.5 * (self.box_min + self.box_max)
+
+    def _to_density(self, geometry: Float[Tensor, "P G"]) -> Float[Tensor, "P"]:
+        return self.initial_density * torch.exp(geometry[:, 0].float().clamp(max=_MAX_EXPONENT))
 
     def encode(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P F"]:
         """Hash encoding in single precision, compiled on the CPU."""
@@ -96,7 +133,8 @@ class HashGridField(Field):
             from nerfro.fields.hash_encoding_cpu import hash_encode  # compiled code, so only where it is used
         else:
             hash_encode = hash_encoding.hash_encode
-        return hash_encode(unit, self.table, self.levels)
+        features = hash_encode(unit, self.table, self.levels)
+        return features if self.fading_in == 0 else features * self.shown.repeat_interleave(hash_encoding.NUM_FEATURES)
 
     def encode_directions(self, directions: Float[Tensor, "P 3"]) -> Float[Tensor, "P K"]:
         """Spherical harmonics, compiled on the CPU."""
@@ -115,6 +153,12 @@ class HashGridField(Field):
             return relu_mlp(list(inputs), weights, getattr(torch, self.precision))
         with torch.autocast(inputs[0].device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
             return mlp(torch.cat([part.to(inputs[0].dtype) for part in inputs], dim=-1))
+
+
+def _shown(num_levels: int, progress: float) -> Float[Tensor, "L"]:
+    """Weight of each level: the coarser third from the beginning, the others in turn until `progress` is 1."""
+    first = -(-num_levels // 3)
+    return (first + progress * (num_levels - first) - torch.arange(num_levels)).clamp(0, 1)
 
 
 def _mlp(num_inputs: int, width: int, num_hidden: int, num_outputs: int) -> nn.Sequential:

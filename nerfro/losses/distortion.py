@@ -16,7 +16,7 @@ class Distortion(Loss):
     """Spread of the last level's weights along each path, which fog has and surfaces have not (mip-NeRF 360, Eqn. 15).
 
     Arc length is measured in units of the path's length, far - near, so that the weight does not depend on the scene's
-    scale.
+    scale; contracted length, where space is contracted, in units of all of it.
     """
 
     def __init__(self, weight: float = 1e-2, start: int = 0, ramp: int = 0) -> None:
@@ -24,9 +24,11 @@ class Distortion(Loss):
 
     def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
         rendering = renderings[-1]
-        near, far = rendering.path.near[:, None], rendering.path.far[:, None]
+        edges, near, far = rendering.samples.edges, rendering.path.near[:, None], rendering.path.far[:, None]
+        if rendering.samples.measure is not None:
+            edges, near, far = rendering.samples.measure, 0.0, rendering.samples.measure[:, -1:]
         # A path of no length has no weights either; the clamp only keeps the quotient a number.
-        edges = (rendering.samples.edges - near) / (far - near).clamp(min=1e-6)
+        edges = (edges - near) / (far - near).clamp(min=1e-6)
         return mean_over_rays(rendering.path.per_ray(distortion(rendering.weights, edges)), batch.num_rows)
 
 

@@ -139,10 +139,11 @@ class NerfModel(LightningModule, ABC):
         factor = learning_rate_factor(self.global_step, progress, self.optimizer_config)
         for group in self.trainer.optimizers[0].param_groups:
             group["lr"] = group["initial_lr"] * factor
+        for field in self.fields:
+            field.before_step(progress)  # type: ignore[operator]
         # Not at the end of the step before, which comes after its checkpoint: a resumed run would miss the update.
         if self.global_step > 0:
             self.point_sampler.after_step(self.global_step, list(self.fields))  # type: ignore[arg-type]
-            self.boundary.after_step(self.global_step)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         groups = [

@@ -10,13 +10,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Count, Range, Share, corners_of_box
+from nerfro.allowed import Count, NotNegative, Positive, Range, Share, corners_of_box
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
+from nerfro.geometry.contraction import contract, contracted_box, expand, shrinkage
 from nerfro.registry import register
 from nerfro.rendering import volume_weights
 from nerfro.samplers.base import PointSampler
-from nerfro.samplers.stepfun import invert_cdf, spread_uniform
+from nerfro.samplers.measures import Contracted, WithinBox
+from nerfro.samplers.stepfun import invert_cdf, midpoints, spread_uniform
 from nerfro.samplers.stratified import cone_samples
 from nerfro.types import Path, Rendering, Samples
 
@@ -37,10 +39,14 @@ class DensityGridSampler(PointSampler):
         num_samples: intervals on each path.
         num_bins: places along the path at which the grid is asked.
         box_min, box_max: corners of the content's box; nothing is sampled outside.
+        radius: of a ball around the box's middle, world units, to sample all of space instead, evenly in the length
+            that paths have where what is beyond the ball is contracted (see `field=hash_grid`); none for the box alone.
+        near: arc length at which samples begin then, whatever the path's; they go on to practical infinity.
         resolution: cells of the grid along each side.
         uniform: share of the samples that are spread evenly.
         every: steps between two looks at the field.
-        decay: factor of the remembered density at each look.
+        looks: share of the cells that are looked at then, drawn at random.
+        decay: factor of a cell's remembered density at each look.
     """
 
     num_levels = 1
@@ -53,15 +59,20 @@ class DensityGridSampler(PointSampler):
         num_bins: Annotated[int, Range(at_least=2)] = 96,
         box_min: list[float] = (-1.0, -1.0, -1.0),  # type: ignore[assignment]
         box_max: list[float] = (1.0, 1.0, 1.0),  # type: ignore[assignment]
+        radius: Positive | None = None,
+        near: NotNegative = 0.0,
         resolution: Annotated[int, Range(at_least=2)] = 64,
         uniform: Share = 0.2,
         every: Count = 16,
+        looks: Share = 1 / 16,
         decay: Share = 0.9,
     ) -> None:
         super().__init__()
         self.num_samples, self.num_bins, self.resolution = num_samples, num_bins, resolution
-        self.uniform, self.every, self.decay = uniform, every, decay
-        self.register_buffer("box", torch.from_numpy(corners_of_box(box_min, box_max)).float(), persistent=False)
+        self.uniform, self.every, self.looks, self.decay = uniform, every, looks, decay
+        self.radius, self.near = radius, near
+        box = torch.from_numpy(corners_of_box(box_min, box_max)).float()
+        self.register_buffer("box", box if radius is None else contracted_box(box, radius), persistent=False)
         self.register_buffer("density", torch.zeros(resolution, resolution, resolution))
 
     def forward(self, path: Path, previous: Rendering | None) -> Samples:
@@ -71,18 +82,31 @@ class DensityGridSampler(PointSampler):
         if self.training:  # the field may have grown since the grid has looked
             samples = replace(samples, occupied=None)
         # The kernel has found positions too; they are asked of the path only where it has gradients to give.
-        return Samples.along(path, samples.s, samples.edges) if path.positions.requires_grad else samples
+        if not path.positions.requires_grad:
+            return samples
+        return replace(Samples.along(path, samples.s, samples.edges), lengths=samples.lengths, measure=samples.measure)
 
     def draw(self, path: Path, u: Float[Tensor, "R N+1"]) -> Samples:
         """Samples at places `u` of the cumulative weights: the plain reference of the compiled kernel."""
-        near, far = path.span(self.box)
-        fractions = torch.linspace(0, 1, self.num_bins + 1, device=near.device)
-        edges = near[:, None] + fractions * (far - near)[:, None]
-        positions, _ = path.at(0.5 * (edges[:, 1:] + edges[:, :-1]))
-        weights, _ = volume_weights(self.lookup(positions), edges[:, 1:] - edges[:, :-1])
+        if self.radius is None:
+            measure: WithinBox | Contracted = WithinBox.of(path, self.box)
+        else:
+            measure = Contracted.of(path, self.centre, self.radius, self.near)
+        places = torch.linspace(0, 1, self.num_bins + 1, device=u.device) * measure.total[:, None]
+        positions, _ = path.at(measure.arc_length(midpoints(places)).to(path.s.dtype))
+        weights, _ = volume_weights(self.lookup(self.contracted(positions)), places.diff(dim=1))
         share = weights / weights.sum(-1, keepdim=True).clamp(min=1e-6)
-        samples = cone_samples(path, invert_cdf(edges, share + self._floor, u))
-        return replace(samples, occupied=self.lookup(samples.positions) * samples.deltas >= _EMPTY)
+        places = invert_cdf(places, share + self._floor, u)
+        edges = measure.arc_length(places).to(path.s.dtype)
+        if self.radius is None:
+            samples = cone_samples(path, edges)
+        else:
+            samples = Samples.along(path, measure.arc_length(midpoints(places)).to(path.s.dtype), edges)
+            smaller = shrinkage(samples.positions, self.centre, self.radius)
+            lengths = (places.diff(dim=1) / smaller).to(path.s.dtype)
+            samples = replace(samples, lengths=lengths, measure=places.to(path.s.dtype))
+        depths = self.lookup(self.contracted(samples.positions)) * places.diff(dim=1)
+        return replace(samples, occupied=depths >= _EMPTY)
 
     def draw_compiled(self, path: Path, u: Float[Tensor, "R N+1"]) -> Samples:
         """The same as `draw`, on the CPU.
@@ -107,9 +131,20 @@ class DensityGridSampler(PointSampler):
             self.num_bins,
             self._floor,
             _EMPTY,
+            self.radius or 0.0,
+            self.near,
         )
-        edges, s, positions, directions, occupied = (torch.from_numpy(array) for array in drawn)
-        return Samples(positions, directions, s, edges, path.radii, occupied)
+        edges, s, positions, directions, occupied, *of_measure = (torch.from_numpy(array) for array in drawn)
+        of_measure = of_measure if self.radius is not None else []
+        return Samples(positions, directions, s, edges, path.radii, occupied, *of_measure)
+
+    @property
+    def centre(self) -> Float[Tensor, "3"]:
+        return self.box.mean(0)
+
+    def contracted(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Where the grid has what is at these positions of the world."""
+        return positions if self.radius is None else contract(positions, self.centre, self.radius)
 
     @property
     def _floor(self) -> float:
@@ -117,34 +152,35 @@ class DensityGridSampler(PointSampler):
         return self.uniform / (1 - self.uniform) / self.num_bins
 
     def lookup(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Remembered density of the cell that each position lies in."""
+        """Remembered density of the cell that each position of the grid lies in; per contracted length."""
         cell = ((positions - self.box[0]) / (self.box[1] - self.box[0]) * self.resolution).long()
         x, y, z = cell.clamp(0, self.resolution - 1).unbind(-1)
         return self.density.view(-1)[(x * self.resolution + y) * self.resolution + z]
 
     @torch.no_grad()
     def after_step(self, step: int, fields: Sequence[Field]) -> None:
-        """Look at a random sixteenth of the cells, at a random place in each."""
+        """Look at some of the cells, at a random place in each."""
         if step % self.every:
             return
         num_cells = self.resolution**3
         device = self.density.device
-        cells = torch.randint(num_cells, (num_cells // 16,), device=device)
+        cells = torch.randint(num_cells, (int(num_cells * self.looks),), device=device)
         corners = torch.stack(
             [cells // self.resolution**2, cells // self.resolution % self.resolution, cells % self.resolution], dim=-1
         )
         unit = (corners + torch.rand(len(cells), 3, device=device)) / self.resolution
-        found = field_density(fields[-1], self.box[0] + unit * (self.box[1] - self.box[0]))
+        places = self.box[0] + unit * (self.box[1] - self.box[0])
+        found = self._look(fields[-1], places)
         flat = self.density.view(-1)
         # A cell that was drawn twice must not depend on the order of writing, or runs could not be repeated.
         flat[cells] = flat[cells] * self.decay
         flat.scatter_reduce_(0, cells, found, "amax")
 
-
-def field_density(field: Field, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
-    """A field's density at points, seen from above; density does not depend on the direction."""
-    directions = torch.zeros_like(positions)
-    directions[:, 2] = -1
-    s = torch.zeros(len(positions), 1, device=positions.device)
-    samples = Samples(positions[:, None], directions[:, None], s, torch.cat([s, s], dim=1), s[:, 0])
-    return field(samples).density[:, 0].float()
+    def _look(self, field: Field, places: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
+        """A field's density at places of the grid."""
+        if self.radius is None:
+            return field.density(places)
+        positions = expand(places, self.centre, self.radius)
+        outside = (places - self.centre).norm(dim=-1) >= 2 * self.radius  # corners in which no place of the world lies
+        density = field.density(positions) / shrinkage(positions, self.centre, self.radius)
+        return torch.where(outside, 0.0, density)

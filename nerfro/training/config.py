@@ -5,23 +5,19 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, Optional
 
-import numpy as np
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig
 
 from nerfro.allowed import Count, Natural, NotNegative, Positive, Range
+from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
-from nerfro.files.cache import load_array
-from nerfro.geometry.mesh import load_mesh
 from nerfro.losses.base import Loss
 from nerfro.media.analytic import Vacuum
-from nerfro.media.base import Medium
 from nerfro.models.base import NerfModel, Parts
 from nerfro.models.optimizer import OptimizerConfig
-from nerfro.paths import resolve_path
 from nerfro.registry import build, configure, find
+from nerfro.training.content import ContentConfig, settle_content
 
 
 @dataclass
@@ -72,17 +68,6 @@ class CheckpointConfig:
 
     every_seconds: Optional[Positive] = 60.0  # noqa: UP045
     every_steps: Optional[Count] = None  # noqa: UP045
-
-
-@dataclass
-class ContentConfig:
-    """The box outside of which there is nothing but the boundary, for fields and samplers that stay inside one."""
-
-    # Its corners, world units; none takes the bounds of the object.
-    box_min: Optional[list[float]] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    box_max: Optional[list[float]] = None  # noqa: UP045
-    # .npy of the box's centre and half sides [2, 3] instead, as Eikonal Fields stores it.
-    box_file: Optional[str] = None  # noqa: UP045
 
 
 @dataclass
@@ -146,13 +131,18 @@ def build_losses(nodes: DictConfig) -> dict[str, Loss]:
     return losses
 
 
-def build_model(config: DictConfig) -> NerfModel:
-    """Compose the model of a configuration (see `TrainConfig`); fills in `config.content` where it is left open."""
+def build_model(config: DictConfig, cameras: Cameras | None = None) -> NerfModel:
+    """Compose the model of a configuration (see `TrainConfig`); fills in `config.content` where it is left open.
+
+    Args:
+        config: of the run.
+        cameras: of the training views, where they are loaded already.
+    """
     losses = build_losses(config.loss)
     optimizer = OptimizerConfig(**config.optimizer)
     path_sampler = build(config.sampler.path)
     medium = build(config.medium) if path_sampler.needs_medium else Vacuum()
-    _settle_content(config, medium)
+    settle_content(config, medium, cameras)
     parts = Parts(
         medium=medium,
         path_sampler=path_sampler,
@@ -166,47 +156,3 @@ def build_model(config: DictConfig) -> NerfModel:
         chunk_size=config.evaluation.chunk_size,
     )
     return build(config.model, parts=parts)
-
-
-def _settle_content(config: DictConfig, medium: Medium) -> None:
-    if (config.content.box_min is None) != (config.content.box_max is None):
-        raise NerfroError("content: give both box_min and box_max, or neither for the bounds of the object")
-    if config.content.box_min is not None:
-        return
-    if config.content.box_file is not None:
-        centre, half = _read_box(resolve_path(config.content.box_file))
-        config.content.box_min, config.content.box_max = (centre - half).tolist(), (centre + half).tolist()
-        return
-    if not isinstance(medium, Vacuum):
-        box = medium.content_box.tolist()
-    elif "mesh" in config.medium and resolve_path(config.medium.mesh).is_file():
-        # Straight rays need no medium, but a baseline is told where the object is, as ours is.
-        box = load_mesh(resolve_path(config.medium.mesh), accept_open_mesh=True).bounds.tolist()
-    else:
-        _require_no_box(config)
-        return
-    config.content.box_min, config.content.box_max = ([round(x, 6) for x in corner] for corner in box)
-
-
-def _require_no_box(config: DictConfig) -> None:
-    """Refuse parts that stay inside the content's box where nothing says where that is."""
-    for name, node in (
-        ("field", config.field),
-        ("sampler/points", config.sampler.points),
-        ("boundary", config.boundary),
-    ):
-        written = OmegaConf.to_container(node, resolve=False)
-        if isinstance(written, dict) and "content.box" in str(written.get("box_min")):
-            mesh = f", and medium.mesh={config.medium.mesh} does not exist" if "mesh" in config.medium else ""
-            raise NerfroError(
-                f"{name} stays inside a box, and straight rays know no object to take it from{mesh}; give "
-                "content.box_min=[X,Y,Z] content.box_max=[X,Y,Z] in world units, around what shall be seen sharply"
-            )
-
-
-def _read_box(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Centre and half sides of a box, from Eikonal Fields' bounding_box_vals.npy."""
-    values = load_array(path)
-    if values.shape != (2, 3) or not np.isfinite(values).all() or values[1].min() <= 0:
-        raise NerfroError(f"content.box_file={path} must hold a box's centre and positive half sides, 2x3 numbers")
-    return values[0], values[1]

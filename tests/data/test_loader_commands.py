@@ -21,11 +21,6 @@ TINY = [
     "field.num_levels=4",
     "field.log2_table_size=10",
     "field.width=16",
-    "boundary.num_levels=4",
-    "boundary.log2_table_size=10",
-    "boundary.width=16",
-    "boundary.num_samples=8",
-    "boundary.grid_resolution=16",
     "medium.resolution=32",
     "medium.cache=false",
     "batches.size=32",
@@ -54,7 +49,9 @@ def test_a_reconstruction_with_a_distorting_lens_trains_in_a_room(train_here, tm
     rows = json.loads((run / "metrics.json").read_text())["views"]
     assert len(rows) == 2
     config = OmegaConf.load(run / "config.yaml")
-    assert config.boundary.box_min == config.content.box_min  # the mesh's bounds
+    middle = [0.5 * (low + high) for low, high in zip(config.field.box_min, config.field.box_max, strict=True)]
+    assert middle == pytest.approx([0, 0, 0], abs=1e-4)  # of the mesh
+    assert config.field.radius == config.sampler.points.radius > 0.5
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from nerfro.fields import hash_encoding
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.fields.selection import evaluate_selected, inside_box
 from nerfro.fields.spherical_harmonics import spherical_harmonics
+from nerfro.geometry.contraction import contract
 from nerfro.types import Samples
 
 
@@ -184,3 +185,44 @@ def test_field_learns_a_coloured_ball() -> None:
 def test_impossible_fields_are_refused(settings: dict, message: str) -> None:
     with pytest.raises(NerfroError, match=message):
         HashGridField(**settings)
+
+
+def test_field_of_all_space_is_asked_where_contraction_leads() -> None:
+    box = {"box_min": [-0.5, 0.0, 0.5], "box_max": [0.5, 1.0, 1.5]}
+    everywhere, samples = make_field(**box, radius=0.8), make_samples(scale=5.0)
+    centre, positions = torch.tensor([0.0, 0.5, 1.0]), samples.positions.flatten(0, 1)
+    offset = positions - centre
+    within = offset.norm(dim=-1) < 0.8
+    assert 0 < within.sum() < len(within)
+    radiance = everywhere(samples)
+    density, rgb = everywhere.decode(contract(positions, centre, 0.8), samples.directions.flatten(0, 1))
+    torch.testing.assert_close(radiance.rgb.flatten(0, 1), rgb)
+    found = radiance.density.flatten()
+    torch.testing.assert_close(found[within], density[within])
+    torch.testing.assert_close(found[~within], (density * (0.8 / offset.norm(dim=-1)) ** 2)[~within])
+    assert (found > 0).all()
+
+
+def test_levels_appear_coarse_before_fine() -> None:
+    field, samples = make_field(fading_in=0.5), make_samples()
+    shown = []
+    for progress in (0.0, 0.25, 0.5, 1.0):
+        field.before_step(progress)
+        shown.append(field.shown.tolist())
+    assert shown == [[1, 1, 0, 0], [1, 1, 1, 0], [1, 1, 1, 1], [1, 1, 1, 1]]
+    all_of_them = make_field()
+    assert torch.equal(field(samples).density, all_of_them(samples).density)
+    # Those that have not appeared do not learn; they travel with the weights.
+    field.before_step(0.0)
+    field(samples).density.sum().backward()
+    first = field.levels.offsets[2]
+    assert field.table.grad[:first].any()
+    assert not field.table.grad[first:].any()
+    assert "shown" in field.state_dict()
+    assert "shown" not in all_of_them.state_dict()
+
+
+@pytest.mark.parametrize("radius", [None, 0.8])
+def test_density_alone_is_that_of_samples(radius: float | None) -> None:
+    field, samples = make_field(radius=radius), make_samples()
+    assert torch.equal(field.density(samples.positions.flatten(0, 1)), field(samples).density.flatten())

@@ -53,22 +53,30 @@ def test_splitting_an_interval_changes_nothing() -> None:
     torch.testing.assert_close(distortion(weights.repeat_interleave(2, -1) / 2, finer), distortion(weights, edges))
 
 
+def loss(weights: torch.Tensor, s: torch.Tensor, measure: torch.Tensor | None = None) -> torch.Tensor:
+    """Of weights on intervals between arc lengths [5, 7], which may have other lengths in contracted space."""
+    ends = s[:, [0, -1]]
+    vectors = torch.zeros(5, 2, 3)
+    path = Path(vectors, vectors, ends, vectors[:, 0], torch.zeros(5, dtype=torch.bool), torch.ones(5))
+    positions = torch.zeros(5, 6, 3)
+    samples = Samples(positions, positions, s[:, :-1], s, torch.ones(5), measure=measure)
+    colour = torch.zeros(5, 3)
+    rendering = Rendering(colour, weights, torch.zeros(5), colour, samples, path)
+    batch = Batch(None, colour, None, None)  # type: ignore[arg-type]  # nor is the model asked
+    return Distortion()([rendering], batch, None)  # type: ignore[arg-type]
+
+
 def test_loss_does_not_depend_on_the_scenes_scale_or_place() -> None:
     weights, edges = random_intervals(5, 6, torch.float32)
+    torch.testing.assert_close(loss(weights, edges), loss(weights, 2.0 + 30.0 * edges), rtol=1e-4, atol=0)
 
-    def loss(scale: float, near: float) -> torch.Tensor:
-        s = near + scale * edges
-        ends = s[:, [0, -1]]
-        vectors = torch.zeros(5, 2, 3)
-        path = Path(vectors, vectors, ends, vectors[:, 0], torch.zeros(5, dtype=torch.bool), torch.ones(5))
-        positions = torch.zeros(5, 6, 3)
-        samples = Samples(positions, positions, s[:, :-1], s, torch.ones(5))
-        colour = torch.zeros(5, 3)
-        rendering = Rendering(colour, weights, torch.zeros(5), colour, samples, path)
-        batch = Batch(None, colour, None, None)  # type: ignore[arg-type]  # nor is the model asked
-        return Distortion()([rendering], batch, None)  # type: ignore[arg-type]
 
-    torch.testing.assert_close(loss(1.0, 0.0), loss(30.0, 2.0), rtol=1e-4, atol=0)
+def test_distances_are_contracted_where_space_is() -> None:
+    weights, edges = random_intervals(5, 6, torch.float32)
+    edges[:, 0] = 0.0
+    far_away = torch.tan(edges * 1.57)  # however long the last interval is
+    contracted = loss(weights, far_away, measure=3.0 * edges)
+    torch.testing.assert_close(contracted, loss(weights, edges), rtol=1e-4, atol=0)
 
 
 def test_a_single_sharp_sample_has_none() -> None:

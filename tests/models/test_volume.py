@@ -1,0 +1,98 @@
+"""One volume: a glass ball in a painted room with a toy before it, which no sky can explain, learned from pictures."""
+
+from __future__ import annotations
+
+import torch
+from torch.nn.functional import normalize
+
+from nerfro.boundaries.base import Boundary
+from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.cameras import Cameras
+from nerfro.fields.hash_grid import HashGridField
+from nerfro.media.shapes import Ball
+from nerfro.rendering import composite
+from nerfro.samplers.density_grid import DensityGridSampler
+from nerfro.samplers.snell import Snell
+from nerfro.types import Path
+
+WALL = 3.0  # half side of the room
+TOY, SIZE = torch.tensor([0.3, 1.2, 0.2]), 0.3
+SPACE = {"box_min": [-1.0] * 3, "box_max": [1.0] * 3, "radius": 2.0}
+
+
+def seen(path: Path) -> tuple[torch.Tensor, torch.Tensor]:
+    """What all paths end on, walls painted by place or the toy, and whether it is the toy."""
+    colour, toy = torch.full((len(path.s), 3), torch.nan), torch.zeros(len(path.s)).bool()
+    for run in range(path.s.shape[1]):
+        origin, direction = path.positions[:, run], path.directions[:, run]
+        last = run == path.s.shape[1] - 1
+        length = torch.full_like(path.s[:, 0], torch.inf) if last else path.s[:, run + 1] - path.s[:, run]
+        along = ((TOY - origin) * direction).sum(-1)
+        root = SIZE**2 - (origin + along[:, None] * direction - TOY).square().sum(-1)
+        to_toy = along - root.clamp(min=0).sqrt()
+        to_wall = torch.where(direction > 0, (WALL - origin) / direction, (-WALL - origin) / direction).amin(-1)
+        open_ = colour.isnan().any(-1)
+        on_toy = open_ & (root > 0) & (to_toy > 0) & (to_toy < length)
+        on_wall = open_ & ~on_toy & (to_wall < length)
+        places = origin + to_wall[:, None] * direction
+        painted = 0.5 + 0.4 * torch.sin(1.7 * places + torch.tensor([0.0, 1.0, 2.0]))
+        colour = torch.where(on_wall[:, None], painted, colour)
+        colour = torch.where(on_toy[:, None], torch.tensor([0.9, 0.1, 0.1]), colour)
+        toy = toy | on_toy
+    return colour, toy
+
+
+def photographs(num_views: int, seed: int) -> tuple[Path, torch.Tensor, torch.Tensor]:
+    """Paths and colours of all pixels of cameras around the ball."""
+    generator = torch.Generator().manual_seed(seed)
+    back = normalize(torch.randn(num_views, 3, generator=generator), dim=-1)
+    right = normalize(torch.linalg.cross(torch.randn(num_views, 3, generator=generator), back), dim=-1)
+    pose = torch.stack([right, torch.linalg.cross(back, right), back, 2.2 * back], -1)
+    focal, centre = torch.full((num_views,), 17.5), torch.full((num_views,), 12.0)
+    cameras = Cameras(pose, focal, focal, centre, centre, 24, 24, 0.1, 5.0)
+    view, row, column = torch.cartesian_prod(torch.arange(num_views), torch.arange(24), torch.arange(24)).unbind(-1)
+    path = Snell()(cameras.rays(view, row, column), Ball(radius=0.8))
+    return path, *seen(path)
+
+
+class Nothing(Boundary):
+    def forward(self, exits: object) -> torch.Tensor:
+        return torch.zeros_like(exits.directions)
+
+
+def rendered(path: Path, sampler: DensityGridSampler, field: HashGridField, boundary: Boundary) -> torch.Tensor:
+    samples = sampler(path, None)
+    return composite(samples, field(samples), boundary(path.exits()), path).rgb
+
+
+def scores(space: dict, boundary: Boundary, num_steps: int = 150) -> list[float]:
+    """PSNR of unseen views: of all pixels, of those behind glass, of those that see the toy."""
+    path, target, _ = photographs(24, 1)
+    field = HashGridField(
+        **space, num_levels=6, base_resolution=8, finest_resolution=64, log2_table_size=14, width=32, initial_depth=3.0,
+        direction_bands=1,
+    )  # fmt: skip
+    sampler = DensityGridSampler(24, 48, **space, near=0.3, resolution=32, every=4, decay=0.6)
+    parameters = [*field.parameters(), *boundary.parameters()]
+    optimizer = torch.optim.Adam(parameters, eps=1e-15)
+    for step in range(num_steps):
+        sampler.after_step(step, [field])
+        optimizer.param_groups[0]["lr"] = 4e-2 * 0.1 ** (step / num_steps)
+        chosen = torch.randint(len(target), (512,))
+        loss = (rendered(path[chosen], sampler, field, boundary) - target[chosen]).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    sampler.eval()
+    path, target, toy = photographs(3, 2)
+    with torch.no_grad():
+        error = (rendered(path, sampler, field, boundary) - target).square().mean(-1)
+    return [float(-10 * torch.log10(e.mean())) for e in (error, error[path.refracted], error[toy])]
+
+
+def test_a_volume_learns_a_room_and_what_stands_before_the_glass_where_a_box_under_a_sky_cannot() -> None:
+    volume = scores(SPACE, Nothing())
+    sky = scores({"box_min": [-0.85] * 3, "box_max": [0.85] * 3}, EnvironmentMap([4, 8, 16, 32]))
+    assert volume[0] > sky[0] + 6
+    assert volume[1] > sky[1] + 5, "behind the glass"
+    assert volume[2] > sky[2] + 5, "a box holds what is in it, and the toy stands before it"

@@ -1,0 +1,109 @@
+"""Which space a run covers: from Eikonal Fields' file, or found from cameras."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from nerfro.cameras import Cameras
+from nerfro.errors import NerfroError
+from nerfro.media.analytic import Vacuum
+from nerfro.training.config import TrainConfig
+from nerfro.training.content import describe, looked_at, settle_content
+
+
+def settled(path: Path) -> DictConfig:
+    config = OmegaConf.structured(TrainConfig)
+    config.content.box_file = str(path)
+    settle_content(config, Vacuum())
+    return config.content
+
+
+def test_box_is_centre_and_half_sides(tmp_path: Path) -> None:
+    path = tmp_path / "bounding_box_vals.npy"
+    np.save(path, [[0.5, -1.0, 2.0], [0.25, 0.5, 1.0]])
+    content = settled(path)
+    assert list(content.box_min) == [0.25, -1.5, 1.0]
+    assert list(content.box_max) == [0.75, -0.5, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ([[0, 0, 0], [1, -1, 1]], "positive half sides"),
+        ([[0, 0], [1, 1]], "2x3 numbers"),
+        ([[0, 0, np.nan], [1, 1, 1]], "2x3 numbers"),
+        (None, "does not exist"),
+        ([["a"] * 3] * 2, "not a .npy of numbers"),
+    ],
+)
+def test_wrong_files_are_refused(tmp_path: Path, values: list | None, message: str) -> None:
+    path = tmp_path / "box.npy"
+    if values is not None:
+        np.save(path, values)
+    with pytest.raises(NerfroError, match=message):
+        settled(path)
+
+
+MIDDLE = np.array([0.4, -2.0, 1.0])
+
+
+def around(num: int, distance: float = 3.0) -> Cameras:
+    """Cameras on a sphere that look at one place, with 40 pixels of focal length."""
+    generator = np.random.default_rng(2)
+    back = generator.normal(size=(num, 3))
+    back /= np.linalg.norm(back, axis=1, keepdims=True)
+    right = np.cross(generator.normal(size=(num, 3)), back)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    pose = np.stack([right, np.cross(back, right), back, MIDDLE + distance * back], -1)
+    focal, centre = torch.full((num,), 40.0), torch.full((num,), 8.0)
+    return Cameras(torch.tensor(pose).float(), focal, focal, centre, centre, 16, 16, 0.5, 5.0)
+
+
+def of_all_space(**content: object) -> DictConfig:
+    config = OmegaConf.structured(TrainConfig)
+    config.medium = {}
+    config.content.space = "all"
+    config.content.update(content)
+    settle_content(config, Vacuum(), around(7))
+    return config.content
+
+
+def test_ball_lies_where_the_cameras_look() -> None:
+    content = of_all_space()
+    np.testing.assert_allclose(np.mean([content.box_min, content.box_max], axis=0), MIDDLE, atol=1e-4)
+    assert content.radius == 1.5
+    assert content.near == pytest.approx(0.9)
+    # A pixel is 3 / 40 wide there, and contracted space 6; 80 cells would be too few.
+    assert content.cells == 128
+    assert of_all_space(radius=6.0).cells == pytest.approx(320, abs=1)
+    assert "contracted beyond 1.5 around (0.4, -2, 1)" in describe(content)
+
+
+def test_what_is_given_is_kept() -> None:
+    given = {"box_min": [0.0, 0.0, 0.0], "box_max": [2.0, 2.0, 2.0], "radius": 5.0, "near": 0.0, "cells": 77}
+    content = of_all_space(**given)
+    assert {name: content[name] for name in given} == given
+
+
+def test_axes_that_are_parallel_are_followed_to_a_usual_depth() -> None:
+    centres = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+    forward = np.tile([0.0, 0.0, -1.0], (4, 1))
+    np.testing.assert_allclose(looked_at(centres, forward, 4.0), [0.5, 0.5, -4.0], atol=1e-9)
+
+
+def test_a_box_covers_nothing_else_and_needs_no_cameras() -> None:
+    config = OmegaConf.structured(TrainConfig)
+    config.content.box_min, config.content.box_max = [0.0] * 3, [1.0] * 3
+    settle_content(config, Vacuum())
+    assert config.content.radius is None
+    assert describe(config.content) == ""
+
+
+def test_unknown_spaces_are_refused() -> None:
+    with pytest.raises(NerfroError, match="space=some is not allowed; choose box, all"):
+        of_all_space(space="some")
