@@ -34,6 +34,7 @@ from nerfro.training.run_folder import (
     require_same_configuration,
 )
 from nerfro.training.trainer import finish_logs, make_trainer, prepare_process
+from nerfro.training.viewer import Viewer
 
 
 @entry_point("train", TrainConfig)
@@ -56,7 +57,8 @@ def main(config: DictConfig) -> None:
     if checkpoint is not None:
         require_same_configuration(checkpoint, load_checkpoint(checkpoint)[1], config)
     throughput, interruption = Throughput(), StopOnSignal()
-    trainer = make_trainer(config, folder, [throughput, interruption])
+    viewer = [Viewer(config, source, test)] if config.viewer else []
+    trainer = make_trainer(config, folder, [throughput, interruption, *viewer])
     batches = batches.share(trainer.global_rank, trainer.world_size)
     batches = traced(batches, model, config)
     memory = require_memory(model, batches.batch(0).rays, trainer.strategy.root_device)

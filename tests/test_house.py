@@ -39,7 +39,9 @@ IMPORTS = {module: set(imported(file)) - {module} for module, file in FILES.item
 
 
 def is_command(module: str) -> bool:
-    return module.count(".") == 1 and 'if __name__ == "__main__"' in FILES[module].read_text(encoding="utf-8")
+    """A module at the top level, or the `__main__` of a package, that can be run."""
+    at_top = module.count(".") == 1 or module.endswith(".__main__")
+    return at_top and 'if __name__ == "__main__"' in FILES[module].read_text(encoding="utf-8")
 
 
 def room(module: str) -> str:
@@ -47,12 +49,12 @@ def room(module: str) -> str:
 
     `nerfro` itself stands with the commands: it hands on what is for everybody, imported when it is asked for.
     """
-    if module == "nerfro":
+    if module == "nerfro" or is_command(module):
         return "commands"
     name = module.split(".")[1]
     if (PACKAGE_DIR / name).is_dir() or name == "testing":
         return name
-    return "commands" if is_command(module) else "core"
+    return "core"
 
 
 @pytest.mark.parametrize("module", sorted(FILES))

@@ -125,6 +125,8 @@ class TrainConfig:
     logger: Any = None
     # Checkpoint to go on from, or `last` for the newest of this experiment.
     ckpt_path: Optional[str] = None  # noqa: UP045
+    viewer: bool = False  # serve an interactive page of the model while it trains, to this machine's browsers
+    viewer_port: Annotated[int, Range(at_least=0, at_most=65535)] = 8008  # that it is served on; 0 for any free one
     # Backend of torch.compile for the networks, such as inductor or cudagraphs on a GPU; none runs them as they
     # are. Compiling takes a minute or more at the start.
     compile: Optional[str] = None  # noqa: UP045

@@ -42,6 +42,8 @@ _NAMED = {
     "logger": Role.WATCHING,
     "checkpoint": Role.WATCHING,
     "ckpt_path": Role.WATCHING,
+    "viewer": Role.WATCHING,
+    "viewer_port": Role.WATCHING,
     "trainer.log_every_n_steps": Role.WATCHING,
     "trainer.enable_model_summary": Role.WATCHING,
     "trainer.enable_progress_bar": Role.WATCHING,

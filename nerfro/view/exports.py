@@ -13,10 +13,12 @@ from omegaconf import MISSING, DictConfig
 
 from nerfro.allowed import Count, Positive
 from nerfro.errors import NerfroError
+from nerfro.files.atomic import write_atomically
 from nerfro.files.cache import save_arrays
 from nerfro.files.lat_long import save_lat_long
 from nerfro.view.meshes import write_mesh
 from nerfro.view.mitsuba_scene import files_beside, write_mitsuba
+from nerfro.view.page import page_of
 from nerfro.view.points import write_points
 from nerfro.view.scene import SKY_HEIGHT, Scene
 from nerfro.view.volume import RESOLUTION, bake, find_half_depth
@@ -27,7 +29,7 @@ class ExportConfig:
     """What `python -m nerfro.export` is asked."""
 
     checkpoint: str = MISSING  # run folder, or a checkpoint in it
-    what: str = MISSING  # mesh, points, sky, volume or mitsuba
+    what: str = MISSING  # page, mesh, points, sky, volume or mitsuba
     out: str = MISSING  # file that is written; its ending says in which format
     # Grid vertices along the longest side of the inside, or rows of the sky.
     resolution: Optional[Count] = None
@@ -88,7 +90,14 @@ def _mitsuba(scene: Scene, out: Path, config: DictConfig) -> str:
     return write_mitsuba(scene, out, config.resolution or RESOLUTION, find_half_depth(scene, config.half_depth))
 
 
+def _page(scene: Scene, out: Path, config: DictConfig) -> str:
+    page = page_of(scene, config.resolution or RESOLUTION)
+    write_atomically(out, page)
+    return f"an interactive page of {len(page) / 1e6:.1f} MB"
+
+
 EXPORTS = {
+    "page": Export((".html",), _page),
     "mesh": Export((".glb", ".ply"), _mesh),
     "points": Export((".ply",), _points),
     "sky": Export((".hdr", ".exr", ".png"), _sky),

@@ -21,7 +21,7 @@ from nerfro.view.surface import level_set, without_crumbs
 
 RESOLUTION = 128
 # Optical depth along a cell below which nobody sees its colour.
-_UNSEEN = 1e-3
+UNSEEN = 1e-3
 _POINTS_AT_ONCE = 1 << 16
 
 
@@ -35,19 +35,23 @@ class Volume:
 
 
 @torch.inference_mode()
-def bake(scene: Scene, resolution: int = RESOLUTION) -> Volume:
-    """All that the field of a scene holds, with `resolution` vertices along the longest side of its box."""
-    box = scene.bounds if scene.content is None else scene.content
+def bake(
+    scene: Scene, resolution: int = RESOLUTION, box: Float[Tensor, "2 3"] | None = None, progress: bool = True
+) -> Volume:
+    """The field of a scene over a box, by default that of all it holds; `resolution` vertices on its longest side."""
+    if box is None:
+        box = scene.bounds if scene.content is None else scene.content
     field, device = scene.field, scene.model.device
     sides = box[1] - box[0]
     counts = ((resolution - 1) * sides / sides.max()).ceil().long() + 1
     axes = [torch.linspace(float(a), float(b), int(n)) for a, b, n in zip(*box, counts, strict=True)]
     positions = torch.cartesian_prod(*axes)
     above = torch.tensor([0.0, 0.0, -1.0])
-    blocks = tqdm(positions.split(_POINTS_AT_ONCE), unit="block", desc="bake", dynamic_ncols=True)
+    blocks = positions.split(_POINTS_AT_ONCE)
+    blocks = tqdm(blocks, unit="block", desc="bake", dynamic_ncols=True, disable=not progress)
     density = torch.cat([ask(field, some.to(device), above.expand_as(some))[0].cpu() for some in blocks])
     cell = float((sides / (counts - 1)).max())
-    seen = (density * cell > _UNSEEN).nonzero()[:, 0]
+    seen = (density * cell > UNSEEN).nonzero()[:, 0]
     rgb = torch.zeros(len(positions), 3)
     along = torch.cat([torch.eye(3), -torch.eye(3)])
     for rows in seen.split(_POINTS_AT_ONCE):

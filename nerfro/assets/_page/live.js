@@ -1,0 +1,59 @@
+// The viewer beside a training: the same page, filled again whenever the training has something new.
+
+const LOOK_AGAIN = 2000; // milliseconds
+
+async function watch(page) {
+  for (;;) {
+    // While nobody looks, the training need not show anything.
+    if (!document.hidden) await askForNews(page);
+    await new Promise((done) => setTimeout(done, LOOK_AGAIN));
+  }
+}
+
+async function askForNews(page) {
+  try {
+    const answer = await fetch(`state?after=${page.scene.version}`, { cache: "no-store" });
+    if (!answer.ok) throw new Error(`${answer.status} ${answer.statusText}`);
+    const { losses, news } = await answer.json();
+    showLosses(losses);
+    if (news) await refill(page, news);
+    $("message").textContent = "";
+  } catch (error) {
+    $("message").textContent = `The training does not answer (${error.message}); it may have ended.`;
+  }
+}
+
+async function refill(page, { scene, arrays }) {
+  const images = { ...page.images };
+  for (const [name, uri] of Object.entries(arrays)) {
+    images[name] = new Image();
+    images[name].src = uri;
+    await images[name].decode();
+  }
+  followIndices(page.scene.surface.iors, scene.surface?.iors ?? []);
+  page.images = images;
+  page.scene = { ...page.scene, ...scene };
+  page.tracer.load(page.scene, images);
+  page.changed();
+}
+
+// Sliders that nobody has moved follow indices that are learned.
+function followIndices(before, now) {
+  now.forEach((ior, body) => {
+    const slider = $(`ior${body}`);
+    if (Number(slider.value) !== before[body]) return;
+    slider.value = ior;
+    $(`ior${body}-value`).value = ior.toFixed(2);
+  });
+}
+
+function showLosses(losses) {
+  const last = losses.at(-1);
+  if (!last) return;
+  $("losses").textContent = `step ${last[0]}, training loss ${last[1].toPrecision(3)}`;
+  const logs = losses.map(([, loss]) => Math.log(Math.max(loss, 1e-9)));
+  const [low, high] = [Math.min(...logs), Math.max(...logs)];
+  const points = losses.map(([step], i) =>
+    `${(1000 * step) / Math.max(last[0], 1)},${100 - (96 * (logs[i] - low)) / Math.max(high - low, 1e-9) - 2}`);
+  document.querySelector("#progress polyline").setAttribute("points", points.join(" "));
+}

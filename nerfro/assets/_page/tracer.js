@@ -1,0 +1,209 @@
+// WebGL2: the textures of a scene, and the two programs that trace and show it.
+
+// Textures of the tracing program, in the order of their units.
+const UNITS = ["coefficients", "clearance", "volume", "occupied", "sky", "picture"];
+
+class Tracer {
+  constructor(canvas) {
+    const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
+    if (!gl) throw new Error("This page needs WebGL2, which this browser does not have or has switched off.");
+    if (!gl.getExtension("EXT_color_buffer_float") && !gl.getExtension("EXT_color_buffer_half_float")) {
+      throw new Error("This page needs to draw into textures of half floats, which this graphics driver does not allow.");
+    }
+    this.gl = gl;
+    this.canvas = canvas;
+    this.textures = {};
+    this.target = gl.createTexture();
+    this.buffer = gl.createFramebuffer();
+    this.size = [0, 0];
+    gl.bindVertexArray(gl.createVertexArray());
+  }
+
+  // Fill the textures with a scene's arrays; `images` are decoded pictures by name.
+  load(scene, images) {
+    const gl = this.gl;
+    const { surface, volume, sky } = scene;
+    if (!this.programs || this.scene.surface.iors.length !== surface.iors.length) {
+      const bodies = Math.max(surface.iors.length, 1);
+      this.programs = {
+        trace: this.program(source("trace").replaceAll("MAX_BODIES", bodies)),
+        show: this.program(source("show")),
+      };
+    }
+    this.scene = scene;
+    if (surface.iors.length) {
+      const distances = distanceBytes(voxelsOf(images.distances, surface.size));
+      this.texture3D("coefficients", gl.R16I, gl.RED_INTEGER, gl.SHORT, surface.size, distances);
+      const blocks = firstBytes(voxelsOf(images.clearance, surface.blocks));
+      this.texture3D("clearance", gl.R8UI, gl.RED_INTEGER, gl.UNSIGNED_BYTE, surface.blocks, blocks);
+      this.signs = distances;
+    } else {
+      this.texture3D("coefficients", gl.R16I, gl.RED_INTEGER, gl.SHORT, [1, 1, 1], new Int16Array(1));
+      this.texture3D("clearance", gl.R8UI, gl.RED_INTEGER, gl.UNSIGNED_BYTE, [1, 1, 1], new Uint8Array(1));
+    }
+    const content = withAlpha(voxelsOf(images.colour, volume.size), voxelsOf(images.density, volume.size));
+    this.texture3D("volume", gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, volume.size, content, gl.LINEAR);
+    const occupied = firstBytes(voxelsOf(images.occupied, volume.bricks));
+    this.texture3D("occupied", gl.R8UI, gl.RED_INTEGER, gl.UNSIGNED_BYTE, volume.bricks, occupied);
+    const faces = sharedExponent(
+      voxelsOf(images.sky, [sky.size, sky.size, 6]), voxelsOf(images.sky_exponent, [sky.size, sky.size, 6]));
+    this.bind("sky", gl.TEXTURE_CUBE_MAP, gl.LINEAR);
+    for (let face = 0; face < 6; ++face) {
+      gl.texImage2D(
+        gl.TEXTURE_CUBE_MAP_POSITIVE_X + face, 0, gl.RGB9_E5, sky.size, sky.size, 0, gl.RGB,
+        gl.UNSIGNED_INT_5_9_9_9_REV, faces, face * sky.size ** 2);
+    }
+    if (!this.textures.picture) this.setPicture(null);
+  }
+
+  // Another sky: a lat-long picture (an image, or decoded radiance); null for the scene's own.
+  setPicture(picture) {
+    const gl = this.gl;
+    this.skyIsPicture = picture !== null;
+    this.bind("picture", gl.TEXTURE_2D, gl.LINEAR);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.REPEAT);
+    if (picture === null) {
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+    } else if (picture.pixels) {
+      const { width, height, pixels } = picture;
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, width, height, 0, gl.RGBA, gl.FLOAT, pixels);
+    } else {
+      const format = this.scene.linear ? gl.SRGB8_ALPHA8 : gl.RGBA8; // the sampler undoes sRGB
+      gl.texImage2D(gl.TEXTURE_2D, 0, format, gl.RGBA, gl.UNSIGNED_BYTE, picture);
+    }
+  }
+
+  // Trace one ray through each pixel, `jitter` from its centre, and mix it with those before: its share is `weight`.
+  // A view has: eye, axes (right, up, back), focal, principal and size in pixels of its own picture, near.
+  trace(view, settings, [width, height], jitter = [0, 0], weight = 1) {
+    const gl = this.gl;
+    this.resize(width, height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.buffer);
+    gl.viewport(0, 0, width, height);
+    gl.useProgram(this.programs.trace.program);
+    UNITS.forEach((name, unit) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(this.textures[name].target, this.textures[name].texture);
+    });
+    const scale = [width / view.size[0], height / view.size[1]];
+    const { surface, volume } = this.scene;
+    const shown = settings.glass ? surface.iors.length : 0;
+    this.set("trace", {
+      focal: [view.focal[0] * scale[0], view.focal[1] * scale[1]],
+      principal: [view.principal[0] * scale[0], view.principal[1] * scale[1]],
+      jitter, height, axes: view.axes, eye: view.eye, near: view.near,
+      vertices: surface.vertices, gridLow: surface.low, gridHigh: surface.high, distanceStep: surface.step,
+      clearanceStep: surface.clearance, blockCells: surface.block, shortestStep: surface.shortest,
+      bodies: shown, maxEvents: surface.events, startInside: shown ? this.bodiesAt(view.eye) : 0,
+      index: [1, ...settings.iors], absorption: [0, 0, 0, ...settings.absorption.flat()],
+      reflection: settings.reflection,
+      volumeLow: volume.low, volumeHigh: volume.high, logDensity: volume.density, brightest: volume.brightest,
+      marchStep: volume.step, skyIsPicture: this.skyIsPicture,
+    });
+    gl.enable(gl.BLEND);
+    gl.blendColor(0, 0, 0, weight);
+    gl.blendFunc(gl.CONSTANT_ALPHA, gl.ONE_MINUS_CONSTANT_ALPHA);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.disable(gl.BLEND);
+  }
+
+  // Show what is traced on the whole canvas.
+  show() {
+    const gl = this.gl;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+    gl.useProgram(this.programs.show.program);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, this.target);
+    this.set("show", { size: [this.canvas.width, this.canvas.height], linear: this.scene.linear });
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  // A bit for each body that a place is in, by the vertex next to it.
+  bodiesAt(place) {
+    const { vertices, low, high, iors } = this.scene.surface;
+    const at = place.map((x, i) => Math.round(((x - low[i]) / (high[i] - low[i])) * (vertices[i] - 1)));
+    if (at.some((i, axis) => i < 0 || i >= vertices[axis])) return 0;
+    const [nx, ny, nz] = vertices;
+    return iors.reduce((bits, _, b) => bits | ((this.signs[((b * nz + at[2]) * ny + at[1]) * nx + at[0]] < 0) << b), 0);
+  }
+
+  resize(width, height) {
+    if (this.size[0] === width && this.size[1] === height) return;
+    const gl = this.gl;
+    this.size = [width, height];
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, this.target);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, width, height, 0, gl.RGBA, gl.HALF_FLOAT, null);
+    this.filter(gl.TEXTURE_2D, gl.LINEAR);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.buffer);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.target, 0);
+  }
+
+  bind(name, target, filter) {
+    const gl = this.gl;
+    this.textures[name] ??= { target, texture: gl.createTexture() };
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(target, this.textures[name].texture);
+    this.filter(target, filter);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+  }
+
+  filter(target, filter) {
+    const gl = this.gl;
+    gl.texParameteri(target, gl.TEXTURE_MIN_FILTER, filter);
+    gl.texParameteri(target, gl.TEXTURE_MAG_FILTER, filter);
+    for (const axis of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T, gl.TEXTURE_WRAP_R]) {
+      gl.texParameteri(target, axis, gl.CLAMP_TO_EDGE);
+    }
+  }
+
+  texture3D(name, internal, format, type, [width, height, depth], values, filter = this.gl.NEAREST) {
+    const gl = this.gl;
+    this.bind(name, gl.TEXTURE_3D, filter);
+    gl.texImage3D(gl.TEXTURE_3D, 0, internal, width, height, depth, 0, format, type, values);
+  }
+
+  program(fragment) {
+    const gl = this.gl;
+    const program = gl.createProgram();
+    // One triangle over the whole picture.
+    const vertex = `#version 300 es
+      void main() { gl_Position = vec4(4 * (gl_VertexID & 1) - 1, 2 * (gl_VertexID & 2) - 1, 0, 1); }`;
+    for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, text);
+      gl.compileShader(shader);
+      gl.attachShader(program, shader);
+    }
+    gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) {
+      const logs = gl.getAttachedShaders(program).map((shader) => gl.getShaderInfoLog(shader));
+      throw new Error(["The graphics driver refuses the shader.", ...logs, gl.getProgramInfoLog(program)].join("\n"));
+    }
+    gl.useProgram(program);
+    const uniforms = {};
+    for (let i = gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS) - 1; i >= 0; --i) {
+      const { name, type } = gl.getActiveUniform(program, i);
+      uniforms[name.replace("[0]", "")] = { type, place: gl.getUniformLocation(program, name) };
+    }
+    UNITS.forEach((name, unit) => uniforms[name] && gl.uniform1i(uniforms[name].place, unit));
+    return { program, uniforms };
+  }
+
+  set(program, values) {
+    const gl = this.gl;
+    const setters = {
+      [gl.FLOAT]: "uniform1fv", [gl.FLOAT_VEC2]: "uniform2fv", [gl.FLOAT_VEC3]: "uniform3fv",
+      [gl.INT]: "uniform1iv", [gl.BOOL]: "uniform1iv", [gl.INT_VEC3]: "uniform3iv",
+    };
+    for (const [name, value] of Object.entries(values)) {
+      const uniform = this.programs[program].uniforms[name];
+      if (!uniform) continue; // the compiler found that it changes nothing
+      if (uniform.type === gl.FLOAT_MAT3) gl.uniformMatrix3fv(uniform.place, false, value);
+      else gl[setters[uniform.type]](uniform.place, [value].flat());
+    }
+  }
+}
+
+const source = (name) => document.getElementById(`${name}.glsl`).textContent.trim();

@@ -1,0 +1,63 @@
+"""The interactive page of a model while it trains: `viewer=true`."""
+
+from __future__ import annotations
+
+import time
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+from omegaconf import DictConfig
+
+from nerfro.data.base import DataSource, Views
+from nerfro.models.base import NerfModel
+from nerfro.types import Batch
+from nerfro.view.baking import bake_surface
+from nerfro.view.live import LivePage
+from nerfro.view.scene import Scene
+from nerfro.view.server import PageServer
+
+_LOSS_SECONDS = 1.0  # between two points of the curve: on a GPU each waits for the step
+
+
+class Viewer(Callback):
+    """Serves the page to this machine, fed with the current weights and the losses; on the first process alone.
+
+    Args:
+        config: of the run, see `TrainConfig`.
+        source: the data.
+        views: of the split that is evaluated, whose cameras and photographs are shown.
+    """
+
+    def __init__(self, config: DictConfig, source: DataSource, views: Views) -> None:
+        self._config, self._source, self._views = config, source, views
+        self._server: PageServer | None = None
+        self._live: LivePage | None = None
+        self._told = 0.0
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        if trainer.is_global_zero:  # what cannot be shown, or nowhere, is refused before the first step
+            assert isinstance(pl_module, NerfModel)
+            bake_surface(pl_module)
+            self._server = PageServer("localhost", self._config.viewer_port)
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self._server is None:
+            return
+        assert isinstance(pl_module, NerfModel)
+        scene = Scene(pl_module, self._source, name=self._config.name)
+        self._live = LivePage(self._server, scene, self._views, self._config.evaluation.split)
+        print(f"nerfro: the model as it learns: {self._server.url}", flush=True)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
+    ) -> None:
+        if self._server is None or self._live is None:
+            return
+        if time.monotonic() - self._told > _LOSS_SECONDS and "loss/total" in trainer.callback_metrics:
+            self._told = time.monotonic()
+            self._server.add_loss(trainer.global_step, float(trainer.callback_metrics["loss/total"]))
+        self._live.update()
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        if self._server is not None:
+            self._server.close()
+            self._server = self._live = None

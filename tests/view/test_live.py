@@ -1,0 +1,96 @@
+"""A page that follows a model: baked when somebody looks, within its share of the time, and shown in the browser."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from nerfro.view import live
+from nerfro.view.live import LivePage
+from nerfro.view.scene import Scene
+from nerfro.view.server import PageServer
+from tests.view.chromium import needs_chromium, open_page
+
+
+@pytest.fixture
+def server() -> Iterator[PageServer]:
+    server = PageServer("localhost", 0)
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """A clock that the test sets; a bake takes three of its seconds."""
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    bake = live.parts_of
+
+    def slow(*arguments: object) -> dict:
+        now[0] += 3
+        return bake(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(live, "parts_of", slow)
+    return now
+
+
+def test_bakes_take_their_share_of_the_time(scene: Scene, server: PageServer, clock: list[float]) -> None:
+    page = LivePage(server, scene, scene.views(), "test", resolution=24)
+
+    def version() -> int:
+        news = json.loads(server.state(0))["news"]
+        return news["scene"]["version"] if news else 0
+
+    page.update()
+    assert version() == 0, "nobody looks"
+    page.update()
+    assert version() == 1, "now somebody does: asking for the version was looking"
+    begun = clock[0] - 3
+    while version() == 1:
+        clock[0] += 1
+        page.update()
+    assert clock[0] - 3 - begun >= 3 / 0.02
+    clock[0] += 1000
+    page.update()
+    assert version() == 2, "nobody has looked for a long time"
+
+
+def test_training_mode_and_weights_stay(scene: Scene, server: PageServer) -> None:
+    scene.model.train()
+    page = LivePage(server, scene, scene.views(), "test", resolution=8)
+    page.show(scene)
+    assert scene.model.training
+    assert set(json.loads(server.state(0))["news"]["scene"]) == {"volume", "sky", "version"}, "the surface stays"
+
+
+@needs_chromium
+def test_browser_shows_news_and_losses(scene: Scene, server: PageServer, tmp_path: Path) -> None:
+    page = LivePage(server, scene, scene.views(), "test", resolution=8)
+    server.add_loss(3, 0.5)
+    server.add_loss(7, 0.25)
+    page.show(scene)
+    dom = open_page(server.url, tmp_path, "--virtual-time-budget=3000", "--dump-dom")
+    assert "step 7, training loss 0.250" in dom
+    assert 'points="428' in dom
+    assert server.watched
+
+
+def test_training_serves_its_model(
+    train_here: Callable, tiny_run: list[str], server: PageServer, tmp_path: Path
+) -> None:
+    options = ["medium=sdf_grid" if option == "medium=voxel_grid" else option for option in tiny_run]
+    options += ["trainer.max_steps=2", "viewer=true", f"hydra.run.dir={tmp_path / 'run'}"]
+    done = train_here(*options, "viewer_port=0")
+    assert done.code == 0, done.err
+    assert re.search(r"^nerfro: the model as it learns: http://localhost:\d+$", done.out, re.MULTILINE)
+    elsewhere = f"hydra.run.dir={tmp_path / 'other'}"
+    taken = train_here(*options, elsewhere, f"viewer_port={server.url.rpartition(':')[2]}")
+    assert taken.code == 1
+    assert "cannot be served on" in taken.err
+    refused = train_here(*tiny_run, elsewhere, "trainer.max_steps=2", "viewer=true", "viewer_port=0")
+    assert refused.code == 1
+    assert "an interactive page shows bodies with a surface" in refused.err

@@ -1,0 +1,185 @@
+"""The page of a scene shows in a browser what nerfro renders, and its controls change what they say."""
+
+from __future__ import annotations
+
+import base64
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Float
+from PIL import Image
+
+from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.cameras import Cameras
+from nerfro.data.blender import BlenderData
+from nerfro.errors import NerfroError
+from nerfro.evaluation.render_view import Supersampling
+from nerfro.files import lat_long, radiance_hdr
+from nerfro.light import to_linear
+from nerfro.media.analytic import Luneburg
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.models.base import psnr
+from nerfro.paths import resolve_path
+from nerfro.variants import variant
+from nerfro.view.page import page_of, upwards
+from nerfro.view.scene import Scene
+from tests.view.chromium import ask, needs_chromium, open_page
+from tests.view.conftest import IOR, RADIUS, sky_of
+
+# The picture of the canvas after one ray a pixel of camera `number`, bottom row first, as text.
+SHOT = """const shot = (number, size) => {
+  const { gl, canvas } = page.tracer;
+  canvas.width = canvas.height = size;
+  page.camera = number;
+  page.drawOnce();
+  const pixels = new Uint8Array(4 * size * size);
+  gl.readPixels(0, 0, size, size, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+  return btoa(String.fromCharCode(...pixels));
+};
+const set = (id, value) => {
+  if (typeof value === "boolean") $(id).checked = value;
+  else $(id).value = value;
+  $(id).dispatchEvent(new Event("input", { bubbles: true }));
+};
+"""
+
+
+def picture(text: str) -> Float[torch.Tensor, "H W 3"]:
+    pixels = np.frombuffer(base64.b64decode(text), np.uint8)
+    size = math.isqrt(len(pixels) // 4)
+    return torch.from_numpy(pixels.reshape(size, size, 4)[::-1, :, :3] / 255.0).float()
+
+
+def one_ray(scene: Scene, cameras: Cameras | None = None) -> Float[torch.Tensor, "V H W 3"]:
+    return scene.render(cameras or scene.cameras("test"), Supersampling()).rgb
+
+
+@pytest.fixture
+def glass_cube(scene: Scene) -> Scene:
+    """The embedded scene's glass, sky and cameras around the ball inside, and a bubble in the glass."""
+    mesh = "embedded:torus/mesh.ply"
+    box = torch.tensor([[-1.5] * 3, [1.5] * 3])
+    outer = SdfGrid(mesh, resolution=64, cache=False)
+    axes = torch.stack(torch.meshgrid(*[torch.linspace(-1.5, 1.5, 64)] * 3, indexing="ij"), -1)
+    bubble = torch.linalg.vector_norm(axes - torch.tensor([-0.3, -0.3, 0.2]), dim=-1) - 0.15
+    medium = SdfGrid.from_distances(torch.stack([outer.distances[0], bubble]), box, [1.5, 1.05], outer.shell)
+    sky = EnvironmentMap([128], str(resolve_path("embedded:torus/sky.png")))
+    return Scene(variant(scene.model, medium=medium, boundary=sky), BlenderData("embedded:torus", 2.0, 6.0, 2))
+
+
+@needs_chromium
+def test_five_cameras_of_a_cube_with_a_bubble_agree_with_nerfro(glass_cube: Scene, tmp_path: Path) -> None:
+    views = [0, 4, 8, 12, 16]
+    page = page_of(glass_cube, 64)
+    found = ask(page, f"(() => {{ {SHOT} return {views}.map((view) => shot(view, 64)); }})()", tmp_path)
+    expected = one_ray(glass_cube, glass_cube.cameras("test").select(views))
+    scores = [float(psnr(picture(shot), rgb)) for shot, rgb in zip(found, expected, strict=True)]
+    assert min(scores) > 30, scores
+
+
+@needs_chromium
+def test_controls_change_what_they_say(scene: Scene, tmp_path: Path) -> None:
+    lamp = lat_long.directions(32)
+    lamp = 4 * (lamp[..., 2:] > 0.5) * torch.tensor([1.0, 0.5, 0.1]) + 0.1
+    hdr = base64.b64encode(radiance_hdr.encode(lamp.numpy())).decode()
+    script = f"""(() => {{
+      {SHOT}
+      const shots = {{ start: shot(0, 32) }};
+      set("ior0", 1.6); shots.index = shot(0, 32); const said = $("ior0-value").value; set("ior0", {IOR});
+      set("glass", false); shots.glass = shot(0, 32); set("glass", true);
+      set("reflection", true); shots.reflection = shot(0, 32); set("reflection", false);
+      set("tint", 1); set("tint-colour", "#804000"); shots.tint = shot(0, 32); set("tint", 0);
+      const bytes = Uint8Array.from(atob("{hdr}"), (character) => character.charCodeAt(0));
+      page.tracer.setPicture(decodeHdr(bytes)); shots.sky = shot(0, 32); page.tracer.setPicture(null);
+      shots.end = shot(0, 32);
+      for (const button of document.querySelectorAll("#cameras button")) if (button.value === "1") button.click();
+      return {{ shots, said, camera: page.camera, photograph: !$("photograph").hidden, alt: $("photograph").alt,
+        unnamed: [...document.querySelectorAll("input, canvas")].filter((e) => !e.labels?.length && !e.ariaLabel)
+          .length }};
+    }})()"""
+    found = ask(page_of(scene, 48), script, tmp_path)
+    shots = {name: picture(text) for name, text in found["shots"].items()}
+
+    def agrees(name: str, changed: Scene) -> bool:
+        return float(psnr(shots[name], one_ray(changed)[0])) > 30
+
+    assert agrees("start", scene)
+    assert agrees("index", scene.with_(ior=1.6))
+    assert not agrees("index", scene)
+    assert found["said"] == "1.60"
+    assert agrees("glass", scene.with_(glass=False))
+    assert agrees("sky", scene.with_(sky=lamp))
+    torch.testing.assert_close(shots["end"], shots["start"])
+    _check_reflection(scene, to_linear(shots["start"]), to_linear(shots["reflection"]))
+    met = scene.render(scene.cameras("test"), Supersampling()).normals[0].any(-1)
+    left = (to_linear(shots["tint"]) / to_linear(shots["start"]))[met].mean(0)
+    assert left[0] > left[1] > left[2]
+    assert left[0] < 0.9
+    torch.testing.assert_close(shots["tint"][~met], shots["start"][~met])
+    assert (found["camera"], found["photograph"], found["alt"], found["unnamed"]) == (1, True, "photograph test_001", 0)
+
+
+def _check_reflection(scene: Scene, without: torch.Tensor, with_it: torch.Tensor) -> None:
+    """On a ball: (1 - F) of the light that came before, and F of the sky that the first surface mirrors."""
+    rays = scene.cameras("test").image_rays(0)
+    along = (rays.origins * rays.directions).sum(-1)
+    squared = along**2 - (rays.origins.square().sum(-1) - RADIUS**2)
+    t = -along - squared.clamp(min=0).sqrt()
+    normal = torch.nn.functional.normalize(rays.origins + t[:, None] * rays.directions, dim=-1)
+    cosine = -(normal * rays.directions).sum(-1)
+    after = (1 - (1 - cosine**2) / IOR**2).sqrt()
+    s, p = (cosine - IOR * after) / (cosine + IOR * after), (IOR * cosine - after) / (IOR * cosine + after)
+    share = (0.5 * (s**2 + p**2))[:, None]
+    mirrored = sky_of(rays.directions + 2 * cosine[:, None] * normal)
+    expected = (1 - share) * without.view(-1, 3) + share * mirrored
+    # Not on the rim, where neighbouring pixels differ by all of F.
+    met = (squared > 0) & (cosine > 0.2)
+    assert met.sum() > 100
+    torch.testing.assert_close(with_it.view(-1, 3)[met], expected[met], atol=0.01, rtol=0)
+    assert share[met].max() > 0.1
+
+
+@needs_chromium
+def test_fragment_shows_one_camera_alone(scene: Scene, tmp_path: Path) -> None:
+    file = tmp_path / "page.html"
+    file.write_text(page_of(scene, 32), encoding="utf-8")
+    shot = tmp_path / "shot.png"
+    open_page(f"{file.as_uri()}#camera=test_001&size=48", tmp_path, f"--screenshot={shot}", size=(500, 300))
+    with Image.open(shot) as image:
+        seen = torch.from_numpy(np.array(image.convert("RGB")) / 255.0).float()
+    expected = one_ray(scene, scene.cameras("test").select([1]).resized(48, 48))[0]
+    assert float(psnr(seen[:48, :48], expected)) > 30
+    assert (seen[48:] == seen[-1, -1]).all()
+    assert (seen[:48, 48:] == seen[-1, -1]).all()
+
+
+@needs_chromium
+def test_browser_without_webgl2_is_told(scene: Scene, tmp_path: Path) -> None:
+    file = tmp_path / "page.html"
+    file.write_text(page_of(scene, 8), encoding="utf-8")
+    dom = open_page(file.as_uri(), tmp_path, "--disable-3d-apis", "--dump-dom")
+    assert "This page needs WebGL2" in dom.partition('id="message"')[2][:200]
+
+
+def test_page_loads_nothing_and_names_its_cameras(scene: Scene) -> None:
+    page = page_of(scene, 8)
+    assert 'src="http' not in page
+    assert "import " not in page.partition("<script>")[2]
+    assert page.count('"name": "test_') == 3
+
+
+def test_page_of_a_medium_without_surface_is_refused(scene: Scene) -> None:
+    lens = replace(scene, model=variant(scene.model, medium=Luneburg()))
+    with pytest.raises(NerfroError, match="bodies with a surface"):
+        page_of(lens, 8)
+
+
+def test_up_is_where_cameras_have_it(scene: Scene) -> None:
+    cameras = scene.cameras("test")
+    assert upwards(cameras).tolist() == [0, 0, 1]
+    turn = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    assert upwards(replace(cameras, camera_to_world=turn @ cameras.camera_to_world)).tolist() == [0, 1, 0]
