@@ -16,6 +16,8 @@ from nerfro.errors import NerfroError
 
 _WATCHED = 10.0  # seconds for which a browser that has asked is thought to look
 _LOSSES = 500  # points of the curve, at most; twice as many are thinned out
+# What a browser sees that comes before the page is made; it asks again by itself.
+_SOON = b'<!DOCTYPE html><meta http-equiv="refresh" content="2"><title>nerfro</title><p>The page is being made.'
 
 
 class PageServer:
@@ -42,7 +44,7 @@ class PageServer:
         self._server.page = self  # type: ignore[attr-defined]
         self.url = f"http://{host}:{self._server.server_address[1]}"
         self._lock = threading.Lock()
-        self._page, self._news, self._version = b"", b"null", 0
+        self._page, self._news, self._version = _SOON, b"null", 0
         self._losses: list[tuple[int, float]] = []
         self._asked = -_WATCHED
         threading.Thread(target=self._server.serve_forever, daemon=True, name="page server").start()

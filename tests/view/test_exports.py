@@ -179,7 +179,7 @@ def test_mitsuba_renders_the_same_picture(scene: Scene, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("what", "name", "message"),
     [
-        ("fog", "a.glb", "what=fog is not known; choose mesh"),
+        ("fog", "a.glb", "what=fog is not known; choose page, mesh"),
         ("mesh", "a.obj", "must end in .glb or .ply"),
         ("volume", "a.vdb", "must end in .npz"),
     ],

@@ -15,7 +15,6 @@ from nerfro.view.server import PageServer
 @pytest.fixture
 def server() -> Iterator[PageServer]:
     server = PageServer("localhost", 0)
-    server.open("<p>page")
     yield server
     server.close()
 
@@ -28,6 +27,8 @@ def get(server: PageServer, path: str, **headers: str) -> tuple[int, str]:
 
 
 def test_page_and_its_news(server: PageServer) -> None:
+    assert "being made" in get(server, "/")[1]
+    server.open("<p>page")
     assert get(server, "/") == (200, "<p>page")
     assert not server.watched
     assert json.loads(get(server, "/state?after=0")[1]) == {"losses": [], "news": None}

@@ -50,6 +50,7 @@ function followIndices(before, now) {
 function showLosses(losses) {
   const last = losses.at(-1);
   if (!last) return;
+  $("progress").hidden = false;
   $("losses").textContent = `step ${last[0]}, training loss ${last[1].toPrecision(3)}`;
   const logs = losses.map(([, loss]) => Math.log(Math.max(loss, 1e-9)));
   const [low, high] = [Math.min(...logs), Math.max(...logs)];

@@ -72,7 +72,7 @@ class Page {
     this.tracer.show();
     this.sync = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
-    ++this.rays;
+    this.shown = ++this.rays;
     this.wake();
   }
 
@@ -101,7 +101,7 @@ class Page {
 
   tell(milliseconds) {
     const [width, height] = this.traced;
-    $("frame").value = `${width} x ${height}, ${milliseconds.toFixed(0)} ms, ${this.rays} rays a pixel`;
+    $("frame").value = `${width} x ${height}, ${milliseconds.toFixed(0)} ms, ${this.shown} rays a pixel`;
   }
 
   // Show the picture of one of the data's cameras beside its photograph, or the orbit (null) from where the eye is.
