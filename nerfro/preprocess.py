@@ -1,69 +1,73 @@
-"""`python -m nerfro.preprocess data.root=DIR medium.ior=1.33`: an object's surface from its silhouettes."""
+"""`python -m nerfro.preprocess data.root=DIR`: an object's surface by its silhouettes, its index by its pictures."""
 
 from __future__ import annotations
 
-import json
 import shlex
 
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
-from jaxtyping import Float
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
-from nerfro.capture.overlays import contact_sheet
-from nerfro.capture.pose_conventions import GOOD_OVERLAP, overlap, require_consistent_poses
-from nerfro.capture.preprocess_options import MESH, REPORT, SHEET, PreprocessConfig, claim, train_command
+from nerfro.capture.index_report import CURVE, INDEX, search_index
+from nerfro.capture.overlaps import REPORT, SHEET, report_overlaps
+from nerfro.capture.pose_conventions import require_consistent_poses
+from nerfro.capture.preprocess_options import (
+    MESH,
+    PreprocessConfig,
+    build_medium,
+    claim,
+    index_settings,
+    surface_settings,
+    train_command,
+)
 from nerfro.capture.surface import make_mesh, read_silhouettes
-from nerfro.cli import entry_point, warn
-from nerfro.errors import first_of
-from nerfro.files.atomic import write_atomically
-from nerfro.files.images import save_picture
+from nerfro.cli import entry_point
+from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import load_mesh
+from nerfro.media.solid import Solid
 from nerfro.paths import resolve_path
 from nerfro.registry import build
-
-_MAX_PIXELS = 256
 
 
 @entry_point("preprocess", PreprocessConfig)
 @torch.no_grad()
 def main(config: DictConfig) -> None:
-    """Carve, fit, compare with the masks, and say how to train; whatever can be refused is refused before that."""
+    """Carve, fit, compare with the masks, find the index; whatever can be refused is refused before that."""
     mesh = None if config.mesh is None else load_mesh(resolve_path(config.mesh))
     folder = claim(config)
     views = build(config.data).load(config.split)
     box = None if config.box_min is None else np.array([config.box_min, config.box_max], np.float64)
-    silhouettes = read_silhouettes(views, box is not None)
-    require_consistent_poses(silhouettes, views.names, config.wrong_masks)
-    location, written = config.mesh, [SHEET, REPORT]
-    if mesh is None:
-        mesh = make_mesh(silhouettes, box, config.resolution, config.wrong_masks, config.keep, config.smoothing)
-        location, written = str(folder / MESH), [MESH, *written]
-    overlaps = overlap(mesh, silhouettes, _MAX_PIXELS)
-    _report(overlaps, views.names)
-    # Pictures and figures first: they help to find out what is wrong with a mesh that the medium then refuses.
-    save_picture(folder / SHEET, contact_sheet(views, mesh, overlaps, _MAX_PIXELS))
-    each = dict(zip(views.names, (round(float(x), 4) for x in overlaps), strict=True))
-    figures = {"split": config.split, "mean": round(float(overlaps.mean()), 4), "views": each}
-    write_atomically(folder / REPORT, json.dumps(figures, indent=1) + "\n")
-    if MESH in written:
-        mesh.save(folder / MESH)
+    overrides = list(HydraConfig.get().overrides.task)
+    location, written = config.mesh, []
+    if mesh is None or views.masks is not None:
+        silhouettes = read_silhouettes(views, box is not None)
+        require_consistent_poses(silhouettes, views.names, config.wrong_masks)
+        if mesh is None:
+            mesh = make_mesh(silhouettes, box, config.resolution, config.wrong_masks, config.keep, config.smoothing)
+            location = str(folder / MESH)
+            mesh.save(folder / MESH)
+            written = [MESH]
+        # Pictures and figures first: they help to find out what is wrong with a mesh that the medium then refuses.
+        report_overlaps(config.split, views, mesh, silhouettes, folder)
+        written += [SHEET, REPORT]
+    settings = surface_settings(config, views.cameras, mesh, location, overrides)
+    if not OmegaConf.is_missing(config.medium, "ior"):
+        build_medium(config, settings, location, [config.medium.ior, *config.medium.get("inner_iors", [])])
+        settings = {"medium.ior": config.medium.ior, **settings}
+    else:
+        medium = build_medium(config, settings, location, [1.5] * (1 + len(config.medium.get("inner_meshes", []))))
+        if not isinstance(medium, Solid):
+            raise NerfroError("the index of this medium is not searched for; give medium.ior=, or take medium=object")
+        found = search_index(views, mesh, medium, config.room, folder)
+        written += [INDEX, CURVE]
+        if found.doubts:
+            print("give medium.ior=N yourself")
+        else:
+            settings = {f"medium.{name}": value for name, value in index_settings(found.iors).items()} | settings
     print(f"wrote {', '.join(str(folder / name) for name in written)}")
-    command = train_command(config, silhouettes, mesh, location, list(HydraConfig.get().overrides.task))
     print("where the surroundings are near, add +experiment=refractive_room; the baseline is +experiment=mipnerf")
-    print(f"train on it: {shlex.join(command)}")
-
-
-def _report(overlaps: Float[np.ndarray, "V"], names: list[str]) -> None:
-    print("overlap (intersection over union) of the surface's silhouette with each mask:")
-    for name, value in zip(names, overlaps, strict=True):
-        print(f"  {value:.4f}  {name}")
-    worst = int(overlaps.argmin())
-    print(f"  {overlaps.mean():.4f}  mean; {overlaps[worst]:.4f} lowest, {names[worst]}")
-    bad = [names[view] for view in np.argsort(overlaps, kind="stable") if overlaps[view] < GOOD_OVERLAP]
-    if bad:
-        warn(f"overlaps below {GOOD_OVERLAP}: {first_of(bad)}; look at {SHEET}, and correct their masks or poses")
+    print(f"train on it: {shlex.join(train_command(settings, overrides))}")
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ from abc import abstractmethod
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from nerfro.allowed import Positive, checked
 from nerfro.kernels.tolerances import MIN_COSINE, SAFE_SHARE, STEPS_PER_SHELL
@@ -27,10 +27,14 @@ class Solid(Medium):
 
     iors: Float[Tensor, "K"]  # refractive index of each body; a parameter where it is learned
 
-    def __init__(self, iors: list[Positive], shell: Positive) -> None:
+    def __init__(self, iors: list[Positive], shell: Positive, learn_ior: bool = False) -> None:
         super().__init__()
         # Double precision: kernels ask for it, and a number without dimensions takes on the precision of what it meets.
-        self.register_buffer("iors", torch.tensor(iors, dtype=torch.float64), persistent=False)
+        indices = torch.tensor(iors, dtype=torch.float64)
+        if learn_ior:
+            self.iors = nn.Parameter(indices)
+        else:
+            self.register_buffer("iors", indices, persistent=False)
         self.shell = float(shell)
 
     @abstractmethod

@@ -75,7 +75,15 @@ class NerfModel(LightningModule, ABC):
     def trace(self, rays: Rays, path: Path | None = None) -> Path:
         """Paths of rays, or the ones given; with gradients by what bends them where that learns."""
         path = self.path_sampler(rays, self.medium) if path is None else path
-        return self.path_sampler.refine(path, rays, self.medium) if self.paths_learn else path
+        if not self.paths_learn:
+            return path
+        refined = self.path_sampler.refine(path, rays, self.medium)
+        steady = self.path_sampler.steady(path, self.medium)
+        every = ("positions", "directions", "s", "exit_directions")
+        old, new = ([getattr(each, name) for name in every] for each in (path, refined))
+        return refined.moved(
+            *(torch.where(steady.view(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(old, new, strict=True))
+        )
 
     @property
     def paths_learn(self) -> bool:
@@ -130,7 +138,8 @@ class NerfModel(LightningModule, ABC):
         progress = self.trainer.strategy.broadcast(training_progress(self.trainer))
         factor = learning_rate_factor(self.global_step, progress, self.optimizer_config)
         for group in self.trainer.optimizers[0].param_groups:
-            group["lr"] = group["initial_lr"] * factor
+            waits = group["name"] == "medium" and self.global_step < self.optimizer_config.medium_start
+            group["lr"] = 0.0 if waits else group["initial_lr"] * factor
         # Not at the end of the step before, which comes after its checkpoint: a resumed run would miss the update.
         if self.global_step > 0:
             self.point_sampler.after_step(self.global_step, list(self.fields))  # type: ignore[arg-type]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Optional
 
 from omegaconf import MISSING, DictConfig, OmegaConf
 from tqdm import tqdm
@@ -40,6 +41,7 @@ class SynthesizeConfig:
     photographs: int = MISSING
     noise: float = MISSING
     fresnel: bool = MISSING
+    ior: Optional[float] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     seed: int = MISSING
     sky_height: int = MISSING
     extras: bool = MISSING
@@ -76,7 +78,10 @@ def synthesize(config: DictConfig) -> tuple[Scene, Path]:
         value = OmegaConf.select(config, name)
         if value < least:
             raise NerfroError(f"{name}={value} is too small; give {least} or more")
+    if config.ior is not None and not config.ior > 0:
+        raise NerfroError(f"ior={config.ior} is no refractive index; give a positive number, or none for the scene's")
     scene, folder = build_scene(config.scene, config.resolution), user_path(config.out)
+    scene = scene if config.ior is None else replace(scene, ior=config.ior)
     mitsuba = load_mitsuba(config.variant)  # before anything is cleared that could not be rendered again
     data = (dataset.Photographs if config.scene in CAPTURES else dataset.Views)(config, scene, folder)
     data.prepare(mitsuba)
