@@ -68,11 +68,7 @@ def spoiled(mesh: TriangleMesh, kind: str, share: float) -> TriangleMesh:
 
 def basin(found: IndexEstimate) -> tuple[float, float]:
     """Between which starts the error of a single body falls all the way to the lowest candidate."""
-    values, first = np.unique(found.candidates[:, 0].round(6), return_index=True)
-    errors = found.errors[first]
-    # Every candidate of the first, wide look, and the best one.
-    wide = (np.abs(values / 0.05 - np.round(values / 0.05)) < 1e-6) | (errors == errors.min())
-    values, errors = values[wide], errors[wide]
+    values, errors = found.wide.T
     low = high = int(errors.argmin())
     while low > 0 and errors[low - 1] > errors[low]:
         low -= 1

@@ -17,7 +17,7 @@ from nerfro.files.images import save_png
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.samplers.snell import trace_interfaces
+from nerfro.samplers.snell import Snell
 
 SIZE, NUM_VIEWS, RADIUS, INNER = 40, 16, 0.7, 0.5
 BOX = torch.tensor([[-0.9] * 3, [0.9] * 3])
@@ -31,7 +31,7 @@ def cameras() -> Cameras:
     back = torch.stack([flat * turn.cos(), flat * turn.sin(), z], -1)
     right = normalize(torch.linalg.cross(torch.tensor([0.3, 0.9, 0.1]).expand_as(back), back), dim=-1)
     poses = torch.stack([right, torch.linalg.cross(back, right), back, 3 * back], -1)
-    focal, middle = torch.full((NUM_VIEWS,), 1.6 * SIZE), torch.full((NUM_VIEWS,), SIZE / 2)
+    focal, middle = torch.full((NUM_VIEWS,), 1.0 * SIZE), torch.full((NUM_VIEWS,), SIZE / 2)
     return Cameras(poses, focal, focal, middle, middle, SIZE, SIZE, 0.5, 6.0)
 
 
@@ -57,7 +57,7 @@ def photographs(iors: list[float], opaque: bool = False) -> Views:
     taken, images = cameras(), []
     for view in range(NUM_VIEWS):
         rays = taken.image_rays(view)
-        path = trace_interfaces(rays, solid(iors), 16)[0]
+        path = Snell()(rays, solid(iors))
         radiance = sky(path.exit_directions)
         if opaque:  # painted, in every colour of the sky
             radiance = torch.where(path.refracted[:, None], sky(normalize(path.positions[:, 1], dim=-1)), radiance)

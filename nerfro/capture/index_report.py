@@ -54,30 +54,23 @@ def search_index(views: Views, mesh: TriangleMesh, medium: Solid, room: bool | N
 
 
 def draw_index(found: IndexEstimate, file: Path) -> None:
-    """Write the error against each body's index: the lowest of all candidates, and closer, those beside the best."""
+    """Write the error against each body's index, the lowest over the others': from afar, and near the best."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     num_bodies = len(found.iors)
     figure = Figure(figsize=(11, 4 * num_bodies), layout="constrained", dpi=110)
-    axes = figure.subplots(num_bodies, 2, squeeze=False)
-    for body, (whole, close) in enumerate(axes):
+    for body, axes in enumerate(figure.subplots(num_bodies, 2, squeeze=False)):
         ior, error = found.iors[body], found.standard_errors[body]
-        values = np.unique(found.candidates[:, body].round(6))
-        lowest = [found.errors[np.abs(found.candidates[:, body] - value) < 1e-6].min() for value in values]
-        name = "index" if num_bodies == 1 else f"index of body {body + 1}"
-        for plot in (whole, close):
-            plot.plot(values, lowest, "o-", markersize=3, linewidth=1)
+        for plot, tried in zip(axes, (found.wide, found.close), strict=True):
+            values = np.unique(tried[:, body])
+            plot.plot(values, [tried[tried[:, body] == value, -1].min() for value in values], "o-", markersize=4)
             plot.axvline(ior, color="tab:red", linewidth=1)
             plot.axvspan(ior - error, ior + error, color="tab:red", alpha=0.2)
-            plot.set_xlabel(name)
+            plot.set_xlabel("index" if num_bodies == 1 else f"index of body {body + 1}")
             plot.set_ylabel("robust error")
-        whole.axhline(found.unrelated, color="grey", linestyle=":", label="unrelated colours")
-        whole.legend()
-        near = [value for value, x in zip(lowest, values, strict=True) if abs(x - ior) < 0.06]
-        close.set_xlim(ior - 0.06, ior + 0.06)
-        close.set_ylim(min(near), max(near) + 0.05 * (max(near) - min(near)) + 1e-6)
-        close.set_title(f"{ior:.4f} +- {error:.4f}")
-    figure.suptitle("; ".join(found.doubts)[:160] if found.doubts else "")
+        axes[0].axhline(found.unrelated, color="grey", linestyle=":", label="unrelated colours")
+        axes[0].legend()
+        axes[1].set_title(f"{ior:.4f} ± {error:.4f}")
     with atomic_file(file) as stream:
         FigureCanvasAgg(figure).print_png(stream)

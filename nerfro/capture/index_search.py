@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.boundaries.near_field import NearField
 from nerfro.capture.surroundings import Pixels, Surroundings
 from nerfro.errors import NerfroError
 from nerfro.media.solid import Solid
@@ -27,7 +28,8 @@ _COARSE = {1: (31, 12_000), 2: (13, 4_000)}
 # Candidates along each axis of a closer look, by the number of bodies, and their distance from its middle, each look's.
 _AROUND = {1: 9, 2: 5}
 _REACHES = (0.05, 0.02)
-_FINE_PIXELS = 60_000
+# Of a closer look, by the number of bodies, and of one at surroundings that are rendered for each ray.
+_FINE_PIXELS, _NEAR_PIXELS = {1: 60_000, 2: 20_000}, 12_000
 _MOST_LOOKS = 4  # at the last distance, until the middle stays where it is
 # Rays with more events are no help: tiny errors of the surface turn them anywhere.
 _MAX_EVENTS = 4
@@ -47,7 +49,8 @@ class IndexEstimate:
         iors: of each body, the outer one first.
         standard_errors: by resampling views. What is wrong with the surface is not in them.
         curvature: second derivative of the error along each index.
-        candidates, errors: all that was tried, and its robust error: 0 where all is explained, 1 where nothing is.
+        wide, close: candidates of the first look and of the last, with their robust errors in the last column: 0 where
+            all is explained, 1 where nothing is. They are of other pixels and not to be compared.
         unrelated: the error of colours that have nothing to do with each other.
         doubts: why the pictures do not tell the index; empty where they do.
     """
@@ -55,8 +58,8 @@ class IndexEstimate:
     iors: Float[np.ndarray, "K"]
     standard_errors: Float[np.ndarray, "K"]
     curvature: Float[np.ndarray, "K"]
-    candidates: Float[np.ndarray, "C K"]
-    errors: Float[np.ndarray, "C"]
+    wide: Float[np.ndarray, "C K+1"]
+    close: Float[np.ndarray, "c K+1"]
     unrelated: float
     doubts: list[str]
 
@@ -78,13 +81,14 @@ def find_index(
     num_bodies = len(medium.iors)
     if num_bodies not in _COARSE:
         raise NerfroError(f"the indices of {num_bodies} bodies are not searched for, of two at most; give medium.ior=")
-    search = _Search(medium, through, surroundings)
+    num_fine = _NEAR_PIXELS if isinstance(surroundings.boundary, NearField) else _FINE_PIXELS[num_bodies]
+    search = _Search(medium, through.some(num_fine), surroundings)
     per_axis, num_pixels = _COARSE[num_bodies]
+    num_pixels = min(num_pixels, num_fine // 4)
     axis = np.linspace(LOWEST, HIGHEST, per_axis)
     coarse = np.array(list(itertools.product(axis, repeat=num_bodies)))
-    share = len(coarse) * num_pixels / (len(coarse) * num_pixels + 4 * _AROUND[num_bodies] ** num_bodies * _FINE_PIXELS)
-    costs = search.costs(coarse, num_pixels, lambda done: progress(share * done)).mean_error()
-    candidates, errors = [coarse], [costs]
+    share = len(coarse) * num_pixels / (len(coarse) * num_pixels + 4 * _AROUND[num_bodies] ** num_bodies * num_fine)
+    costs = search.costs(coarse, num_pixels, False, lambda done: progress(share * done)).mean_error()
     middle = coarse[costs.argmin()]
     looks = [*_REACHES, *[_REACHES[-1]] * (_MOST_LOOKS - 1)]
     for look, reach in enumerate(looks):
@@ -92,10 +96,11 @@ def find_index(
         middle = middle.clip(LOWEST + reach, HIGHEST - reach)
         stencil = middle + np.array(list(itertools.product(steps, repeat=num_bodies)))
         begun = share + (1 - share) * look / len(looks)
-        fine = search.costs(stencil, _FINE_PIXELS, lambda done, b=begun: progress(b + (1 - share) * done / len(looks)))
-        candidates.append(stencil)
-        errors.append(fine.mean_error())
-        found, curvature = _lowest(stencil, errors[-1][None], reach)
+        fine = search.costs(
+            stencil, num_fine, True, lambda done, b=begun: progress(b + (1 - share) * done / len(looks))
+        )
+        errors = fine.mean_error()
+        found, curvature = _lowest(stencil, errors[None], reach)
         settled = np.abs(found[0] - middle).max() < 0.5 * reach
         middle = found[0].clip(LOWEST, HIGHEST)
         if settled and reach == _REACHES[-1]:
@@ -105,10 +110,9 @@ def find_index(
     weights = np.random.default_rng(0).multinomial(num_views, np.full(num_views, 1 / num_views), _RESAMPLES)
     spread = _lowest(stencil, fine.mean_error(weights), reach)[0].std(0)
     medium.iors = torch.from_numpy(middle).to(medium.iors)
-    doubts = _doubts(middle, spread, curvature[0], 1 - errors[-1].min() / search.unrelated)
-    return IndexEstimate(
-        middle, spread, curvature[0], np.concatenate(candidates), np.concatenate(errors), search.unrelated, doubts
-    )
+    doubts = _doubts(middle, spread, curvature[0], 1 - errors.min() / search.unrelated)
+    wide, close = np.column_stack([coarse, costs]), np.column_stack([stencil, errors])
+    return IndexEstimate(middle, spread, curvature[0], wide, close, search.unrelated, doubts)
 
 
 def _lowest(
@@ -170,8 +174,7 @@ class _Search:
         self._medium, self._surroundings = medium, surroundings
         self._sampler = Snell(max_events=_MAX_EVENTS)
         medium.iors = torch.full_like(medium.iors, 1.5)
-        pixels = through.some(_FINE_PIXELS)
-        self._pixels = pixels[self._sampler(pixels.rays, medium).refracted]
+        self._pixels = through[self._sampler(through.rays, medium).refracted]
         if not len(self._pixels):
             raise NerfroError("no ray of the object's pixels meets its surface; mesh and poses do not belong together")
         colours = surroundings.colours
@@ -179,19 +182,28 @@ class _Search:
         other = colours[torch.randint(len(colours), (len(self._pixels),), generator=torch.Generator().manual_seed(1))]
         self.unrelated = float(self._robust(other - self._pixels.radiance).mean())
 
-    def costs(self, candidates: Float[np.ndarray, "C K"], num_pixels: int, progress: Callable[[float], None]) -> _Costs:
+    def costs(
+        self, candidates: Float[np.ndarray, "C K"], num_pixels: int, alike: bool, progress: Callable[[float], None]
+    ) -> _Costs:
+        """Errors of candidates. Where a ray's light comes from is not always known, and that differs among candidates.
+
+        Far apart, they are compared by all pixels, with an error that favours none where nothing is known; `alike`
+        ones by those pixels for which all know it, or they would be preferred for knowing more.
+        """
         pixels = self._pixels.some(num_pixels)
-        rays, view, num_views = pixels.rays, pixels.view, len(pixels.cameras)
-        sums = []
+        rays = pixels.rays
+        errors, everywhere = [], torch.ones(len(pixels), dtype=torch.bool)
         for number, iors in enumerate(candidates):
             self._medium.iors = torch.from_numpy(iors).to(self._medium.iors)
             trace = self._sampler.trace(rays, self._medium)
             radiance, known = self._surroundings.radiance(trace.path.exits())
-            error = self._robust(radiance - pixels.radiance)
-            # Where nothing is known, an error that favours no candidate.
-            error = torch.where(known & ~trace.exceeded, error, self.unrelated)
-            sums.append(torch.bincount(view, error.double(), num_views).numpy())
+            known &= ~trace.exceeded
+            everywhere &= known
+            errors.append(torch.where(known, self._robust(radiance - pixels.radiance), self.unrelated))
             progress((number + 1) / len(candidates))
+        used = everywhere if alike and everywhere.any() else torch.ones_like(everywhere)
+        view, num_views = pixels.view[used], len(pixels.cameras)
+        sums = [torch.bincount(view, error[used].double(), num_views).numpy() for error in errors]
         return _Costs(np.stack(sums), torch.bincount(view, minlength=num_views).double().numpy())
 
     def _robust(self, residual: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:

@@ -33,7 +33,7 @@ _RATES = (0.03, 0.0015)
 # Every so many-th view is held back, to see how well the surroundings are known where they were not learned.
 _HELD_BACK = 8
 # A sky that leaves more than this share of the held-back views' variance unexplained is no sky: then things are near.
-_NO_SKY = 0.1
+_NO_SKY = 0.25
 # Texels a face's side of the map of directions that some ray has seen.
 _SEEN_TEXELS = 64
 
@@ -73,15 +73,16 @@ class Pixels:
         return self[chosen.sort().values]
 
 
-def divide_pixels(views: Views, mesh: TriangleMesh) -> tuple[Pixels, Pixels]:
+def divide_pixels(views: Views, mesh: TriangleMesh, max_pixels: int = _MAX_PIXELS) -> tuple[Pixels, Pixels]:
     """Pixels beside the object and pixels that it fills, by its masks, or by its mesh where there are none.
 
-    Pixels on the outline and next to it are neither. Large photographs are averaged down, in linear light.
+    Pixels on the outline and next to it are neither. Photographs of more than `max_pixels` a side are averaged down, in
+    linear light.
 
     Raises:
         NerfroError: there are none of the one or the other.
     """
-    stride = pixel_stride(views.cameras, _MAX_PIXELS)
+    stride = pixel_stride(views.cameras, max_pixels)
     height, width = views.cameras.height // stride, views.cameras.width // stride
     window = Window(0, 0, height * stride, width * stride)
     cameras = views.cameras.crop(window).resized(width, height)
@@ -125,7 +126,6 @@ class Surroundings:
     unexplained: float
     colours: Float[Tensor, "P 3"]
 
-    @torch.no_grad()
     def radiance(self, exits: Exits) -> tuple[Float[Tensor, "P 3"], Bool[Tensor, "P"]]:
         """What a photograph shows in these directions, and whether that is known."""
         radiance = self.boundary(exits).clamp(max=1)
