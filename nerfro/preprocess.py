@@ -21,7 +21,10 @@ from nerfro.capture.preprocess_options import (
     surface_settings,
     train_command,
 )
+from nerfro.capture.refined_mesh import ERRORS, refine_mesh
+from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.surface import make_mesh, read_silhouettes
+from nerfro.capture.visual_hull import Silhouettes
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import load_mesh
@@ -39,7 +42,7 @@ def main(config: DictConfig) -> None:
     views = build(config.data).load(config.split)
     box = None if config.box_min is None else np.array([config.box_min, config.box_max], np.float64)
     overrides = list(HydraConfig.get().overrides.task)
-    location, written = config.mesh, []
+    location, written, silhouettes = config.mesh, [], None
     if mesh is None or views.masks is not None:
         silhouettes = read_silhouettes(views, box is not None)
         require_consistent_poses(silhouettes, views.names, config.wrong_masks)
@@ -52,19 +55,32 @@ def main(config: DictConfig) -> None:
         report_overlaps(config.split, views, mesh, silhouettes, folder)
         written += [SHEET, REPORT]
     settings = surface_settings(config, views.cameras, mesh, location, overrides)
-    if not OmegaConf.is_missing(config.medium, "ior"):
-        build_medium(config, settings, location, [config.medium.ior, *config.medium.get("inner_iors", [])])
-        settings = {"medium.ior": config.medium.ior, **settings}
-    else:
-        medium = build_medium(config, settings, location, [1.5] * (1 + len(config.medium.get("inner_meshes", []))))
+    num_bodies = 1 + len(config.medium.get("inner_meshes", []))
+    if OmegaConf.is_missing(config.medium, "ior"):
+        medium = build_medium(config, settings, location, [1.5] * num_bodies)
         if not isinstance(medium, Solid):
             raise NerfroError("the index of this medium is not searched for; give medium.ior=, or take medium=object")
         found = search_index(views, mesh, medium, config.room, folder)
         written += [INDEX, CURVE]
-        if found.doubts:
-            print("give medium.ior=N yourself")
-        else:
-            settings = {f"medium.{name}": value for name, value in index_settings(found.iors).items()} | settings
+        iors, told = found.iors.tolist(), not found.doubts
+    else:
+        iors, told = [config.medium.ior, *config.medium.get("inner_iors", [])], True
+        build_medium(config, settings, location, iors)
+    if config.refine:
+        if num_bodies > 1:
+            raise NerfroError("refine=true takes one body; refine the outer surface without medium.inner_meshes")
+        outlines = silhouettes or Silhouettes.of(views.cameras, mesh_silhouettes(mesh, views.cameras, 1).float())
+        mesh = refine_mesh(views, mesh, outlines, iors[0], config.room, config.resolution, folder)
+        mesh.save(folder / MESH)
+        location = str(folder / MESH)
+        if silhouettes is not None:
+            report_overlaps(config.split, views, mesh, silhouettes, folder)
+        settings = surface_settings(config, views.cameras, mesh, location, overrides)
+        written = list(dict.fromkeys([MESH, *written, ERRORS]))
+    if told:
+        settings = {f"medium.{name}": value for name, value in index_settings(iors).items()} | settings
+    else:
+        print("give medium.ior=N yourself")
     print(f"wrote {', '.join(str(folder / name) for name in written)}")
     print("where the surroundings are near, add +experiment=refractive_room; the baseline is +experiment=mipnerf")
     print(f"train on it: {shlex.join(train_command(settings, overrides))}")

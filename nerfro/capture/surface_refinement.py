@@ -97,7 +97,7 @@ def refine(
     outlines: OutlinePixels,
     ior: float,
     judge: Callable[[int], bool],
-    progress: Callable[[int], None],
+    begin: int = 0,
 ) -> None:
     """Descend stage after stage.
 
@@ -106,37 +106,35 @@ def refine(
         stages: coarse to fine.
         outlines: stay where they are.
         ior: of the body.
-        judge: is asked after some steps, with their number, whether it pays to go on.
-        progress: is told the number of steps done.
+        judge: is told after each step how many are done, of all stages; says whether the stage is to go on.
+        begin: number of steps that were done before.
     """
-    done = 0
+    ended = 0
     for stage in stages:
+        begun, ended = ended, ended + stage.steps
         first, last = (rate * distance.spacing for rate in _RATES)
         optimizer = torch.optim.Adam(distance.parameters(), first, betas=(0.9, 0.99))
-        square = (_HALF * float(stage.surroundings.colours.std(0).mean())) ** 2 + 1e-6
-        for step in range(stage.steps):
-            share = step / stage.steps
-            optimizer.param_groups[0]["lr"] = last + (first - last) * 0.5 * (1 + math.cos(math.pi * share))
-            generator = torch.Generator().manual_seed(done)
+        for step in range(max(begun, begin), ended):
+            turn = math.pi * (step - begun) / stage.steps
+            optimizer.param_groups[0]["lr"] = last + (first - last) * 0.5 * (1 + math.cos(turn))
+            generator = torch.Generator().manual_seed(step)
             offset = distance.offset()
             medium = distance.medium([ior], offset)
             drawn = stage.through[torch.randint(len(stage.through), (_PIXELS,), generator=generator)]
-            data = seen_error(medium, drawn, stage, square, True)[0].mean()
-            loss = data + _MASK_WEIGHT * outlines.misfit(medium, generator)
+            loss = seen_error(medium, drawn, stage, learn=True)[0].mean()
+            loss = loss + _MASK_WEIGHT * outlines.misfit(medium, generator)
             loss = loss + _ROUGHNESS_WEIGHT * distance.roughness(offset)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
-            done += 1
-            progress(done)
-            if not judge(done):
+            if not judge(step + 1):
                 break
 
 
 def seen_error(
-    medium: SdfGrid, pixels: Pixels, stage: Stage, square: float, learn: bool
+    medium: SdfGrid, pixels: Pixels, stage: Stage, learn: bool
 ) -> tuple[Float[Tensor, "K"], Bool[Tensor, "P"]]:
-    """Robust errors r^2 / (r^2 + s^2) of what pixels show, and which of them are known: K of them."""
+    """Robust errors r^2 / (r^2 + s^2) of what pixels show, and of which K pixels; with gradients where it `learn`s."""
     rays, sampler = pixels.rays, Snell(max_events=stage.max_events)
     trace = sampler.trace(rays, medium)
     used = trace.path.refracted & ~trace.exceeded
@@ -148,6 +146,7 @@ def seen_error(
     radiance, known = stage.surroundings.radiance(path.exits())
     used[used.clone()] = known
     error = (radiance[known] - pixels.radiance[used]).square().mean(-1)
+    square = (_HALF * float(stage.surroundings.colours.std(0).mean())) ** 2 + 1e-6
     return error / (error + square), used
 
 

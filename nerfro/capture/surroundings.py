@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -150,8 +151,9 @@ def learn_surroundings(
     judges = judges.some(_SKY_PIXELS)
     found = None
     if not near:
-        side = float(beside.cameras.fx.mean()) * torch.pi / 2  # texels as wide as pixels
-        levels = [4 * 2**level for level in range(16) if 4 * 2**level <= max(16, 1.5 * side)]
+        # Texels as wide as pixels, and no more of them than half the pixels: what none teaches would be speckle.
+        side = min(1.5 * float(beside.cameras.fx.mean()) * math.pi / 2, math.sqrt(len(learned) / 12))
+        levels = [4 * 2**level for level in range(16) if 4 * 2**level <= max(16, side)]
         boundary = EnvironmentMap(levels)
         _learn(boundary, learned, _SKY_STEPS, _SKY_PIXELS, progress)
         seen = torch.zeros(6, _SEEN_TEXELS, _SEEN_TEXELS, dtype=torch.bool)
