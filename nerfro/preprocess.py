@@ -7,7 +7,7 @@ import shlex
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nerfro.capture.index_report import CURVE, INDEX, search_index
 from nerfro.capture.overlaps import REPORT, SHEET, report_overlaps
@@ -18,6 +18,7 @@ from nerfro.capture.preprocess_options import (
     build_medium,
     claim,
     index_settings,
+    is_given,
     surface_settings,
     train_command,
 )
@@ -38,10 +39,10 @@ from nerfro.registry import build
 def main(config: DictConfig) -> None:
     """Carve, fit, compare with the masks, find the index; whatever can be refused is refused before that."""
     mesh = None if config.mesh is None else load_mesh(resolve_path(config.mesh))
-    folder = claim(config)
+    overrides = list(HydraConfig.get().overrides.task)
+    folder = claim(config, overrides)
     views = build(config.data).load(config.split)
     box = None if config.box_min is None else np.array([config.box_min, config.box_max], np.float64)
-    overrides = list(HydraConfig.get().overrides.task)
     location, written, silhouettes = config.mesh, [], None
     if mesh is None or views.masks is not None:
         silhouettes = read_silhouettes(views, box is not None)
@@ -56,7 +57,7 @@ def main(config: DictConfig) -> None:
         written += [SHEET, REPORT]
     settings = surface_settings(config, views.cameras, mesh, location, overrides)
     num_bodies = 1 + len(config.medium.get("inner_meshes", []))
-    if OmegaConf.is_missing(config.medium, "ior"):
+    if not is_given("medium.ior", overrides):
         medium = build_medium(config, settings, location, [1.5] * num_bodies)
         if not isinstance(medium, Solid):
             raise NerfroError("the index of this medium is not searched for; give medium.ior=, or take medium=object")

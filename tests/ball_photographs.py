@@ -19,7 +19,7 @@ from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.snell import Snell
 
-SIZE, NUM_VIEWS, RADIUS, INNER = 40, 16, 0.7, 0.5
+SIZE, NUM_VIEWS, RADIUS, INNER = 40, 30, 0.7, 0.5
 BOX = torch.tensor([[-0.9] * 3, [0.9] * 3])
 
 
@@ -31,7 +31,7 @@ def cameras() -> Cameras:
     back = torch.stack([flat * turn.cos(), flat * turn.sin(), z], -1)
     right = normalize(torch.linalg.cross(torch.tensor([0.3, 0.9, 0.1]).expand_as(back), back), dim=-1)
     poses = torch.stack([right, torch.linalg.cross(back, right), back, 3 * back], -1)
-    focal, middle = torch.full((NUM_VIEWS,), 1.0 * SIZE), torch.full((NUM_VIEWS,), SIZE / 2)
+    focal, middle = torch.full((NUM_VIEWS,), 0.8 * SIZE), torch.full((NUM_VIEWS,), SIZE / 2)
     return Cameras(poses, focal, focal, middle, middle, SIZE, SIZE, 0.5, 6.0)
 
 

@@ -25,12 +25,12 @@ from nerfro.samplers.snell import Snell
 LOWEST, HIGHEST = 1.0, 2.5
 # Candidates along each axis and pixels of the first look, by the number of bodies.
 _COARSE = {1: (31, 12_000), 2: (13, 4_000)}
-# Candidates along each axis of a closer look, by the number of bodies, and their distance from its middle, each look's.
+# Candidates along each axis of closer looks, by the number of bodies, and how far they reach from its middle.
 _AROUND = {1: 9, 2: 5}
-_REACHES = (0.05, 0.02)
+_REACHES = {1: (0.05, 0.02), 2: (0.15, 0.05, 0.02)}
 # Of a closer look, by the number of bodies, and of one at surroundings that are rendered for each ray.
 _FINE_PIXELS, _NEAR_PIXELS = {1: 60_000, 2: 20_000}, 12_000
-_MOST_LOOKS = 4  # at the last distance, until the middle stays where it is
+_MOST_LOOKS = 4  # of each reach, until the middle stays where it is
 # Rays with more events are no help: tiny errors of the surface turn them anywhere.
 _MAX_EVENTS = 4
 # Residuals count half at this share of the surroundings' standard deviation: what is inside spoils many pixels.
@@ -39,6 +39,8 @@ _RESAMPLES = 200
 # Without a valley so deep (share of the error of unrelated colours), or with a larger standard error (share of the
 # index), the pictures do not tell.
 _SHALLOW, _LOOSE = 0.03, 0.02
+# Nor if for less than this share of the pixels it is known where their light comes from.
+_UNKNOWN = 0.1
 
 
 @dataclass(frozen=True)
@@ -90,27 +92,34 @@ def find_index(
     share = len(coarse) * num_pixels / (len(coarse) * num_pixels + 4 * _AROUND[num_bodies] ** num_bodies * num_fine)
     costs = search.costs(coarse, num_pixels, False, lambda done: progress(share * done)).mean_error()
     middle = coarse[costs.argmin()]
-    looks = [*_REACHES, *[_REACHES[-1]] * (_MOST_LOOKS - 1)]
-    for look, reach in enumerate(looks):
+    looks = len(_REACHES[num_bodies]) * _MOST_LOOKS
+    look = 0
+    for reach in _REACHES[num_bodies]:
         steps = np.linspace(-reach, reach, _AROUND[num_bodies])
-        middle = middle.clip(LOWEST + reach, HIGHEST - reach)
-        stencil = middle + np.array(list(itertools.product(steps, repeat=num_bodies)))
-        begun = share + (1 - share) * look / len(looks)
-        fine = search.costs(
-            stencil, num_fine, True, lambda done, b=begun: progress(b + (1 - share) * done / len(looks))
-        )
-        errors = fine.mean_error()
-        found, curvature = _lowest(stencil, errors[None], reach)
-        settled = np.abs(found[0] - middle).max() < 0.5 * reach
-        middle = found[0].clip(LOWEST, HIGHEST)
-        if settled and reach == _REACHES[-1]:
-            break
+        for _ in range(_MOST_LOOKS):
+            middle = middle.clip(LOWEST + reach, HIGHEST - reach)
+            stencil = middle + np.array(list(itertools.product(steps, repeat=num_bodies)))
+            begun, look = share + (1 - share) * look / looks, look + 1
+            closest = reach == _REACHES[num_bodies][-1]
+            fine = search.costs(
+                stencil,
+                num_fine if closest else num_fine // 3,
+                True,
+                lambda done, b=begun: progress(b + (1 - share) * done / looks),
+            )
+            errors = fine.mean_error()
+            found, curvature = _lowest(stencil, errors[None], reach)
+            settled = np.abs(found[0] - middle).max() < 0.5 * reach
+            middle = found[0].clip(LOWEST, HIGHEST)
+            if settled:
+                break
     progress(1.0)
     num_views = len(fine.counts)
     weights = np.random.default_rng(0).multinomial(num_views, np.full(num_views, 1 / num_views), _RESAMPLES)
     spread = _lowest(stencil, fine.mean_error(weights), reach)[0].std(0)
     medium.iors = torch.from_numpy(middle).to(medium.iors)
-    doubts = _doubts(middle, spread, curvature[0], 1 - errors.min() / search.unrelated)
+    known = fine.counts.sum() / max(1, search.num_pixels)
+    doubts = _doubts(middle, spread, curvature[0], 1 - errors.min() / search.unrelated, known)
     wide, close = np.column_stack([coarse, costs]), np.column_stack([stencil, errors])
     return IndexEstimate(middle, spread, curvature[0], wide, close, search.unrelated, doubts)
 
@@ -139,8 +148,12 @@ def _lowest(
     return middle + reach * place, np.diagonal(hessian, axis1=1, axis2=2) / reach**2
 
 
-def _doubts(iors: np.ndarray, standard_errors: np.ndarray, curvature: np.ndarray, depth: float) -> list[str]:
+def _doubts(
+    iors: np.ndarray, standard_errors: np.ndarray, curvature: np.ndarray, depth: float, known: float
+) -> list[str]:
     doubts = []
+    if known < _UNKNOWN:
+        doubts.append(f"of {1 - known:.0%} of the object's light no photograph shows where it comes from")
     if depth < _SHALLOW:
         doubts.append(
             f"the best index explains only {max(0.0, depth):.1%} of what unrelated colours leave unexplained: the "
@@ -165,7 +178,7 @@ class _Costs:
     def mean_error(self, weights: Float[np.ndarray, "B V"] | None = None) -> np.ndarray:
         """Mean over pixels of each candidate [C], or of each weighting of views [B, C]."""
         if weights is None:
-            return self.sums.sum(1) / self.counts.sum()
+            return self.sums.sum(1) / self.counts.sum().clip(1)
         return (weights @ self.sums.T) / (weights @ self.counts)[:, None].clip(1)
 
 
@@ -175,7 +188,8 @@ class _Search:
         self._sampler = Snell(max_events=_MAX_EVENTS)
         medium.iors = torch.full_like(medium.iors, 1.5)
         self._pixels = through[self._sampler(through.rays, medium).refracted]
-        if not len(self._pixels):
+        self.num_pixels = len(self._pixels)
+        if not self.num_pixels:
             raise NerfroError("no ray of the object's pixels meets its surface; mesh and poses do not belong together")
         colours = surroundings.colours
         self._square = float((_HALF * colours.std(0).mean()) ** 2) + 1e-6
@@ -201,7 +215,7 @@ class _Search:
             everywhere &= known
             errors.append(torch.where(known, self._robust(radiance - pixels.radiance), self.unrelated))
             progress((number + 1) / len(candidates))
-        used = everywhere if alike and everywhere.any() else torch.ones_like(everywhere)
+        used = everywhere if alike else torch.ones_like(everywhere)
         view, num_views = pixels.view[used], len(pixels.cameras)
         sums = [torch.bincount(view, error[used].double(), num_views).numpy() for error in errors]
         return _Costs(np.stack(sums), torch.bincount(view, minlength=num_views).double().numpy())

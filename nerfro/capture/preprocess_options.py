@@ -63,7 +63,12 @@ class PreprocessConfig:
     overwrite: bool = False
 
 
-def claim(config: DictConfig) -> Path:
+def is_given(option: str, overrides: list[str]) -> bool:
+    """Whether a command line says what an option is."""
+    return option in {text.lstrip("+").split("=")[0] for text in overrides}
+
+
+def claim(config: DictConfig, overrides: list[str]) -> Path:
     """The folder to write to; refused if an option is out of range, or it is the package's, or a file is there."""
     if not 16 <= config.resolution <= 1024:
         raise NerfroError(f"resolution={config.resolution} is not allowed; take 16 to 1024 voxels a side")
@@ -83,7 +88,7 @@ def claim(config: DictConfig) -> Path:
     folder = resolve_path(config.data.root) if config.out is None else user_path(config.out)
     names = [SHEET, REPORT] if config.mesh is not None and not config.refine else [MESH, SHEET, REPORT]
     names += [ERRORS] if config.refine else []
-    names += [INDEX, CURVE] if OmegaConf.is_missing(config.medium, "ior") else []
+    names += [] if is_given("medium.ior", overrides) else [INDEX, CURVE]
     refuse_existing([folder / name for name in names], config.overwrite)
     return folder
 
@@ -95,11 +100,10 @@ def surface_settings(
 
     The surface's file is its `location`.
     """
-    given = {key.lstrip("+").split("=")[0] for key in overrides}
     settings: dict[str, object] = {}
     if location != f"{config.data.root}/{MESH}":
         settings["medium.mesh"] = location
-    if not {"medium.box_min", "medium.box_max"} & given:
+    if not (is_given("medium.box_min", overrides) or is_given("medium.box_max", overrides)):
         centre, half_side = mesh.bounds.mean(0), (0.5 + _MARGIN_SHARE) * float(np.ptp(mesh.bounds, axis=0).max())
         digits = max(0, 3 - int(np.floor(np.log10(half_side))))
         for name, corner in (("box_min", centre - half_side), ("box_max", centre + half_side)):

@@ -35,7 +35,7 @@ _HALF = 0.4
 _REACH, _MISFIT = 1.5, 0.5
 _MASK_WEIGHT, _ROUGHNESS_WEIGHT = 0.3, 0.3
 # Of Adam, as a share of the voxels' spacing, at the beginning and the end of a stage.
-_RATES = (0.02, 0.004)
+_RATES = (0.008, 0.001)
 # Places on a ray at which the distance to the surface is looked for.
 _PLACES = 64
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -35,8 +36,11 @@ _RATES = (0.03, 0.0015)
 _HELD_BACK = 8
 # A sky that leaves more than this share of the held-back views' variance unexplained is no sky: then things are near.
 _NO_SKY = 0.25
-# Texels a face's side of the map of directions that some ray has seen.
-_SEEN_TEXELS = 64
+# Less variance than this, of linear radiance, is none.
+_LEVEL = 1e-4
+# Texels a face's side of the map of directions that some ray has seen, at most, and pixels for each of them: few enough
+# that where photographs have looked there are no holes.
+_SEEN_TEXELS, _SEEN_PIXELS = 64, 8
 
 
 @dataclass(frozen=True)
@@ -132,7 +136,7 @@ class Surroundings:
         radiance = self.boundary(exits).clamp(max=1)
         if self.seen is None:
             return radiance, torch.ones(len(radiance), dtype=torch.bool)
-        return radiance, self.seen[_texel(exits.directions)]
+        return radiance, self.seen[_texel(exits.directions, self.seen.shape[-1])]
 
 
 def learn_surroundings(
@@ -156,12 +160,13 @@ def learn_surroundings(
         levels = [4 * 2**level for level in range(16) if 4 * 2**level <= max(16, side)]
         boundary = EnvironmentMap(levels)
         _learn(boundary, learned, _SKY_STEPS, _SKY_PIXELS, progress)
-        seen = torch.zeros(6, _SEEN_TEXELS, _SEEN_TEXELS, dtype=torch.bool)
-        seen[_texel(learned.rays.directions)] = True
+        n = max(1, min(_SEEN_TEXELS, int(math.sqrt(len(learned) / (6 * _SEEN_PIXELS)))))
+        seen = torch.zeros(6, n, n, dtype=torch.bool)
+        seen[_texel(learned.rays.directions, n)] = True
         found = Surroundings(boundary, seen, _unexplained(boundary, judges), judges.radiance)
     if near or (near is None and found is not None and found.unexplained > _NO_SKY):
         margin = 0.05 * (mesh.bounds[1] - mesh.bounds[0]).max()
-        low, high = (mesh.bounds + margin * [[-1.0], [1.0]]).tolist()
+        low, high = (mesh.bounds + margin * np.array([[-1.0], [1.0]])).tolist()
         distance = (beside.cameras.camera_to_world[:, :, 3] - torch.tensor(mesh.bounds.mean(0)).float()).norm(dim=-1)
         field = NearField(low, high, radius=float(distance.mean()))
         _learn(field, learned, _NEAR_STEPS, _NEAR_PIXELS, progress)
@@ -201,10 +206,10 @@ def _learn(boundary: Boundary, pixels: Pixels, steps: int, batch: int, progress:
 @torch.no_grad()
 def _unexplained(boundary: Boundary, pixels: Pixels) -> float:
     error = boundary(exits_of(pixels.rays)).clamp(max=1) - pixels.radiance
-    return float(error.square().mean() / pixels.radiance.var(0).mean().clamp(min=1e-12))
+    return float(error.square().mean() / pixels.radiance.var(0).mean().clamp(min=_LEVEL))
 
 
-def _texel(directions: Float[Tensor, "P 3"]) -> tuple[Tensor, Tensor, Tensor]:
+def _texel(directions: Float[Tensor, "P 3"], n: int) -> tuple[Tensor, Tensor, Tensor]:
     face, coordinates = project(directions)
-    column, row = ((coordinates + 1) / 2 * _SEEN_TEXELS).long().clamp(0, _SEEN_TEXELS - 1).unbind(-1)
+    column, row = ((coordinates + 1) / 2 * n).long().clamp(0, n - 1).unbind(-1)
     return face, row, column
