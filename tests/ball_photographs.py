@@ -19,7 +19,7 @@ from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.snell import Snell
 
-SIZE, NUM_VIEWS, RADIUS, INNER = 40, 30, 0.7, 0.5
+SIZE, NUM_VIEWS, RADIUS, INNER = 40, 30, 0.7, 0.35
 BOX = torch.tensor([[-0.9] * 3, [0.9] * 3])
 
 

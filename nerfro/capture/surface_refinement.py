@@ -34,8 +34,9 @@ _HALF = 0.4
 # Pixels whose centres are within so many pixels of an outline, and the misfit that counts half, pixels.
 _REACH, _MISFIT = 1.5, 0.5
 _MASK_WEIGHT, _ROUGHNESS_WEIGHT = 0.3, 0.3
-# Of Adam, as a share of the voxels' spacing, at the beginning and the end of a stage.
-_RATES = (0.008, 0.001)
+# Of Adam, as the tilt of the surface by a step, radians, at the beginning and the end of a stage: a grid may move as
+# much as its cells are wide times that. Ten times as much diverges.
+_RATES = (4e-4, 4e-5)
 # Places on a ray at which the distance to the surface is looked for.
 _PLACES = 64
 
@@ -112,11 +113,13 @@ def refine(
     ended = 0
     for stage in stages:
         begun, ended = ended, ended + stage.steps
-        first, last = (rate * distance.spacing for rate in _RATES)
-        optimizer = torch.optim.Adam(distance.parameters(), first, betas=(0.9, 0.99))
+        first, last = _RATES
+        cells = [float(distance.box[1, 0] - distance.box[0, 0]) / (len(grid[0, 0]) - 1) for grid in distance.offsets]
+        optimizer = torch.optim.Adam([{"params": [grid]} for grid in distance.offsets], first, betas=(0.9, 0.99))
         for step in range(max(begun, begin), ended):
             turn = math.pi * (step - begun) / stage.steps
-            optimizer.param_groups[0]["lr"] = last + (first - last) * 0.5 * (1 + math.cos(turn))
+            for group, cell in zip(optimizer.param_groups, cells, strict=True):
+                group["lr"] = cell * (last + (first - last) * 0.5 * (1 + math.cos(turn)))
             generator = torch.Generator().manual_seed(step)
             offset = distance.offset()
             medium = distance.medium([ior], offset)
