@@ -13,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from tracing import BOX, N_BALL, RADIUS, angles, euler, exits, grid_distances, make_rays, view
 
+from nerfro.cameras import central_window
 from nerfro.evaluation.path_plot import plot_paths
 from nerfro.files import lat_long
 from nerfro.light import to_srgb
@@ -100,18 +101,18 @@ def cube_of_distances(**options: list[float]) -> SdfGrid:
     return SdfGrid.from_distances(values, BOX, [1.5], 0.02, **options)
 
 
-def picture(sampler: Snell, medium: SdfGrid, side: int = 200, parts: int = 3) -> np.ndarray:
+def picture(sampler: Snell, medium: SdfGrid, side: int = 260, parts: int = 2) -> np.ndarray:
     """The medium under the sky of the scene `torus`, several rays a pixel, sRGB."""
-    cameras, radiance_of_sky = view().resized(side, side), lat_long.load_lat_long(ASSETS_DIR / "torus" / "sky.png")
+    cameras = view().resized(side, side).crop(central_window(side, side, 0.6))
+    radiance_of_sky = lat_long.load_lat_long(ASSETS_DIR / "torus" / "sky.png")
     radiance = []
-    for pixels in torch.arange(side * side).split(8192):
+    for pixels in torch.arange(cameras.width * cameras.height).split(8192):
         path = medium.tinted(sampler(part_rays(cameras, pixels, parts), medium))
         light = lat_long.sample(radiance_of_sky, path.exit_directions, width=4096)
         if path.absorbs:
             light = light * path.transmitted(path.far[:, None])[:, 0]
         radiance.append(path.per_ray(light).view(-1, parts**2, 3).mean(1))
-    middle = slice(side // 5, side - side // 5)
-    return to_srgb(torch.cat(radiance)).clamp(0, 1).view(side, side, 3)[middle, middle].numpy()
+    return to_srgb(torch.cat(radiance)).clamp(0, 1).view(cameras.height, cameras.width, 3).numpy()
 
 
 def draw_paths(voxels: VoxelGrid, file: Path) -> None:

@@ -134,8 +134,8 @@ def test_absorption_is_that_of_the_path_and_is_learned_from_a_picture(what: str)
     assert agreement(picture(given, BRANCHES(rays_of_picture(), given)), expected) > 35
     few = BRANCHES(rays_of_picture(4), given)
     assert float(learner.absorption.max()) < 0.03  # type: ignore[union-attr]
-    optimizer = torch.optim.Adam(learner.parameters(), lr=0.2)
-    for _ in range(60):
+    optimizer = torch.optim.Adam(learner.parameters(), lr=0.1)
+    for _ in range(150):
         loss = (to_srgb(picture(learner, few)) - to_srgb(expected)).square().mean()
         optimizer.zero_grad()
         loss.backward()
