@@ -5,11 +5,12 @@ from __future__ import annotations
 import typing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Optional
+from typing import Annotated, Any, Optional
 
 import numpy as np
 from omegaconf import MISSING, DictConfig, OmegaConf
 
+from nerfro.allowed import Count, Natural, NotNegative, Range, corners_of_box
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing
@@ -45,30 +46,21 @@ class PreprocessConfig:
     split: str = "train"
     mesh: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     out: Optional[str] = None  # noqa: UP045
-    resolution: int = 96
+    resolution: Annotated[int, Range(at_least=16, at_most=1024)] = 96
     box_min: Optional[list[float]] = None  # noqa: UP045
     box_max: Optional[list[float]] = None  # noqa: UP045
-    wrong_masks: int = 0
-    keep: Optional[int] = None  # noqa: UP045
-    smoothing: float = 1.0
+    wrong_masks: Natural = 0
+    keep: Optional[Count] = None  # noqa: UP045
+    smoothing: NotNegative = 1.0
     overwrite: bool = False
 
 
 def claim(config: DictConfig) -> Path:
-    """The folder to write to; refused if an option is out of range, or it is the package's, or a file is there."""
-    if not 16 <= config.resolution <= 1024:
-        raise NerfroError(f"resolution={config.resolution} is not allowed; take 16 to 1024 voxels a side")
-    if config.wrong_masks < 0 or (config.keep is not None and config.keep < 1) or not config.smoothing >= 0:
-        raise NerfroError(
-            f"wrong_masks={config.wrong_masks}, keep={config.keep}, smoothing={config.smoothing} are not allowed; "
-            "wrong_masks and smoothing start at 0, keep at 1"
-        )
+    """The folder to write to; refused if it is the package's, or a file is there."""
     if (config.box_min is None) != (config.box_max is None):
         raise NerfroError("give both box_min and box_max, or neither to have the box found")
-    if config.box_min is not None and (
-        len(config.box_min) != 3 or len(config.box_max) != 3 or not (np.array(config.box_min) < config.box_max).all()
-    ):
-        raise NerfroError(f"box_min={config.box_min}, box_max={config.box_max} is no box; give three numbers each")
+    if config.box_min is not None:
+        corners_of_box(config.box_min, config.box_max)
     if config.out is None and str(config.data.root).startswith(EMBEDDED_PREFIX):
         raise NerfroError(f"data.root={config.data.root} ships with nerfro and is not written to; add out=FOLDER")
     folder = resolve_path(config.data.root) if config.out is None else user_path(config.out)
