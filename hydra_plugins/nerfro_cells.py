@@ -107,6 +107,8 @@ class CellSweeper(BasicSweeper):
         assert self.hydra_context is not None
         parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
         (jobs,) = self.split_arguments(parser.parse_overrides([*self._parse_config(), *arguments]), None)
+        if not jobs:
+            raise NerfroError("the sweep has no cells: a glob or range in it names nothing")
         # What is swept over in a file tells cells apart even where the command line leaves one value of it.
         told_apart = [
             i
@@ -148,5 +150,4 @@ class CellSweeper(BasicSweeper):
             print("nerfro: the sweep was interrupted; the same command goes on with it", file=sys.stderr, flush=True)
             raise
         except Exception as error:  # a worker died, or the launcher could not start any: the cells tell what is done
-            reason = in_one_line(error) or f"{type(error).__name__}: {error}".splitlines()[0]
-            print(f"nerfro: the launcher gave up: {reason}", file=sys.stderr, flush=True)
+            print(f"nerfro: the launcher gave up: {in_one_line(error)}", file=sys.stderr, flush=True)

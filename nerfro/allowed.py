@@ -1,4 +1,8 @@
-"""What a parameter or setting may be, said once, in its annotation: `Annotated[int, Range(at_least=1)]`, or `Count`."""
+"""What a parameter or setting may be, said once, in its annotation: `Annotated[int, Range(at_least=1)]`, or `Count`.
+
+A number is finite unless its annotation says otherwise. `Annotated[str, Literal["a", "b"]]` has choices for OmegaConf,
+which knows no `Literal`.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, nearest_of
 
 Class = TypeVar("Class")
 
@@ -43,11 +47,20 @@ class Range:
         return " and ".join(f"{word.replace('_', ' ')} {end}" for word, end in ends if end is not None)
 
 
+_FURTHEST = 10**6  # world units: beyond, neighbouring float32 numbers are 0.06 apart
+
+AnyNumber = Annotated[float, None]  # infinite ones and NaN too
 Count = Annotated[int, Range(at_least=1)]
+NumRays = Annotated[int, Range(at_least=1, at_most=2**22)]  # computed at once
+Side = Annotated[int, Range(at_least=1, at_most=32)]  # rays along each side of a pixel
+Resolution = Annotated[int, Range(at_least=4, at_most=2048)]  # vertices along each side of a grid
 Natural = Annotated[int, Range(at_least=0)]
 Positive = Annotated[float, Range(more_than=0)]
 NotNegative = Annotated[float, Range(at_least=0)]
+Factor = Annotated[float, Range(at_least=1)]
 Share = Annotated[float, Range(more_than=0, less_than=1)]
+Coordinate = Annotated[float, Range(at_least=-_FURTHEST, at_most=_FURTHEST)]  # world units
+Distance = Annotated[float, Range(at_least=0, at_most=_FURTHEST)]  # world units
 
 
 def checked(where: str) -> Callable[[type[Class]], type[Class]]:
@@ -78,6 +91,21 @@ def check_settings(config: DictConfig, schema: type, prefix: str = "") -> None:
             check_settings(value, hints[name], f"{prefix}{name}.")
 
 
+def check_names(config: DictConfig, prefix: str = "", groups: Sequence[str] = (), also: Sequence[str] = ()) -> None:
+    """Refuse settings that the dataclass of a configuration, or of any node in it, does not have.
+
+    Hydra lets a `+` add them to any node. `groups` may have been meant, `also` are allowed in the root.
+    """
+    schema = OmegaConf.get_type(config)
+    fields = None if not dataclasses.is_dataclass(schema) else [field.name for field in dataclasses.fields(schema)]
+    for key, node in config.items_ex(resolve=False):
+        name = str(key)
+        if fields is not None and name not in (*fields, *also):
+            raise NerfroError(f"{prefix}{name} is no setting; {nearest_of(name, [*fields, *groups])}")
+        if isinstance(node, DictConfig) and not (node._is_none() or node._is_missing() or node._is_interpolation()):
+            check_names(node, f"{prefix}{name}.")
+
+
 def check(where: str, hints: Mapping[str, Any], values: Mapping[str, Any]) -> None:
     """Refuse the first value that its annotation does not allow.
 
@@ -96,12 +124,13 @@ def corners_of_box(
     """The corners of a box as an array.
 
     Raises:
-        NerfroError: not three numbers each, the first below the second, and finite ones where it is `bounded`.
+        NerfroError: not three numbers each, the first below the second, and coordinates where it is `bounded`.
     """
     box = np.array([box_min, box_max], np.float64) if len(box_min) == len(box_max) == 3 else np.zeros((2, 3))
-    if not (box[1] > box[0]).all() or (bounded and not np.isfinite(box).all()):
+    if not (box[1] > box[0]).all() or (bounded and not (np.abs(box) <= _FURTHEST).all()):
         raise NerfroError(
-            f"box_min={list(box_min)}, box_max={list(box_max)} is no box; give three numbers each, min below max"
+            f"box_min={list(box_min)}, box_max={list(box_max)} is no box; give three numbers each, min below max, "
+            f"and none beyond {_FURTHEST}"
         )
     return box
 
@@ -112,8 +141,12 @@ def _refusal(value: Any, hint: Any) -> str | None:
         return None
     if origin is Literal:
         return None if value in hints else f"choose {', '.join(map(repr, hints))}"
+    if origin is Annotated and isinstance(hints[1], Range):
+        return f"take {hints[1]}" if value not in hints[1] else None
     if origin is Annotated:
-        return f"take {hints[1]}" if isinstance(hints[1], Range) and value not in hints[1] else None
+        return _refusal(value, hints[1])
+    if hint is float:
+        return None if math.isfinite(value) else "take a finite number"
     if origin in (list, tuple) and isinstance(value, Sequence):
         return next((reason for each in value if (reason := _refusal(each, hints[0]))), None)
     if origin in (Union, types.UnionType):

@@ -3,26 +3,34 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import errno
 import functools
 import os
 import re
 import shlex
 import sys
+import tempfile
+import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import cast
 
 import hydra
 import yaml
+from hydra._internal.utils import get_args_parser
 from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from nerfro.allowed import check_settings
-from nerfro.errors import NerfroError
+from nerfro.allowed import check_names, check_settings
+from nerfro.errors import NerfroError, nearest_of
 from nerfro.paths import CONF_DIR
-from nerfro.registry import discover, fields_of_config
+from nerfro.registry import discover
 
+_NO_MEMORY = re.compile("allocate memory|out of memory")  # as torch tells it, on a CPU and on a GPU
 EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141  # as a shell tells of a program that SIGPIPE ended
 
@@ -45,6 +53,9 @@ def entry_point(
         @functools.wraps(task)
         def job(config: DictConfig) -> None:
             with errors_in_one_line():  # inside the job too, or Hydra prints a line of its own first
+                check_names(config, groups=[path.name for path in config_dir.iterdir() if path.is_dir()])
+                # Hydra adds a group that its own dataclass lacks.
+                check_names(cast(DictConfig, HydraConfig.get()), "hydra.", also=["env"])
                 check_settings(config, schema)
                 task(config)
 
@@ -53,54 +64,86 @@ def entry_point(
             # Without this Hydra prints its own report of errors and exits, before we can.
             os.environ["HYDRA_FULL_ERROR"] = "1"
             with errors_in_one_line():
+                sys.argv[1:] = _flags_first(sys.argv[1:])
                 ConfigStore.instance().store(name=f"{config_name}_schema", node=schema, provider="nerfro")
                 discover()
                 sys.argv[1:] = [_quoted(argument, verbatim) for argument in sys.argv[1:]]
-                hydra.main(version_base="1.3", config_path=str(config_dir), config_name=config_name)(job)()
+                try:
+                    hydra.main(version_base="1.3", config_path=str(config_dir), config_name=config_name)(job)()
+                except OSError as error:  # not of the job: Hydra makes its folder
+                    if isinstance(error, HydraException):
+                        raise
+                    reason = f"{error.filename} cannot be used: {error.strerror}"
+                    raise NerfroError(f"{reason}; choose another hydra.run.dir, or hydra.sweep.dir") from error
 
         return run
 
     return decorate
 
 
+def _flags_first(arguments: list[str]) -> list[str]:
+    """Hydra's flags before the overrides: its parser takes no overrides behind a flag that stands among them."""
+    known, others = get_args_parser().parse_known_args(arguments)
+    flag = next((text for text in others if text.startswith("-")), None)
+    if flag is not None:
+        raise NerfroError(f"{flag} is no option; write key=value, or see --help")
+    overrides = [*known.overrides, *others]
+    return [text for text in arguments if text not in overrides] + overrides
+
+
 @contextlib.contextmanager
 def errors_in_one_line() -> Iterator[None]:
-    """Tell a user's mistake in one line and exit with status 1; a bug keeps its traceback."""
+    """Tell whatever goes wrong in one line and exit with status 1; with NERFRO_DEBUG=1 in the traceback instead."""
     try:
         yield
         sys.stdout.flush()
     except BrokenPipeError:  # `| head` has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still to be flushed at exit
         sys.exit(EXIT_BROKEN_PIPE)
-    except KeyboardInterrupt:
-        print("nerfro: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as interruption:
+        print(f"nerfro: interrupted{f'; {interruption}' if str(interruption) else ''}", file=sys.stderr)
         sys.exit(EXIT_INTERRUPTED)
     except Exception as error:
-        line = in_one_line(error)
-        if line is None:
+        if os.environ.get("NERFRO_DEBUG"):
             raise
-        print(f"nerfro: error: {line}", file=sys.stderr)
+        print(f"nerfro: error: {in_one_line(error)}", file=sys.stderr)
         sys.exit(1)
 
 
-def in_one_line(error: Exception) -> str | None:
-    """What to tell the user about a mistake of theirs; None for a bug."""
+def in_one_line(error: Exception) -> str:
+    """What to tell the user of an error: a mistake of theirs, something that the machine lacks, or a bug of ours."""
     if isinstance(error, NerfroError):
         return str(error)
     if isinstance(error, OverrideParseException):
         return _not_parsed(error.override)
     if isinstance(error, yaml.YAMLError):
         return " ".join(str(error).split())
-    if isinstance(error, MemoryError):
-        return f"not enough memory ({error}); take smaller sizes" if str(error) else "not enough memory"
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error))):
+        reason = " ".join(str(error).split("\n")[0].split())
+        return f"not enough memory{reason and f' ({reason})'}; take smaller sizes, such as batches.size"
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return " ".join(_messages(error))
     # Hydra's refusal of a group that is set to no option (field=null); any other ValueError is a bug.
     if isinstance(error, ValueError) and str(error).startswith("Config group override"):
         return f"{error}; give the name of an option, as in field=nerf"
-    if isinstance(error, OSError):
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"no space is left for {error.filename or 'a file'}; free some, or write to another folder"
+    if isinstance(error, OSError) and error.errno is not None:
         return f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}"
-    return None
+    return _unforeseen(error)
+
+
+def _unforeseen(error: Exception) -> str:
+    """Keep the traceback of a bug in a file, and say where."""
+    what = f"{type(error).__name__}: {error}".splitlines()[0]
+    try:
+        with tempfile.NamedTemporaryFile("w", prefix="nerfro_", suffix=".txt", delete=False) as file:
+            print(shlex.join(sys.argv), file=file)
+            traceback.print_exception(error, file=file)
+        where = f"please report it with {file.name}, which has the traceback"
+    except OSError:
+        where = "please report it with its traceback"
+    return f"{what}; this is a bug of nerfro: {where} (NERFRO_DEBUG=1 shows it)"
 
 
 def _quoted(argument: str, keys: tuple[str, ...]) -> str:
@@ -122,13 +165,16 @@ def _not_parsed(override: str) -> str:
 
 def _messages(error: BaseException) -> list[str]:
     """An error's lines and its cause's, joined to one; Hydra keeps the name of the bad key in the cause."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    cause = error.__cause__
-    if cause is not None and isinstance(cause, OmegaConfBaseException):
-        lines += [line.strip() for line in str(cause).splitlines() if line.strip() and line.strip() not in lines]
-    refused = re.search(r"not in '(\w+)'", " ".join(lines))
-    fields = None if refused is None else fields_of_config(refused[1])
-    return lines if fields is None else [*lines, f"fields: {', '.join(fields)}"]
+    lines = [line.strip() for line in str(error).partition("Config search path")[0].splitlines() if line.strip()]
+    cause = error.__cause__ or error.__context__ or error
+    if not isinstance(cause, OmegaConfBaseException):
+        return lines
+    schema = cause.object_type
+    names = schema.__dataclass_fields__ if dataclasses.is_dataclass(schema) else cause.parent_node
+    if isinstance(cause, (ConfigKeyError, ConfigAttributeError)) and names is not None:
+        where = [f"{lines[0].partition(':')[0]}:"] if lines[0].startswith("In '") else []
+        return [*where, f"{cause.full_key} is no setting; {nearest_of(str(cause.key), list(map(str, names)))}"]
+    return lines + [line.strip() for line in str(cause).splitlines() if line.strip() and line.strip() not in lines]
 
 
 def warn(message: str) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from omegaconf import DictConfig
 
 from nerfro.cli import entry_point
@@ -11,7 +9,7 @@ from nerfro.evaluation.error_maps import write_error_sheet
 from nerfro.evaluation.folders import match_folders
 from nerfro.evaluation.lpips import find_lpips_networks
 from nerfro.evaluation.metrics import ImageMetrics
-from nerfro.evaluation.request import EvaluateConfig, find_device, free_folder, require_one_task
+from nerfro.evaluation.request import EvaluateConfig, find_device, own_folder, record, require_one_task
 from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.score_tables import report
 from nerfro.evaluation.scoring import score_folders, score_views
@@ -26,47 +24,52 @@ from nerfro.training.run_folder import load_checkpoint
 def main(config: DictConfig) -> None:
     """Load, check, render if there is a model, score, print."""
     require_one_task(config)
-    folder = _evaluate_folder(config) if config.checkpoint is None else _evaluate_checkpoint(config)
-    print(f"pictures and tables: {folder}")
+    evaluate = _evaluate_folder if config.checkpoint is None else _evaluate_checkpoint
+    evaluate(config)
 
 
-def _evaluate_checkpoint(config: DictConfig) -> Path:
+def _evaluate_checkpoint(config: DictConfig) -> None:
     path = user_path(config.checkpoint)
     checkpoint, trained = load_checkpoint(path)
-    folder = free_folder(config, path.parent.parent / f"evaluate_{config.split}")
     if config.root is not None:
         trained.data.root = config.root
     for name in ("chunk_size", "lpips_backbone", "lpips_vgg_backbone", "supersample", "divergence", "contrast"):
         if config[name] is not None:
             trained.evaluation[name] = config[name]
-    scene = scene_of(checkpoint, trained, find_device(config.device))
-    views = scene.views(config.split).checked()
-    # Checkpoints from before there was LPIPS over VGG-16 lack the option.
-    backbones = trained.evaluation.lpips_backbone, trained.evaluation.get("lpips_vgg_backbone")
-    networks, reasons = find_lpips_networks(*backbones)
-    metrics = ImageMetrics(networks, reasons, config.protocol == "8bit", prefix=config.split)
-    result = score_views(scene.model, views, metrics, folder, scene.supersampling)
-    for index, view in enumerate(result.views):
-        prediction = load_png(folder / "images" / f"{view.name}.png")
-        write_error_sheet(folder, view.name, prediction, views.images[index], networks)
-    spent = Throughput()
-    spent.load_state_dict(checkpoint["callbacks"]["Throughput"])
-    title = f"{trained.name} on {trained.data.root}, {config.split} views"
-    report(RunMetrics(result, checkpoint["global_step"], spent.seconds, spent.rays_per_second), title, folder)
-    return folder
+    device = find_device(config.device)
+    with own_folder(config, path.parent.parent / f"evaluate_{config.split}") as folder:
+        scene = scene_of(checkpoint, trained, device)
+        views = scene.views(config.split).checked()
+        # Checkpoints from before there was LPIPS over VGG-16 lack the option.
+        backbones = trained.evaluation.lpips_backbone, trained.evaluation.get("lpips_vgg_backbone")
+        networks, reasons = find_lpips_networks(*backbones)
+        metrics = ImageMetrics(networks, reasons, config.protocol == "8bit", prefix=config.split)
+        record(folder, config)
+        result = score_views(scene.model, views, metrics, folder, scene.supersampling)
+        for index, view in enumerate(result.views):
+            prediction = load_png(folder / "images" / f"{view.name}.png")
+            write_error_sheet(folder, view.name, prediction, views.images[index], networks)
+        spent = Throughput()
+        spent.load_state_dict(checkpoint["callbacks"]["Throughput"])
+        title = f"{trained.name} on {trained.data.root}, {config.split} views"
+        report(RunMetrics(result, checkpoint["global_step"], spent.seconds, spent.rays_per_second), title, folder)
+    print(f"pictures and tables: {folder}")
 
 
-def _evaluate_folder(config: DictConfig) -> Path:
+def _evaluate_folder(config: DictConfig) -> None:
     predictions, references = user_path(config.predictions), user_path(config.references)
     masks = None if config.masks is None else user_path(config.masks)
     pairs = match_folders(predictions, references, masks)
-    folder = free_folder(config, predictions / "scores")
+    for pair in pairs:  # what is damaged, or does not fit its partner, is told before anything is scored
+        pair.load(config.alpha)
     device = find_device(config.device)
-    networks, reasons = find_lpips_networks(config.lpips_backbone, config.lpips_vgg_backbone)
-    metrics = ImageMetrics(networks, reasons, config.protocol == "8bit")
-    result = score_folders(pairs, config.alpha, metrics, networks, folder, device)
-    report(RunMetrics(result), f"{predictions} against {references}", folder)
-    return folder
+    with own_folder(config, predictions / "scores") as folder:
+        networks, reasons = find_lpips_networks(config.lpips_backbone, config.lpips_vgg_backbone)
+        metrics = ImageMetrics(networks, reasons, config.protocol == "8bit")
+        record(folder, config)
+        result = score_folders(pairs, config.alpha, metrics, networks, folder, device)
+        report(RunMetrics(result), f"{predictions} against {references}", folder)
+    print(f"pictures and tables: {folder}")
 
 
 if __name__ == "__main__":

@@ -133,12 +133,6 @@ def find(kind: str, name: str) -> Plugin:
     return _plugins[kind, name]
 
 
-def fields_of_config(name: str) -> list[str] | None:
-    """Fields of the plugin whose configuration class has this name; None if there is none."""
-    found = next((plugin for plugin in _plugins.values() if plugin.config.__name__ == name), None)
-    return None if found is None else [field for field, _, _ in found.fields()]
-
-
 def build(node: DictConfig | Mapping[str, object], **parts: object) -> Any:
     """Instantiate the registered class (or Lightning object) that a configuration node names.
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Optional
+from typing import Annotated, Any, Literal, Optional
 
 import rich
 from omegaconf import DictConfig, ListConfig
 
+from nerfro.allowed import Natural
 from nerfro.cli import entry_point
-from nerfro.errors import NerfroError
-from nerfro.evaluation.results import FULL, OBJECT_REGIONS
+from nerfro.evaluation.results import FULL
 from nerfro.evaluation.tables import to_rich, write_table
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.paths import user_path
@@ -30,10 +30,10 @@ class SummaryConfig:
     out: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     report: bool = False  # whether to write the page `report.html`, to `outputs/summary` if `out` is none
     metrics: list[str] = field(default_factory=lambda: ["psnr", "ssim", "lpips"])  # columns, see docs/metrics.md
-    region: str = FULL  # of the pictures: full, mask or crop
+    region: Annotated[str, Literal["full", "mask", "crop"]] = FULL  # of the pictures: full, mask or crop
     methods: dict[str, str] = field(default_factory=dict)  # titles of experiments, in the order of the rows
     scenes: dict[str, str] = field(default_factory=dict)  # titles of scenes, by the last part of the data's folder
-    views: int = 8  # number of views of each scene on the page, evenly spread; 0 for all
+    views: Natural = 8  # number of views of each scene on the page, evenly spread; 0 for all
     view: Any = None  # views of the figures, as in {torus: 3}; otherwise those of the median score
     # Insets of the figures, as in {torus: [[top, left, size], ...]}, pixels; otherwise those where methods differ most.
     crops: Any = None
@@ -44,8 +44,6 @@ class SummaryConfig:
 @entry_point("summary", SummaryConfig)
 def main(config: DictConfig) -> None:
     """Read, compare, print, write."""
-    if config.region not in (FULL, *OBJECT_REGIONS):
-        raise NerfroError(f"region={config.region} is not a region; choose from {', '.join((FULL, *OBJECT_REGIONS))}")
     metrics = find_metrics(config.metrics)
     wanted = Wanted.of(config.views, config.view, config.crops, config.error_map, metrics[0], config.region)
     places = list(config.runs) if isinstance(config.runs, ListConfig) else [str(config.runs)]

@@ -26,15 +26,7 @@ from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.memory import require_memory
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.reach import require_reach
-from nerfro.training.run_folder import (
-    LAST_CHECKPOINT,
-    claim,
-    find_checkpoint,
-    load_checkpoint,
-    needed_bytes,
-    record,
-    require_same_configuration,
-)
+from nerfro.training.run_folder import LAST_CHECKPOINT, needed_bytes, own, record, require_room, require_same_run
 from nerfro.training.trainer import finish_logs, make_trainer, prepare_process
 from nerfro.training.viewer import Viewer
 
@@ -43,7 +35,11 @@ from nerfro.training.viewer import Viewer
 def main(config: DictConfig) -> None:
     """Train one experiment and evaluate it; everything that can be refused is refused before training starts."""
     folder = Path(HydraConfig.get().runtime.output_dir)
-    checkpoint = find_checkpoint(config.ckpt_path, folder)
+    with own(folder, config) as checkpoint:
+        _train(config, folder, checkpoint)
+
+
+def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     prepare_process(config.seed)
     source = build(config.data)
     test = source.load(config.evaluation.split).checked()
@@ -56,18 +52,19 @@ def main(config: DictConfig) -> None:
     )
     lpips = find_lpips_networks(config.evaluation.lpips_backbone, config.evaluation.lpips_vgg_backbone)
     model = build_model(config, training.cameras)
-    if checkpoint is not None:
-        require_same_configuration(checkpoint, load_checkpoint(checkpoint)[1], config)
+    require_same_run(folder, checkpoint, config)
     throughput, interruption = Throughput(), StopOnSignal()
     viewer = [Viewer(config, source, test)] if config.viewer else []
     trainer = make_trainer(config, folder, [throughput, interruption, *viewer])
     batches = batches.share(trainer.global_rank, trainer.world_size)
     batches = traced(batches, model, config)
-    first = batches.batch(0)
+    few = batches.smaller(4096)
+    share = few.batch_size / batches.batch_size
+    first = few.batch(0)
     require_reach(model, first)
-    memory = require_memory(model, first.rays, trainer.strategy.root_device)
+    memory = require_memory(model, first.rays, trainer.strategy.root_device, share)
     if trainer.is_global_zero:
-        claim(folder, checkpoint is not None, needed_bytes(model))
+        require_room(folder, needed_bytes(model))
         record(folder, config)
         space = describe(config.content)
         print(f"nerfro: {config.name} on {config.data.root} -> {folder}\n{space}{memory}", flush=True)

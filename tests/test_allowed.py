@@ -9,7 +9,7 @@ from typing import Annotated, Literal, Optional
 import pytest
 from omegaconf import OmegaConf
 
-from nerfro.allowed import Count, NotNegative, Positive, Range, check_settings, checked, corners_of_box
+from nerfro.allowed import AnyNumber, Count, NotNegative, Positive, Range, check_settings, checked, corners_of_box
 from nerfro.errors import NerfroError
 
 
@@ -22,7 +22,8 @@ class Thing:
         radius: Positive | None = None,
         sizes: list[Count] = (),  # type: ignore[assignment]
         mode: Literal["fast", "exact"] = "fast",
-        anything: float = 0.0,
+        anything: AnyNumber = 0.0,
+        finite: float = 0.0,
     ) -> None:
         self.count = count
 
@@ -40,6 +41,7 @@ def test_what_is_allowed_passes() -> None:
         ({"rate": math.nan}, "rate=nan is not allowed"),
         ({"radius": math.inf}, "radius=inf is not allowed; take more than 0"),
         ({"sizes": [3, 0]}, r"sizes=\[3, 0\] is not allowed; take at least 1"),
+        ({"finite": math.inf}, "finite=inf is not allowed; take a finite number"),
         ({"mode": "slow"}, "mode='slow' is not allowed; choose 'fast', 'exact'"),
     ],
 )

@@ -27,6 +27,13 @@ def put_nan(document: dict[str, Any]) -> None:
     document["frames"][1]["transform_matrix"][0][3] = float("nan")
 
 
+def put_pose(value: float) -> Callable[[dict[str, Any]], None]:
+    def put(document: dict[str, Any]) -> None:
+        document["frames"][1]["transform_matrix"][0][3] = value
+
+    return put
+
+
 def truncate(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
@@ -57,6 +64,21 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     "no field of view": (
         lambda root: edit(root / "transforms_train.json", lambda d: d.pop("camera_angle_x")),
         ["camera_angle_x"],
+    ),
+    "pose far away": (lambda root: edit(root / "transforms_train.json", put_pose(1e39)), ["r_1", "at least -1000000"]),
+    "pose of 400 digits": (lambda root: edit(root / "transforms_train.json", put_pose(10**400)), ["r_1", "infinite"]),
+    "field of view of 400 digits": (
+        lambda root: edit(root / "transforms_train.json", lambda d: d.update(camera_angle_x=10**400)),
+        ["camera_angle_x"],
+    ),
+    "field of view of nothing": (
+        lambda root: edit(root / "transforms_train.json", lambda d: d.update(camera_angle_x=1e-300)),
+        ["its lens has fx="],
+    ),
+    "deep json": (lambda root: (root / "transforms_train.json").write_text("[" * 5000), ["is not valid JSON"]),
+    "mask that is no path": (
+        lambda root: edit(root / "transforms_train.json", lambda d: d["frames"][0].update(mask_path=False)),
+        ["'file_path' and 'mask_path' must be text"],
     ),
     "no frames": (lambda root: edit(root / "transforms_train.json", lambda d: d.update(frames=[])), ["frames"]),
     "no mesh": (lambda root: (root / "mesh.ply").unlink(), ["mesh.ply does not exist"]),
@@ -106,7 +128,7 @@ def test_open_mesh_is_accepted_when_asked(
     ("override", "words"),
     [
         ("data.near=7", ["data.near=7.0", "data.far=6.0", "near < far"]),
-        ("data.near=-1", ["data.near=-1.0"]),
+        ("data.near=-1", ["near=-1.0 is not allowed; take at least 0"]),
         ("data.downscale=0", ["downscale=0"]),
         ("evaluation.split=night", ["no split 'night'; it has train, val, test"]),
         ("data.root=embedded:nothing", ["embedded scenes: torus"]),
@@ -115,6 +137,31 @@ def test_open_mesh_is_accepted_when_asked(
         ("data.root=a(1),b", ["data.root=a(1),b cannot be read", "quote"]),
         ("trainer.max_time=5", ["trainer.max_time=5", "DD:HH:MM:SS"]),
         ("medium.ior=0", ["ior=0.0 is not allowed; take more than 0"]),
+        ("medium.ior=inf", ["ior=inf is not allowed"]),
+        ("medium.resolution=3000", ["resolution=3000 is not allowed", "at most 2048"]),
+        ("medium.smoothing_size=999999", ["smoothing_size=999999 is not allowed", "at most 99"]),
+        ("loss.boundary.weight=nan", ["weight=nan is not allowed"]),
+        ("batches.divergence=nan", ["batches.divergence=nan is not allowed"]),
+        ("batches.supersample=1000", ["batches.supersample=1000 is not allowed; take at least 1 and at most 32"]),
+        ("batches.precrop_fraction=nan", ["precrop_fraction=nan is not allowed"]),
+        ("batches.size=1e12", ["batches.size", "could not be converted to Integer"]),
+        ("batches.size=1000000000000", ["batches.size=1000000000000 is not allowed; take at least 1 and at most"]),
+        ("sampler.points.num_coarse=1000000000", ["num_coarse=1000000000 is not allowed"]),
+        ("evaluation.supersample=1000000", ["evaluation.supersample=1000000 is not allowed"]),
+        ("evaluation.divergence=nan", ["evaluation.divergence=nan is not allowed"]),
+        ("optimizer.learning_rate=nan", ["optimizer.learning_rate=nan is not allowed"]),
+        ("optimizer.adam_epsilon=0", ["optimizer.adam_epsilon=0.0 is not allowed"]),
+        ("optimizer.adam_epsilon=-1", ["optimizer.adam_epsilon=-1.0 is not allowed"]),
+        ("trainer.max_steps=1.5", ["trainer.max_steps", "could not be converted to Integer"]),
+        ("trainer.max_steps=99999999999", ["trainer.max_steps=99999999999 is not allowed"]),
+        ("trainer.precision=8", ["trainer.precision='8' is not allowed; choose '32-true'"]),
+        ("trainer.accumulate_grad_batches=0", ["trainer.accumulate_grad_batches=0 is not allowed"]),
+        ("+trainer.limit_train_batches=0", ["trainer.limit_train_batches is no setting"]),
+        ("checkpoint.every_seconds=-1", ["checkpoint.every_seconds=-1.0 is not allowed"]),
+        ("checkpoint.every_seconds=inf", ["checkpoint.every_seconds=inf is not allowed"]),
+        ("checkpoint={every_steps: -1, every_seconds: null}", ["checkpoint.every_steps=-1 is not allowed"]),
+        ("data.root=embedded:", ["embedded scenes: torus"]),
+        ("data.root=DIR/Übung", ["cannot be read; quote the value"]),
         ("medium.resolution=2", ["resolution=2 is not allowed; take at least 4"]),
         ("medium.smoothing_size=4", ["must be odd"]),
         ("batches.size=100000", ["batch_size=100000 exceeds the 16x16 pixels"]),
@@ -138,7 +185,7 @@ def test_impossible_options_are_refused(
 @pytest.mark.parametrize(
     ("module", "override", "words"),
     [
-        ("nerfro.train", "field.widht=3", "Key 'widht' not in"),
+        ("nerfro.train", "field.widht=3", "field.widht is no setting; did you mean width?"),
         ("nerfro.train", "data.root=/nowhere", "/nowhere is not a folder"),
         ("nerfro.evaluate", "checkpoint=no.ckpt", "checkpoint no.ckpt does not exist"),
     ],

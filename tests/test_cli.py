@@ -16,7 +16,7 @@ import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 
-from nerfro.cli import in_one_line
+from nerfro.cli import _flags_first, in_one_line
 from nerfro.errors import NerfroError
 from nerfro.paths import CONF_DIR, PACKAGE_DIR, resolve_path, user_path
 from nerfro.registry import KINDS
@@ -57,6 +57,14 @@ def test_overrides_that_cannot_be_read_are_told_how_to_quote(override: str, hint
     if "'" in hint:
         (parsed,) = parser.parse_overrides([hint.strip("'")])
         assert parsed.value() == override.partition("=")[2]
+
+
+def test_flags_may_stand_anywhere() -> None:
+    given = ["seed=1", "--config-dir", "mine", "seed=2", "-m"]
+    assert _flags_first(given) == ["--config-dir", "mine", "-m", "seed=1", "seed=2"]
+    assert _flags_first(["~seed", "+a=-1"]) == ["~seed", "+a=-1"]
+    with pytest.raises(NerfroError, match="--sed is no option; write key=value"):
+        _flags_first(["--sed"])
 
 
 def test_a_file_that_is_no_yaml_is_named_with_the_line(tmp_path: Path) -> None:

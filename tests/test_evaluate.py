@@ -127,8 +127,8 @@ def test_damaged_picture_is_told_before_anything_is_scored(
         (["checkpoint=a", "alpha=white"], "alpha=white means nothing with checkpoint=...; leave it out"),
         (["predictions=a", "references=b", "root=c"], "root=c means nothing with predictions=...; leave it out"),
         (["predictions=a", "references=b", "split=val"], "split=val means nothing with predictions=...; leave it out"),
-        (["predictions=a", "references=b", "protocol=9bit"], "protocol=9bit is not allowed; choose one of 8bit, float"),
-        (["predictions=a", "references=b", "alpha=red"], "alpha=red is not allowed; choose one of drop, white, black"),
+        (["predictions=a", "references=b", "protocol=9bit"], "protocol='9bit' is not allowed; choose '8bit', 'float'"),
+        (["predictions=a", "references=b", "alpha=red"], "alpha='red' is not allowed; choose 'drop', 'white', 'black'"),
         (["predictions=/nowhere", "references=b"], "predictions=/nowhere is not a folder"),
     ],
 )

@@ -20,7 +20,6 @@ from omegaconf import OmegaConf
 from nerfro.errors import NerfroError
 from nerfro.training.run_folder import (
     LAST_CHECKPOINT,
-    claim,
     find_checkpoint,
     load_checkpoint,
     require_same_configuration,
@@ -154,7 +153,7 @@ def test_folder_of_another_run_is_refused_and_kept(
     before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
     finished = train_here(*overrides, "seed=1")
     assert finished.code == 1
-    assert "already holds a run; go on with it (ckpt_path=last) or choose another folder" in finished.err
+    assert "go on with a run (ckpt_path=last) or choose another folder (hydra.run.dir=...)" in finished.err
     assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == before
 
 
@@ -214,7 +213,8 @@ def test_budget_and_name_may_change_between_runs(tmp_path: Path) -> None:
 
 def test_damaged_checkpoints_are_refused_in_one_line(tmp_path: Path) -> None:
     whole = tmp_path / "whole.ckpt"
-    torch.save({"nerfro_config": "seed: 0", "state_dict": {"w": torch.zeros(100)}}, whole)
+    parts = ("state_dict", "optimizer_states", "lr_schedulers", "callbacks", "global_step", "loops")
+    torch.save({"nerfro_config": "seed: 0", **dict.fromkeys(parts, torch.zeros(100))}, whole)
     assert load_checkpoint(whole)[1].seed == 0
     content = whole.read_bytes()
     foreign = tmp_path / "foreign.ckpt"
@@ -222,7 +222,7 @@ def test_damaged_checkpoints_are_refused_in_one_line(tmp_path: Path) -> None:
     for name, data in (("half", content[: len(content) // 2]), ("empty", b""), ("text", b"hello")):
         (tmp_path / name).write_bytes(data)
     for path in (tmp_path / "half", tmp_path / "empty", tmp_path / "text", foreign):
-        with pytest.raises(NerfroError, match=r"is not a readable nerfro checkpoint \(") as caught:
+        with pytest.raises(NerfroError, match=r"is not a readable nerfro checkpoint \(|lacks callbacks") as caught:
             load_checkpoint(path)
         assert "\n" not in str(caught.value)
     with pytest.raises(NerfroError, match="does not exist"):
@@ -247,8 +247,9 @@ def test_pickled_code_in_a_checkpoint_is_not_executed(format: str, tmp_path: Pat
         torch.save(content, path)
     else:
         path.write_bytes(pickle.dumps(content))
-    with pytest.raises(NerfroError, match="is not a readable nerfro checkpoint"):
+    with pytest.raises(NerfroError, match="is not a readable nerfro checkpoint") as caught:
         load_checkpoint(path)
+    assert "weights_only" not in str(caught.value), "torch's advice would run it"
     assert not traces.exists()
 
 
@@ -273,9 +274,3 @@ def test_full_disk_is_refused_before_training(
     assert finished.code == 1
     assert "has 1 MiB free and this run needs " in finished.err
     assert not [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
-
-
-def test_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(NerfroError, match=r"cannot write to .*/file/run: .*; choose another hydra\.run\.dir"):
-        claim(tmp_path / "file" / "run", resumed=False, needed_bytes=0)

@@ -348,7 +348,7 @@ def test_command_prints_writes_all_forms_and_refuses_to_overwrite(
     [
         ("metrics=[]", "metrics: none is given; choose from psnr"),
         ("metrics=[psnr,foo]", "'foo' is not a metric; choose from psnr"),
-        ("region=x", "choose from full, mask, crop"),
+        ("region=x", "choose 'full', 'mask', 'crop'"),
         ("views=-1", "views=-1"),
         ("view={ship: 0}", "'ship' is not a scene of these runs; choose from torus"),
         ("view={torus: 2}", "give 0 to 1"),

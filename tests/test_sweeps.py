@@ -277,3 +277,33 @@ def state(cell: Path) -> str | None:
         return json.loads((cell / "cell.json").read_text())["state"]
     except FileNotFoundError:
         return None
+
+
+def test_sweep_over_nothing_is_refused_in_one_line(sweep: Callable[..., Any]) -> None:
+    for swept in ("seed=range(0,0)", "+experiment=glob(zzz*)"):
+        finished = sweep(swept)
+        assert finished.code == 1
+        assert finished.err.strip() == "nerfro: error: the sweep has no cells: a glob or range in it names nothing"
+
+
+def test_damaged_record_costs_its_own_cell_alone(sweep: Callable[..., Any], tmp_path: Path) -> None:
+    assert sweep("seed=0,1").code == 0
+    record = sorted((tmp_path / "sweep").glob("*/cell.json"))[0]
+    record.write_text(record.read_text()[:40])
+    finished = sweep("seed=0,1")
+    assert finished.code == 1
+    assert f"{record} is damaged" in finished.out
+    assert "1 of 2 cells finished" in finished.out
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [("+batches.foo=1", "batches.foo is no setting"), ("batches.divergence=nan", "divergence=nan is not allowed")],
+)
+def test_settings_of_cells_are_checked_before_any_is_run(
+    override: str, words: str, sweep: Callable[..., Any], tmp_path: Path
+) -> None:
+    finished = sweep("seed=0,1", override)
+    assert finished.code == 1
+    assert words in finished.out
+    assert not list((tmp_path / "sweep").rglob("*.ckpt"))

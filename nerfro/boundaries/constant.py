@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.allowed import NotNegative
 from nerfro.boundaries.base import Boundary
 from nerfro.errors import NerfroError
 from nerfro.registry import register
@@ -22,7 +23,7 @@ class ConstantBoundary(Boundary):
 
     rgb: Float[Tensor, "3"]
 
-    def __init__(self, rgb: list[float] = (0.0, 0.0, 0.0)) -> None:  # type: ignore[assignment]
+    def __init__(self, rgb: list[NotNegative] = (0.0, 0.0, 0.0)) -> None:  # type: ignore[assignment]
         super().__init__()
         if len(rgb) != 3:
             raise NerfroError(f"boundary=constant: rgb={list(rgb)} needs three numbers")

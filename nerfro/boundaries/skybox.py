@@ -5,6 +5,7 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.allowed import Count, Natural
 from nerfro.boundaries.base import Boundary
 from nerfro.fields.encoding import positional_encoding
 from nerfro.fields.mlp import SkipMLP, glorot_linear, padded_sigmoid
@@ -23,7 +24,7 @@ class Skybox(Boundary):
         direction_degree: octaves of the direction's encoding; 4 in the paper, which bounds how sharp a sky can be.
     """
 
-    def __init__(self, width: int = 128, depth: int = 4, skip: int = 3, direction_degree: int = 4) -> None:
+    def __init__(self, width: Count = 128, depth: Count = 4, skip: int = 3, direction_degree: Natural = 4) -> None:
         super().__init__()
         self.direction_degree = direction_degree
         self.trunk = SkipMLP(3 * (1 + 2 * direction_degree), width, depth, skip)

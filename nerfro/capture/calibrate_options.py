@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Optional
+from typing import Annotated, Literal, Optional
 
 import numpy as np
 from omegaconf import DictConfig
 
-from nerfro.allowed import Count
-from nerfro.capture.boards import LAYOUTS, tag_grid, twelve_faces
+from nerfro.allowed import Count, Positive, Range
+from nerfro.capture.boards import tag_grid, twelve_faces
 from nerfro.capture.calibration import Intrinsics
 from nerfro.capture.targets import CharucoTarget, TagTarget, Target
+from nerfro.data.frames import Every
 from nerfro.errors import NerfroError
 
-_ALLOWED = {
-    "target": ("apriltag", "charuco", "colmap"),
-    "board": ("twelve_faces", "grid"),
-    "lens": ("pinhole", "radial", "opencv"),
-    "family": (*LAYOUTS, None),
-    "pairs": ("sequential", "all", None),
-}
+Squares = Annotated[int, Range(at_least=1, at_most=100)]  # along a side of a board
 
 
 @dataclass
@@ -53,44 +48,36 @@ class CalibrateConfig:
 
     images: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     out: Optional[str] = None  # noqa: UP045
-    target: str = "apriltag"
-    board: str = "twelve_faces"
-    family: Optional[str] = None  # noqa: UP045
-    columns: Optional[int] = None  # noqa: UP045
-    rows: Optional[int] = None  # noqa: UP045
-    size: Optional[float] = None  # noqa: UP045
-    marker: Optional[float] = None  # noqa: UP045
+    target: Annotated[str, Literal["apriltag", "charuco", "colmap"]] = "apriltag"
+    board: Annotated[str, Literal["twelve_faces", "grid"]] = "twelve_faces"
+    family: Annotated[Optional[str], Literal["tag36h11", "tagStandard41h12"]] = None  # noqa: UP045
+    columns: Optional[Squares] = None  # noqa: UP045
+    rows: Optional[Squares] = None  # noqa: UP045
+    size: Optional[Positive] = None  # noqa: UP045
+    marker: Optional[Positive] = None  # noqa: UP045
     dictionary: str = "6X6_250"
     write_board: bool = False
     reconstruction: Optional[str] = None  # noqa: UP045
-    pairs: Optional[str] = None  # noqa: UP045
+    pairs: Annotated[Optional[str], Literal["sequential", "all"]] = None  # noqa: UP045
     threads: Optional[Count] = None  # noqa: UP045
-    lens: str = "pinhole"
-    intrinsics: Optional[list[float]] = None  # noqa: UP045
+    lens: Annotated[str, Literal["pinhole", "radial", "opencv"]] = "pinhole"
+    intrinsics: Optional[list[Positive]] = None  # noqa: UP045
     distortion: Optional[list[float]] = None  # noqa: UP045
-    test_every: int = 8
+    test_every: Every = 8
     overwrite: bool = False
 
 
 def check_options(config: DictConfig) -> Intrinsics | None:
     """The lens that is given, if one is; options that can be refused are refused here."""
-    for name, allowed in _ALLOWED.items():
-        if config[name] not in allowed:
-            raise NerfroError(f"{name}={config[name]} is not allowed; choose one of {', '.join(filter(None, allowed))}")
     if config.out is None:
         raise NerfroError("set out= to the folder that takes the data set")
     if config.images is None and not (config.write_board and config.target != "colmap"):
         raise NerfroError("set images= to the folder of the photographs; or write_board=true for a board to print")
-    if config.test_every < 2:
-        raise NerfroError(f"test_every={config.test_every} leaves nothing to train on; take 2 or more")
-    for name in ("columns", "rows", "size", "marker"):
-        if config[name] is not None and not config[name] > 0:
-            raise NerfroError(f"{name}={config[name]} is not allowed; it must be positive")
     if config.intrinsics is None:
         if config.distortion:
             raise NerfroError("distortion= belongs to a lens that is known; give intrinsics=[fx,fy,cx,cy] as well")
         return None
-    if len(config.intrinsics) != 4 or min(config.intrinsics) <= 0 or len(config.distortion or ()) not in (0, 4):
+    if len(config.intrinsics) != 4 or len(config.distortion or ()) not in (0, 4):
         raise NerfroError(
             f"intrinsics={config.intrinsics}, distortion={config.distortion} are no lens; give fx, fy, cx, cy in "
             "pixels, and k1, k2, p1, p2 or nothing"

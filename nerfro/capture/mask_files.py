@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ from nerfro.capture.targets import opencv
 from nerfro.data.base import DataSource, Frame
 from nerfro.data.image_files import read_mask, to_unit
 from nerfro.data.masks import masks_left_out
+from nerfro.data.transforms import read_json
 from nerfro.errors import NerfroError
 from nerfro.files.drawing import sheet
 from nerfro.files.images import save_picture
@@ -55,13 +55,7 @@ def read_outlines(given: object) -> dict[str, list]:
     if OmegaConf.is_config(given):
         given = OmegaConf.to_container(given)  # type: ignore[arg-type]
     if isinstance(given, str):
-        path = user_path(given)
-        try:
-            given = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise NerfroError(
-                f"outlines={path} cannot be read ({error}); give a JSON file of outlines by name"
-            ) from error
+        given = read_json(user_path(given), "give a JSON file of outlines by name")
     if given is None:
         return {}
     if not isinstance(given, Mapping):

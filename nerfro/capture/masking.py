@@ -20,6 +20,8 @@ _ITERATIONS = 5
 _SURROUNDINGS = 0.4
 # How far the object may reach beyond the projected hull, and what is surely object within it, shares of its diameter.
 _REACH, _CORE = 0.06, 0.2
+# Colours that OpenCV's GrabCut models each of the two regions with.
+_NUM_COLOURS = 5
 
 
 def grab(
@@ -52,7 +54,8 @@ def grab(
     labels[shrink(likely & possible)] = cv2.GC_PR_FGD
     if certain is not None:
         labels[shrink(certain & possible)] = cv2.GC_FGD
-    if not (labels == cv2.GC_BGD).any() or not (labels & 1).any():
+    num_inside = int((labels & 1).sum())
+    if not (labels == cv2.GC_BGD).any() or min(num_inside, labels.size - num_inside) < _NUM_COLOURS:
         return likely & possible  # nothing to learn one of the two from
     cv2.setRNGSeed(0)
     pixels = cv2.resize(np.ascontiguousarray(image[window]), small, interpolation=cv2.INTER_AREA)

@@ -6,11 +6,12 @@ import typing
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Optional
+from typing import Annotated, Any, Optional
 
 import numpy as np
 from omegaconf import MISSING, DictConfig, OmegaConf
 
+from nerfro.allowed import Count, Natural, NotNegative, Range, corners_of_box
 from nerfro.cameras import Cameras
 from nerfro.capture.index_report import CURVE, INDEX
 from nerfro.capture.overlaps import REPORT, SHEET
@@ -54,12 +55,12 @@ class PreprocessConfig:
     room: Optional[bool] = None  # noqa: UP045
     out: Optional[str] = None  # noqa: UP045
     refine: bool = False
-    resolution: int = 96
+    resolution: Annotated[int, Range(at_least=16, at_most=1024)] = 96
     box_min: Optional[list[float]] = None  # noqa: UP045
     box_max: Optional[list[float]] = None  # noqa: UP045
-    wrong_masks: int = 0
-    keep: Optional[int] = None  # noqa: UP045
-    smoothing: float = 1.0
+    wrong_masks: Natural = 0
+    keep: Optional[Count] = None  # noqa: UP045
+    smoothing: NotNegative = 1.0
     overwrite: bool = False
 
 
@@ -69,20 +70,11 @@ def is_given(option: str, overrides: list[str]) -> bool:
 
 
 def claim(config: DictConfig, overrides: list[str]) -> Path:
-    """The folder to write to; refused if an option is out of range, or it is the package's, or a file is there."""
-    if not 16 <= config.resolution <= 1024:
-        raise NerfroError(f"resolution={config.resolution} is not allowed; take 16 to 1024 voxels a side")
-    if config.wrong_masks < 0 or (config.keep is not None and config.keep < 1) or not config.smoothing >= 0:
-        raise NerfroError(
-            f"wrong_masks={config.wrong_masks}, keep={config.keep}, smoothing={config.smoothing} are not allowed; "
-            "wrong_masks and smoothing start at 0, keep at 1"
-        )
+    """The folder to write to; refused if it is the package's, or a file is there."""
     if (config.box_min is None) != (config.box_max is None):
         raise NerfroError("give both box_min and box_max, or neither to have the box found")
-    if config.box_min is not None and (
-        len(config.box_min) != 3 or len(config.box_max) != 3 or not (np.array(config.box_min) < config.box_max).all()
-    ):
-        raise NerfroError(f"box_min={config.box_min}, box_max={config.box_max} is no box; give three numbers each")
+    if config.box_min is not None:
+        corners_of_box(config.box_min, config.box_max)
     if config.out is None and str(config.data.root).startswith(EMBEDDED_PREFIX):
         raise NerfroError(f"data.root={config.data.root} ships with nerfro and is not written to; add out=FOLDER")
     folder = resolve_path(config.data.root) if config.out is None else user_path(config.out)

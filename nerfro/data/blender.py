@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from nerfro.allowed import Distance, Factor
 from nerfro.data.base import Views
 from nerfro.data.frames import Lens, PosedImages
 from nerfro.data.image_files import Alpha
@@ -22,9 +23,9 @@ class BlenderData(PosedImages):
     def __init__(
         self,
         root: str = "embedded:torus",
-        near: float = 2.0,
-        far: float = 6.0,
-        downscale: float = 1,
+        near: Distance = 2.0,
+        far: Distance = 6.0,
+        downscale: Factor = 1,
         alpha: Alpha = "drop",
     ) -> None:
         super().__init__(root, near, far, downscale, alpha)

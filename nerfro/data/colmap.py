@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from nerfro.allowed import Distance, Factor
 from nerfro.data.base import Frame, Views
 from nerfro.data.colmap_model import ColmapCamera, ColmapModel, read_colmap
-from nerfro.data.frames import Lens, PosedImages, held_out
+from nerfro.data.frames import Every, Lens, PosedImages, held_out
 from nerfro.data.image_files import Alpha
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
@@ -37,13 +38,13 @@ class ColmapData(PosedImages):
     def __init__(
         self,
         root: str,
-        near: float | None = None,
-        far: float | None = None,
-        downscale: float = 1,
+        near: Distance | None = None,
+        far: Distance | None = None,
+        downscale: Factor = 1,
         alpha: Alpha = "drop",
         images: str = "images",
         model: str | None = None,
-        test_every: int = 8,
+        test_every: Every = 8,
     ) -> None:
         super().__init__(root, near, far, downscale, alpha)
         self.images, self.model, self.test_every = images, model, test_every

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
+from nerfro.allowed import Coordinate, Range, check
 from nerfro.cameras import Cameras, central_window
 from nerfro.data.base import DataSource, Frame, Views
 from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb
@@ -22,6 +22,7 @@ from nerfro.errors import NerfroError
 from nerfro.lens import distort, undistort
 from nerfro.paths import resolve_path
 
+Every = Annotated[int, Range(at_least=2)]  # each such view is not trained on
 SPLITS = ["train", "val", "test"]
 
 _ROTATION_TOLERANCE = 1e-3
@@ -72,7 +73,7 @@ class PosedImages(DataSource):
     """
 
     def __init__(self, root: str, near: float | None, far: float | None, downscale: float, alpha: Alpha) -> None:
-        check_options(near, far, downscale)
+        _require_interval(near, far)
         self.root = resolve_path(root)
         self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
 
@@ -110,12 +111,16 @@ class PosedImages(DataSource):
             NerfroError: an image or mask is missing, no image or of the wrong size, or a lens has no inverse.
         """
         near, far = nearest if self.near is None else self.near, farthest if self.far is None else self.far
-        check_options(near, far, self.downscale)
+        _require_interval(near, far)
         files, alpha = [frame.image for frame in frames], self.alpha
         images = Pictures.of(files, lambda path: read_rgb(path, alpha), self.downscale, size, alpha != "drop", alpha)
         (height, width), stored = images.shape, images.size[::-1]
         masks = find_masks(files, [frame.mask for frame in frames], self.downscale, stored)
         full = lenses(*stored)
+        for frame, lens in zip(frames, full, strict=True):
+            focal, centre = Annotated[float, Range(at_least=1e-3, at_most=1e9)], Coordinate
+            hints = {"fx": focal, "fy": focal, "cx": centre, "cy": centre}
+            check(f"{frame.name}: its lens has ", hints, vars(lens))
         poses = np.stack([frame.camera_to_world for frame in frames])
         if axes == "opencv":
             poses = poses * np.array([1.0, -1.0, -1.0, 1.0])
@@ -132,19 +137,13 @@ class PosedImages(DataSource):
         return Views(cameras, images, masks, [frame.name for frame in frames], frames=frames)
 
 
-def check_options(near: float | None, far: float | None, downscale: float) -> None:
-    """Refuse options of `PosedImages` that are out of range."""
-    known = (0.0 if near is None else near), (sys.float_info.max if far is None else far)
-    if not 0 <= known[0] < known[1] < math.inf:  # also false for NaN
-        raise NerfroError(f"data.near={near} and data.far={far} are no interval; take 0 <= near < far")
-    if not 1 <= downscale < math.inf:
-        raise NerfroError(f"data.downscale={downscale:g} is not allowed; take 1 for full size, 2 for half, or 2.5")
+def _require_interval(near: float | None, far: float | None) -> None:
+    if near is not None and far is not None and near >= far:
+        raise NerfroError(f"data.near={near} and data.far={far} are no interval; take near < far")
 
 
 def held_out(num_views: int, every: int, split: str, root: Path) -> list[int]:
     """The views of a split where the data has none: each `every`-th, from the first, is for val and test (LLFF)."""
-    if every < 2:
-        raise NerfroError(f"data.test_every={every} leaves nothing to train on; take 2 or more")
     if num_views < 2:
         raise NerfroError(f"data.root={root} holds one image; two or more are needed to train on one and test another")
     return [i for i in range(num_views) if (i % every == 0) == (split != "train")]
@@ -181,6 +180,7 @@ def check_pose(
         )
     if len(matrix) == 4 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > _ROTATION_TOLERANCE:
         raise NerfroError(f"{where}: the last row of {name} is {matrix[3].tolist()}; it must be 0, 0, 0, 1")
+    check(f"{where}: position in ", {name: list[Coordinate]}, {name: matrix[:3, 3].tolist()})
     return matrix[:3]
 
 

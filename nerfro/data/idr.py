@@ -9,8 +9,9 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
+from nerfro.allowed import Distance, Factor
 from nerfro.data.base import Frame, Views
-from nerfro.data.frames import Lens, PosedImages, held_out, list_images
+from nerfro.data.frames import Every, Lens, PosedImages, held_out, list_images
 from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha
 from nerfro.data.transforms import parse_matrix
 from nerfro.errors import NerfroError
@@ -39,13 +40,13 @@ class IdrData(PosedImages):
     def __init__(
         self,
         root: str,
-        near: float | None = None,
-        far: float | None = None,
-        downscale: float = 1,
+        near: Distance | None = None,
+        far: Distance | None = None,
+        downscale: Factor = 1,
         alpha: Alpha = "drop",
         cameras: str = "cameras_sphere.npz",
         world: Literal["sphere", "file"] = "sphere",
-        test_every: int = 8,
+        test_every: Every = 8,
     ) -> None:
         super().__init__(root, near, far, downscale, alpha)
         if world == "file" and (near is None or far is None):

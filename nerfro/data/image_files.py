@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
-from PIL import Image, UnidentifiedImageError
+from PIL import ExifTags, Image, UnidentifiedImageError
 from scipy.sparse import csr_array
 
 from nerfro.errors import NerfroError
@@ -46,6 +46,7 @@ def read_size(path: Path) -> tuple[int, int, int]:
         if is_png16(start):
             return (*struct.unpack_from(">II", start, 16), 16)
         with Image.open(file) as image:
+            _require_upright(image, path)
             return *image.size, 8
 
 
@@ -63,6 +64,17 @@ def _naming(path: Path) -> Iterator[None]:
         raise NerfroError(f"image {path} cannot be read ({error}); copy or export it again") from error
 
 
+def _require_upright(image: Image.Image, path: Path) -> None:
+    """Refuse a photograph that shall be turned when it is shown: which pixels poses and masks mean, nobody knows."""
+    # Pillow itself turns TIFF.
+    orientation = image.getexif().get(ExifTags.Base.Orientation, 1) if "exif" in image.info else 1
+    if orientation != 1:
+        raise NerfroError(
+            f"image {path} asks to be turned or mirrored (EXIF orientation {orientation}); turn its pixels (magick "
+            "mogrify -auto-orient), or remove the entry (exiftool -Orientation=) where poses fit the pixels as stored"
+        )
+
+
 def _read_8bit(content: bytes, path: Path) -> UInt8[np.ndarray, "H W C"]:
     with Image.open(io.BytesIO(content)) as image:
         # Pillow reduces colour TIFF of more bits without a word, as it does PNG; tag 258 is BitsPerSample.
@@ -72,6 +84,7 @@ def _read_8bit(content: bytes, path: Path) -> UInt8[np.ndarray, "H W C"]:
         if image.mode not in ("L", "LA", "RGB", "RGBA"):
             transparent = image.has_transparency_data
             image = image.convert("RGBA" if transparent else "L" if image.mode == "1" else "RGB")
+        _require_upright(image, path)
         levels = np.asarray(image)
     return levels.reshape(*levels.shape[:2], -1)
 

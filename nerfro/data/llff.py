@@ -9,8 +9,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from nerfro.allowed import Distance, Factor
 from nerfro.data.base import Frame, Views
-from nerfro.data.frames import Lens, PosedImages, check_pose, held_out, list_images, require_root
+from nerfro.data.frames import Every, Lens, PosedImages, check_pose, held_out, list_images, require_root
 from nerfro.data.image_files import Alpha
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
@@ -44,14 +45,14 @@ class LlffData(PosedImages):
     def __init__(
         self,
         root: str,
-        near: float | None = None,
-        far: float | None = None,
-        downscale: float = 1,
+        near: Distance | None = None,
+        far: Distance | None = None,
+        downscale: Factor = 1,
         alpha: Alpha = "drop",
         images: str = "images",
         frame: Literal["llff", "eikonal", "file"] = "llff",
         video: str | None = None,
-        test_every: int = 8,
+        test_every: Every = 8,
     ) -> None:
         super().__init__(root, near, far, downscale, alpha)
         self.images, self.frame, self.video, self.test_every = images, frame, video, test_every

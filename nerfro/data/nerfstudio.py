@@ -11,9 +11,10 @@ from typing import Literal
 
 import numpy as np
 
+from nerfro.allowed import Distance, Factor
 from nerfro.data.base import Views
 from nerfro.data.bounds import find_bounds
-from nerfro.data.frames import SPLITS, Lens, PosedImages, held_out
+from nerfro.data.frames import SPLITS, Every, Lens, PosedImages, held_out
 from nerfro.data.image_files import Alpha, read_size
 from nerfro.data.masks import find_mask, find_usable
 from nerfro.data.transforms import Manifest, find_splits, is_number, parse_manifest, read_manifest
@@ -47,12 +48,12 @@ class NerfstudioData(PosedImages):
     def __init__(
         self,
         root: str,
-        near: float | None = None,
-        far: float | None = None,
-        downscale: float = 1,
+        near: Distance | None = None,
+        far: Distance | None = None,
+        downscale: Factor = 1,
         alpha: Alpha = "drop",
         missing: Literal["skip", "refuse"] = "skip",
-        test_every: int = 10,
+        test_every: Every = 10,
     ) -> None:
         super().__init__(root, near, far, downscale, alpha)
         self.skip_missing, self.test_every = missing == "skip", test_every

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from nerfro.allowed import Distance, Factor
 from nerfro.data.base import Frame, Views
 from nerfro.data.frames import Lens, PosedImages, check_pose, list_images
 from nerfro.data.image_files import Alpha
@@ -35,7 +36,12 @@ class NerrfData(PosedImages):
     """
 
     def __init__(
-        self, root: str, near: float = 0.02, far: float | None = None, downscale: float = 1, alpha: Alpha = "drop"
+        self,
+        root: str,
+        near: Distance = 0.02,
+        far: Distance | None = None,
+        downscale: Factor = 1,
+        alpha: Alpha = "drop",
     ) -> None:
         super().__init__(root, near, far, downscale, alpha)
 

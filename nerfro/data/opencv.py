@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import warnings
+from typing import Annotated
 
 import numpy as np
 
+from nerfro.allowed import Distance, Factor, Range
 from nerfro.data.base import Views
 from nerfro.data.frames import Lens, PosedImages
 from nerfro.data.image_files import Alpha
@@ -30,15 +32,13 @@ class OpenCVData(PosedImages):
     def __init__(
         self,
         root: str,
-        near: float = 0.2,
-        far: float = 12.0,
-        downscale: float = 1,
+        near: Distance = 0.2,
+        far: Distance = 12.0,
+        downscale: Factor = 1,
         alpha: Alpha = "drop",
-        eval_crop: float = 1.0,
+        eval_crop: Annotated[float, Range(more_than=0, at_most=1)] = 1.0,
     ) -> None:
         super().__init__(root, near, far, downscale, alpha)
-        if not 0 < eval_crop <= 1:
-            raise NerfroError(f"data.eval_crop={eval_crop} is not allowed; take a share in (0, 1], 1 for no crop")
         self.eval_crop = eval_crop
 
     @property

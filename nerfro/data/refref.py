@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from nerfro.allowed import Distance, Factor
 from nerfro.data.base import Frame, Views
 from nerfro.data.frames import SPLITS, Lens, PosedImages, check_pose
 from nerfro.data.image_files import Alpha
@@ -42,9 +43,9 @@ class RefRefData(PosedImages):
         self,
         root: str,
         scene: str | None = None,
-        near: float = 0.2,
-        far: float | None = None,
-        downscale: float = 1,
+        near: Distance = 0.2,
+        far: Distance | None = None,
+        downscale: Factor = 1,
         alpha: Alpha = "drop",
     ) -> None:
         super().__init__(root, near, far, downscale, alpha)

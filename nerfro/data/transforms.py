@@ -99,10 +99,12 @@ def parse_manifest(path: Path, mask_key: str = "mask_path", skip_missing: bool =
 def read_json(path: Path, unreadable: str) -> Any:
     """The content of a JSON file; `unreadable` is what to tell the user of one that cannot be opened."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        # Whole numbers too long for any use become infinite ones, which are refused where they are read.
+        long = 300
+        return json.loads(path.read_text("utf-8"), parse_int=lambda text: int(text) if len(text) < long else math.inf)
     except OSError as error:
         raise NerfroError(f"{path} cannot be read ({error.strerror}); {unreadable}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise NerfroError(f"{path} is not valid JSON ({error}): truncated? copy or export it again") from error
 
 
@@ -110,9 +112,12 @@ def parse_matrix(value: object, shapes: tuple[tuple[int, int], ...], where: str)
     """A matrix of finite numbers of one of the shapes."""
     allowed = " or ".join(f"{rows}x{columns}" for rows, columns in shapes)
     try:
-        matrix = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise NerfroError(f"{where} is not a matrix of numbers; give {allowed} numbers") from error
+        matrix = np.array(value)
+    except ValueError:  # rows of several lengths
+        matrix = np.empty(0, object)
+    if matrix.dtype.kind not in "fiu":
+        raise NerfroError(f"{where} is not a matrix of numbers; give {allowed} numbers")
+    matrix = matrix.astype(np.float64)
     if matrix.shape not in shapes:
         raise NerfroError(
             f"{where} has shape {'x'.join(map(str, matrix.shape)) or 'of a number'}; give {allowed} numbers"
@@ -147,7 +152,7 @@ def _read_frame(path: Path, index: int, entry: object, mask_key: str) -> Frame:
             raise NerfroError(f"{where} has no '{key}'; add it or take the frame out")
     # RefRef's key for the silhouette.
     stated = entry.get(mask_key, entry.get("mask_file_path"))
-    if not isinstance(entry["file_path"], str) or not isinstance(stated or "", str):
+    if not isinstance(entry["file_path"], str) or not isinstance(stated, str | None):
         raise NerfroError(f"{where}: 'file_path' and '{mask_key}' must be text")
     name = PurePosixPath(entry["file_path"].replace("\\", "/")).as_posix()
     where += f" ('{name}')"

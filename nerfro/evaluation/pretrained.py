@@ -96,7 +96,10 @@ def unreachable(url: str, seconds: float = CONNECT_SECONDS) -> str:
 
 def _read(path: Path, title: str) -> dict[str, Tensor]:
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
+        weights = torch.load(path, map_location="cpu", weights_only=True)
+        if isinstance(weights, dict) and all(isinstance(value, Tensor) for value in weights.values()):
+            return weights
+        raise NerfroError(f"{title} weights {path} are no state dict; delete it to fetch it again")
     except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
         reason = str(error).partition("\n")[0]
         raise NerfroError(f"{title} weights {path} cannot be read ({reason}); delete it to fetch it again") from error

@@ -6,27 +6,22 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from nerfro.allowed import NotNegative, Positive, Side, checked
 from nerfro.cameras import Cameras
-from nerfro.errors import NerfroError
 from nerfro.models.base import NerfModel, RenderedRays
 from nerfro.pixel_parts import contrast, divergence, part_rays, rays_beside
 
 
+@checked("supersampling")
 @dataclass(frozen=True)
 class Supersampling:
     """How many rays a pixel is given."""
 
-    side: int = 1  # rays in each direction; a chosen pixel costs side^2 more rays
+    side: Side = 1  # rays in each direction; a chosen pixel costs side^2 more rays
     # Pixels are chosen whose ray leaves so many pixel angles or more (`pixel_parts.divergence`) from the one beside it.
-    divergence: float = 0.0
+    divergence: NotNegative = 0.0
     # And pixels whose colour differs from that of a neighbour by so much (sRGB): fine texture, edges of things inside.
-    contrast: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.side < 1 or self.divergence < 0:
-            raise NerfroError(
-                f"supersampling side={self.side} divergence={self.divergence}; take 1 or more, and 0 or more"
-            )
+    contrast: Positive | None = None
 
 
 def render_view(model: NerfModel, cameras: Cameras, view: int, supersampling: Supersampling) -> RenderedRays:

@@ -4,17 +4,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Optional
+from typing import Annotated, Literal, Optional
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
-from nerfro.allowed import Count, NotNegative, Positive
-from nerfro.errors import NerfroError
-from nerfro.files.atomic import refuse_existing
+from nerfro.allowed import NotNegative, NumRays, Positive, Side
+from nerfro.errors import Interrupted, NerfroError
+from nerfro.files.atomic import refuse_existing, write_atomically
+from nerfro.files.owned import held, require_own
 from nerfro.paths import user_path
+
+REQUEST_FILE = "evaluate.yaml"
 
 
 @dataclass
@@ -24,19 +29,21 @@ class EvaluateConfig:
     checkpoint: Optional[str] = None  # file written by nerfro.train, to render and score
     split: str = "test"  # of the data to render
     root: Optional[str] = None  # folder of the data, if it has moved since training
-    chunk_size: Optional[Count] = None  # rays rendered at once, which bounds the memory; the trained one by default
+    chunk_size: Optional[NumRays] = None  # rays rendered at once, which bounds the memory; the trained one by default
     # Rays per pixel (see docs/experiments.md); as trained by default.
-    supersample: Optional[Count] = None
+    supersample: Optional[Side] = None
     divergence: Optional[NotNegative] = None
     contrast: Optional[Positive] = None
     predictions: Optional[str] = None  # folder of pictures to score, instead of a checkpoint
     references: Optional[str] = None  # folder of pictures of the same names, compared with `predictions`
     # Folder of masks of the same names; by default those that lie with the references, or their transparency.
     masks: Optional[str] = None
-    alpha: str = "drop"  # what becomes of transparency in both: `drop`, or composite over `white` or `black`
+    # What becomes of transparency in both: `drop`, or composite over `white` or `black`.
+    alpha: Annotated[str, Literal["drop", "white", "black"]] = "drop"
     # Folder for pictures and tables; by default beside the checkpoint's folder, or `scores` in `predictions`.
     out: Optional[str] = None
-    protocol: str = "8bit"  # `8bit` rounds predictions to what a PNG holds before they are scored, `float` does not
+    # `8bit` rounds predictions to what a PNG holds before they are scored, `float` does not.
+    protocol: Annotated[str, Literal["8bit", "float"]] = "8bit"
     lpips_backbone: Optional[str] = None  # file of AlexNet weights, if torch's hub cache has none
     lpips_vgg_backbone: Optional[str] = None  # file of VGG-16 weights, if torch's hub cache has none
     device: str = "auto"  # `cpu`, `cuda`, or `auto` for a GPU if there is one
@@ -59,16 +66,25 @@ def require_one_task(config: DictConfig) -> None:
     for name in others:
         if config[name] != getattr(EvaluateConfig, name):
             raise NerfroError(f"{name}={config[name]} means nothing with {task}=...; leave it out")
-    for name, allowed in (("protocol", ("8bit", "float")), ("alpha", ("drop", "white", "black"))):
-        if config[name] not in allowed:
-            raise NerfroError(f"{name}={config[name]} is not allowed; choose one of {', '.join(allowed)}")
 
 
-def free_folder(config: DictConfig, default: Path) -> Path:
-    """Where the scores go; refused if an earlier evaluation lies there and may not be replaced."""
+@contextmanager
+def own_folder(config: DictConfig, default: Path) -> Iterator[Path]:
+    """Hold the folder that the scores go to; refused if it holds anything else than an evaluation to be replaced."""
     folder = default if config.out is None else user_path(config.out)
+    if not (folder / REQUEST_FILE).is_file():
+        require_own(folder, (), "it is no evaluation's folder; give another out=...")
     refuse_existing([folder / "metrics.json"], config.overwrite)
-    return folder
+    with held(folder, "out"):
+        try:
+            yield folder
+        except KeyboardInterrupt:
+            raise Interrupted("the same command begins it again") from None
+
+
+def record(folder: Path, config: DictConfig) -> None:
+    """Write what is evaluated, before anything else of it: from then on the folder is an evaluation's."""
+    write_atomically(folder / REQUEST_FILE, OmegaConf.to_yaml(config, resolve=True))
 
 
 def find_device(name: str) -> torch.device:

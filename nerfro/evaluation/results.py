@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from nerfro.data.transforms import is_number, read_json
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 
@@ -121,28 +122,33 @@ def read_metrics_json(path: Path | str) -> RunMetrics:
         NerfroError: if the file is missing, truncated, or lacks a key.
     """
     path = Path(path)
+    if not path.is_file():
+        raise NerfroError(f"{path} does not exist; has this run been evaluated? run nerfro.evaluate on it")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path, "run nerfro.evaluate on the run again")
         views = tuple(
             ViewScores(
-                row["name"],
+                str(row["name"]),
                 _scores(row),
                 {r: _scores(s) for r, s in row.get("regions", {}).items() if r in OBJECT_REGIONS},
             )
             for row in content["views"]
         )
         result = EvaluationResult(views, content.get("notes", {}), content.get("protocol", "8bit"))
-        return RunMetrics(result, content["steps"], content["train_seconds"], content["rays_per_second"])
-    except FileNotFoundError as error:
-        raise NerfroError(f"{path} does not exist; has this run been evaluated? run nerfro.evaluate on it") from error
-    except (OSError, ValueError) as error:  # unreadable, not UTF-8, not JSON
-        raise NerfroError(f"{path} cannot be read ({error}); run nerfro.evaluate on the run again") from error
+        spent = {key: _number(content[key]) for key in ("steps", "train_seconds", "rays_per_second")}
+        return RunMetrics(result, **spent)  # type: ignore[arg-type]
     except (KeyError, TypeError, AttributeError) as error:
         raise NerfroError(f"{path} is not a metrics file ({error!r}); run nerfro.evaluate on the run again") from error
 
 
 def _scores(row: Mapping[str, Score]) -> dict[str, Score]:
-    return {metric.name: row.get(metric.name) for metric in METRICS}
+    return {metric.name: _number(row.get(metric.name)) for metric in METRICS}
+
+
+def _number(value: object) -> float | None:
+    if value is None or is_number(value):
+        return value
+    raise TypeError(f"{value!r} is no number")
 
 
 def _refuse_non_finite(value: object, name: str) -> None:

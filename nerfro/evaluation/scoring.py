@@ -49,12 +49,7 @@ def score_folders(
     folder: Path,
     device: torch.device,
 ) -> EvaluationResult:
-    """Score each prediction on a device, and draw its error maps into `folder/errors`.
-
-    A file that is damaged or does not fit its partner is told before anything is scored.
-    """
-    for pair in pairs:  # kept in memory for no longer than it takes
-        pair.load(alpha)
+    """Score each prediction on a device, and draw its error maps into `folder/errors`."""
     metrics = metrics.to(device)
     for pair in tqdm(pairs, unit="view", desc="evaluate", dynamic_ncols=True):
         prediction, reference, coverage = pair.load(alpha)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Count, Natural, Positive, corners_of_box
+from nerfro.allowed import AnyNumber, Count, Natural, Positive, corners_of_box
 from nerfro.fields.base import Field
 from nerfro.fields.encoding import positional_encoding
 from nerfro.fields.mlp import RadianceMLP
@@ -41,8 +41,8 @@ class NerfField(Field):
         position_degree: Natural = 10,
         direction_degree: Natural = 4,
         normalise: Positive = 1.0,
-        box_min: list[float] = (-inf, -inf, -inf),  # type: ignore[assignment]
-        box_max: list[float] = (inf, inf, inf),  # type: ignore[assignment]
+        box_min: list[AnyNumber] = (-inf, -inf, -inf),  # type: ignore[assignment]
+        box_max: list[AnyNumber] = (inf, inf, inf),  # type: ignore[assignment]
     ) -> None:
         super().__init__()
         box = corners_of_box(box_min, box_max, bounded=False)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import IO
 
 from nerfro.errors import NerfroError
+from nerfro.files.owned import require_held
 
 
 @contextlib.contextmanager
@@ -22,6 +23,7 @@ def atomic_file(path: Path | str, advice: str = "free some space or choose anoth
     """
     path = Path(path)
     temporary = None
+    require_held(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import zipfile
+import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
@@ -14,6 +14,12 @@ import numpy as np
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import atomic_file
 from nerfro.paths import user_path
+
+# Bytes of all entries together; those that have not been used for longest go first.
+LIMIT = 32 * 2**30
+_ENTRIES = ("distance_*.npz", "occupancy_*.npz", "mapped_*.npy")
+_ABANDONED_SECONDS = 86400.0
+_CHECKSUM = "checksum"  # of an entry's arrays, beside them
 
 
 def cache_dir() -> Path:
@@ -66,8 +72,9 @@ def _reading(path: Path, trouble: str, advice: str) -> Iterator[None]:
         yield
     except FileNotFoundError as error:
         raise NerfroError(f"{path} does not exist; check the path") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise NerfroError(f"{path} {trouble} ({error}); {advice}") from error
+    except Exception as error:  # NumPy and zipfile raise nearly anything on a damaged file
+        reason = str(error).strip().split("\n", 1)[0] or type(error).__name__
+        raise NerfroError(f"{path} {trouble} ({reason}); {advice}") from error
 
 
 def cached_arrays(
@@ -83,12 +90,34 @@ def cached_arrays(
     if not enabled:
         return compute()
     path = cache_dir() / f"{key}.npz"
-    if path.is_file():
-        try:
-            return load_arrays(path)
-        except NerfroError:
-            path.unlink(missing_ok=True)
+    with contextlib.suppress(NerfroError, OSError):
+        arrays = load_arrays(path)
+        if str(arrays.pop(_CHECKSUM, "")) == _checksum(arrays):
+            os.utime(path)
+            return arrays
     arrays = compute()
-    with contextlib.suppress(NerfroError):
-        save_arrays(path, arrays)
+    with contextlib.suppress(NerfroError, OSError):
+        make_room(path.parent, sum(array.nbytes for array in arrays.values()))
+        save_arrays(path, {**arrays, _CHECKSUM: np.array(_checksum(arrays))})
     return arrays
+
+
+def make_room(folder: Path, num_bytes: int) -> None:
+    """Remove what killed processes left, and what was used longest ago while there would be more than the limit.
+
+    A process that has a file mapped keeps it after it is removed.
+    """
+    for pattern in _ENTRIES:
+        for partial in folder.glob(f".{pattern}*.partial"):
+            if time.time() - partial.stat().st_mtime > _ABANDONED_SECONDS:
+                partial.unlink(missing_ok=True)
+    files = [path for pattern in _ENTRIES for path in folder.glob(pattern)]
+    total = num_bytes + sum(path.stat().st_size for path in files)
+    for path in sorted(files, key=lambda path: path.stat().st_mtime):
+        if total > LIMIT:
+            total -= path.stat().st_size
+            path.unlink(missing_ok=True)
+
+
+def _checksum(arrays: Mapping[str, np.ndarray]) -> str:
+    return content_hash(*(part for name in sorted(arrays) for part in (name, arrays[name])))

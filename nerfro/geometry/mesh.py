@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from nerfro.allowed import Coordinate, check
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 
@@ -77,6 +78,8 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
         raise NerfroError(f"mesh {path} has vertices that are not finite; export it again")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise NerfroError(f"mesh {path} has triangles of vertices that it lacks; export it again")
+    check(f"mesh {path} reaches too far; scale it to about one unit: ", {"coordinate": Coordinate},
+          {"coordinate": float(vertices.flat[np.abs(vertices).argmax()])})  # fmt: skip
     extent = float(np.ptp(vertices, axis=0).min())
     if extent < _THINNEST:
         raise NerfroError(
@@ -115,8 +118,25 @@ def merge_vertices(
     faces: Int[np.ndarray, "F 3"],
     normals: Float[np.ndarray, "F 3 3"] | None = None,
 ) -> TriangleMesh:
-    """Unite vertices at equal positions (texture seams and STL files repeat them) and drop collapsed triangles."""
+    """Unite vertices at equal positions (texture seams and STL files repeat them); drop collapsed triangles and copies.
+
+    A triangle and its copy, which looks the same way, would together bound nothing.
+    """
     unique, inverse = np.unique(vertices, axis=0, return_inverse=True)
     merged = inverse.reshape(-1)[faces]
-    distinct = (merged[:, 0] != merged[:, 1]) & (merged[:, 1] != merged[:, 2]) & (merged[:, 2] != merged[:, 0])
-    return TriangleMesh(unique, merged[distinct], None if normals is None else normals[distinct])
+    kept = (merged[:, 0] != merged[:, 1]) & (merged[:, 1] != merged[:, 2]) & (merged[:, 2] != merged[:, 0])
+    # Turned so that the smallest index comes first, which keeps the way that a triangle looks.
+    turned = np.take_along_axis(merged, (merged.argmin(1)[:, None] + np.arange(3)) % 3, 1)
+    first = np.zeros(len(merged), bool)
+    first[np.unique(turned, axis=0, return_index=True)[1]] = True
+    kept &= first
+    return TriangleMesh(unique, merged[kept], None if normals is None else normals[kept])
+
+
+def require_inside(some: bool) -> None:
+    """Refuse a mesh in which no vertex of a grid lies: there would be no object."""
+    if not some:
+        raise NerfroError(
+            "no vertex of the grid lies inside the mesh: it is flat, thinner than a voxel (raise medium.resolution), "
+            "or every triangle is there twice, facing both ways"
+        )

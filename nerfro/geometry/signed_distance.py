@@ -8,11 +8,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numba import prange
 from scipy.ndimage import distance_transform_edt
+from tqdm import tqdm
 
-from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.mesh import TriangleMesh, require_inside
 from nerfro.geometry.normals import corner_normals
 from nerfro.geometry.occupancy import occupancy_fraction, triangles_by_plane
 from nerfro.kernels.compilation import compiled, compiled_parallel
+
+_LEAST_DEPTH = 0.01  # of a vertex in the mesh, voxels
+_PLANES = 16  # of a grid, between two looks of the progress bar
 
 
 def signed_distance_grid(
@@ -37,12 +41,19 @@ def signed_distance_grid(
     triangles = np.ascontiguousarray(mesh.triangles)
     order, starts = triangles_by_plane(triangles, origin[0], spacing[0], resolution, reach)
     normals = corner_normals(mesh, crease_degrees)
-    distance, height = _narrow_band(triangles, normals, order, starts, origin, spacing, resolution, reach)
+    distance, height = (np.full((resolution,) * 3, value, np.float32) for value in (np.inf, 0.0))
+    for first in tqdm(range(0, resolution, _PLANES), desc="distances", delay=2, dynamic_ncols=True):
+        planes = slice(first, first + _PLANES)
+        found = distance[planes], height[planes]
+        _narrow_band(triangles, normals, order, starts[first:], origin, spacing, first, reach, *found)
     near = distance <= reach
     # A point's nearest surface point has a near voxel within half a voxel's diagonal, wherever that is in the band.
     half_diagonal = 0.5 * float(np.linalg.norm(spacing))
     far = distance_to_set(distance <= half_diagonal, spacing) - half_diagonal
-    sign = np.where(occupancy_fraction(mesh, box, resolution, subsamples=1) > 0.5, -1.0, 1.0)
+    inside = occupancy_fraction(mesh, box, resolution, subsamples=1) > 0.5
+    # In a flat mesh those count as inside that happen to lie on it.
+    require_inside(bool((inside & (distance > _LEAST_DEPTH * spacing.min())).any()))
+    sign = np.where(inside, -1.0, 1.0)
     return np.where(near, sign * distance - height, sign * np.maximum(far, reach)).astype(np.float32)
 
 
@@ -99,12 +110,14 @@ def _closest_barycentric(t, x, y, z):
 
 
 @compiled_parallel
-def _narrow_band(triangles, normals, order, starts, origin, spacing, resolution, reach):
-    """Distance to the nearest triangle (infinite beyond reach) and the smooth surface's signed height over it."""
-    distance = np.full((resolution, resolution, resolution), np.inf, np.float32)
-    height = np.zeros((resolution, resolution, resolution), np.float32)
-    for i in prange(resolution):
-        x = origin[0] + i * spacing[0]
+def _narrow_band(triangles, normals, order, starts, origin, spacing, first, reach, distance, height):
+    """Put the distance to the nearest triangle, and the smooth surface's signed height over it, where it is in reach.
+
+    The planes of the grid are those from number `first` on.
+    """
+    resolution = distance.shape[1]
+    for i in prange(len(distance)):
+        x = origin[0] + (first + i) * spacing[0]
         for index in order[starts[i] : starts[i + 1]]:
             t = triangles[index]
             first_j = max(math.ceil((t[:, 1].min() - reach - origin[1]) / spacing[1]), 0)
@@ -140,4 +153,3 @@ def _narrow_band(triangles, normals, order, starts, origin, spacing, resolution,
                                 + (t[corner, 2] - pz) * normals[index, corner, 2]
                             )
                         height[i, j, k] = 0.5 * total
-    return distance, height

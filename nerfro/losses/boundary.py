@@ -5,6 +5,7 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.allowed import Natural, NotNegative
 from nerfro.distributed import rank_and_size, sum_over_processes
 from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
@@ -25,10 +26,10 @@ class BoundaryRegulariser(Loss):
 
     def __init__(
         self,
-        weight: float = 0.025,
-        start: int = 2500,
-        ramp: int = 0,
-        threshold: float = 0.5,
+        weight: NotNegative = 0.025,
+        start: Natural = 2500,
+        ramp: Natural = 0,
+        threshold: NotNegative = 0.5,
         refracted_only: bool = False,
     ) -> None:
         super().__init__(weight, start, ramp)

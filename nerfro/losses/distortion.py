@@ -5,6 +5,7 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.allowed import Natural, NotNegative
 from nerfro.distributed import mean_over_rays
 from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
@@ -19,7 +20,7 @@ class Distortion(Loss):
     scale; contracted length, where space is contracted, in units of all of it.
     """
 
-    def __init__(self, weight: float = 1e-2, start: int = 0, ramp: int = 0) -> None:
+    def __init__(self, weight: NotNegative = 1e-2, start: Natural = 0, ramp: Natural = 0) -> None:
         super().__init__(weight, start, ramp)
 
     def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.func import functional_call
 from torch.nn.functional import mse_loss
 
+from nerfro.allowed import Natural, NotNegative
 from nerfro.boundaries.base import Boundary
 from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
@@ -25,7 +26,9 @@ class Photometric(Loss):
         coarse: factor of the earlier levels' errors; 1 in the paper, 0.1 in mip-NeRF.
     """
 
-    def __init__(self, weight: float = 1.0, start: int = 0, ramp: int = 0, coarse: float = 1.0) -> None:
+    def __init__(
+        self, weight: NotNegative = 1.0, start: Natural = 0, ramp: Natural = 0, coarse: NotNegative = 1.0
+    ) -> None:
         super().__init__(weight, start, ramp)
         self.coarse = coarse
 

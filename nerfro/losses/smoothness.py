@@ -7,7 +7,7 @@ from typing import Annotated
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Range
+from nerfro.allowed import Natural, NotNegative, Range
 from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
 from nerfro.types import Batch, Exits, Rendering
@@ -22,7 +22,11 @@ class Smoothness(Loss):
     """
 
     def __init__(
-        self, weight: float = 1.0, start: int = 2500, ramp: int = 0, tile_size: Annotated[int, Range(at_least=2)] = 128
+        self,
+        weight: NotNegative = 1.0,
+        start: Natural = 2500,
+        ramp: Natural = 0,
+        tile_size: Annotated[int, Range(at_least=2)] = 128,
     ) -> None:
         super().__init__(weight, start, ramp)
         self.tile_size = tile_size

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerfro.allowed import Count, Range
+from nerfro.allowed import Count, Natural, NotNegative, Range
 from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
 from nerfro.types import Batch, Exits, Rendering
@@ -30,9 +30,9 @@ class TotalVariation(Loss):
 
     def __init__(
         self,
-        weight: float = 1e-3,
-        start: int = 0,
-        ramp: int = 0,
+        weight: NotNegative = 1e-3,
+        start: Natural = 0,
+        ramp: Natural = 0,
         num_directions: Count = 1024,
         angle: Annotated[float, Range(more_than=0, less_than=90)] = 0.7,
     ) -> None:

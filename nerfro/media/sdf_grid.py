@@ -9,17 +9,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Natural, NotNegative, Positive, Range, corners_of_box
+from nerfro.allowed import NotNegative, Positive, Range, Resolution, corners_of_box
 from nerfro.errors import NerfroError
 from nerfro.files.cache import cached_arrays, content_hash
+from nerfro.geometry.bodies import require_separate
 from nerfro.geometry.interpolation import quadratic_spline, smooth, spline_coefficients
 from nerfro.geometry.intersection import MeshIntersector, Triangles
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.signed_distance import signed_distance_grid
+from nerfro.kernels.available import require_bytes
 from nerfro.kernels.constants import constant
 from nerfro.media.base import Scalars, Vectors, lazy_buffer
 from nerfro.media.solid import Solid
-from nerfro.media.voxel_grid import check_margin
+from nerfro.media.voxel_grid import BYTES_A_VERTEX, check_margin
 from nerfro.paths import resolve_path
 from nerfro.registry import register
 
@@ -71,12 +73,12 @@ class SdfGrid(Solid):
         inner_meshes: list[str] = [],  # noqa: B006 (the registry reads and copies it)
         inner_iors: list[Positive] = [],  # noqa: B006
         learn_ior: bool = False,
-        resolution: Annotated[int, Range(at_least=4)] = 128,
+        resolution: Resolution = 128,
         box_min: list[float] = [-1.5, -1.5, -1.5],  # noqa: B006
         box_max: list[float] = [1.5, 1.5, 1.5],  # noqa: B006
         shell_voxels: Positive = 0.1,
         crease_degrees: NotNegative = 30.0,
-        smoothing_size: Natural = 0,
+        smoothing_size: Annotated[int, Range(at_least=0, at_most=99)] = 0,
         smoothing_sigma: Positive = 1.0,
         accept_open_mesh: bool = False,
         absorption: list[NotNegative] = [],  # noqa: B006
@@ -89,6 +91,7 @@ class SdfGrid(Solid):
                 f"medium.inner_meshes has {len(inner_meshes)} entries and medium.inner_iors {len(inner_iors)}; "
                 "give one index for each inner mesh"
             )
+        require_bytes(BYTES_A_VERTEX * resolution**3, f"medium.resolution={resolution}")
         box = corners_of_box(box_min, box_max)
         spacing = (box[1] - box[0]) / (resolution - 1)
         shell = shell_voxels * float(spacing.min())
@@ -99,6 +102,8 @@ class SdfGrid(Solid):
         distances = []
         for body in self.meshes:
             check_margin(body, box, resolution, 2)
+            if body.is_closed:
+                require_separate(body)
             distances.append(_cached_distance(body, box, resolution, band, crease_degrees, cache))
         values = torch.from_numpy(np.stack(distances))
         if smoothing_size:

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_type_hints
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Count, Natural, Positive, Range, corners_of_box
+from nerfro.allowed import Count, Positive, Range, Resolution, check, corners_of_box
 from nerfro.errors import NerfroError
 from nerfro.files.cache import cached_arrays, content_hash, load_arrays, save_arrays
+from nerfro.geometry.bodies import require_separate
 from nerfro.geometry.interpolation import gradient, smooth, trilinear
-from nerfro.geometry.mesh import TriangleMesh, load_mesh
+from nerfro.geometry.mesh import TriangleMesh, load_mesh, require_inside
 from nerfro.geometry.occupancy import occupancy_fraction
 from nerfro.geometry.signed_distance import distance_to_set
+from nerfro.kernels.available import require_bytes
 from nerfro.kernels.constants import constant
 from nerfro.media.base import Medium, Scalars, Vectors, lazy_buffer
 from nerfro.paths import resolve_path
@@ -24,6 +26,7 @@ from nerfro.registry import register
 
 # Part of the cache's key: raise it when the same mesh and settings give other fractions than before.
 _VERSION = 1
+BYTES_A_VERTEX = 64  # of a grid while it is made
 
 
 @register("medium", "voxel_grid")
@@ -53,10 +56,10 @@ class VoxelGrid(Medium):
         self,
         mesh: str | None = None,
         ior: Positive = 1.5,
-        resolution: Annotated[int, Range(at_least=4)] = 128,
+        resolution: Resolution = 128,
         box_min: list[float] = [-1.5, -1.5, -1.5],  # noqa: B006 (the registry reads and copies it)
         box_max: list[float] = [1.5, 1.5, 1.5],  # noqa: B006
-        smoothing_size: Natural = 9,
+        smoothing_size: Annotated[int, Range(at_least=0, at_most=99)] = 9,
         smoothing_sigma: Positive = 1.0,
         subsamples: Count = 4,
         accept_open_mesh: bool = False,
@@ -70,10 +73,13 @@ class VoxelGrid(Medium):
             stored = _load_grid(resolve_path(grid))
             self._set(*stored)
             return
+        require_bytes(BYTES_A_VERTEX * resolution**3, f"medium.resolution={resolution}")
         box = corners_of_box(box_min, box_max)
         loaded = load_mesh(resolve_path(str(mesh)), accept_open_mesh)
         # One voxel for the sub-samples, one for the gradient's difference, and what the smoothing spreads.
         check_margin(loaded, box, resolution, 2 + smoothing_size // 2)
+        if loaded.is_closed:
+            require_separate(loaded)
         key = "occupancy_" + content_hash(_VERSION, loaded.vertices, loaded.faces, box, resolution, subsamples)
         occupancy = cached_arrays(
             key,
@@ -81,6 +87,7 @@ class VoxelGrid(Medium):
             lambda: {"occupancy": occupancy_fraction(loaded, box, resolution, subsamples).astype(np.float16)},
             cache,
         )["occupancy"]
+        require_inside(occupancy.max() > 0.25)  # more than what happens to lie on a flat mesh
         fractions, corners = torch.from_numpy(occupancy).float(), torch.from_numpy(box).float()
         self._set(fractions, corners, ior, smoothing_size, smoothing_sigma)
 
@@ -209,6 +216,13 @@ def _load_grid(path: Path) -> tuple[Tensor, Tensor, float, int, float]:
     missing = {"occupancy", "box", "ior", "smoothing"} - arrays.keys()
     if missing:
         raise NerfroError(f"{path} is no voxel grid, it lacks {', '.join(sorted(missing))}; make it again")
-    size, sigma = arrays["smoothing"]
-    occupancy, box = torch.from_numpy(arrays["occupancy"]).float(), torch.from_numpy(arrays["box"]).float()
-    return occupancy, box, float(arrays["ior"]), int(size), float(sigma)
+    shapes = {"occupancy": (*arrays["occupancy"].shape, 0, 0, 0)[:3], "box": (2, 3), "ior": (), "smoothing": (2,)}
+    if any(arrays[name].shape != shape or arrays[name].dtype.kind not in "fiu" for name, shape in shapes.items()):
+        raise NerfroError(f"{path} is no voxel grid; make it again")
+    occupancy, (size, sigma), ior = arrays["occupancy"], arrays["smoothing"].tolist(), float(arrays["ior"])
+    values = {"ior": ior, "smoothing_size": int(size), "smoothing_sigma": sigma}
+    values["occupancy"] = [float(occupancy.min()), float(occupancy.max())]
+    hints = get_type_hints(VoxelGrid.__init__, include_extras=True)
+    check(f"{path}: ", hints | {"occupancy": list[Annotated[float, Range(at_least=0, at_most=1)]]}, values)
+    box = torch.from_numpy(corners_of_box(*arrays["box"].tolist())).float()
+    return torch.from_numpy(occupancy).float(), box, ior, int(size), sigma

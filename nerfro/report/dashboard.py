@@ -10,10 +10,12 @@ import shutil
 import socket
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from omegaconf import MISSING
 from omegaconf.errors import OmegaConfBaseException
 
+from nerfro.allowed import Range
 from nerfro.errors import NerfroError
 from nerfro.files.foreign_config import foreign_config
 from nerfro.training.sweeps import scene_name
@@ -28,7 +30,7 @@ class DashboardConfig:
 
     outputs: str = MISSING
     host: str = MISSING
-    port: int = MISSING
+    port: Annotated[int, Range(at_least=0, at_most=2**16 - 1)] = MISSING
     open: bool = MISSING
 
 
@@ -89,8 +91,6 @@ def serve(logs: Path, host: str, port: int) -> str:
         socket.getaddrinfo(host, None)
     except OSError as error:
         raise NerfroError(f"host={host} is no address of this machine ({error.strerror}); try localhost") from error
-    if not 0 <= port < 2**16:
-        raise NerfroError(f"port={port} is no port; give 1 to {2**16 - 1}, or 0 for any that is free")
     # Its warning about reduced functions without TensorFlow; nothing here needs it.
     tb_logging.get_logger().setLevel(logging.ERROR)
     server = program.TensorBoard()

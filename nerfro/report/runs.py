@@ -15,11 +15,13 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from PIL import Image
 
+from nerfro.data.transforms import read_json
 from nerfro.errors import NerfroError, first_of
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
 from nerfro.files.foreign_config import foreign_config
 from nerfro.paths import EMBEDDED_PREFIX, user_path
-from nerfro.training.sweeps import CELL_FILE, scene_name
+from nerfro.training.run_folder import CELL_FILE
+from nerfro.training.sweeps import scene_name
 
 _FACTS = {"command", "machine", "python", "threads", "versions"}  # of run.json
 
@@ -110,7 +112,7 @@ def _why_unfinished(folder: Path) -> str:
     """The reason that a sweep recorded for a run without scores, if one did."""
     try:
         reason = json.loads((folder / CELL_FILE).read_text(encoding="utf-8"))["reason"]
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         reason = ""
     return f"it failed: {reason}" if reason else "it has no metrics.json, so it has not been evaluated"
 
@@ -121,7 +123,7 @@ def read_run(folder: Path) -> Run:
     try:
         text = (folder / "config.yaml").read_text(encoding="utf-8")
         config: Any = OmegaConf.to_container(foreign_config(text, folder / "config.yaml"))
-        facts = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+        facts = read_json(folder / "run.json", "repair it or leave the run out")
         absent = _FACTS - facts.keys()
         if absent:
             raise NerfroError(f"{folder / 'run.json'} lacks {first_of(sorted(absent))}; leave the run out")

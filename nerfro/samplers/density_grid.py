@@ -55,13 +55,13 @@ class DensityGridSampler(PointSampler):
 
     def __init__(
         self,
-        num_samples: Count = 32,
-        num_bins: Annotated[int, Range(at_least=2)] = 96,
+        num_samples: Annotated[int, Range(at_least=1, at_most=8192)] = 32,
+        num_bins: Annotated[int, Range(at_least=2, at_most=8192)] = 96,
         box_min: list[float] = (-1.0, -1.0, -1.0),  # type: ignore[assignment]
         box_max: list[float] = (1.0, 1.0, 1.0),  # type: ignore[assignment]
         radius: Positive | None = None,
         near: NotNegative = 0.0,
-        resolution: Annotated[int, Range(at_least=2)] = 64,
+        resolution: Annotated[int, Range(at_least=2, at_most=1024)] = 64,
         uniform: Share = 0.2,
         every: Count = 16,
         looks: Share = 1 / 16,

@@ -44,7 +44,7 @@ class Eikonal(PathSampler):
     def __init__(
         self,
         integrator: Literal["adaptive", "euler", "leapfrog", "rk4"] = "adaptive",
-        num_steps: Annotated[int, Range(at_least=2)] = 768,
+        num_steps: Annotated[int, Range(at_least=2, at_most=8192)] = 768,
         tolerance: Positive = 2e-4,
         max_steps: Count = 16384,
     ) -> None:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Count, NotNegative, Range
+from nerfro.allowed import NotNegative, Range
 from nerfro.errors import NerfroError
 from nerfro.registry import register
 from nerfro.samplers.base import PointSampler
@@ -36,8 +36,8 @@ class Hierarchical(PointSampler):
 
     def __init__(
         self,
-        num_coarse: Annotated[int, Range(at_least=4)] = 64,
-        num_fine: Count = 128,
+        num_coarse: Annotated[int, Range(at_least=4, at_most=8192)] = 64,
+        num_fine: Annotated[int, Range(at_least=1, at_most=8192)] = 128,
         union: bool = True,
         blur: bool = False,
         padding: NotNegative = 0.0,

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from nerfro.allowed import Count, Positive, Share
+from nerfro.allowed import Positive, Range, Share
 from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.kernels.tolerances import MIN_SEARCH_STEP
@@ -51,7 +51,7 @@ class Snell(PathSampler):
     def __init__(
         self,
         interface: Literal["sdf", "mesh"] = "sdf",
-        max_events: Count = 16,
+        max_events: Annotated[int, Range(at_least=1, at_most=1000)] = 16,
         branches: Literal["none", "first", "all"] = "none",
         least_weight: Share = 0.02,
         wavelengths: list[Positive] = (610.0, 550.0, 465.0),  # type: ignore[assignment]

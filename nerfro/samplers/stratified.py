@@ -36,7 +36,7 @@ class Stratified(PointSampler):
 
     def __init__(
         self,
-        num_samples: Annotated[int, Range(at_least=2)] = 64,
+        num_samples: Annotated[int, Range(at_least=2, at_most=8192)] = 64,
         draw: Literal["arc_length", "vertices"] = "arc_length",
         cast: Literal["points", "cones"] = "points",
         offset: Annotated[float, Range(at_least=0, less_than=1)] = 0.5,

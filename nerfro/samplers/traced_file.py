@@ -13,6 +13,7 @@ from jaxtyping import Float
 from omegaconf import MISSING
 from torch import Tensor
 
+from nerfro.allowed import Coordinate, Distance, check
 from nerfro.errors import NerfroError
 from nerfro.files.cache import load_arrays
 from nerfro.geometry.interpolation import intersect_box
@@ -41,10 +42,10 @@ class TraceConfig:
     # .npz that is written, with `exit_positions` and `exit_directions` [R, 3], `path_lengths` and `hit` [R]. Where rays
     # split there is a row for each path, and also its `ray` (row in `rays`) and `throughput` [P, 3].
     out: str = MISSING
-    near: float = 0.0  # arc length at which paths begin
+    near: Distance = 0.0  # arc length at which paths begin
     # Arc length at which paths end, or where they have left the medium's box if that is later; by default all end
     # where they leave it.
-    far: Optional[float] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    far: Optional[Distance] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     plot: bool = False  # whether to draw some of the paths and the object beside `out`, as .png
     overwrite: bool = False  # whether `out`, and the drawing, may be replaced
 
@@ -82,8 +83,10 @@ def read_rays(file: FilePath) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"
             raise NerfroError(f"{file} has no array '{name}'; it needs origins and directions, both [R, 3]")
         if arrays[name].ndim != 2 or arrays[name].shape[1] != 3 or len(arrays[name]) == 0:
             raise NerfroError(f"{name} in {file} has shape {arrays[name].shape}; it must be [R, 3], not empty")
-        if not np.isfinite(arrays[name]).all():
-            raise NerfroError(f"{name} in {file} has values that are not finite; correct them")
+        if arrays[name].dtype.kind not in "fiu":
+            raise NerfroError(f"{name} in {file} are {arrays[name].dtype}; they must be real numbers")
+        arrays[name] = arrays[name].astype(np.float64)
+        check(f"{file}: ", {name: Coordinate}, {name: float(np.abs(arrays[name]).max())})
     origins, directions = arrays["origins"], arrays["directions"]
     if origins.shape != directions.shape:
         raise NerfroError(f"{file} has {len(origins)} origins and {len(directions)} directions; give one for each ray")

@@ -5,11 +5,12 @@ from __future__ import annotations
 import importlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Optional
+from typing import Annotated, Optional
 
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig
 from tqdm import tqdm
 
+from nerfro.allowed import Count, Natural, NotNegative, Positive, Range
 from nerfro.errors import NerfroError
 from nerfro.paths import user_path
 from nerfro.scenes import SCENES, dataset
@@ -23,9 +24,9 @@ CAPTURES = ("dolphin_capture",)
 class ViewCounts:
     """Number of views per split."""
 
-    train: int = MISSING
-    val: int = MISSING
-    test: int = MISSING
+    train: Count = MISSING
+    val: Count = MISSING
+    test: Count = MISSING
 
 
 @dataclass
@@ -34,17 +35,17 @@ class SynthesizeConfig:
 
     scene: str = MISSING
     out: str = MISSING
-    resolution: int = MISSING
-    spp: int = MISSING
-    test_spp: int = MISSING
+    resolution: Annotated[int, Range(at_least=8, at_most=16384)] = MISSING
+    spp: Count = MISSING
+    test_spp: Count = MISSING
     views: ViewCounts = field(default_factory=ViewCounts)
-    photographs: int = MISSING
-    noise: float = MISSING
+    photographs: Count = MISSING
+    noise: NotNegative = MISSING
     fresnel: bool = MISSING
-    absorption: list[float] = MISSING
-    ior: Optional[float] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    seed: int = MISSING
-    sky_height: int = MISSING
+    absorption: list[NotNegative] = MISSING
+    ior: Optional[Positive] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    seed: Natural = MISSING
+    sky_height: Annotated[int, Range(at_least=16, at_most=16384)] = MISSING
     extras: bool = MISSING
     variant: str = MISSING
     overwrite: bool = MISSING
@@ -72,20 +73,13 @@ def synthesize(config: DictConfig) -> tuple[Scene, Path]:
         config: resolved `SynthesizeConfig`.
 
     Raises:
-        NerfroError: an option is out of range, Mitsuba is missing, or `out` holds something else.
+        NerfroError: Mitsuba is missing, or `out` holds something else.
     """
-    lowest = {"resolution": 8, "spp": 1, "test_spp": 1, "seed": 0, "sky_height": 16, "photographs": 1, "noise": 0}
-    for name, least in (lowest | {f"views.{split}": 1 for split in dataset.SPLITS}).items():
-        value = OmegaConf.select(config, name)
-        if value < least:
-            raise NerfroError(f"{name}={value} is too small; give {least} or more")
-    absorption = tuple(config.absorption)
-    if len(absorption) != 3 or not all(0 <= value < float("inf") for value in absorption):
-        raise NerfroError(f"absorption={list(absorption)} is not allowed; give red, green and blue, at least 0 each")
-    if config.ior is not None and not config.ior > 0:
-        raise NerfroError(f"ior={config.ior} is no refractive index; give a positive number, or none for the scene's")
+    if len(config.absorption) != 3:
+        raise NerfroError(f"absorption={list(config.absorption)} is not allowed; give red, green and blue")
     scene, folder = build_scene(config.scene, config.resolution), user_path(config.out)
-    scene = replace(scene, absorption=absorption, ior=scene.ior if config.ior is None else config.ior)
+    ior = scene.ior if config.ior is None else config.ior
+    scene = replace(scene, absorption=tuple(config.absorption), ior=ior)
     mitsuba = load_mitsuba(config.variant)  # before anything is cleared that could not be rendered again
     data = (dataset.Photographs if config.scene in CAPTURES else dataset.Views)(config, scene, folder)
     data.prepare(mitsuba)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -11,6 +12,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
 from tqdm import tqdm
 
+from nerfro.files.owned import require_held
 from nerfro.models.optimizer import training_progress
 from nerfro.types import Batch
 
@@ -148,10 +150,14 @@ class StopOnSignal(Callback):
 
 
 class ConfigInCheckpoint(Callback):
-    """Puts the resolved configuration into every checkpoint, so that the file alone tells how to rebuild the model."""
+    """Puts the resolved configuration into every checkpoint, so that the file alone tells how to rebuild the model.
 
-    def __init__(self, config: str) -> None:
-        self._config = config
+    A run's folder that somebody has removed is not made again.
+    """
+
+    def __init__(self, folder: Path, config: str) -> None:
+        self._folder, self._config = folder, config
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        require_held(self._folder / "checkpoints")
         checkpoint["nerfro_config"] = self._config

@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any, Literal, Optional
 
 from omegaconf import MISSING, DictConfig
 
-from nerfro.allowed import Count, Natural, NotNegative, Positive, Range
+from nerfro.allowed import Count, Natural, NotNegative, NumRays, Positive, Range, Resolution, Side
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.losses.base import Loss
@@ -32,14 +32,15 @@ class SamplerConfig:
 class BatchesConfig:
     """Which pixels are trained on."""
 
-    size: Count = 1024  # pixels of a step
-    batching: str = "single_image"  # pixels of `single_image` at a time, or of `all_images`
+    size: NumRays = 1024  # pixels of a step
+    # Pixels of `single_image` at a time, or of `all_images`.
+    batching: Annotated[str, Literal["single_image", "all_images"]] = "single_image"
     jitter: bool = False  # draw each ray anywhere inside its pixel instead of through its centre
     precrop_steps: Natural = 0  # number of first steps that see only the central window of the images
-    precrop_fraction: float = 0.5  # side of that window
+    precrop_fraction: Annotated[float, Range(more_than=0, at_most=1)] = 0.5  # side of that window
     # Rays in each direction of a pixel whose ray leaves `divergence` pixels or more away from the ray beside it;
     # 1 gives all pixels one ray.
-    supersample: Count = 1
+    supersample: Side = 1
     divergence: NotNegative = 8.0
 
 
@@ -48,14 +49,14 @@ class EvaluationConfig:
     """How a trained model is evaluated."""
 
     split: str = "test"  # of the data
-    chunk_size: Count = 8192  # rays rendered at once; bounds the memory
+    chunk_size: NumRays = 8192  # rays rendered at once; bounds the memory
     # File of AlexNet weights; none looks in torch's hub cache and then on the network.
     lpips_backbone: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     # File of VGG-16 weights; none looks in torch's hub cache only.
     lpips_vgg_backbone: Optional[str] = None  # noqa: UP045
     every: Natural = 500  # steps between two looks at one validation image while training; 0 for never
     # Rays along each side of a pixel that is supersampled, see `divergence`; 1 for one central ray.
-    supersample: Count = 1
+    supersample: Side = 1
     # Supersample pixels whose ray leaves this many pixels or more away from the one beside it; 0 for all.
     divergence: NotNegative = 0.0
     # And pixels whose colour differs from a neighbour's by this much (sRGB); none for no others.
@@ -71,16 +72,39 @@ class CheckpointConfig:
 
 
 @dataclass
+class TrainerConfig:
+    """Lightning's Trainer: those of its arguments that mean something here. None is Lightning's default."""
+
+    _target_: str = "lightning.pytorch.Trainer"
+    accelerator: str = "auto"
+    devices: Any = 1
+    num_nodes: Optional[Count] = None  # noqa: UP045
+    strategy: Any = "auto"
+    max_steps: Annotated[int, Range(at_least=-1, at_most=10**9)] = -1  # -1 for as many as max_time allows
+    max_time: Any = None  # DD:HH:MM:SS
+    precision: Annotated[str, Literal["32-true", "16-mixed", "bf16-mixed", "64-true"]] = "32-true"
+    gradient_clip_val: Optional[Positive] = None  # noqa: UP045
+    gradient_clip_algorithm: Annotated[Optional[str], Literal["norm", "value"]] = None  # noqa: UP045
+    accumulate_grad_batches: Optional[Count] = None  # noqa: UP045
+    log_every_n_steps: Count = 50
+    deterministic: Any = None
+    benchmark: Optional[bool] = None  # noqa: UP045
+    detect_anomaly: Optional[bool] = None  # noqa: UP045
+    profiler: Optional[str] = None  # noqa: UP045
+    enable_model_summary: bool = False
+
+
+@dataclass
 class AuthorsConfig:
     """What the authors of the paper set for a scene, taken up by the `paper_*` experiments alone."""
 
-    resolution: int = 512  # vertices a side of the index grid
+    resolution: Resolution = 512  # vertices a side of the index grid
     # Taps and standard deviation (voxels) of its smoothing.
-    smoothing_size: int = 9
-    smoothing_sigma: float = 1.0
-    num_steps: int = 768  # Eikonal steps, N_c x N_e
-    boundary_weight: float = 0.025  # of the boundary regulariser
-    max_steps: int = 200_000  # iterations
+    smoothing_size: Natural = 9
+    smoothing_sigma: Positive = 1.0
+    num_steps: Count = 768  # Eikonal steps, N_c x N_e
+    boundary_weight: NotNegative = 0.025  # of the boundary regulariser
+    max_steps: Count = 200_000  # iterations
 
 
 @dataclass
@@ -105,9 +129,8 @@ class TrainConfig:
     batches: BatchesConfig = dataclasses.field(default_factory=BatchesConfig)
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
     checkpoint: CheckpointConfig = dataclasses.field(default_factory=CheckpointConfig)
-    # Lightning objects.
-    trainer: Any = MISSING
-    logger: Any = None
+    trainer: TrainerConfig = dataclasses.field(default_factory=TrainerConfig)
+    logger: Any = None  # Lightning objects by any name
     # Checkpoint to go on from, or `last` for the newest of this experiment.
     ckpt_path: Optional[str] = None  # noqa: UP045
     viewer: bool = False  # serve an interactive page of the model while it trains, to this machine's browsers

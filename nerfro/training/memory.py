@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from nerfro.errors import NerfroError
+from nerfro.kernels.available import available_bytes, number_in
 from nerfro.models.base import NerfModel
 from nerfro.rays import Rays
 
@@ -21,20 +20,22 @@ _STEP, _EVALUATION = 2.0, 0.5
 _LATER_BYTES = 250e6
 
 
-def require_memory(model: NerfModel, rays: Rays, device: torch.device) -> str:
+def require_memory(model: NerfModel, rays: Rays, device: torch.device, share: float = 1.0) -> str:
     """What a run will need at most, in one line.
 
     A few rays are rendered, and what autograd keeps of them is counted: it grows with rays, and is most of what does.
+    The rays are this `share` of a step's.
     """
     kept = _kept_bytes(model, rays[:: max(len(rays) // _PROBED_RAYS, 1)])
     state = sum(tensor.nbytes for tensor in model.state_dict().values())
     learned = sum(p.nbytes for p in model.parameters() if p.requires_grad)
     # Gradients and Adam's two moments beside the weights.
-    needed: float = 3 * learned + kept * max(_STEP * len(rays), _EVALUATION * model.chunk_size)
+    num_rays = len(rays) / share
+    needed: float = 3 * learned + kept * max(_STEP * num_rays, _EVALUATION * model.chunk_size)
     if device.type == "cuda":
         needed, there = needed + state, float(torch.cuda.mem_get_info(device)[0])
     else:
-        resident = _number(Path("/proc/self/status"), r"VmRSS:\s+(\d+)", 1024)
+        resident = number_in(Path("/proc/self/status"), r"VmRSS:\s+(\d+)", 1024)
         needed, there = needed + resident + _LATER_BYTES, available_bytes() + resident
     if needed > there:
         raise NerfroError(
@@ -42,49 +43,7 @@ def require_memory(model: NerfModel, rays: Rays, device: torch.device) -> str:
             f"free; {kept / 1e3:.0f} kB are for each ray: take a smaller batches.size or evaluation.chunk_size"
         )
     of = "" if there == math.inf else f" of {there / 1e9:.1f} GB that are free"
-    return f"memory: about {needed / 1e9:.1f} GB{of}, {kept / 1e3:.0f} kB of it for each of {len(rays)} rays a step"
-
-
-def available_bytes() -> float:
-    """Memory that this process may still take: what the system has, within its control groups' limits.
-
-    Infinite where nobody tells (other systems than Linux).
-    """
-    free = [_number(Path("/proc/meminfo"), r"MemAvailable:\s+(\d+)", 1024, math.inf)]
-    for folder, limit, usage in _control_groups():
-        # Cached files count as used there, but are dropped when somebody needs the room.
-        cache = _number(folder / "memory.stat", r"^(?:total_)?inactive_file (\d+)")
-        free.append(_number(folder / limit, r"(\d+)", 1, math.inf) - _number(folder / usage, r"(\d+)") + cache)
-    return min(free)
-
-
-def _control_groups() -> Iterator[tuple[Path, str, str]]:
-    """Folders of this process's memory groups and those around them, with their files of limit and usage."""
-    try:
-        lines = Path("/proc/self/cgroup").read_text().splitlines()
-    except OSError:
-        return
-    for line in lines:
-        _, controllers, path = line.split(":", 2)
-        if controllers == "":  # version 2
-            root, files = Path("/sys/fs/cgroup"), ("memory.max", "memory.current")
-        elif "memory" in controllers.split(","):
-            root, files = Path("/sys/fs/cgroup/memory"), ("memory.limit_in_bytes", "memory.usage_in_bytes")
-        else:
-            continue
-        inner = root / path.lstrip("/")
-        for folder in (inner, *inner.parents):
-            if folder.is_relative_to(root):
-                yield folder, *files
-
-
-def _number(file: Path, pattern: str, unit: int = 1, default: float = 0) -> float:
-    """The first number of a pattern in a file of the system; the default without either."""
-    try:
-        found = re.search(pattern, file.read_text(), re.MULTILINE)
-    except OSError:
-        return default
-    return default if found is None else int(found[1]) * unit
+    return f"memory: about {needed / 1e9:.1f} GB{of}, {kept / 1e3:.0f} kB of it for each of {num_rays:.0f} rays a step"
 
 
 def _kept_bytes(model: NerfModel, rays: Rays) -> float:

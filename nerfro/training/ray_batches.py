@@ -101,6 +101,14 @@ class RayBatches:
         shared._share = share_of(self.batch_size, rank, size)
         return shared
 
+    def smaller(self, most: int) -> RayBatches:
+        """A sequence of at most so many pixels a step."""
+        few = copy.copy(self)
+        few.batch_size = min(most, self.batch_size)
+        ends = (end * few.batch_size // self.batch_size for end in (self._share.start or 0, self._share.stop))
+        few._share = slice(*ends)
+        return few
+
     def batch(self, step: int) -> Batch:
         """The batch (or the share) of a step: a function of seed and step alone, on every device the same pixels."""
         cameras = self._cameras

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import pickle
 import platform
 import shlex
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -15,32 +18,51 @@ from typing import Any
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
+from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.errors import NerfroError
+from nerfro.errors import Interrupted, NerfroError, first_of
 from nerfro.files.atomic import write_atomically
 from nerfro.files.foreign_config import foreign_config
+from nerfro.files.owned import held, require_own
 from nerfro.models.base import NerfModel
 from nerfro.paths import PACKAGE_DIR, user_path
 from nerfro.training.config import build_model
 from nerfro.training.settings import RESUMING, first_difference, settings
 
 LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
+CONFIG_FILE, CELL_FILE = "config.yaml", "cell.json"  # what the run is; what it is in a sweep
+_PARTS = {"nerfro_config", "state_dict", "optimizer_states", "lr_schedulers", "callbacks", "global_step", "loops"}
 _SPARE_BYTES = 64 * 2**20  # pictures and logs, beside the checkpoints
 _PACKAGES = ("nerfro", "torch", "lightning", "hydra-core", "torchmetrics", "numpy", "numba", "trimesh")
 
 
-def claim(folder: Path, resumed: bool, needed_bytes: int) -> None:
-    """Make a run folder, or refuse one that would be overwritten or whose disk is full."""
-    if (folder / LAST_CHECKPOINT).exists() and not resumed:
-        raise NerfroError(
-            f"{folder} already holds a run; go on with it (ckpt_path=last) or choose another folder (hydra.run.dir=...)"
-        )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        free = shutil.disk_usage(folder).free
-    except OSError as error:
-        raise NerfroError(f"cannot write to {folder}: {error.strerror}; choose another hydra.run.dir") from error
+@contextmanager
+def own(folder: Path, config: DictConfig) -> Iterator[Path | None]:
+    """Hold a run's folder for this process, and say which checkpoint the run goes on from, if it does.
+
+    A folder is refused that another process writes to, or that holds anything that this run did not make.
+    """
+    checkpoint = find_checkpoint(config.ckpt_path, folder)
+    if rank_zero_only.rank != 0:  # type: ignore[attr-defined]  # of several processes the first one has looked
+        yield checkpoint
+        return
+    with held(folder, "hydra.run.dir"):
+        begun = folder if checkpoint is None else checkpoint.parent.parent
+        if config.ckpt_path is None or begun.resolve() != folder.resolve():
+            advice = "go on with a run (ckpt_path=last) or choose another folder (hydra.run.dir=...)"
+            require_own(folder, (CELL_FILE,), advice)
+        try:
+            yield checkpoint
+        except KeyboardInterrupt:  # before training, or after it
+            if (folder / CONFIG_FILE).is_file():
+                raise Interrupted(f"to go on, repeat it with hydra.run.dir={folder} ckpt_path=last") from None
+            raise
+
+
+def require_room(folder: Path, needed_bytes: int) -> None:
+    """Refuse a disk that is too full for a run."""
+    free = shutil.disk_usage(folder).free
     if free < needed_bytes:
         raise NerfroError(
             f"{folder} has {free / 2**20:,.0f} MiB free and this run needs {needed_bytes / 2**20:,.0f}; "
@@ -56,7 +78,7 @@ def needed_bytes(model: NerfModel) -> int:
 
 def record(folder: Path, config: DictConfig) -> None:
     """Write what repeats the run: config.yaml (resolved), run.json (command, versions, commit) and git.diff."""
-    write_atomically(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
+    write_atomically(folder / CONFIG_FILE, OmegaConf.to_yaml(config, resolve=True))
     commit, diff = _git("rev-parse", "HEAD"), _git("diff", "HEAD")
     facts = {
         "command": _command(),
@@ -75,7 +97,10 @@ def record(folder: Path, config: DictConfig) -> None:
 
 
 def find_checkpoint(ckpt_path: str | None, folder: Path) -> Path | None:
-    """The checkpoint to go on from: a file, or for `last` that of this folder, else the newest beside it."""
+    """The checkpoint to go on from: a file, or for `last` that of this folder, else the newest beside it.
+
+    None if there is none to go on from, because `last` names a run that ended before its first checkpoint, too.
+    """
     if ckpt_path is None:
         return None
     if ckpt_path != "last":
@@ -85,6 +110,8 @@ def find_checkpoint(ckpt_path: str | None, folder: Path) -> Path | None:
         return path
     if (folder / LAST_CHECKPOINT).is_file():
         return folder / LAST_CHECKPOINT
+    if (folder / CONFIG_FILE).is_file():
+        return None
     siblings = sorted(folder.parent.glob(f"*/{LAST_CHECKPOINT}"), key=lambda p: p.stat().st_mtime)
     if not siblings:
         raise NerfroError(
@@ -97,11 +124,16 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], DictConfig]:
     """Read a checkpoint without executing pickled code, and the configuration that it was trained with."""
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        missing = _PARTS - checkpoint.keys()
+        if missing:
+            raise NerfroError(f"{path} lacks {first_of(sorted(missing))}, so it is no checkpoint of nerfro.train")
         config = foreign_config(checkpoint["nerfro_config"], path)
     except NerfroError:
         raise
     except FileNotFoundError as error:
         raise NerfroError(f"checkpoint {path} does not exist; it is usually RUN/{LAST_CHECKPOINT}") from error
+    except pickle.UnpicklingError as error:  # torch advises to load it nevertheless
+        raise NerfroError(f"{path} is not a readable nerfro checkpoint (it holds more than numbers)") from error
     except Exception as error:  # torch.load raises nearly anything on a damaged file
         reason = str(error).strip().split("\n", 1)[0]
         raise NerfroError(f"{path} is not a readable nerfro checkpoint ({type(error).__name__}: {reason})") from error
@@ -121,8 +153,17 @@ def restore(checkpoint: dict, config: DictConfig) -> NerfModel:
     return model.eval()
 
 
+def require_same_run(folder: Path, checkpoint: Path | None, config: DictConfig) -> None:
+    """Refuse to go on from a checkpoint of another configuration, or in a folder that another run has begun."""
+    begun = folder / CONFIG_FILE
+    if checkpoint is not None:
+        require_same_configuration(checkpoint, load_checkpoint(checkpoint)[1], config)
+    elif config.ckpt_path is not None:
+        require_same_configuration(begun, foreign_config(begun.read_text(encoding="utf-8"), begun), config)
+
+
 def require_same_configuration(path: Path, trained: DictConfig, wanted: DictConfig) -> None:
-    """Refuse to go on from a checkpoint of another configuration."""
+    """Refuse to go on with what has another configuration."""
     old, new = settings(trained, RESUMING), settings(wanted, RESUMING)
     key = first_difference(old, new)
     if key is not None:

@@ -46,7 +46,6 @@ _NAMED = {
     "viewer_port": Role.WATCHING,
     "trainer.log_every_n_steps": Role.WATCHING,
     "trainer.enable_model_summary": Role.WATCHING,
-    "trainer.enable_progress_bar": Role.WATCHING,
 }
 
 # A checkpoint can be gone on from where these agree: for longer, on another machine, scored in another way.

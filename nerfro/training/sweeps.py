@@ -10,28 +10,27 @@ import hashlib
 import json
 import re
 import sys
-import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from nerfro.allowed import check_names, check_settings
 from nerfro.cli import in_one_line
 from nerfro.data.image_files import IMAGE_SUFFIXES
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
+from nerfro.files.owned import held, is_held
 from nerfro.paths import EMBEDDED_PREFIX, resolve_path
 from nerfro.registry import build, discover
 from nerfro.scenes import SCENES
-from nerfro.training.run_folder import LAST_CHECKPOINT
+from nerfro.training.config import TrainConfig
+from nerfro.training.run_folder import CELL_FILE, CONFIG_FILE
 from nerfro.training.settings import RESULT, first_difference, settings
-
-CELL_FILE, _LOCK = "cell.json", "cell.lock"
 
 # Larger files of a data folder are told apart by name and size, so that no sweep begins with reading for minutes.
 _MAX_HASHED = 64 * 2**20  # bytes
@@ -88,6 +87,11 @@ class Cell:
 def refusal(config: DictConfig) -> str | None:
     """Why a cell cannot be run at all, as far as that can be told without work; None if nothing speaks against it."""
     try:
+        check_names(config)
+        check_settings(config, TrainConfig)
+    except NerfroError as error:
+        return str(error)
+    try:
         if "train" in build(config.data).splits:
             return None
         reason = f"data.root={config.data.root} has no training views"
@@ -126,26 +130,22 @@ class CellTask:
     def __call__(self, config: DictConfig) -> None:
         discover()  # the worker may be a new process
         folder = Path(HydraConfig.get().runtime.output_dir)
-        try:
-            with FileLock(folder / _LOCK, blocking=False):
-                self._run(config, folder)
-        except Timeout:
+        if is_held(folder):
             return  # a process that outlived an earlier start of the sweep is at it
+        with held(folder, "hydra.sweep.dir"):
+            self._run(config, folder)
 
     def _run(self, config: DictConfig, folder: Path) -> None:
         identity = Identity.of(config)
         if _recorded(folder, identity)[0] is State.FINISHED:
             return
-        if (folder / LAST_CHECKPOINT).is_file():
-            config.ckpt_path = str(folder / LAST_CHECKPOINT)
+        if (folder / CONFIG_FILE).is_file():
+            config.ckpt_path = "last"
         _record(folder, identity, State.OPEN)
         try:
             self._task(config)
         except Exception as error:  # whatever it is, the other cells go on
             reason = in_one_line(error)
-            if reason is None:
-                traceback.print_exc()
-                reason = f"{type(error).__name__}: {error}".splitlines()[0]
             print(f"nerfro: {folder.name} failed: {reason}", file=sys.stderr, flush=True)
             _record(folder, identity, State.FAILED, reason)
         else:
@@ -163,33 +163,25 @@ def _record(folder: Path, identity: Identity, state: State, reason: str = "") ->
 
 
 def _look(folder: Path, identity: Identity) -> tuple[State, str]:
-    if not folder.is_dir():
-        return State.OPEN, ""
-    try:
-        with FileLock(folder / _LOCK, blocking=False):
-            pass
-    except Timeout:
-        return State.RUNNING, ""
-    return _recorded(folder, identity)
+    return (State.RUNNING, "") if is_held(folder) else _recorded(folder, identity)
 
 
 def _recorded(folder: Path, identity: Identity) -> tuple[State, str]:
+    holds_a_run = (folder / CONFIG_FILE).is_file()
     try:
         record = json.loads((folder / CELL_FILE).read_text(encoding="utf-8"))
+        different, state, reason = identity.difference(record), State(record["state"]), str(record["reason"])
     except FileNotFoundError:
-        record = None
-    holds_a_run = (folder / LAST_CHECKPOINT).is_file()
-    if record is None:
         return (State.REFUSED, f"{folder} holds a run that is no cell of a sweep") if holds_a_run else (State.OPEN, "")
-    different = identity.difference(record)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return State.REFUSED, f"{folder / CELL_FILE} is damaged; choose another hydra.sweep.dir or remove its folder"
     if different is not None:
         if not holds_a_run:
             return State.OPEN, ""
         return State.REFUSED, f"{folder} holds a run with {different}; choose another hydra.sweep.dir or remove it"
-    state = State(record["state"])
     if state is State.FINISHED and not (folder / "metrics.json").is_file():
         return State.OPEN, ""
-    return state, record["reason"]
+    return state, reason
 
 
 def _hash_of_files(root: Path) -> str:

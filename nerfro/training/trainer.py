@@ -20,7 +20,7 @@ from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.registry import build
 from nerfro.training.callbacks import ConfigInCheckpoint, TrainingProgress
 from nerfro.training.log import TrainingLog
-from nerfro.training.run_folder import LAST_CHECKPOINT
+from nerfro.training.run_folder import CONFIG_FILE, LAST_CHECKPOINT
 
 
 def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.Trainer:
@@ -36,7 +36,7 @@ def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.
         enable_version_counter=False,
         save_on_train_epoch_end=False,
     )
-    in_checkpoint = ConfigInCheckpoint(OmegaConf.to_yaml(config, resolve=True))
+    in_checkpoint = ConfigInCheckpoint(folder, OmegaConf.to_yaml(config, resolve=True))
     ours = {
         "default_root_dir": str(folder),
         "callbacks": [checkpoints, TrainingProgress(), in_checkpoint, TrainingLog(), *extra],
@@ -48,18 +48,17 @@ def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.
         "num_sanity_val_steps": 0,
         "use_distributed_sampler": False,
     }
-    taken = sorted(ours.keys() & config.trainer.keys())
-    if taken:
-        raise NerfroError(f"trainer.{taken[0]} is set by nerfro.train itself; see evaluation, checkpoint and logger")
     if config.trainer.get("strategy") == "ddp":
         # The index grid is a buffer and would be sent around in every step, though all processes have the same one.
         ours["strategy"] = DDPStrategy(broadcast_buffers=False)
     limit = config.trainer.get("max_time")
     if isinstance(limit, (int, float)):
         raise NerfroError(f"trainer.max_time={limit} has no unit; write DD:HH:MM:SS, such as 00:00:05:00")
-    trainer = build(config.trainer, **ours)
+    trainer = build({name: value for name, value in config.trainer.items() if value is not None}, **ours)
     if trainer.world_size > 1 and HydraConfig.get().mode == RunMode.MULTIRUN:
         raise NerfroError("a sweep (-m) cannot use several devices; start its runs one by one")
+    if trainer.world_size > 1 and config.ckpt_path == "last" and not (folder / CONFIG_FILE).is_file():
+        raise NerfroError("several processes could disagree about the last run; name its file in ckpt_path")
     if limit is None and trainer.max_steps < 0:
         raise NerfroError("the run would never end; set trainer.max_time (DD:HH:MM:SS), trainer.max_steps, or both")
     return trainer

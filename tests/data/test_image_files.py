@@ -167,3 +167,18 @@ def test_flipped_bit_in_an_8bit_image_is_found(save):
     path.write_bytes(content)
     with pytest.raises(NerfroError, match=r"image\.png cannot be read"):
         read_rgb(path, "drop")
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+def test_photograph_that_asks_to_be_turned_is_refused(orientation: int, suffix: str, tmp_path: Path) -> None:
+    path, exif = tmp_path / f"a{suffix}", Image.Exif()
+    exif[274] = orientation
+    Image.new("RGB", (6, 4)).save(path, exif=exif)
+    if orientation == 1:
+        assert image_files.read_size(path)[:2] == (6, 4)
+        assert image_files.read_levels(path).shape == (4, 6, 3)
+        return
+    for read in (image_files.read_size, image_files.read_levels):
+        with pytest.raises(NerfroError, match=rf"EXIF orientation {orientation}\); turn its pixels"):
+            read(path)

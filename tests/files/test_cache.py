@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from nerfro.errors import NerfroError
+from nerfro.files import cache
 from nerfro.files.cache import cached_arrays, content_hash, load_arrays, save_arrays
 
 
@@ -23,27 +26,65 @@ def test_arrays_are_computed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv("NERFRO_CACHE", str(tmp_path))
     counter = _Counter()
     for _ in range(3):
-        np.testing.assert_array_equal(cached_arrays("entry", counter.compute)["values"], np.arange(5.0))
+        np.testing.assert_array_equal(cached_arrays("distance_entry", counter.compute)["values"], np.arange(5.0))
     assert counter.calls == 1
-    cached_arrays("entry", counter.compute, enabled=False)
+    cached_arrays("distance_entry", counter.compute, enabled=False)
     assert counter.calls == 2
 
 
 def test_a_truncated_file_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NERFRO_CACHE", str(tmp_path))
     counter = _Counter()
-    cached_arrays("entry", counter.compute)
-    file = tmp_path / "entry.npz"
+    cached_arrays("distance_entry", counter.compute)
+    file = tmp_path / "distance_entry.npz"
     file.write_bytes(file.read_bytes()[:50])
-    np.testing.assert_array_equal(cached_arrays("entry", counter.compute)["values"], np.arange(5.0))
+    np.testing.assert_array_equal(cached_arrays("distance_entry", counter.compute)["values"], np.arange(5.0))
     assert counter.calls == 2
     assert "values" in load_arrays(file)
+
+
+def replaced(**arrays: np.ndarray) -> Callable[[Path], None]:
+    return lambda file: np.savez(file, **arrays)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        replaced(values=np.full(5, np.nan)),
+        replaced(others=np.arange(5.0)),
+        replaced(values=np.arange(6.0)),
+        replaced(values=np.arange(5.0), checksum=np.array("of something else")),
+        lambda file: file.write_bytes(b""),
+        lambda file: file.write_bytes(b"\x93NUMPY"),
+    ],
+)
+def test_what_does_not_match_its_checksum_is_made_again(
+    damage: Callable[[Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NERFRO_CACHE", str(tmp_path))
+    damage(tmp_path / "distance_entry.npz")
+    counter = _Counter()
+    for _ in range(2):
+        (arrays,) = cached_arrays("distance_entry", counter.compute).items()
+        assert arrays[0] == "values"
+        np.testing.assert_array_equal(arrays[1], np.arange(5.0))
+    assert counter.calls == 1
+
+
+def test_cache_does_not_grow_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NERFRO_CACHE", str(tmp_path))
+    monkeypatch.setattr(cache, "LIMIT", 1000)
+    (tmp_path / "mine.npz").write_bytes(bytes(2000))
+    for number in range(5):
+        cached_arrays(f"distance_{number}", lambda: {"values": np.random.default_rng(0).random(50)})
+        os.utime(tmp_path / f"distance_{number}.npz", (number, number))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["distance_4.npz", "mine.npz"]
 
 
 def test_a_folder_that_cannot_be_made_costs_only_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("NERFRO_CACHE", str(tmp_path / "file" / "below"))
-    assert len(cached_arrays("entry", _Counter().compute)["values"]) == 5
+    assert len(cached_arrays("distance_entry", _Counter().compute)["values"]) == 5
 
 
 def test_hash_depends_on_values_shapes_types_and_order() -> None:

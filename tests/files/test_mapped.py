@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from nerfro.errors import NerfroError
-from nerfro.files import mapped
+from nerfro.files import cache as cache_module
 from nerfro.files.mapped import mapped_array
 
 SHAPE, TYPE = (4, 1000), np.dtype(np.uint16)
@@ -45,7 +45,7 @@ def test_nothing_is_left_of_an_array_that_could_not_be_made(cache: Path) -> None
 
 
 def test_arrays_used_longest_ago_go_first(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mapped, "LIMIT", 2.5 * 8200)
+    monkeypatch.setattr(cache_module, "LIMIT", 2.5 * 8200)
     for age, key in ((300, "a"), (200, "b")):
         mapped_array(key, SHAPE, TYPE, rows)
         os.utime(cache / f"mapped_{key}.npy", (1e9 - age, 1e9 - age))
@@ -58,8 +58,22 @@ def test_arrays_used_longest_ago_go_first(cache: Path, monkeypatch: pytest.Monke
 
 
 def test_what_a_killed_process_left_goes_after_a_day(cache: Path) -> None:
-    for name, age in (("mapped_old.partial", 1e9), ("mapped_new.partial", 2e9)):
+    for name, age in ((".mapped_old.npy.x.partial", 1e9), (".mapped_new.npy.x.partial", 2e9), (".mine.partial", 1e9)):
         (cache / name).touch()
         os.utime(cache / name, (age, age))
     mapped_array("a", SHAPE, TYPE, rows)
-    assert sorted(path.name for path in cache.iterdir()) == ["mapped_a.npy", "mapped_new.partial"]
+    assert sorted(path.name for path in cache.iterdir()) == [
+        ".mapped_new.npy.x.partial",
+        ".mine.partial",
+        "mapped_a.npy",
+    ]
+
+
+@pytest.mark.parametrize("place", [-1, -500, 200])
+def test_array_that_does_not_match_its_checksum_is_made_again(place: int, cache: Path) -> None:
+    mapped_array("a", SHAPE, TYPE, rows)
+    content = bytearray((cache / "mapped_a.npy").read_bytes())
+    content[place] ^= 1
+    (cache / "mapped_a.npy").write_bytes(content)
+    assert np.array_equal(mapped_array("a", SHAPE, TYPE, rows), np.arange(4000).reshape(SHAPE))
+    assert np.array_equal(mapped_array("a", SHAPE, TYPE, broken), np.arange(4000).reshape(SHAPE))

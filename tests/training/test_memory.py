@@ -11,6 +11,8 @@ import torch
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.errors import NerfroError
 from nerfro.fields.nerf import NerfField
+from nerfro.kernels import available
+from nerfro.kernels.available import available_bytes, require_bytes
 from nerfro.media.analytic import Vacuum
 from nerfro.models.base import NerfModel, Parts
 from nerfro.models.optimizer import OptimizerConfig
@@ -19,7 +21,7 @@ from nerfro.samplers.straight import Straight
 from nerfro.samplers.stratified import Stratified
 from nerfro.testing import example_rays
 from nerfro.training import memory
-from nerfro.training.memory import available_bytes, require_memory
+from nerfro.training.memory import require_memory
 
 
 def model_of(width: int) -> NerfModel:
@@ -64,6 +66,22 @@ def test_limit_of_a_control_group_counts_without_files_that_can_go(
     (tmp_path / "memory.stat").write_text("anon 5\ninactive_file 1000000\nactive_file 7\n")
     if limit is not None:
         (tmp_path / "memory.max").write_text(limit)
-    monkeypatch.setattr(memory, "_control_groups", lambda: iter([(tmp_path, "memory.max", "memory.current")]))
+    monkeypatch.setattr(available, "_control_groups", lambda: iter([(tmp_path, "memory.max", "memory.current")]))
     assert 0 < system < math.inf
     assert available_bytes() == free if free < math.inf else available_bytes() > 1e8
+
+
+def test_what_does_not_fit_is_refused_before_it_is_begun(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(available, "available_bytes", lambda: 2e9)
+    require_bytes(1e9, "medium.resolution=100")
+    with pytest.raises(NerfroError, match=r"medium\.resolution=900 needs about 3\.0 GB of memory and 2\.0 GB are free"):
+        require_bytes(3e9, "medium.resolution=900")
+
+
+def test_share_of_a_steps_rays_stands_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, rays, device = model_of(64), example_rays(), torch.device("cpu")
+    monkeypatch.setattr(memory, "available_bytes", lambda: 1e12)
+    line = require_memory(model, rays, device, share=0.01)
+    assert f"each of {100 * len(rays)} rays a step" in line
+    with pytest.raises(NerfroError, match="needs about"):
+        require_memory(model, rays, device, share=1e-9)

@@ -277,3 +277,11 @@ def test_batches_hold_all_polylines_of_their_rays(views):
     assert len(again.ray) > 1.5 * len(batch.rays)
     for name in ("ray", "exit_directions", "throughput"):
         torch.testing.assert_close(getattr(batch.path, name), getattr(again, name))
+
+
+def test_smaller_sequence_has_its_share_of_a_process(views):
+    batches = RayBatches(views, 40, "all_images", seed=3)
+    assert len(batches.smaller(100).batch(0).rays) == 40
+    assert len(batches.smaller(10).batch(0).rays) == 10
+    assert [len(batches.share(rank, 2).smaller(10).batch(0).rays) for rank in range(2)] == [5, 5]
+    assert len(batches.batch(0).rays) == 40, "the sequence itself stays"

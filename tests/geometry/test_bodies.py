@@ -1,0 +1,110 @@
+"""Closed surfaces in one mesh: those that go through each other are found, others pass."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from nerfro.errors import NerfroError
+from nerfro.geometry.bodies import bodies_of, require_separate
+from nerfro.geometry.mesh import TriangleMesh, load_mesh, merge_vertices
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.voxel_grid import VoxelGrid
+
+BOX = {"box_min": [-1.5] * 3, "box_max": [1.5] * 3, "resolution": 24, "cache": False}
+
+
+def ball(radius: float, x: float = 0.0) -> trimesh.Trimesh:
+    return trimesh.creation.icosphere(2, radius).apply_translation((x, 0, 0))
+
+
+def mesh_of(*parts: trimesh.Trimesh) -> TriangleMesh:
+    whole = trimesh.util.concatenate(parts)
+    return merge_vertices(np.asarray(whole.vertices), np.asarray(whole.faces))
+
+
+def box(size: float, x: float = 0.0) -> trimesh.Trimesh:
+    return trimesh.creation.box((size, size, size)).apply_translation((x, 0, 0))
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [ball(0.5)],
+        [ball(0.5, -0.6), ball(0.5, 0.6)],
+        [ball(0.6), ball(0.3)],
+        [ball(0.6), ball(0.3, -0.2), ball(0.1, 0.3)],
+        [box(0.5), box(0.5, 0.5)],  # side by side
+        [box(0.5), box(0.3, 0.4)],
+        [box(0.5), box(0.2, 0.1)],
+    ],
+)
+def test_surfaces_apart_inside_each_other_or_touching_pass(parts: list[trimesh.Trimesh]) -> None:
+    require_separate(mesh_of(*parts))
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [ball(0.5, -0.2), ball(0.5, 0.2)],
+        [ball(0.3), trimesh.creation.box((2, 0.01, 0.01))],  # a needle through it: no vertex is inside the other
+        [box(0.5), box(0.5, 0.2).apply_translation((0, 0.1, 0.07))],
+        [ball(0.2, -1.0), ball(0.2, -0.5), ball(0.3, 0.5), ball(0.3, 0.6)],
+    ],
+)
+def test_surfaces_that_go_through_each_other_are_refused(parts: list[trimesh.Trimesh]) -> None:
+    mesh = mesh_of(*parts)
+    assert bodies_of(mesh).max() == len(parts) - 1
+    with pytest.raises(NerfroError, match="go through each other"):
+        require_separate(mesh)
+
+
+@pytest.mark.parametrize("medium", [SdfGrid, VoxelGrid])
+def test_surface_that_is_there_twice_counts_once(medium: type, tmp_path: Path) -> None:
+    ball(0.6).export(tmp_path / "once.ply")
+    trimesh.util.concatenate([ball(0.6), ball(0.6)]).export(tmp_path / "twice.ply")
+    once, twice = (medium(str(tmp_path / f"{name}.ply"), **BOX) for name in ("once", "twice"))
+    for name, values in once.named_buffers():
+        assert values.equal(dict(twice.named_buffers())[name]), name
+
+
+@pytest.mark.parametrize("medium", [SdfGrid, VoxelGrid])
+@pytest.mark.parametrize("shape", ["flat", "both ways", "thin"])
+def test_mesh_without_an_inside_is_refused(medium: type, shape: str, tmp_path: Path) -> None:
+    mesh = ball(0.6)
+    if shape == "flat":
+        normal = np.array([1.0, 2.0, 3.0]) / 14**0.5
+        mesh.vertices -= np.outer(mesh.vertices @ normal, normal)
+    elif shape == "both ways":
+        faces = np.concatenate([mesh.faces, mesh.faces[:, ::-1]])
+        mesh = trimesh.Trimesh(mesh.vertices, faces, process=False)
+    else:
+        mesh = trimesh.creation.box((0.5, 0.5, 0.001)).apply_translation((0, 0, 0.03))
+    mesh.export(tmp_path / "mesh.ply")
+    with pytest.raises(NerfroError, match="no vertex of the grid lies inside the mesh"):
+        medium(str(tmp_path / "mesh.ply"), **BOX)
+
+
+@pytest.mark.parametrize("index", [-1, 10**6])
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+def test_triangle_of_a_vertex_that_is_not_there_is_refused(index: int, encoding: str, tmp_path: Path) -> None:
+    file = tmp_path / "mesh.ply"
+    ball(0.6).export(file, encoding="ascii" if encoding == "ascii" else "binary")
+    if encoding == "ascii":
+        *rows, last = file.read_text().splitlines()
+        file.write_text("\n".join([*rows, " ".join(["3", str(index), *last.split()[2:]]), ""]))
+    else:
+        content = file.read_bytes()
+        file.write_bytes(content[:-12] + index.to_bytes(4, "little", signed=True) + content[-8:])
+    with pytest.raises(NerfroError, match="triangles of vertices that it lacks"):
+        load_mesh(file)
+
+
+@pytest.mark.parametrize("scale", [1e8, 1e30])
+def test_mesh_that_is_far_too_large_is_refused(scale: float, tmp_path: Path) -> None:
+    ball(scale).export(tmp_path / "mesh.ply")
+    with pytest.raises(NerfroError, match="reaches too far; scale it to about one unit"):
+        load_mesh(tmp_path / "mesh.ply")

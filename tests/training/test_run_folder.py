@@ -1,0 +1,245 @@
+"""A folder belongs to one run: what another run, a user or another process has there is never touched."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import nerfro.evaluate
+import nerfro.train
+from nerfro.cli import entry_point
+from nerfro.errors import NerfroError
+from nerfro.files.atomic import write_atomically
+from nerfro.files.owned import held, is_held
+from nerfro.training.config import TrainConfig
+from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
+
+
+def content(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def train(train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path) -> Callable[..., Any]:
+    """Two steps in tmp_path/run."""
+    always = [*tiny_default_run, "trainer.max_steps=2", "evaluation.every=0", f"hydra.run.dir={tmp_path / 'run'}"]
+    return lambda *overrides: train_here(*always, *overrides)
+
+
+@pytest.fixture
+def evaluate(
+    train: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str]]:
+    """Evaluate the run in tmp_path/run: status and error."""
+    assert train().code == 0
+    monkeypatch.setattr(nerfro.evaluate, "find_lpips_networks", lambda *files: ({}, {}))
+
+    def evaluate(*overrides: str) -> tuple[int, str]:
+        checkpoint = f"checkpoint={tmp_path / 'run' / LAST_CHECKPOINT}"
+        monkeypatch.setattr("sys.argv", ["nerfro.evaluate", checkpoint, "device=cpu", *overrides])
+        code = 0
+        try:
+            nerfro.evaluate.main()
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 1
+        return code, capsys.readouterr().err
+
+    return evaluate
+
+
+@pytest.fixture
+def another_process(tmp_path: Path) -> Iterator[Callable[[Path], None]]:
+    """Have another process hold a folder."""
+    processes = []
+
+    def hold(folder: Path) -> None:
+        program = (
+            "import sys, pathlib; from nerfro.files.owned import held\n"
+            f"with held(pathlib.Path({str(folder)!r}), 'out'): print('held', flush=True); sys.stdin.read()"
+        )
+        command = [sys.executable, "-c", program]
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        processes.append(process)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+
+    yield hold
+    for process in processes:
+        process.communicate("")
+
+
+@pytest.mark.parametrize("file", ["config.yaml", "run.json", "metrics.json", "images/test_000.png", "notes/mine.txt"])
+@pytest.mark.parametrize("going_on", [[], ["ckpt_path=last"], ["ckpt_path=elsewhere"]], ids=["new", "last", "file"])
+def test_what_the_run_did_not_make_stays(
+    file: str, going_on: list[str], train: Callable[..., Any], tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    if going_on == ["ckpt_path=elsewhere"]:
+        assert train(f"hydra.run.dir={tmp_path / 'other'}").code == 0
+        going_on = [f"ckpt_path={tmp_path / 'other' / LAST_CHECKPOINT}"]
+    (folder / file).parent.mkdir(parents=True)
+    (folder / file).write_text("foreign")
+    before = sorted(folder.rglob("*"))
+    finished = train(*going_on)
+    assert finished.code == 1
+    assert len(finished.err.strip().splitlines()) == 1
+    assert sorted(folder.rglob("*")) == before
+    assert (folder / file).read_text() == "foreign"
+
+
+def test_run_that_lost_its_checkpoints_is_not_replaced(train: Callable[..., Any], tmp_path: Path) -> None:
+    assert train().code == 0
+    shutil.rmtree(tmp_path / "run" / "checkpoints")
+    before = content(tmp_path / "run")
+    finished = train("seed=9")
+    assert finished.code == 1
+    assert "already holds config.yaml" in finished.err
+    assert content(tmp_path / "run") == before
+
+
+def test_run_that_ended_before_its_first_checkpoint_begins_again(train: Callable[..., Any], tmp_path: Path) -> None:
+    assert train().code == 0
+    weights = load_checkpoint(tmp_path / "run" / LAST_CHECKPOINT)[0]["state_dict"]
+    shutil.rmtree(tmp_path / "run" / "checkpoints")
+    assert "was trained with seed=0, this run has 1" in train("ckpt_path=last", "seed=1").err
+    assert train("ckpt_path=last").code == 0
+    again = load_checkpoint(tmp_path / "run" / LAST_CHECKPOINT)[0]["state_dict"]
+    assert all(weights[name].equal(again[name]) for name in weights)
+
+
+def test_second_process_in_a_folder_is_refused(
+    train: Callable[..., Any], another_process: Callable[[Path], None], tmp_path: Path
+) -> None:
+    another_process(tmp_path / "run")
+    assert is_held(tmp_path / "run")
+    finished = train()
+    assert finished.code == 1
+    assert f"another process is writing to {tmp_path / 'run'}" in finished.err
+    assert not content(tmp_path / "run").keys() - {tmp_path / "run" / ".lock"}
+
+
+def test_folder_that_is_removed_while_training_is_not_made_again(
+    train: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(nerfro.train, "require_room", lambda folder, _: shutil.rmtree(folder))
+    finished = train()
+    assert finished.code == 1
+    assert f"{tmp_path / 'run'} was removed while it was written to" in finished.err
+    assert not (tmp_path / "run").exists()
+
+
+def test_checkpoint_in_a_removed_folder_is_not_made_again(
+    train: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fit = nerfro.train.RayDataModule.train_dataloader
+
+    def remove(module: Any) -> Any:
+        shutil.rmtree(tmp_path / "run")
+        return fit(module)
+
+    monkeypatch.setattr(nerfro.train.RayDataModule, "train_dataloader", remove)
+    finished = train()
+    assert finished.code == 1
+    assert "was removed while it was written to" in finished.err
+    assert not (tmp_path / "run").exists()
+
+
+def test_evaluation_replaces_only_what_an_evaluation_wrote(
+    evaluate: Callable[..., tuple[int, str]], another_process: Callable[[Path], None], tmp_path: Path
+) -> None:
+    mine = tmp_path / "mine"
+    (mine / "images").mkdir(parents=True)
+    (mine / "images" / "test_000.png").write_text("mine")
+    for folder in (mine, tmp_path / "run"):
+        before = content(folder)
+        code, error = evaluate(f"out={folder}", "overwrite=true")
+        assert code == 1
+        assert "it is no evaluation's folder; give another out=" in error
+        assert content(folder) == before
+    scores = tmp_path / "scores"
+    assert evaluate(f"out={scores}")[0] == 0
+    assert "metrics.json exists" in evaluate(f"out={scores}")[1]
+    (scores / "metrics.json").unlink()  # as after a kill: the evaluation goes on
+    assert evaluate(f"out={scores}")[0] == 0
+    assert evaluate(f"out={scores}", "overwrite=true")[0] == 0
+    another_process(scores)
+    assert "another process is writing to" in evaluate(f"out={scores}", "overwrite=true")[1]
+
+
+def test_refused_evaluation_leaves_no_folder(evaluate: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
+    assert evaluate(f"out={tmp_path / 'a' / 'b'}", "split=night")[0] == 1
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("below", ["", "run"])
+def test_file_in_place_of_the_run_folder_is_told(below: str, train: Callable[..., Any], tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    finished = train(f"hydra.run.dir={tmp_path / 'file' / below}")
+    assert finished.code == 1
+    assert len(finished.err.strip().splitlines()) == 1
+    assert "choose another hydra.run.dir" in finished.err
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_folder_is_held_several_times_over_by_one_process(tmp_path: Path) -> None:
+    with held(tmp_path, "out"):
+        with held(tmp_path, "out"):
+            assert not is_held(tmp_path), "only other processes count"
+        write_atomically(tmp_path / "a", "b")
+    assert (tmp_path / "a").is_file()
+
+
+def test_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with (
+        pytest.raises(NerfroError, match=r"cannot write to out=.*/file/run: .*; choose another out"),
+        held(tmp_path / "file" / "run", "out"),
+    ):
+        pass
+
+
+def test_nothing_foreseen_is_one_line_and_a_file(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(config: object) -> None:
+        raise ZeroDivisionError("a bug\nof two lines")
+
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr("sys.argv", ["nerfro.train", f"hydra.run.dir={tmp_path / 'run'}"])
+    main = entry_point("train", TrainConfig)(broken)
+    with pytest.raises(SystemExit):
+        main()
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    (file,) = tmp_path.glob("nerfro_*.txt")
+    assert "ZeroDivisionError: a bug; this is a bug of nerfro: please report it with" in line
+    assert str(file) in line
+    assert "raise ZeroDivisionError" in file.read_text()
+    monkeypatch.setenv("NERFRO_DEBUG", "1")
+    with pytest.raises(ZeroDivisionError):
+        main()
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (MemoryError(), "not enough memory; take smaller sizes"),
+        (RuntimeError("can't allocate memory: you tried to allocate 80 bytes"), "not enough memory (can't allocate"),
+        (OSError(28, "No space left on device", "a.png"), "no space is left for a.png; free some"),
+    ],
+)
+def test_what_the_machine_lacks_is_told_as_such(
+    error: Exception, words: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(config: object) -> None:
+        raise error
+
+    monkeypatch.setattr("sys.argv", ["nerfro.train", f"hydra.run.dir={tmp_path / 'run'}"])
+    with pytest.raises(SystemExit):
+        entry_point("train", TrainConfig)(broken)()
+    assert words in capsys.readouterr().err
