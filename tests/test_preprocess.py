@@ -58,6 +58,7 @@ def preprocess(
 
     def run(*overrides: str) -> str:
         common = [f"data.root={capture}", "resolution=24", "medium.resolution=32", "medium.cache=false"]
+        common += [] if any(text.startswith("medium.ior=") for text in overrides) else ["medium.ior=1.5"]
         monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", *common, *overrides])
         try:
             nerfro.preprocess.main()

@@ -163,6 +163,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path, name, content):
     [
         ({"scene": "tours"}, "choose one of torus, ship, deerglobe, starlamp"),
         ({"resolution": 0}, "resolution=0 is too small; give 8 or more"),
+        ({"ior": 0.0}, "ior=0.0 is no refractive index"),
         ({"spp": 0}, "spp=0"),
         ({"views": {"test": 0}}, "views.test=0"),
         ({"seed": -1}, "seed=-1"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import typing
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Optional
@@ -10,14 +11,17 @@ from typing import Any, Optional
 import numpy as np
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from nerfro.capture.visual_hull import Silhouettes
+from nerfro.cameras import Cameras
+from nerfro.capture.index_report import CURVE, INDEX
+from nerfro.capture.overlaps import REPORT, SHEET
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing
 from nerfro.geometry.mesh import TriangleMesh
+from nerfro.media.base import Medium
 from nerfro.paths import EMBEDDED_PREFIX, resolve_path, user_path
 from nerfro.registry import build
 
-MESH, SHEET, REPORT = "mesh.ply", "overlays.png", "overlaps.json"
+MESH = "mesh.ply"
 # The medium's grid is this much wider than the object.
 _MARGIN_SHARE = 0.15
 
@@ -31,7 +35,8 @@ class PreprocessConfig:
         medium: what becomes of the surface (options of the group `medium`).
         split: whose masks are used.
         mesh: a surface that was made elsewhere; it is checked against the masks, and no hull is made.
-        out: folder that mesh.ply, overlays.png and overlaps.json are written to; by default data.root.
+        room: whether the surroundings are near, for the search of the index; by default found out.
+        out: folder that the results are written to; by default data.root.
         resolution: voxels along the longest side of the hull.
         box_min, box_max: box that the hull is carved in, world units; by default found from cameras and masks.
         wrong_masks: number of views that may be wrong about any point of space.
@@ -44,6 +49,7 @@ class PreprocessConfig:
     medium: Any = MISSING
     split: str = "train"
     mesh: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    room: Optional[bool] = None  # noqa: UP045
     out: Optional[str] = None  # noqa: UP045
     resolution: int = 96
     box_min: Optional[list[float]] = None  # noqa: UP045
@@ -54,7 +60,12 @@ class PreprocessConfig:
     overwrite: bool = False
 
 
-def claim(config: DictConfig) -> Path:
+def is_given(option: str, overrides: list[str]) -> bool:
+    """Whether a command line says what an option is."""
+    return option in {text.lstrip("+").split("=")[0] for text in overrides}
+
+
+def claim(config: DictConfig, overrides: list[str]) -> Path:
     """The folder to write to; refused if an option is out of range, or it is the package's, or a file is there."""
     if not 16 <= config.resolution <= 1024:
         raise NerfroError(f"resolution={config.resolution} is not allowed; take 16 to 1024 voxels a side")
@@ -73,35 +84,50 @@ def claim(config: DictConfig) -> Path:
         raise NerfroError(f"data.root={config.data.root} ships with nerfro and is not written to; add out=FOLDER")
     folder = resolve_path(config.data.root) if config.out is None else user_path(config.out)
     names = [SHEET, REPORT] if config.mesh is not None else [MESH, SHEET, REPORT]
+    names += [] if is_given("medium.ior", overrides) else [INDEX, CURVE]
     refuse_existing([folder / name for name in names], config.overwrite)
     return folder
 
 
-def train_command(
-    config: DictConfig, silhouettes: Silhouettes, mesh: TriangleMesh, location: str, overrides: list[str]
-) -> list[str]:
-    """The command that trains on the surface; makes the index grid, so that a bad one is refused now and not then.
+def surface_settings(
+    config: DictConfig, cameras: Cameras, mesh: TriangleMesh, location: str, overrides: list[str]
+) -> dict[str, object]:
+    """What has to be said beside this command line's overrides, so that medium and data hold the surface.
 
-    The surface's file is its `location`; the overrides are those of this command line.
+    The surface's file is its `location`.
     """
-    given = {key.lstrip("+").split("=")[0] for key in overrides}
-    settings = {"medium.ior": config.medium.ior}
+    settings: dict[str, object] = {}
     if location != f"{config.data.root}/{MESH}":
         settings["medium.mesh"] = location
-    if not {"medium.box_min", "medium.box_max"} & given:
+    if not (is_given("medium.box_min", overrides) or is_given("medium.box_max", overrides)):
         centre, half_side = mesh.bounds.mean(0), (0.5 + _MARGIN_SHARE) * float(np.ptp(mesh.bounds, axis=0).max())
         digits = max(0, 3 - int(np.floor(np.log10(half_side))))
         for name, corner in (("box_min", centre - half_side), ("box_max", centre + half_side)):
             settings[f"medium.{name}"] = [round(float(x), digits) for x in corner]
-    offsets = silhouettes.cameras.camera_to_world[:, None, :, 3].double().numpy() - mesh.vertices[::16]
+    offsets = cameras.camera_to_world[:, None, :, 3].double().numpy() - mesh.vertices[::16]
     distance = np.linalg.norm(offsets, axis=-1)
-    if silhouettes.cameras.near >= distance.min():
+    if cameras.near >= distance.min():
         settings["data.near"] = float(f"{0.8 * distance.min():.3g}")
-    if silhouettes.cameras.far <= distance.max():
+    if cameras.far <= distance.max():
         settings["data.far"] = float(f"{1.2 * distance.max():.3g}")
+    return settings
+
+
+def build_medium(config: DictConfig, settings: dict[str, object], location: str, iors: Sequence[float]) -> Medium:
+    """The medium with the surface in it, so that a bad one is refused now and not in training."""
     medium = typing.cast(dict[str, object], OmegaConf.to_container(config.medium, resolve=True))
     medium |= {name.removeprefix("medium."): value for name, value in settings.items() if name.startswith("medium.")}
-    build(medium | {"mesh": location})
+    return typing.cast(Medium, build(medium | {"mesh": location} | index_settings(iors)))
+
+
+def index_settings(iors: Sequence[float]) -> dict[str, object]:
+    """The medium's options that give its bodies these indices."""
+    first, *inner = (round(float(ior), 4) for ior in iors)
+    return {"ior": first} | ({"inner_iors": inner} if inner else {})
+
+
+def train_command(settings: dict[str, object], overrides: list[str]) -> list[str]:
+    """The command that trains with these settings and what this command line said of data and medium."""
     kept = [text for text in overrides if text.lstrip("+").startswith(("data=", "data.", "medium=", "medium."))]
     kept = [text for text in kept if text.lstrip("+").split("=")[0] not in {*settings, "medium.mesh"}]
     written = [f"{name}={str(value).replace(' ', '')}" for name, value in settings.items()]

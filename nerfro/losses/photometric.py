@@ -5,8 +5,10 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.func import functional_call
 from torch.nn.functional import mse_loss
 
+from nerfro.boundaries.base import Boundary
 from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
 from nerfro.types import Batch, Rendering
@@ -17,7 +19,7 @@ class Photometric(Loss):
     """Mean squared colour error of the last level, plus that of earlier ones (paper, Eqn. lossRGB).
 
     The mean is over pixels and channels, as in the authors' code; the paper's norm is three times that. Divided pixels
-    teach the field alone: their rays part so widely that the boundary would learn speckle from them.
+    teach the boundary nothing: their rays part so widely that it would learn speckle from them.
 
     Args:
         coarse: factor of the earlier levels' errors; 1 in the paper, 0.1 in mip-NeRF.
@@ -30,15 +32,23 @@ class Photometric(Loss):
     def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
         value, target = torch.zeros((), device=batch.rgb.device), batch.of_pixels(batch.rgb)
         for rendering, factor in zip(renderings, [self.coarse] * (len(renderings) - 1) + [1.0], strict=True):
-            radiance = batch.of_pixels(_teaching(rendering, batch))
+            radiance = batch.of_pixels(_teaching(rendering, batch, model.boundary))
             value = value + factor * mse_loss(*model.difference(radiance, target))
         return value
 
 
-def _teaching(rendering: Rendering, batch: Batch) -> Float[Tensor, "R 3"]:
-    """The rays' radiance, of which that of divided pixels has no gradient in the boundary."""
+def _teaching(rendering: Rendering, batch: Batch, boundary: Boundary) -> Float[Tensor, "R 3"]:
+    """The rays' radiance, of which that of divided pixels has no gradient by the boundary's parameters.
+
+    What bends the rays still learns from where they leave.
+    """
     if batch.num_whole is None:
         return rendering.rgb
-    boundary = rendering.boundary_rgb
-    from_boundary = rendering.path.per_ray(rendering.transmittance[:, None] * (boundary - boundary.detach()))
+    learned = rendering.boundary_rgb - rendering.boundary_rgb.detach()
+    exits = rendering.path.exits()
+    if exits.directions.requires_grad:
+        fixed = {name: parameter.detach() for name, parameter in boundary.named_parameters()}
+        bent = functional_call(boundary, fixed, (exits,))
+        learned = learned - (bent - bent.detach())
+    from_boundary = rendering.path.per_ray(rendering.transmittance[:, None] * learned)
     return torch.cat([rendering.rgb[: batch.num_whole], (rendering.rgb - from_boundary)[batch.num_whole :]])

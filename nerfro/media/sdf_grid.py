@@ -41,6 +41,7 @@ class SdfGrid(Solid):
         inner_meshes: bodies inside it (a liquid, a bubble), each inside those before; opaque things do not belong
             here, because rays do not bend on them.
         inner_iors: their refractive indices.
+        learn_ior: refine all indices in training, by the replay of paths.
         resolution: grid vertices a side.
         box_min, box_max: corners of the grid, world units; the object needs a margin of air inside.
         shell_voxels: half width of the smooth interface that the Eikonal equation sees, voxels.
@@ -69,6 +70,7 @@ class SdfGrid(Solid):
         ior: Positive = 1.5,
         inner_meshes: list[str] = [],  # noqa: B006 (the registry reads and copies it)
         inner_iors: list[Positive] = [],  # noqa: B006
+        learn_ior: bool = False,
         resolution: Annotated[int, Range(at_least=4)] = 128,
         box_min: list[float] = [-1.5, -1.5, -1.5],  # noqa: B006
         box_max: list[float] = [1.5, 1.5, 1.5],  # noqa: B006
@@ -90,7 +92,7 @@ class SdfGrid(Solid):
         box = corners_of_box(box_min, box_max)
         spacing = (box[1] - box[0]) / (resolution - 1)
         shell = shell_voxels * float(spacing.min())
-        super().__init__([ior, *inner_iors], shell, absorption, learn_absorption, abbe)
+        super().__init__([ior, *inner_iors], shell, absorption, learn_absorption, abbe, learn_ior)
         self.crease_degrees = crease_degrees
         self.meshes = [load_mesh(resolve_path(path), accept_open_mesh) for path in (mesh, *inner_meshes)]
         band = _BAND + smoothing_size

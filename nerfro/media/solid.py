@@ -54,6 +54,7 @@ class Solid(Medium):
         absorption: list[NotNegative] = (),  # type: ignore[assignment]
         learn_absorption: bool = False,
         abbe: list[Positive] = (),  # type: ignore[assignment]
+        learn_ior: bool = False,
     ) -> None:
         super().__init__()
         if len(abbe) not in (0, 1, len(iors)):
@@ -70,7 +71,11 @@ class Solid(Medium):
         else:
             self.register_buffer("_absorption", given if given.any() else None, persistent=False)
         # Double precision: kernels ask for it, and a number without dimensions takes on the precision of what it meets.
-        self.register_buffer("iors", torch.tensor(iors, dtype=torch.float64), persistent=False)
+        indices = torch.tensor(iors, dtype=torch.float64)
+        if learn_ior:
+            self.iors = nn.Parameter(indices)
+        else:
+            self.register_buffer("iors", indices, persistent=False)
         self.shell = float(shell)
 
     @property

@@ -76,8 +76,17 @@ class NerfModel(LightningModule, ABC):
     def trace(self, rays: Rays, path: Path | None = None) -> Path:
         """Paths of rays, or the given ones, tinted by the medium; with gradients by what bends and learns."""
         path = self.path_sampler(rays, self.medium) if path is None else path
-        path = self.path_sampler.refine(path, rays, self.medium) if self.paths_learn else path
-        return self.medium.tinted(path)
+        return self.medium.tinted(self._steadily_refined(path, rays) if self.paths_learn else path)
+
+    def _steadily_refined(self, path: Path, rays: Rays) -> Path:
+        """Paths with gradients, but for those whose derivatives are too large to learn from."""
+        refined = self.path_sampler.refine(path, rays, self.medium)
+        steady = self.path_sampler.steady(path, self.medium)
+        every = ("positions", "directions", "s", "exit_directions")
+        old, new = ([getattr(each, name) for name in every] for each in (path, refined))
+        return refined.moved(
+            *(torch.where(steady.view(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(old, new, strict=True))
+        )
 
     @property
     def paths_learn(self) -> bool:
@@ -138,7 +147,8 @@ class NerfModel(LightningModule, ABC):
         progress = self.trainer.strategy.broadcast(training_progress(self.trainer))
         factor = learning_rate_factor(self.global_step, progress, self.optimizer_config)
         for group in self.trainer.optimizers[0].param_groups:
-            group["lr"] = group["initial_lr"] * factor
+            waits = group["name"] == "medium" and self.global_step < self.optimizer_config.medium_start
+            group["lr"] = 0.0 if waits else group["initial_lr"] * factor
         for field in self.fields:
             field.before_step(progress)  # type: ignore[operator]
         # Not at the end of the step before, which comes after its checkpoint: a resumed run would miss the update.

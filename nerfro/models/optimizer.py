@@ -24,6 +24,7 @@ class OptimizerConfig:
     boundary_learning_rate: Optional[Positive] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     medium_learning_rate: Optional[Positive] = None  # noqa: UP045
     camera_learning_rate: Optional[Positive] = None  # noqa: UP045
+    medium_start: Natural = 0  # steps before what bends rays learns, so that it is not misled by an unlearned scene
     warmup_steps: Natural = 2500  # length of the warm-up; 0 for none
     warmup_factor: NotNegative = 0.01  # factor of the learning rate at its first step
     adam_epsilon: Positive = 1e-8  # of Adam

@@ -5,7 +5,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
-from torch import nn
+import torch
+from jaxtyping import Bool
+from torch import Tensor, nn
 
 from nerfro.fields.base import Field
 from nerfro.media.base import Medium
@@ -27,6 +29,10 @@ class PathSampler(nn.Module, ABC):
         Silhouettes that move, and events that appear or go, have no gradients.
         """
         return path
+
+    def steady(self, path: Path, medium: Medium) -> Bool[Tensor, "P"]:
+        """Which traced paths have derivatives that are bounded; those of others are left out in training."""
+        return torch.ones_like(path.refracted)
 
     def releases_python(self, medium: Medium) -> bool:
         """Whether a thread that traces on the CPU leaves Python to others, so that it can work beside them."""

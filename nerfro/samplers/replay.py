@@ -57,7 +57,7 @@ def with_gradient(value: Float[Tensor, "..."], replayed: Float[Tensor, "..."]) -
     return _ValueOf.apply(value, replayed)
 
 
-def smallest_cosine(path: Path, medium: Solid) -> Float[Tensor, "P"]:
+def smallest_cosine(path: Path, medium: Medium) -> Float[Tensor, "P"]:
     """Least |N . d| of a path just before and just after its events at sharp surfaces; 1 where there is none.
 
     First derivatives of the path are sound where this is above 0.15; below, the ray grazes a surface or leaves one

@@ -23,12 +23,14 @@ from nerfro.samplers.branching import ONE_PATH, Branching, Event
 from nerfro.samplers.compiled import snell_on_grid
 from nerfro.samplers.mesh_interfaces import snell_on_mesh
 from nerfro.samplers.polylines import Polylines
-from nerfro.samplers.replay import meet_solid, meet_triangles, replay
+from nerfro.samplers.replay import meet_solid, meet_triangles, replay, smallest_cosine
 from nerfro.samplers.snell_law import reflectance, refract
 from nerfro.samplers.straight import straight_path
 from nerfro.types import Path, Rays
 
 _ROOT_ITERATIONS = 60
+# Nearer to grazing or to the critical angle, as a cosine, derivatives are too large to learn from.
+_STEADY = 0.15
 
 
 @register("sampler/path", "snell")
@@ -91,6 +93,9 @@ class Snell(PathSampler):
         if self.interface == "mesh" and isinstance(medium, SdfGrid):
             medium.traced_triangles()  # made before they are shared
         return [medium.at_wavelength(wavelength) for wavelength in self.wavelengths]
+
+    def steady(self, path: Path, medium: Medium) -> Bool[Tensor, "P"]:
+        return smallest_cosine(path, medium) > _STEADY
 
     def releases_python(self, medium: Medium) -> bool:
         return self.interface == "sdf" and isinstance(medium, SdfGrid)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Optional
 
 from omegaconf import MISSING, DictConfig, OmegaConf
 from tqdm import tqdm
@@ -41,6 +42,7 @@ class SynthesizeConfig:
     noise: float = MISSING
     fresnel: bool = MISSING
     absorption: list[float] = MISSING
+    ior: Optional[float] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     seed: int = MISSING
     sky_height: int = MISSING
     extras: bool = MISSING
@@ -80,8 +82,10 @@ def synthesize(config: DictConfig) -> tuple[Scene, Path]:
     absorption = tuple(config.absorption)
     if len(absorption) != 3 or not all(0 <= value < float("inf") for value in absorption):
         raise NerfroError(f"absorption={list(absorption)} is not allowed; give red, green and blue, at least 0 each")
-    scene = replace(build_scene(config.scene, config.resolution), absorption=absorption)
-    folder = user_path(config.out)
+    if config.ior is not None and not config.ior > 0:
+        raise NerfroError(f"ior={config.ior} is no refractive index; give a positive number, or none for the scene's")
+    scene, folder = build_scene(config.scene, config.resolution), user_path(config.out)
+    scene = replace(scene, absorption=absorption, ior=scene.ior if config.ior is None else config.ior)
     mitsuba = load_mitsuba(config.variant)  # before anything is cleared that could not be rendered again
     data = (dataset.Photographs if config.scene in CAPTURES else dataset.Views)(config, scene, folder)
     data.prepare(mitsuba)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-import torch
+import dataclasses
 
+import torch
+from torch.func import functional_call
+
+from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.light import to_srgb
 from nerfro.losses.boundary import BoundaryRegulariser
 from nerfro.losses.photometric import Photometric
 from nerfro.models.refractive import RefractiveModel
 from nerfro.testing import example_parts
-from nerfro.types import Batch, Path, Rendering, Samples
+from nerfro.types import Batch, Exits, Path, Rendering, Samples
 
 NUM_WHOLE, NUM_DIVIDED, PARTS = 3, 2, 4
 NUM_RAYS = NUM_WHOLE + NUM_DIVIDED * PARTS
@@ -47,6 +51,33 @@ def test_a_divided_pixel_is_compared_as_a_whole_and_teaches_the_field_alone() ->
     torch.testing.assert_close(of_boundary[:NUM_WHOLE], whole_boundary[:NUM_WHOLE])
     assert whole_boundary[NUM_WHOLE:].abs().min() > 0
     torch.testing.assert_close(of_boundary[NUM_WHOLE:], torch.zeros(NUM_DIVIDED * PARTS, 3), rtol=0, atol=1e-7)
+
+
+def test_what_bends_rays_learns_from_divided_pixels_and_the_sky_does_not() -> None:
+    sky = EnvironmentMap([4])
+    torch.nn.init.normal_(sky.texels)
+    model = RefractiveModel(dataclasses.replace(example_parts(), boundary=sky))
+    directions = torch.nn.functional.normalize(torch.randn(NUM_RAYS, 3), dim=-1).requires_grad_()
+    given, passed, colour = batch(), torch.rand(NUM_RAYS), torch.rand(NUM_RAYS, 3)
+
+    def loss(held: bool) -> torch.Tensor:
+        """By hand: the same pixels, of which the divided ones see a sky that is held."""
+        whole, divided = directions[:NUM_WHOLE], directions[NUM_WHOLE:]
+        fixed = (
+            functional_call(sky, {"texels": sky.texels.detach()}, (Exits(divided),)) if held else sky(Exits(divided))
+        )
+        seen = (1 - passed)[:, None] * colour + passed[:, None] * torch.cat([sky(Exits(whole)), fixed])
+        pixels = torch.cat([seen[:NUM_WHOLE], seen[NUM_WHOLE:].view(NUM_DIVIDED, PARTS, 3).mean(1)])
+        target = torch.cat([given.rgb[:NUM_WHOLE], given.rgb[NUM_WHOLE::PARTS]])
+        return (to_srgb(pixels) - target).square().mean()
+
+    rendered = rendering(colour, sky(Exits(directions)), passed)
+    path = dataclasses.replace(rendered.path, exit_directions=directions)
+    value = Photometric()([dataclasses.replace(rendered, path=path)], given, model)
+    found = torch.autograd.grad(value, [directions, sky.texels])
+    for gradient, expected in zip(found, torch.autograd.grad(loss(held=True), [directions, sky.texels]), strict=True):
+        torch.testing.assert_close(gradient, expected)
+    assert not torch.allclose(found[1], torch.autograd.grad(loss(held=False), sky.texels)[0])
 
 
 def test_parts_of_a_pixel_need_not_have_its_colour_for_the_regulariser() -> None:

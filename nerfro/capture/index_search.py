@@ -1,0 +1,225 @@
+"""The refractive index of a known surface, found by where its rays end up in known surroundings.
+
+For each candidate, pixels of the object are traced, and what they show is compared with the surroundings in the
+direction in which their rays leave. The error has one wide valley around the true index: an error of 0.1 turns the
+light that leaves a ball by some degrees, the more the farther from its middle.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.capture.surroundings import Pixels, Room, Surroundings
+from nerfro.errors import NerfroError
+from nerfro.media.solid import Solid
+from nerfro.samplers.snell import Snell
+
+LOWEST, HIGHEST = 1.0, 2.5
+# Candidates along each axis and pixels of the first look, by the number of bodies.
+_COARSE = {1: (31, 12_000), 2: (13, 4_000)}
+# Candidates along each axis of closer looks, by the number of bodies, and how far they reach from its middle.
+_AROUND = {1: 9, 2: 5}
+_REACHES = {1: (0.05, 0.02), 2: (0.15, 0.05, 0.02)}
+# Of a closer look, by the number of bodies, and of one at surroundings that are rendered for each ray.
+_FINE_PIXELS, _NEAR_PIXELS = {1: 60_000, 2: 20_000}, 12_000
+_MOST_LOOKS = 4  # of each reach, until the middle stays where it is
+# Rays with more events are no help: tiny errors of the surface turn them anywhere.
+_MAX_EVENTS = 4
+# Residuals count half at this share of the surroundings' standard deviation: what is inside spoils many pixels.
+_HALF = 0.5
+_RESAMPLES = 200
+# Without a valley so deep (share of the error of unrelated colours), or with a larger standard error (share of the
+# index), the pictures do not tell.
+_SHALLOW, _LOOSE = 0.03, 0.02
+# Nor if for less than this share of the pixels it is known where their light comes from.
+_UNKNOWN = 0.1
+
+
+@dataclass(frozen=True)
+class IndexEstimate:
+    """Indices of a medium's bodies and how they were found.
+
+    Attributes:
+        iors: of each body, the outer one first.
+        standard_errors: by resampling views. What is wrong with the surface is not in them.
+        curvature: second derivative of the error along each index.
+        wide, close: candidates of the first look and of the last, with their robust errors in the last column: 0 where
+            all is explained, 1 where nothing is. They are of other pixels and not to be compared.
+        unrelated: the error of colours that have nothing to do with each other.
+        doubts: why the pictures do not tell the index; empty where they do.
+    """
+
+    iors: Float[np.ndarray, "K"]
+    standard_errors: Float[np.ndarray, "K"]
+    curvature: Float[np.ndarray, "K"]
+    wide: Float[np.ndarray, "C K+1"]
+    close: Float[np.ndarray, "c K+1"]
+    unrelated: float
+    doubts: list[str]
+
+
+def find_index(
+    medium: Solid, through: Pixels, surroundings: Surroundings, progress: Callable[[float], None] = lambda done: None
+) -> IndexEstimate:
+    """Search all indices from 1 to 2.5, coarse then fine.
+
+    Args:
+        medium: the bodies; its indices are set to what is found.
+        through: pixels that the object fills.
+        surroundings: what is seen around it.
+        progress: is told the share done.
+
+    Raises:
+        NerfroError: the medium has more than two bodies, or no ray of the pixels meets it.
+    """
+    num_bodies = len(medium.iors)
+    if num_bodies not in _COARSE:
+        raise NerfroError(f"the indices of {num_bodies} bodies are not searched for, of two at most; give medium.ior=")
+    num_fine = _NEAR_PIXELS if isinstance(surroundings.boundary, Room) else _FINE_PIXELS[num_bodies]
+    search = _Search(medium, through.some(num_fine), surroundings)
+    per_axis, num_pixels = _COARSE[num_bodies]
+    num_pixels = min(num_pixels, num_fine // 4)
+    axis = np.linspace(LOWEST, HIGHEST, per_axis)
+    coarse = np.array(list(itertools.product(axis, repeat=num_bodies)))
+    share = len(coarse) * num_pixels / (len(coarse) * num_pixels + 4 * _AROUND[num_bodies] ** num_bodies * num_fine)
+    costs = search.costs(coarse, num_pixels, False, lambda done: progress(share * done)).mean_error()
+    middle = coarse[costs.argmin()]
+    looks = len(_REACHES[num_bodies]) * _MOST_LOOKS
+    look = 0
+    for reach in _REACHES[num_bodies]:
+        steps = np.linspace(-reach, reach, _AROUND[num_bodies])
+        for _ in range(_MOST_LOOKS):
+            middle = middle.clip(LOWEST + reach, HIGHEST - reach)
+            stencil = middle + np.array(list(itertools.product(steps, repeat=num_bodies)))
+            begun, look = share + (1 - share) * look / looks, look + 1
+            closest = reach == _REACHES[num_bodies][-1]
+            fine = search.costs(
+                stencil,
+                num_fine if closest else num_fine // 3,
+                True,
+                lambda done, b=begun: progress(b + (1 - share) * done / looks),
+            )
+            errors = fine.mean_error()
+            found, curvature = _lowest(stencil, errors[None], reach)
+            settled = np.abs(found[0] - middle).max() < 0.5 * reach
+            middle = found[0].clip(LOWEST, HIGHEST)
+            if settled:
+                break
+    progress(1.0)
+    num_views = len(fine.counts)
+    weights = np.random.default_rng(0).multinomial(num_views, np.full(num_views, 1 / num_views), _RESAMPLES)
+    spread = _lowest(stencil, fine.mean_error(weights), reach)[0].std(0)
+    medium.iors = torch.from_numpy(middle).to(medium.iors)
+    known = fine.counts.sum() / max(1, search.num_pixels)
+    doubts = _doubts(middle, spread, curvature[0], 1 - errors.min() / search.unrelated, known)
+    wide, close = np.column_stack([coarse, costs]), np.column_stack([stencil, errors])
+    return IndexEstimate(middle, spread, curvature[0], wide, close, search.unrelated, doubts)
+
+
+def _lowest(
+    stencil: Float[np.ndarray, "C K"], errors: Float[np.ndarray, "B C"], reach: float
+) -> tuple[Float[np.ndarray, "B K"], Float[np.ndarray, "B K"]]:
+    """Where the parabolas through errors around a middle are lowest, and their second derivatives.
+
+    A parabola that has no lowest place near the stencil has it at the stencil's best candidate.
+    """
+    num_bodies, middle = stencil.shape[1], stencil.mean(0)
+    x = (stencil - middle) / reach
+    pairs = list(itertools.combinations_with_replacement(range(num_bodies), 2))
+    terms = np.stack([np.ones(len(x)), *x.T, *(x[:, i] * x[:, j] for i, j in pairs)], 1)
+    fitted = errors @ np.linalg.pinv(terms).T
+    hessian = np.zeros((len(errors), num_bodies, num_bodies))
+    for (i, j), factor in zip(pairs, fitted[:, 1 + num_bodies :].T, strict=True):
+        hessian[:, i, j] += factor
+        hessian[:, j, i] += factor
+    regular = np.linalg.eigvalsh(hessian)[:, 0] > 1e-9
+    hessian_or_one = np.where(regular[:, None, None], hessian, np.eye(num_bodies))
+    place = -np.linalg.solve(hessian_or_one, fitted[:, 1 : 1 + num_bodies, None])[..., 0]
+    near = regular & (np.abs(place).max(1) < 1.5)
+    place = np.where(near[:, None], place, x[errors.argmin(1)])
+    return middle + reach * place, np.diagonal(hessian, axis1=1, axis2=2) / reach**2
+
+
+def _doubts(
+    iors: np.ndarray, standard_errors: np.ndarray, curvature: np.ndarray, depth: float, known: float
+) -> list[str]:
+    doubts = []
+    if known < _UNKNOWN:
+        doubts.append(f"of {1 - known:.0%} of the object's light no photograph shows where it comes from")
+    if depth < _SHALLOW:
+        doubts.append(
+            f"the best index explains only {max(0.0, depth):.1%} of what unrelated colours leave unexplained: the "
+            "object may be opaque, or its surroundings may not be known where its light comes from"
+        )
+    for body, (ior, error, bend) in enumerate(zip(iors, standard_errors, curvature, strict=True)):
+        name = "the index" if len(iors) == 1 else f"the index of body {body + 1}"
+        if not LOWEST + 0.01 < ior < HIGHEST - 0.01:
+            doubts.append(f"{name} is at the end of what is searched, {LOWEST:g} to {HIGHEST:g}")
+        elif bend <= 0 or error > _LOOSE * ior:
+            doubts.append(f"{name} has a standard error of {error:.2g}: views do not agree on it")
+    return doubts
+
+
+@dataclass(frozen=True)
+class _Costs:
+    """Robust errors of candidates: sums over the pixels of each view, and how many pixels there are."""
+
+    sums: Float[np.ndarray, "C V"]
+    counts: Float[np.ndarray, "V"]
+
+    def mean_error(self, weights: Float[np.ndarray, "B V"] | None = None) -> np.ndarray:
+        """Mean over pixels of each candidate [C], or of each weighting of views [B, C]."""
+        if weights is None:
+            return self.sums.sum(1) / self.counts.sum().clip(1)
+        return (weights @ self.sums.T) / (weights @ self.counts)[:, None].clip(1)
+
+
+class _Search:
+    def __init__(self, medium: Solid, through: Pixels, surroundings: Surroundings) -> None:
+        self._medium, self._surroundings = medium, surroundings
+        self._sampler = Snell(max_events=_MAX_EVENTS)
+        medium.iors, medium.abbe = torch.full_like(medium.iors, 1.5), []  # one index for all colours
+        self._pixels = through[self._sampler(through.rays, medium).refracted]
+        self.num_pixels = len(self._pixels)
+        if not self.num_pixels:
+            raise NerfroError("no ray of the object's pixels meets its surface; mesh and poses do not belong together")
+        colours = surroundings.colours
+        self._square = float((_HALF * colours.std(0).mean()) ** 2) + 1e-6
+        other = colours[torch.randint(len(colours), (len(self._pixels),), generator=torch.Generator().manual_seed(1))]
+        self.unrelated = float(self._robust(other - self._pixels.radiance).mean())
+
+    def costs(
+        self, candidates: Float[np.ndarray, "C K"], num_pixels: int, alike: bool, progress: Callable[[float], None]
+    ) -> _Costs:
+        """Errors of candidates. Where a ray's light comes from is not always known, and that differs among candidates.
+
+        Far apart, they are compared by all pixels, with an error that favours none where nothing is known; `alike`
+        ones by those pixels for which all know it, or they would be preferred for knowing more.
+        """
+        pixels = self._pixels.some(num_pixels)
+        rays = pixels.rays
+        errors, everywhere = [], torch.ones(len(pixels), dtype=torch.bool)
+        for number, iors in enumerate(candidates):
+            self._medium.iors = torch.from_numpy(iors).to(self._medium.iors)
+            trace = self._sampler.trace(rays, self._medium)
+            radiance, known = self._surroundings.radiance(trace.path.exits())
+            known &= ~trace.exceeded
+            everywhere &= known
+            errors.append(torch.where(known, self._robust(radiance - pixels.radiance), self.unrelated))
+            progress((number + 1) / len(candidates))
+        used = everywhere if alike else torch.ones_like(everywhere)
+        view, num_views = pixels.view[used], len(pixels.cameras)
+        sums = [torch.bincount(view, error[used].double(), num_views).numpy() for error in errors]
+        return _Costs(np.stack(sums), torch.bincount(view, minlength=num_views).double().numpy())
+
+    def _robust(self, residual: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
+        """r^2 / (r^2 + s^2)."""
+        square = residual.square().mean(-1)
+        return square / (square + self._square)

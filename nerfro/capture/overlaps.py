@@ -1,0 +1,61 @@
+"""How well a surface's silhouettes are the masks: printed, and written as figures and as a sheet of pictures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from nerfro.capture.overlays import contact_sheet
+from nerfro.capture.pose_conventions import GOOD_OVERLAP, better_wrong_masks, overlap
+from nerfro.capture.visual_hull import Silhouettes
+from nerfro.cli import warn
+from nerfro.data.base import Views
+from nerfro.errors import first_of
+from nerfro.files.atomic import write_atomically
+from nerfro.files.images import save_picture
+from nerfro.geometry.mesh import TriangleMesh
+
+SHEET, REPORT = "overlays.png", "overlaps.json"
+_MAX_PIXELS = 256
+
+
+def report_overlaps(
+    split: str, views: Views, mesh: TriangleMesh, silhouettes: Silhouettes, wrong_masks: int | None, folder: Path
+) -> None:
+    """Print and write how well a surface's silhouettes are the masks.
+
+    Args:
+        split: of the views.
+        views: with their masks.
+        mesh: the surface.
+        silhouettes: of the masks.
+        wrong_masks: with which the surface was carved; None for one that was not.
+        folder: to write to.
+    """
+    overlaps = overlap(mesh, silhouettes, _MAX_PIXELS)
+    print("overlap (intersection over union) of the surface's silhouette with each mask:")
+    for name, value in zip(views.names, overlaps, strict=True):
+        print(f"  {value:.4f}  {name}")
+    worst = int(overlaps.argmin())
+    print(f"  {overlaps.mean():.4f}  mean; {overlaps[worst]:.4f} lowest, {views.names[worst]}")
+    _warn_of_bad(overlaps, views.names, silhouettes, wrong_masks)
+    save_picture(folder / SHEET, contact_sheet(views, mesh, overlaps, _MAX_PIXELS))
+    each = dict(zip(views.names, (round(float(x), 4) for x in overlaps), strict=True))
+    figures = {"split": split, "mean": round(float(overlaps.mean()), 4), "views": each}
+    write_atomically(folder / REPORT, json.dumps(figures, indent=1) + "\n")
+
+
+def _warn_of_bad(
+    overlaps: Float[np.ndarray, "V"], names: list[str], silhouettes: Silhouettes, wrong_masks: int | None
+) -> None:
+    bad = [names[view] for view in np.argsort(overlaps, kind="stable") if overlaps[view] < GOOD_OVERLAP]
+    if not bad:
+        return
+    better = None if wrong_masks is None else better_wrong_masks(silhouettes, wrong_masks)
+    advice = (
+        "" if better is None else f"; where few masks are wrong, the others make a better hull: wrong_masks={better}"
+    )
+    warn(f"overlaps below {GOOD_OVERLAP}: {first_of(bad)}; look at {SHEET}, and correct their masks or poses{advice}")

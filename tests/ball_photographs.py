@@ -1,0 +1,83 @@
+"""Photographs of balls in balls under a smooth sky, all in closed form but for the grid of distances."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import torch
+import trimesh
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from nerfro.cameras import Cameras
+from nerfro.data.base import Views
+from nerfro.files.images import save_png
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.light import to_srgb
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.samplers.snell import Snell
+
+SIZE, NUM_VIEWS, RADIUS, INNER = 40, 30, 0.7, 0.35
+BOX = torch.tensor([[-0.9] * 3, [0.9] * 3])
+
+
+def cameras() -> Cameras:
+    """Around the origin, looking at it."""
+    index = torch.arange(NUM_VIEWS) + 0.5
+    z = 1 - 2 * index / NUM_VIEWS
+    flat, turn = (1 - z * z).sqrt(), 2.4 * index
+    back = torch.stack([flat * turn.cos(), flat * turn.sin(), z], -1)
+    right = normalize(torch.linalg.cross(torch.tensor([0.3, 0.9, 0.1]).expand_as(back), back), dim=-1)
+    poses = torch.stack([right, torch.linalg.cross(back, right), back, 3 * back], -1)
+    focal, middle = torch.full((NUM_VIEWS,), 0.8 * SIZE), torch.full((NUM_VIEWS,), SIZE / 2)
+    return Cameras(poses, focal, focal, middle, middle, SIZE, SIZE, 0.5, 6.0)
+
+
+def sky(directions: Tensor) -> Tensor:
+    """Smooth linear radiance in [0.1, 0.9]."""
+    x, y, z = directions.unbind(-1)
+    waves = [(4 * x + 2 * y).sin() * (3 * z).cos(), (5 * y - 2 * z).sin(), (4 * z + 3 * x).cos() * (2 * y).sin()]
+    return 0.5 + 0.4 * torch.stack(waves, -1)
+
+
+def ball(radius: float) -> Tensor:
+    axis = torch.linspace(-0.9, 0.9, 41, dtype=torch.float64)
+    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    return (points.norm(dim=-1) - radius).float()
+
+
+def solid(iors: list[float]) -> SdfGrid:
+    return SdfGrid.from_distances(torch.stack([ball(RADIUS), ball(INNER)][: len(iors)]), BOX, iors, 0.01)
+
+
+def photographs(iors: list[float], opaque: bool = False) -> Views:
+    """What the bodies show of the sky: their surfaces are those of balls, to a grid's accuracy."""
+    taken, images = cameras(), []
+    for view in range(NUM_VIEWS):
+        rays = taken.image_rays(view)
+        path = Snell()(rays, solid(iors))
+        radiance = sky(path.exit_directions)
+        if opaque:  # painted, in every colour of the sky
+            radiance = torch.where(path.refracted[:, None], sky(normalize(path.positions[:, 1], dim=-1)), radiance)
+        images.append(to_srgb(radiance).view(SIZE, SIZE, 3))
+    return Views(taken, torch.stack(images), None, [str(view) for view in range(NUM_VIEWS)])
+
+
+def mesh() -> TriangleMesh:
+    made = trimesh.creation.icosphere(3, RADIUS)
+    return TriangleMesh(made.vertices, made.faces)
+
+
+def save(views: Views, root: Path) -> None:
+    """Write a split `train` in Blender format, and the ball's mesh."""
+    frames = []
+    for view, image in enumerate(views.images):
+        save_png(root / "train" / f"r_{view}.png", image)
+        pose = torch.eye(4)
+        pose[:3] = views.cameras.camera_to_world[view]
+        frames.append({"file_path": f"./train/r_{view}", "transform_matrix": pose.tolist()})
+    angle = 2 * math.atan(0.5 * SIZE / float(views.cameras.fx[0]))
+    (root / "transforms_train.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    mesh().save(root / "mesh.ply")

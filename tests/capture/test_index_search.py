@@ -1,0 +1,87 @@
+"""The index of a known surface, from photographs of it under a sky in closed form."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import nerfro.preprocess
+from nerfro.capture.index_search import IndexEstimate, find_index
+from nerfro.capture.surroundings import divide_pixels, learn_surroundings
+from nerfro.data.base import Views
+from nerfro.errors import NerfroError
+from nerfro.media.sdf_grid import SdfGrid
+from tests.ball_photographs import NUM_VIEWS, SIZE, cameras, mesh, photographs, save, solid
+
+
+def search(views: Views, num_bodies: int = 1) -> tuple[IndexEstimate, SdfGrid]:
+    beside, through = divide_pixels(views, mesh())
+    medium = solid([1.5] * num_bodies)
+    return find_index(medium, through, learn_surroundings(beside, mesh(), False)), medium
+
+
+@pytest.mark.parametrize("ior", [1.2, 1.5])
+def test_index_of_a_ball(ior: float) -> None:
+    found, medium = search(photographs([ior]))
+    assert found.iors[0] == pytest.approx(ior, rel=0.005)
+    assert medium.iors.item() == pytest.approx(found.iors[0])
+    assert 0 < found.standard_errors[0] < 0.01 * ior
+    assert found.curvature[0] > 0
+    assert not found.doubts
+
+
+@pytest.mark.slow
+def test_indices_of_water_in_a_wall_of_glass() -> None:
+    found, _ = search(photographs([1.5, 1.33]), 2)
+    assert found.iors.tolist() == pytest.approx([1.5, 1.33], rel=0.01)
+    assert not found.doubts
+
+
+def test_an_opaque_ball_has_no_index() -> None:
+    found, _ = search(photographs([1.5], opaque=True))
+    assert found.doubts
+
+
+def test_masks_decide_which_pixels_are_the_objects() -> None:
+    views = photographs([1.5])
+    masks = torch.zeros(NUM_VIEWS, SIZE, SIZE)
+    masks[:, 10:20, 10:20] = 1
+    beside, through = divide_pixels(replace(views, masks=masks), mesh())
+    assert len(through) == NUM_VIEWS * 8 * 8
+    assert len(beside) == NUM_VIEWS * (SIZE * SIZE - 12 * 12)
+    with pytest.raises(NerfroError, match="0 through it"):
+        divide_pixels(replace(views, masks=0 * masks), mesh())
+
+
+def test_large_photographs_are_averaged_in_linear_light() -> None:
+    taken = cameras()
+    big = replace(taken, width=10 * SIZE, height=10 * SIZE, fx=10 * taken.fx, fy=10 * taken.fy, cx=10 * taken.cx,
+                  cy=10 * taken.cy)  # fmt: skip
+    checker = (torch.arange(10 * SIZE)[:, None] + torch.arange(10 * SIZE)) % 2
+    images = checker.float()[None, ..., None].expand(NUM_VIEWS, -1, -1, 3)
+    beside, _ = divide_pixels(Views(big, images, None, [""] * NUM_VIEWS), mesh())
+    assert beside.cameras.width == 5 * SIZE
+    torch.testing.assert_close(beside.radiance, torch.full_like(beside.radiance, 0.5))
+    # The same directions: the middle of a block of two is the corner between its pixels.
+    assert math.isclose(float(beside.cameras.fx[0]), 5 * float(taken.fx[0]), rel_tol=1e-6)
+
+
+def test_preprocess_writes_the_index_and_trains_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save(photographs([1.5]), tmp_path)
+    out = tmp_path / "out"
+    options = [f"data.root={tmp_path}", f"mesh={tmp_path / 'mesh.ply'}", f"out={out}", "data.near=0.5"]
+    monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", *options, "medium.cache=false", "medium.resolution=64"])
+    nerfro.preprocess.main()
+    found = json.loads((out / "index.json").read_text())
+    assert found["ior"] == [pytest.approx(1.5, rel=0.005)]
+    assert 0 < found["standard_error"][0] < 0.02
+    assert (out / "index.png").is_file()
+    assert f"medium.ior={found['ior'][0]:.4f}".rstrip("0") in capsys.readouterr().out
