@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from nerfro.boundaries.near_field import NearField
 from nerfro.capture.index_search import IndexEstimate, find_index
-from nerfro.capture.surroundings import divide_pixels, learn_surroundings
+from nerfro.capture.surroundings import Room, divide_pixels, learn_surroundings
 from nerfro.cli import warn
 from nerfro.data.base import Views
 from nerfro.files.atomic import atomic_file, write_atomically
@@ -36,7 +35,7 @@ def search_index(views: Views, mesh: TriangleMesh, medium: Solid, room: bool | N
         beside, through = divide_pixels(views, mesh)
         surroundings = learn_surroundings(beside, mesh, room, lambda done: progress.update(learning, completed=done))
         found = find_index(medium, through, surroundings, lambda done: progress.update(searching, completed=done))
-    what = "near" if isinstance(surroundings.boundary, NearField) else "far away"
+    what = "near" if isinstance(surroundings.boundary, Room) else "far away"
     print(f"surroundings: {what}; {surroundings.unexplained:.1%} of other views' variance unexplained")
     names = ["index"] if len(found.iors) == 1 else [f"index of body {body + 1}" for body in range(len(found.iors))]
     for name, ior, error, bend in zip(names, found.iors, found.standard_errors, found.curvature, strict=True):

@@ -16,8 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.boundaries.near_field import NearField
-from nerfro.capture.surroundings import Pixels, Surroundings
+from nerfro.capture.surroundings import Pixels, Room, Surroundings
 from nerfro.errors import NerfroError
 from nerfro.media.solid import Solid
 from nerfro.samplers.snell import Snell
@@ -83,7 +82,7 @@ def find_index(
     num_bodies = len(medium.iors)
     if num_bodies not in _COARSE:
         raise NerfroError(f"the indices of {num_bodies} bodies are not searched for, of two at most; give medium.ior=")
-    num_fine = _NEAR_PIXELS if isinstance(surroundings.boundary, NearField) else _FINE_PIXELS[num_bodies]
+    num_fine = _NEAR_PIXELS if isinstance(surroundings.boundary, Room) else _FINE_PIXELS[num_bodies]
     search = _Search(medium, through.some(num_fine), surroundings)
     per_axis, num_pixels = _COARSE[num_bodies]
     num_pixels = min(num_pixels, num_fine // 4)
@@ -186,7 +185,7 @@ class _Search:
     def __init__(self, medium: Solid, through: Pixels, surroundings: Surroundings) -> None:
         self._medium, self._surroundings = medium, surroundings
         self._sampler = Snell(max_events=_MAX_EVENTS)
-        medium.iors = torch.full_like(medium.iors, 1.5)
+        medium.iors, medium.abbe = torch.full_like(medium.iors, 1.5), []  # one index for all colours
         self._pixels = through[self._sampler(through.rays, medium).refracted]
         self.num_pixels = len(self._pixels)
         if not self.num_pixels:

@@ -23,30 +23,29 @@ _MAX_PIXELS = 256
 
 
 def report_overlaps(
-    split: str, views: Views, mesh: TriangleMesh, silhouettes: Silhouettes, folder: Path, wrong_masks: int | None
+    split: str, views: Views, mesh: TriangleMesh, silhouettes: Silhouettes, wrong_masks: int | None, folder: Path
 ) -> None:
-    """Print and write how well the surface's silhouettes are the masks.
+    """Print and write how well a surface's silhouettes are the masks.
 
     Args:
-        split, views, mesh, silhouettes: of the data, the surface, and the masks.
-        folder: where the figures and the sheet go.
-        wrong_masks: how many masks the hull forgives, for advice; None for a surface that is no hull.
+        split: of the views.
+        views: with their masks.
+        mesh: the surface.
+        silhouettes: of the masks.
+        wrong_masks: with which the surface was carved; None for one that was not.
+        folder: to write to.
     """
     overlaps = overlap(mesh, silhouettes, _MAX_PIXELS)
-    _report(overlaps, views.names)
+    print("overlap (intersection over union) of the surface's silhouette with each mask:")
+    for name, value in zip(views.names, overlaps, strict=True):
+        print(f"  {value:.4f}  {name}")
+    worst = int(overlaps.argmin())
+    print(f"  {overlaps.mean():.4f}  mean; {overlaps[worst]:.4f} lowest, {views.names[worst]}")
     _warn_of_bad(overlaps, views.names, silhouettes, wrong_masks)
     save_picture(folder / SHEET, contact_sheet(views, mesh, overlaps, _MAX_PIXELS))
     each = dict(zip(views.names, (round(float(x), 4) for x in overlaps), strict=True))
     figures = {"split": split, "mean": round(float(overlaps.mean()), 4), "views": each}
     write_atomically(folder / REPORT, json.dumps(figures, indent=1) + "\n")
-
-
-def _report(overlaps: Float[np.ndarray, "V"], names: list[str]) -> None:
-    print("overlap (intersection over union) of the surface's silhouette with each mask:")
-    for name, value in zip(names, overlaps, strict=True):
-        print(f"  {value:.4f}  {name}")
-    worst = int(overlaps.argmin())
-    print(f"  {overlaps.mean():.4f}  mean; {overlaps[worst]:.4f} lowest, {names[worst]}")
 
 
 def _warn_of_bad(

@@ -15,7 +15,6 @@ from nerfro.allowed import Count, Natural, NotNegative, Range, corners_of_box
 from nerfro.cameras import Cameras
 from nerfro.capture.index_report import CURVE, INDEX
 from nerfro.capture.overlaps import REPORT, SHEET
-from nerfro.capture.refined_mesh import ERRORS
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing
 from nerfro.geometry.mesh import TriangleMesh
@@ -39,8 +38,7 @@ class PreprocessConfig:
         mesh: a surface that was made elsewhere; it is checked against the masks, and no hull is made.
         room: whether the surroundings are near, for the search of the index; by default found out.
         out: folder that the results are written to; by default data.root.
-        refine: whether the surface is refined from what is seen through it.
-        resolution: voxels along the longest side of the hull, and of the refined surface.
+        resolution: voxels along the longest side of the hull.
         box_min, box_max: box that the hull is carved in, world units; by default found from cameras and masks.
         wrong_masks: number of views that may be wrong about any point of space.
         keep: number of separate parts to keep, the largest; by default all but strays.
@@ -54,7 +52,6 @@ class PreprocessConfig:
     mesh: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     room: Optional[bool] = None  # noqa: UP045
     out: Optional[str] = None  # noqa: UP045
-    refine: bool = False
     resolution: Annotated[int, Range(at_least=16, at_most=1024)] = 96
     box_min: Optional[list[float]] = None  # noqa: UP045
     box_max: Optional[list[float]] = None  # noqa: UP045
@@ -78,8 +75,7 @@ def claim(config: DictConfig, overrides: list[str]) -> Path:
     if config.out is None and str(config.data.root).startswith(EMBEDDED_PREFIX):
         raise NerfroError(f"data.root={config.data.root} ships with nerfro and is not written to; add out=FOLDER")
     folder = resolve_path(config.data.root) if config.out is None else user_path(config.out)
-    names = [SHEET, REPORT] if config.mesh is not None and not config.refine else [MESH, SHEET, REPORT]
-    names += [ERRORS] if config.refine else []
+    names = [SHEET, REPORT] if config.mesh is not None else [MESH, SHEET, REPORT]
     names += [] if is_given("medium.ior", overrides) else [INDEX, CURVE]
     refuse_existing([folder / name for name in names], config.overwrite)
     return folder

@@ -15,15 +15,18 @@ from torch.nn import functional
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.cube_map import project
 from nerfro.boundaries.envmap import EnvironmentMap
-from nerfro.boundaries.near_field import NearField
 from nerfro.cameras import Cameras, Window
 from nerfro.capture.silhouettes import mesh_silhouettes, pixel_stride
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
+from nerfro.fields.hash_grid import HashGridField
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.light import to_linear
 from nerfro.pixel_parts import pixel_rays
 from nerfro.rays import Rays
+from nerfro.rendering import composite
+from nerfro.samplers.density_grid import DensityGridSampler
+from nerfro.samplers.straight import straight_path
 from nerfro.types import Exits
 
 # Photographs are averaged down to at most so many pixels a side.
@@ -165,16 +168,45 @@ def learn_surroundings(
         seen[_texel(learned.rays.directions, n)] = True
         found = Surroundings(boundary, seen, _unexplained(boundary, judges), judges.radiance)
     if near or (near is None and found is not None and found.unexplained > _NO_SKY):
-        margin = 0.05 * (mesh.bounds[1] - mesh.bounds[0]).max()
-        low, high = (mesh.bounds + margin * np.array([[-1.0], [1.0]])).tolist()
-        distance = (beside.cameras.camera_to_world[:, :, 3] - torch.tensor(mesh.bounds.mean(0)).float()).norm(dim=-1)
-        field = NearField(low, high, radius=float(distance.mean()))
+        middle = torch.from_numpy(mesh.bounds.mean(0)).float()
+        distance = (beside.cameras.camera_to_world[:, :, 3] - middle).norm(dim=-1)
+        field = Room(mesh.bounds, float(distance.mean()))
         _learn(field, learned, _NEAR_STEPS, _NEAR_PIXELS, progress)
         unexplained = _unexplained(field, judges)
         if found is None or unexplained < found.unexplained:
             found = Surroundings(field, None, unexplained, judges.radiance)
     assert found is not None
     return found
+
+
+class Room(Boundary):
+    """Surroundings at finite distance: radiance in all of space, seen along the lines on which light leaves.
+
+    Args:
+        bounds: of the object, world units.
+        radius: of the ball around its middle in which details are finest; best the cameras' distance.
+    """
+
+    def __init__(self, bounds: Float[np.ndarray, "2 3"], radius: float) -> None:
+        super().__init__()
+        low, high = bounds.tolist()
+        self.field = HashGridField(
+            low, high, radius, finest_resolution=512, log2_table_size=17, direction_bands=1, initial_depth=3.0
+        )
+        self.sampler = DensityGridSampler(box_min=low, box_max=high, radius=radius, looks=0.25, decay=0.6)
+
+    def forward(self, exits: Exits) -> Float[Tensor, "P 3"]:
+        """Where light comes from infinity, it has the colour of what is farthest."""
+        assert exits.positions is not None
+        ones = torch.ones_like(exits.positions[:, 0])
+        rays = Rays(exits.positions, exits.directions, exits.radii * ones, 0 * ones, ones)
+        path = straight_path(rays)
+        samples = self.sampler(path, None)
+        radiance = self.field(samples)
+        return composite(samples, radiance, radiance.rgb[:, -1], path).rgb
+
+    def after_step(self, step: int) -> None:
+        self.sampler.after_step(step, [self.field])
 
 
 def exits_of(rays: Rays) -> Exits:
