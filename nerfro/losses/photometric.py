@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import mse_loss
 
+from nerfro.allowed import NotNegative
 from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
 from nerfro.types import Batch, Rendering
@@ -17,28 +18,38 @@ class Photometric(Loss):
     """Mean squared colour error of the last level, plus that of earlier ones (paper, Eqn. lossRGB).
 
     The mean is over pixels and channels, as in the authors' code; the paper's norm is three times that. Divided pixels
-    teach the field alone: their rays part so widely that the boundary would learn speckle from them.
+    teach the field alone: their rays part so widely that the boundary would learn speckle from them. So do the fainter
+    branches of rays that split: Adam takes steps of one length, however weak the light that asks for them.
 
     Args:
         coarse: factor of the earlier levels' errors; 1 in the paper, 0.1 in mip-NeRF.
+        teaching_share: weight of a branch, of the ray's heaviest, below which it teaches the boundary nothing.
     """
 
-    def __init__(self, weight: float = 1.0, start: int = 0, ramp: int = 0, coarse: float = 1.0) -> None:
+    def __init__(
+        self, weight: float = 1.0, start: int = 0, ramp: int = 0, coarse: float = 1.0, teaching_share: NotNegative = 0.5
+    ) -> None:
         super().__init__(weight, start, ramp)
-        self.coarse = coarse
+        self.coarse, self.teaching_share = coarse, teaching_share
 
     def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
         value, target = torch.zeros((), device=batch.rgb.device), batch.of_pixels(batch.rgb)
         for rendering, factor in zip(renderings, [self.coarse] * (len(renderings) - 1) + [1.0], strict=True):
-            radiance = batch.of_pixels(_teaching(rendering, batch))
+            radiance = batch.of_pixels(_teaching(rendering, batch, self.teaching_share))
             value = value + factor * mse_loss(*model.difference(radiance, target))
         return value
 
 
-def _teaching(rendering: Rendering, batch: Batch) -> Float[Tensor, "R 3"]:
-    """The rays' radiance, of which that of divided pixels has no gradient in the boundary."""
-    if batch.num_whole is None:
+def _teaching(rendering: Rendering, batch: Batch, share: float) -> Float[Tensor, "R 3"]:
+    """The rays' radiance, of which that of divided pixels and of faint branches has no gradient in the boundary."""
+    path = rendering.path
+    if batch.num_whole is None and not path.splits:
         return rendering.rgb
     boundary = rendering.boundary_rgb
-    from_boundary = rendering.path.per_ray(rendering.transmittance[:, None] * (boundary - boundary.detach()))
-    return torch.cat([rendering.rgb[: batch.num_whole], (rendering.rgb - from_boundary)[batch.num_whole :]])
+    silent = path.ray >= (path.num_rays if batch.num_whole is None else batch.num_whole)
+    if path.splits:
+        weight = path.throughput.amax(-1)
+        heaviest = weight.new_zeros(path.num_rays).scatter_reduce(0, path.ray, weight, "amax")
+        silent = silent | (weight < share * path.of_ray(heaviest))
+    from_boundary = rendering.transmittance[:, None] * (boundary - boundary.detach())
+    return rendering.rgb - path.per_ray(torch.where(silent[:, None], from_boundary, 0.0))
