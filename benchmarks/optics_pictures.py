@@ -92,7 +92,7 @@ def draw_light(folder: Path) -> None:
             panel.imshow(image, interpolation="nearest")
             panel.set_title(title)
             panel.axis("off")
-        figure.savefig(folder / name, dpi=90)
+        figure.savefig(folder / name, dpi=90, bbox_inches="tight")
 
 
 def cube_of_distances(**options: list[float]) -> SdfGrid:
@@ -103,7 +103,7 @@ def cube_of_distances(**options: list[float]) -> SdfGrid:
 
 def picture(sampler: Snell, medium: SdfGrid, side: int = 260, parts: int = 2) -> np.ndarray:
     """The medium under the sky of the scene `torus`, several rays a pixel, sRGB."""
-    cameras = view().resized(side, side).crop(central_window(side, side, 0.6))
+    cameras = view().resized(side, side).crop(central_window(side, side, 0.75))
     radiance_of_sky = lat_long.load_lat_long(ASSETS_DIR / "torus" / "sky.png")
     radiance = []
     for pixels in torch.arange(cameras.width * cameras.height).split(8192):

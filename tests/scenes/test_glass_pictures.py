@@ -99,6 +99,7 @@ def agreement(found: Tensor, expected: Tensor) -> float:
     return float(psnr(*(to_srgb(picture.clamp(0, 1)) for picture in (found, expected))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["ball", "cube", "bottle"])
 def test_pictures_of_empty_glass_are_those_of_a_dielectric(what: str, tmp_path: FilePath) -> None:
     interface, inner, glass = "sdf", None, BALL if what == "ball" else CUBE
@@ -117,12 +118,14 @@ def test_pictures_of_empty_glass_are_those_of_a_dielectric(what: str, tmp_path: 
         sampler = Snell(interface, 32, branches, 0.002)  # type: ignore[arg-type]
         return agreement(seen(sampler(rays, medium)), expected)
 
-    assert score("all") > 35
+    single, once, every = (score(branches) for branches in ("none", "first", "all"))
+    assert every > 35
     # Light that is left out is missed, and so is what is reflected later.
-    assert score("none") < 30
-    assert score("none") < score("first") < score("all")
+    assert single < once < every
+    assert single < every - 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["ball", "cube"])
 def test_absorption_is_that_of_the_path_and_is_learned_from_a_picture(what: str) -> None:
     expected = path_traced(BALL if what == "ball" else CUBE, 1.5, COLOURED).float()
@@ -132,10 +135,10 @@ def test_absorption_is_that_of_the_path_and_is_learned_from_a_picture(what: str)
         return seen(path, medium.tinted(path).transmitted(path.far[:, None])[:, 0])
 
     assert agreement(picture(given, BRANCHES(rays_of_picture(), given)), expected) > 35
-    few = BRANCHES(rays_of_picture(4), given)
-    assert float(learner.absorption.max()) < 0.03  # type: ignore[union-attr]
-    optimizer = torch.optim.Adam(learner.parameters(), lr=0.1)
-    for _ in range(150):
+    few = BRANCHES(rays_of_picture(8), given)
+    assert max(learner.learned().values()) < 0.03
+    optimizer = torch.optim.Adam(learner.parameters(), lr=0.15)
+    for _ in range(80):
         loss = (to_srgb(picture(learner, few)) - to_srgb(expected)).square().mean()
         optimizer.zero_grad()
         loss.backward()
