@@ -105,8 +105,8 @@ class DensityGridSampler(PointSampler):
             smaller = shrinkage(samples.positions, self.centre, self.radius)
             lengths = (places.diff(dim=1) / smaller).to(path.s.dtype)
             samples = replace(samples, lengths=lengths, measure=places.to(path.s.dtype))
-        depths = self.lookup(self.contracted(samples.positions)) * places.diff(dim=1)
-        return replace(samples, occupied=depths >= _EMPTY)
+        depth = self.lookup(self.contracted(samples.positions)) * places.diff(dim=1)
+        return replace(samples, occupied=depth >= _EMPTY)
 
     def draw_compiled(self, path: Path, u: Float[Tensor, "R N+1"]) -> Samples:
         """The same as `draw`, on the CPU.
@@ -135,8 +135,8 @@ class DensityGridSampler(PointSampler):
             self.near,
         )
         edges, s, positions, directions, occupied, *of_measure = (torch.from_numpy(array) for array in drawn)
-        of_measure = of_measure if self.radius is not None else []
-        return Samples(positions, directions, s, edges, path.radii, occupied, *of_measure)
+        lengths, measure = (None, None) if self.radius is None else of_measure
+        return Samples(positions, directions, s, edges, path.radii, occupied, lengths, measure)
 
     @property
     def centre(self) -> Float[Tensor, "3"]:

@@ -105,15 +105,20 @@ def _shrinkage(position, centre, radius):
 
 
 @compiled
-def _cell(position, centre, low, high, cells, radius):
-    """Number of the grid's cell that holds a place of the world; the nearest one of a place outside."""
-    share = np.sqrt(_shrinkage(position, centre, radius))
+def _contract(position, centre, smaller):
+    """`geometry.contraction.contract` of one place, in place."""
+    if smaller < 1.0:
+        share = np.sqrt(smaller)
+        for axis in range(3):
+            position[axis] = centre[axis] + (2.0 - share) * share * (position[axis] - centre[axis])
+
+
+@compiled
+def _cell(position, low, high, cells):
+    """Number of the grid's cell that a place lies in."""
     cell = 0
     for axis in range(3):
-        here = position[axis]
-        if share < 1.0:
-            here = centre[axis] + (2.0 - share) * share * (here - centre[axis])
-        along = int((here - low[axis]) / (high[axis] - low[axis]) * cells)
+        along = int((position[axis] - low[axis]) / (high[axis] - low[axis]) * cells)
         cell = cell * cells + min(max(along, 0), cells - 1)
     return cell
 
@@ -125,8 +130,8 @@ def draw(positions, directions, s, low, high, density, u, num_bins, floor, empty
     `u` are places in the cumulative distribution, ascending on each ray [R, N + 1]; `floor` is the weight that every
     bin has beside its share, which sums to one. With a `radius` above 0 what is beyond it is contracted, and `low` and
     `high` are the corners of the cube around contracted space. Returns edges [R, N + 1], arc lengths [R, N], positions
-    and directions [R, N, 3], whether the optical depth there is `empty` or more [R, N], the samples' `lengths` [R, N]
-    and `measure` [R, N + 1].
+    and directions [R, N, 3], whether the optical depth there is `empty` or more [R, N], and the samples' `lengths`
+    [R, N] and `measure` [R, N + 1].
     """
     num_rays, num_edges = u.shape
     cells, num_runs = density.shape[0], s.shape[1]
@@ -161,8 +166,8 @@ def draw(positions, directions, s, low, high, density, u, num_bins, floor, empty
                 at = _arc_length(place, run, marks, begin, passing, aside, radius)
                 for axis in range(3):
                     here[axis] = positions[ray, run, axis] + (at - s[ray, run]) * directions[ray, run, axis]
-                cell = _cell(here, centre, low, high, cells, radius)
-                stopped = 1.0 - np.exp(-density.flat[cell] * width)
+                _contract(here, centre, _shrinkage(here, centre, radius))
+                stopped = 1.0 - np.exp(-density.flat[_cell(here, low, high, cells)] * width)
                 weights[index] = passed * stopped
                 passed *= 1.0 - stopped
                 total += weights[index]
@@ -194,8 +199,9 @@ def draw(positions, directions, s, low, high, density, u, num_bins, floor, empty
                     here[axis] = positions[ray, run, axis] + (at - s[ray, run]) * slope
                     points[ray, edge - 1, axis] = here[axis]
                     headings[ray, edge - 1, axis] = slope
-                lengths[ray, edge - 1] = (place - before) / _shrinkage(here, centre, radius)
-                cell = _cell(here, centre, low, high, cells, radius)
-                occupied[ray, edge - 1] = density.flat[cell] * (place - before) >= empty
+                smaller = _shrinkage(here, centre, radius)
+                lengths[ray, edge - 1] = (place - before) / smaller
+                _contract(here, centre, smaller)
+                occupied[ray, edge - 1] = density.flat[_cell(here, low, high, cells)] * (place - before) >= empty
             before = place
     return edges, middles, points, headings, occupied, lengths, measure

@@ -148,8 +148,9 @@ def _require_no_box(config: DictConfig) -> None:
         if isinstance(written, dict) and "content.box" in str(written.get("box_min")):
             mesh = f", and medium.mesh={config.medium.mesh} does not exist" if "mesh" in config.medium else ""
             raise NerfroError(
-                f"{name} stays inside a box, and straight rays know no object to take it from{mesh}; give "
-                "content.box_min=[X,Y,Z] content.box_max=[X,Y,Z] in world units, around what shall be seen sharply"
+                f"{name} stays inside a box, and straight rays know no object to take it from{mesh}; for an ordinary "
+                "photo set take +experiment=straight, which needs none, or give content.box_min=[X,Y,Z] "
+                "content.box_max=[X,Y,Z] in world units, around what shall be seen sharply"
             )
 
 

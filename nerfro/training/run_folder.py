@@ -28,6 +28,7 @@ from nerfro.files.owned import held, require_own
 from nerfro.models.base import NerfModel
 from nerfro.paths import PACKAGE_DIR, user_path
 from nerfro.training.config import build_model
+from nerfro.training.content import describe
 from nerfro.training.settings import RESUMING, first_difference, settings
 
 LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
@@ -58,6 +59,13 @@ def own(folder: Path, config: DictConfig) -> Iterator[Path | None]:
             if (folder / CONFIG_FILE).is_file():
                 raise Interrupted(f"to go on, repeat it with hydra.run.dir={folder} ckpt_path=last") from None
             raise
+
+
+def begin(folder: Path, config: DictConfig, model: NerfModel) -> None:
+    """Refuse a disk that is too full, write what repeats the run, and say in a line or two what it is."""
+    require_room(folder, needed_bytes(model))
+    record(folder, config)
+    print(f"nerfro: {config.name} on {config.data.root} -> {folder}\n{describe(config.content)}", end="", flush=True)
 
 
 def require_room(folder: Path, needed_bytes: int) -> None:
