@@ -21,12 +21,11 @@ from nerfro.fields.mlp import compile_networks
 from nerfro.registry import build
 from nerfro.training.callbacks import StopOnSignal, Throughput
 from nerfro.training.config import TrainConfig, build_model
-from nerfro.training.content import describe
 from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.memory import require_memory
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.reach import require_reach
-from nerfro.training.run_folder import LAST_CHECKPOINT, needed_bytes, own, record, require_room, require_same_run
+from nerfro.training.run_folder import LAST_CHECKPOINT, begin, own, require_same_run
 from nerfro.training.trainer import finish_logs, make_trainer, prepare_process
 from nerfro.training.viewer import Viewer
 
@@ -64,10 +63,8 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     require_reach(model, first)
     memory = require_memory(model, first.rays, trainer.strategy.root_device, share)
     if trainer.is_global_zero:
-        require_room(folder, needed_bytes(model))
-        record(folder, config)
-        space = describe(config.content)
-        print(f"nerfro: {config.name} on {config.data.root} -> {folder}\n{space}{memory}", flush=True)
+        begin(folder, config, model)
+        print(memory, flush=True)
     if config.compile is not None:
         compile_networks(model, config.compile)
 

@@ -19,9 +19,6 @@ class Field(nn.Module, ABC):
         """Opposite corners of the box outside of which it holds nothing, world units; None where it has none."""
         return None
 
-    def before_step(self, progress: float) -> None:
-        """Called before a training step with the share of the run's budget that is spent, in [0, 1]."""
-
     def density(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
         """Density alone, per world unit, in single precision; it does not depend on the direction."""
         directions = torch.zeros_like(positions)

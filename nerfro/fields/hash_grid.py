@@ -44,14 +44,11 @@ class HashGridField(Field):
         width: of the hidden layers.
         direction_bands: bands of spherical harmonics that encode the direction; 1 makes colour independent of it.
         initial_depth: optical depth of the untrained field along the box's longest side.
-        fading_in: share of the training during which levels appear one after the other, coarse before fine; 0 for all
-            at once. What few rays see is then first explained as simply as can be.
         precision: of the MLPs' matrix products; `float32` for processors without bfloat16 units.
     """
 
     box_min: Float[Tensor, "3"]
     box_max: Float[Tensor, "3"]
-    shown: Float[Tensor, "L"]
 
     def __init__(
         self,
@@ -65,7 +62,6 @@ class HashGridField(Field):
         width: Count = 64,
         direction_bands: Annotated[int, Range(at_least=1, at_most=harmonics.MAX_BANDS)] = 4,
         initial_depth: Positive = 0.1,
-        fading_in: Annotated[float, Range(at_least=0, less_than=1)] = 0.0,
         precision: Literal["bfloat16", "float32"] = "bfloat16",
     ) -> None:
         super().__init__()
@@ -77,10 +73,6 @@ class HashGridField(Field):
         self.initial_density = initial_depth / self.side
         self.direction_bands, self.precision = direction_bands, precision
         self.levels = hash_encoding.grid_levels(num_levels, base_resolution, finest_resolution, log2_table_size)
-        self.fading_in = fading_in
-        # How much of each level is seen; kept with the weights, which mean nothing without it.
-        shown = torch.ones(num_levels) if fading_in == 0 else _shown(num_levels, 0.0)
-        self.register_buffer("shown", shown, persistent=fading_in > 0)
         self.table = nn.Parameter(torch.empty(self.levels.num_entries, hash_encoding.NUM_FEATURES))
         nn.init.uniform_(self.table, -1e-4, 1e-4)
         num_harmonics = harmonics.spherical_harmonics(torch.zeros(1, 3), direction_bands).shape[-1]
@@ -98,10 +90,6 @@ class HashGridField(Field):
         density, rgb = self.decode(contract(positions, self.centre, self.radius), samples.directions.flatten(0, 1))
         density = density * shrinkage(positions, self.centre, self.radius)
         return Radiance(density.view(samples.s.shape), rgb.view(samples.positions.shape))
-
-    def before_step(self, progress: float) -> None:
-        if self.fading_in > 0:
-            self.shown.copy_(_shown(len(self.levels), progress / self.fading_in))
 
     def decode(
         self, positions: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]
@@ -133,8 +121,7 @@ class HashGridField(Field):
             from nerfro.fields.hash_encoding_cpu import hash_encode  # compiled code, so only where it is used
         else:
             hash_encode = hash_encoding.hash_encode
-        features = hash_encode(unit, self.table, self.levels)
-        return features if self.fading_in == 0 else features * self.shown.repeat_interleave(hash_encoding.NUM_FEATURES)
+        return hash_encode(unit, self.table, self.levels)
 
     def encode_directions(self, directions: Float[Tensor, "P 3"]) -> Float[Tensor, "P K"]:
         """Spherical harmonics, compiled on the CPU."""
@@ -153,12 +140,6 @@ class HashGridField(Field):
             return relu_mlp(list(inputs), weights, getattr(torch, self.precision))
         with torch.autocast(inputs[0].device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
             return mlp(torch.cat([part.to(inputs[0].dtype) for part in inputs], dim=-1))
-
-
-def _shown(num_levels: int, progress: float) -> Float[Tensor, "L"]:
-    """Weight of each level: the coarser third from the beginning, the others in turn until `progress` is 1."""
-    first = -(-num_levels // 3)
-    return (first + progress * (num_levels - first) - torch.arange(num_levels)).clamp(0, 1)
 
 
 def _mlp(num_inputs: int, width: int, num_hidden: int, num_outputs: int) -> nn.Sequential:

@@ -25,11 +25,14 @@ class Distortion(Loss):
 
     def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
         rendering = renderings[-1]
-        edges, near, far = rendering.samples.edges, rendering.path.near[:, None], rendering.path.far[:, None]
-        if rendering.samples.measure is not None:
-            edges, near, far = rendering.samples.measure, 0.0, rendering.samples.measure[:, -1:]
+        bounds = rendering.samples.measure
+        if bounds is None:
+            bounds = rendering.samples.edges - rendering.path.near[:, None]
+            total = (rendering.path.far - rendering.path.near)[:, None]
+        else:
+            total = bounds[:, -1:]
         # A path of no length has no weights either; the clamp only keeps the quotient a number.
-        edges = (edges - near) / (far - near).clamp(min=1e-6)
+        edges = bounds / total.clamp(min=1e-6)
         return mean_over_rays(rendering.path.per_ray(distortion(rendering.weights, edges)), batch.num_rows)
 
 

@@ -28,6 +28,7 @@ from nerfro.files.owned import held, require_own
 from nerfro.models.base import NerfModel
 from nerfro.paths import PACKAGE_DIR, user_path
 from nerfro.training.config import build_model
+from nerfro.training.content import describe
 from nerfro.training.settings import RESUMING, first_difference, settings
 
 LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
@@ -74,6 +75,13 @@ def needed_bytes(model: NerfModel) -> int:
     """What a run writes: weights and Adam's two moments, beside an old checkpoint until the new one is whole."""
     weights = sum(parameter.numel() * parameter.element_size() for parameter in model.parameters())
     return 2 * 3 * weights + _SPARE_BYTES
+
+
+def begin(folder: Path, config: DictConfig, model: NerfModel) -> None:
+    """See that there is room, write what repeats the run, and say in a line or two what it is."""
+    require_room(folder, needed_bytes(model))
+    record(folder, config)
+    print(f"nerfro: {config.name} on {config.data.root} -> {folder}\n{describe(config.content)}", end="", flush=True)
 
 
 def record(folder: Path, config: DictConfig) -> None:

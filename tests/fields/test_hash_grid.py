@@ -203,25 +203,6 @@ def test_field_of_all_space_is_asked_where_contraction_leads() -> None:
     assert (found > 0).all()
 
 
-def test_levels_appear_coarse_before_fine() -> None:
-    field, samples = make_field(fading_in=0.5), make_samples()
-    shown = []
-    for progress in (0.0, 0.25, 0.5, 1.0):
-        field.before_step(progress)
-        shown.append(field.shown.tolist())
-    assert shown == [[1, 1, 0, 0], [1, 1, 1, 0], [1, 1, 1, 1], [1, 1, 1, 1]]
-    all_of_them = make_field()
-    assert torch.equal(field(samples).density, all_of_them(samples).density)
-    # Those that have not appeared do not learn; they travel with the weights.
-    field.before_step(0.0)
-    field(samples).density.sum().backward()
-    first = field.levels.offsets[2]
-    assert field.table.grad[:first].any()
-    assert not field.table.grad[first:].any()
-    assert "shown" in field.state_dict()
-    assert "shown" not in all_of_them.state_dict()
-
-
 @pytest.mark.parametrize("radius", [None, 0.8])
 def test_density_alone_is_that_of_samples(radius: float | None) -> None:
     field, samples = make_field(radius=radius), make_samples()
