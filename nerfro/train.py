@@ -53,8 +53,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     model = build_model(config, training.cameras)
     require_same_run(folder, checkpoint, config)
     throughput, interruption = Throughput(), StopOnSignal()
-    viewer = [Viewer(config, source, test)] if config.viewer else []
-    trainer = make_trainer(config, folder, [throughput, interruption, *viewer])
+    trainer = make_trainer(config, folder, [throughput, interruption, Viewer(config, source, test)])
     batches = batches.share(trainer.global_rank, trainer.world_size)
     batches = traced(batches, model, config)
     few = batches.smaller(4096)

@@ -19,7 +19,9 @@ _LOSS_SECONDS = 1.0  # between two points of the curve: on a GPU each waits for 
 
 
 class Viewer(Callback):
-    """Serves the page to this machine, fed with the current weights and the losses; on the first process alone.
+    """Serves the page to this machine if `viewer` is set, fed with the current weights and the losses.
+
+    With several processes the first one serves it.
 
     Args:
         config: of the run, see `TrainConfig`.
@@ -34,7 +36,7 @@ class Viewer(Callback):
         self._told = 0.0
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        if trainer.is_global_zero:  # what cannot be shown, or nowhere, is refused before the first step
+        if self._config.viewer and trainer.is_global_zero:  # what cannot be shown, or nowhere, is refused before the first step
             assert isinstance(pl_module, NerfModel)
             bake_surface(pl_module)
             self._server = PageServer("localhost", self._config.viewer_port)
