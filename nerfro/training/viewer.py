@@ -36,7 +36,8 @@ class Viewer(Callback):
         self._told = 0.0
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        if self._config.viewer and trainer.is_global_zero:  # what cannot be shown, or nowhere, is refused before the first step
+        # What cannot be shown, or nowhere, is refused before the first step.
+        if self._config.viewer and trainer.is_global_zero:
             assert isinstance(pl_module, NerfModel)
             bake_surface(pl_module)
             self._server = PageServer("localhost", self._config.viewer_port)

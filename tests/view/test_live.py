@@ -87,10 +87,9 @@ def test_training_serves_its_model(
     done = train_here(*options, "viewer_port=0")
     assert done.code == 0, done.err
     assert re.search(r"^nerfro: the model as it learns: http://localhost:\d+$", done.out, re.MULTILINE)
-    elsewhere = f"hydra.run.dir={tmp_path / 'other'}"
-    taken = train_here(*options, elsewhere, f"viewer_port={server.url.rpartition(':')[2]}")
+    taken = train_here(*options, f"hydra.run.dir={tmp_path / 'taken'}", f"viewer_port={server.url.rpartition(':')[2]}")
     assert taken.code == 1
     assert "cannot be served on" in taken.err
-    refused = train_here(*tiny_run, elsewhere, "trainer.max_steps=2", "viewer=true", "viewer_port=0")
+    refused = train_here(*tiny_run, *options[-3:-1], f"hydra.run.dir={tmp_path / 'refused'}", "viewer_port=0")
     assert refused.code == 1
     assert "an interactive page shows bodies with a surface" in refused.err
