@@ -230,7 +230,8 @@ def _learn(boundary: Boundary, pixels: Pixels, steps: int, batch: int, progress:
             optimizer.zero_grad()
             functional.mse_loss(seen, drawn.radiance).backward()
             optimizer.step()
-            boundary.after_step(step + 1)
+            if isinstance(boundary, Room):
+                boundary.after_step(step + 1)
             progress((step + 1) / steps)
     boundary.eval().requires_grad_(False)
 
