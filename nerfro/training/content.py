@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,6 +65,9 @@ def settle_content(config: DictConfig, medium: Medium, cameras: Cameras | None =
         NerfroError: half a box, an unknown space, or no place that the cameras look at.
     """
     content = config.content
+    for option in dataclasses.fields(ContentConfig):  # runs from before it was there lack it
+        if option.name not in content:
+            content[option.name] = option.default
     if content.space not in ("box", "all"):
         raise NerfroError(f"content.space={content.space} is not allowed; choose box, all")
     if (content.box_min is None) != (content.box_max is None):
