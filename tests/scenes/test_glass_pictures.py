@@ -26,7 +26,7 @@ from nerfro.types import Path, Rays
 # Sums over a pixel of a cube converge slowly: an edge sees lamps in many directions.
 SIDE, ANGLE, SPP, PARTS = 20, 0.5, 4096, 16
 POSE = look_at_origin(np.array([2.6, 2.2, 2.0]))
-COLOURED = (0.2, 0.5, 1.1)
+COLOURED = (0.4, 0.8, 1.4)
 BRANCHES = Snell(branches="all", least_weight=0.002, max_events=32)
 BOX = torch.tensor([[-0.9] * 3, [0.9] * 3])
 BALL, CUBE = sphere(0.7, 6), rounded_box((0.55, 0.55, 0.55), 0.2, edge_steps=24)
@@ -149,9 +149,10 @@ def test_absorption_is_that_of_the_path_and_is_learned_from_a_picture(what: str)
 
 
 def test_a_dispersive_cube_is_that_of_three_colours() -> None:
-    medium, rays = on_grid("cube", abbe=[15.0]), rays_of_picture()
+    medium, rays = on_grid("cube", abbe=[5.0]), rays_of_picture()
     iors = [float(medium.at_wavelength(wavelength).iors) for wavelength in BRANCHES.wavelengths]
-    assert iors[2] - iors[0] > 0.03
+    assert iors[2] - iors[0] > 0.1
     expected = torch.stack([path_traced(CUBE, ior)[..., colour] for colour, ior in enumerate(iors)], -1)
-    assert agreement(seen(BRANCHES(rays, medium)), expected) > 35
-    assert agreement(seen(BRANCHES(rays, on_grid("cube"))), expected) < 33
+    found, of_one_index = (agreement(seen(BRANCHES(rays, cube)), expected) for cube in (medium, on_grid("cube")))
+    assert found > 35
+    assert of_one_index < found - 5
