@@ -104,7 +104,7 @@ def find_index(
                 stencil,
                 num_fine if closest else num_fine // 3,
                 True,
-                lambda done, b=begun: progress(b + (1 - share) * done / looks),
+                lambda done, b=begun: progress(b + (1 - share) * done / looks),  # type: ignore[misc]
             )
             errors = fine.mean_error()
             found, curvature = _lowest(stencil, errors[None], reach)

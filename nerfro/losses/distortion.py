@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -27,7 +28,7 @@ class Distortion(Loss):
         rendering = renderings[-1]
         edges, near, far = rendering.samples.edges, rendering.path.near[:, None], rendering.path.far[:, None]
         if rendering.samples.measure is not None:
-            edges, near, far = rendering.samples.measure, 0.0, rendering.samples.measure[:, -1:]
+            edges, near, far = rendering.samples.measure, torch.zeros_like(near), rendering.samples.measure[:, -1:]
         # A path of no length has no weights either; the clamp only keeps the quotient a number.
         edges = (edges - near) / (far - near).clamp(min=1e-6)
         return mean_over_rays(rendering.path.per_ray(distortion(rendering.weights, edges)), batch.num_rows)

@@ -20,40 +20,33 @@ class Photometric(Loss):
     """Mean squared colour error of the last level, plus that of earlier ones (paper, Eqn. lossRGB).
 
     The mean is over pixels and channels, as in the authors' code; the paper's norm is three times that. Divided pixels
-    teach the boundary nothing: their rays part so widely that it would learn speckle from them. Nor do the fainter
-    branches of rays that split: Adam takes steps of one length, however weak the light that asks for them.
+    teach the boundary nothing: their rays part so widely that it would learn speckle from them.
 
     Args:
         coarse: factor of the earlier levels' errors; 1 in the paper, 0.1 in mip-NeRF.
-        teaching_share: weight of a branch, of the ray's heaviest, below which it teaches the boundary nothing.
     """
 
     def __init__(
-        self,
-        weight: NotNegative = 1.0,
-        start: Natural = 0,
-        ramp: Natural = 0,
-        coarse: NotNegative = 1.0,
-        teaching_share: NotNegative = 0.5,
+        self, weight: NotNegative = 1.0, start: Natural = 0, ramp: Natural = 0, coarse: NotNegative = 1.0
     ) -> None:
         super().__init__(weight, start, ramp)
-        self.coarse, self.teaching_share = coarse, teaching_share
+        self.coarse = coarse
 
     def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
         value, target = torch.zeros((), device=batch.rgb.device), batch.of_pixels(batch.rgb)
         for rendering, factor in zip(renderings, [self.coarse] * (len(renderings) - 1) + [1.0], strict=True):
-            radiance = batch.of_pixels(_teaching(rendering, batch, model.boundary, self.teaching_share))
+            radiance = batch.of_pixels(_teaching(rendering, batch, model.boundary))
             value = value + factor * mse_loss(*model.difference(radiance, target))
         return value
 
 
-def _teaching(rendering: Rendering, batch: Batch, boundary: Boundary, share: float) -> Float[Tensor, "R 3"]:
-    """The rays' radiance, of which that of divided pixels and faint branches has no gradient by the boundary.
+def _teaching(rendering: Rendering, batch: Batch, boundary: Boundary) -> Float[Tensor, "R 3"]:
+    """The rays' radiance, of which that of divided pixels has no gradient by the boundary.
 
     What bends and tints the rays still learns from where they leave.
     """
     path = rendering.path
-    if batch.num_whole is None and not path.splits:
+    if batch.num_whole is None:
         return rendering.rgb
     learned = rendering.boundary_rgb - rendering.boundary_rgb.detach()
     exits = path.exits()
@@ -63,10 +56,5 @@ def _teaching(rendering: Rendering, batch: Batch, boundary: Boundary, share: flo
         if path.absorbs:
             bent = bent * path.transmitted(path.far[:, None])[:, 0]
         learned = learned - (bent - bent.detach())
-    silent = path.ray >= (path.num_rays if batch.num_whole is None else batch.num_whole)
-    if path.splits:
-        weight = path.throughput.amax(-1)
-        heaviest = weight.new_zeros(path.num_rays).scatter_reduce(0, path.ray, weight, "amax")
-        silent = silent | (weight < share * path.of_ray(heaviest))
-    from_boundary = rendering.transmittance[:, None] * learned
-    return rendering.rgb - path.per_ray(torch.where(silent[:, None], from_boundary, 0.0))
+    from_boundary = path.per_ray(rendering.transmittance[:, None] * learned)
+    return torch.cat([rendering.rgb[: batch.num_whole], (rendering.rgb - from_boundary)[batch.num_whole :]])

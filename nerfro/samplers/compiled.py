@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -36,13 +36,15 @@ def snell_on_grid(
     shortest = float((solids.high - solids.low).min())
     settings = (solids, min_step * shortest, max_events, branching.num_events, branching.least_weight)
     of_rays, room = _ray_arrays(rays), _ROOM if branching.num_events else 1
-    *columns, counts = trace_snell(*of_rays, *settings, _CAPACITY, room)
+    arguments: list[Any] = [*of_rays, *settings, _CAPACITY, room]
+    *columns, counts = trace_snell(*arguments)
     kept, needed = (counts <= (room, _CAPACITY)).all(1), counts.max(0, initial=1)
     width = max(int(needed[1]), 2)
     parts = [_rows(columns, np.where(kept, counts[:, 0], 0), width)]
     if not kept.all():
         rest = (~kept).nonzero()[0]
-        *columns, counts = trace_snell(*(array[rest] for array in of_rays), *settings, width, int(needed[0]))
+        arguments = [*(array[rest] for array in of_rays), *settings, width, int(needed[0])]
+        *columns, counts = trace_snell(*arguments)
         ray, columns = _rows(columns, counts[:, 0], width)
         parts.append((rest[ray], columns))
     ray = np.concatenate([ray for ray, _ in parts])

@@ -175,8 +175,8 @@ def trace_interfaces(
             state = (x, d, s, inside, num_events, exceeded, weight, ray)
             x, d, s, inside, num_events, exceeded, weight, ray = (values[event.source] for values in state)
             lines.take(event.source)
-            met = (before, after, flipped, normal, n_before, n_after, visible)
-            before, after, flipped, normal, n_before, n_after, visible = (v[event.place] for v in met)
+            of_event = (before, after, flipped, normal, n_before, n_after, visible)
+            before, after, flipped, normal, n_before, n_after, visible = (v[event.place] for v in of_event)
             active, reflected = event.active, event.reflected
             weight[active] *= event.factor
             turned, _ = refract(d[active], normal, n_before, n_after, reflected)
