@@ -120,8 +120,10 @@ class Path:
 
     def to(self, like: Tensor) -> Path:
         """The same polylines on the device and in the precision of a tensor."""
-        tensors = self._tensors().items()
-        return Path(**{name: t.to(like) if t.is_floating_point() else t.to(like.device) for name, t in tensors})
+        tensors = self._tensors()
+        for name, tensor in tensors.items():
+            tensors[name] = tensor.to(like) if tensor.is_floating_point() else tensor.to(like.device)
+        return Path(**tensors)
 
     def _tensors(self) -> dict[str, Tensor]:
         """What the path was made of."""

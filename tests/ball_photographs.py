@@ -66,7 +66,7 @@ def photographs(iors: list[float], opaque: bool = False) -> Views:
 
 
 def mesh() -> TriangleMesh:
-    made = trimesh.creation.icosphere(3, RADIUS)
+    made = trimesh.creation.icosphere(5, RADIUS)
     return TriangleMesh(made.vertices, made.faces)
 
 

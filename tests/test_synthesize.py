@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 from scipy.spatial import ConvexHull
 
+from nerfro.allowed import check_settings
 from nerfro.errors import NerfroError
 from nerfro.light import to_linear, to_srgb
 from nerfro.paths import ASSETS_DIR, CONF_DIR
@@ -162,16 +163,18 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path, name, content):
     ("options", "message"),
     [
         ({"scene": "tours"}, "choose one of torus, ship, deerglobe, starlamp"),
-        ({"resolution": 0}, "resolution=0 is too small; give 8 or more"),
-        ({"ior": 0.0}, "ior=0.0 is no refractive index"),
+        ({"resolution": 0}, "resolution=0 is not allowed; take at least 8"),
+        ({"ior": 0.0}, "ior=0.0 is not allowed"),
         ({"spp": 0}, "spp=0"),
         ({"views": {"test": 0}}, "views.test=0"),
         ({"seed": -1}, "seed=-1"),
     ],
 )
 def test_options_out_of_range_are_refused_before_anything_is_written(tmp_path, options, message):
-    with pytest.raises(NerfroError, match=message):
-        synthesize(small(tmp_path / "scene", **options))
+    config = small(tmp_path / "scene", **options)
+    with pytest.raises(NerfroError, match=message):  # noqa: PT012 (options are looked at first, then the rest)
+        check_settings(config, SynthesizeConfig)
+        synthesize(config)
     assert not (tmp_path / "scene").exists()
 
 

@@ -138,8 +138,8 @@ class PosedImages(DataSource):
 
 
 def _require_interval(near: float | None, far: float | None) -> None:
-    if near is not None and far is not None and near >= far:
-        raise NerfroError(f"data.near={near} and data.far={far} are no interval; take near < far")
+    if far is not None and (near or 0.0) >= far:
+        raise NerfroError(f"data.near={near} and data.far={far} are no interval; take 0 <= near < far")
 
 
 def held_out(num_views: int, every: int, split: str, root: Path) -> list[int]:

@@ -72,7 +72,6 @@ class SdfGrid(Solid):
         ior: Positive = 1.5,
         inner_meshes: list[str] = [],  # noqa: B006 (the registry reads and copies it)
         inner_iors: list[Positive] = [],  # noqa: B006
-        learn_ior: bool = False,
         resolution: Resolution = 128,
         box_min: list[float] = [-1.5, -1.5, -1.5],  # noqa: B006
         box_max: list[float] = [1.5, 1.5, 1.5],  # noqa: B006
@@ -84,6 +83,7 @@ class SdfGrid(Solid):
         absorption: list[NotNegative] = [],  # noqa: B006
         learn_absorption: bool = False,
         abbe: list[Positive] = [],  # noqa: B006
+        learn_ior: bool = False,
         cache: bool = True,
     ) -> None:
         if len(inner_meshes) != len(inner_iors):

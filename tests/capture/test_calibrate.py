@@ -194,7 +194,7 @@ def test_mistakes_are_told_in_one_line(tmp_path: Path, command: Callable[..., st
     for name in ("a.png", "b.png", "c.png"):
         Image.fromarray(np.full((48, 64), 90, np.uint8)).save(photos / name)
     common = f"images={photos}", f"out={tmp_path}"
-    assert "target=chess is not allowed; choose one of apriltag" in command("calibrate", *common, "target=chess")
+    assert "target='chess' is not allowed; choose 'apriltag'" in command("calibrate", *common, "target=chess")
     assert "set out=" in command("calibrate", f"images={photos}")
     assert "set images=" in command("calibrate", f"out={tmp_path}")
     assert "0 of 3 images show 3 or more tags" in command("calibrate", *common)

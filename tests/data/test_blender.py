@@ -116,10 +116,10 @@ def test_missing_folder_and_folder_without_transforms_are_named(tmp_path: Path):
     [
         ({"near": 6.0, "far": 6.0}, r"data.near=6.0 and data.far=6.0 are no interval; take 0 <= near < far"),
         ({"near": 7.0}, "data.near=7.0 and data.far=6.0 are no interval"),
-        ({"near": -1.0}, "data.near=-1.0"),
-        ({"near": math.nan}, "data.near=nan"),
-        ({"far": math.inf}, "data.far=inf"),
-        ({"downscale": 0}, "data.downscale=0 is not allowed; take 1"),
+        ({"near": -1.0}, "near=-1.0 is not allowed"),
+        ({"near": math.nan}, "near=nan is not allowed"),
+        ({"far": math.inf}, "far=inf is not allowed"),
+        ({"downscale": 0}, "downscale=0 is not allowed; take at least 1"),
     ],
 )
 def test_option_out_of_range_is_refused(options, message):

@@ -111,7 +111,7 @@ def test_camera_matrix_of_another_image_size_gives_a_warning(write_opencv):
 
 @pytest.mark.parametrize("share", [0.0, -1.0, 1.2])
 def test_impossible_crop_is_refused(share):
-    with pytest.raises(NerfroError, match=f"data.eval_crop={share} is not allowed"):
+    with pytest.raises(NerfroError, match=f"eval_crop={share} is not allowed"):
         OpenCVData("anywhere", eval_crop=share)
 
 

@@ -49,10 +49,10 @@ def test_surfaces_apart_inside_each_other_or_touching_pass(parts: list[trimesh.T
 @pytest.mark.parametrize(
     "parts",
     [
-        [ball(0.5, -0.2), ball(0.5, 0.2)],
+        [ball(0.5, -0.2), ball(0.45, 0.2)],
         [ball(0.3), trimesh.creation.box((2, 0.01, 0.01))],  # a needle through it: no vertex is inside the other
         [box(0.5), box(0.5, 0.2).apply_translation((0, 0.1, 0.07))],
-        [ball(0.2, -1.0), ball(0.2, -0.5), ball(0.3, 0.5), ball(0.3, 0.6)],
+        [ball(0.2, -1.0), ball(0.2, -0.5), ball(0.3, 0.5), ball(0.25, 0.6)],
     ],
 )
 def test_surfaces_that_go_through_each_other_are_refused(parts: list[trimesh.Trimesh]) -> None:

@@ -13,6 +13,7 @@ import pytest
 
 import nerfro.evaluate
 import nerfro.train
+import nerfro.training.run_folder
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
@@ -127,7 +128,7 @@ def test_second_process_in_a_folder_is_refused(
 def test_folder_that_is_removed_while_training_is_not_made_again(
     train: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(nerfro.train, "require_room", lambda folder, _: shutil.rmtree(folder))
+    monkeypatch.setattr(nerfro.training.run_folder, "require_room", lambda folder, _: shutil.rmtree(folder))
     finished = train()
     assert finished.code == 1
     assert f"{tmp_path / 'run'} was removed while it was written to" in finished.err
