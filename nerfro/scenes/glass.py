@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import Any
+from typing import Any, cast
 
 PLUGIN = "transmitting_glass"
 EMBEDDED = "embedded_in_glass"
@@ -76,7 +76,7 @@ def register_materials(variant: str) -> None:
         def __init__(self, properties: mi.Properties) -> None:
             super().__init__(properties)
             self.absorption = mi.Color3f(properties.get("absorption", mi.ScalarColor3f(0.0)))
-            self.nested: Any = properties["nested"]
+            self.nested = cast(Any, properties["nested"])
             self.m_components = [self.nested.flags(index) for index in range(self.nested.component_count())]
             self.m_flags = self.nested.flags()
 
