@@ -24,6 +24,13 @@ from nerfro.errors import NerfroError, nearest_of
 Class = TypeVar("Class")
 
 
+def _is_finite(number: float) -> bool:
+    try:
+        return math.isfinite(number)
+    except OverflowError:  # an integer of hundreds of digits
+        return False
+
+
 @dataclass(frozen=True)
 class Range:
     """Finite numbers from one end to the other; an end that is not given allows all on its side."""
@@ -35,7 +42,7 @@ class Range:
 
     def __contains__(self, number: float) -> bool:
         return (
-            math.isfinite(number)
+            _is_finite(number)
             and (self.at_least is None or number >= self.at_least)
             and (self.more_than is None or number > self.more_than)
             and (self.at_most is None or number <= self.at_most)
@@ -146,7 +153,7 @@ def _refusal(value: Any, hint: Any) -> str | None:
     if origin is Annotated:
         return _refusal(value, hints[1])
     if hint is float:
-        return None if math.isfinite(value) else "take a finite number"
+        return None if _is_finite(value) else "take a finite number"
     if origin in (list, tuple) and isinstance(value, Sequence):
         return next((reason for each in value if (reason := _refusal(each, hints[0]))), None)
     if origin in (Union, types.UnionType):

@@ -42,6 +42,8 @@ def test_what_is_allowed_passes() -> None:
         ({"radius": math.inf}, "radius=inf is not allowed; take more than 0"),
         ({"sizes": [3, 0]}, r"sizes=\[3, 0\] is not allowed; take at least 1"),
         ({"finite": math.inf}, "finite=inf is not allowed; take a finite number"),
+        ({"finite": 10**400}, "is not allowed; take a finite number"),
+        ({"rate": 10**400}, "is not allowed; take more than 0"),
         ({"mode": "slow"}, "mode='slow' is not allowed; choose 'fast', 'exact'"),
     ],
 )

@@ -138,7 +138,7 @@ def test_absorption_is_that_of_the_path_and_is_learned_from_a_picture(what: str)
     few = BRANCHES(rays_of_picture(8), given)
     assert max(learner.learned().values()) < 0.03
     optimizer = torch.optim.Adam(learner.parameters(), lr=0.15)
-    for _ in range(80):
+    for _ in range(160):
         loss = (to_srgb(picture(learner, few)) - to_srgb(expected)).square().mean()
         optimizer.zero_grad()
         loss.backward()
