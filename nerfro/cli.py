@@ -121,6 +121,9 @@ def in_one_line(error: Exception) -> str:
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error))):
         reason = " ".join(str(error).split("\n")[0].split())
         return f"not enough memory{reason and f' ({reason})'}; take smaller sizes, such as batches.size"
+    setting = re.search(r"full_key: (\S+)", str(error)) if isinstance(error, OverflowError) else None
+    if setting is not None:  # as OmegaConf tells of an integer of hundreds of digits
+        return f"{setting[1]} is too large; take a number that a float can hold"
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return " ".join(_messages(error))
     # Hydra's refusal of a group that is set to no option (field=null); any other ValueError is a bug.

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Optional, get_type_hints
@@ -15,6 +16,7 @@ import pytest
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
+from omegaconf import OmegaConf
 
 from nerfro.cli import _flags_first, in_one_line
 from nerfro.errors import NerfroError
@@ -117,3 +119,15 @@ def test_no_option_is_called_like_a_group_of_options(module: str) -> None:
     groups = {path.name for path in CONF_DIR.iterdir() if path.is_dir()} | set(KINDS)
     values = {name for name, hint in hints.items() if hint in (str, Optional[str], int, float, bool)}  # noqa: UP045
     assert values & groups == set()
+
+
+@dataclass
+class Weight:
+    weight: float = 1.0
+
+
+def test_an_integer_that_no_float_holds_is_named() -> None:
+    config = OmegaConf.structured(Weight)
+    with pytest.raises(OverflowError) as caught:
+        config.weight = 10**400
+    assert in_one_line(caught.value) == "weight is too large; take a number that a float can hold"
