@@ -360,7 +360,7 @@ def report_view(path: Path, side: int = 400, turns: int = 5) -> None:
     cameras = build(config.data).load("test").cameras.resized(side, side)
     print(f"| 400x400 view of `{config.name}` | s |\n|---|---|")
     supersampled = Supersampling(
-        config.evaluation.supersample, config.evaluation.divergence, config.evaluation.contrast
+        config.evaluation.supersample, config.evaluation.divergence, config.evaluation.get("contrast")
     )
     for name, sampling in (("one ray a pixel", Supersampling(1, 0.0)), ("supersampled", supersampled)):
         seconds = min(timed(lambda: render_view(model, cameras, 0, sampling)) for _ in range(turns))  # noqa: B023
