@@ -17,7 +17,7 @@ from typing import Any
 
 import nerfro.train
 from nerfro.training.viewer import Viewer
-from nerfro.view import server
+from nerfro.viewing import server
 
 _WARM_UP = 20.0  # seconds
 

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from nerfro.samplers.bend import bend
     from nerfro.training.load import load
-    from nerfro.view.scene import Scene
+    from nerfro.viewing.scene import Scene
 
 __version__ = "0.1.0"
 __all__ = ["Scene", "__version__", "bend", "load"]
 
-_HOMES = {"Scene": "nerfro.view.scene", "bend": "nerfro.samplers.bend", "load": "nerfro.training.load"}
+_HOMES = {"Scene": "nerfro.viewing.scene", "bend": "nerfro.samplers.bend", "load": "nerfro.training.load"}
 
 
 def __getattr__(name: str) -> Any:

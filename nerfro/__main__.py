@@ -31,12 +31,11 @@ def main() -> None:
 def commands() -> dict[str, str]:
     """What each command does, by its name: modules whose first line is "`python -m nerfro.NAME ...`: what it does"."""
     found = {}
-    for file in (*PACKAGE_DIR.glob("*.py"), *PACKAGE_DIR.glob("*/__main__.py")):
-        name = file.parent.name if file.parent != PACKAGE_DIR else file.stem
+    for file in sorted(PACKAGE_DIR.glob("*.py")):
         first = (ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or "").partition("\n")[0]
-        if first.startswith(f"`python -m nerfro.{name}"):
-            found[name] = first.partition("`: ")[2]
-    return dict(sorted(found.items()))
+        if first.startswith(f"`python -m nerfro.{file.stem}"):
+            found[file.stem] = first.partition("`: ")[2]
+    return found
 
 
 if __name__ == "__main__":

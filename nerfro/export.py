@@ -8,7 +8,7 @@ from nerfro.cli import entry_point
 from nerfro.files.atomic import refuse_existing
 from nerfro.paths import user_path
 from nerfro.training.load import load
-from nerfro.view.exports import ExportConfig, find_export
+from nerfro.viewing.exports import ExportConfig, find_export
 
 
 @entry_point("export", ExportConfig)

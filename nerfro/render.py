@@ -8,11 +8,11 @@ from nerfro.cli import entry_point
 from nerfro.files.cache import file_hash
 from nerfro.paths import CONF_DIR, user_path
 from nerfro.training.load import checkpoint_of, load
-from nerfro.view.film import write_film
-from nerfro.view.frames import Rendering, render_frames
-from nerfro.view.layers import LAYERS
-from nerfro.view.render_request import RenderConfig, check_request, checkpoints, find_shots, labels, prepared
-from nerfro.view.sweep import read_sweep
+from nerfro.viewing.film import write_film
+from nerfro.viewing.frames import Rendering, render_frames
+from nerfro.viewing.layers import LAYERS
+from nerfro.viewing.render_request import RenderConfig, check_request, checkpoints, find_shots, labels, prepared
+from nerfro.viewing.sweep import read_sweep
 
 
 @entry_point("render", RenderConfig, CONF_DIR / "render", verbatim=("sweep",))

@@ -13,8 +13,7 @@ import pytest
 
 from nerfro.paths import PACKAGE_DIR
 
-COMMANDS = {file.stem for file in PACKAGE_DIR.glob("*.py") if "\n@entry_point" in file.read_text()}
-COMMANDS |= {"plugins", "view"}
+COMMANDS = {file.stem for file in PACKAGE_DIR.glob("*.py") if "\n@entry_point" in file.read_text()} | {"plugins"}
 
 
 def run(*command: str | Path, folder: Path | None = None) -> subprocess.CompletedProcess[str]:

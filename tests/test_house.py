@@ -12,7 +12,7 @@ from nerfro.paths import PACKAGE_DIR
 
 # From above to below: a package imports what follows it, and itself.
 ORDER = (
-    "commands", "testing", "report", "training", "view", "evaluation", "scenes", "capture", "models", "losses",
+    "commands", "testing", "report", "training", "viewing", "evaluation", "scenes", "capture", "models", "losses",
     "boundaries", "camera", "samplers", "fields", "media", "data", "geometry", "kernels", "files", "core",
 )  # fmt: skip
 FILES = {
@@ -39,9 +39,7 @@ IMPORTS = {module: set(imported(file)) - {module} for module, file in FILES.item
 
 
 def is_command(module: str) -> bool:
-    """A module at the top level, or the `__main__` of a package, that can be run."""
-    at_top = module.count(".") == 1 or module.endswith(".__main__")
-    return at_top and 'if __name__ == "__main__"' in FILES[module].read_text(encoding="utf-8")
+    return module.count(".") == 1 and 'if __name__ == "__main__"' in FILES[module].read_text(encoding="utf-8")
 
 
 def room(module: str) -> str:
@@ -49,12 +47,10 @@ def room(module: str) -> str:
 
     `nerfro` itself stands with the commands: it hands on what is for everybody, imported when it is asked for.
     """
-    if module == "nerfro" or is_command(module):
-        return "commands"
-    name = module.split(".")[1]
-    if (PACKAGE_DIR / name).is_dir() or name == "testing":
+    name = module.split(".")[1] if "." in module else "commands"
+    if (PACKAGE_DIR / name).is_dir() or name in ("testing", "commands"):
         return name
-    return "core"
+    return "commands" if is_command(module) else "core"
 
 
 @pytest.mark.parametrize("module", sorted(FILES))

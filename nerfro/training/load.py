@@ -13,7 +13,7 @@ from nerfro.evaluation.request import find_device
 from nerfro.paths import user_path
 from nerfro.registry import build, discover
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint, restore
-from nerfro.view.scene import Scene
+from nerfro.viewing.scene import Scene
 
 
 def load(run: str | Path, device: str = "auto", root: str | Path | None = None) -> Scene:

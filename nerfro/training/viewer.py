@@ -10,10 +10,10 @@ from omegaconf import DictConfig
 from nerfro.data.base import DataSource, Views
 from nerfro.models.base import NerfModel
 from nerfro.types import Batch
-from nerfro.view.baking import bake_surface
-from nerfro.view.live import LivePage
-from nerfro.view.scene import Scene
-from nerfro.view.server import PageServer
+from nerfro.viewing.baking import bake_surface
+from nerfro.viewing.live import LivePage
+from nerfro.viewing.scene import Scene
+from nerfro.viewing.server import PageServer
 
 _LOSS_SECONDS = 1.0  # between two points of the curve: on a GPU each waits for the step
 

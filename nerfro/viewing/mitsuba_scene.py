@@ -18,9 +18,9 @@ from nerfro.files.atomic import write_atomically
 from nerfro.files.ply import write_ply
 from nerfro.media.solid import Solid
 from nerfro.scenes.path_tracer import envmap_texture
-from nerfro.view.changes import absorption_of
-from nerfro.view.meshes import find_solid, with_normals
-from nerfro.view.scene import SKY_HEIGHT, Scene
+from nerfro.viewing.changes import absorption_of
+from nerfro.viewing.meshes import find_solid, with_normals
+from nerfro.viewing.scene import SKY_HEIGHT, Scene
 
 _MAX_DEPTH, _SAMPLES = 64, 64
 # Mitsuba's skies stand on edge (y up); this turns y to our z.

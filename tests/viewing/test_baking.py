@@ -8,7 +8,7 @@ import torch
 
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.types import Exits
-from nerfro.view.baking import _bricks, bake_sky, cube_directions
+from nerfro.viewing.baking import _bricks, bake_sky, cube_directions
 
 
 def gl_face(direction: np.ndarray) -> tuple[int, float, float]:

@@ -16,7 +16,7 @@ from nerfro.data.frames import Lens, check_pose
 from nerfro.data.nerfstudio import read_lens
 from nerfro.data.transforms import is_number, parse_matrix, read_json
 from nerfro.errors import NerfroError
-from nerfro.view.camera_paths import Surroundings
+from nerfro.viewing.camera_paths import Surroundings
 
 
 def read_cameras(file: Path, around: Surroundings) -> Cameras:

@@ -16,8 +16,8 @@ from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import trilinear
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.types import Samples
-from nerfro.view.scene import Scene
-from nerfro.view.surface import level_set, without_crumbs
+from nerfro.viewing.scene import Scene
+from nerfro.viewing.surface import level_set, without_crumbs
 
 RESOLUTION = 128
 # Optical depth along a cell below which nobody sees its colour.

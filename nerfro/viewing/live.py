@@ -12,11 +12,11 @@ from omegaconf import MISSING
 
 from nerfro.allowed import Range
 from nerfro.data.base import Views
-from nerfro.view.baking import Baked
-from nerfro.view.page import document, frame_of, parts_of
-from nerfro.view.scene import Scene
-from nerfro.view.server import PageServer
-from nerfro.view.volume import RESOLUTION
+from nerfro.viewing.baking import Baked
+from nerfro.viewing.page import document, frame_of, parts_of
+from nerfro.viewing.scene import Scene
+from nerfro.viewing.server import PageServer
+from nerfro.viewing.volume import RESOLUTION
 
 LOOK_AGAIN = 3.0  # seconds between two looks at a checkpoint that may be replaced
 

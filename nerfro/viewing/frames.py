@@ -19,10 +19,10 @@ from nerfro.files.cache import content_hash
 from nerfro.files.drawing import GAP, LINE_HEIGHT, fit, paper, write
 from nerfro.files.exr import save_exr
 from nerfro.files.images import save_picture, save_png
-from nerfro.view.layers import Layer
-from nerfro.view.render_request import Shots
-from nerfro.view.scene import Scene
-from nerfro.view.sweep import Sweep
+from nerfro.viewing.layers import Layer
+from nerfro.viewing.render_request import Shots
+from nerfro.viewing.scene import Scene
+from nerfro.viewing.sweep import Sweep
 
 _RECORD = "frames.json"
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from nerfro.errors import NerfroError
 from nerfro.files.lat_long import load_lat_long
 from nerfro.paths import user_path
-from nerfro.view.scene import Scene
+from nerfro.viewing.scene import Scene
 
 
 @dataclass(frozen=True)

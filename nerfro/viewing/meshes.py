@@ -16,9 +16,9 @@ from nerfro.files.ply import write_ply
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.light import to_srgb
 from nerfro.media.solid import Solid
-from nerfro.view.changes import absorption_of
-from nerfro.view.scene import Scene
-from nerfro.view.volume import ColouredMesh, bake, solid_surface
+from nerfro.viewing.changes import absorption_of
+from nerfro.viewing.scene import Scene
+from nerfro.viewing.volume import ColouredMesh, bake, solid_surface
 
 # Opacity of glass in a .ply, which knows no glass.
 _GLASS_RGBA = (255, 255, 255, 60)

@@ -21,7 +21,7 @@ from nerfro.samplers.snell import Snell
 from nerfro.samplers.stratified import Stratified
 from nerfro.scenes.viewpoints import look_at_origin
 from nerfro.types import Radiance, Samples
-from nerfro.view.scene import Scene
+from nerfro.viewing.scene import Scene
 
 RADIUS, INSIDE_RADIUS, INSIDE_CENTRE, IOR = 0.8, 0.3, (0.1, 0.0, 0.05), 1.3
 

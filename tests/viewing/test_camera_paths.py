@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from nerfro.errors import NerfroError
-from nerfro.view.camera_files import read_cameras
-from nerfro.view.camera_paths import PATHS, Flight, Surroundings, fly
-from nerfro.view.scene import Scene
+from nerfro.viewing.camera_files import read_cameras
+from nerfro.viewing.camera_paths import PATHS, Flight, Surroundings, fly
+from nerfro.viewing.scene import Scene
 
 CENTRE = torch.tensor([0.5, -0.2, 0.1])
 

@@ -16,7 +16,7 @@ from PIL import Image
 import nerfro.render
 from nerfro.evaluation.render_view import Supersampling
 from nerfro.files.lat_long import save_lat_long
-from nerfro.view.scene import Scene
+from nerfro.viewing.scene import Scene
 
 
 @pytest.fixture

@@ -17,10 +17,10 @@ from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.paths import user_path
 from nerfro.variants import variant
-from nerfro.view.camera_files import read_cameras
-from nerfro.view.camera_paths import PATHS, Flight, Surroundings, fly
-from nerfro.view.layers import LAYERS
-from nerfro.view.scene import Scene
+from nerfro.viewing.camera_files import read_cameras
+from nerfro.viewing.camera_paths import PATHS, Flight, Surroundings, fly
+from nerfro.viewing.layers import LAYERS
+from nerfro.viewing.scene import Scene
 
 FILMS = ("mp4", "gif")
 Angle = Annotated[float, Range(more_than=0, less_than=180)]

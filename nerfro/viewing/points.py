@@ -14,8 +14,8 @@ from nerfro.files.images import to_8bit
 from nerfro.files.ply import write_ply
 from nerfro.light import to_srgb
 from nerfro.pixel_parts import pixel_rays
-from nerfro.view.scene import Scene
-from nerfro.view.volume import ask
+from nerfro.viewing.scene import Scene
+from nerfro.viewing.volume import ask
 
 # Rays of which less light than this stops inside tell of nothing.
 _SOLID = 0.5

@@ -18,9 +18,9 @@ from nerfro.data.base import DataSource, Views
 from nerfro.errors import NerfroError
 from nerfro.files.images import to_8bit
 from nerfro.paths import ASSETS_DIR
-from nerfro.view.baking import Baked, bake_sky, bake_surface, volume_arrays
-from nerfro.view.scene import Scene
-from nerfro.view.volume import UNSEEN, bake
+from nerfro.viewing.baking import Baked, bake_sky, bake_surface, volume_arrays
+from nerfro.viewing.scene import Scene
+from nerfro.viewing.volume import UNSEEN, bake
 
 _TEMPLATES = ASSETS_DIR / "_page"
 _PHOTOGRAPHS = 24  # at most, evenly spread

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.cameras import Cameras
-from nerfro.view.scene import RenderedViews, Scene
+from nerfro.viewing.scene import RenderedViews, Scene
 
 Pictures = Float[Tensor, "V H W C"]
 

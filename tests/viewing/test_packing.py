@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerfro.view.packing import pack, shared_exponent, two_bytes
+from nerfro.viewing.packing import pack, shared_exponent, two_bytes
 
 
 def unpacked(uri: str, shape: tuple[int, int, int]) -> np.ndarray:

@@ -12,6 +12,8 @@ import pytest
 import torch
 from jaxtyping import Float
 from PIL import Image
+from tests.viewing.chromium import ask, needs_chromium, open_page
+from tests.viewing.conftest import IOR, RADIUS, sky_of
 
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.cameras import Cameras
@@ -25,10 +27,8 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.models.base import psnr
 from nerfro.paths import resolve_path
 from nerfro.variants import variant
-from nerfro.view.page import page_of, upwards
-from nerfro.view.scene import Scene
-from tests.view.chromium import ask, needs_chromium, open_page
-from tests.view.conftest import IOR, RADIUS, sky_of
+from nerfro.viewing.page import page_of, upwards
+from nerfro.viewing.scene import Scene
 
 # The picture of the canvas after one ray a pixel of camera `number`, bottom row first, as text.
 SHOT = """const shot = (number, size) => {

@@ -23,8 +23,8 @@ from nerfro.models.base import NerfModel
 from nerfro.paths import user_path
 from nerfro.types import Exits
 from nerfro.variants import variant
-from nerfro.view.changes import with_absorption, with_indices, with_sky, without_glass, without_inside
-from nerfro.view.surface import surface_of
+from nerfro.viewing.changes import with_absorption, with_indices, with_sky, without_glass, without_inside
+from nerfro.viewing.surface import surface_of
 
 # Rows of the sky that `Scene.sky` is drawn with: the default environment map's finest texels.
 SKY_HEIGHT = 512

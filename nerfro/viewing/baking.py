@@ -24,8 +24,8 @@ from nerfro.media.sdf_grid import BLOCK, SdfGrid
 from nerfro.media.solid import Solid
 from nerfro.models.base import NerfModel
 from nerfro.types import Exits
-from nerfro.view import packing
-from nerfro.view.volume import UNSEEN, Volume
+from nerfro.viewing import packing
+from nerfro.viewing.volume import UNSEEN, Volume
 
 # Distances are kept up to this many cells from the surface, where the spline that is its zero level reads them; beyond,
 # rays jump by the blocks' clearance.

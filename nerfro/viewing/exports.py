@@ -16,12 +16,12 @@ from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.cache import save_arrays
 from nerfro.files.lat_long import save_lat_long
-from nerfro.view.meshes import write_mesh
-from nerfro.view.mitsuba_scene import files_beside, write_mitsuba
-from nerfro.view.page import page_of
-from nerfro.view.points import write_points
-from nerfro.view.scene import SKY_HEIGHT, Scene
-from nerfro.view.volume import RESOLUTION, bake, find_half_depth
+from nerfro.viewing.meshes import write_mesh
+from nerfro.viewing.mitsuba_scene import files_beside, write_mitsuba
+from nerfro.viewing.page import page_of
+from nerfro.viewing.points import write_points
+from nerfro.viewing.scene import SKY_HEIGHT, Scene
+from nerfro.viewing.volume import RESOLUTION, bake, find_half_depth
 
 
 @dataclass

@@ -10,9 +10,9 @@ from omegaconf import DictConfig
 
 from nerfro.cli import entry_point
 from nerfro.training.load import checkpoint_of, load
-from nerfro.view.live import LOOK_AGAIN, LivePage, ViewConfig
-from nerfro.view.page import page_split
-from nerfro.view.server import PageServer
+from nerfro.viewing.live import LOOK_AGAIN, LivePage, ViewConfig
+from nerfro.viewing.page import page_split
+from nerfro.viewing.server import PageServer
 
 
 @entry_point("view", ViewConfig)

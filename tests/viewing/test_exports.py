@@ -14,14 +14,14 @@ import pytest
 import torch
 import trimesh
 from omegaconf import OmegaConf
+from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, colour, sky_of
 
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.light import to_srgb
-from nerfro.view.exports import ExportConfig, find_export
-from nerfro.view.scene import Scene
-from nerfro.view.surface import without_crumbs
-from tests.view.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, colour, sky_of
+from nerfro.viewing.exports import ExportConfig, find_export
+from nerfro.viewing.scene import Scene
+from nerfro.viewing.surface import without_crumbs
 
 CELL = 2.12 * RADIUS / 47  # of the box with its margin of air
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from nerfro.errors import NerfroError
-from nerfro.view.server import PageServer
+from nerfro.viewing.server import PageServer
 
 
 @pytest.fixture
