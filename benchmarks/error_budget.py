@@ -11,17 +11,17 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+import nerfro
 from nerfro.cameras import Cameras
-from nerfro.evaluation.render_view import Supersampling, render_view
+from nerfro.evaluation.render_view import render_view
 from nerfro.models.base import NerfModel
 from nerfro.pixel_parts import divergence, pixel_rays, rays_beside
-from nerfro.registry import build, discover
-from nerfro.training.run_folder import load_checkpoint, restore
 
 CLASSES = ("past the glass", "things inside", "edges", "sky through the glass")
 
@@ -34,15 +34,10 @@ def main() -> None:
         parser.add_argument(f"--{option}", type=kind, help=f"evaluation.{option}; as trained by default")
     parser.add_argument("--edge", type=float, default=8.0, help="pixel angles from which neighbours part")
     arguments = parser.parse_args()
-    discover()
-    checkpoint, trained = load_checkpoint(arguments.run / "checkpoints" / "last.ckpt")
-    model = restore(checkpoint, trained)
-    views = build(trained.data).load("test").checked()
-    settings = trained.evaluation
-    for option in ("supersample", "divergence", "contrast"):
-        if getattr(arguments, option) is not None:
-            settings[option] = getattr(arguments, option)
-    supersampling = Supersampling(settings.supersample, settings.divergence, settings.get("contrast"))
+    scene = nerfro.load(arguments.run, device="cpu")
+    model, views = scene.model, scene.views().checked()
+    wanted = {"side": arguments.supersample, "divergence": arguments.divergence, "contrast": arguments.contrast}
+    supersampling = replace(scene.supersampling, **{name: value for name, value in wanted.items() if value is not None})
     errors, classes = [], []
     for view in range(min(len(views), arguments.views or len(views))):
         rendered = render_view(model, views.cameras, view, supersampling)

@@ -34,6 +34,7 @@ from omegaconf import DictConfig
 from torch.profiler import ProfilerActivity, profile, record_function
 from torch.utils.flop_counter import FlopCounterMode
 
+import nerfro
 from nerfro.evaluation.render_view import Supersampling, render_view
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.kernels.allocator import keep_freed_memory
@@ -43,7 +44,6 @@ from nerfro.registry import build, discover
 from nerfro.training.config import TrainConfig, build_model
 from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.ray_batches import RayBatches
-from nerfro.training.run_folder import load_checkpoint, restore
 from nerfro.types import Batch
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -354,16 +354,11 @@ def report_budget(budget: str) -> None:
 
 def report_view(path: Path, side: int = 400, turns: int = 5) -> None:
     """Seconds to render a view of the test camera at 400x400 with one ray a pixel, and supersampled as trained."""
-    discover()
-    checkpoint, config = load_checkpoint(path)
-    model = restore(checkpoint, config)
-    cameras = build(config.data).load("test").cameras.resized(side, side)
-    print(f"| 400x400 view of `{config.name}` | s |\n|---|---|")
-    supersampled = Supersampling(
-        config.evaluation.supersample, config.evaluation.divergence, config.evaluation.get("contrast")
-    )
-    for name, sampling in (("one ray a pixel", Supersampling(1, 0.0)), ("supersampled", supersampled)):
-        seconds = min(timed(lambda: render_view(model, cameras, 0, sampling)) for _ in range(turns))  # noqa: B023
+    scene = nerfro.load(path)
+    cameras = scene.cameras("test").resized(side, side)
+    print(f"| 400x400 view of `{scene.name}` | s |\n|---|---|")
+    for name, sampling in (("one ray a pixel", Supersampling()), ("supersampled", scene.supersampling)):
+        seconds = min(timed(lambda: render_view(scene.model, cameras, 0, sampling)) for _ in range(turns))  # noqa: B023
         print(f"| {name} | {seconds:.2f} |")
 
 

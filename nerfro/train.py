@@ -46,9 +46,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     wanted, training = config.batches, source.load("train")
     precrop = wanted.precrop_steps, wanted.precrop_fraction
     batches = RayBatches(training, wanted.size, wanted.batching, config.seed, *precrop, wanted.jitter)
-    supersampling = Supersampling(
-        config.evaluation.supersample, config.evaluation.divergence, config.evaluation.contrast
-    )
+    supersampling = Supersampling.of(config.evaluation)
     lpips = find_lpips_networks(config.evaluation.lpips_backbone, config.evaluation.lpips_vgg_backbone)
     model = build_model(config, training.cameras)
     require_same_run(folder, checkpoint, config)

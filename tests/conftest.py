@@ -6,9 +6,9 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -41,8 +41,7 @@ def random_pose() -> Callable[[int], np.ndarray]:
     return _random_pose
 
 
-@dataclass(frozen=True)
-class Finished:
+class Finished(NamedTuple):
     """How an entry point ended: its exit code and what it printed."""
 
     code: int
@@ -56,20 +55,35 @@ def train_here(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[st
     import nerfro.train
 
     monkeypatch.setattr(nerfro.train, "find_lpips_networks", lambda *files: ({}, {}))
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    return lambda *overrides: finish(nerfro.train.main, overrides, monkeypatch, capsys)
 
-    def train(*overrides: str) -> Finished:
-        monkeypatch.setattr(sys, "argv", ["nerfro.train", *overrides])
-        monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-        capsys.readouterr()
-        code = 0
-        try:
-            nerfro.train.main()
-        except SystemExit as end:
-            code = end.code if isinstance(end.code, int) else 1
-        printed = capsys.readouterr()
-        return Finished(code, printed.out, printed.err)
 
-    return train
+@pytest.fixture
+def evaluate_here(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Finished]:
+    """`python -m nerfro.evaluate`'s main in this process, on the CPU and without looking for LPIPS weights."""
+    import nerfro.evaluate
+
+    monkeypatch.setattr(nerfro.evaluate, "find_lpips_networks", lambda *files: ({}, {"lpips": "no cable"}))
+    return lambda *overrides: finish(nerfro.evaluate.main, ("device=cpu", *overrides), monkeypatch, capsys)
+
+
+def finish(
+    main: Callable[[], None],
+    overrides: Sequence[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> Finished:
+    """Run a command's main with these arguments to its end."""
+    monkeypatch.setattr(sys, "argv", [main.__module__, *overrides])
+    capsys.readouterr()
+    code = 0
+    try:
+        main()
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 1
+    printed = capsys.readouterr()
+    return Finished(code, printed.out, printed.err)
 
 
 @pytest.fixture(scope="session")

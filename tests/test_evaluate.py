@@ -9,29 +9,7 @@ import pytest
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio
 
-import nerfro.evaluate
-
 HEIGHT, WIDTH = 24, 40
-
-
-@pytest.fixture
-def evaluate_here(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., tuple[int, str, str]]:
-    """The entry point in this process: exit code, standard output and standard error."""
-    monkeypatch.setattr(nerfro.evaluate, "find_lpips_networks", lambda *files: ({}, {"lpips": "no cable"}))
-
-    def evaluate(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["nerfro.evaluate", "device=cpu", *arguments])
-        code = 0
-        try:
-            nerfro.evaluate.main()
-        except SystemExit as end:
-            code = end.code if isinstance(end.code, int) else 1
-        printed = capsys.readouterr()
-        return code, printed.out, printed.err
-
-    return evaluate
 
 
 @pytest.fixture

@@ -13,7 +13,6 @@ import torch
 from omegaconf import OmegaConf
 from PIL import Image
 
-import nerfro.evaluate
 from nerfro.data.blender import BlenderData
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint, restore
 
@@ -30,25 +29,6 @@ def run(train_here: Callable[..., Any], overrides: list[str], tmp_path: Path) ->
     finished = train_here(*overrides, f"hydra.run.dir={folder}", "logger=tensorboard")
     assert finished.code == 0, finished.err
     return folder
-
-
-@pytest.fixture
-def evaluate_here(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., tuple[int, str]]:
-    """`python -m nerfro.evaluate`'s main in this process; exit code and standard error."""
-    monkeypatch.setattr(nerfro.evaluate, "find_lpips_networks", lambda *files: ({}, {}))
-
-    def evaluate(*arguments: str) -> tuple[int, str]:
-        monkeypatch.setattr("sys.argv", ["nerfro.evaluate", "device=cpu", *arguments])
-        code = 0
-        try:
-            nerfro.evaluate.main()
-        except SystemExit as end:
-            code = end.code if isinstance(end.code, int) else 1
-        return code, capsys.readouterr().err
-
-    return evaluate
 
 
 def read(path: Path) -> np.ndarray:
@@ -163,9 +143,9 @@ def test_time_ends_a_run(train_here: Callable[..., Any], overrides: list[str], t
 
 
 def test_evaluation_of_the_checkpoint_repeats_the_runs_own(
-    run: Path, evaluate_here: Callable[..., tuple[int, str]], tmp_path: Path
+    run: Path, evaluate_here: Callable[..., Any], tmp_path: Path
 ) -> None:
-    code, errors = evaluate_here(f"checkpoint={run / LAST_CHECKPOINT}", f"out={tmp_path / 'again'}")
+    code, _, errors = evaluate_here(f"checkpoint={run / LAST_CHECKPOINT}", f"out={tmp_path / 'again'}")
     assert code == 0, errors
     first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (run, tmp_path / "again"))
     assert first["views"] == second["views"]
@@ -176,16 +156,14 @@ def test_evaluation_of_the_checkpoint_repeats_the_runs_own(
         assert (tmp_path / "again" / "errors" / name).is_file()
 
 
-def test_evaluation_never_replaces_an_earlier_one_unasked(
-    run: Path, evaluate_here: Callable[..., tuple[int, str]]
-) -> None:
+def test_evaluation_never_replaces_an_earlier_one_unasked(run: Path, evaluate_here: Callable[..., Any]) -> None:
     checkpoint = f"checkpoint={run / LAST_CHECKPOINT}"
-    assert evaluate_here(checkpoint, "split=val")[0] == 0
+    assert evaluate_here(checkpoint, "split=val").code == 0
     assert (run / "evaluate_val" / "images" / "val_001.png").exists()
-    code, errors = evaluate_here(checkpoint, "split=val")
+    code, _, errors = evaluate_here(checkpoint, "split=val")
     assert code == 1
     assert "metrics.json exists; give another out=... or overwrite=true" in errors
-    assert evaluate_here(checkpoint, "split=val", "overwrite=true")[0] == 0
+    assert evaluate_here(checkpoint, "split=val", "overwrite=true").code == 0
 
 
 @pytest.mark.parametrize(
@@ -199,16 +177,16 @@ def test_evaluation_never_replaces_an_earlier_one_unasked(
     ],
 )
 def test_evaluation_refuses_in_one_line(
-    arguments: list[str], message: str, run: Path, evaluate_here: Callable[..., tuple[int, str]], tmp_path: Path
+    arguments: list[str], message: str, run: Path, evaluate_here: Callable[..., Any], tmp_path: Path
 ) -> None:
-    code, errors = evaluate_here(f"checkpoint={run / LAST_CHECKPOINT}", f"out={tmp_path / 'out'}", *arguments)
+    code, _, errors = evaluate_here(f"checkpoint={run / LAST_CHECKPOINT}", f"out={tmp_path / 'out'}", *arguments)
     assert code == 1
     assert message in errors.strip().splitlines()[-1]
     assert not (tmp_path / "out").exists()
 
 
-def test_evaluation_without_a_checkpoint_asks_for_one(evaluate_here: Callable[..., tuple[int, str]]) -> None:
-    code, errors = evaluate_here()
+def test_evaluation_without_a_checkpoint_asks_for_one(evaluate_here: Callable[..., Any]) -> None:
+    code, _, errors = evaluate_here()
     assert code == 1
     assert "what is to be scored? give checkpoint=RUN/checkpoints/last.ckpt, or predictions=DIR" in errors
 

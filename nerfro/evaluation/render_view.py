@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+from omegaconf import DictConfig
 
 from nerfro.allowed import NotNegative, Positive, Side, checked
 from nerfro.cameras import Cameras
@@ -22,6 +23,11 @@ class Supersampling:
     divergence: NotNegative = 0.0
     # And pixels whose colour differs from that of a neighbour by so much (sRGB): fine texture, edges of things inside.
     contrast: Positive | None = None
+
+    @classmethod
+    def of(cls, evaluation: DictConfig) -> Supersampling:
+        """What `evaluation` of a run asks for; runs of former releases do not name `contrast`."""
+        return cls(evaluation.supersample, evaluation.divergence, evaluation.get("contrast"))
 
 
 def render_view(model: NerfModel, cameras: Cameras, view: int, supersampling: Supersampling) -> RenderedRays:

@@ -42,9 +42,7 @@ def checkpoint_of(run: str | Path) -> Path:
 
 def scene_of(checkpoint: dict[str, Any], config: DictConfig, device: torch.device) -> Scene:
     """The scene of a checkpoint and its configuration, of which the data and how it is evaluated may have changed."""
-    wanted = config.evaluation
     model = restore(checkpoint, config).to(device)
     corners = [config.content.box_min, config.content.box_max]  # which the model has settled
     content = None if None in corners else torch.tensor([list(corner) for corner in corners])
-    supersampling = Supersampling(wanted.supersample, wanted.divergence, wanted.get("contrast"))
-    return Scene(model, build(config.data), supersampling, config.name, content)
+    return Scene(model, build(config.data), Supersampling.of(config.evaluation), config.name, content)

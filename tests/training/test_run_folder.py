@@ -34,24 +34,10 @@ def train(train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path:
 
 
 @pytest.fixture
-def evaluate(
-    train: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., tuple[int, str]]:
-    """Evaluate the run in tmp_path/run: status and error."""
+def evaluate(train: Callable[..., Any], evaluate_here: Callable[..., Any], tmp_path: Path) -> Callable[..., Any]:
+    """Evaluate the run in tmp_path/run."""
     assert train().code == 0
-    monkeypatch.setattr(nerfro.evaluate, "find_lpips_networks", lambda *files: ({}, {}))
-
-    def evaluate(*overrides: str) -> tuple[int, str]:
-        checkpoint = f"checkpoint={tmp_path / 'run' / LAST_CHECKPOINT}"
-        monkeypatch.setattr("sys.argv", ["nerfro.evaluate", checkpoint, "device=cpu", *overrides])
-        code = 0
-        try:
-            nerfro.evaluate.main()
-        except SystemExit as end:
-            code = end.code if isinstance(end.code, int) else 1
-        return code, capsys.readouterr().err
-
-    return evaluate
+    return lambda *overrides: evaluate_here(f"checkpoint={tmp_path / 'run' / LAST_CHECKPOINT}", *overrides)
 
 
 @pytest.fixture
@@ -89,7 +75,8 @@ def test_what_the_run_did_not_make_stays(
     before = sorted(folder.rglob("*"))
     finished = train(*going_on)
     assert finished.code == 1
-    assert len(finished.err.strip().splitlines()) == 1
+    lines = [line for line in finished.err.splitlines() if not line.startswith("distances:")]  # a slow machine's bar
+    assert len([line for line in lines if line.strip()]) == 1
     assert sorted(folder.rglob("*")) == before
     assert (folder / file).read_text() == "foreign"
 
@@ -152,29 +139,29 @@ def test_checkpoint_in_a_removed_folder_is_not_made_again(
 
 
 def test_evaluation_replaces_only_what_an_evaluation_wrote(
-    evaluate: Callable[..., tuple[int, str]], another_process: Callable[[Path], None], tmp_path: Path
+    evaluate: Callable[..., Any], another_process: Callable[[Path], None], tmp_path: Path
 ) -> None:
     mine = tmp_path / "mine"
     (mine / "images").mkdir(parents=True)
     (mine / "images" / "test_000.png").write_text("mine")
     for folder in (mine, tmp_path / "run"):
         before = content(folder)
-        code, error = evaluate(f"out={folder}", "overwrite=true")
+        code, _, error = evaluate(f"out={folder}", "overwrite=true")
         assert code == 1
         assert "it is no evaluation's folder; give another out=" in error
         assert content(folder) == before
     scores = tmp_path / "scores"
-    assert evaluate(f"out={scores}")[0] == 0
-    assert "metrics.json exists" in evaluate(f"out={scores}")[1]
+    assert evaluate(f"out={scores}").code == 0
+    assert "metrics.json exists" in evaluate(f"out={scores}").err
     (scores / "metrics.json").unlink()  # as after a kill: the evaluation goes on
-    assert evaluate(f"out={scores}")[0] == 0
-    assert evaluate(f"out={scores}", "overwrite=true")[0] == 0
+    assert evaluate(f"out={scores}").code == 0
+    assert evaluate(f"out={scores}", "overwrite=true").code == 0
     another_process(scores)
-    assert "another process is writing to" in evaluate(f"out={scores}", "overwrite=true")[1]
+    assert "another process is writing to" in evaluate(f"out={scores}", "overwrite=true").err
 
 
-def test_refused_evaluation_leaves_no_folder(evaluate: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
-    assert evaluate(f"out={tmp_path / 'a' / 'b'}", "split=night")[0] == 1
+def test_refused_evaluation_leaves_no_folder(evaluate: Callable[..., Any], tmp_path: Path) -> None:
+    assert evaluate(f"out={tmp_path / 'a' / 'b'}", "split=night").code == 1
     assert not (tmp_path / "a").exists()
 
 
@@ -183,7 +170,8 @@ def test_file_in_place_of_the_run_folder_is_told(below: str, train: Callable[...
     (tmp_path / "file").write_text("mine")
     finished = train(f"hydra.run.dir={tmp_path / 'file' / below}")
     assert finished.code == 1
-    assert len(finished.err.strip().splitlines()) == 1
+    # On a slow machine the bar of the distance grid stands before the message.
+    assert finished.err.count("nerfro: ") == len(finished.err.strip().split("\r")[-1].splitlines()) == 1
     assert "choose another hydra.run.dir" in finished.err
     assert (tmp_path / "file").read_text() == "mine"
 

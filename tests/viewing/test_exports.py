@@ -14,7 +14,6 @@ import pytest
 import torch
 import trimesh
 from omegaconf import OmegaConf
-from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, colour, sky_of
 
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
@@ -22,6 +21,7 @@ from nerfro.light import to_srgb
 from nerfro.viewing.exports import ExportConfig, find_export
 from nerfro.viewing.scene import Scene
 from nerfro.viewing.surface import without_crumbs
+from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, colour, sky_of
 
 CELL = 2.12 * RADIUS / 47  # of the box with its margin of air
 

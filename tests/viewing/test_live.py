@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from tests.viewing.chromium import needs_chromium, open_page
 
 from nerfro.viewing import live
 from nerfro.viewing.live import LivePage
 from nerfro.viewing.scene import Scene
 from nerfro.viewing.server import PageServer
+from tests.viewing.chromium import needs_chromium, open_page
 
 
 @pytest.fixture

@@ -12,8 +12,6 @@ import pytest
 import torch
 from jaxtyping import Float
 from PIL import Image
-from tests.viewing.chromium import ask, needs_chromium, open_page
-from tests.viewing.conftest import IOR, RADIUS, sky_of
 
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.cameras import Cameras
@@ -29,6 +27,8 @@ from nerfro.paths import resolve_path
 from nerfro.variants import variant
 from nerfro.viewing.page import page_of, upwards
 from nerfro.viewing.scene import Scene
+from tests.viewing.chromium import ask, needs_chromium, open_page
+from tests.viewing.conftest import IOR, RADIUS, sky_of
 
 # The picture of the canvas after one ray a pixel of camera `number`, bottom row first, as text.
 SHOT = """const shot = (number, size) => {

@@ -6,12 +6,12 @@ import math
 
 import pytest
 import torch
-from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, colour, sky_of
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation.render_view import Supersampling
 from nerfro.files import lat_long
 from nerfro.viewing.scene import Scene
+from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, colour, sky_of
 
 
 def rays_of(scene: Scene) -> tuple[torch.Tensor, torch.Tensor]:
