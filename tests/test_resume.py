@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import os
 import pickle
 import random
@@ -9,15 +11,19 @@ import signal
 import subprocess
 import sys
 from collections import namedtuple
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 import torch
 from omegaconf import OmegaConf
 
+import nerfro.evaluate
 from nerfro.errors import NerfroError
+from nerfro.evaluation import scoring
+from nerfro.files.images import save_png
 from nerfro.training.run_folder import (
     LAST_CHECKPOINT,
     find_checkpoint,
@@ -143,6 +149,62 @@ def test_interrupted_run_saves_and_says_how_to_go_on(
     assert resumed.returncode == 0, errors
     seen = [int(line.rsplit(" ", 1)[1]) for line in out.splitlines() if line.startswith("at step")]
     assert seen == [steps, steps + 1]
+
+
+@pytest.fixture
+def evaluate_here(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str]]:
+    """`python -m nerfro.evaluate` in this process: its exit code, and its last line on standard error."""
+    monkeypatch.setattr(nerfro.evaluate, "find_lpips_networks", lambda *files: ({}, {}))
+
+    def evaluate(*arguments: str) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["nerfro.evaluate", "device=cpu", *arguments])
+        code = 0
+        try:
+            nerfro.evaluate.main()
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 1
+        return code, capsys.readouterr().err.strip().splitlines()[-1]
+
+    return evaluate
+
+
+@contextlib.contextmanager
+def interrupted_at_second_picture() -> Iterator[None]:
+    """Ctrl-C when one test view has been rendered and written, and another one not."""
+    count = itertools.count(1)
+
+    def save(path: Path, rgb: torch.Tensor) -> None:
+        if next(count) == 2:
+            signal.raise_signal(signal.SIGINT)
+        save_png(path, rgb)
+
+    with mock.patch.object(scoring, "save_png", save):
+        yield
+
+
+def test_interrupted_evaluation_says_how_to_go_on(
+    train_here: Callable[..., Any], evaluate_here: Callable[..., tuple[int, str]], tiny_run: list[str], tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    training = [*tiny_run, "trainer.max_steps=2", "evaluation.every=0"]
+    with interrupted_at_second_picture():
+        finished = train_here(*training, f"hydra.run.dir={run}")
+    assert finished.code == 130
+    advice = f"hydra.run.dir={run} ckpt_path=last"
+    assert finished.err.splitlines()[-1] == f"nerfro: interrupted; to go on, repeat it with {advice}"
+    assert not (run / "metrics.json").exists()
+    # What the message says works.
+    assert train_here(*training, *advice.split()).code == 0
+    assert (run / "metrics.json").exists()
+
+    scored = [f"checkpoint={run / LAST_CHECKPOINT}", f"out={tmp_path / 'scores'}"]
+    with interrupted_at_second_picture():
+        assert evaluate_here(*scored) == (130, "nerfro: interrupted; the same command begins it again")
+    assert not (tmp_path / "scores" / "metrics.json").exists()
+    assert evaluate_here(*scored)[0] == 0
+    assert (tmp_path / "scores" / "metrics.json").exists()
 
 
 def test_folder_of_another_run_is_refused_and_kept(

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 from torch import Tensor
-from tqdm import tqdm
 
 from nerfro.cameras import Cameras
 from nerfro.data.pictures import Pictures
+from nerfro.progress import told
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,7 @@ class Views:
         """These views, of which every picture has been decoded once, to refuse what is corrupt, and forgotten."""
         for pictures in (self.images, self.masks):
             if isinstance(pictures, Pictures):
-                bar = tqdm(pictures.all_levels(), "reading", len(pictures), delay=2, dynamic_ncols=True)
-                deque(bar, maxlen=0)
+                deque(told("reading", pictures.all_levels(), len(pictures)), maxlen=0)
         return self
 
 

@@ -50,7 +50,7 @@ def load_weights(published: Published, path: Path | str | None = None, download:
     if path is not None:
         if not Path(path).is_file():
             raise NerfroError(f"the {title} weights {path} do not exist; give the path of a downloaded {url}")
-        return _read(Path(path), title)
+        return _read(Path(path), title, f"give the path of a downloaded {url}")
     cached = Path(torch.hub.get_dir()) / "checkpoints" / url.rsplit("/", 1)[-1]
     if not cached.is_file():
         by_hand = f"put {url} at {cached} by hand"
@@ -68,7 +68,7 @@ def load_weights(published: Published, path: Path | str | None = None, download:
             raise NerfroError(f"the download of {title} weights failed ({error}); {by_hand}") from error
         finally:
             socket.setdefaulttimeout(before)
-    return _read(cached, title)
+    return _read(cached, title, "delete it to fetch it again")
 
 
 @functools.lru_cache
@@ -94,12 +94,12 @@ def unreachable(url: str, seconds: float = CONNECT_SECONDS) -> str:
     return reasons[-1]
 
 
-def _read(path: Path, title: str) -> dict[str, Tensor]:
+def _read(path: Path, title: str, advice: str) -> dict[str, Tensor]:
     try:
         weights = torch.load(path, map_location="cpu", weights_only=True)
-        if isinstance(weights, dict) and all(isinstance(value, Tensor) for value in weights.values()):
-            return weights
-        raise NerfroError(f"{title} weights {path} are no state dict; delete it to fetch it again")
-    except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
-        reason = str(error).partition("\n")[0]
-        raise NerfroError(f"{title} weights {path} cannot be read ({reason}); delete it to fetch it again") from error
+    except Exception as error:  # torch.load raises nearly anything on a file that is none of its own
+        reason = type(error).__name__ if isinstance(error, pickle.UnpicklingError) else str(error).partition("\n")[0]
+        raise NerfroError(f"{title} weights {path} cannot be read ({reason}); {advice}") from error
+    if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
+        raise NerfroError(f"{title} weights {path} are no state dict; {advice}")
+    return weights

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from nerfro.allowed import NotNegative, NumRays, Positive, Side
 from nerfro.errors import Interrupted, NerfroError
 from nerfro.files.atomic import refuse_existing, write_atomically
-from nerfro.files.owned import held, require_own
+from nerfro.files.owned import held, remove_unfinished, require_own
 from nerfro.paths import user_path
 
 REQUEST_FILE = "evaluate.yaml"
@@ -76,6 +76,7 @@ def own_folder(config: DictConfig, default: Path) -> Iterator[Path]:
         require_own(folder, (), "it is no evaluation's folder; give another out=...")
     refuse_existing([folder / "metrics.json"], config.overwrite)
     with held(folder, "out"):
+        remove_unfinished(folder)
         try:
             yield folder
         except KeyboardInterrupt:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO
 
 from nerfro.errors import NerfroError
-from nerfro.files.owned import require_held
+from nerfro.files.owned import PARTIAL, require_held
 
 
 @contextlib.contextmanager
@@ -26,7 +26,7 @@ def atomic_file(path: Path | str, advice: str = "free some space or choose anoth
     require_held(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")
+        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=PARTIAL)
         with os.fdopen(descriptor, "w+b") as stream:
             yield stream
             stream.flush()

@@ -10,7 +10,7 @@ from filelock import FileLock, Timeout
 
 from nerfro.errors import NerfroError, first_of
 
-_LOCK = ".lock"
+_LOCK, PARTIAL = ".lock", ".partial"  # the second ends the names of files that are being written
 _held: dict[Path, int] = {}  # folders of this process, and the inode of each one's lock
 
 
@@ -73,6 +73,14 @@ def require_held(path: Path) -> None:
             gone = True
         if gone:
             raise NerfroError(f"{folder} was removed while it was written to, so this ends here; start again")
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove what killed processes were writing in a folder; what others write in folders that they hold stays."""
+    for partial in folder.rglob(f".*{PARTIAL}"):
+        below = [path for path in partial.parents if path != folder and path.is_relative_to(folder)]
+        if not any(map(is_held, below)):
+            partial.unlink(missing_ok=True)
 
 
 def require_own(folder: Path, allowed: tuple[str, ...], advice: str) -> None:

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh
 
 _MARGIN = 1e-3  # of an edge: surfaces that touch at its ends, or along it, do not cross
+_TOUCHING = 1e-5  # of the mesh's extent: what is nearer to a surface along a line lies on it
+_FEWEST, _MOST = 2**9, 2**16  # points of a body that are looked for inside others
+_NUM_LINES = 3  # through each of them, both ways
 
 
 def bodies_of(mesh: TriangleMesh) -> Int[np.ndarray, "F"]:
@@ -24,32 +28,76 @@ def bodies_of(mesh: TriangleMesh) -> Int[np.ndarray, "F"]:
 
 
 def require_separate(mesh: TriangleMesh) -> None:
-    """Refuse a mesh in which an edge of one closed surface goes through another; one may lie inside another."""
+    """Refuse a closed mesh of which one surface goes through another, or covers it; one may lie inside another."""
     body = bodies_of(mesh)
-    corners = [mesh.triangles[body == number] for number in range(body.max() + 1)]
+    # Of extent one around the origin: Embree counts in single precision.
+    triangles = (mesh.triangles - mesh.bounds.mean(0)) / np.ptp(mesh.bounds, axis=0).max()
+    corners = [triangles[body == number] for number in range(body.max() + 1)]
     low, high = (np.stack([end(c.reshape(-1, 3), axis=0) for c in corners]) for end in (np.min, np.max))
     for number, own in enumerate(corners):
-        near = (low <= high[number]).all(1) & (high >= low[number]).all(1)
+        near = (low <= high[number] + _TOUCHING).all(1) & (high >= low[number] - _TOUCHING).all(1)
         near[number] = False
-        if near.any() and _crosses(own, np.concatenate([corners[other] for other in near.nonzero()[0]])):
+        if not near.any():
+            continue
+        others = _Others(np.concatenate([corners[other] for other in near.nonzero()[0]]))
+        if others.are_crossed(own) or not others.leave_on_one_side(own):
             raise NerfroError(
                 "closed surfaces of the mesh go through each other, and where they do there is no inside; unite them "
                 "(boolean union), or give bodies inside others as medium.inner_meshes"
             )
 
 
-def _crosses(own: np.ndarray, others: np.ndarray) -> bool:
-    """Whether an edge of some triangles [F, 3, 3] goes through one of others [G, 3, 3]."""
-    start, end = (torch.from_numpy(own[:, corners].reshape(-1, 3)) for corners in ([0, 1, 2], [1, 2, 0]))
-    along = end - start
-    hit = MeshIntersector(others).first_hits(start, along)
-    start, along, triangle = start[hit >= 0], along[hit >= 0], torch.from_numpy(others)[hit[hit >= 0]]
-    normal = torch.linalg.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])
-    steep = (along * normal).sum(-1)
-    share = ((triangle[:, 0] - start) * normal).sum(-1) / steep
-    # An edge that lies in a triangle's plane does not go through it, nor does one that touches its border.
-    through = steep.abs() > _MARGIN * along.norm(dim=-1) * normal.norm(dim=-1)
-    to_corners = triangle - (start + share[:, None] * along)[:, None]
-    parts = (torch.linalg.cross(to_corners, to_corners.roll(-1, 1)) * normal[:, None]).sum(-1)
-    within = (parts > _MARGIN * parts.sum(-1, keepdim=True)).all(-1)
-    return bool((through & within & (share > _MARGIN) & (share < 1 - _MARGIN)).any())
+class _Others:
+    """Closed surfaces that another one of triangles [F, 3, 3] must not go through."""
+
+    def __init__(self, triangles: Float[np.ndarray, "G 3 3"]) -> None:
+        self._triangles, self._intersector = torch.from_numpy(triangles), MeshIntersector(triangles)
+
+    def are_crossed(self, own: Float[np.ndarray, "F 3 3"]) -> bool:
+        """Whether an edge goes through a triangle: so the thinnest needle is found."""
+        start, end = (torch.from_numpy(own[:, corners].reshape(-1, 3)) for corners in ([0, 1, 2], [1, 2, 0]))
+        along = end - start
+        met, triangle, normal = self._first_hits(start, along)
+        start, along = start[met], along[met]
+        steep = (along * normal).sum(-1)
+        share = ((triangle[:, 0] - start) * normal).sum(-1) / steep
+        # An edge that lies in a triangle's plane does not go through it, nor does one that touches its border.
+        through = steep.abs() > _MARGIN * along.norm(dim=-1) * normal.norm(dim=-1)
+        to_corners = triangle - (start + share[:, None] * along)[:, None]
+        parts = (torch.linalg.cross(to_corners, to_corners.roll(-1, 1)) * normal[:, None]).sum(-1)
+        within = (parts > _MARGIN * parts.sum(-1, keepdim=True)).all(-1)
+        return bool((through & within & (share > _MARGIN) & (share < 1 - _MARGIN)).any())
+
+    def leave_on_one_side(self, own: Float[np.ndarray, "F 3 3"]) -> bool:
+        """Whether its points lie all inside or all outside: so bodies are found whose edges meet edges alone.
+
+        A surface that has no point clear of the others lies on them, and has no side.
+        """
+        generator = np.random.default_rng(0)
+        some = own[:: -(-len(own) // _MOST)]
+        weights = generator.dirichlet(np.ones(3), (-(-_FEWEST // len(some)), len(some)))
+        points = torch.from_numpy(np.einsum("nfc,fcx->nfx", weights, some).reshape(-1, 3))
+        lines = torch.nn.functional.normalize(torch.from_numpy(generator.normal(size=(_NUM_LINES, 3))), dim=-1)
+        # Lines from a point that lies on a surface disagree: it is between the two ways.
+        odd = torch.stack([self._are_met_oddly(points, way * line) for line in lines for way in (1, -1)])
+        return bool(odd.all(0).any() != (~odd).all(0).any())
+
+    def _are_met_oddly(self, points: Float[Tensor, "P 3"], along: Float[Tensor, "3"]) -> Bool[Tensor, "P"]:
+        """Whether the line from each point crosses an odd number of triangles."""
+        odd, left = torch.zeros(len(points), dtype=torch.bool), torch.arange(len(points))
+        origin = points + _TOUCHING * along
+        while len(left):
+            met, triangle, normal = self._first_hits(origin, along.expand(len(origin), 3))
+            left, origin = left[met], origin[met]
+            odd[left] ^= True
+            distance = ((triangle[:, 0] - origin) * normal).sum(-1) / (along * normal).sum(-1)
+            origin = origin + (distance.clamp(min=0) + _TOUCHING)[:, None] * along
+        return odd
+
+    def _first_hits(
+        self, start: Float[Tensor, "R 3"], along: Float[Tensor, "R 3"]
+    ) -> tuple[Bool[Tensor, "R"], Float[Tensor, "M 3 3"], Float[Tensor, "M 3"]]:
+        """Which rays meet a triangle, the first one of each, and its normal."""
+        hit = self._intersector.first_hits(start, along.contiguous())
+        triangle = self._triangles[hit[hit >= 0]]
+        return hit >= 0, triangle, torch.linalg.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])

@@ -10,6 +10,9 @@ from numba import prange
 
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.kernels.compilation import compiled, compiled_parallel
+from nerfro.progress import told
+
+PLANES = 16  # of a grid, between two looks of the progress bar
 
 
 def occupancy_fraction(
@@ -32,7 +35,10 @@ def occupancy_fraction(
         origin, end = np.asarray(box, np.float64)[:, axes]
         spacing = (end - origin) / (resolution - 1)
         order, starts = triangles_by_plane(triangles, origin[0], spacing[0], resolution, float(spacing[0]))
-        counts = _count_inside(triangles, order, starts, origin, spacing, offsets, resolution)
+        counts = np.zeros((resolution,) * 3, np.uint16)
+        for first in told("occupancy", range(0, resolution, PLANES)):
+            planes = counts[first : first + PLANES]
+            _count_inside(triangles, order, starts[first:], origin, spacing, offsets, first, planes)
         votes.append((counts.astype(np.float32) / subsamples**3).transpose(np.argsort(axes)))
     return votes[0] if len(votes) == 1 else np.median(votes, axis=0).astype(np.float32)
 
@@ -69,14 +75,14 @@ def _is_left(side: float, ax: float, ay: float, bx: float, by: float) -> bool:
 
 
 @compiled_parallel
-def _count_inside(triangles, order, starts, origin, spacing, offsets, resolution):
-    num = len(offsets)
-    counts = np.zeros((resolution, resolution, resolution), np.uint16)
-    for i in prange(resolution):
+def _count_inside(triangles, order, starts, origin, spacing, offsets, first_plane, counts):
+    """Add the sub-samples inside to zeros; the planes of the grid are those from number `first_plane` on."""
+    num, resolution = len(offsets), counts.shape[1]
+    for i in prange(len(counts)):
         crossings = np.zeros((resolution, num, num, resolution + 1), np.uint8)
         for a in range(num):
             crossings[:] = 0
-            x = origin[0] + (i + offsets[a]) * spacing[0]
+            x = origin[0] + (first_plane + i + offsets[a]) * spacing[0]
             for index in order[starts[i] : starts[i + 1]]:
                 t = triangles[index]
                 if x < min(t[0, 0], t[1, 0], t[2, 0]) or x > max(t[0, 0], t[1, 0], t[2, 0]):
@@ -113,4 +119,3 @@ def _count_inside(triangles, order, starts, origin, spacing, offsets, resolution
                         for k in range(resolution):
                             inside ^= crossings[j, b, c, k]
                             counts[i, j, k] += inside
-    return counts

@@ -8,15 +8,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numba import prange
 from scipy.ndimage import distance_transform_edt
-from tqdm import tqdm
 
 from nerfro.geometry.mesh import TriangleMesh, require_inside
 from nerfro.geometry.normals import corner_normals
-from nerfro.geometry.occupancy import occupancy_fraction, triangles_by_plane
+from nerfro.geometry.occupancy import PLANES, occupancy_fraction, triangles_by_plane
 from nerfro.kernels.compilation import compiled, compiled_parallel
+from nerfro.progress import told
 
 _LEAST_DEPTH = 0.01  # of a vertex in the mesh, voxels
-_PLANES = 16  # of a grid, between two looks of the progress bar
 
 
 def signed_distance_grid(
@@ -42,8 +41,8 @@ def signed_distance_grid(
     order, starts = triangles_by_plane(triangles, origin[0], spacing[0], resolution, reach)
     normals = corner_normals(mesh, crease_degrees)
     distance, height = (np.full((resolution,) * 3, value, np.float32) for value in (np.inf, 0.0))
-    for first in tqdm(range(0, resolution, _PLANES), desc="distances", delay=2, dynamic_ncols=True):
-        planes = slice(first, first + _PLANES)
+    for first in told("distances", range(0, resolution, PLANES)):
+        planes = slice(first, first + PLANES)
         found = distance[planes], height[planes]
         _narrow_band(triangles, normals, order, starts[first:], origin, spacing, first, reach, *found)
     near = distance <= reach

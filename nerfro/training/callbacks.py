@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import time
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -12,7 +11,6 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
 from tqdm import tqdm
 
-from nerfro.files.owned import require_held
 from nerfro.models.optimizer import training_progress
 from nerfro.types import Batch
 
@@ -150,14 +148,10 @@ class StopOnSignal(Callback):
 
 
 class ConfigInCheckpoint(Callback):
-    """Puts the resolved configuration into every checkpoint, so that the file alone tells how to rebuild the model.
+    """Puts the resolved configuration into every checkpoint, so that the file alone tells how to rebuild the model."""
 
-    A run's folder that somebody has removed is not made again.
-    """
-
-    def __init__(self, folder: Path, config: str) -> None:
-        self._folder, self._config = folder, config
+    def __init__(self, config: str) -> None:
+        self._config = config
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        require_held(self._folder / "checkpoints")
         checkpoint["nerfro_config"] = self._config

@@ -24,7 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 from nerfro.errors import Interrupted, NerfroError, first_of
 from nerfro.files.atomic import write_atomically
 from nerfro.files.foreign_config import foreign_config
-from nerfro.files.owned import held, require_own
+from nerfro.files.owned import held, remove_unfinished, require_own
 from nerfro.models.base import NerfModel
 from nerfro.paths import PACKAGE_DIR, user_path
 from nerfro.training.config import build_model
@@ -53,6 +53,7 @@ def own(folder: Path, config: DictConfig) -> Iterator[Path | None]:
         if config.ckpt_path is None or begun.resolve() != folder.resolve():
             advice = "go on with a run (ckpt_path=last) or choose another folder (hydra.run.dir=...)"
             require_own(folder, (CELL_FILE,), advice)
+        remove_unfinished(folder)
         try:
             yield checkpoint
         except KeyboardInterrupt:  # before training, or after it

@@ -19,6 +19,7 @@ from nerfro.errors import NerfroError
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.registry import build
 from nerfro.training.callbacks import ConfigInCheckpoint, TrainingProgress
+from nerfro.training.checkpoint_files import CheckpointFiles
 from nerfro.training.log import TrainingLog
 from nerfro.training.run_folder import CONFIG_FILE, LAST_CHECKPOINT
 
@@ -36,10 +37,11 @@ def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.
         enable_version_counter=False,
         save_on_train_epoch_end=False,
     )
-    in_checkpoint = ConfigInCheckpoint(folder, OmegaConf.to_yaml(config, resolve=True))
+    in_checkpoint = ConfigInCheckpoint(OmegaConf.to_yaml(config, resolve=True))
     ours = {
         "default_root_dir": str(folder),
         "callbacks": [checkpoints, TrainingProgress(), in_checkpoint, TrainingLog(), *extra],
+        "plugins": [CheckpointFiles()],
         "logger": [build(node, save_dir=str(folder)) for node in (config.logger or {}).values()],
         "max_epochs": -1,
         "val_check_interval": every if every > 0 else None,

@@ -201,6 +201,7 @@ def test_mistakes_are_told_in_one_line(tmp_path: Path, command: Callable[..., st
     assert "set board=grid" in command("calibrate", *common, "family=tag36h11")
     assert "no dictionary=9X9" in command("calibrate", *common, "target=charuco", "dictionary=9X9")
     assert "no lens" in command("calibrate", *common, "intrinsics=[700,700,32]")
+    assert "give size in metres" in command("calibrate", f"out={tmp_path}", "write_board=true", "size=30")
     assert "no tag 587" in command("calibrate", *common, "write_board=true", "board=grid", "columns=30", "rows=30")
     (tmp_path / "cameras.png").write_bytes(b"mine")
     assert "cameras.png exists; give another out=... or overwrite=true" in command("calibrate", *common)

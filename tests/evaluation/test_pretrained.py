@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation import pretrained
@@ -123,6 +125,23 @@ def test_damaged_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(NerfroError, match=r"damaged\.pth cannot be read") as caught:
         load_weights(ALEXNET, damaged)
     assert "\n" not in str(caught.value)
+
+
+@given(text=st.text(max_size=200))
+@example(text="")
+@example(text="(lp0\n.")  # pickles, of the first protocol
+@example(text="cos\nsystem\n(S'true'\ntR.")
+@example(text="\x80\x02]q\x00.")
+@example(text="PK\x03\x04")  # the beginning of a zip file
+def test_any_text_file_is_refused_in_one_line_that_says_what_to_give(
+    text: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    file = tmp_path_factory.mktemp("texts") / "weights.txt"
+    file.write_text(text, encoding="latin-1", errors="replace")
+    with pytest.raises(NerfroError, match=rf"AlexNet weights {file} .*; give the path of a downloaded") as caught:
+        load_weights(ALEXNET, file)
+    assert "\n" not in str(caught.value)
+    assert "weights_only" not in str(caught.value)
 
 
 class Code:

@@ -30,7 +30,7 @@ from nerfro.files import cache
 
 SECONDS = 60
 # Progress bars are no lines of the report.
-_BAR = re.compile(r"^(train|evaluate|reading|looking for|cutting|distances)\b.*")
+_BAR = re.compile(r"^(train|evaluate|reading|looking for|cutting|distances|occupancy|smoothing)\b.*")
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,9 @@ def box(size: float, x: float = 0.0) -> trimesh.Trimesh:
         [box(0.5), box(0.5, 0.5)],  # side by side
         [box(0.5), box(0.3, 0.4)],
         [box(0.5), box(0.2, 0.1)],
+        [box(0.5), box(0.3, 0.1)],  # inside, against the wall
+        [box(0.5), box(0.5, 0.5).apply_translation((0, 0.2, 0))],
+        [ball(0.3), *(ball(0.01, x) for x in np.linspace(-0.25, 0.25, 9))],
     ],
 )
 def test_surfaces_apart_inside_each_other_or_touching_pass(parts: list[trimesh.Trimesh]) -> None:
@@ -53,6 +56,15 @@ def test_surfaces_apart_inside_each_other_or_touching_pass(parts: list[trimesh.T
         [ball(0.3), trimesh.creation.box((2, 0.01, 0.01))],  # a needle through it: no vertex is inside the other
         [box(0.5), box(0.5, 0.2).apply_translation((0, 0.1, 0.07))],
         [ball(0.2, -1.0), ball(0.2, -0.5), ball(0.3, 0.5), ball(0.25, 0.6)],
+        # Their edges meet in edges and in common planes alone.
+        [box(0.5), box(0.5, 0.2)],
+        [box(0.5), box(0.5, 0.01)],
+        [box(0.5), trimesh.creation.box((0.5, 0.2, 0.2)).apply_translation((0.1, 0, 0))],
+        [box(0.5), trimesh.creation.box((1, 0.5, 0.2))],
+        [ball(0.5), ball(0.5, 0.01)],
+        [ball(0.5, -0.2), ball(0.5, 0.2)],
+        # A copy that is moved by less than what counts as touching, beside another body.
+        [ball(0.2, -0.5), ball(0.3, 0.5), ball(0.3, 0.5 + 1e-7)],
     ],
 )
 def test_surfaces_that_go_through_each_other_are_refused(parts: list[trimesh.Trimesh]) -> None:

@@ -184,6 +184,21 @@ def test_folder_is_held_several_times_over_by_one_process(tmp_path: Path) -> Non
     assert (tmp_path / "a").is_file()
 
 
+def test_what_killed_processes_were_writing_goes_and_what_others_write_stays(
+    train: Callable[..., Any], another_process: Callable[[Path], None], tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    assert train().code == 0
+    another_process(run / "evaluate_test")
+    (run / "evaluate_test" / "images").mkdir()
+    partial = [run / ".config.yaml.a1.partial", run / "images" / ".test_000.png.b2.partial"]
+    partial.append(run / "evaluate_test" / "images" / ".test_000.png.c3.partial")
+    for path in partial:
+        path.write_text("half")
+    assert train("ckpt_path=last").code == 0
+    assert [path.exists() for path in partial] == [False, False, True]
+
+
 def test_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with (
