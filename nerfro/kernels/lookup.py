@@ -14,6 +14,9 @@ from jaxtyping import Float
 from nerfro.kernels.compilation import compiled
 from nerfro.kernels.tolerances import BEYOND_BOX, SAFE_SHARE
 
+# Unsigned, because Numba counts signed indices from the end where they are negative, a test for each access.
+_UINT = np.uintp
+
 
 class MediumGrid(NamedTuple):
     """A medium on a grid, as kernels see it. What is None has another type, for which kernels are compiled anew."""
@@ -30,29 +33,42 @@ class MediumGrid(NamedTuple):
     # Cells and blocks a world unit.
     inverse_spacing: Float[np.ndarray, "3"]
     inverse_block: Float[np.ndarray, "3"]
+    # Lowest and highest derivatives of the bodies' splines in the blocks; None where there are no bodies.
+    slopes: Float[np.ndarray, "K x y z 3 2"] | None
+
+
+@compiled
+def _stencil(place, count):
+    """The first of three vertices that a spline reads along an axis, and how far from the middle one it is asked."""
+    middle = min(max(math.floor(place + 0.5), 1), count - 2)
+    return _UINT(middle - 1), min(max(place - middle, -1.5), 1.5)
+
+
+@compiled
+def _weights(t):
+    return 0.5 * (0.5 - t) * (0.5 - t), 0.75 - t * t, 0.5 * (0.5 + t) * (0.5 + t)
+
+
+@compiled
+def _slopes(t):
+    return t - 0.5, -2.0 * t, t + 0.5
 
 
 @compiled
 def spline_value(coefficients, low, inverse_spacing, x, y, z):
     """Quadratic B-spline on a grid."""
-    fx = (x - low[0]) * inverse_spacing[0]
-    fy = (y - low[1]) * inverse_spacing[1]
-    fz = (z - low[2]) * inverse_spacing[2]
-    i = min(max(math.floor(fx + 0.5), 1), coefficients.shape[0] - 2)
-    j = min(max(math.floor(fy + 0.5), 1), coefficients.shape[1] - 2)
-    k = min(max(math.floor(fz + 0.5), 1), coefficients.shape[2] - 2)
-    tx = min(max(fx - i, -1.5), 1.5)
-    ty = min(max(fy - j, -1.5), 1.5)
-    tz = min(max(fz - k, -1.5), 1.5)
-    wx = (0.5 * (0.5 - tx) * (0.5 - tx), 0.75 - tx * tx, 0.5 * (0.5 + tx) * (0.5 + tx))
-    wy = (0.5 * (0.5 - ty) * (0.5 - ty), 0.75 - ty * ty, 0.5 * (0.5 + ty) * (0.5 + ty))
-    wz = (0.5 * (0.5 - tz) * (0.5 - tz), 0.75 - tz * tz, 0.5 * (0.5 + tz) * (0.5 + tz))
+    i, tx = _stencil((x - low[0]) * inverse_spacing[0], coefficients.shape[0])
+    j, ty = _stencil((y - low[1]) * inverse_spacing[1], coefficients.shape[1])
+    k, tz = _stencil((z - low[2]) * inverse_spacing[2], coefficients.shape[2])
+    wx, wy, wz = _weights(tx), _weights(ty), _weights(tz)
     value = 0.0
     for a in range(3):
         plane = 0.0
         for b in range(3):
-            row = coefficients[i + a - 1, j + b - 1]
-            plane += wy[b] * (wz[0] * row[k - 1] + wz[1] * row[k] + wz[2] * row[k + 1])
+            line = 0.0
+            for c in range(3):
+                line += wz[c] * coefficients[i + _UINT(a), j + _UINT(b), k + _UINT(c)]
+            plane += wy[b] * line
         value += wx[a] * plane
     return value
 
@@ -60,30 +76,23 @@ def spline_value(coefficients, low, inverse_spacing, x, y, z):
 @compiled
 def spline_value_gradient(coefficients, low, inverse_spacing, x, y, z):
     """Quadratic B-spline on a grid, and its exact gradient."""
-    fx = (x - low[0]) * inverse_spacing[0]
-    fy = (y - low[1]) * inverse_spacing[1]
-    fz = (z - low[2]) * inverse_spacing[2]
-    i = min(max(math.floor(fx + 0.5), 1), coefficients.shape[0] - 2)
-    j = min(max(math.floor(fy + 0.5), 1), coefficients.shape[1] - 2)
-    k = min(max(math.floor(fz + 0.5), 1), coefficients.shape[2] - 2)
-    tx = min(max(fx - i, -1.5), 1.5)
-    ty = min(max(fy - j, -1.5), 1.5)
-    tz = min(max(fz - k, -1.5), 1.5)
-    wx = (0.5 * (0.5 - tx) * (0.5 - tx), 0.75 - tx * tx, 0.5 * (0.5 + tx) * (0.5 + tx))
-    wy = (0.5 * (0.5 - ty) * (0.5 - ty), 0.75 - ty * ty, 0.5 * (0.5 + ty) * (0.5 + ty))
-    wz = (0.5 * (0.5 - tz) * (0.5 - tz), 0.75 - tz * tz, 0.5 * (0.5 + tz) * (0.5 + tz))
-    ux = (tx - 0.5, -2.0 * tx, tx + 0.5)
-    uy = (ty - 0.5, -2.0 * ty, ty + 0.5)
-    uz = (tz - 0.5, -2.0 * tz, tz + 0.5)
+    i, tx = _stencil((x - low[0]) * inverse_spacing[0], coefficients.shape[0])
+    j, ty = _stencil((y - low[1]) * inverse_spacing[1], coefficients.shape[1])
+    k, tz = _stencil((z - low[2]) * inverse_spacing[2], coefficients.shape[2])
+    wx, wy, wz = _weights(tx), _weights(ty), _weights(tz)
+    ux, uy, uz = _slopes(tx), _slopes(ty), _slopes(tz)
     value, gx, gy, gz = 0.0, 0.0, 0.0, 0.0
     for a in range(3):
         plane, plane_y, plane_z = 0.0, 0.0, 0.0
         for b in range(3):
-            row = coefficients[i + a - 1, j + b - 1]
-            line = wz[0] * row[k - 1] + wz[1] * row[k] + wz[2] * row[k + 1]
+            line, line_z = 0.0, 0.0
+            for c in range(3):
+                value_there = coefficients[i + _UINT(a), j + _UINT(b), k + _UINT(c)]
+                line += wz[c] * value_there
+                line_z += uz[c] * value_there
             plane += wy[b] * line
             plane_y += uy[b] * line
-            plane_z += wy[b] * (uz[0] * row[k - 1] + uz[1] * row[k] + uz[2] * row[k + 1])
+            plane_z += wy[b] * line_z
         value += wx[a] * plane
         gx += ux[a] * plane
         gy += wx[a] * plane_y
@@ -155,7 +164,31 @@ def block_clearance(clearance, low, inverse_size, x, y, z):
     i = min(max(int((x - low[0]) * inverse_size[0]), 0), clearance.shape[0] - 1)
     j = min(max(int((y - low[1]) * inverse_size[1]), 0), clearance.shape[1] - 1)
     k = min(max(int((z - low[2]) * inverse_size[2]), 0), clearance.shape[2] - 1)
-    return clearance[i, j, k]
+    return clearance[_UINT(i), _UINT(j), _UINT(k)]
+
+
+@compiled
+def monotone_run(slopes, low, inverse_size, x, y, z, dx, dy, dz):
+    """Distance ahead to the wall of the block, if every body's spline only grows or only falls till there; else 0."""
+    position, direction = (x, y, z), (dx, dy, dz)
+    i = min(max(int((x - low[0]) * inverse_size[0]), 0), slopes.shape[1] - 1)
+    j = min(max(int((y - low[1]) * inverse_size[1]), 0), slopes.shape[2] - 1)
+    k = min(max(int((z - low[2]) * inverse_size[2]), 0), slopes.shape[3] - 1)
+    for body in range(slopes.shape[0]):
+        lowest, highest = 0.0, 0.0
+        for axis in range(3):
+            bounds = slopes[_UINT(body), _UINT(i), _UINT(j), _UINT(k), _UINT(axis)]
+            one, other = direction[axis] * bounds[0], direction[axis] * bounds[1]
+            lowest += min(one, other)
+            highest += max(one, other)
+        if not (lowest > 0.0 or highest < 0.0):
+            return 0.0
+    out, block = math.inf, (i, j, k)
+    for axis in range(3):
+        if direction[axis] != 0.0:
+            wall = block[axis] + (1 if direction[axis] > 0.0 else 0)
+            out = min(out, (wall / inverse_size[axis] + low[axis] - position[axis]) / direction[axis])
+    return out
 
 
 @compiled
@@ -195,20 +228,20 @@ def put_vertex(positions, directions, s, count, x, y, z, dx, dy, dz, length):
 
 @compiled
 def put_end(positions, directions, s, count, low, high, bent, x, y, z, dx, dy, dz, length, far):
-    """Fill the row with the last vertex, at far; a bent path has left the box by then, if need be later."""
+    """Append the last vertex, at far; a bent path has left the box by then, if need be later."""
     ahead = far - length
     if bent:
         ahead = max(ahead, distance_out(low, high, x, y, z, dx, dy, dz))
-    count = put_vertex(
+    return put_vertex(
         positions, directions, s, count, x + ahead * dx, y + ahead * dy, z + ahead * dz, dx, dy, dz, length + ahead
     )
-    _repeat_last(positions, directions, s, min(count, s.shape[0]))
-    return count
 
 
 @compiled
-def _repeat_last(positions, directions, s, count):
-    for i in range(count, s.shape[0]):
-        positions[i] = positions[count - 1]
-        directions[i] = directions[count - 1]
-        s[i] = s[count - 1]
+def repeat_last(positions, directions, s, count):
+    """Fill a row with its last vertex."""
+    last = min(count, s.shape[0]) - 1
+    for i in range(last + 1, s.shape[0]):
+        for axis in range(3):
+            positions[i, axis], directions[i, axis] = positions[last, axis], directions[last, axis]
+        s[i] = s[last]

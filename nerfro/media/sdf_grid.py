@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import max_pool3d
 
 from nerfro.allowed import NotNegative, Positive, Range, Resolution, corners_of_box
 from nerfro.errors import NerfroError
@@ -138,7 +139,7 @@ class SdfGrid(Solid):
         return torch.from_numpy(self.meshes[0].bounds).float() if self.meshes else self.box
 
     def at_wavelength(self, wavelength: float) -> SdfGrid:
-        self.coarse_clearance  # noqa: B018 (made before it is shared)
+        self.coarse_clearance, self.coarse_slopes  # noqa: B018 (made before they are shared)
         return super().at_wavelength(wavelength)
 
     @torch.no_grad()
@@ -168,6 +169,33 @@ class SdfGrid(Solid):
         # A point is within half a cell's diagonal of a vertex; the spline's surface is a little off the data's.
         margin = 0.5 * torch.linalg.vector_norm(spacing) + 0.25 * spacing.min()
         return (nearest - margin).clamp(min=0).to(self.distances.device)
+
+    @lazy_buffer
+    def coarse_slopes(self) -> Float[Tensor, "K x y z 3 2"]:
+        """Lowest and highest derivative of each body's spline along the axes in each block of `BLOCK`^3 cells.
+
+        A derivative is a mean of differences of neighbouring coefficients, so that these bound it. Nothing bounds it
+        at the grid's border, where splines are continued.
+        """
+        counts = torch.tensor(self.coefficients.shape[1:])
+        blocks = counts.sub(1).div(BLOCK, rounding_mode="floor").add(1).tolist()
+        spacing = (self.box[1] - self.box[0]).cpu() / (counts - 1)
+        values = self.coefficients.detach().cpu()
+        for axis, count in enumerate(blocks):  # the vertices from one before each block to one after it
+            index = torch.arange(-1, count * BLOCK + 2).clamp(0, values.shape[axis + 1] - 1)
+            values = values.index_select(axis + 1, index)
+        bounds = []
+        for axis in range(3):
+            differences = values.diff(dim=axis + 1)[:, None] / spacing[axis]
+            kernel = [BLOCK + 3 - (other == axis) for other in range(3)]
+            lowest, highest = (sign * max_pool3d(sign * differences, kernel, BLOCK)[:, 0] for sign in (-1, 1))
+            bounds.append(torch.stack([lowest, highest], -1))
+        slopes = torch.stack(bounds, -2)
+        for axis, count in enumerate(counts.tolist()):
+            border = [block for block in range(blocks[axis]) if block == 0 or (block + 1) * BLOCK > count - 2]
+            slopes.index_fill_(axis + 1, torch.tensor(border), torch.inf)
+        slopes[..., 0] = torch.where(slopes[..., 0] == torch.inf, -torch.inf, slopes[..., 0])
+        return slopes.contiguous()
 
     def clearance(self, positions: Vectors) -> Scalars:
         """Distance to the nearest shell: a lower bound from the blocks, or where that is none the distance itself."""

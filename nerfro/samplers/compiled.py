@@ -63,17 +63,17 @@ def _rows(
     """The ray of each polyline that is there, and the arrays of these polylines, with `width` vertices.
 
     Args:
-        columns: arrays [R, B, ...], or with an axis of vertices [R, B, V, ...] which comes before positions' and
-            directions' three.
-        counts: polylines of each ray, B at most.
+        columns: what `trace_snell` returns but for the counts.
+        counts: polylines of each ray that are wanted, as many as there is room for at most.
         width: number of vertices.
     """
-    room = columns[0].shape[1]
-    valid = np.arange(room) < counts[:, None]
-    chosen = [column[:, 0] if room == 1 and valid.all() else column[valid] for column in columns]
-    last = np.minimum(np.arange(width), columns[0].shape[2] - 1)  # shorter rows repeat their last vertex
-    chosen = [column if column.ndim == 1 else column[:, last] for column in chosen]
-    return valid.nonzero()[0], chosen
+    from nerfro.samplers.snell_cpu import polylines_of_width
+
+    positions, directions, s, bodies, weights, events, exceeded = columns
+    valid = np.arange(weights.shape[1]) < counts[:, None]
+    ray, place = valid.nonzero()
+    chosen = polylines_of_width(positions, directions, s, bodies, events, ray, place, width)
+    return ray, [*chosen, weights[valid], events[valid], exceeded[valid]]
 
 
 def eikonal_on_grid(
@@ -151,10 +151,11 @@ def _for_kernels(medium: VoxelGrid | SdfGrid) -> MediumGrid:
             high,
             inverse_spacing,
             inverse_spacing / BLOCK,
+            medium.coarse_slopes.numpy(),
         )
     inverse_spacing = (np.array(medium.table.shape[:3]) - 1) / (high - low)
     values, clearance = medium.table.detach().numpy(), medium.clearance_grid.numpy()
-    return MediumGrid(values, clearance, None, 0.0, low, high, inverse_spacing, inverse_spacing)
+    return MediumGrid(values, clearance, None, 0.0, low, high, inverse_spacing, inverse_spacing, None)
 
 
 def _path(

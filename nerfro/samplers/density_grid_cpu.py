@@ -8,6 +8,9 @@ from numba import prange
 from nerfro.geometry.contraction import FAR, NEAREST
 from nerfro.kernels.compilation import compiled, compiled_parallel
 
+_BLOCK = 64  # rays that share a thread's scratch memory
+_THIN = 5e-4  # optical depth whose cube is nothing in single precision
+
 
 @compiled
 def _span(positions, directions, s, low, high):
@@ -96,31 +99,36 @@ def _arc_length(place, run, marks, begin, passing, aside, radius):
 
 
 @compiled
-def _shrinkage(position, centre, radius):
+def _shrinkage(x, y, z, centre, radius):
     """`geometry.contraction.shrinkage` of one place; 1 where nothing is contracted."""
-    square = 0.0
-    for axis in range(3):
-        square += (position[axis] - centre[axis]) ** 2
-    return radius * radius / square if square > radius * radius and radius > 0.0 else 1.0
+    if radius == 0.0:
+        return 1.0
+    square = (x - centre[0]) ** 2 + (y - centre[1]) ** 2 + (z - centre[2]) ** 2
+    return radius * radius / square if square > radius * radius else 1.0
 
 
 @compiled
-def _contract(position, centre, smaller):
-    """`geometry.contraction.contract` of one place, in place."""
+def _cell(x, y, z, smaller, centre, low, per_unit, cells):
+    """Number of the grid's cell that a place lies in, which is contracted where its shrinkage is below 1.
+
+    There are `per_unit` cells a unit along each axis, `cells` in all.
+    """
     if smaller < 1.0:
-        share = np.sqrt(smaller)
-        for axis in range(3):
-            position[axis] = centre[axis] + (2.0 - share) * share * (position[axis] - centre[axis])
+        share = (2.0 - np.sqrt(smaller)) * np.sqrt(smaller)
+        x = centre[0] + share * (x - centre[0])
+        y = centre[1] + share * (y - centre[1])
+        z = centre[2] + share * (z - centre[2])
+    i = min(max(int((x - low[0]) * per_unit[0]), 0), cells - 1)
+    j = min(max(int((y - low[1]) * per_unit[1]), 0), cells - 1)
+    k = min(max(int((z - low[2]) * per_unit[2]), 0), cells - 1)
+    # Unsigned, because Numba counts signed indices from the end where they are negative, a test for each access.
+    return np.uintp((i * cells + j) * cells + k)
 
 
 @compiled
-def _cell(position, low, high, cells):
-    """Number of the grid's cell that a place lies in."""
-    cell = 0
-    for axis in range(3):
-        along = int((position[axis] - low[axis]) / (high[axis] - low[axis]) * cells)
-        cell = cell * cells + min(max(along, 0), cells - 1)
-    return cell
+def _stopped(depth):
+    """1 - exp(-depth), in single precision; most bins are next to empty, and need no exponential."""
+    return depth - 0.5 * depth * depth if depth < _THIN else 1.0 - np.exp(-depth)
 
 
 @compiled_parallel
@@ -142,66 +150,78 @@ def draw(positions, directions, s, low, high, density, u, num_bins, floor, empty
     occupied = np.empty((num_rays, num_edges - 1), np.bool_)
     lengths = np.empty((num_rays, num_edges - 1), np.float32)
     measure = np.empty((num_rays, num_edges), np.float32)
-    for ray in prange(num_rays):
-        runs = np.empty((4, num_runs))
+    flat = density.ravel()
+    for block in prange((num_rays + _BLOCK - 1) // _BLOCK):
+        runs, weights = np.empty((4, num_runs)), np.empty(num_bins, np.float32)
         marks, begin, passing, aside = runs[0], runs[1], runs[2], runs[3]
-        centre, here = np.empty(3), np.empty(3)
+        centre, per_unit = np.empty(3), np.empty(3)
         for axis in range(3):
             centre[axis] = 0.5 * (low[axis] + high[axis])
-        if radius > 0.0:
-            first = 0.0
-            last = _contracted_runs(
-                positions[ray], directions[ray], s[ray], centre, radius, near, marks, begin, passing, aside
-            )
-        else:
-            first, last = _span(positions[ray], directions[ray], s[ray], low, high)
-            _even_runs(s[ray], marks)
-        width = (last - first) / num_bins
-        weights = np.zeros(num_bins, np.float32)
-        total, passed, run = 0.0, 1.0, 0
-        if width > 0.0:
+            per_unit[axis] = cells / (high[axis] - low[axis])
+        for ray in range(block * _BLOCK, min((block + 1) * _BLOCK, num_rays)):
+            if radius > 0.0:
+                first = 0.0
+                last = _contracted_runs(
+                    positions[ray], directions[ray], s[ray], centre, radius, near, marks, begin, passing, aside
+                )
+            else:
+                first, last = _span(positions[ray], directions[ray], s[ray], low, high)
+                _even_runs(s[ray], marks)
+            width = (last - first) / num_bins
+            if width == 0.0:  # most rays of a picture miss the object
+                run = _segment(marks, 0, last)
+                for axis in range(3):
+                    slope = directions[ray, run, axis]
+                    points[ray, :, axis] = positions[ray, run, axis] + (last - s[ray, run]) * slope
+                    headings[ray, :, axis] = slope
+                edges[ray], measure[ray], middles[ray] = last, last, last
+                lengths[ray], occupied[ray] = 0.0, False
+                continue
+            total, passed, run = 0.0, 1.0, 0
             for index in range(num_bins):
                 place = first + (index + 0.5) * width
                 run = _segment(marks, run, place)
-                at = _arc_length(place, run, marks, begin, passing, aside, radius)
-                for axis in range(3):
-                    here[axis] = positions[ray, run, axis] + (at - s[ray, run]) * directions[ray, run, axis]
-                _contract(here, centre, _shrinkage(here, centre, radius))
-                stopped = 1.0 - np.exp(-density.flat[_cell(here, low, high, cells)] * width)
+                ahead = _arc_length(place, run, marks, begin, passing, aside, radius) - s[ray, run]
+                x = positions[ray, run, 0] + ahead * directions[ray, run, 0]
+                y = positions[ray, run, 1] + ahead * directions[ray, run, 1]
+                z = positions[ray, run, 2] + ahead * directions[ray, run, 2]
+                smaller = _shrinkage(x, y, z, centre, radius)
+                stopped = _stopped(flat[_cell(x, y, z, smaller, centre, low, per_unit, cells)] * width)
                 weights[index] = passed * stopped
                 passed *= 1.0 - stopped
                 total += weights[index]
-        total = max(total, 1e-6)
-        norm = 0.0
-        for index in range(num_bins):
-            weights[index] = weights[index] / total + floor
-            norm += weights[index]
-        below, index = 0.0, 0
-        share = weights[0] / norm
-        before, run_of_edge, run = np.float32(0), 0, 0
-        for edge in range(num_edges):
-            while index < num_bins - 1 and u[ray, edge] >= below + share:
-                below += share
-                index += 1
-                share = weights[index] / norm
-            inside = min(max((u[ray, edge] - below) / share, 0.0), 1.0)
-            place = np.float32(first + (index + inside) * width)
-            measure[ray, edge] = place
-            run_of_edge = _segment(marks, run_of_edge, place)
-            edges[ray, edge] = _arc_length(place, run_of_edge, marks, begin, passing, aside, radius)
-            if edge > 0:
-                middle = 0.5 * (before + place)
-                run = _segment(marks, run, middle)
-                at = _arc_length(middle, run, marks, begin, passing, aside, radius)
-                middles[ray, edge - 1] = at
-                for axis in range(3):
-                    slope = directions[ray, run, axis]
-                    here[axis] = positions[ray, run, axis] + (at - s[ray, run]) * slope
-                    points[ray, edge - 1, axis] = here[axis]
-                    headings[ray, edge - 1, axis] = slope
-                smaller = _shrinkage(here, centre, radius)
-                lengths[ray, edge - 1] = (place - before) / smaller
-                _contract(here, centre, smaller)
-                occupied[ray, edge - 1] = density.flat[_cell(here, low, high, cells)] * (place - before) >= empty
-            before = place
+            per_total, norm = 1.0 / max(total, 1e-6), 0.0
+            for index in range(num_bins):
+                weights[index] = weights[index] * per_total + floor
+                norm += weights[index]
+            below, index = 0.0, 0
+            share = weights[0] / norm
+            before, run_of_edge, run = np.float32(0), 0, 0
+            for edge in range(num_edges):
+                while index < num_bins - 1 and u[ray, edge] >= below + share:
+                    below += share
+                    index += 1
+                    share = weights[index] / norm
+                inside = min(max((u[ray, edge] - below) / share, 0.0), 1.0)
+                place = np.float32(first + (index + inside) * width)
+                measure[ray, edge] = place
+                run_of_edge = _segment(marks, run_of_edge, place)
+                edges[ray, edge] = _arc_length(place, run_of_edge, marks, begin, passing, aside, radius)
+                if edge > 0:
+                    middle = 0.5 * (before + place)
+                    run = _segment(marks, run, middle)
+                    at = _arc_length(middle, run, marks, begin, passing, aside, radius)
+                    middles[ray, edge - 1] = at
+                    ahead = at - s[ray, run]
+                    dx, dy, dz = directions[ray, run, 0], directions[ray, run, 1], directions[ray, run, 2]
+                    x = positions[ray, run, 0] + ahead * dx
+                    y = positions[ray, run, 1] + ahead * dy
+                    z = positions[ray, run, 2] + ahead * dz
+                    points[ray, edge - 1, 0], points[ray, edge - 1, 1], points[ray, edge - 1, 2] = x, y, z
+                    headings[ray, edge - 1, 0], headings[ray, edge - 1, 1], headings[ray, edge - 1, 2] = dx, dy, dz
+                    smaller = _shrinkage(x, y, z, centre, radius)
+                    lengths[ray, edge - 1] = (place - before) / smaller
+                    depth = flat[_cell(x, y, z, smaller, centre, low, per_unit, cells)] * (place - before)
+                    occupied[ray, edge - 1] = depth >= empty
+                before = place
     return edges, middles, points, headings, occupied, lengths, measure

@@ -16,6 +16,7 @@ from nerfro.kernels.lookup import (
     box_span,
     put_end,
     put_vertex,
+    repeat_last,
     solid_clearance,
     solid_index,
     voxel_index,
@@ -200,7 +201,7 @@ def _step_length(iors, step, dx, dy, dz, gx, gy, gz):
 @compiled
 def _march_ray(medium, origin, direction, near, far, step, tolerance, max_steps, row):
     """One ray's vertices into its row: their number, whether the index varied, and whether it took `max_steps`."""
-    values, clearance, iors, shell, low, high, inverse_spacing, inverse_block = medium
+    values, clearance, iors, shell, low, high, inverse_spacing, inverse_block, _ = medium
     positions, directions, lengths = row
     skip = REACHED * step
     dx, dy, dz = float(direction[0]), float(direction[1]), float(direction[2])
@@ -257,6 +258,7 @@ def _march_ray(medium, origin, direction, near, far, step, tolerance, max_steps,
         if (dx - kdx) ** 2 + (dy - kdy) ** 2 + (dz - kdz) ** 2 > MIN_TURN:
             count = put_vertex(positions, directions, lengths, count, x, y, z, dx, dy, dz, s)
     count = put_end(*row, count, low, high, refracted, x, y, z, dx, dy, dz, s, end)
+    repeat_last(*row, count)
     return count, refracted, exceeded
 
 

@@ -14,6 +14,7 @@ from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.lookup import (
     block_clearance,
     box_span,
+    monotone_run,
     put_end,
     put_vertex,
     spline_value,
@@ -22,20 +23,27 @@ from nerfro.kernels.lookup import (
 
 # Root search ends at this fraction of the shortest step.
 _ROOT_TOLERANCE = 1e-6
+_BEYOND_WALL = 1e-3  # of the shortest step
+_BLOCK = 64  # rays that share a thread's scratch memory
 _ROOT_ITERATIONS = 60
+_SECANTS = 6  # without bisection between them
 
 
 @compiled
-def _root(coefficients, low, inverse_spacing, x, y, z, dx, dy, dz, start, end, tolerance):
-    """Shrink [start, end] around a change of sign (Illinois method); start keeps its sign, so does end."""
-    at_start = spline_value(coefficients, low, inverse_spacing, x + start * dx, y + start * dy, z + start * dz)
-    at_end = spline_value(coefficients, low, inverse_spacing, x + end * dx, y + end * dy, z + end * dz)
+def _root(coefficients, low, inverse_spacing, x, y, z, dx, dy, dz, start, end, at_start, at_end, tolerance):
+    """Shrink [start, end] around a change of sign (Illinois method); start keeps its sign, so does end.
+
+    The value at the end is known, that at the start too or not a number. Secants close in from one side until one steps
+    over the root; bisection takes turns with them where they do not.
+    """
+    if math.isnan(at_start):
+        at_start = spline_value(coefficients, low, inverse_spacing, x + start * dx, y + start * dy, z + start * dz)
     start_inside = at_start < 0.0
     weight_start, weight_end = at_start, at_end
     for iteration in range(_ROOT_ITERATIONS):
         if end - start <= tolerance:
             break
-        if iteration % 3 == 2 or weight_end == weight_start:
+        if (iteration >= _SECANTS and iteration % 2 == 0) or weight_end == weight_start:
             middle = 0.5 * (start + end)
         else:
             middle = (start * weight_end - end * weight_start) / (weight_end - weight_start)
@@ -69,8 +77,13 @@ def _index(inside, iors):
 
 
 @compiled
-def _surface_ahead(solids, inside, x, y, z, dx, dy, dz, min_step):
-    """Sphere tracing to the first surface: body (-1 where there is none), and arc lengths before and after it."""
+def _surface_ahead(solids, inside, known, x, y, z, dx, dy, dz, min_step):
+    """The first surface on a line: body (-1 where there is none), and arc lengths before and after it.
+
+    Steps are as long as the distance to the nearest surface, as in sphere tracing, or longer: across a block of cells
+    in which the distance only grows or only falls, there is at most one surface of each body, between values of other
+    signs. `known` is scratch memory: values of the bodies at the last two places.
+    """
     clearance, low, inverse_spacing, inverse_block = (
         solids.clearance,
         solids.low,
@@ -79,19 +92,23 @@ def _surface_ahead(solids, inside, x, y, z, dx, dy, dz, min_step):
     )
     splines, bodies = solids.values, len(inside)
     _, leave = box_span(low, solids.high, x, y, z, dx, dy, dz)
-    t, before, crossed = 0.0, 0.0, False
-    while not crossed:
+    t, before, crossed, across = 0.0, 0.0, False, False
+    while True:
         px, py, pz = x + t * dx, y + t * dy, z + t * dz
-        free = block_clearance(clearance, low, inverse_block, px, py, pz)
+        # Behind a block there may be a surface in it, even where none is near any more.
+        free = 0.0 if across else block_clearance(clearance, low, inverse_block, px, py, pz)
         if free > 2.0 * min_step:
             before = t
+            known[1, :] = math.nan
             t += free
             if t >= leave:
                 return -1, 0.0, 0.0
             continue
         distance = math.inf
         for body in range(bodies):
+            known[0, body] = known[1, body]
             value = spline_value(splines[body], low, inverse_spacing, px, py, pz)
+            known[1, body] = value
             crossed = crossed or (value < 0.0) != inside[body]
             distance = min(distance, abs(value))
         if crossed:
@@ -99,15 +116,19 @@ def _surface_ahead(solids, inside, x, y, z, dx, dy, dz, min_step):
         if t >= leave:
             return -1, 0.0, 0.0
         before = t
-        t = min(t + max(distance, min_step), leave)
+        run = monotone_run(solids.slopes, low, inverse_block, px, py, pz, dx, dy, dz)
+        across = run > max(distance, min_step)
+        # A little beyond the wall, to be in the next block for sure.
+        t = min(t + (run + _BEYOND_WALL * min_step if across else max(distance, min_step)), leave)
     # The first of the surfaces that were crossed in this step.
     hit, hit_before, hit_after = -1, 0.0, math.inf
+    tolerance = _ROOT_TOLERANCE * min_step
     for body in range(bodies):
-        coefficients = splines[body]
-        value = spline_value(coefficients, low, inverse_spacing, x + t * dx, y + t * dy, z + t * dz)
-        if (value < 0.0) != inside[body]:
-            tolerance = _ROOT_TOLERANCE * min_step
-            first, last = _root(coefficients, low, inverse_spacing, x, y, z, dx, dy, dz, before, t, tolerance)
+        if (known[1, body] < 0.0) != inside[body]:
+            first, last = _root(
+                splines[body], low, inverse_spacing, x, y, z, dx, dy, dz,
+                before, t, known[0, body], known[1, body], tolerance,
+            )  # fmt: skip
             if last < hit_after:
                 hit, hit_before, hit_after = body, first, last
     return hit, hit_before, hit_after
@@ -149,9 +170,15 @@ def _mirrored(dx, dy, dz, nx, ny, nz, ratio):
 
 
 @compiled
-def _trace_ray(solids, origin, direction, near, far, min_step, max_events, num_splits, least_weight, rows):
-    """One ray's polylines into its rows: their number, and the largest number of vertices."""
+def _trace_ray(solids, origin, direction, near, far, min_step, max_events, num_splits, least_weight, scratch, rows):
+    """One ray's polylines into its rows: their number, and the largest number of vertices.
+
+    What follows a row's last vertex is left as it is.
+    """
     positions, directions, lengths, bodies, weights, events, exceeded = rows
+    # `waiting` are parts of the light that are followed later, the last one first: each shares most of the polyline
+    # before it.
+    inside, known, waiting, waiting_numbers, waiting_inside = scratch
     room = lengths.shape[0]
     dx, dy, dz = float(direction[0]), float(direction[1]), float(direction[2])
     s, end = float(near), float(far)
@@ -165,21 +192,16 @@ def _trace_ray(solids, origin, direction, near, far, min_step, max_events, num_s
         )
     jump = max(enter, 0.0)
     x, y, z, s = x + jump * dx, y + jump * dy, z + jump * dz, s + jump
-    inside = np.empty(solids.values.shape[0], np.bool_)
     for body in range(len(inside)):
         value = spline_value(solids.values[body], solids.low, solids.inverse_spacing, x, y, z)
         inside[body] = value < 0.0
     bodies[0, 0] = _innermost(inside)
-    # Parts of the light that are followed later, the last one first: it shares most of the polyline before it.
-    waiting = np.empty((num_splits, 8))
-    waiting_numbers = np.empty((num_splits, 2), np.int64)
-    waiting_inside = np.empty((num_splits, len(inside)), np.bool_)
     num_events, weight, num_waiting, polyline, most = 0, 1.0, 0, 0, 0
     while True:
         row = min(polyline, room - 1)  # rows beyond the room are counted, not kept
         too_many = False
         while True:
-            hit, before, after = _surface_ahead(solids, inside, x, y, z, dx, dy, dz, min_step)
+            hit, before, after = _surface_ahead(solids, inside, known, x, y, z, dx, dy, dz, min_step)
             if hit < 0:
                 break
             n_before = _index(inside, solids.iors)
@@ -249,14 +271,14 @@ def trace_snell(origins, directions, near, far, solids, min_step, max_events, nu
 
     Returns:
         positions [R, B, V, 3], directions [R, B, V, 3], s [R, B, V]: with V the capacity and B the room for a ray's
-            polylines, in the rays' precision.
+            polylines, in the rays' precision. There are two vertices more than events; nothing is in the rest.
         bodies [R, B, V]: number of the body in which each vertex is left, see `types.Path`.
         weights [R, B]: share of the ray's light.
         events [R, B]: refractions and reflections.
         exceeded [R, B]: whether the limit of events was met; the polyline goes straight on from there.
         counts [R, 2]: polylines of each ray and the most vertices of one, more than B and V where these do not suffice.
     """
-    num_rays = origins.shape[0]
+    num_rays, num_bodies = origins.shape[0], solids.values.shape[0]
     out_positions = np.empty((num_rays, room, capacity, 3), origins.dtype)
     out_directions = np.empty((num_rays, room, capacity, 3), origins.dtype)
     out_s = np.empty((num_rays, room, capacity), origins.dtype)
@@ -265,12 +287,41 @@ def trace_snell(origins, directions, near, far, solids, min_step, max_events, nu
     events = np.empty((num_rays, room), np.int64)
     exceeded = np.empty((num_rays, room), np.bool_)
     counts = np.empty((num_rays, 2), np.int64)
-    for ray in prange(num_rays):
-        rows = (
-            out_positions[ray], out_directions[ray], out_s[ray], bodies[ray], weights[ray], events[ray], exceeded[ray]
+    for block in prange((num_rays + _BLOCK - 1) // _BLOCK):
+        scratch = (
+            np.empty(num_bodies, np.bool_), np.empty((2, num_bodies)), np.empty((num_splits, 8)),
+            np.empty((num_splits, 2), np.int64), np.empty((num_splits, num_bodies), np.bool_),
         )  # fmt: skip
-        counts[ray] = _trace_ray(
-            solids, origins[ray], directions[ray], near[ray], far[ray],
-            min_step, max_events, num_splits, least_weight, rows,
-        )  # fmt: skip
+        for ray in range(block * _BLOCK, min((block + 1) * _BLOCK, num_rays)):
+            rows = (
+                out_positions[ray], out_directions[ray], out_s[ray], bodies[ray], weights[ray], events[ray],
+                exceeded[ray],
+            )  # fmt: skip
+            counts[ray] = _trace_ray(
+                solids, origins[ray], directions[ray], near[ray], far[ray],
+                min_step, max_events, num_splits, least_weight, scratch, rows,
+            )  # fmt: skip
     return out_positions, out_directions, out_s, bodies, weights, events, exceeded, counts
+
+
+@compiled_parallel
+def polylines_of_width(positions, directions, s, bodies, events, ray, place, width):
+    """Vertices [P, W] of polylines `place` of rays `ray`, with the last one repeated where there are fewer.
+
+    Takes what `trace_snell` returns of that name, and returns positions, directions, s and bodies.
+    """
+    number, capacity = len(ray), s.shape[2]
+    out_positions, out_directions = np.empty((number, width, 3), s.dtype), np.empty((number, width, 3), s.dtype)
+    out_s, out_bodies = np.empty((number, width), s.dtype), np.zeros((number, width), np.int8)
+    for p in prange(number):
+        r, b = ray[p], place[p]
+        last = min(events[r, b] + 2, capacity, width) - 1
+        for i in range(width):
+            j = min(i, last)
+            for axis in range(3):
+                out_positions[p, i, axis] = positions[r, b, j, axis]
+                out_directions[p, i, axis] = directions[r, b, j, axis]
+            out_s[p, i] = s[r, b, j]
+        for i in range(last):
+            out_bodies[p, i] = bodies[r, b, i]
+    return out_positions, out_directions, out_s, out_bodies

@@ -17,8 +17,8 @@ def register_materials(variant: str) -> None:
     keeps its radiance: there is no partial Fresnel reflection, and no scaling by n^2, which cancels anyway as both ends
     of every path lie in air. Above the critical angle it is reflected totally. That is the paper's image formation: one
     path per ray. With `fresnel` it reflects Fresnel's share, as Mitsuba's dielectric does.
-    Parameters: `ior` (float, inside over outside), `tint` (linear RGB factor per transmission), `fresnel` (bool), and
-    `absorption` (RGB per world unit), by which light is attenuated that comes through the body to its surface.
+    Parameters: `int_ior` (float, inside over outside), `tint` (linear RGB factor per transmission), `fresnel` (bool),
+    and `absorption` (RGB per world unit), by which light is attenuated that comes through the body to its surface.
 
     `embedded_in_glass`: the nested BSDF of a thing inside the body, attenuated likewise (`absorption`). Together the
     two attenuate every run of a path inside the body, each where it ends.
@@ -29,7 +29,7 @@ def register_materials(variant: str) -> None:
     class TransmittingGlass(mi.BSDF):
         def __init__(self, properties: mi.Properties) -> None:
             super().__init__(properties)
-            self.ior = mi.Float(properties.get("ior", 1.5))
+            self.ior = mi.Float(properties.get("int_ior", 1.5))
             self.tint = mi.Color3f(properties.get("tint", mi.ScalarColor3f(1.0)))
             self.absorption = mi.Color3f(properties.get("absorption", mi.ScalarColor3f(0.0)))
             self.fresnel = bool(properties.get("fresnel", False))

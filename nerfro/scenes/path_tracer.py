@@ -98,7 +98,7 @@ class PathTracer:
         self.mitsuba = mi = load_mitsuba(variant)
         self.camera = camera
         absorption = {"absorption": mi.ScalarColor3f(*scene.absorption)}
-        glass: dict = {"type": PLUGIN, "ior": scene.ior, "tint": mi.ScalarColor3f(*scene.tint), "fresnel": fresnel}
+        glass: dict = {"type": PLUGIN, "int_ior": scene.ior, "tint": mi.ScalarColor3f(*scene.tint), "fresnel": fresnel}
         glass |= absorption
         absorbs = any(scene.absorption)
         if fresnel and not absorbs:

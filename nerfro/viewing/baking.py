@@ -153,6 +153,7 @@ def volume_arrays(volume: Volume, colour: str) -> Baked:
             "density": [math.log(thinnest), span],
             "brightest": brightest,
             "step": 0.7 * cell,
+            "radius": volume.radius or 0.0,
         },
         {"colour": slices[..., :3], "density": slices[..., 3:], "occupied": occupied[..., None]},
     )

@@ -30,8 +30,10 @@ _UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 def write_mitsuba(scene: Scene, out: Path, resolution: int, half_depth: float) -> str:
     """Write OUT.xml, and OUT_glass.ply, OUT_inside.ply and OUT_sky.hdr beside it.
 
-    Glass is Mitsuba's `dielectric`, which also reflects in part. What is inside shines with the radiance that it is
-    seen with from in front, and nothing lights it again. The test cameras are the sensors, in their order.
+    Glass is Mitsuba's `dielectric`, which also reflects in part; the parameter `glass` names another material, such as
+    `transmitting_glass` (see `scenes.glass`) for a model without partial reflection. What is inside shines with the
+    radiance that it is seen with from in front, and nothing lights it again. The test cameras are the sensors, in
+    their order.
 
     Raises:
         NerfroError: bodies lie inside bodies.
@@ -46,8 +48,9 @@ def write_mitsuba(scene: Scene, out: Path, resolution: int, half_depth: float) -
          value=str(_MAX_DEPTH))  # fmt: skip
     _add_sky(root, scene, out.with_name(f"{out.stem}_sky.hdr"))
     if glass:
+        _add(root, "default", name="glass", value="dielectric")
         shape = _add_mesh(root, out.with_name(f"{out.stem}_glass.ply"), *with_normals(glass[0]))
-        _add(_add(shape, "bsdf", type="dielectric"), "float", name="int_ior", value=f"{float(scene.ior[0]):g}")
+        _add(_add(shape, "bsdf", type="$glass"), "float", name="int_ior", value=f"{float(scene.ior[0]):g}")
         if absorption.any():
             _add_absorption(shape, absorption[0].tolist())
     if solid is not None:

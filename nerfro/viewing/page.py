@@ -52,7 +52,7 @@ def parts_of(
     """All that a model may change: sky and inside, and the surface on demand."""
     model = scene.model
     parts = {"surface": bake_surface(model)} if surface else {}
-    inside = bake(scene, resolution, volume_box(scene, cameras), progress)
+    inside = bake(scene, resolution, volume_box(scene, cameras), progress, contracted_beyond(scene))
     return {**parts, "volume": volume_arrays(inside, model.colour), "sky": bake_sky(model.boundary, model.device)}
 
 
@@ -80,6 +80,10 @@ def frame_of(scene: Scene, views: Views, split: str) -> dict[str, Any]:
     box = model.medium.content_box.float().cpu()
     if not (box[1] > box[0]).all():
         box = volume_box(scene, cameras)
+        if contracted_beyond(scene) is not None:  # what is seen sharply is half as wide as contracted space
+            box = box.mean(0) + 0.5 * (box - box.mean(0))
+    # Where light begins to be added up along a ray.
+    near = float(cameras.near) if contracted_beyond(scene) is None else float(model.point_sampler.near)  # type: ignore[arg-type]
     return {
         "linear": model.colour == "linear",
         "reflection": getattr(model.path_sampler, "branches", "none") != "none",
@@ -88,13 +92,13 @@ def frame_of(scene: Scene, views: Views, split: str) -> dict[str, Any]:
             "radius": float((box[1] - box[0]).norm() / 2),
             "halfWidth": float((box[1] - box[0]).min() / 2),
             "up": upwards(cameras).tolist(),
-            "near": float(cameras.near),
+            "near": near,
         },
-        "cameras": [_camera(views, view, f"{split}_{view:03d}") for view in range(len(views))],
+        "cameras": [_camera(views, view, f"{split}_{view:03d}", near) for view in range(len(views))],
     }
 
 
-def _camera(views: Views, view: int, name: str) -> dict[str, Any]:
+def _camera(views: Views, view: int, name: str, near: float) -> dict[str, Any]:
     cameras, count = views.cameras, len(views)
     pose = cameras.camera_to_world[view].cpu()
     shown = count <= _PHOTOGRAPHS or view in {i * count // _PHOTOGRAPHS for i in range(_PHOTOGRAPHS)}
@@ -105,7 +109,7 @@ def _camera(views: Views, view: int, name: str) -> dict[str, Any]:
         "focal": [float(cameras.fx[view]), float(cameras.fy[view])],
         "principal": [float(cameras.cx[view]), float(cameras.cy[view])],
         "size": [cameras.width, cameras.height],
-        "near": float(cameras.near),
+        "near": near,
         "photograph": _photograph(views.images[view]) if shown else None,
     }
 
@@ -120,6 +124,8 @@ def _photograph(rgb: Float[Tensor, "H W 3"]) -> str:
 
 def volume_box(scene: Scene, cameras: Cameras) -> Float[Tensor, "2 3"]:
     """Bounds of what the field holds: those of its samples, or, where these know none, found among the cameras.
+
+    Where space is contracted, they are those of the cube around contracted space.
 
     Raises:
         NerfroError: nothing says where to look.
@@ -139,6 +145,12 @@ def volume_box(scene: Scene, cameras: Cameras) -> Float[Tensor, "2 3"]:
         return box
     corners = box[0] + cell * torch.stack([held.amin(0) - 1, held.amax(0) + 1])
     return torch.maximum(torch.minimum(corners, box[1]), box[0])
+
+
+def contracted_beyond(scene: Scene) -> float | None:
+    """Radius of the ball that samples see as it is, where they lie in all of space; None where they are in a box."""
+    radius: float | None = getattr(scene.model.point_sampler, "radius", None)
+    return radius
 
 
 def upwards(cameras: Cameras) -> Float[Tensor, "3"]:

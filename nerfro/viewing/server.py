@@ -7,6 +7,7 @@ import json
 import socket
 import threading
 import time
+from collections.abc import Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -71,6 +72,13 @@ class PageServer:
             self._losses.append((step, loss))
             if len(self._losses) > 2 * _LOSSES:
                 self._losses = self._losses[::2]
+
+    def show_losses(self, losses: Sequence[tuple[int, float]]) -> None:
+        """The curve so far: optimisation steps and losses."""
+        every = -(-len(losses) // _LOSSES) or 1
+        with self._lock:
+            # Counted from the end, which is told in words.
+            self._losses = list(losses)[::-every][::-1]
 
     def page(self) -> bytes:
         return self._page

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
+from nerfro.geometry.contraction import expand, shrinkage
 from nerfro.geometry.interpolation import trilinear
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.types import Samples
@@ -29,16 +30,29 @@ _POINTS_AT_ONCE = 1 << 16
 class Volume:
     """The radiance field at the vertices of a grid whose first and last ones lie on the faces of a box."""
 
-    density: Float[Tensor, "X Y Z"]  # per world unit
+    density: Float[Tensor, "X Y Z"]  # per world unit, or unit of contracted length
     rgb: Float[Tensor, "X Y Z 3"]  # linear radiance, the mean of what is seen along the three axes; 0 in empty space
     box: Float[Tensor, "2 3"]  # corners, world units
+    radius: float | None = None  # of the ball around the box's middle beyond which space is contracted in the grid
 
 
 @torch.inference_mode()
 def bake(
-    scene: Scene, resolution: int = RESOLUTION, box: Float[Tensor, "2 3"] | None = None, progress: bool = True
+    scene: Scene,
+    resolution: int = RESOLUTION,
+    box: Float[Tensor, "2 3"] | None = None,
+    progress: bool = True,
+    radius: float | None = None,
 ) -> Volume:
-    """The field of a scene over a box, by default that of all it holds; `resolution` vertices on its longest side."""
+    """The field of a scene on a grid over a box, by default that of all it holds.
+
+    Args:
+        scene: whose field is asked.
+        resolution: vertices on the box's longest side.
+        box: corners, world units.
+        progress: whether to show a bar.
+        radius: with one, space is contracted beyond this distance from the box's middle (`geometry.contraction`).
+    """
     if box is None:
         box = scene.bounds if scene.content is None else scene.content
     field, device = scene.field, scene.model.device
@@ -46,10 +60,15 @@ def bake(
     counts = ((resolution - 1) * sides / sides.max()).ceil().long() + 1
     axes = [torch.linspace(float(a), float(b), int(n)) for a, b, n in zip(*box, counts, strict=True)]
     positions = torch.cartesian_prod(*axes)
+    smaller = torch.ones(())
+    if radius is not None:
+        positions = expand(positions, box.mean(0), radius)
+        smaller = shrinkage(positions, box.mean(0), radius)
     above = torch.tensor([0.0, 0.0, -1.0])
     blocks = positions.split(_POINTS_AT_ONCE)
     blocks = tqdm(blocks, unit="block", desc="bake", dynamic_ncols=True, disable=not progress)
     density = torch.cat([ask(field, some.to(device), above.expand_as(some))[0].cpu() for some in blocks])
+    density = density / smaller
     cell = float((sides / (counts - 1)).max())
     seen = (density * cell > UNSEEN).nonzero()[:, 0]
     rgb = torch.zeros(len(positions), 3)
@@ -59,7 +78,7 @@ def bake(
         colours = [ask(field, where, direction.expand_as(where))[1].cpu() for direction in along]
         rgb[rows] = torch.stack(colours).mean(0)
     shape = [int(n) for n in counts]
-    return Volume(density.view(shape), scene.model.linear(rgb).view(*shape, 3), box)
+    return Volume(density.view(shape), scene.model.linear(rgb).view(*shape, 3), box, radius)
 
 
 def ask(

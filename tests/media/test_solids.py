@@ -97,6 +97,21 @@ def test_coarse_clearance_is_a_lower_bound() -> None:
     assert (coarse >= exact - 3**0.5 * (block + 3 / 42) - 1e-6).all()
 
 
+def test_coarse_slopes_bound_all_derivatives() -> None:
+    medium = _nested_balls(43)
+    block = 4 * 3 / 42
+    positions = torch.rand(20000, 3, dtype=torch.float64) * 3 - 1.5
+    x, y, z = ((positions + 1.5) / block).long().unbind(-1)
+    bounds = medium.coarse_slopes.double()[:, x, y, z].movedim(0, 1)
+    gradients = medium.signed_distances(positions)[1]
+    assert (bounds[..., 0] <= gradients + 1e-5).all()
+    assert (gradients <= bounds[..., 1] + 1e-5).all()
+    # Where the outer ball is nearly flat they are narrow.
+    bounded = bounds[:, 0].isfinite().all(-1).all(-1) & ((positions.norm(dim=-1) - 0.9).abs() < 0.05)
+    assert bounded.sum() > 500
+    assert (bounds[bounded, 0, :, 1] - bounds[bounded, 0, :, 0]).median() < 0.9
+
+
 def test_mesh_becomes_a_distance_that_is_smooth_where_the_mesh_is(tmp_path: Path) -> None:
     trimesh.creation.icosphere(3, 0.8).export(tmp_path / "ball.ply")
     medium = SdfGrid(str(tmp_path / "ball.ply"), resolution=64, cache=False)

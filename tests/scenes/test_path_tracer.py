@@ -49,7 +49,7 @@ def trace(surface, origins, directions, crossings):
     mi = load_mitsuba()
     if mi.variant().startswith("scalar"):
         pytest.skip("traces many rays at once, which needs LLVM or CUDA")
-    material = {"type": "transmitting_glass", "ior": IOR, "tint": mi.ScalarColor3f(0.5)}
+    material = {"type": "transmitting_glass", "int_ior": IOR, "tint": mi.ScalarColor3f(0.5)}
     scene = mi.load_dict({"type": "scene", "glass": path_tracer._mesh(mi, "glass", surface, material)})
 
     def columns(array):

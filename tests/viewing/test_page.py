@@ -18,12 +18,15 @@ from nerfro.cameras import Cameras
 from nerfro.data.blender import BlenderData
 from nerfro.errors import NerfroError
 from nerfro.evaluation.render_view import Supersampling
+from nerfro.fields.base import Field
 from nerfro.files import lat_long, radiance_hdr
 from nerfro.light import to_linear
 from nerfro.media.analytic import Luneburg
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.models.base import psnr
 from nerfro.paths import resolve_path
+from nerfro.samplers.density_grid import DensityGridSampler
+from nerfro.types import Radiance, Samples
 from nerfro.variants import variant
 from nerfro.viewing.page import page_of, upwards
 from nerfro.viewing.scene import Scene
@@ -79,6 +82,37 @@ def test_five_cameras_of_a_cube_with_a_bubble_agree_with_nerfro(glass_cube: Scen
     expected = one_ray(glass_cube, glass_cube.cameras("test").select(views))
     scores = [float(psnr(picture(shot), rgb)) for shot, rgb in zip(found, expected, strict=True)]
     assert min(scores) > 30, scores
+
+
+class Surroundings(Field):
+    """Two soft coloured clouds: one beside the glass, and a large one far behind it."""
+
+    def forward(self, samples: Samples) -> Radiance:
+        density = torch.zeros_like(samples.s)
+        rgb = torch.zeros_like(samples.positions)
+        clouds = (([0.9, 1.1, 0.2], 0.4, 6.0, [0.8, 0.2, 0.1]), ([-9.0, -1.0, 2.0], 4.0, 0.5, [0.1, 0.3, 0.9]))
+        for centre, width, thickest, cloud in clouds:
+            offset = samples.positions - torch.tensor(centre)
+            of_cloud = thickest * torch.exp(-offset.square().sum(-1) / width**2)
+            density += of_cloud
+            rgb += of_cloud[..., None] * torch.tensor(cloud)
+        return Radiance(density, rgb / density[..., None].clamp(min=1e-9))
+
+
+@needs_chromium
+def test_contracted_surroundings_are_shown(scene: Scene, tmp_path: Path) -> None:
+    sampler = DensityGridSampler(512, 256, [-2.0] * 3, [2.0] * 3, radius=2.0, near=1.0, resolution=48, looks=1.0)
+    field = Surroundings()
+    for _ in range(3):
+        sampler.after_step(0, [field])
+    everywhere = replace(
+        scene, model=variant(scene.model, point_sampler=sampler.eval(), fields=torch.nn.ModuleList([field]))
+    )
+    found = ask(page_of(everywhere, 96), f"(() => {{ {SHOT} return [0, 1, 2].map((v) => shot(v, 32)); }})()", tmp_path)
+    expected, without = one_ray(everywhere), one_ray(everywhere.with_(inside=False))
+    for shot, rgb, empty in zip(found, expected, without, strict=True):
+        assert float(psnr(picture(shot), rgb)) > 33
+        assert float(psnr(empty, rgb)) < 22, "the surroundings are much of what is seen"
 
 
 @needs_chromium

@@ -51,6 +51,16 @@ def test_losses_stay_few(server: PageServer) -> None:
     assert steps[-1] >= 4990
 
 
+def test_a_logged_curve_is_shown_with_its_end(server: PageServer) -> None:
+    server.show_losses([(step, 1 / (step + 1)) for step in range(0, 12340, 10)])
+    losses = json.loads(server.state(0))["losses"]
+    assert 300 < len(losses) <= 500
+    assert losses[-1] == [12330, 1 / 12331]
+    assert [step for step, _ in losses] == sorted(step for step, _ in losses)
+    server.show_losses([])
+    assert json.loads(server.state(0))["losses"] == []
+
+
 @pytest.mark.parametrize("path", ["/../pyproject.toml", "/etc/passwd", "/%2e%2e/pyproject.toml", "/index.html"])
 def test_nothing_else_is_served(server: PageServer, path: str) -> None:
     assert get(server, path)[0] == 404

@@ -1,4 +1,4 @@
-// The viewer beside a training: the same page, filled again whenever the training has something new.
+// The page that is served: filled again whenever a training has something new.
 
 const LOOK_AGAIN = 2000; // milliseconds
 
@@ -19,7 +19,7 @@ async function askForNews(page) {
     if (news) await refill(page, news);
     $("message").textContent = "";
   } catch (error) {
-    $("message").textContent = `The training does not answer (${error.message}); it may have ended.`;
+    $("message").textContent = `nerfro does not answer (${error.message}); it may have ended.`;
   }
 }
 

@@ -36,6 +36,7 @@ uniform usampler3D occupied;  // whether a brick of the volume holds anything
 uniform vec3 volumeLow, volumeHigh;
 uniform vec2 logDensity;  // lowest, and range
 uniform float brightest, marchStep;
+uniform float ball;  // radius around the volume's middle beyond which space is contracted in it; 0 for none
 
 uniform samplerCube sky;  // equal angles, see boundaries/cube_map.py
 uniform sampler2D picture;  // lat-long, z up, +x in the middle
@@ -167,22 +168,44 @@ float fresnel(float cosine, float cosineAfter, float n) {
   return 0.5 * (s * s + p * p);
 }
 
+// Share of a length that is left of it in the volume, and the place there (geometry/contraction.py).
+float shrinkage(vec3 x) {
+  vec3 offset = x - 0.5 * (volumeLow + volumeHigh);
+  return ball > 0.0 ? min(ball * ball / dot(offset, offset), 1.0) : 1.0;
+}
+
+vec3 inVolume(vec3 x) {
+  vec3 middle = 0.5 * (volumeLow + volumeHigh);
+  float share = sqrt(shrinkage(x));
+  return middle + (2.0 - share) * share * (x - middle);
+}
+
+// Steps of `delta` to the wall of an empty brick, at least one; none is skipped where lines are bent in the volume.
+float stepsToWall(vec3 place, vec3 brick, vec3 bricks, vec3 x, vec3 d, float delta) {
+  vec3 size = volumeHigh - volumeLow;
+  vec3 walls = ((brick + vec3(greaterThan(d, vec3(0.0)))) / bricks - place) * size;
+  vec3 ahead = mix(walls / d, vec3(FAR), lessThan(abs(d), vec3(1e-9)));
+  float straight = ball > 0.0 ? ball - distance(x, 0.5 * (volumeLow + volumeHigh)) : FAR;
+  return max(ceil(min(straight, min(ahead.x, min(ahead.y, ahead.z))) / delta), 1.0);
+}
+
 // Light of the volume on a straight run, and what the run leaves of the light behind it.
 void march(vec3 x, vec3 d, float start, float end, vec3 absorbed, inout vec3 left, inout vec3 radiance) {
   vec3 size = volumeHigh - volumeLow;
-  vec2 span = boxSpan(volumeLow, volumeHigh, x, d);
+  vec2 span = ball > 0.0 ? vec2(start, min(end, 1e4 * ball)) : boxSpan(volumeLow, volumeHigh, x, d);
   float first = max(span.x, start), last = min(span.y, end);
   vec3 bricks = vec3(textureSize(occupied, 0)), texels = vec3(textureSize(volume, 0));
   float transmittance = 1.0;
   if (first < last) {
     float delta = (last - first) / ceil((last - first) / marchStep);
-    for (float t = first + 0.5 * delta; t < last && transmittance > 1e-3;) {
-      vec3 place = clamp((x + t * d - volumeLow) / size, 0.0, 0.999999);
+    // Steps are even in the volume, and wider in the world where it contracts space.
+    for (float t = first + 0.5 * delta / shrinkage(x + first * d); t < last && transmittance > 1e-3;) {
+      vec3 here = x + t * d;
+      float smaller = shrinkage(here);
+      vec3 place = clamp((inVolume(here) - volumeLow) / size, 0.0, 0.999999);
       vec3 brick = floor(place * bricks);
       if (texelFetch(occupied, ivec3(brick), 0).r == 0u) {
-        vec3 walls = ((brick + vec3(greaterThan(d, vec3(0.0)))) / bricks - place) * size;
-        vec3 ahead = mix(walls / d, vec3(FAR), lessThan(abs(d), vec3(1e-9)));
-        t += delta * max(ceil(min(ahead.x, min(ahead.y, ahead.z)) / delta), 1.0);
+        t += delta / smaller * stepsToWall(place, brick, bricks, here, d, delta);
         continue;
       }
       vec4 stored = textureLod(volume, (place * (texels - 1.0) + 0.5) / texels, 0.0);
@@ -192,7 +215,7 @@ void march(vec3 x, vec3 d, float start, float end, vec3 absorbed, inout vec3 lef
         radiance += left * exp(-absorbed * (t - start)) * transmittance * (1.0 - passes) * light;
         transmittance *= passes;
       }
-      t += delta;
+      t += delta / smaller;
     }
   }
   left *= transmittance * exp(-absorbed * (min(end, FAR) - start));

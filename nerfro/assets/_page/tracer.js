@@ -98,7 +98,7 @@ class Tracer {
       index: [1, ...settings.iors], absorption: [0, 0, 0, ...settings.absorption.flat()],
       reflection: settings.reflection,
       volumeLow: volume.low, volumeHigh: volume.high, logDensity: volume.density, brightest: volume.brightest,
-      marchStep: volume.step, skyIsPicture: this.skyIsPicture,
+      marchStep: volume.step, ball: volume.radius, skyIsPicture: this.skyIsPicture,
     });
     gl.enable(gl.BLEND);
     gl.blendColor(0, 0, 0, weight);

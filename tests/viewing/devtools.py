@@ -1,0 +1,127 @@
+"""A headless browser that is driven as by a person: real pointers, touches, keys and dropped files.
+
+Speaks the DevTools protocol through a pair of pipes (https://chromedevtools.github.io/devtools-protocol).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from tests.viewing.chromium import OPTIONS
+
+
+class Browser:
+    """One page in a browser of its own; what its console says is kept in `said`."""
+
+    def __init__(self, address: str, folder: Path, size: tuple[int, int]) -> None:
+        to_browser, self._write = os.pipe()
+        self._read, from_browser = os.pipe()
+        shell = f'exec chromium "$@" 3<&{to_browser} 4>&{from_browser}'
+        options = [*OPTIONS, f"--user-data-dir={folder / 'profile'}", f"--window-size={size[0]},{size[1]}",
+                   "--touch-events=enabled", "--remote-debugging-pipe", "about:blank"]  # fmt: skip
+        self._browser = subprocess.Popen(
+            ["bash", "-c", shell, "chromium", *options],
+            pass_fds=(to_browser, from_browser),
+            stderr=subprocess.DEVNULL,
+        )
+        os.close(to_browser)
+        os.close(from_browser)
+        self._number, self._left = 0, b""
+        self._session: str | None = None
+        self.said: list[str] = []
+        page = self.call("Target.createTarget", url="about:blank")["targetId"]
+        self._session = self.call("Target.attachToTarget", targetId=page, flatten=True)["sessionId"]
+        self.call("Runtime.enable")
+        self.call("Page.enable")
+        self.call("Page.navigate", url=address)
+        while self._receive().get("method") != "Page.loadEventFired":
+            pass
+        self.wait_for("page !== null")
+
+    def __enter__(self) -> Browser:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._browser.terminate()
+        self._browser.wait(30)
+        os.close(self._write)
+        os.close(self._read)
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """What a command of the protocol answers."""
+        self._number += 1
+        message = {"id": self._number, "method": method, "params": parameters}
+        if self._session is not None:
+            message["sessionId"] = self._session
+        os.write(self._write, json.dumps(message).encode() + b"\0")
+        while True:
+            answer = self._receive()
+            if answer.get("id") == self._number:
+                assert "error" not in answer, answer
+                return answer["result"]
+
+    def evaluate(self, expression: str) -> Any:
+        """The value of an expression in the page."""
+        found = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in found, found
+        return found["result"].get("value")
+
+    def wait_for(self, condition: str, seconds: float = 60) -> None:
+        """Wait until an expression is true."""
+        deadline = time.monotonic() + seconds
+        while not self.evaluate(condition):
+            assert time.monotonic() < deadline, condition
+            time.sleep(0.05)
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float], button: str = "left") -> None:
+        """Press a button, move, and let go."""
+        buttons = {"left": 1, "right": 2}[button]
+        named = {"button": button, "buttons": buttons, "clickCount": 1}
+        self.call("Input.dispatchMouseEvent", type="mousePressed", x=start[0], y=start[1], **named)
+        for share in (0.5, 1.0):
+            x, y = (a + share * (b - a) for a, b in zip(start, end, strict=True))
+            self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, **named)
+        named["buttons"] = 0
+        self.call("Input.dispatchMouseEvent", type="mouseReleased", x=end[0], y=end[1], **named)
+
+    def wheel(self, at: tuple[float, float], down: float) -> None:
+        self.call("Input.dispatchMouseEvent", type="mouseWheel", x=at[0], y=at[1], deltaX=0, deltaY=down)
+
+    def touch(self, *places: list[tuple[float, float]]) -> None:
+        """Fingers that are put down at the first places, moved to the others one after another, and lifted."""
+        for kind, fingers in zip(["touchStart", *["touchMove"] * (len(places) - 1)], places, strict=True):
+            points = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(fingers)]
+            self.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+        self.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
+    def press(self, key: str) -> None:
+        """Press a key: a character, or by its name."""
+        named: dict[str, Any] = {"key": key, "windowsVirtualKeyCode": 32} if key == " " else {"key": key}
+        text = {"text": key} if len(key) == 1 else {}
+        self.call("Input.dispatchKeyEvent", type="keyDown", **named, **text)
+        self.call("Input.dispatchKeyEvent", type="keyUp", **named)
+
+    def drop(self, file: Path, at: tuple[float, float]) -> None:
+        """Drag a file from elsewhere into the page, and let it go."""
+        data = {"items": [], "files": [str(file)], "dragOperationsMask": 1}
+        for kind in ("dragEnter", "dragOver", "drop"):
+            self.call("Input.dispatchDragEvent", type=kind, x=at[0], y=at[1], data=data)
+
+    def _receive(self) -> dict[str, Any]:
+        while b"\0" not in self._left:
+            some = os.read(self._read, 1 << 16)
+            assert some, "the browser has ended"
+            self._left += some
+        text, _, self._left = self._left.partition(b"\0")
+        message = json.loads(text)
+        if message.get("method") in ("Runtime.consoleAPICalled", "Runtime.exceptionThrown"):
+            self.said.append(json.dumps(message["params"]))
+        return message
