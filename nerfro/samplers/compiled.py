@@ -34,8 +34,10 @@ def snell_on_grid(
 
     solids = _for_kernels(medium)
     shortest = float((solids.high - solids.low).min())
-    settings = (solids, min_step * shortest, max_events, branching.num_events, branching.least_weight)
-    of_rays, room = _ray_arrays(rays), _ROOM if branching.num_events else 1
+    settings = (
+        solids, min_step * shortest, max_events, branching.num_events, branching.least_weight, branching.main_only
+    )  # fmt: skip
+    of_rays, room = _ray_arrays(rays), _ROOM if branching.num_events and not branching.main_only else 1
     arguments: list[Any] = [*of_rays, *settings, _CAPACITY, room]
     *columns, counts = trace_snell(*arguments)
     kept, needed = (counts <= (room, _CAPACITY)).all(1), counts.max(0, initial=1)
@@ -70,9 +72,11 @@ def _rows(
     """
     room = columns[0].shape[1]
     valid = np.arange(room) < counts[:, None]
-    chosen = [column[:, 0] if room == 1 and valid.all() else column[valid] for column in columns]
-    last = np.minimum(np.arange(width), columns[0].shape[2] - 1)  # shorter rows repeat their last vertex
-    chosen = [column if column.ndim == 1 else column[:, last] for column in chosen]
+    kept = [column if column.ndim == 2 else column[:, :, :width] for column in columns]
+    chosen = [column[:, 0] if room == 1 and valid.all() else column[valid] for column in kept]
+    missing = width - columns[0].shape[2]
+    if missing > 0:  # shorter rows repeat their last vertex
+        chosen = [c if c.ndim == 1 else np.concatenate([c, np.repeat(c[:, -1:], missing, 1)], 1) for c in chosen]
     return valid.nonzero()[0], chosen
 
 
