@@ -134,13 +134,13 @@ class Path:
         """Share of light that comes from arc lengths `s` through what absorbs before them (Beer-Lambert), linear."""
         vertex, runs = self._vertex_before(s), self.s.diff(dim=1)
         since = s - self.s.gather(1, vertex)
-        lengths = []
+        depth = s.new_zeros(*s.shape, 3)
         for number in range(1, len(self.absorption)):
             within = (self.body == number).to(s)
             before = torch.nn.functional.pad((within[:, :-1] * runs).cumsum(1), (1, 0))
-            lengths.append(before.gather(1, vertex) + within.gather(1, vertex) * since)
-        # The bodies' absorption comes last, so that its gradient is one product.
-        return torch.exp(-(torch.stack(lengths, -1) @ self.absorption[1:]))
+            length = before.gather(1, vertex) + within.gather(1, vertex) * since
+            depth = depth + length[..., None] * self.absorption[number]
+        return torch.exp(-depth)
 
     def exits(self, directions: Float[Tensor, "P 3"] | None = None) -> Exits:
         """Where light comes from beyond all vertices: the last straight run of each polyline."""
