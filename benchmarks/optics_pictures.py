@@ -90,7 +90,7 @@ def draw_light(folder: Path) -> None:
         plot_paths(axes[0], path, medium)
         for panel, (title, image) in zip(axes[1:], shown.items(), strict=True):
             panel.imshow(image, interpolation="nearest")
-            panel.set_title(title)
+            panel.set_title(title, fontsize=11)
             panel.axis("off")
         figure.savefig(folder / name, dpi=90, bbox_inches="tight")
 
@@ -101,7 +101,7 @@ def cube_of_distances(**options: list[float]) -> SdfGrid:
     return SdfGrid.from_distances(values, BOX, [1.5], 0.02, **options)
 
 
-def picture(sampler: Snell, medium: SdfGrid, side: int = 260, parts: int = 2) -> np.ndarray:
+def picture(sampler: Snell, medium: SdfGrid, side: int = 260, parts: int = 3) -> np.ndarray:
     """The medium under the sky of the scene `torus`, several rays a pixel, sRGB."""
     cameras = view().resized(side, side).crop(central_window(side, side, 0.75))
     radiance_of_sky = lat_long.load_lat_long(ASSETS_DIR / "torus" / "sky.png")

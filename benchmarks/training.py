@@ -87,21 +87,23 @@ def main() -> None:
 
 
 class Steps(pl.Callback):
-    """Wall-clock seconds and total loss of every training step, from one step's end to the next's."""
+    """Seconds by the clock and of the processor and total loss of every training step, from one's end to the next's."""
 
     def __init__(self) -> None:
         self.seconds: list[float] = []
+        self.processor: list[float] = []
         self.losses: list[float] = []
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        self._last = time.perf_counter()
+        self._last, self._last_processor = time.perf_counter(), time.process_time()
 
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object, batch: Batch, batch_idx: int
     ) -> None:
-        now = time.perf_counter()
+        now, processor = time.perf_counter(), time.process_time()
         self.seconds.append(now - self._last)
-        self._last = now
+        self.processor.append(processor - self._last_processor)
+        self._last, self._last_processor = now, processor
         self.losses.append(float(trainer.callback_metrics["loss/total"]))
 
 
@@ -279,7 +281,10 @@ def report_paths(turns: int = 6, num_steps: int = 11) -> None:
 
 
 def report_branches(turns: int = 3, num_steps: int = 9) -> None:
-    """A step of the default preset with and without light that splits, and with a tint that learns, in turns."""
+    """A step of the default preset with and without light that splits, and with a tint that learns, in turns.
+
+    Processor time is of all threads, and hardly depends on what else the machine does.
+    """
     of_path = "sampler.path.branches"
     ways = {
         "none (`refractive`)": Training("+experiment=refractive"),
@@ -287,19 +292,21 @@ def report_branches(turns: int = 3, num_steps: int = 9) -> None:
         "all": Training("+experiment=refractive", f"{of_path}=all"),
         "all, and the tint learns (`glass`)": Training("+experiment=glass"),
     }
-    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
     for turn in range(turns + 1):
         for name, training in ways.items():
-            steps = training.run(num_steps).seconds[1:]
+            steps = training.run(num_steps)
             if turn > 0:  # the first one compiles and allocates
-                seconds[name].append(float(np.median(steps)))
-    base = np.median(seconds["none (`refractive`)"])
-    print("| default preset, branches | paths a training ray | ms a step | against one path |\n|---|---|---|---|")
+                seconds[name].append((float(np.median(steps.seconds[1:])), float(np.median(steps.processor[1:]))))
+    base = np.median(seconds["none (`refractive`)"], 0)
+    print("| default preset, branches | paths a training ray | ms a step | processor, ms | against one path |")
+    print("|---|---|---|---|---|")
     for name, training in ways.items():
         path = training.batches.batch(0).path
         assert path is not None
-        median = float(np.median(seconds[name]))
-        print(f"| {name} | {len(path.ray) / path.num_rays:.2f} | {1e3 * median:.1f} | {median / base:.2f}x |")
+        wall, processor = np.median(seconds[name], 0)
+        paths = len(path.ray) / path.num_rays
+        print(f"| {name} | {paths:.2f} | {1e3 * wall:.1f} | {1e3 * processor:.1f} | {processor / base[1]:.2f}x |")
 
 
 def label(stack: ExitStack, owner: object, method: str, name: str) -> None:

@@ -44,8 +44,8 @@ class Path:
     # Innermost body of the medium in which each vertex is left, numbered from 1; 0 in air, or where the index
     # varies continuously.
     body: Int[Tensor, "P S"] = None  # type: ignore[assignment]
-    # Absorption of the body in which each vertex is left, for each colour channel, per world unit; 0 by default.
-    absorption: Float[Tensor, "P S 3"] = None  # type: ignore[assignment]
+    # Absorption of air and of each body, for each colour channel, per world unit; 0 by default.
+    absorption: Float[Tensor, "K+1 3"] = None  # type: ignore[assignment]
     # Number of the wavelength at which the polyline is bent, where the index depends on it; 0 by default.
     band: Int[Tensor, "P"] = None  # type: ignore[assignment]
     # Which of these were given. Known here, so that the ordinary path is neither summed up nor weighted, bit for bit.
@@ -57,7 +57,7 @@ class Path:
             "ray": lambda: torch.arange(len(self.s), device=self.s.device),
             "throughput": lambda: (zero + 1).expand(len(self.s), 3),
             "body": lambda: zero.to(torch.int8).expand(self.s.shape),
-            "absorption": lambda: zero.expand(*self.s.shape, 3),
+            "absorption": lambda: zero.expand(1, 3),
             "band": lambda: zero.to(torch.int8).expand(len(self.s)),
         }
         missing = [name for name in defaults if getattr(self, name) is None]
@@ -132,12 +132,15 @@ class Path:
 
     def transmitted(self, s: Float[Tensor, "P N"]) -> Float[Tensor, "P N 3"]:
         """Share of light that comes from arc lengths `s` through what absorbs before them (Beer-Lambert), linear."""
-        of_runs = self.absorption[:, :-1] * self.s.diff(dim=1)[..., None]
-        depth = torch.cat([torch.zeros_like(of_runs[:, :1]), of_runs.cumsum(1)], 1)
-        vertex = self._vertex_before(s)
-        index = vertex[..., None].expand(-1, -1, 3)
-        since = (s - self.s.gather(1, vertex))[..., None]
-        return torch.exp(-(depth.gather(1, index) + self.absorption.gather(1, index) * since))
+        vertex, runs = self._vertex_before(s), self.s.diff(dim=1)
+        since = s - self.s.gather(1, vertex)
+        depth = s.new_zeros(*s.shape, 3)
+        for number in range(1, len(self.absorption)):
+            within = (self.body == number).to(s)
+            before = torch.nn.functional.pad((within[:, :-1] * runs).cumsum(1), (1, 0))
+            length = before.gather(1, vertex) + within.gather(1, vertex) * since
+            depth = depth + length[..., None] * self.absorption[number]
+        return torch.exp(-depth)
 
     def exits(self, directions: Float[Tensor, "P 3"] | None = None) -> Exits:
         """Where light comes from beyond all vertices: the last straight run of each polyline."""
@@ -161,7 +164,9 @@ class Path:
 
     def __getitem__(self, index: slice | Tensor) -> Path:
         """Some of the polylines, each as that of a ray of its own."""
-        return Path(**{name: tensor[index] for name, tensor in self._tensors().items() if name != "ray"})
+        tensors = self._tensors()
+        tensors.pop("ray", None)
+        return Path(**{name: tensor if name in _OF_BODIES else tensor[index] for name, tensor in tensors.items()})
 
     def of_rays(self, rows: Int[Tensor, "C"]) -> Path:
         """Some of the rays, with all their polylines."""
@@ -179,6 +184,8 @@ class Path:
 
         def joined(name: str) -> Tensor:
             parts: list[Tensor] = [getattr(part, name) for part in (self, other)]
+            if name in _OF_BODIES:
+                return max(parts, key=len)
             if name == "ray":
                 parts[1] = parts[1] + self.num_rays
             if name in _OF_VERTICES:
@@ -227,7 +234,8 @@ class Path:
 
 
 _OF_ALL_PATHS = ("positions", "directions", "s", "exit_directions", "refracted", "radii")
-_OF_VERTICES = frozenset({"positions", "directions", "s", "body", "absorption"})
+_OF_VERTICES = frozenset({"positions", "directions", "s", "body"})
+_OF_BODIES = frozenset({"absorption"})
 
 
 @dataclass(frozen=True)

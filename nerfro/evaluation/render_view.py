@@ -38,8 +38,8 @@ def render_view(model: NerfModel, cameras: Cameras, view: int, supersampling: Su
     size = cameras.height * cameras.width
     pixels = torch.arange(view * size, (view + 1) * size, device=cameras.device)
     with torch.inference_mode():
-        beside = [model.trace(rays_beside(cameras, some)) for some in pixels.split(model.chunk_size)]
-    exits = torch.cat([path.first_of_ray(path.exit_directions) for path in beside])
+        beside = [model.exit_directions(rays_beside(cameras, some)) for some in pixels.split(model.chunk_size)]
+    exits = torch.cat(beside)
     angles = divergence(cameras, pixels, rendered.exit_directions, exits)
     divided = angles >= supersampling.divergence
     if supersampling.contrast is not None:

@@ -45,16 +45,16 @@ def _teaching(rendering: Rendering, batch: Batch, boundary: Boundary) -> Float[T
 
     What bends and tints the rays still learns from where they leave.
     """
-    path = rendering.path
-    if batch.num_whole is None:
+    if (whole := batch.num_whole) is None:
         return rendering.rgb
-    learned = rendering.boundary_rgb - rendering.boundary_rgb.detach()
-    exits = path.exits()
-    if exits.directions.requires_grad or path.absorption.requires_grad:
+    first = int(torch.searchsorted(rendering.path.ray, whole))
+    path, light = rendering.path[first:].changed(ray=rendering.path.ray[first:] - whole), rendering.boundary_rgb[first:]
+    learned = light - light.detach()
+    if path.exit_directions.requires_grad or path.absorption.requires_grad:
         fixed = {name: parameter.detach() for name, parameter in boundary.named_parameters()}
-        bent = functional_call(boundary, fixed, (exits,))
+        bent = functional_call(boundary, fixed, (path.exits(),))
         if path.absorbs:
             bent = bent * path.transmitted(path.far[:, None])[:, 0]
         learned = learned - (bent - bent.detach())
-    from_boundary = path.per_ray(rendering.transmittance[:, None] * learned)
-    return torch.cat([rendering.rgb[: batch.num_whole], (rendering.rgb - from_boundary)[batch.num_whole :]])
+    from_boundary = path.per_ray(rendering.transmittance[first:, None] * learned)
+    return torch.cat([rendering.rgb[:whole], rendering.rgb[whole:] - from_boundary])

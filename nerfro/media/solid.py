@@ -107,8 +107,7 @@ class Solid(Medium):
         of_bodies = self.absorption
         if of_bodies is None:
             return path
-        of_all = torch.cat([torch.zeros_like(of_bodies[:1]), of_bodies]).to(path.s)
-        return path.changed(absorption=of_all[path.body.long()])
+        return path.changed(absorption=torch.cat([torch.zeros_like(of_bodies[:1]), of_bodies]).to(path.s))
 
     def bending_parameters(self) -> list[nn.Parameter]:
         return [parameter for parameter in self.parameters() if parameter is not self._absorption]

@@ -78,6 +78,10 @@ class NerfModel(LightningModule, ABC):
         path = self.path_sampler(rays, self.medium) if path is None else path
         return self.medium.tinted(self._steadily_refined(path, rays) if self.paths_learn else path)
 
+    def exit_directions(self, rays: Rays) -> Float[Tensor, "R 3"]:
+        """Unit direction in which the main polyline of each ray leaves, without its branches and their cost."""
+        return self.path_sampler.main(rays, self.medium).exit_directions
+
     def _steadily_refined(self, path: Path, rays: Rays) -> Path:
         """Paths with gradients, but for those whose derivatives are too large to learn from."""
         refined = self.path_sampler.refine(path, rays, self.medium)

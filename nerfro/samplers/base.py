@@ -23,6 +23,10 @@ class PathSampler(nn.Module, ABC):
     def forward(self, rays: Rays, medium: Medium) -> Path:
         """Trace every ray from near to far through the medium; a bent path ends outside it, if need be beyond far."""
 
+    def main(self, rays: Rays, medium: Medium) -> Path:
+        """The first polyline of every ray, as `forward` traces it: for what asks only where rays go."""
+        return self(rays, medium)
+
     def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
         """The traced path with gradients by what bends it, and the same values; asked where something of that learns.
 

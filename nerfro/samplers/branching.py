@@ -19,10 +19,12 @@ class Branching:
         num_events: at how many of its first events a ray may split; at later ones all light is transmitted where it
             can be.
         least_weight: share of the ray's light below which a part is not followed.
+        main_only: whether only a ray's first polyline is followed, though its light splits.
     """
 
     num_events: int = 0
     least_weight: float = 1.0
+    main_only: bool = False
 
     def decide(
         self, weight: Float[Tensor, "A"], reflectance: Float[Tensor, "A"], num_events: Int[Tensor, "A"]
@@ -72,9 +74,10 @@ class Event:
     ) -> None:
         splits, whole = branching.decide(weight[active], share, num_events[active])
         copies = torch.ones(len(weight), dtype=torch.long, device=active.device)
-        copies[active] += splits
+        followed = splits & (not branching.main_only)
+        copies[active] += followed
         self.source = torch.arange(len(weight), device=active.device).repeat_interleave(copies)
-        self.place = torch.arange(len(active), device=active.device).repeat_interleave(1 + splits.long())
+        self.place = torch.arange(len(active), device=active.device).repeat_interleave(1 + followed.long())
         second = torch.zeros_like(self.place, dtype=torch.bool)
         second[1:] = self.place[1:] == self.place[:-1]
         self.row = copies.cumsum(0) - copies

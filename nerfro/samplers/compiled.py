@@ -34,8 +34,10 @@ def snell_on_grid(
 
     solids = _for_kernels(medium)
     shortest = float((solids.high - solids.low).min())
-    settings = (solids, min_step * shortest, max_events, branching.num_events, branching.least_weight)
-    of_rays, room = _ray_arrays(rays), _ROOM if branching.num_events else 1
+    settings = (
+        solids, min_step * shortest, max_events, branching.num_events, branching.least_weight, branching.main_only
+    )  # fmt: skip
+    of_rays, room = _ray_arrays(rays), _ROOM if branching.num_events and not branching.main_only else 1
     arguments: list[Any] = [*of_rays, *settings, _CAPACITY, room]
     *columns, counts = trace_snell(*arguments)
     kept, needed = (counts <= (room, _CAPACITY)).all(1), counts.max(0, initial=1)

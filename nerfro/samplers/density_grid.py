@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Annotated
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfro.allowed import Count, NotNegative, Positive, Range, Share, corners_of_box
@@ -24,6 +24,8 @@ from nerfro.types import Path, Rendering, Samples
 
 # Remembered optical depth below which a sample of a picture is not worth asking the field.
 _EMPTY = 0.005
+# In training: samples of the faintest branches, and the weight from which a branch is asked everywhere.
+_FEWEST, _HEAVY = 8, 0.5
 
 
 @register("sampler/points", "density_grid")
@@ -77,14 +79,37 @@ class DensityGridSampler(PointSampler):
 
     def forward(self, path: Path, previous: Rendering | None) -> Samples:
         with torch.no_grad():
-            u = spread_uniform(path, self.num_samples + 1, self.training)
+            u = self._places(path)
             samples = self.draw_compiled(path, u) if path.s.device.type == "cpu" else self.draw(path, u)
-        if self.training:  # the field may have grown since the grid has looked
-            samples = replace(samples, occupied=None)
+            if self.training:
+                samples = replace(samples, occupied=self._asked(path, samples))
         # The kernel has found positions too; they are asked of the path only where it has gradients to give.
         if not path.positions.requires_grad:
             return samples
-        return replace(Samples.along(path, samples.s, samples.edges), lengths=samples.lengths, measure=samples.measure)
+        along = Samples.along(path, samples.s, samples.edges)
+        return replace(along, occupied=samples.occupied, lengths=samples.lengths, measure=samples.measure)
+
+    def _places(self, path: Path) -> Float[Tensor, "P N+1"]:
+        """Where in the cumulative weights the edges of samples lie.
+
+        In training a branch is given samples by its weight. The intervals that it lacks are at its end, of no length.
+        """
+        if not (self.training and path.splits):
+            return spread_uniform(path, self.num_samples + 1, self.training)
+        num = (self.num_samples * _weight(path)).ceil().clamp(min=min(self.num_samples, _FEWEST)).long()[:, None]
+        edge = torch.arange(self.num_samples + 1, device=num.device).minimum(num)
+        return (edge + path.rand(self.num_samples + 1).gather(1, edge)) / (num + 1)
+
+    @staticmethod
+    def _asked(path: Path, samples: Samples) -> Bool[Tensor, "P N"] | None:
+        """Which samples the field is asked at in training: all but those of faint branches where nothing is remembered.
+
+        The field may have grown since the grid has looked; heavy branches find that out.
+        """
+        if not path.splits:
+            return None
+        assert samples.occupied is not None
+        return ((_weight(path) >= _HEAVY)[:, None] | samples.occupied) & (samples.deltas > 0)
 
     def draw(self, path: Path, u: Float[Tensor, "R N+1"]) -> Samples:
         """Samples at places `u` of the cumulative weights: the plain reference of the compiled kernel."""
@@ -184,3 +209,8 @@ class DensityGridSampler(PointSampler):
         outside = (places - self.centre).norm(dim=-1) >= 2 * self.radius  # corners in which no place of the world lies
         density = field.density(positions) / shrinkage(positions, self.centre, self.radius)
         return torch.where(outside, 0.0, density)
+
+
+def _weight(path: Path) -> Float[Tensor, "P"]:
+    """Share of its ray's light that a polyline brings, of the colour of which it brings most."""
+    return path.throughput.amax(-1).clamp(max=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import torch
@@ -70,6 +71,12 @@ class Snell(PathSampler):
         """Trace every ray from near to far, or until it has left the medium's box; straight runs are two vertices."""
         return self.trace(rays, medium).path
 
+    @torch.no_grad()
+    def main(self, rays: Rays, medium: Medium) -> Path:
+        if isinstance(medium, Solid) and medium.disperses:
+            medium = self._seen(medium)[0]
+        return self.trace(rays, medium, replace(self.branching, main_only=True)).path
+
     def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
         """The path with gradients by rays, indices and the surface that was traced; see `samplers.replay`.
 
@@ -101,8 +108,8 @@ class Snell(PathSampler):
         return self.interface == "sdf" and isinstance(medium, SdfGrid)
 
     @torch.no_grad()
-    def trace(self, rays: Rays, medium: Medium) -> SnellTrace:
-        """Paths, the number of events on each, and which rays had too many."""
+    def trace(self, rays: Rays, medium: Medium, branching: Branching | None = None) -> SnellTrace:
+        """Paths, the number of events on each, and which rays had too many; branches other than the sampler's."""
         if isinstance(medium, Vacuum):
             none = torch.zeros(len(rays), dtype=torch.long, device=rays.near.device)
             return SnellTrace(straight_path(rays), none, none.bool())
@@ -110,16 +117,17 @@ class Snell(PathSampler):
             raise NerfroError("sampler/path=snell needs a medium with a surface; take medium=sdf_grid, or path=eikonal")
         if medium.disperses:
             return traced_in_bands(rays, self._seen(medium), self._trace)
-        return self._trace(rays, medium)
+        return self._trace(rays, medium, branching)
 
-    def _trace(self, rays: Rays, medium: Solid) -> SnellTrace:
+    def _trace(self, rays: Rays, medium: Solid, branching: Branching | None = None) -> SnellTrace:
+        branching = branching or self.branching
         if self.interface == "mesh":
             if not isinstance(medium, SdfGrid) or not medium.meshes:
                 raise NerfroError("sampler.path.interface=mesh needs a medium made of a mesh; take medium=sdf_grid")
-            return SnellTrace(*snell_on_mesh(rays, medium, self.max_events, self.branching))
+            return SnellTrace(*snell_on_mesh(rays, medium, self.max_events, branching))
         if isinstance(medium, SdfGrid) and rays.origins.device.type == "cpu":
-            return SnellTrace(*snell_on_grid(rays, medium, MIN_SEARCH_STEP, self.max_events, self.branching))
-        return SnellTrace(*trace_interfaces(rays, medium, self.max_events, self.branching))
+            return SnellTrace(*snell_on_grid(rays, medium, MIN_SEARCH_STEP, self.max_events, branching))
+        return SnellTrace(*trace_interfaces(rays, medium, self.max_events, branching))
 
 
 def trace_interfaces(

@@ -170,7 +170,9 @@ def _mirrored(dx, dy, dz, nx, ny, nz, ratio):
 
 
 @compiled
-def _trace_ray(solids, origin, direction, near, far, min_step, max_events, num_splits, least_weight, scratch, rows):
+def _trace_ray(
+    solids, origin, direction, near, far, min_step, max_events, num_splits, least_weight, main_only, scratch, rows
+):  # fmt: skip
     """One ray's polylines into its rows: their number, and the largest number of vertices.
 
     What follows a row's last vertex is left as it is.
@@ -221,15 +223,16 @@ def _trace_ray(solids, origin, direction, near, far, min_step, max_events, num_s
             if num_events < num_splits and not reflected:
                 mx, my, mz, share = _mirrored(dx, dy, dz, nx, ny, nz, n_before / n_after)
                 if weight * min(share, 1.0 - share) >= least_weight:
-                    waiting[num_waiting, 0] = x + before * dx
-                    waiting[num_waiting, 1] = y + before * dy
-                    waiting[num_waiting, 2] = z + before * dz
-                    waiting[num_waiting, 3], waiting[num_waiting, 4], waiting[num_waiting, 5] = mx, my, mz
-                    waiting[num_waiting, 6], waiting[num_waiting, 7] = s + before, weight * share
-                    waiting_numbers[num_waiting, 0], waiting_numbers[num_waiting, 1] = count, num_events + 1
-                    waiting_inside[num_waiting] = inside
-                    waiting_inside[num_waiting, hit] = not inside[hit]
-                    num_waiting += 1
+                    if not main_only:
+                        waiting[num_waiting, 0] = x + before * dx
+                        waiting[num_waiting, 1] = y + before * dy
+                        waiting[num_waiting, 2] = z + before * dz
+                        waiting[num_waiting, 3], waiting[num_waiting, 4], waiting[num_waiting, 5] = mx, my, mz
+                        waiting[num_waiting, 6], waiting[num_waiting, 7] = s + before, weight * share
+                        waiting_numbers[num_waiting, 0], waiting_numbers[num_waiting, 1] = count, num_events + 1
+                        waiting_inside[num_waiting] = inside
+                        waiting_inside[num_waiting, hit] = not inside[hit]
+                        num_waiting += 1
                     weight *= 1.0 - share
                 elif share > 0.5:
                     tx, ty, tz, reflected = mx, my, mz, True
@@ -266,7 +269,9 @@ def _trace_ray(solids, origin, direction, near, far, min_step, max_events, num_s
 
 
 @compiled_parallel
-def trace_snell(origins, directions, near, far, solids, min_step, max_events, num_splits, least_weight, capacity, room):
+def trace_snell(
+    origins, directions, near, far, solids, min_step, max_events, num_splits, least_weight, main_only, capacity, room
+):
     """Polylines of all rays, which may split at their first events (`samplers.branching`).
 
     Returns:
@@ -299,7 +304,7 @@ def trace_snell(origins, directions, near, far, solids, min_step, max_events, nu
             )  # fmt: skip
             counts[ray] = _trace_ray(
                 solids, origins[ray], directions[ray], near[ray], far[ray],
-                min_step, max_events, num_splits, least_weight, scratch, rows,
+                min_step, max_events, num_splits, least_weight, main_only, scratch, rows,
             )  # fmt: skip
     return out_positions, out_directions, out_s, bodies, weights, events, exceeded, counts
 

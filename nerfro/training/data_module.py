@@ -106,7 +106,12 @@ def can_trace_ahead(model: NerfModel) -> bool:
 def traced(batches: RayBatches, model: NerfModel, config: DictConfig) -> RayBatches:
     """The batches with their paths, and with several rays in pixels for which one does not stand."""
     side = config.batches.supersample if model.path_sampler.needs_medium else 1  # straight rays do not part
-    return batches.traced(lambda rays, view: model.trace(model.camera(rays, view)), side, config.batches.divergence)
+    return batches.traced(
+        lambda rays, view: model.path_sampler(model.camera(rays, view), model.medium),
+        side,
+        config.batches.divergence,
+        lambda rays, view: model.exit_directions(model.camera(rays, view)),
+    )
 
 
 class RotatingView:

@@ -24,6 +24,7 @@ from nerfro.types import Batch, Path
 
 Batching = Literal["single_image", "all_images"]
 Tracer = Callable[[Rays, Tensor], Path]
+Leaving = Callable[[Rays, Tensor], Tensor]  # unit directions [R, 3] in which rays leave
 
 # Numbers of divided pixels are multiples of this share of a batch, so that tensors have few different sizes.
 _STEP_OF_DIVIDED = 1 / 32
@@ -55,6 +56,7 @@ class RayBatches:
         self.precrop_steps, self.jitter = precrop_steps, jitter
         self._share = slice(batch_size)
         self._trace: Tracer | None = None
+        self._leaving: Leaving | None = None
         self._side, self._divergence = 1, 0.0
         cameras = views.cameras
         self._cameras = cameras
@@ -77,14 +79,18 @@ class RayBatches:
         moved._cameras, moved._pixels = self._cameras.to(device), self._pixels.to(device)
         return moved
 
-    def traced(self, trace: Tracer, side: int = 1, divergence: float = 8.0) -> RayBatches:
+    def traced(
+        self, trace: Tracer, side: int = 1, divergence: float = 8.0, leaving: Leaving | None = None
+    ) -> RayBatches:
         """The sequence with the paths of its rays, more than one for pixels for which one does not stand.
 
         Pixels are divided whose ray leaves in another direction than the one beside it, by `divergence` pixel angles or
         more (see `pixel_parts.divergence`), into `side` rays in each direction; 1 divides none.
+        Where the rays beside them leave is asked of `leaving`, if that is cheaper than to trace them.
         """
         traced = copy.copy(self)
         traced._trace, traced._side, traced._divergence = trace, side, divergence
+        traced._leaving = leaving or (lambda rays, view: _main_exits(trace(rays, view)))
         return traced
 
     def forget(self) -> None:
@@ -130,6 +136,7 @@ class RayBatches:
     def _divided_batch(self, drawn: Int[np.ndarray, "P"], generator: np.random.Generator, cameras: Cameras) -> Batch:
         """The batch of the drawn pixels: first those that have one ray, then the divided ones with all of theirs."""
         assert self._trace is not None
+        assert self._leaving is not None
         several = self._side**2
         pixels = self._to_device(drawn)
         view = pixels // (self._cameras.height * self._cameras.width)
@@ -137,9 +144,9 @@ class RayBatches:
         place_in_part = self._to_device(self._random(generator, several, 2)) if self.jitter else None
         # Every process traces the rays of the whole batch once, to know how the others divide their pixels.
         rays = pixel_rays(self._cameras, pixels, place)
-        path = self._trace(rays.followed_by(rays_beside(self._cameras, pixels, place)), view.repeat(2))
-        exits, beside = path.first_of_ray(path.exit_directions).view(2, -1, 3)
-        divided = self._widest(divergence(self._cameras, pixels, exits, beside))
+        path = self._trace(rays, view)
+        beside = self._leaving(rays_beside(self._cameras, pixels, place), view)
+        divided = self._widest(divergence(self._cameras, pixels, _main_exits(path), beside))
 
         # Each pixel's first row in the whole batch.
         num_rays = torch.where(divided, several, 1)
@@ -209,6 +216,10 @@ class RayBatches:
             )
         if counts.sum() == 0:
             raise NerfroError(f"the masks leave no pixel to train on{precropped}; black is ignored, white is used")
+
+
+def _main_exits(path: Path) -> Float[Tensor, "R 3"]:
+    return path.first_of_ray(path.exit_directions)
 
 
 class _Usable:

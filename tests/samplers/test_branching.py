@@ -176,6 +176,17 @@ def test_the_first_polyline_is_the_one_that_is_transmitted() -> None:
     assert torch.equal(Snell(branches="first", least_weight=0.6)(rays, medium).ray, torch.arange(len(rays)))
 
 
+@pytest.mark.parametrize("tracer", ["grid", "closed form", "mesh"])
+def test_main_polylines_alone_are_the_first_of_all(tracer: str, tmp_path: FilePath) -> None:
+    rays, medium = _bundle(), {"grid": _nested_grid, "closed form": NestedBalls}.get(tracer, lambda: None)()
+    medium = medium or _nested_mesh(tmp_path)
+    sampler = Snell("mesh" if tracer == "mesh" else "sdf", branches="all")
+    every, main = sampler(rays, medium), sampler.main(rays, medium)
+    assert main.num_rays == len(main.s) == len(rays) < len(every.s)
+    for name in ("throughput", "exit_directions"):
+        assert torch.equal(getattr(main, name), every.first_of_ray(getattr(every, name)))
+
+
 def test_what_is_too_light_is_added_to_the_rest() -> None:
     heights = torch.tensor([0.0, 0.6, 0.799]).double()
     path = Snell(branches="all", least_weight=0.1)(beam(heights), Ball(0.8, 1.5).double())

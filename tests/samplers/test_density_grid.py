@@ -107,3 +107,36 @@ def test_grid_travels_with_the_checkpoint() -> None:
     restored = DensityGridSampler(num_samples=16, num_bins=64, resolution=32)
     restored.load_state_dict(sampler.state_dict())
     assert torch.equal(restored.density, sampler.density)
+
+
+def split_in_two(shares: tuple[float, float]) -> Path:
+    """Each of 64 rays as two equal polylines with shares of its light."""
+    path = example_path(64)
+    rows = torch.arange(64).repeat_interleave(2)
+    return path[rows].changed(ray=rows, throughput=torch.tensor(shares).repeat(64)[:, None].expand(-1, 3))
+
+
+def test_branches_are_sampled_by_their_weight_in_training() -> None:
+    sampler, path = trained_sampler(), split_in_two((0.9, 0.1))
+    torch.manual_seed(1)
+    samples = sampler(path, None)
+    num = (samples.deltas > 0).sum(-1).view(-1, 2)
+    assert num.max(0).values.tolist() == [15, 8]
+    dense = sampler.lookup(samples.positions) * samples.deltas >= 0.005
+    main, faint = samples.occupied[::2], samples.occupied[1::2]
+    assert torch.equal(main, samples.deltas[::2] > 0), "the main path finds what the grid has not seen yet"
+    assert torch.equal(faint, dense[1::2])
+    assert 0 < faint.sum() < main.sum() / 3
+    # In pictures all are sampled alike.
+    drawn = sampler.eval()(path, None)
+    assert torch.equal(drawn.edges[::2], drawn.edges[1::2])
+
+
+def test_a_ray_that_does_not_split_is_sampled_as_ever() -> None:
+    sampler, path = trained_sampler(), example_path(64)
+    torch.manual_seed(1)
+    alone = sampler(path, None)
+    torch.manual_seed(1)
+    whole = sampler(split_in_two((1.0, 1.0)), None)
+    assert torch.equal(whole.edges[::2], alone.edges)
+    assert alone.occupied is None
