@@ -101,7 +101,7 @@ class Surroundings(Field):
 
 @needs_chromium
 def test_contracted_surroundings_are_shown(scene: Scene, tmp_path: Path) -> None:
-    sampler = DensityGridSampler(512, 256, [-2.0] * 3, [2.0] * 3, radius=2.0, near=1.0, resolution=48, looks=1.0)
+    sampler = DensityGridSampler(512, 256, [-2.0] * 3, [2.0] * 3, radius=2.0, near=1.0, resolution=48, looks=0.9)
     field = Surroundings()
     for _ in range(3):
         sampler.after_step(0, [field])
