@@ -82,7 +82,7 @@ def _sky(scene: Scene, out: Path, config: DictConfig) -> str:
 
 def _volume(scene: Scene, out: Path, config: DictConfig) -> str:
     volume = bake(scene, config.resolution or RESOLUTION)
-    save_arrays(out, {name: value.numpy() for name, value in vars(volume).items()})
+    save_arrays(out, {name: getattr(volume, name).numpy() for name in ("density", "rgb", "box")})
     return f"the inside: {'x'.join(map(str, volume.density.shape))} vertices with density and linear rgb"
 
 

@@ -101,7 +101,7 @@ class Surroundings(Field):
 
 @needs_chromium
 def test_contracted_surroundings_are_shown(scene: Scene, tmp_path: Path) -> None:
-    sampler = DensityGridSampler(512, 256, [-2.0] * 3, [2.0] * 3, radius=2.0, near=1.0, resolution=48, looks=1.0)
+    sampler = DensityGridSampler(512, 256, [-2.0] * 3, [2.0] * 3, radius=2.0, near=1.0, resolution=48, looks=0.9)
     field = Surroundings()
     for _ in range(3):
         sampler.after_step(0, [field])
@@ -112,7 +112,7 @@ def test_contracted_surroundings_are_shown(scene: Scene, tmp_path: Path) -> None
     expected, without = one_ray(everywhere), one_ray(everywhere.with_(inside=False))
     for shot, rgb, empty in zip(found, expected, without, strict=True):
         assert float(psnr(picture(shot), rgb)) > 33
-        assert float(psnr(empty, rgb)) < 22, "the surroundings are much of what is seen"
+        assert float(psnr(empty, rgb)) < 25, "the surroundings are much of what is seen"
 
 
 @needs_chromium
