@@ -19,6 +19,7 @@ from nerfro.evaluation.score_tables import report
 from nerfro.evaluation.scoring import score_views
 from nerfro.fields.mlp import compile_networks
 from nerfro.registry import build
+from nerfro.training.boundary_first import BoundaryFirst
 from nerfro.training.callbacks import StopOnSignal, Throughput
 from nerfro.training.config import TrainConfig, build_model
 from nerfro.training.data_module import RayDataModule, traced
@@ -51,7 +52,8 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     model = build_model(config, training.cameras)
     require_same_run(folder, checkpoint, config)
     throughput, interruption = Throughput(), StopOnSignal()
-    trainer = make_trainer(config, folder, [throughput, interruption, Viewer(config, source, test)])
+    first = BoundaryFirst(batches, config.optimizer.boundary_first)
+    trainer = make_trainer(config, folder, [throughput, interruption, first, Viewer(config, source, test)])
     batches = batches.share(trainer.global_rank, trainer.world_size)
     batches = traced(batches, model, config)
     few = batches.smaller(4096)

@@ -25,6 +25,8 @@ class OptimizerConfig:
     medium_learning_rate: Optional[Positive] = None  # noqa: UP045
     camera_learning_rate: Optional[Positive] = None  # noqa: UP045
     medium_start: Natural = 0  # steps before what bends rays learns, so that it is not misled by an unlearned scene
+    # Steps before the first in which the boundary alone learns, from rays that miss the content's box.
+    boundary_first: Natural = 0
     warmup_steps: Natural = 2500  # length of the warm-up; 0 for none
     warmup_factor: NotNegative = 0.01  # factor of the learning rate at its first step
     adam_epsilon: Positive = 1e-8  # of Adam

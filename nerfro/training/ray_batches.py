@@ -17,6 +17,7 @@ from nerfro.data.base import Views
 from nerfro.data.pictures import Pictures
 from nerfro.distributed import share_of
 from nerfro.errors import NerfroError
+from nerfro.geometry.interpolation import intersect_box
 from nerfro.pixel_parts import divergence, part_rays, pixel_rays, rays_beside
 from nerfro.rays import Rays
 from nerfro.training.pixel_store import PixelStore
@@ -132,6 +133,34 @@ class RayBatches:
         rays, views = pixel_rays(cameras, index, place), index // (height * width)
         path = None if self._trace is None else self._trace(rays, views)
         return Batch(rays, views, self._pixels[index], cameras.crop(window), path=path, index=index)
+
+    @property
+    def num_pixels(self) -> int:
+        """Of all views."""
+        return len(self._cameras) * self._cameras.height * self._cameras.width
+
+    def missing(self, box: Float[Tensor, "2 3"], num_pixels: int, step: int) -> tuple[Rays, Float[Tensor, "R 3"]]:
+        """Rays through random pixels of all views, of those that miss a box, and their colours; alike in all processes.
+
+        Args:
+            box: its corners, world units.
+            num_pixels: that are drawn.
+            step: another one draws others.
+        """
+        cameras = self._cameras
+        generator = np.random.default_rng([self.seed, step, num_pixels])
+        size = cameras.height * cameras.width
+        if self._usable is None:
+            drawn = generator.integers(self.num_pixels, size=num_pixels)
+        else:
+            usable = self._usable[central_window(cameras.height, cameras.width, 1.0)]
+            view, pixel = usable.find(generator.integers(usable.starts[-1], size=num_pixels))
+            drawn = view * size + pixel
+        index = self._to_device(drawn)
+        rays = pixel_rays(cameras, index)
+        enter, leave = intersect_box(box, rays.origins, rays.directions)
+        beside = (enter >= leave) | (leave <= 0)
+        return rays[beside], self._pixels[index[beside]]
 
     def _divided_batch(self, drawn: Int[np.ndarray, "P"], generator: np.random.Generator, cameras: Cameras) -> Batch:
         """The batch of the drawn pixels: first those that have one ray, then the divided ones with all of theirs."""

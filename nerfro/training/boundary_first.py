@@ -1,0 +1,78 @@
+"""What lies beyond the object, learned before the first step: nothing stands before it where rays miss the object."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from lightning.pytorch import Callback, LightningModule, Trainer
+from torch import Tensor
+
+from nerfro.fields.base import Field
+from nerfro.models.base import NerfModel, step_seed
+from nerfro.progress import told
+from nerfro.rays import Rays
+from nerfro.training.ray_batches import RayBatches
+from nerfro.types import Exits
+
+# Pixels that are drawn for a step, at most this share of all; those that see the object are left out.
+_NUM_PIXELS, _SHARE = 16384, 0.01
+# A step with fewer pixels beside the object is no step.
+_FEWEST = 64
+# Of the boundary's learning rate, in the first and in the last of these steps.
+_RATES = 4.0, 0.4
+
+
+class BoundaryFirst(Callback):
+    """Lets the boundary alone learn, for some steps, from rays that miss the boxes of content and object.
+
+    Their pixels cost one look-up each and no tracing, and a sky that is known lets the first gradients of the field be
+    about the object. The run's own optimiser does it, so that the boundary's moments are warm as well. A run that goes
+    on from a checkpoint has it behind it.
+
+    Args:
+        batches: of the run.
+        num_steps: how many.
+    """
+
+    def __init__(self, batches: RayBatches, num_steps: int) -> None:
+        self._batches, self._num_steps = batches, num_steps
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        assert isinstance(pl_module, NerfModel)
+        learning = [parameter for parameter in pl_module.boundary.parameters() if parameter.requires_grad]
+        box = _occupied(pl_module)
+        if trainer.global_step > 0 or not learning or box is None:
+            return
+        optimizer = trainer.optimizers[0]
+        group = next(group for group in optimizer.param_groups if group["name"] == "boundary")
+        first, last = _RATES
+        batches = self._batches.to(pl_module.device)
+        num_pixels = min(_NUM_PIXELS, int(_SHARE * batches.num_pixels))
+        for step in told("boundary", range(self._num_steps)):
+            rays, rgb = batches.missing(box, num_pixels, step)
+            if len(rays) < _FEWEST:
+                return
+            torch.manual_seed(step_seed(pl_module.seed, -1 - step))
+            group["lr"] = group["initial_lr"] * first * (last / first) ** (step / self._num_steps)
+            loss = torch.nn.functional.mse_loss(*pl_module.difference(pl_module.boundary(_exits(rays)), rgb))
+            # Not by backward(): gradients of several processes would be waited for.
+            gradients = torch.autograd.grad(loss, learning, allow_unused=True)
+            for parameter, gradient in zip(learning, gradients, strict=True):
+                parameter.grad = gradient
+            optimizer.step()
+        optimizer.zero_grad()
+
+
+def _occupied(model: NerfModel) -> Float[Tensor, "2 3"] | None:
+    """Corners of the box outside of which there is nothing but the boundary; None where the field fills all space."""
+    field = model.fields[0]
+    assert isinstance(field, Field)
+    if field.bounds is None:
+        return None
+    boxes = [box.to(model.device) for box in (field.bounds, model.medium.content_box) if box is not None]
+    return torch.stack([torch.stack([box[0] for box in boxes]).amin(0), torch.stack([box[1] for box in boxes]).amax(0)])
+
+
+def _exits(rays: Rays) -> Exits:
+    """Of rays that nothing bends."""
+    return Exits(rays.directions, rays.origins + rays.far[:, None] * rays.directions, rays.radii)
