@@ -1,0 +1,67 @@
+"""The sky is learned before the first step, from rays that miss the object, and by nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from nerfro.data.blender import BlenderData
+from nerfro.training import boundary_first
+from nerfro.training.ray_batches import RayBatches
+from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
+
+FOLDER = "hydra.run.dir"
+
+
+@pytest.fixture
+def weights(
+    train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., dict[str, Tensor]]:
+    """Weights after a run whose rates are too small to move anything after its first steps."""
+    monkeypatch.setattr(boundary_first, "_SHARE", 1.0)
+    still = ["trainer.max_steps=1", "evaluation.every=0", "optimizer.warmup_factor=0", "optimizer.warmup_steps=1000"]
+
+    def run(name: str, *overrides: str) -> dict[str, Tensor]:
+        finished = train_here(*tiny_default_run, *still, f"{FOLDER}={tmp_path / name}", *overrides)
+        assert finished.code == 0, finished.err
+        return load_checkpoint(tmp_path / name / LAST_CHECKPOINT)[0]["state_dict"]
+
+    return run
+
+
+def test_the_boundary_alone_has_learned_before_the_first_step(weights: Callable[..., dict[str, Tensor]]) -> None:
+    without, learned = weights("without", "optimizer.boundary_first=0"), weights("with", "optimizer.boundary_first=20")
+    changed = {name for name, value in learned.items() if not torch.equal(value, without[name])}
+    assert changed == {"boundary.texels"}
+
+
+def test_a_run_that_goes_on_does_not_learn_it_again(
+    weights: Callable[..., dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights("run", "optimizer.boundary_first=5")
+
+    def never(*given: object) -> None:
+        raise AssertionError("pixels beside the object were asked for")
+
+    monkeypatch.setattr(RayBatches, "missing", never)
+    weights("run", "optimizer.boundary_first=5", "ckpt_path=last", "trainer.max_steps=2")
+
+
+def test_rays_that_miss_a_box_have_their_own_colours(tiny_scene: Path) -> None:
+    views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
+    batches = RayBatches(views, 16, "all_images")
+    box = torch.tensor([[-0.6] * 3, [0.6] * 3])
+    rays, rgb = batches.missing(box, 500, 0)
+    assert 100 < len(rays) < 500
+    # The scene's sky is a linear function of direction, seen wherever the ball is not.
+    assert torch.allclose(rgb, 0.5 + 0.4 * rays.directions, atol=3e-3)
+    nearest = rays.origins - (rays.origins * rays.directions).sum(-1, keepdim=True) * rays.directions
+    assert (nearest.norm(dim=-1) > 0.6).all()
+    again, others = batches.missing(box, 500, 0)[0], batches.missing(box, 500, 1)[0]
+    assert torch.equal(again.directions, rays.directions)
+    assert len(others) != len(rays) or not torch.equal(others.directions, rays.directions)
