@@ -12,7 +12,8 @@ from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.request import EvaluateConfig, find_device, own_folder, record, require_one_task
 from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.score_tables import report
-from nerfro.evaluation.scoring import score_folders, score_views
+from nerfro.evaluation.scoring import score_folders
+from nerfro.evaluation.treatments import score_split
 from nerfro.files.images import load_png
 from nerfro.paths import user_path
 from nerfro.training.callbacks import Throughput
@@ -33,7 +34,8 @@ def _evaluate_checkpoint(config: DictConfig) -> None:
     checkpoint, trained = load_checkpoint(path)
     if config.root is not None:
         trained.data.root = config.root
-    for name in ("chunk_size", "lpips_backbone", "lpips_vgg_backbone", "supersample", "divergence", "contrast"):
+    rays = "supersample", "divergence", "contrast"
+    for name in ("chunk_size", "lpips_backbone", "lpips_vgg_backbone", *rays, "refine_steps"):
         if config[name] is not None:
             trained.evaluation[name] = config[name]
     device = find_device(config.device)
@@ -45,14 +47,16 @@ def _evaluate_checkpoint(config: DictConfig) -> None:
         networks, reasons = find_lpips_networks(*backbones)
         metrics = ImageMetrics(networks, reasons, config.protocol == "8bit", prefix=config.split)
         record(folder, config)
-        result = score_views(scene.model, views, metrics, folder, scene.supersampling)
+        steps = trained.evaluation.get("refine_steps", 0)  # which older checkpoints lack
+        result, treated = score_split(scene.model, views, metrics, folder, scene.supersampling, steps)
         for index, view in enumerate(result.views):
             prediction = load_png(folder / "images" / f"{view.name}.png")
             write_error_sheet(folder, view.name, prediction, views.images[index], networks)
         spent = Throughput()
         spent.load_state_dict(checkpoint["callbacks"]["Throughput"])
         title = f"{trained.name} on {trained.data.root}, {config.split} views"
-        report(RunMetrics(result, checkpoint["global_step"], spent.seconds, spent.rays_per_second), title, folder)
+        spending = checkpoint["global_step"], spent.seconds, spent.rays_per_second
+        report(RunMetrics(result, *spending, treated), title, folder)
     print(f"pictures and tables: {folder}")
 
 

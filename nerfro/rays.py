@@ -39,3 +39,7 @@ class Rays:
     def to(self, where_or_what: torch.device | str | torch.dtype) -> Rays:
         """The same rays on another device, or in another precision."""
         return Rays(*(tensor.to(where_or_what) for tensor in vars(self).values()))
+
+    def detach(self) -> Rays:
+        """The same rays without gradients."""
+        return Rays(*(tensor.detach() for tensor in vars(self).values()))

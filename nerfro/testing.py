@@ -100,6 +100,7 @@ def _check_medium(medium: Medium) -> None:
 
 
 def _check_camera(camera: Camera) -> None:
+    camera.begin(example_batch().cameras)
     rays = camera(example_rays(), torch.arange(NUM_RAYS) % 2)
     _require(rays.origins.shape == (NUM_RAYS, 3) and _unit(rays.directions), "forward returns unit rays")
 

@@ -16,7 +16,7 @@ from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.render_view import Supersampling
 from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.score_tables import report
-from nerfro.evaluation.scoring import score_views
+from nerfro.evaluation.treatments import score_split
 from nerfro.fields.mlp import compile_networks
 from nerfro.registry import build
 from nerfro.training.boundary_first import BoundaryFirst
@@ -29,6 +29,7 @@ from nerfro.training.reach import require_reach
 from nerfro.training.run_folder import LAST_CHECKPOINT, begin, own, require_same_run
 from nerfro.training.trainer import finish_logs, make_trainer, prepare_process
 from nerfro.training.viewer import Viewer
+from nerfro.viewing.camera_files import write_cameras
 
 
 @entry_point("train", TrainConfig)
@@ -49,7 +50,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     batches = RayBatches(training, wanted.size, wanted.batching, config.seed, *precrop, wanted.jitter)
     supersampling = Supersampling.of(config.evaluation)
     lpips = find_lpips_networks(config.evaluation.lpips_backbone, config.evaluation.lpips_vgg_backbone)
-    model = build_model(config, training.cameras)
+    model = build_model(config, training)
     require_same_run(folder, checkpoint, config)
     throughput, interruption = Throughput(), StopOnSignal()
     first = BoundaryFirst(batches, config.optimizer.boundary_first)
@@ -80,10 +81,12 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
         sys.exit(EXIT_INTERRUPTED)
 
     model.to(trainer.strategy.root_device)
+    write_cameras(folder / "cameras.json", model.camera, training)
     metrics = ImageMetrics(*lpips, prefix=config.evaluation.split)
-    result = score_views(model, test, metrics, folder, supersampling)
+    result, treated = score_split(model, test, metrics, folder, supersampling, config.evaluation.refine_steps)
     title = f"{config.name} on {config.data.root}, {config.evaluation.split} views"
-    report(RunMetrics(result, trainer.global_step, throughput.seconds, throughput.rays_per_second), title, folder)
+    spent = trainer.global_step, throughput.seconds, throughput.rays_per_second
+    report(RunMetrics(result, *spent, treated), title, folder)
     print(f"{trainer.global_step} steps in {throughput.seconds:.0f} s, {throughput.rays_per_second or 0:,.0f} rays/s.")
     print("Look at:")
     print(f"  {folder}/images/  the pictures; metrics.json, .csv, .md and .tex beside them")

@@ -6,7 +6,7 @@ as rays where no ray splits; what is documented with R then has P rows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
@@ -305,6 +305,13 @@ class Rendering:
     boundary_rgb: Float[Tensor, "P 3"]
     samples: Samples
     path: Path  # the polylines that they lie on
+    # Factor by which the photograph of each polyline is brighter than its light, which `rgb` and `boundary_rgb` have.
+    gain: Float[Tensor, "P 3"] | None = None
+
+    def exposed(self, gain: Float[Tensor, "R 3"]) -> Rendering:
+        """What photographs make of linear radiance that are brighter by a factor."""
+        of_path = self.path.of_ray(gain)
+        return replace(self, rgb=self.rgb * gain, boundary_rgb=self.boundary_rgb * of_path, gain=of_path)
 
     @property
     def opacity(self) -> Float[Tensor, "R"]:

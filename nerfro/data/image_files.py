@@ -75,6 +75,24 @@ def _require_upright(image: Image.Image, path: Path) -> None:
         )
 
 
+def read_exposure(path: Path) -> tuple[float | None, float | None, float | None]:
+    """Exposure time in seconds, f-number and ISO sensitivity of a photograph, where its EXIF tells."""
+    with _naming(path), Image.open(path) as image:
+        tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
+    named = ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings
+    time, number, sensitivity = (_positive(tags.get(tag)) for tag in named)
+    return time, number, sensitivity
+
+
+def _positive(value: object) -> float | None:
+    """A tag's number; None where it is missing or means nothing."""
+    try:
+        number = float(value[0] if isinstance(value, tuple) else value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError, IndexError):
+        return None
+    return number if 0 < number < float("inf") else None
+
+
 def _read_8bit(content: bytes, path: Path) -> UInt8[np.ndarray, "H W C"]:
     with Image.open(io.BytesIO(content)) as image:
         # Pillow reduces colour TIFF of more bits without a word, as it does PNG; tag 258 is BitsPerSample.

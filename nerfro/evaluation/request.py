@@ -13,7 +13,7 @@ from typing import Annotated, Literal, Optional
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.allowed import NotNegative, NumRays, Positive, Side
+from nerfro.allowed import Natural, NotNegative, NumRays, Positive, Side
 from nerfro.errors import Interrupted, NerfroError
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.files.owned import held, remove_unfinished, require_own
@@ -34,6 +34,8 @@ class EvaluateConfig:
     supersample: Optional[Side] = None
     divergence: Optional[NotNegative] = None
     contrast: Optional[Positive] = None
+    # Steps in which the views' cameras are refined on left halves, to be scored on right ones; as trained by default.
+    refine_steps: Optional[Natural] = None
     predictions: Optional[str] = None  # folder of pictures to score, instead of a checkpoint
     references: Optional[str] = None  # folder of pictures of the same names, compared with `predictions`
     # Folder of masks of the same names; by default those that lie with the references, or their transparency.

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from nerfro.data.transforms import is_number, read_json
 from nerfro.errors import NerfroError
@@ -37,6 +37,7 @@ METRICS = (
 
 Region = Literal["full", "mask", "crop"]  # of a picture, see nerfro/evaluation/regions.py
 FULL: Region = "full"
+AS_GIVEN = "as given"  # how test views are treated under `test`: cameras and exposure are the data's
 OBJECT_REGIONS: tuple[Region, ...] = ("mask", "crop")  # those that need to know where the object is
 
 
@@ -89,6 +90,8 @@ class RunMetrics:
     steps: int | None = None  # optimisation steps that the weights have seen; None for pictures of another program
     train_seconds: float | None = None  # wall-clock, without evaluation; None if nothing was trained
     rays_per_second: float | None = None  # training throughput; None if nothing was trained
+    # The same views under other cameras or exposures than the data's, by the name of the treatment; see `treatments`.
+    treatments: Mapping[str, EvaluationResult] = field(default_factory=dict)
 
 
 def write_metrics_json(path: Path | str, metrics: RunMetrics) -> None:
@@ -99,12 +102,9 @@ def write_metrics_json(path: Path | str, metrics: RunMetrics) -> None:
     """
     result = metrics.result
     content = {
-        "test": result.means(),
-        "regions": {region: result.means(region) for region in result.regions if region != FULL},
-        "views": [
-            {"name": view.name, **view.scores, "regions": {name: dict(row) for name, row in view.regions.items()}}
-            for view in result.views
-        ],
+        **_scored(result),
+        "test_views": AS_GIVEN,
+        "treatments": {name: _scored(treated) for name, treated in metrics.treatments.items()},
         "steps": metrics.steps,
         "train_seconds": metrics.train_seconds,
         "rays_per_second": metrics.rays_per_second,
@@ -126,19 +126,38 @@ def read_metrics_json(path: Path | str) -> RunMetrics:
         raise NerfroError(f"{path} does not exist; has this run been evaluated? run nerfro.evaluate on it")
     try:
         content = read_json(path, "run nerfro.evaluate on the run again")
-        views = tuple(
-            ViewScores(
-                str(row["name"]),
-                _scores(row),
-                {r: _scores(s) for r, s in row.get("regions", {}).items() if r in OBJECT_REGIONS},
-            )
-            for row in content["views"]
-        )
-        result = EvaluationResult(views, content.get("notes", {}), content.get("protocol", "8bit"))
+        notes, protocol = content.get("notes", {}), content.get("protocol", "8bit")
+        result = EvaluationResult(_views(content["views"]), notes, protocol)
+        treatments = {
+            name: EvaluationResult(_views(treated["views"]), notes, protocol)
+            for name, treated in content.get("treatments", {}).items()
+        }
         spent = {key: _number(content[key]) for key in ("steps", "train_seconds", "rays_per_second")}
-        return RunMetrics(result, **spent)  # type: ignore[arg-type]
+        return RunMetrics(result, **spent, treatments=treatments)  # type: ignore[arg-type]
     except (KeyError, TypeError, AttributeError) as error:
         raise NerfroError(f"{path} is not a metrics file ({error!r}); run nerfro.evaluate on the run again") from error
+
+
+def _scored(result: EvaluationResult) -> dict[str, Any]:
+    return {
+        "test": result.means(),
+        "regions": {region: result.means(region) for region in result.regions if region != FULL},
+        "views": [
+            {"name": view.name, **view.scores, "regions": {name: dict(row) for name, row in view.regions.items()}}
+            for view in result.views
+        ],
+    }
+
+
+def _views(rows: list[Any]) -> tuple[ViewScores, ...]:
+    return tuple(
+        ViewScores(
+            str(row["name"]),
+            _scores(row),
+            {r: _scores(s) for r, s in row.get("regions", {}).items() if r in OBJECT_REGIONS},
+        )
+        for row in rows
+    )
 
 
 def _scores(row: Mapping[str, Score]) -> dict[str, Score]:

@@ -7,7 +7,16 @@ from pathlib import Path
 
 import rich
 
-from nerfro.evaluation.results import FULL, METRICS, EvaluationResult, Region, RunMetrics, Score, write_metrics_json
+from nerfro.evaluation.results import (
+    AS_GIVEN,
+    FULL,
+    METRICS,
+    EvaluationResult,
+    Region,
+    RunMetrics,
+    Score,
+    write_metrics_json,
+)
 from nerfro.evaluation.tables import MISSING, Column, Row, Table, to_rich, write_table
 
 _Scores = Sequence[tuple[str, Mapping[str, Score]]]
@@ -27,6 +36,12 @@ def regions_table(result: EvaluationResult, title: str) -> Table:
     missing = {region: _missing(result, region) for region in result.regions}
     notes = [f"{region}: {note}" for region, note in missing.items() if note and note != told]
     return _table(title, "region", scores, [], [_mask_note(result), *notes])
+
+
+def treatments_table(metrics: RunMetrics, title: str) -> Table:
+    """The mean scores of the same views under each treatment."""
+    treated = [(name, result.means()) for name, result in metrics.treatments.items()]
+    return _table(title, "test views", [(AS_GIVEN, metrics.result.means()), *treated], [], [])
 
 
 def short(reason: str) -> str:
@@ -72,3 +87,5 @@ def report(metrics: RunMetrics, title: str, folder: Path) -> None:
     rich.print(to_rich(views_table(result, title)))
     if len(result.regions) > 1:
         rich.print(to_rich(regions_table(result, "means of the full images, of the object's mask, and of the crop")))
+    if metrics.treatments:
+        rich.print(to_rich(treatments_table(metrics, "means of the full images, or of right halves")))

@@ -21,9 +21,14 @@ from nerfro.models.base import NerfModel
 
 
 def score_views(
-    model: NerfModel, views: Views, metrics: ImageMetrics, folder: Path, supersampling: Supersampling
+    model: NerfModel,
+    views: Views,
+    metrics: ImageMetrics,
+    folder: Path,
+    supersampling: Supersampling,
+    pictures: str = "images",
 ) -> EvaluationResult:
-    """Render every view as `folder/images/<prefix>_NNN.png` (8-bit sRGB, rounded) and score it.
+    """Render every view as `folder/<pictures>/<prefix>_NNN.png` (8-bit sRGB, rounded) and score it.
 
     Memory: one view's rays and pictures, plus `model.chunk_size` rays' samples and activations.
     """
@@ -34,7 +39,7 @@ def score_views(
         for view in range(len(views)):
             rendered = render_view(model, cameras, view, supersampling)
             rgb = model.encode(rendered.radiance).clamp(0, 1).reshape(height, width, 3).cpu()
-            save_png(folder / "images" / f"{metrics.prefix}_{view:03d}.png", rgb)
+            save_png(folder / pictures / f"{metrics.prefix}_{view:03d}.png", rgb)
             coverage = None if views.masks is None else views.masks[view]
             metrics.update(rgb, views.images[view], view, coverage)
             progress.update(height * width)

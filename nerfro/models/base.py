@@ -18,6 +18,7 @@ from nerfro.boundaries.base import Boundary
 from nerfro.camera.base import Camera
 from nerfro.camera.given import GivenCamera
 from nerfro.distributed import drawing_for
+from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.light import clipped_alike, to_linear, to_srgb
 from nerfro.losses.base import Loss
@@ -63,6 +64,8 @@ class NerfModel(LightningModule, ABC):
         self.fields = nn.ModuleList(fields)
         self.boundary = parts.boundary
         self.losses = nn.ModuleDict(dict(parts.losses))
+        if colour == "srgb" and self.camera.exposure is not None:
+            raise NerfroError("camera.exposure=true needs linear radiance; take model.colour=linear")
         self.optimizer_config, self.chunk_size, self.seed = parts.optimizer, parts.chunk_size, parts.seed
 
     @abstractmethod
@@ -76,16 +79,18 @@ class NerfModel(LightningModule, ABC):
     def trace(self, rays: Rays, path: Path | None = None) -> Path:
         """Paths of rays, or the given ones, tinted by the medium; with gradients by what bends and learns."""
         path = self.path_sampler(rays, self.medium) if path is None else path
-        return self.medium.tinted(self._steadily_refined(path, rays) if self.paths_learn else path)
+        return self.medium.tinted(self.refined(path, rays) if self.paths_learn else path)
 
     def exit_directions(self, rays: Rays) -> Float[Tensor, "R 3"]:
         """Unit direction in which the main polyline of each ray leaves, without its branches and their cost."""
         return self.path_sampler.main(rays, self.medium).exit_directions
 
-    def _steadily_refined(self, path: Path, rays: Rays) -> Path:
-        """Paths with gradients, but for those whose derivatives are too large to learn from."""
+    def refined(self, path: Path, rays: Rays) -> Path:
+        """Paths with gradients, but for those whose derivatives are too large, or not yet to be learned from."""
         refined = self.path_sampler.refine(path, rays, self.medium)
         steady = self.path_sampler.steady(path, self.medium)
+        if self.training and self.global_step < self.camera.glass_start:
+            steady = steady & ~path.refracted
         every = ("positions", "directions", "s", "exit_directions")
         old, new = ([getattr(each, name) for name in every] for each in (path, refined))
         return refined.moved(
@@ -95,7 +100,11 @@ class NerfModel(LightningModule, ABC):
     @property
     def paths_learn(self) -> bool:
         """Whether paths change while training: then none may be traced before the step that needs it."""
-        bending = [*self.camera.parameters(), *self.medium.bending_parameters(), *self.path_sampler.parameters()]
+        bending = [
+            *self.camera.bending_parameters(),
+            *self.medium.bending_parameters(),
+            *self.path_sampler.parameters(),
+        ]
         return torch.is_grad_enabled() and any(parameter.requires_grad for parameter in bending)
 
     def parameter_groups(self) -> dict[str, tuple[list[nn.Parameter], float]]:
@@ -105,7 +114,8 @@ class NerfModel(LightningModule, ABC):
             "fields": (list(self.fields.parameters()), config.learning_rate),
             "boundary": (list(self.boundary.parameters()), config.rate("boundary")),
             "medium": ([*self.medium.parameters(), *self.path_sampler.parameters()], config.rate("medium")),
-            "camera": (list(self.camera.parameters()), config.rate("camera")),
+            "camera": (self.camera.bending_parameters(), config.rate("camera")),
+            "exposure": (self.camera.brightness_parameters(), config.rate("exposure")),
         }
         return {name: group for name, group in groups.items() if group[0]}
 
@@ -128,6 +138,8 @@ class NerfModel(LightningModule, ABC):
     def training_step(self, batch: Batch, batch_index: int) -> Float[Tensor, ""]:
         with drawing_for(batch.rows, batch.num_rows):
             renderings = self.render_path(self.trace(self.camera(batch.rays, batch.view), batch.path))
+        if (gains := self.camera.gains(batch.view)) is not None:
+            renderings = [rendering.exposed(gains) for rendering in renderings]
         total = torch.zeros((), device=self.device)
         for name, loss in self.losses.items():
             weight = loss.weight_at(self.global_step)  # type: ignore[operator]
@@ -141,6 +153,8 @@ class NerfModel(LightningModule, ABC):
         self.log("loss/total", total)
         for name, value in self.medium.learned().items():
             self.log(f"medium/{name}", value)
+        for name, value in self.camera.learned().items():
+            self.log(f"camera/{name}", value)
         return total
 
     def on_train_batch_start(self, batch: Batch, batch_index: int) -> None:
@@ -156,6 +170,12 @@ class NerfModel(LightningModule, ABC):
         # Not at the end of the step before, which comes after its checkpoint: a resumed run would miss the update.
         if self.global_step > 0:
             self.point_sampler.after_step(self.global_step, list(self.fields))  # type: ignore[arg-type]
+
+    def on_after_backward(self) -> None:
+        if self.global_step < self.camera.start:
+            for parameter in self.camera.bending_parameters():
+                if parameter.grad is not None:  # not remembered either: an unlearned scene says nothing
+                    parameter.grad.zero_()
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         groups = [

@@ -24,6 +24,7 @@ class OptimizerConfig:
     boundary_learning_rate: Optional[Positive] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     medium_learning_rate: Optional[Positive] = None  # noqa: UP045
     camera_learning_rate: Optional[Positive] = None  # noqa: UP045
+    exposure_learning_rate: Optional[Positive] = None  # noqa: UP045
     medium_start: Natural = 0  # steps before what bends rays learns, so that it is not misled by an unlearned scene
     # Steps before the first in which the boundary alone learns, from rays that miss the content's box.
     boundary_first: Natural = 0

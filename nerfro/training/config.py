@@ -10,7 +10,8 @@ from typing import Annotated, Any, Literal, Optional
 from omegaconf import MISSING, DictConfig
 
 from nerfro.allowed import Count, Natural, NotNegative, NumRays, Positive, Range, Resolution, Side
-from nerfro.cameras import Cameras
+from nerfro.data.base import Views
+from nerfro.data.exposure import exif_exposures
 from nerfro.errors import NerfroError
 from nerfro.losses.base import Loss
 from nerfro.media.analytic import Vacuum
@@ -61,6 +62,9 @@ class EvaluationConfig:
     divergence: NotNegative = 0.0
     # And pixels whose colour differs from a neighbour's by this much (sRGB); none for no others.
     contrast: Optional[Positive] = None  # noqa: UP045
+    # Steps in which test cameras are refined on the left halves of their photographs, to be scored on the right ones
+    # under a name of their own; 0 for none.
+    refine_steps: Natural = 0
 
 
 @dataclass
@@ -154,25 +158,29 @@ def build_losses(nodes: DictConfig) -> dict[str, Loss]:
     return losses
 
 
-def build_model(config: DictConfig, cameras: Cameras | None = None) -> NerfModel:
+def build_model(config: DictConfig, training: Views | None = None) -> NerfModel:
     """Compose the model of a configuration (see `TrainConfig`); fills in `config.content` where it is left open.
 
     Args:
         config: of the run.
-        cameras: of the training views, where they are loaded already.
+        training: views, where they are loaded already; without them, a checkpoint must tell what was believed of them.
     """
     losses = build_losses(config.loss)
     optimizer = OptimizerConfig(**config.optimizer)
     path_sampler = build(config.sampler.path)
     medium = build(config.medium) if path_sampler.needs_medium else Vacuum()
-    settle_content(config, medium, cameras)
+    settle_content(config, medium, None if training is None else training.cameras)
+    camera = build(config.camera)
+    if training is not None:
+        exposures = None if camera.exposure is None else exif_exposures([f.image for f in training.frames])
+        camera.begin(training.cameras, exposures)
     parts = Parts(
         medium=medium,
         path_sampler=path_sampler,
         point_sampler=build(config.sampler.points),
         make_field=lambda: build(config.field),
         boundary=build(config.boundary),
-        camera=build(config.camera),
+        camera=camera,
         losses=losses,
         optimizer=optimizer,
         seed=config.seed,

@@ -1,7 +1,8 @@
-"""Cameras of other programs: nerfstudio's camera paths, and transforms.json."""
+"""Files of cameras: nerfstudio's camera paths and transforms.json are read, refined cameras written."""
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -11,12 +12,20 @@ from typing import Any
 import numpy as np
 import torch
 
+from nerfro.camera.base import Camera
+from nerfro.camera.similarity import motion_between
 from nerfro.cameras import Cameras
+from nerfro.capture.calibrated_data import relative
+from nerfro.data.base import Views
 from nerfro.data.frames import Lens, check_pose
 from nerfro.data.nerfstudio import read_lens
 from nerfro.data.transforms import is_number, parse_matrix, read_json
 from nerfro.errors import NerfroError
+from nerfro.files.atomic import write_atomically
 from nerfro.viewing.camera_paths import Surroundings
+
+# Names of the nine coefficients (`nerfro.lens`); other programs know the first six.
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2", "k5", "k6", "k7")
 
 
 def read_cameras(file: Path, around: Surroundings) -> Cameras:
@@ -58,6 +67,33 @@ def read_cameras(file: Path, around: Surroundings) -> Cameras:
     pose = torch.from_numpy(np.stack(poses)).float()
     near, far = around.camera.near, around.camera.far
     return around.bounded(Cameras(pose, fx, fy, cx, cy, width, height, near, far, distortion))
+
+
+def write_cameras(file: Path, camera: Camera, views: Views) -> None:
+    """Write the training cameras as they are believed to be, where anything of them learns, for `data=nerfstudio`.
+
+    It is a `transforms.json`. Each frame also tells how far its camera was moved (`turned_degrees`, `shifted` in world
+    units), and its `gain`.
+    """
+    if not list(camera.parameters()):
+        return
+    given, believed = views.cameras, camera.believed(views.cameras).to("cpu")
+    turned, shifted = (values.tolist() for values in motion_between(given.camera_to_world, believed.camera_to_world))
+    gains = None if camera.exposure is None else camera.exposure.gains().tolist()
+    frames = []
+    for view, frame in enumerate(views.frames):
+        lens = {"fl_x": believed.fx, "fl_y": believed.fy, "cx": believed.cx, "cy": believed.cy}
+        entry = {"file_path": relative(frame.image, file.parent)}
+        entry |= {name: float(values[view]) for name, values in lens.items()}
+        if believed.distortion is not None:
+            entry |= dict(zip(_DISTORTION, believed.distortion[view].tolist(), strict=True))
+        entry["transform_matrix"] = [*believed.camera_to_world[view].tolist(), [0.0, 0.0, 0.0, 1.0]]
+        entry |= {"turned_degrees": turned[view], "shifted": shifted[view]}
+        if gains is not None:
+            entry["gain"] = gains[view]
+        frames.append(entry)
+    document = {"camera_model": "OPENCV", "w": given.width, "h": given.height, "frames": frames}
+    write_atomically(file, json.dumps(document, indent=1) + "\n")
 
 
 def _lens_of_path(place: Mapping[str, Any], width: int, height: int, where: str) -> Lens:

@@ -1,0 +1,110 @@
+"""How far disturbed poses come back, and what it does to the pictures: `python benchmarks/cameras.py`.
+
+Every training camera of a scene is turned about a random axis and shifted in a random direction; what all share is
+taken out, because it is the world's. The test cameras stay as they are. Each run is `nerfro.train` with the given
+options; errors are of the cameras that it believes in, left as they are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.camera.pixel_units import object_distances, world_motions
+from nerfro.camera.refined import rotations
+from nerfro.camera.similarity import motion_between
+from nerfro.cameras import Cameras
+from nerfro.data.blender import BlenderData
+from nerfro.evaluation.results import read_metrics_json
+from nerfro.paths import resolve_path
+
+
+def main() -> None:
+    """Train with true poses, with disturbed ones, and with disturbed ones that are refined; print a row for each."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--root", default="embedded:torus", help="folder in Blender format, with a mesh")
+    parser.add_argument("--degrees", type=float, default=0.5, help="by which each camera is turned")
+    parser.add_argument("--percent", type=float, default=1.0, help="of its distance, by which each camera is shifted")
+    parser.add_argument("--seed", type=int, default=0, help="of the disturbance")
+    parser.add_argument("--out", help="folder for the runs; removed in the end if none is given")
+    parser.add_argument("--rows", nargs="+", default=["true", "disturbed", "refined"], help="which runs")
+    parser.add_argument("options", nargs="*", help="of nerfro.train, for all runs")
+    given = parser.parse_args()
+    with TemporaryDirectory() as folder:
+        out = Path(given.out or folder).resolve()
+        true = BlenderData(given.root).load("train").cameras
+        moved = disturbed(true, math.radians(given.degrees), given.percent / 100, given.seed)
+        data = write_disturbed(resolve_path(given.root), moved, out / "data")
+        print("poses          PSNR   on the object   aligned   rotation, degrees    position, % of the distance")
+        print("                                                 median   largest     median   largest", flush=True)
+        for row in given.rows:
+            run = out / row
+            root = given.root if row == "true" else str(data)
+            camera = ["camera=refined"] if row.startswith("refined") else []
+            options = [f"data.root={root}", *camera, *given.options, f"hydra.run.dir={run}", "logger=none"]
+            subprocess.run([sys.executable, "-m", "nerfro.train", *options], check=True, stdout=subprocess.DEVNULL)
+            print(line(row, run, true, moved), flush=True)
+
+
+def disturbed(cameras: Cameras, angle: float, share: float, seed: int) -> Float[Tensor, "V 3 4"]:
+    """Poses turned by an angle (radians) and shifted by a share of the distance, none of it common to all."""
+    generator = torch.Generator().manual_seed(seed)
+    poses, distances = cameras.camera_to_world.double(), object_distances(cameras)
+    units = torch.stack([torch.full_like(distances, angle), share * distances], -1).repeat_interleave(3, -1)
+    axes = torch.randn(len(cameras), 2, 3, generator=generator, dtype=torch.float64)
+    motion = torch.nn.functional.normalize(axes, dim=-1).flatten(1)
+    of_world = world_motions(poses, units)
+    motion = (motion - torch.einsum("kvi,kwj,wj->vi", of_world, of_world, motion)) * units
+    axes = poses[..., :3]
+    return torch.cat([axes @ rotations(motion[:, :3]), poses[..., 3:] + axes @ motion[:, 3:, None]], -1)
+
+
+def write_disturbed(root: Path, poses: Float[Tensor, "V 3 4"], folder: Path) -> Path:
+    """A folder with everything that the data set has, but other poses of the training cameras."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in root.iterdir():
+        if path.name != "transforms_train.json" and not (folder / path.name).exists():
+            os.symlink(path, folder / path.name)
+    document = json.loads((root / "transforms_train.json").read_text("utf-8"))
+    for frame, pose in zip(document["frames"], poses.tolist(), strict=True):
+        frame["transform_matrix"] = [*pose, [0.0, 0.0, 0.0, 1.0]]
+    (folder / "transforms_train.json").write_text(json.dumps(document))
+    return folder
+
+
+def line(row: str, run: Path, true: Cameras, moved: Float[Tensor, "V 3 4"]) -> str:
+    """A row of the table."""
+    poses = true.camera_to_world.double()
+    if row != "true":
+        poses = moved
+    if row.startswith("refined"):
+        document = json.loads((run / "cameras.json").read_text("utf-8"))
+        poses = torch.tensor([frame["transform_matrix"][:3] for frame in document["frames"]], dtype=torch.float64)
+    result = read_metrics_json(run / "metrics.json")
+    turn, shift = errors(poses, true)
+    aligned = result.treatments.get("aligned")
+    return (
+        f"{row:<12} {result.result.mean('psnr'):6.2f} {result.result.mean('psnr', 'mask') or math.nan:15.2f} "
+        f"{aligned.mean('psnr') if aligned else math.nan:9.2f} {turn.median():10.3f} {turn.max():9.3f} "
+        f"{shift.median():10.3f} {shift.max():9.3f}"
+    )
+
+
+def errors(poses: Float[Tensor, "V 3 4"], true: Cameras) -> tuple[Float[Tensor, "V"], Float[Tensor, "V"]]:
+    """By how many degrees, and percent of its distance, each camera is off."""
+    turn, shift = motion_between(true.camera_to_world, poses)
+    return turn, 100 * shift / object_distances(true)
+
+
+if __name__ == "__main__":
+    main()

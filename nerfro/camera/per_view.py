@@ -1,0 +1,18 @@
+"""Tensors with a row for each training view."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor, nn
+
+
+class PerView(nn.Module):
+    """A module whose tensors have no row until `begin`, or until a checkpoint brings as many as there were."""
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+        for name, tensor in (*self._parameters.items(), *self._buffers.items()):
+            stored = state_dict.get(prefix + name)
+            if tensor is not None and stored is not None and len(tensor) == 0:
+                tensor.data = stored.new_empty(stored.shape, dtype=tensor.dtype, device=tensor.device)
+        super()._load_from_state_dict(state_dict, prefix, *rest)

@@ -1,0 +1,170 @@
+"""Cameras that are refined with the scene."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn.functional import normalize
+
+from nerfro.allowed import Natural
+from nerfro.camera.base import Camera
+from nerfro.camera.per_view import PerView
+from nerfro.camera.pixel_units import object_distances, pixel_motions, world_motions
+from nerfro.camera.similarity import similarity
+from nerfro.cameras import Cameras
+from nerfro.lens import distort, undistort
+from nerfro.rays import Rays
+from nerfro.registry import register
+
+
+class _Motions(PerView):
+    """Turn and shift of each camera along its own axes, counted in pixels; the world as a whole stays."""
+
+    poses: Float[Tensor, "V 3 4"]
+    focal: Float[Tensor, "V 2"]
+    distortion: Float[Tensor, "V 9"]
+    units: Float[Tensor, "V 6"]
+    of_world: Float[Tensor, "K V 6"]
+    focal_unit: Float[Tensor, "1"]
+
+    def __init__(self, hold_world: bool = True) -> None:
+        super().__init__()
+        self.hold_world = hold_world
+        self.motion = nn.Parameter(torch.zeros(0, 6))
+        shapes = {"poses": (3, 4), "focal": (2,), "distortion": (9,), "units": (6,), "of_world": (0, 6)}
+        for name, shape in {**shapes, "focal_unit": ()}.items():
+            self.register_buffer(name, torch.zeros(0, *shape))
+
+    def begin(self, cameras: Cameras) -> None:
+        poses = cameras.camera_to_world.double().cpu()
+        pixels = pixel_motions(cameras, object_distances(cameras))
+        units = 1 / pixels[:, :6]
+        distortion = torch.zeros(0, 9) if cameras.distortion is None else cameras.distortion
+        found = {
+            "poses": poses,
+            "focal": torch.stack([cameras.fx, cameras.fy], -1),
+            "distortion": distortion,
+            "units": units,
+            "of_world": world_motions(poses, units) if self.hold_world else units.new_zeros(0, *units.shape),
+            "focal_unit": 1 / pixels[:, 6].square().mean().sqrt()[None],
+        }
+        for name, tensor in found.items():
+            buffer = getattr(self, name)
+            setattr(self, name, tensor.to(buffer))
+        self.motion.data = self.motion.new_zeros(len(cameras), 6)
+
+    def forward(self) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 3"]]:
+        """Rotation of each camera and shift of its centre, along its own axes as given."""
+        motion = self.in_pixels() * self.units
+        return rotations(motion[:, :3]), motion[:, 3:]
+
+    def in_pixels(self) -> Float[Tensor, "V 6"]:
+        """Turn and shift of each camera, without what is the world's."""
+        common = torch.einsum("kvi,vi->k", self.of_world, self.motion)
+        return self.motion - torch.einsum("kvi,k->vi", self.of_world, common)
+
+    def moved(self) -> Float[Tensor, "V 3 4"]:
+        """The cameras' poses as they are believed to be."""
+        turns, shifts = self()
+        axes = self.poses[..., :3]
+        return torch.cat([axes @ turns, self.poses[..., 3:] + axes @ shifts[..., None]], -1)
+
+
+@register("camera", "refined")
+class RefinedCamera(Camera):
+    """Rotation and position of each training camera, and the lens that all share, refined with the scene.
+
+    All are counted in pixels: a step of any of them moves points at the object's distance by as much
+    (`pixel_units`), so that `optimizer.camera_learning_rate` is in pixels. A motion that all cameras share is taken
+    out, to first order: the world stays where the data have put it, with its surface.
+
+    Args:
+        start: steps before cameras learn, so that they are not misled by an unlearned scene.
+        glass_start: steps before they learn from rays that the object bends, too; from then on these tell most.
+        lens: whether the focal length and the principal point, shared by all views, are refined.
+        exposure: whether each training view has a gain of its own, for each colour channel.
+        hold_world: whether the motion that all share is taken out; not for cameras in a world that is known.
+    """
+
+    def __init__(
+        self,
+        start: Natural = 100,
+        glass_start: Natural = 200,
+        lens: bool = False,
+        exposure: bool = False,
+        hold_world: bool = True,
+    ) -> None:
+        super().__init__(exposure)
+        self.start, self.glass_start = start, glass_start
+        self.motions = _Motions(hold_world)
+        self.lens = nn.Parameter(torch.zeros(3)) if lens else None  # focal length and principal point, pixels
+
+    def begin(self, cameras: Cameras, exposures: Float[Tensor, "V"] | None = None) -> None:
+        super().begin(cameras, exposures)
+        self.motions.begin(cameras)
+
+    def forward(self, rays: Rays, view: Int[Tensor, "R"]) -> Rays:
+        turns, shifts = self.motions()
+        axes = self.motions.poses[view, :, :3]
+        local = (rays.directions[:, None] @ axes)[:, 0]
+        if self.lens is not None:
+            local = self._through_lens(local, view)
+        directions = (axes @ (turns[view] @ local[..., None]))[..., 0]
+        origins = rays.origins + (axes @ shifts[view, :, None])[..., 0]
+        return replace(rays, origins=origins, directions=normalize(directions, dim=-1))
+
+    def _through_lens(self, local: Float[Tensor, "R 3"], view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
+        """Directions along the cameras' axes, of the same pixels behind the lens as it is believed to be."""
+        growth, shift = self._lens()
+        ideal = local[:, :2] / -local[:, 2:]
+        flipped = ideal * ideal.new_tensor([1.0, -1.0])  # y down, as in the image
+        distorted = len(self.motions.distortion) > 0
+        if distorted:
+            flipped, _ = distort(flipped, self.motions.distortion[view])
+        flipped = (flipped - shift / self.motions.focal[view]) / growth
+        if distorted:
+            flipped, _ = undistort(flipped, self.motions.distortion[view])
+        return torch.cat([flipped * ideal.new_tensor([1.0, -1.0]), -torch.ones_like(local[:, 2:])], -1)
+
+    def _lens(self) -> tuple[Float[Tensor, ""], Float[Tensor, "2"]]:
+        """Factor of the focal length, and shift of the principal point in pixels."""
+        assert self.lens is not None
+        return torch.exp(self.lens[0] * self.motions.focal_unit[0]), self.lens[1:]
+
+    @torch.no_grad()
+    def believed(self, cameras: Cameras) -> Cameras:
+        poses = self.motions.moved().to(cameras.camera_to_world)
+        return self._with_lens(replace(cameras, camera_to_world=poses))
+
+    @torch.no_grad()
+    def aligned(self, cameras: Cameras) -> Cameras:
+        """Other cameras, moved by the similarity of the training cameras, behind the lens that is believed in."""
+        whole = similarity(self.motions.poses.double(), self.motions.moved().double())
+        poses = whole.moved(cameras.camera_to_world.to(whole.shift)).to(cameras.camera_to_world)
+        return self._with_lens(replace(cameras, camera_to_world=poses))
+
+    def _with_lens(self, cameras: Cameras) -> Cameras:
+        if self.lens is None:
+            return cameras
+        growth, shift = (values.to(cameras.fx) for values in self._lens())
+        x, y = cameras.cx + shift[0], cameras.cy + shift[1]
+        return replace(cameras, fx=cameras.fx * growth, fy=cameras.fy * growth, cx=x, cy=y)
+
+    def learned(self) -> dict[str, float]:
+        with torch.no_grad():
+            found = {"motion_pixels": float(self.motions.in_pixels().square().sum(-1).mean().sqrt())}
+            if self.lens is not None:
+                growth, (x, y) = self._lens()
+                found |= {"focal_length_factor": float(growth), "principal_x": float(x), "principal_y": float(y)}
+        return super().learned() | found
+
+
+def rotations(vectors: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3 3"]:
+    """Rotations about axes by the vectors' lengths, in radians."""
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
+    return torch.linalg.matrix_exp(cross.view(-1, 3, 3))

@@ -1,0 +1,191 @@
+"""Refined cameras: derivatives of rays, what is held, units, files; how far disturbed poses and gains come back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from nerfro.camera.pixel_units import object_distances, pixel_motions, world_motions
+from nerfro.camera.refined import RefinedCamera, rotations
+from nerfro.camera.similarity import Similarity, motion_between, similarity
+from nerfro.cameras import Cameras
+from nerfro.lens import coefficients
+
+NUM_VIEWS, SIZE = 8, 20
+
+
+def cameras(distortion: tuple[float, ...] | None = None) -> Cameras:
+    """Around a point, at different distances, in double precision."""
+    generator = torch.Generator().manual_seed(1)
+    back = normalize(torch.randn(NUM_VIEWS, 3, generator=generator, dtype=torch.float64), dim=-1)
+    up = torch.tensor([0.1, 0.2, 1.0], dtype=torch.float64).expand_as(back)
+    right = normalize(torch.linalg.cross(up, back), dim=-1)
+    distances = 3 + torch.rand(NUM_VIEWS, 1, generator=generator, dtype=torch.float64)
+    centres = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64) + distances * back
+    poses = torch.stack([right, torch.linalg.cross(back, right), back, centres], -1)
+    focal, middle = torch.full((2, NUM_VIEWS), 24.0, dtype=torch.float64), torch.full((NUM_VIEWS,), 9.3).double()
+    lens = None if distortion is None else torch.tensor([distortion] * NUM_VIEWS, dtype=torch.float64)
+    return Cameras(poses, *focal, middle, middle, SIZE, SIZE, 0.5, 8.0, lens)
+
+
+def part(given: Cameras, lens: bool = True, seed: int = 0) -> RefinedCamera:
+    """A camera part that has moved by about a pixel."""
+    made = RefinedCamera(lens=lens).double()
+    made.begin(given)
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in made.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator, dtype=torch.float64))
+    return made
+
+
+def pixels(given: Cameras, num: int = 40) -> tuple[Tensor, Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(3)
+    view, row, column = (torch.randint(most, (num,), generator=generator) for most in (len(given), SIZE, SIZE))
+    return view, row, column
+
+
+LENSES = [None, coefficients([0.05, -0.02], [0.002, -0.001])]
+
+
+@pytest.mark.parametrize("distortion", LENSES)
+def test_derivatives_of_rays_are_those_of_central_differences(distortion: tuple[float, ...] | None) -> None:
+    given = cameras(distortion)
+    made, (view, row, column) = part(given), pixels(given)
+    rays = given.rays(view, row, column)
+    weights = torch.randn(2, len(view), 3, dtype=torch.float64)
+
+    def value() -> Tensor:
+        moved = made(rays, view)
+        return (weights[0] * moved.origins + weights[1] * moved.directions).sum()
+
+    value().backward()
+    for parameter in made.parameters():
+        flat, h = parameter.data.view(-1), 1e-4
+        for i in range(len(flat)):
+            kept = float(flat[i])
+            ends = []
+            for sign in (1, -1):
+                flat[i] = kept + sign * h
+                ends.append(float(value()))
+            flat[i] = kept
+            assert float(parameter.grad.view(-1)[i]) == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=1e-5, abs=1e-9)
+
+
+@pytest.mark.parametrize("distortion", LENSES)
+def test_rays_are_those_of_the_cameras_that_are_believed_in(distortion: tuple[float, ...] | None) -> None:
+    given = cameras(distortion)
+    made, (view, row, column) = part(given), pixels(given)
+    moved, expected = made(given.rays(view, row, column), view), made.believed(given).rays(view, row, column)
+    torch.testing.assert_close(moved.origins, expected.origins)
+    torch.testing.assert_close(moved.directions, expected.directions, rtol=0, atol=1e-9)
+
+
+def test_a_camera_that_has_learned_nothing_leaves_rays_alone() -> None:
+    given = cameras()
+    made = RefinedCamera(lens=True).double()
+    made.begin(given)
+    view, row, column = pixels(given)
+    rays = given.rays(view, row, column)
+    moved = made(rays, view)
+    torch.testing.assert_close(moved.origins, rays.origins)
+    torch.testing.assert_close(moved.directions, rays.directions)
+
+
+def test_a_motion_that_all_cameras_share_is_taken_out() -> None:
+    given = cameras()
+    made, small = part(given), 1e-4
+    poses = given.camera_to_world
+    turn = rotations(small * torch.tensor([[0.3, -0.7, 0.5]], dtype=torch.float64))[0]
+    world = Similarity(torch.tensor(1 + small).double(), turn, small * torch.tensor([1.0, 2.0, -1.0]).double())
+    shared = world.moved(poses)
+    turns, shifts = poses[..., :3].mT @ shared[..., :3], poses[..., :3].mT @ (shared[..., 3:] - poses[..., 3:])
+    vector = torch.stack([turns[:, 2, 1], turns[:, 0, 2], turns[:, 1, 0]], -1)
+    before = made.motions.moved()
+    with torch.no_grad():
+        made.motions.motion += torch.cat([vector, shifts[..., 0]], -1) / made.motions.units
+    turned, shifted = motion_between(before, made.motions.moved())
+    moved = motion_between(poses, shared)
+    assert float(turned.max()) < 1e-3 * float(moved[0].max())
+    assert float(shifted.max()) < 1e-3 * float(moved[1].max())
+
+
+def test_all_that_moves_pixels_is_held_to_no_motion_on_the_whole() -> None:
+    given = cameras()
+    made = part(given)
+    whole = similarity(given.camera_to_world, made.motions.moved())
+    moved = motion_between(given.camera_to_world, made.motions.moved())
+    common = motion_between(given.camera_to_world, whole.moved(given.camera_to_world))
+    # To first order: cameras move by a pixel, and what they share is of the order of that squared.
+    assert float(common[0].max()) < 0.05 * float(moved[0].median())
+    assert float(common[1].max()) < 0.05 * float(moved[1].median())
+
+
+def test_a_unit_of_each_parameter_moves_points_by_a_pixel() -> None:
+    given = cameras()
+    distances, h = object_distances(given), 1e-5
+    axis = (torch.arange(90) + 0.5).double() * SIZE / 90
+    motions = pixel_motions(given, distances)
+    for view in range(len(given)):
+        one = given.select([view])
+        u, v = (place.flatten() for place in torch.meshgrid(axis, axis, indexing="xy"))
+        local = torch.stack([(u - one.cx) / one.fx, (one.cy - v) / one.fy, -torch.ones_like(u)], -1)
+        points = distances[view] * local @ one.camera_to_world[0, :, :3].T + one.camera_to_world[0, :, 3]
+        axes = one.camera_to_world[..., :3]
+        for k in range(6):
+            turn, shift = torch.zeros(2, 1, 3, dtype=torch.float64)
+            (turn if k < 3 else shift)[0, k % 3] = h
+            pose = torch.cat([axes @ rotations(turn), one.camera_to_world[..., 3:] + axes @ shift[..., None]], -1)
+            seen, _ = replace(one, camera_to_world=pose).project(points)
+            moved = (seen[0] - torch.stack([u, v], -1)).square().sum(-1).mean().sqrt() / h
+            assert float(motions[view, k]) == pytest.approx(float(moved), rel=0.02)
+        seen, _ = replace(one, fx=one.fx * (1 + h), fy=one.fy * (1 + h)).project(points)
+        moved = (seen[0] - torch.stack([u, v], -1)).square().sum(-1).mean().sqrt() / h
+        assert float(motions[view, 6]) == pytest.approx(float(moved), rel=0.02)
+
+
+@pytest.mark.parametrize(("num", "rank"), [(1, 6), (2, 7), (8, 7)])
+def test_motions_of_the_world_are_orthonormal_and_as_many_as_there_are(num: int, rank: int) -> None:
+    given = cameras().select(list(range(num)))
+    units = 1 / pixel_motions(given, object_distances(given))[:, :6]
+    flat = world_motions(given.camera_to_world, units).flatten(1)
+    torch.testing.assert_close(flat @ flat.T, torch.eye(rank, dtype=torch.float64))
+
+
+def test_a_similarity_is_found_again() -> None:
+    poses = cameras().camera_to_world
+    turn = rotations(torch.tensor([[0.5, -1.0, 2.0]], dtype=torch.float64))[0]
+    made = Similarity(torch.tensor(1.7).double(), turn, torch.tensor([3.0, -1.0, 0.5]).double())
+    for some in (poses, poses[:2], poses[:1]):
+        found = similarity(some, made.moved(some))
+        torch.testing.assert_close(found.rotation, made.rotation)
+        torch.testing.assert_close(found.moved(some), made.moved(some))
+        if len(some) > 1:
+            torch.testing.assert_close(found.scale, made.scale)
+
+
+def test_other_cameras_go_along_with_the_training_cameras() -> None:
+    given = cameras()
+    made = part(given, lens=False)
+    whole = similarity(given.camera_to_world, made.motions.moved())
+    others = replace(cameras(), camera_to_world=cameras().camera_to_world.flip(0))
+    torch.testing.assert_close(made.aligned(others).camera_to_world, whole.moved(others.camera_to_world))
+
+
+def test_weights_of_any_number_of_views_are_read_back() -> None:
+    given = cameras(LENSES[1])
+    made = RefinedCamera(lens=True, exposure=True).double()
+    made.begin(given, torch.arange(1, NUM_VIEWS + 1).double())
+    with torch.no_grad():
+        made.motions.motion.normal_()
+        made.exposure.log_gain.normal_()
+    read = RefinedCamera(lens=True, exposure=True).double()
+    read.load_state_dict(made.state_dict())
+    view, row, column = pixels(given)
+    rays = given.rays(view, row, column)
+    assert torch.equal(read(rays, view).directions, made(rays, view).directions)
+    assert torch.equal(read.gains(view), made.gains(view))

@@ -1,0 +1,166 @@
+"""What disturbed poses and exposures come to in training, and that it is said, scored, written and resumed."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from benchmarks.cameras import disturbed
+from nerfro.camera.pixel_units import object_distances
+from nerfro.camera.similarity import motion_between
+from nerfro.data.nerfstudio import NerfstudioData
+from nerfro.evaluation.left_halves import refine_on_left
+from nerfro.evaluation.results import read_metrics_json
+from nerfro.light import to_linear, to_srgb
+from nerfro.training.load import load
+from nerfro.training.run_folder import load_checkpoint
+from tests.ball_photographs import photographs, save
+
+SMALL = [
+    "logger=none", "medium.cache=false", "medium.resolution=48", "medium.box_min=[-1,-1,-1]", "medium.box_max=[1,1,1]",
+    "data.near=0.5", "boundary.resolutions=[4,8,16,32]", "batches.size=384", "evaluation.split=train",
+    "sampler.points.num_samples=4", "sampler.points.num_bins=16", "sampler.points.resolution=16",
+    "field.num_levels=2", "field.log2_table_size=8", "field.width=16", "loss.boundary.start=0", "evaluation.every=0",
+    "trainer.accelerator=cpu", "trainer.max_time=null", "evaluation.supersample=1", "batches.supersample=1",
+    "medium.ior=1.45",
+]  # fmt: skip
+
+
+def poses_in(file: Path) -> torch.Tensor:
+    frames = json.loads(file.read_text("utf-8"))["frames"]
+    return torch.tensor([frame["transform_matrix"][:3] for frame in frames], dtype=torch.float64)
+
+
+@pytest.mark.slow
+def test_disturbed_poses_come_back(train_here: Callable[..., Any], tmp_path: Path) -> None:
+    views = photographs([1.45])
+    true = views.cameras
+    moved = disturbed(true, math.radians(0.5), 0.01, 0)
+    save(replace(views, cameras=replace(true, camera_to_world=moved.float())), tmp_path / "ball")
+    options = ["camera=refined", "camera.start=40", "camera.glass_start=80", "optimizer.camera_learning_rate=0.01"]
+    options += [*SMALL, "trainer.max_steps=500", f"data.root={tmp_path / 'ball'}"]
+    done = train_here(*options, f"hydra.run.dir={tmp_path / 'run'}")
+    assert done.code == 0, done.err
+    found = poses_in(tmp_path / "run" / "cameras.json")
+    before, after = motion_between(true.camera_to_world, moved), motion_between(true.camera_to_world, found)
+    share = 100 / object_distances(true)
+    for turned, shifted in (before, after):
+        print(f"{float(turned.median()):.4f} degrees, {float((share * shifted).median()):.4f} % of the distance")
+    assert float(after[0].median()) < 0.3 * float(before[0].median())
+    assert float(after[1].median()) < 0.3 * float(before[1].median())
+
+
+@pytest.mark.slow
+def test_cameras_of_other_views_come_back_on_left_halves(train_here: Callable[..., Any], tmp_path: Path) -> None:
+    views = photographs([1.45])
+    true = views.cameras
+    save(views, tmp_path / "ball")
+    done = train_here(
+        *SMALL, "trainer.max_steps=200", f"data.root={tmp_path / 'ball'}", f"hydra.run.dir={tmp_path / 'run'}"
+    )
+    assert done.code == 0, done.err
+    scene = load(tmp_path / "run", "cpu")
+    moved = replace(true, camera_to_world=disturbed(true, math.radians(0.5), 0.01, 1).float())
+    found = refine_on_left(scene.model, replace(views, cameras=moved), torch.ones(len(views), 3), 150)
+    before, after = (motion_between(true.camera_to_world, each.camera_to_world) for each in (moved, found))
+    print([f"{float(v.median()):.4f}" for v in (*before, *after)])
+    assert float(after[0].median()) < 0.3 * float(before[0].median())
+    assert float(after[1].median()) < 0.5 * float(before[1].median())
+
+
+@pytest.mark.slow
+def test_the_gains_of_disturbed_exposures_come_back(train_here: Callable[..., Any], tmp_path: Path) -> None:
+    views = photographs([1.45])
+    logarithm = 0.3 * torch.randn(len(views), 3).clamp(-2, 0)  # darker, so that nothing saturates
+    images = to_srgb(to_linear(views.images) * logarithm.exp()[:, None, None])
+    save(replace(views, images=images), tmp_path / "ball")
+    options = ["camera.exposure=true", *SMALL, "trainer.max_steps=200", f"data.root={tmp_path / 'ball'}"]
+    done = train_here(*options, f"hydra.run.dir={tmp_path / 'run'}")
+    assert done.code == 0, done.err
+    frames = json.loads((tmp_path / "run" / "cameras.json").read_text("utf-8"))["frames"]
+    found = torch.tensor([frame["gain"] for frame in frames]).log()
+    error = found - (logarithm - logarithm.mean(0))
+    print(float(logarithm.std()), float(error.square().mean().sqrt()), float(error.abs().max()))
+    assert float(error.square().mean().sqrt()) < 0.1 * float(logarithm.std())
+    metrics = read_metrics_json(tmp_path / "run" / "metrics.json")
+    assert metrics.treatments["exposed"].mean("psnr") > metrics.result.mean("psnr") + 3
+
+
+def test_each_treatment_of_test_views_is_told_by_its_name(
+    train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
+) -> None:
+    options = ["camera=refined", "camera.lens=true", "camera.exposure=true", "camera.start=0", "camera.glass_start=0"]
+    options += [*tiny_default_run, "trainer.max_steps=3", "optimizer.camera_learning_rate=0.5"]
+    options += ["evaluation.refine_steps=2"]
+    done = train_here(*options, f"hydra.run.dir={tmp_path / 'run'}")
+    assert done.code == 0, done.err
+    document = json.loads((tmp_path / "run" / "metrics.json").read_text("utf-8"))
+    assert document["test_views"] == "as given"
+    assert list(document["treatments"]) == ["aligned", "exposed", "refined"]
+    read = read_metrics_json(tmp_path / "run" / "metrics.json")
+    for name in ("aligned", "exposed", "refined"):
+        assert read.treatments[name].mean("psnr") == pytest.approx(document["treatments"][name]["test"]["psnr"])
+        assert (tmp_path / "run" / f"images_{name}" / "test_000.png").is_file()
+    # The file of cameras is data in nerfstudio's format.
+    folder = tmp_path / "data"
+    folder.mkdir()
+    text = (tmp_path / "run" / "cameras.json").read_text("utf-8")
+    (folder / "transforms.json").write_text(text.replace('"file_path": "', f'"file_path": "{tmp_path}/run/'))
+    source = NerfstudioData(str(folder), near=1.0, far=6.0, test_every=2)
+    shown = source.load("train")
+    poses = dict(zip((Path(n).name for n in shown.names), shown.cameras.camera_to_world, strict=True))
+    frames = json.loads(text)["frames"]
+    assert frames[0]["turned_degrees"] > 0
+    assert frames[0]["shifted"] > 0
+    assert len(frames[0]["gain"]) == 3
+    for frame in frames:
+        if Path(frame["file_path"]).name in poses:
+            expected = torch.tensor(frame["transform_matrix"][:3])
+            torch.testing.assert_close(poses[Path(frame["file_path"]).name], expected)
+
+
+def test_a_run_whose_cameras_learn_goes_on_as_if_it_had_not_stopped(
+    train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
+) -> None:
+    options = ["camera=refined", "camera.lens=true", "camera.exposure=true", "camera.start=2", "camera.glass_start=3"]
+    options += [*tiny_default_run, "optimizer.camera_learning_rate=0.1", "optimizer.final_learning_rate=1e-2"]
+    states = []
+    for name, parts in (("whole", [[6]]), ("parted", [[2], [6]])):
+        for i, (steps,) in enumerate(parts):
+            again = ["ckpt_path=last"] if i else []
+            run = train_here(*options, *again, f"trainer.max_steps={steps}", f"hydra.run.dir={tmp_path / name}")
+            assert run.code == 0, run.err
+        states.append(load_checkpoint(tmp_path / name / "checkpoints" / "last.ckpt")[0]["state_dict"])
+    assert states[0].keys() == states[1].keys()
+    assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
+    assert float(states[0]["camera.motions.motion"].abs().max()) > 0
+    assert float(states[0]["camera.lens"].abs().max()) > 0
+    assert float(states[0]["camera.exposure.log_gain"].abs().max()) > 0
+
+
+def test_cameras_wait_for_the_scene_and_glass_for_the_cameras(
+    train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
+) -> None:
+    options = ["camera=refined", "camera.start=2", *tiny_default_run, "optimizer.camera_learning_rate=0.1"]
+    for steps, moves in ((2, False), (3, True)):
+        folder = tmp_path / f"run{steps}"
+        done = train_here(*options, f"trainer.max_steps={steps}", f"hydra.run.dir={folder}")
+        assert done.code == 0, done.err
+        state = load_checkpoint(folder / "checkpoints" / "last.ckpt")[0]["state_dict"]
+        assert bool((state["camera.motions.motion"] != 0).any()) is moves
+
+
+def test_a_gain_for_each_view_needs_linear_radiance(
+    train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
+) -> None:
+    options = [*tiny_default_run, "camera.exposure=true", "model.colour=srgb"]
+    done = train_here(*options, "trainer.max_steps=1", f"hydra.run.dir={tmp_path / 'run'}")
+    assert done.code != 0
+    assert "model.colour=linear" in done.err
