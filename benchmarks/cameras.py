@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.camera.pixel_units import object_distances, world_motions
+from nerfro.camera.pixel_units import even_weights, object_distances, pixel_motions, without_world, world_motions
 from nerfro.camera.refined import rotations
 from nerfro.camera.similarity import motion_between
 from nerfro.cameras import Cameras
@@ -62,9 +62,9 @@ def disturbed(cameras: Cameras, angle: float, share: float, seed: int) -> Float[
     poses, distances = cameras.camera_to_world.double(), object_distances(cameras)
     units = torch.stack([torch.full_like(distances, angle), share * distances], -1).repeat_interleave(3, -1)
     axes = torch.randn(len(cameras), 2, 3, generator=generator, dtype=torch.float64)
-    motion = torch.nn.functional.normalize(axes, dim=-1).flatten(1)
-    of_world = world_motions(poses, units)
-    motion = (motion - torch.einsum("kvi,kwj,wj->vi", of_world, of_world, motion)) * units
+    weights = even_weights(pixel_motions(cameras, distances))
+    motion = torch.nn.functional.normalize(axes, dim=-1).flatten(1) * units
+    motion = without_world(motion, world_motions(poses, weights), weights)
     axes = poses[..., :3]
     return torch.cat([axes @ rotations(motion[:, :3]), poses[..., 3:] + axes @ motion[:, 3:, None]], -1)
 

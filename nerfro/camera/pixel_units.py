@@ -46,23 +46,35 @@ def pixel_motions(cameras: Cameras, distances: Float[Tensor, "V"]) -> Float[Tens
     return squares.mean(1).sqrt()
 
 
-def world_motions(
-    poses: Float[Tensor, "V 3 4"], units: Float[Tensor, "V 6"], scale: bool = True
-) -> Float[Tensor, "K V 6"]:
+def even_weights(motions: Float[Tensor, "V 7"]) -> Float[Tensor, "V 6"]:
+    """Pixels for a turn and for a shift of each camera, the same about and along all of its axes.
+
+    Where cameras stand as a whole must not depend on which way is up in a picture, or straight ahead.
+    """
+    return torch.stack([motions[:, :2].mean(1), motions[:, 3:5].mean(1)], -1).repeat_interleave(3, -1)
+
+
+def world_motions(poses: Float[Tensor, "V 3 4"], weights: Float[Tensor, "V 6"]) -> Float[Tensor, "K V 6"]:
     """Orthonormal motions of all cameras that a turn, a shift and a scaling of the world would cause.
 
     Args:
         poses: of the cameras.
-        units: of turns and shifts, along the cameras' own axes, in which motions are counted.
-        scale: whether scaling is among them.
+        weights: of turns and shifts, along the cameras' own axes, with which motions are multiplied.
     """
     centres = poses[..., 3] - poses[..., 3].mean(0)
     axes = torch.eye(3, dtype=poses.dtype)[:, None].expand(3, *centres.shape)
     nothing = torch.zeros_like(axes)
     turns = torch.cat([axes, torch.linalg.cross(axes, centres.expand_as(axes))], -1)
-    shifts = torch.cat([nothing, axes], -1)
-    motions = [turns, shifts, torch.cat([nothing[:1], centres[None]], -1)][: 3 if scale else 2]
-    own = torch.cat(motions).unflatten(-1, (2, 3)) @ poses[..., :3]  # along the cameras' own axes
-    flat = (own.flatten(-2) / units).flatten(1)
-    u, values, _ = torch.linalg.svd(flat.T, full_matrices=False)
+    motions = torch.cat([turns, torch.cat([nothing, axes], -1), torch.cat([nothing[:1], centres[None]], -1)])
+    own = motions.unflatten(-1, (2, 3)) @ poses[..., :3]  # along the cameras' own axes
+    u, values, _ = torch.linalg.svd((own.flatten(-2) * weights).flatten(1).T, full_matrices=False)
     return u[:, values > _RANK * values.max()].T.unflatten(-1, (len(poses), 6))
+
+
+def without_world(
+    motion: Float[Tensor, "V 6"], of_world: Float[Tensor, "K V 6"], weights: Float[Tensor, "V 6"]
+) -> Float[Tensor, "V 6"]:
+    """Turns and shifts of cameras without what is common to all: none of `world_motions` is left in them."""
+    weighted = motion * weights
+    common = torch.einsum("kvi,vi->k", of_world, weighted)
+    return (weighted - torch.einsum("kvi,k->vi", of_world, common)) / weights

@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 from nerfro.allowed import Natural
 from nerfro.camera.base import Camera
 from nerfro.camera.per_view import PerView
-from nerfro.camera.pixel_units import object_distances, pixel_motions, world_motions
+from nerfro.camera.pixel_units import even_weights, object_distances, pixel_motions, without_world, world_motions
 from nerfro.camera.similarity import similarity
 from nerfro.cameras import Cameras
 from nerfro.lens import distort, undistort
@@ -27,6 +27,7 @@ class _Motions(PerView):
     focal: Float[Tensor, "V 2"]
     distortion: Float[Tensor, "V 9"]
     units: Float[Tensor, "V 6"]
+    weights: Float[Tensor, "V 6"]
     of_world: Float[Tensor, "K V 6"]
     focal_unit: Float[Tensor, "1"]
 
@@ -34,21 +35,29 @@ class _Motions(PerView):
         super().__init__()
         self.hold_world = hold_world
         self.motion = nn.Parameter(torch.zeros(0, 6))
-        shapes = {"poses": (3, 4), "focal": (2,), "distortion": (9,), "units": (6,), "of_world": (0, 6)}
+        shapes = {
+            "poses": (3, 4),
+            "focal": (2,),
+            "distortion": (9,),
+            "units": (6,),
+            "weights": (6,),
+            "of_world": (0, 6),
+        }
         for name, shape in {**shapes, "focal_unit": ()}.items():
             self.register_buffer(name, torch.zeros(0, *shape))
 
     def begin(self, cameras: Cameras) -> None:
         poses = cameras.camera_to_world.double().cpu()
         pixels = pixel_motions(cameras, object_distances(cameras))
-        units = 1 / pixels[:, :6]
+        weights = even_weights(pixels)
         distortion = torch.zeros(0, 9) if cameras.distortion is None else cameras.distortion
         found = {
             "poses": poses,
             "focal": torch.stack([cameras.fx, cameras.fy], -1),
             "distortion": distortion,
-            "units": units,
-            "of_world": world_motions(poses, units) if self.hold_world else units.new_zeros(0, *units.shape),
+            "units": 1 / pixels[:, :6],
+            "weights": weights,
+            "of_world": world_motions(poses, weights) if self.hold_world else weights.new_zeros(0, *weights.shape),
             "focal_unit": 1 / pixels[:, 6].square().mean().sqrt()[None],
         }
         for name, tensor in found.items():
@@ -58,13 +67,12 @@ class _Motions(PerView):
 
     def forward(self) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 3"]]:
         """Rotation of each camera and shift of its centre, along its own axes as given."""
-        motion = self.in_pixels() * self.units
+        motion = self.held()
         return rotations(motion[:, :3]), motion[:, 3:]
 
-    def in_pixels(self) -> Float[Tensor, "V 6"]:
-        """Turn and shift of each camera, without what is the world's."""
-        common = torch.einsum("kvi,vi->k", self.of_world, self.motion)
-        return self.motion - torch.einsum("kvi,k->vi", self.of_world, common)
+    def held(self) -> Float[Tensor, "V 6"]:
+        """Turn and shift of each camera, without what is the world's; radians and world units."""
+        return without_world(self.motion * self.units, self.of_world, self.weights)
 
     def moved(self) -> Float[Tensor, "V 3 4"]:
         """The cameras' poses as they are believed to be."""
@@ -142,7 +150,8 @@ class RefinedCamera(Camera):
     @torch.no_grad()
     def aligned(self, cameras: Cameras) -> Cameras:
         """Other cameras, moved by the similarity of the training cameras, behind the lens that is believed in."""
-        whole = similarity(self.motions.poses.double(), self.motions.moved().double())
+        old, new, weights = (x.double() for x in (self.motions.poses, self.motions.moved(), self.motions.weights))
+        whole = similarity(old, new, weights[:, 0], weights[:, 3])
         poses = whole.moved(cameras.camera_to_world.to(whole.shift)).to(cameras.camera_to_world)
         return self._with_lens(replace(cameras, camera_to_world=poses))
 
@@ -155,7 +164,7 @@ class RefinedCamera(Camera):
 
     def learned(self) -> dict[str, float]:
         with torch.no_grad():
-            found = {"motion_pixels": float(self.motions.in_pixels().square().sum(-1).mean().sqrt())}
+            found = {"motion_pixels": float((self.motions.held() / self.motions.units).square().sum(-1).mean().sqrt())}
             if self.lens is not None:
                 growth, (x, y) = self._lens()
                 found |= {"focal_length_factor": float(growth), "principal_x": float(x), "principal_y": float(y)}

@@ -1,0 +1,59 @@
+"""Gains of photographs: nothing on average, started from what files tell, seen by every loss."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.nn.functional import mse_loss
+
+from nerfro.camera.exposure import Exposure
+from nerfro.camera.given import GivenCamera
+from nerfro.evaluation.treatments import fit_gain
+from nerfro.light import to_srgb
+from nerfro.losses.photometric import Photometric
+from nerfro.models.refractive import RefractiveModel
+from nerfro.testing import NUM_RAYS, example_batch, example_parts
+
+
+def test_gains_are_one_on_average_whatever_is_learned() -> None:
+    exposure = Exposure()
+    exposure.begin(5)
+    assert torch.equal(exposure.gains(), torch.ones(5, 3))
+    torch.nn.init.normal_(exposure.log_gain, mean=3.0)
+    torch.testing.assert_close(exposure.gains().log().mean(0), torch.zeros(3), rtol=0, atol=1e-6)
+
+
+def test_gains_start_from_the_exposures_that_files_tell() -> None:
+    exposure = Exposure()
+    exposure.begin(3, torch.tensor([0.02, 0.04, 0.16], dtype=torch.float64))
+    gains = exposure(torch.tensor([1, 0, 2]))
+    torch.testing.assert_close(gains[0] / gains[1], torch.full((3,), 2.0))
+    torch.testing.assert_close(gains[2] / gains[1], torch.full((3,), 8.0))
+
+
+def test_a_group_of_its_own_learns_gains_and_bends_no_ray() -> None:
+    camera = GivenCamera(exposure=True)
+    camera.begin(example_batch().cameras)
+    model = RefractiveModel(replace(example_parts(), camera=camera))
+    assert set(model.parameter_groups()) == {"fields", "exposure"}
+    assert not model.paths_learn
+
+
+def test_a_rendering_is_exposed_before_losses_see_it() -> None:
+    model, batch = RefractiveModel(example_parts()), example_batch()
+    gain = torch.rand(NUM_RAYS, 3) + 0.5
+    (rendering,) = model(batch.rays)
+    exposed = rendering.exposed(gain)
+    torch.testing.assert_close(exposed.rgb, gain * rendering.rgb)
+    torch.testing.assert_close(exposed.boundary_rgb, gain * rendering.boundary_rgb)
+    expected = mse_loss(model.encode(gain * rendering.rgb), batch.rgb)
+    torch.testing.assert_close(Photometric()([exposed], batch, model), expected)
+
+
+@pytest.mark.parametrize("factors", [(1.0, 1.0, 1.0), (0.4, 0.9, 1.7), (3.0, 0.2, 1.0)])
+def test_the_gain_of_a_picture_is_found_again_though_parts_of_it_saturate(factors: tuple[float, ...]) -> None:
+    radiance, gain = 1.5 * torch.rand(500, 3), torch.tensor(factors)
+    found = fit_gain(RefractiveModel(example_parts()), radiance, to_srgb(gain * radiance).clamp(max=1))
+    torch.testing.assert_close(found, gain, rtol=1e-4, atol=0)
