@@ -18,7 +18,7 @@ def photograph(path: Path, time: object = None, number: object = None, sensitivi
     for tag, value in (*named, (ExifTags.Base.ISOSpeedRatings, sensitivity)):
         if value is not None:
             tags[tag] = value
-    Image.new("RGB", (8, 8)).save(path, exif=exif)
+    Image.new("RGB", (8, 8)).save(path, exif=exif.tobytes())
     return path
 
 
