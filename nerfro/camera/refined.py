@@ -92,6 +92,8 @@ class RefinedCamera(Camera):
     Args:
         start: steps before cameras learn, so that they are not misled by an unlearned scene.
         glass_start: steps before they learn from rays that the object bends, too; from then on these tell most.
+        coarse_steps: steps in which the levels of hash grids and sky come in, coarse to fine, from half of them on:
+            where the scene is blurred, poses that are off by pixels find the way, and gradients are less noisy.
         lens: whether the focal length and the principal point, shared by all views, are refined.
         exposure: whether each training view has a gain of its own, for each colour channel.
         hold_world: whether the motion that all share is taken out; not for cameras in a world that is known.
@@ -101,12 +103,13 @@ class RefinedCamera(Camera):
         self,
         start: Natural = 100,
         glass_start: Natural = 200,
+        coarse_steps: Natural = 1000,
         lens: bool = False,
         exposure: bool = False,
         hold_world: bool = True,
     ) -> None:
         super().__init__(exposure)
-        self.start, self.glass_start = start, glass_start
+        self.start, self.glass_start, self.coarse_steps = start, glass_start, coarse_steps
         self.motions = _Motions(hold_world)
         self.lens = nn.Parameter(torch.zeros(3)) if lens else None  # focal length and principal point, pixels
 

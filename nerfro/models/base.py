@@ -167,6 +167,8 @@ class NerfModel(LightningModule, ABC):
         for group in self.trainer.optimizers[0].param_groups:
             waits = group["name"] == "medium" and self.global_step < self.optimizer_config.medium_start
             group["lr"] = 0.0 if waits else group["initial_lr"] * factor
+        for part in (self.boundary, *self.fields):
+            part.detail = self.camera.detail(self.global_step)  # type: ignore[assignment]
         # Not at the end of the step before, which comes after its checkpoint: a resumed run would miss the update.
         if self.global_step > 0:
             self.point_sampler.after_step(self.global_step, list(self.fields))  # type: ignore[arg-type]

@@ -83,7 +83,7 @@ def write_cameras(file: Path, camera: Camera, views: Views) -> None:
     frames = []
     for view, frame in enumerate(views.frames):
         lens = {"fl_x": believed.fx, "fl_y": believed.fy, "cx": believed.cx, "cy": believed.cy}
-        entry = {"file_path": relative(frame.image, file.parent)}
+        entry: dict[str, Any] = {"file_path": relative(frame.image, file.parent)}
         entry |= {name: float(values[view]) for name, values in lens.items()}
         if believed.distortion is not None:
             entry |= dict(zip(_DISTORTION, believed.distortion[view].tolist(), strict=True))

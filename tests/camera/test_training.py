@@ -44,8 +44,8 @@ def test_disturbed_poses_come_back(train_here: Callable[..., Any], tmp_path: Pat
     true = views.cameras
     moved = disturbed(true, math.radians(0.5), 0.01, 0)
     save(replace(views, cameras=replace(true, camera_to_world=moved.float())), tmp_path / "ball")
-    options = ["camera=refined", "camera.start=40", "camera.glass_start=80", "optimizer.camera_learning_rate=0.01"]
-    options += [*SMALL, "trainer.max_steps=500", f"data.root={tmp_path / 'ball'}"]
+    options = ["camera=refined", "camera.start=40", "camera.glass_start=80", "optimizer.camera_learning_rate=0.02"]
+    options += ["camera.coarse_steps=100", *SMALL, "batches.size=768", "trainer.max_steps=500", f"data.root={tmp_path / 'ball'}"]
     done = train_here(*options, f"hydra.run.dir={tmp_path / 'run'}")
     assert done.code == 0, done.err
     found = poses_in(tmp_path / "run" / "cameras.json")
@@ -63,7 +63,9 @@ def test_cameras_of_other_views_come_back_on_left_halves(train_here: Callable[..
     true = views.cameras
     save(views, tmp_path / "ball")
     done = train_here(
-        *SMALL, "trainer.max_steps=200", f"data.root={tmp_path / 'ball'}", f"hydra.run.dir={tmp_path / 'run'}"
+        *[*SMALL, "batches.size=768", "trainer.max_steps=300"],
+        f"data.root={tmp_path / 'ball'}",
+        f"hydra.run.dir={tmp_path / 'run'}",
     )
     assert done.code == 0, done.err
     scene = load(tmp_path / "run", "cpu")
@@ -81,7 +83,8 @@ def test_the_gains_of_disturbed_exposures_come_back(train_here: Callable[..., An
     logarithm = 0.3 * torch.randn(len(views), 3).clamp(-2, 0)  # darker, so that nothing saturates
     images = to_srgb(to_linear(views.images) * logarithm.exp()[:, None, None])
     save(replace(views, images=images), tmp_path / "ball")
-    options = ["camera.exposure=true", *SMALL, "trainer.max_steps=200", f"data.root={tmp_path / 'ball'}"]
+    options = ["camera.exposure=true", *SMALL, "trainer.max_steps=300", f"data.root={tmp_path / 'ball'}"]
+    options += ["optimizer.exposure_learning_rate=0.03"]
     done = train_here(*options, f"hydra.run.dir={tmp_path / 'run'}")
     assert done.code == 0, done.err
     frames = json.loads((tmp_path / "run" / "cameras.json").read_text("utf-8"))["frames"]
@@ -130,6 +133,7 @@ def test_a_run_whose_cameras_learn_goes_on_as_if_it_had_not_stopped(
     train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
 ) -> None:
     options = ["camera=refined", "camera.lens=true", "camera.exposure=true", "camera.start=2", "camera.glass_start=3"]
+    options += ["camera.coarse_steps=4"]
     options += [*tiny_default_run, "optimizer.camera_learning_rate=0.1", "optimizer.final_learning_rate=1e-2"]
     states = []
     for name, parts in (("whole", [[6]]), ("parted", [[2], [6]])):
