@@ -55,7 +55,7 @@ def _teaching(rendering: Rendering, batch: Batch, boundary: Boundary) -> Float[T
         bent = functional_call(boundary, fixed, (path.exits(),))
         if path.absorbs:
             bent = bent * path.transmitted(path.far[:, None])[:, 0]
-        bent = bent if rendering.gain is None else bent * rendering.gain
+        bent = bent if rendering.gain is None else bent * rendering.gain[first:]
         learned = learned - (bent - bent.detach())
     from_boundary = path.per_ray(rendering.transmittance[first:, None] * learned)
     return torch.cat([rendering.rgb[:whole], rendering.rgb[whole:] - from_boundary])
