@@ -57,7 +57,9 @@ class EnvironmentMap(Boundary):
             from nerfro.boundaries.cube_map_cpu import lookup  # compiled code, so only where it is used
         else:
             lookup = cube_map.lookup
-        texels, padded, levels = self.texels, self.padded, self.levels
+        levels = self.levels
+        texels: Tensor = self.texels
+        padded: Tensor = self.padded
         if self.training and self.detail < 1:
             levels = levels.coarsest(self.detail)
             texels, padded = texels[: levels.num_texels], padded[: levels.num_padded]
