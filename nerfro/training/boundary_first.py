@@ -49,12 +49,15 @@ class BoundaryFirst(Callback):
         batches = self._batches.to(pl_module.device)
         num_pixels = min(_NUM_PIXELS, int(_SHARE * batches.num_pixels))
         for step in told("boundary", range(self._num_steps)):
-            rays, rgb = batches.missing(box, num_pixels, step)
+            rays, view, rgb = batches.missing(box, num_pixels, step)
             if len(rays) < _FEWEST:
                 return
             torch.manual_seed(step_seed(pl_module.seed, -1 - step))
             group["lr"] = group["initial_lr"] * first * (last / first) ** (step / self._num_steps)
-            loss = torch.nn.functional.mse_loss(*pl_module.difference(pl_module.boundary(_exits(rays)), rgb))
+            radiance = pl_module.boundary(_exits(rays))
+            gains = pl_module.camera.gains(view)
+            radiance = radiance if gains is None else radiance * gains.detach()
+            loss = torch.nn.functional.mse_loss(*pl_module.difference(radiance, rgb))
             # Not by backward(): gradients of several processes would be waited for.
             gradients = torch.autograd.grad(loss, learning, allow_unused=True)
             for parameter, gradient in zip(learning, gradients, strict=True):

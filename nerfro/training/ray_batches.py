@@ -139,8 +139,10 @@ class RayBatches:
         """Of all views."""
         return len(self._cameras) * self._cameras.height * self._cameras.width
 
-    def missing(self, box: Float[Tensor, "2 3"], num_pixels: int, step: int) -> tuple[Rays, Float[Tensor, "R 3"]]:
-        """Rays through random pixels of all views, of those that miss a box, and their colours; alike in all processes.
+    def missing(
+        self, box: Float[Tensor, "2 3"], num_pixels: int, step: int
+    ) -> tuple[Rays, Int[Tensor, "R"], Float[Tensor, "R 3"]]:
+        """Rays through random pixels that miss a box, their views and their colours; alike in all processes.
 
         Args:
             box: its corners, world units.
@@ -160,7 +162,7 @@ class RayBatches:
         rays = pixel_rays(cameras, index)
         enter, leave = intersect_box(box, rays.origins, rays.directions)
         beside = (enter >= leave) | (leave <= 0)
-        return rays[beside], self._pixels[index[beside]]
+        return rays[beside], index[beside] // size, self._pixels[index[beside]]
 
     def _divided_batch(self, drawn: Int[np.ndarray, "P"], generator: np.random.Generator, cameras: Cameras) -> Batch:
         """The batch of the drawn pixels: first those that have one ray, then the divided ones with all of theirs."""

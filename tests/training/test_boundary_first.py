@@ -56,12 +56,13 @@ def test_rays_that_miss_a_box_have_their_own_colours(tiny_scene: Path) -> None:
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
     batches = RayBatches(views, 16, "all_images")
     box = torch.tensor([[-0.6] * 3, [0.6] * 3])
-    rays, rgb = batches.missing(box, 500, 0)
+    rays, view, rgb = batches.missing(box, 500, 0)
     assert 100 < len(rays) < 500
+    assert set(view.tolist()) == {0, 1, 2}
     # The scene's sky is a linear function of direction, seen wherever the ball is not.
     assert torch.allclose(rgb, 0.5 + 0.4 * rays.directions, atol=3e-3)
     nearest = rays.origins - (rays.origins * rays.directions).sum(-1, keepdim=True) * rays.directions
     assert (nearest.norm(dim=-1) > 0.6).all()
-    again, others = batches.missing(box, 500, 0)[0], batches.missing(box, 500, 1)[0]
+    again, others = (batches.missing(box, 500, step)[0] for step in (0, 1))
     assert torch.equal(again.directions, rays.directions)
     assert len(others) != len(rays) or not torch.equal(others.directions, rays.directions)
