@@ -36,7 +36,8 @@ def main(config: DictConfig) -> None:
     folder = claim(config, overrides)
     views = masked_views(build(config.data).load(config.split))
     box = None if config.box_min is None else np.array([config.box_min, config.box_max], np.float64)
-    location, written, overlaps = config.mesh, [], None
+    location, written = config.mesh, []
+    overlaps = None
     if mesh is None or views.masks is not None:
         silhouettes = read_silhouettes(views, box is not None)
         require_consistent_poses(silhouettes, views.names, config.wrong_masks)

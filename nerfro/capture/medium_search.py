@@ -71,7 +71,7 @@ def find_medium(
         found = search_lengths(views, mesh, vessel, list(config.search), config.room, folder)
         lengths = {name: float(f"{value:.5g}") for name, value in zip(found.names, found.values, strict=True)}
         result = FoundMedium(vessel.with_lengths(lengths), written=[LENGTHS, LENGTHS_CURVE])
-        named = dict(lengths)
+        named = {**lengths}
     if found.doubts:
         result.doubtful = [f"medium.{name}=N" for name in named]
     else:
