@@ -66,8 +66,8 @@ def indices_of(medium: Solid) -> Sought:
     num_bodies = len(medium.iors)
     names = ["index"] if num_bodies == 1 else [f"index of body {body + 1}" for body in range(num_bodies)]
     white = variant(medium, abbe=[])
-    ends = (np.full(num_bodies, end) for end in (LOWEST, HIGHEST))
-    return Sought(names, *ends, lambda iors: white.with_indices(torch.from_numpy(iors)))
+    lowest, highest = np.full(num_bodies, LOWEST), np.full(num_bodies, HIGHEST)
+    return Sought(names, lowest, highest, lambda iors: white.with_indices(torch.from_numpy(iors)))
 
 
 def lengths_of(vessel: SdfVessel, names: list[str]) -> Sought:

@@ -54,6 +54,9 @@ class SdfVessel(SdfGrid):
     """
 
     nested = True
+    _outer: Float[Tensor, "X Y Z"]  # signed distances to the outer surface, and to it without its lid
+    _side: Float[Tensor, "X Y Z"]
+    _heights: Float[Tensor, "X Y Z"]  # of the vertices over the lowest point
 
     def __init__(
         self,
