@@ -13,7 +13,7 @@ import torch
 import trimesh
 from jaxtyping import Float
 
-from nerfro.capture.index_search import IndexEstimate, find_index
+from nerfro.capture.index_search import Estimate, find_numbers, indices_of
 from nerfro.capture.surroundings import divide_pixels, learn_surroundings
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.signed_distance import signed_distance_grid
@@ -43,11 +43,11 @@ def main() -> None:
     print("surface                  index   error    standard error   falls from")
     for error in given.errors:
         for kind in ("coat", "lack", "bumps") if error else ("as given",):
-            found = find_index(_medium(spoiled(mesh, kind, error / 100)), through, surroundings)
+            found = find_numbers(indices_of(_medium(spoiled(mesh, kind, error / 100))), through, surroundings)
             low, high = basin(found)
-            share = 100 * (found.iors[0] / given.ior - 1)
+            share = 100 * (found.values[0] / given.ior - 1)
             print(
-                f"{kind:<9} {error:4.1f} %     {found.iors[0]:9.4f} {share:+6.2f} % {found.standard_errors[0]:11.4f}"
+                f"{kind:<9} {error:4.1f} %     {found.values[0]:9.4f} {share:+6.2f} % {found.standard_errors[0]:11.4f}"
                 f"        {low:.2f} to {high:.2f}"
             )
 
@@ -66,7 +66,7 @@ def spoiled(mesh: TriangleMesh, kind: str, share: float) -> TriangleMesh:
     return TriangleMesh(mesh.vertices + share * size * height[:, None] * solid.vertex_normals, mesh.faces)
 
 
-def basin(found: IndexEstimate) -> tuple[float, float]:
+def basin(found: Estimate) -> tuple[float, float]:
     """Between which starts the error of a single body falls all the way to the lowest candidate."""
     values, errors = found.wide.T
     low = high = int(errors.argmin())

@@ -54,10 +54,15 @@ def solid(iors: list[float]) -> SdfGrid:
 
 def photographs(iors: list[float], opaque: bool = False) -> Views:
     """What the bodies show of the sky: their surfaces are those of balls, to a grid's accuracy."""
+    return photographs_of(solid(iors), opaque)
+
+
+def photographs_of(medium: SdfGrid, opaque: bool = False) -> Views:
+    """What a medium shows of the sky."""
     taken, images = cameras(), []
     for view in range(NUM_VIEWS):
         rays = taken.image_rays(view)
-        path = Snell()(rays, solid(iors))
+        path = Snell()(rays, medium)
         radiance = sky(path.exit_directions)
         if opaque:  # painted, in every colour of the sky
             radiance = torch.where(path.refracted[:, None], sky(normalize(path.positions[:, 1], dim=-1)), radiance)

@@ -1,4 +1,4 @@
-"""From photographs and a surface to its index: the search with its progress, its figures and its curve."""
+"""From photographs and a surface to its index, or a vessel's lengths: the search, its figures and its curve."""
 
 from __future__ import annotations
 
@@ -8,68 +8,89 @@ from pathlib import Path
 import numpy as np
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from nerfro.capture.index_search import IndexEstimate, find_index
+from nerfro.capture.index_search import Estimate, Sought, find_numbers, indices_of, lengths_of
 from nerfro.capture.surroundings import Room, divide_pixels, learn_surroundings
 from nerfro.cli import warn
 from nerfro.data.base import Views
 from nerfro.files.atomic import atomic_file, write_atomically
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.solid import Solid
+from nerfro.media.vessel import SdfVessel
 
 INDEX, CURVE = "index.json", "index.png"
+LENGTHS, LENGTHS_CURVE = "lengths.json", "lengths.png"
 
 
-def search_index(views: Views, mesh: TriangleMesh, medium: Solid, room: bool | None, folder: Path) -> IndexEstimate:
+def search_index(views: Views, mesh: TriangleMesh, medium: Solid, room: bool | None, folder: Path) -> Estimate:
     """Find the indices of a medium's bodies; write index.json and index.png, and print what was found.
 
     Args:
         views: photographs with poses.
         mesh: outer surface of the medium.
-        medium: the bodies; its indices are set.
+        medium: the bodies.
         room: whether the surroundings are near; None finds out.
         folder: to write to.
     """
-    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
-    with Progress(*columns) as progress:
-        learning, searching = progress.add_task("surroundings", total=1), progress.add_task("index", total=1)
-        beside, through = divide_pixels(views, mesh)
-        surroundings = learn_surroundings(beside, mesh, room, lambda done: progress.update(learning, completed=done))
-        found = find_index(medium, through, surroundings, lambda done: progress.update(searching, completed=done))
-    what = "near" if isinstance(surroundings.boundary, Room) else "far away"
-    print(f"surroundings: {what}; {surroundings.unexplained:.1%} of other views' variance unexplained")
-    names = ["index"] if len(found.iors) == 1 else [f"index of body {body + 1}" for body in range(len(found.iors))]
-    for name, ior, error, bend in zip(names, found.iors, found.standard_errors, found.curvature, strict=True):
-        print(f"{name}: {ior:.4f} +- {error:.4f} (views resampled); curvature of the error {bend:.3g}")
-    for doubt in found.doubts:
-        warn(f"the pictures do not tell the index: {doubt}; look at {CURVE}")
-    figures = {
-        "ior": [round(float(x), 5) for x in found.iors],
-        "standard_error": [round(float(x), 5) for x in found.standard_errors],
-        "doubts": found.doubts,
-    }
+    found = _search(views, mesh, indices_of(medium), room, folder / CURVE)
+    figures = {"ior": _rounded(found.values), "standard_error": _rounded(found.standard_errors), "doubts": found.doubts}
     write_atomically(folder / INDEX, json.dumps(figures, indent=1) + "\n")
-    draw_index(found, folder / CURVE)
     return found
 
 
-def draw_index(found: IndexEstimate, file: Path) -> None:
-    """Write the error against each body's index, the lowest over the others': from afar, and near the best."""
+def search_lengths(
+    views: Views, mesh: TriangleMesh, vessel: SdfVessel, names: list[str], room: bool | None, folder: Path
+) -> Estimate:
+    """Find some of a vessel's lengths; write lengths.json and lengths.png. Otherwise as `search_index`."""
+    found = _search(views, mesh, lengths_of(vessel, names), room, folder / LENGTHS_CURVE)
+    values, errors = (
+        {name: float(f"{value:.5g}") for name, value in zip(names, of_names, strict=True)}
+        for of_names in (found.values, found.standard_errors)
+    )
+    figures = {"lengths": values, "standard_errors": errors, "doubts": found.doubts}
+    write_atomically(folder / LENGTHS, json.dumps(figures, indent=1) + "\n")
+    return found
+
+
+def _rounded(values: np.ndarray) -> list[float]:
+    return [round(float(x), 5) for x in values]
+
+
+def _search(views: Views, mesh: TriangleMesh, sought: Sought, room: bool | None, curve: Path) -> Estimate:
+    """Search with a progress bar, print what was found, and draw it into a file."""
+    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+    with Progress(*columns) as progress:
+        learning, searching = progress.add_task("surroundings", total=1), progress.add_task("search", total=1)
+        beside, through = divide_pixels(views, mesh)
+        surroundings = learn_surroundings(beside, mesh, room, lambda done: progress.update(learning, completed=done))
+        found = find_numbers(sought, through, surroundings, lambda done: progress.update(searching, completed=done))
+    what = "near" if isinstance(surroundings.boundary, Room) else "far away"
+    print(f"surroundings: {what}; {surroundings.unexplained:.1%} of other views' variance unexplained")
+    for name, value, error, bend in zip(found.names, found.values, found.standard_errors, found.curvature, strict=True):
+        print(f"{name}: {value:.5g} +- {error:.2g} (views resampled); curvature of the error {bend:.3g}")
+    for doubt in found.doubts:
+        warn(f"the pictures do not tell the {' and '.join(found.names)}: {doubt}; look at {curve.name}")
+    _draw(found, curve)
+    return found
+
+
+def _draw(found: Estimate, file: Path) -> None:
+    """Write the error against each number, the lowest over the others': from afar, and near the best."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    num_bodies = len(found.iors)
-    figure = Figure(figsize=(11, 4 * num_bodies), layout="constrained", dpi=110)
-    for body, axes in enumerate(figure.subplots(num_bodies, 2, squeeze=False)):
-        ior, error = found.iors[body], found.standard_errors[body]
+    count = len(found.names)
+    figure = Figure(figsize=(11, 4 * count), layout="constrained", dpi=110)
+    for number, axes in enumerate(figure.subplots(count, 2, squeeze=False)):
+        best, error = found.values[number], found.standard_errors[number]
         for plot, tried in zip(axes, (found.wide, found.close), strict=True):
-            values = np.unique(tried[:, body])
-            plot.plot(values, [tried[tried[:, body] == value, -1].min() for value in values], "o-", markersize=4)
-            plot.axvline(ior, color="tab:red", linewidth=1)
-            plot.axvspan(ior - error, ior + error, color="tab:red", alpha=0.2)
-            plot.set_xlabel("index" if num_bodies == 1 else f"index of body {body + 1}")
+            values = np.unique(tried[:, number])
+            plot.plot(values, [tried[tried[:, number] == value, -1].min() for value in values], "o-", markersize=4)
+            plot.axvline(best, color="tab:red", linewidth=1)
+            plot.axvspan(best - error, best + error, color="tab:red", alpha=0.2)
+            plot.set_xlabel(found.names[number])
             plot.set_ylabel("robust error")
         axes[0].axhline(found.unrelated, color="grey", linestyle=":", label="unrelated colours")
         axes[0].legend()
-        axes[1].set_title(f"{ior:.4f} ± {error:.4f}")
+        axes[1].set_title(f"{best:.5g} ± {error:.2g}")
     with atomic_file(file) as stream:
         FigureCanvasAgg(figure).print_png(stream)

@@ -1,4 +1,4 @@
-"""The refractive index of a known surface, found by where its rays end up in known surroundings.
+"""Numbers of a medium, its index above all, found by where its rays end up in known surroundings.
 
 For each candidate, pixels of the object are traced, and what they show is compared with the surroundings in the
 direction in which their rays leave. The error has one wide valley around the true index: an error of 0.1 turns the
@@ -19,44 +19,91 @@ from torch import Tensor
 from nerfro.capture.surroundings import Pixels, Room, Surroundings
 from nerfro.errors import NerfroError
 from nerfro.media.solid import Solid
+from nerfro.media.vessel import SdfVessel
 from nerfro.samplers.snell import Snell
+from nerfro.variants import variant
 
-LOWEST, HIGHEST = 1.0, 2.5
-# Candidates along each axis and pixels of the first look, by the number of bodies.
+LOWEST, HIGHEST = 1.0, 2.5  # indices
+# Candidates along each axis and pixels of the first look, by how many numbers are looked for.
 _COARSE = {1: (31, 12_000), 2: (13, 4_000)}
-# Candidates along each axis of closer looks, by the number of bodies, and how far they reach from its middle.
+# Candidates along each axis of closer looks, and how far they reach from its middle, as shares of what is searched.
 _AROUND = {1: 9, 2: 5}
-_REACHES = {1: (0.05, 0.02), 2: (0.15, 0.05, 0.02)}
-# Of a closer look, by the number of bodies, and of one at surroundings that are rendered for each ray.
+_REACHES = {1: (1 / 30, 1 / 75), 2: (1 / 10, 1 / 30, 1 / 75)}
+# Of a closer look, by how many numbers are looked for, and of one at surroundings that are rendered for each ray.
 _FINE_PIXELS, _NEAR_PIXELS = {1: 60_000, 2: 20_000}, 12_000
 _MOST_LOOKS = 4  # of each reach, until the middle stays where it is
-# Rays with more events are no help: tiny errors of the surface turn them anywhere.
+# Rays with more events, or more than two for each surface, are no help: tiny errors of the surface turn them anywhere.
 _MAX_EVENTS = 4
 # Residuals count half at this share of the surroundings' standard deviation: what is inside spoils many pixels.
 _HALF = 0.5
 _RESAMPLES = 200
-# Without a valley so deep (share of the error of unrelated colours), or with a larger standard error (share of the
-# index), the pictures do not tell.
+# Without a valley so deep (share of the error of unrelated colours), or with a larger standard error (share of what is
+# searched), the pictures do not tell.
 _SHALLOW, _LOOSE = 0.03, 0.02
+_END = 1 / 150  # so near to an end of what is searched (share of it), the lowest error may lie beyond
 # Nor if for less than this share of the pixels it is known where their light comes from.
 _UNKNOWN = 0.1
 
 
 @dataclass(frozen=True)
-class IndexEstimate:
-    """Indices of a medium's bodies and how they were found.
+class Sought:
+    """Numbers of a medium that are looked for together, two at most.
 
     Attributes:
-        iors: of each body, the outer one first.
+        names: for people.
+        lowest, highest: between which they are looked for.
+        medium: with candidates for the numbers.
+    """
+
+    names: list[str]
+    lowest: Float[np.ndarray, "K"]
+    highest: Float[np.ndarray, "K"]
+    medium: Callable[[Float[np.ndarray, "K"]], Solid]
+
+
+def indices_of(medium: Solid) -> Sought:
+    """The index of each body, the outer one first; the medium has one index for all colours then."""
+    num_bodies = len(medium.iors)
+    names = ["index"] if num_bodies == 1 else [f"index of body {body + 1}" for body in range(num_bodies)]
+    white = variant(medium, abbe=[])
+    lowest, highest = np.full(num_bodies, LOWEST), np.full(num_bodies, HIGHEST)
+    return Sought(names, lowest, highest, lambda iors: white.with_indices(torch.from_numpy(iors)))
+
+
+def lengths_of(vessel: SdfVessel, names: list[str]) -> Sought:
+    """Some of a vessel's lengths, in the unit in which they were given."""
+    unknown = [name for name in names if name not in vessel.lengths]
+    if unknown:
+        raise NerfroError(
+            f"search={unknown} is not looked for; this vessel has {', '.join(vessel.lengths)}"
+            + ("" if "level" in vessel.lengths else ", and no level: give a first guess of it, medium.level=")
+        )
+    lowest, highest = np.array([vessel.length_range(name) for name in names]).T
+    white = variant(vessel, abbe=[])
+
+    def vary(values: Float[np.ndarray, "K"]) -> SdfVessel:
+        return white.with_lengths(dict(zip(names, values.tolist(), strict=True)))
+
+    return Sought(names, lowest, highest, vary)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Numbers of a medium and how they were found.
+
+    Attributes:
+        names: see `Sought`.
+        values: of the numbers.
         standard_errors: by resampling views. What is wrong with the surface is not in them.
-        curvature: second derivative of the error along each index.
+        curvature: second derivative of the error along each number.
         wide, close: candidates of the first look and of the last, with their robust errors in the last column: 0 where
             all is explained, 1 where nothing is. They are of other pixels and not to be compared.
         unrelated: the error of colours that have nothing to do with each other.
-        doubts: why the pictures do not tell the index; empty where they do.
+        doubts: why the pictures do not tell the numbers; empty where they do.
     """
 
-    iors: Float[np.ndarray, "K"]
+    names: list[str]
+    values: Float[np.ndarray, "K"]
     standard_errors: Float[np.ndarray, "K"]
     curvature: Float[np.ndarray, "K"]
     wide: Float[np.ndarray, "C K+1"]
@@ -65,41 +112,43 @@ class IndexEstimate:
     doubts: list[str]
 
 
-def find_index(
-    medium: Solid, through: Pixels, surroundings: Surroundings, progress: Callable[[float], None] = lambda done: None
-) -> IndexEstimate:
-    """Search all indices from 1 to 2.5, coarse then fine.
+def find_numbers(
+    sought: Sought, through: Pixels, surroundings: Surroundings, progress: Callable[[float], None] = lambda done: None
+) -> Estimate:
+    """Search all that they may be, coarse then fine.
 
     Args:
-        medium: the bodies; its indices are set to what is found.
+        sought: what is looked for.
         through: pixels that the object fills.
         surroundings: what is seen around it.
         progress: is told the share done.
 
     Raises:
-        NerfroError: the medium has more than two bodies, or no ray of the pixels meets it.
+        NerfroError: there are more than two numbers, or no ray of the pixels meets the medium.
     """
-    num_bodies = len(medium.iors)
-    if num_bodies not in _COARSE:
-        raise NerfroError(f"the indices of {num_bodies} bodies are not searched for, of two at most; give medium.ior=")
-    num_fine = _NEAR_PIXELS if isinstance(surroundings.boundary, Room) else _FINE_PIXELS[num_bodies]
-    search = _Search(medium, through.some(num_fine), surroundings)
-    per_axis, num_pixels = _COARSE[num_bodies]
+    count, low, high = len(sought.names), sought.lowest, sought.highest
+    if count not in _COARSE:
+        raise NerfroError(
+            f"{', '.join(sought.names)}: {count} numbers are not searched for, but two at most; give some (medium.ior=)"
+        )
+    num_fine = _NEAR_PIXELS if isinstance(surroundings.boundary, Room) else _FINE_PIXELS[count]
+    search = _Search(sought, through.some(num_fine), surroundings)
+    per_axis, num_pixels = _COARSE[count]
     num_pixels = min(num_pixels, num_fine // 4)
-    axis = np.linspace(LOWEST, HIGHEST, per_axis)
-    coarse = np.array(list(itertools.product(axis, repeat=num_bodies)))
-    share = len(coarse) * num_pixels / (len(coarse) * num_pixels + 4 * _AROUND[num_bodies] ** num_bodies * num_fine)
+    coarse = np.array(list(itertools.product(*np.linspace(low, high, per_axis).T)))
+    share = len(coarse) * num_pixels / (len(coarse) * num_pixels + 4 * _AROUND[count] ** count * num_fine)
     costs = search.costs(coarse, num_pixels, False, lambda done: progress(share * done)).mean_error()
     middle = coarse[costs.argmin()]
-    looks = len(_REACHES[num_bodies]) * _MOST_LOOKS
+    looks = len(_REACHES[count]) * _MOST_LOOKS
     look = 0
-    for reach in _REACHES[num_bodies]:
-        steps = np.linspace(-reach, reach, _AROUND[num_bodies])
+    for part in _REACHES[count]:
+        reach = part * (high - low)
+        steps = np.linspace(-1, 1, _AROUND[count])
         for _ in range(_MOST_LOOKS):
-            middle = middle.clip(LOWEST + reach, HIGHEST - reach)
-            stencil = middle + np.array(list(itertools.product(steps, repeat=num_bodies)))
+            middle = middle.clip(low + reach, high - reach)
+            stencil = middle + reach * np.array(list(itertools.product(steps, repeat=count)))
             begun, look = share + (1 - share) * look / looks, look + 1
-            closest = reach == _REACHES[num_bodies][-1]
+            closest = part == _REACHES[count][-1]
             fine = search.costs(
                 stencil,
                 num_fine if closest else num_fine // 3,
@@ -108,62 +157,62 @@ def find_index(
             )
             errors = fine.mean_error()
             found, curvature = _lowest(stencil, errors[None], reach)
-            settled = np.abs(found[0] - middle).max() < 0.5 * reach
-            middle = found[0].clip(LOWEST, HIGHEST)
+            settled = (np.abs(found[0] - middle) < 0.5 * reach).all()
+            middle = found[0].clip(low, high)
             if settled:
                 break
     progress(1.0)
     num_views = len(fine.counts)
     weights = np.random.default_rng(0).multinomial(num_views, np.full(num_views, 1 / num_views), _RESAMPLES)
     spread = _lowest(stencil, fine.mean_error(weights), reach)[0].std(0)
-    medium.iors = torch.from_numpy(middle).to(medium.iors)
     known = fine.counts.sum() / max(1, search.num_pixels)
-    doubts = _doubts(middle, spread, curvature[0], 1 - errors.min() / search.unrelated, known)
+    doubts = _doubts(sought, middle, spread, curvature[0], 1 - errors.min() / search.unrelated, known)
     wide, close = np.column_stack([coarse, costs]), np.column_stack([stencil, errors])
-    return IndexEstimate(middle, spread, curvature[0], wide, close, search.unrelated, doubts)
+    return Estimate(sought.names, middle, spread, curvature[0], wide, close, search.unrelated, doubts)
 
 
 def _lowest(
-    stencil: Float[np.ndarray, "C K"], errors: Float[np.ndarray, "B C"], reach: float
+    stencil: Float[np.ndarray, "C K"], errors: Float[np.ndarray, "B C"], reach: Float[np.ndarray, "K"]
 ) -> tuple[Float[np.ndarray, "B K"], Float[np.ndarray, "B K"]]:
     """Where the parabolas through errors around a middle are lowest, and their second derivatives.
 
     A parabola that has no lowest place near the stencil has it at the stencil's best candidate.
     """
-    num_bodies, middle = stencil.shape[1], stencil.mean(0)
+    count, middle = stencil.shape[1], stencil.mean(0)
     x = (stencil - middle) / reach
-    pairs = list(itertools.combinations_with_replacement(range(num_bodies), 2))
+    pairs = list(itertools.combinations_with_replacement(range(count), 2))
     terms = np.stack([np.ones(len(x)), *x.T, *(x[:, i] * x[:, j] for i, j in pairs)], 1)
     fitted = errors @ np.linalg.pinv(terms).T
-    hessian = np.zeros((len(errors), num_bodies, num_bodies))
-    for (i, j), factor in zip(pairs, fitted[:, 1 + num_bodies :].T, strict=True):
+    hessian = np.zeros((len(errors), count, count))
+    for (i, j), factor in zip(pairs, fitted[:, 1 + count :].T, strict=True):
         hessian[:, i, j] += factor
         hessian[:, j, i] += factor
     regular = np.linalg.eigvalsh(hessian)[:, 0] > 1e-9
-    hessian_or_one = np.where(regular[:, None, None], hessian, np.eye(num_bodies))
-    place = -np.linalg.solve(hessian_or_one, fitted[:, 1 : 1 + num_bodies, None])[..., 0]
+    hessian_or_one = np.where(regular[:, None, None], hessian, np.eye(count))
+    place = -np.linalg.solve(hessian_or_one, fitted[:, 1 : 1 + count, None])[..., 0]
     near = regular & (np.abs(place).max(1) < 1.5)
     place = np.where(near[:, None], place, x[errors.argmin(1)])
     return middle + reach * place, np.diagonal(hessian, axis1=1, axis2=2) / reach**2
 
 
 def _doubts(
-    iors: np.ndarray, standard_errors: np.ndarray, curvature: np.ndarray, depth: float, known: float
+    sought: Sought, values: np.ndarray, standard_errors: np.ndarray, curvature: np.ndarray, depth: float, known: float
 ) -> list[str]:
     doubts = []
     if known < _UNKNOWN:
         doubts.append(f"of {1 - known:.0%} of the object's light no photograph shows where it comes from")
     if depth < _SHALLOW:
         doubts.append(
-            f"the best index explains only {max(0.0, depth):.1%} of what unrelated colours leave unexplained: the "
-            "object may be opaque, or its surroundings may not be known where its light comes from"
+            f"the best {' and '.join(sought.names)} explains only {max(0.0, depth):.1%} of what unrelated colours "
+            "leave unexplained: the object may be opaque, or its surroundings not known where its light comes from"
         )
-    for body, (ior, error, bend) in enumerate(zip(iors, standard_errors, curvature, strict=True)):
-        name = "the index" if len(iors) == 1 else f"the index of body {body + 1}"
-        if not LOWEST + 0.01 < ior < HIGHEST - 0.01:
-            doubts.append(f"{name} is at the end of what is searched, {LOWEST:g} to {HIGHEST:g}")
-        elif bend <= 0 or error > _LOOSE * ior:
-            doubts.append(f"{name} has a standard error of {error:.2g}: views do not agree on it")
+    columns = sought.names, values, standard_errors, curvature, sought.lowest, sought.highest
+    for name, value, error, bend, low, high in zip(*columns, strict=True):
+        end = _END * (high - low)
+        if not low + end < value < high - end:
+            doubts.append(f"the {name} is at the end of what is searched, {low:.4g} to {high:.4g}")
+        elif bend <= 0 or error > _LOOSE * (high - low):
+            doubts.append(f"the {name} has a standard error of {error:.2g}: views do not agree on it")
     return doubts
 
 
@@ -182,10 +231,10 @@ class _Costs:
 
 
 class _Search:
-    def __init__(self, medium: Solid, through: Pixels, surroundings: Surroundings) -> None:
-        self._medium, self._surroundings = medium, surroundings
-        self._sampler = Snell(max_events=_MAX_EVENTS)
-        medium.iors, medium.abbe = torch.full_like(medium.iors, 1.5), []  # one index for all colours
+    def __init__(self, sought: Sought, through: Pixels, surroundings: Surroundings) -> None:
+        self._medium, self._surroundings = sought.medium, surroundings
+        medium = sought.medium(0.5 * (sought.lowest + sought.highest))
+        self._sampler = Snell(max_events=max(_MAX_EVENTS, 2 * len(medium.iors)))
         self._pixels = through[self._sampler(through.rays, medium).refracted]
         self.num_pixels = len(self._pixels)
         if not self.num_pixels:
@@ -206,9 +255,8 @@ class _Search:
         pixels = self._pixels.some(num_pixels)
         rays = pixels.rays
         errors, everywhere = [], torch.ones(len(pixels), dtype=torch.bool)
-        for number, iors in enumerate(candidates):
-            self._medium.iors = torch.from_numpy(iors).to(self._medium.iors)
-            trace = self._sampler.trace(rays, self._medium)
+        for number, values in enumerate(candidates):
+            trace = self._sampler.trace(rays, self._medium(values))
             radiance, known = self._surroundings.radiance(trace.path.exits())
             known &= ~trace.exceeded
             everywhere &= known

@@ -24,8 +24,8 @@ _MAX_PIXELS = 256
 
 def report_overlaps(
     split: str, views: Views, mesh: TriangleMesh, silhouettes: Silhouettes, wrong_masks: int | None, folder: Path
-) -> None:
-    """Print and write how well a surface's silhouettes are the masks.
+) -> Float[np.ndarray, "V"]:
+    """Print, write and return how well a surface's silhouettes are the masks.
 
     Args:
         split: of the views.
@@ -42,10 +42,18 @@ def report_overlaps(
     worst = int(overlaps.argmin())
     print(f"  {overlaps.mean():.4f}  mean; {overlaps[worst]:.4f} lowest, {views.names[worst]}")
     _warn_of_bad(overlaps, views.names, silhouettes, wrong_masks)
-    save_picture(folder / SHEET, contact_sheet(views, mesh, overlaps, _MAX_PIXELS))
+    draw_overlays(views, mesh, overlaps, [], folder)
     each = dict(zip(views.names, (round(float(x), 4) for x in overlaps), strict=True))
     figures = {"split": split, "mean": round(float(overlaps.mean()), 4), "views": each}
     write_atomically(folder / REPORT, json.dumps(figures, indent=1) + "\n")
+    return overlaps
+
+
+def draw_overlays(
+    views: Views, mesh: TriangleMesh, overlaps: Float[np.ndarray, "V"], inside: list[TriangleMesh], folder: Path
+) -> None:
+    """Write the sheet of pictures, with the outlines of what is inside, see `contact_sheet`."""
+    save_picture(folder / SHEET, contact_sheet(views, mesh, overlaps, _MAX_PIXELS, inside))
 
 
 def _warn_of_bad(

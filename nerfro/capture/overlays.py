@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor
 
@@ -17,23 +19,44 @@ _MAX_VIEWS, _COLUMNS = 48, 8
 _WIDTH = 192  # pixels across each picture
 _NAME_LENGTH = 16  # characters, the last ones, that fit below a picture
 _BOTH, _MASK_ONLY, _SURFACE_ONLY = (60, 190, 90), (235, 60, 45), (40, 110, 240)
+_OUTLINES = {"yellow": (255, 215, 0), "white": (255, 255, 255)}  # of bodies inside, the first and the rest
 
 
-def contact_sheet(views: Views, mesh: TriangleMesh, overlaps: Float[np.ndarray, "V"], max_pixels: int) -> Image.Image:
+def contact_sheet(
+    views: Views,
+    mesh: TriangleMesh,
+    overlaps: Float[np.ndarray, "V"],
+    max_pixels: int,
+    inside: Sequence[TriangleMesh] = (),
+) -> Image.Image:
     """The views that overlap least, the worst first: both green, the mask alone red, the surface alone blue.
 
-    Images of more than `max_pixels` a side are shown in every second, third, ... pixel.
+    Bodies inside are drawn as outlines. Images of more than `max_pixels` a side are shown in every second, third, ...
+    pixel.
     """
     assert views.masks is not None
     stride = pixel_stride(views.cameras, max_pixels)
     chosen = np.argsort(overlaps, kind="stable")[:_MAX_VIEWS].tolist()
     pictures, captions = [], []
-    for view, ours in zip(chosen, mesh_silhouettes(mesh, views.cameras.select(chosen), stride), strict=True):
+    cameras = views.cameras.select(chosen)
+    outlines = [_outlines(mesh_silhouettes(body, cameras, stride)) for body in inside]
+    for place, (view, ours) in enumerate(zip(chosen, mesh_silhouettes(mesh, cameras, stride), strict=True)):
         theirs = views.masks[view][::stride, ::stride] > 0.5
-        pictures.append(_tinted(views.images[view][::stride, ::stride], ours, theirs))
+        picture = _tinted(views.images[view][::stride, ::stride], ours, theirs)
+        for body, outline in enumerate(outlines):
+            picture[outline[place]] = torch.tensor(list(_OUTLINES.values())[min(body, 1)]) / 255
+        pictures.append(picture)
         captions.append(f"{overlaps[view]:.3f}  {views.names[view][-_NAME_LENGTH:]}")
-    legend = f"green: both, red: mask only, blue: surface only; worst {len(chosen)} of {len(views)} views"
+    colours = [f"{colour}: body {body + 2}" for body, colour in zip(range(len(inside)), _OUTLINES, strict=False)]
+    legend = ", ".join(["green: both, red: mask only, blue: surface only", *colours])
+    legend += f"; worst {len(chosen)} of {len(views)} views"
     return sheet(pictures, captions, _WIDTH, _COLUMNS, legend)
+
+
+def _outlines(silhouettes: Bool[Tensor, "V h w"]) -> Bool[Tensor, "V h w"]:
+    """The pixels of silhouettes that are next to others."""
+    others = torch.nn.functional.max_pool2d((~silhouettes[:, None]).float(), 3, 1, 1)[:, 0]
+    return silhouettes & (others > 0)
 
 
 def _tinted(image: Tensor, ours: Tensor, theirs: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typing
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
@@ -13,7 +13,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 
 from nerfro.allowed import Count, Natural, NotNegative, Range, corners_of_box
 from nerfro.cameras import Cameras
-from nerfro.capture.index_report import CURVE, INDEX
+from nerfro.capture.index_report import CURVE, INDEX, LENGTHS, LENGTHS_CURVE
 from nerfro.capture.overlaps import REPORT, SHEET
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing
@@ -34,6 +34,7 @@ class PreprocessConfig:
     Attributes:
         data: the views (options of the group `data`).
         medium: what becomes of the surface (options of the group `medium`).
+        search: lengths of a vessel, one or two, that are found from the photographs: wall, foot, level.
         split: whose masks are used.
         mesh: a surface that was made elsewhere; it is checked against the masks, and no hull is made.
         room: whether the surroundings are near, for the search of the index; by default found out.
@@ -48,6 +49,7 @@ class PreprocessConfig:
 
     data: Any = MISSING
     medium: Any = MISSING
+    search: list[str] = field(default_factory=list)
     split: str = "train"
     mesh: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     room: Optional[bool] = None  # noqa: UP045
@@ -66,6 +68,11 @@ def is_given(option: str, overrides: list[str]) -> bool:
     return option in {text.lstrip("+").split("=")[0] for text in overrides}
 
 
+def searches_index(config: DictConfig, overrides: list[str]) -> bool:
+    """Whether the index is to be found: not that of a vessel, whose materials are known."""
+    return not is_given("medium.ior", overrides) and "wall" not in config.medium
+
+
 def claim(config: DictConfig, overrides: list[str]) -> Path:
     """The folder to write to; refused if it is the package's, or a file is there."""
     if (config.box_min is None) != (config.box_max is None):
@@ -76,7 +83,8 @@ def claim(config: DictConfig, overrides: list[str]) -> Path:
         raise NerfroError(f"data.root={config.data.root} ships with nerfro and is not written to; add out=FOLDER")
     folder = resolve_path(config.data.root) if config.out is None else user_path(config.out)
     names = [SHEET, REPORT] if config.mesh is not None else [MESH, SHEET, REPORT]
-    names += [] if is_given("medium.ior", overrides) else [INDEX, CURVE]
+    names += [LENGTHS, LENGTHS_CURVE] if config.search else []
+    names += [INDEX, CURVE] if searches_index(config, overrides) else []
     refuse_existing([folder / name for name in names], config.overwrite)
     return folder
 
@@ -105,11 +113,11 @@ def surface_settings(
     return settings
 
 
-def build_medium(config: DictConfig, settings: dict[str, object], location: str, iors: Sequence[float]) -> Medium:
-    """The medium with the surface in it, so that a bad one is refused now and not in training."""
+def build_medium(config: DictConfig, settings: dict[str, object], location: str, numbers: dict[str, object]) -> Medium:
+    """The medium with the surface and some numbers in it, so that a bad one is refused now and not in training."""
     medium = typing.cast(dict[str, object], OmegaConf.to_container(config.medium, resolve=True))
     medium |= {name.removeprefix("medium."): value for name, value in settings.items() if name.startswith("medium.")}
-    return typing.cast(Medium, build(medium | {"mesh": location} | index_settings(iors)))
+    return typing.cast(Medium, build(medium | {"mesh": location} | numbers))
 
 
 def index_settings(iors: Sequence[float]) -> dict[str, object]:

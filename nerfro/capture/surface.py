@@ -14,6 +14,8 @@ from nerfro.cli import warn
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError, first_of
 from nerfro.geometry.mesh import TriangleMesh
+from nerfro.media.base import Medium
+from nerfro.media.sdf_grid import SdfGrid
 
 _FEWEST_VIEWS, _FEW_VIEWS = 3, 12
 _COARSE_VOXELS = 64
@@ -88,6 +90,16 @@ def make_mesh(
         _warn_of_open_hull(silhouettes, box)
     print(f"{len(mesh.faces)} triangles, voxels of {spacing:.4g}")
     return mesh
+
+
+def surfaces_inside(medium: Medium) -> list[TriangleMesh]:
+    """The surfaces of the bodies inside the outer one, as far as they are there; none of a medium without a grid."""
+    if not isinstance(medium, SdfGrid):
+        return []
+    low, high = medium.box.double().cpu().numpy()
+    spacing = (high - low) / (np.array(medium.distances.shape[1:]) - 1)
+    of_bodies = medium.distances.cummax(0).values[1:].cpu().numpy()
+    return [extract_surface(distances, low, spacing) for distances in of_bodies if (distances < 0).any()]
 
 
 def _object_box(silhouettes: Silhouettes, wrong_masks: int) -> Float[np.ndarray, "2 3"]:

@@ -186,13 +186,14 @@ def remove_strays(distances: Float[np.ndarray, "X Y Z"], keep: int | None = None
 
 
 def extract_surface(
-    distances: Float[np.ndarray, "X Y Z"], corner: Float[np.ndarray, "3"], spacing: float
+    distances: Float[np.ndarray, "X Y Z"], corner: Float[np.ndarray, "3"], spacing: float | Float[np.ndarray, "3"]
 ) -> TriangleMesh:
     """The zero level as a closed mesh in world units; where it meets the grid's border it is closed there."""
     if not (distances < 0).any():
         raise NerfroError("the visual hull is empty: no point is inside all masks")
-    padded = np.pad(distances, 1, constant_values=0.5 * spacing)
-    vertices, faces, _, _ = marching_cubes(padded, 0.0, spacing=(spacing,) * 3, gradient_direction="descent")
+    padded = np.pad(distances, 1, constant_values=0.5 * np.max(spacing))
+    sides = tuple(np.broadcast_to(spacing, 3))
+    vertices, faces, _, _ = marching_cubes(padded, 0.0, spacing=sides, gradient_direction="descent")
     return merge_vertices(vertices.astype(np.float64) + corner - spacing, faces.astype(np.int64))
 
 

@@ -19,7 +19,12 @@ _LEAST_DEPTH = 0.01  # of a vertex in the mesh, voxels
 
 
 def signed_distance_grid(
-    mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], resolution: int, band: float, crease_degrees: float = 30.0
+    mesh: TriangleMesh,
+    box: Float[np.ndarray, "2 3"],
+    resolution: int,
+    band: float,
+    crease_degrees: float = 30.0,
+    lid: Bool[np.ndarray, "F"] | None = None,
 ) -> Float[np.ndarray, "X Y Z"]:
     """Signed distance, world units, at the vertices (`resolution` a side) of a grid; negative inside.
 
@@ -33,27 +38,44 @@ def signed_distance_grid(
     sagitta). So the facets of a finely tessellated curved surface do not show. Farther away the value is a lower bound
     of the distance, at most sqrt(3) voxels short. Edges with angles above `crease_degrees` stay sharp. What is inside a
     mesh that is not closed is decided as in `occupancy_fraction`.
+
+    Distances to triangles of a `lid` do not count, and what is nearer to it than to the others is inside: the inside
+    goes on through it for ever.
     """
     origin = np.asarray(box[0], np.float64)
     spacing = (np.asarray(box[1], np.float64) - origin) / (resolution - 1)
     reach = band * float(spacing.max())
     triangles = np.ascontiguousarray(mesh.triangles)
-    order, starts = triangles_by_plane(triangles, origin[0], spacing[0], resolution, reach)
     normals = corner_normals(mesh, crease_degrees)
+    shown = np.ones(len(triangles), bool) if lid is None else ~lid
+    distance, height = _distance_to(triangles[shown], normals[shown], origin, spacing, resolution, reach)
+    inside = occupancy_fraction(mesh, box, resolution, subsamples=1) > 0.5
+    # In a flat mesh those count as inside that happen to lie on it.
+    require_inside(bool((inside & (distance > _LEAST_DEPTH * spacing.min())).any()))
+    if lid is not None:
+        inside |= _distance_to(triangles[lid], normals[lid], origin, spacing, resolution, reach)[0] < distance
+    return (np.where(inside, -distance, distance) - height).astype(np.float32)
+
+
+def _distance_to(
+    triangles: Float[np.ndarray, "F 3 3"],
+    normals: Float[np.ndarray, "F 3 3"],
+    origin: Float[np.ndarray, "3"],
+    spacing: Float[np.ndarray, "3"],
+    resolution: int,
+    reach: float,
+) -> tuple[Float[np.ndarray, "X Y Z"], Float[np.ndarray, "X Y Z"]]:
+    """Distance to the nearest triangle, a lower bound beyond `reach`, and the smooth surface's height over it."""
+    order, starts = triangles_by_plane(triangles, origin[0], spacing[0], resolution, reach)
     distance, height = (np.full((resolution,) * 3, value, np.float32) for value in (np.inf, 0.0))
     for first in told("distances", range(0, resolution, PLANES)):
         planes = slice(first, first + PLANES)
         found = distance[planes], height[planes]
         _narrow_band(triangles, normals, order, starts[first:], origin, spacing, first, reach, *found)
-    near = distance <= reach
     # A point's nearest surface point has a near voxel within half a voxel's diagonal, wherever that is in the band.
     half_diagonal = 0.5 * float(np.linalg.norm(spacing))
     far = distance_to_set(distance <= half_diagonal, spacing) - half_diagonal
-    inside = occupancy_fraction(mesh, box, resolution, subsamples=1) > 0.5
-    # In a flat mesh those count as inside that happen to lie on it.
-    require_inside(bool((inside & (distance > _LEAST_DEPTH * spacing.min())).any()))
-    sign = np.where(inside, -1.0, 1.0)
-    return np.where(near, sign * distance - height, sign * np.maximum(far, reach)).astype(np.float32)
+    return np.where(distance <= reach, distance, np.maximum(far, reach)), height
 
 
 def distance_to_set(members: Bool[np.ndarray, "X Y Z"], spacing: Float[np.ndarray, "3"]) -> Float[np.ndarray, "X Y Z"]:
@@ -129,13 +151,19 @@ def _narrow_band(triangles, normals, order, starts, origin, spacing, first, reac
             norm = math.sqrt(nx * nx + ny * ny + nz * nz)
             if norm == 0.0:
                 continue
+            cx, cy, cz = t[:, 0].mean(), t[:, 1].mean(), t[:, 2].mean()
+            radius = math.sqrt(((t[:, 0] - cx) ** 2 + (t[:, 1] - cy) ** 2 + (t[:, 2] - cz) ** 2).max())
             for j in range(first_j, last_j + 1):
                 y = origin[1] + j * spacing[1]
                 for k in range(first_k, last_k + 1):
                     z = origin[2] + k * spacing[2]
-                    # The distance to the triangle's plane rules most of the box out.
+                    # The distances to the triangle's middle and to its plane rule most of the box out.
+                    nearest = min(reach, distance[i, j, k])
+                    to_middle = (x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2
+                    if to_middle > (nearest + radius) ** 2:
+                        continue
                     to_plane = (nx * (x - t[0, 0]) + ny * (y - t[0, 1]) + nz * (z - t[0, 2])) / norm
-                    if abs(to_plane) > min(reach, distance[i, j, k]):
+                    if abs(to_plane) > nearest:
                         continue
                     b0, b1, b2 = _closest_barycentric(t, x, y, z)
                     px = b0 * t[0, 0] + b1 * t[1, 0] + b2 * t[2, 0]

@@ -26,6 +26,7 @@ class MediumGrid(NamedTuple):
     values: Float[np.ndarray, "..."]
     clearance: Float[np.ndarray, "x y z"]  # of blocks of cells
     iors: Float[np.ndarray, "K"] | None  # index of each body; None where the values are the index itself
+    nested: bool  # whether a body is only where all before it are too (`media.solid`)
     shell: float  # half width of the bodies' smooth interface, world units
     # Corners of the grid, world units.
     low: Float[np.ndarray, "3"]
@@ -111,24 +112,34 @@ def solid_clearance(coefficients, shell, low, inverse_spacing, x, y, z):
 
 
 @compiled
-def solid_index(coefficients, iors, shell, low, inverse_spacing, x, y, z):
-    """Index, its gradient and the clearance of nested bodies with smooth shells (`media.solid`)."""
+def solid_index(coefficients, iors, nested, shell, low, inverse_spacing, x, y, z):
+    """Index, its gradient and the clearance of bodies with smooth shells (`media.solid`)."""
     n, gx, gy, gz, clearance = 1.0, 0.0, 0.0, 0.0, math.inf
+    within, rx, ry, rz = 1.0, 0.0, 0.0, 0.0
     for body in range(coefficients.shape[0]):
         phi, px, py, pz = spline_value_gradient(coefficients[body], low, inverse_spacing, x, y, z)
         clearance = min(clearance, SAFE_SHARE * abs(phi) - shell)
         t = 0.5 - 0.5 * phi / shell
         if t <= 0.0:
+            if nested:
+                break
             continue
-        if t >= 1.0:
+        if t >= 1.0 and within == 1.0:
             n, gx, gy, gz = iors[body], 0.0, 0.0, 0.0
             continue
+        t = min(t, 1.0)
         step = t * t * (3.0 - 2.0 * t)
-        slope = (iors[body] - n) * 6.0 * t * (1.0 - t) * (-0.5 / shell)
-        gx = gx * (1.0 - step) + slope * px
-        gy = gy * (1.0 - step) + slope * py
-        gz = gz * (1.0 - step) + slope * pz
-        n += (iors[body] - n) * step
+        slope = 6.0 * t * (1.0 - t) * (-0.5 / shell)
+        px, py, pz = slope * px, slope * py, slope * pz
+        if nested:
+            px, py, pz = rx * step + within * px, ry * step + within * py, rz * step + within * pz
+            step *= within
+            within, rx, ry, rz = step, px, py, pz
+        change = iors[body] - n
+        gx = gx * (1.0 - step) + change * px
+        gy = gy * (1.0 - step) + change * py
+        gz = gz * (1.0 - step) + change * pz
+        n += change * step
     return n, gx, gy, gz, max(clearance, 0.0)
 
 

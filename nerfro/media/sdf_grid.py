@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool3d
 
@@ -27,7 +27,7 @@ from nerfro.paths import resolve_path
 from nerfro.registry import register
 
 # Voxels around the surface in which the distance is exact: the spline's support and the step that finds the surface.
-_BAND = 3.0
+BAND = 3.0
 # Cells a side of the blocks in which rays look up how far they may jump before they look up distances themselves.
 BLOCK = 4
 # Part of the cache's key: raise it when the same mesh and settings give other distances than before.
@@ -99,13 +99,13 @@ class SdfGrid(Solid):
         super().__init__([ior, *inner_iors], shell, absorption, learn_absorption, abbe, learn_ior)
         self.crease_degrees = crease_degrees
         self.meshes = [load_mesh(resolve_path(path), accept_open_mesh) for path in (mesh, *inner_meshes)]
-        band = _BAND + smoothing_size
+        band = BAND + smoothing_size
         distances = []
         for body in self.meshes:
             check_margin(body, box, resolution, 2)
             if body.is_closed:
                 require_separate(body)
-            distances.append(_cached_distance(body, box, resolution, band, crease_degrees, cache))
+            distances.append(cached_distance(body, box, resolution, band, crease_degrees, cache))
         values = torch.from_numpy(np.stack(distances))
         if smoothing_size:
             # 2 G - G * G: the curvature's share of the blur cancels.
@@ -224,19 +224,19 @@ class SdfGrid(Solid):
         return torch.stack([phi for phi, _ in splines], -1), torch.stack([gradient for _, gradient in splines], -2)
 
 
-def _cached_distance(
+def cached_distance(
     mesh: TriangleMesh,
     box: Float[np.ndarray, "2 3"],
     resolution: int,
     band: float,
     crease_degrees: float,
     cache: bool,
+    lid: Bool[np.ndarray, "F"] | None = None,
 ) -> Float[np.ndarray, "X Y Z"]:
+    """Signed distance to a mesh at a grid's vertices, see `signed_distance_grid`, from the cache folder if it may."""
     normals = "none" if mesh.normals is None else mesh.normals
-    key = "distance_" + content_hash(
-        _VERSION, mesh.vertices, mesh.faces, normals, box, resolution, band, crease_degrees
-    )
-    arrays = cached_arrays(
-        key, lambda: {"distance": signed_distance_grid(mesh, box, resolution, band, crease_degrees)}, cache
-    )
+    settings = box, resolution, band, crease_degrees
+    left_out = () if lid is None else (lid,)
+    key = "distance_" + content_hash(_VERSION, mesh.vertices, mesh.faces, normals, *settings, *left_out)
+    arrays = cached_arrays(key, lambda: {"distance": signed_distance_grid(mesh, *settings, *left_out)}, cache)
     return arrays["distance"]

@@ -32,7 +32,7 @@ class Solid(Medium):
 
     For the Eikonal equation the surface is a shell of half width w around the zero level, in which the index rises as
     a cubic step of the signed distance phi: S = t^2 (3 - 2 t), t = (1 - phi / w) / 2. Body after body,
-    n <- n + (ior - n) S.
+    n <- n + (ior - n) S; in a `nested` medium with the product of the steps so far in place of S.
 
     Args:
         iors: refractive index of each body.
@@ -44,6 +44,9 @@ class Solid(Medium):
             those of the d line, 587.6 nm.
     """
 
+    # Whether a body is only where all before it are too, so that it may reach beyond them and touch without a gap; one
+    # of index 1 is air, as outside. Otherwise a point belongs to the last body that holds it.
+    nested = False
     iors: Float[Tensor, "K"]  # refractive index of each body; a parameter where it is learned
     _absorption: Float[Tensor, "K 3"] | None  # or, where it is learned, what softplus makes it of
 
@@ -115,7 +118,7 @@ class Solid(Medium):
     def learned(self) -> dict[str, float]:
         if not isinstance(self._absorption, nn.Parameter):
             return {}
-        values = softplus(self._absorption.detach())
+        values = self.absorption.detach()  # type: ignore[union-attr]
         names = [
             f"absorption_{body + 1}_{colour}" for body in range(len(values)) for colour in ("red", "green", "blue")
         ]
@@ -125,29 +128,41 @@ class Solid(Medium):
     def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
         """Signed distance to each body's surface, negative inside, and its gradient; a lower bound far away will do."""
 
-    @staticmethod
-    def innermost(inside: Bool[Tensor, "*batch K"]) -> Int[Tensor, "*batch"]:
-        """Number of the last body that a point is in, from 1 on; 0 in none."""
-        numbers = torch.arange(1, inside.shape[-1] + 1, device=inside.device)
-        return torch.where(inside, numbers, 0).amax(-1)
+    def regions(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
+        """As `signed_distances`, of what of each body is there: in a `nested` medium what lies in all before it."""
+        phi, gradients = self.signed_distances(positions)
+        if not self.nested:
+            return phi, gradients
+        phi, body = phi.cummax(-1)
+        return phi, gradients.gather(-2, body[..., None].expand_as(gradients))
+
+    def innermost(self, inside: Bool[Tensor, "*batch K"]) -> Int[Tensor, "*batch"]:
+        """Number of the body that a point belongs to, from 1 on, by whether it is within each surface; 0 in none."""
+        numbers = torch.arange(inside.shape[-1] + 1, device=inside.device)
+        if self.nested:
+            # Air in the open is air: a ray goes from the one into the other without an event.
+            numbers[1:] *= self.iors != 1
+            return numbers[inside.long().cumprod(-1).sum(-1)]
+        return torch.where(inside, numbers[1:], 0).amax(-1)
 
     def index_inside(self, inside: Bool[Tensor, "*batch K"]) -> Float[Tensor, "*batch"]:
-        """Index of the last body that a point is in, 1 in none."""
-        n = torch.ones(inside.shape[:-1], dtype=self.box.dtype, device=inside.device)
-        for body, ior in enumerate(self.iors.unbind()):
-            n = torch.where(inside[..., body], ior, n)
-        return n
+        """Index of the body that a point belongs to, 1 in none."""
+        return torch.cat([self.iors.new_ones(1), self.iors]).to(self.box)[self.innermost(inside)]
 
     def forward(self, positions: Vectors) -> tuple[Scalars, Vectors]:
         """Index of the smooth shells and its exact gradient."""
         phi, normals = self.signed_distances(positions)
         in_box = ((positions >= self.box[0]) & (positions <= self.box[1])).all(-1)
         n, gradient = torch.ones_like(phi[..., 0]), torch.zeros_like(positions)
+        within, rise = torch.ones_like(n)[..., None], torch.zeros_like(positions)  # product of steps, and its gradient
         for body, ior in enumerate(self.iors.unbind()):
             t = (0.5 - 0.5 * phi[..., body] / self.shell).clamp(0, 1)
             step = (t * t * (3 - 2 * t))[..., None]
-            slope = (ior - n) * 6 * t * (1 - t) * (-0.5 / self.shell)
-            gradient = gradient * (1 - step) + slope[..., None] * normals[..., body, :]
+            slope = (6 * t * (1 - t) * (-0.5 / self.shell))[..., None] * normals[..., body, :]
+            if self.nested:
+                step, slope = within * step, rise * step + within * slope
+                within, rise = step, slope
+            gradient = gradient * (1 - step) + (ior - n)[..., None] * slope
             n = n + (ior - n) * step[..., 0]
         return torch.where(in_box, n, 1.0), torch.where(in_box[..., None], gradient, 0.0)
 

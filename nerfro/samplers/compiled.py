@@ -148,6 +148,7 @@ def _for_kernels(medium: VoxelGrid | SdfGrid) -> MediumGrid:
             values,
             clearance,
             medium.iors.detach().double().numpy(),
+            medium.nested,
             medium.shell,
             low,
             high,
@@ -157,7 +158,7 @@ def _for_kernels(medium: VoxelGrid | SdfGrid) -> MediumGrid:
         )
     inverse_spacing = (np.array(medium.table.shape[:3]) - 1) / (high - low)
     values, clearance = medium.table.detach().numpy(), medium.clearance_grid.numpy()
-    return MediumGrid(values, clearance, None, 0.0, low, high, inverse_spacing, inverse_spacing, None)
+    return MediumGrid(values, clearance, None, False, 0.0, low, high, inverse_spacing, inverse_spacing, None)
 
 
 def _path(

@@ -179,12 +179,12 @@ def _free_length(values, clearance, iors, shell, low, inverse_spacing, inverse_b
 
 
 @compiled
-def _look_up(values, clearance, iors, shell, low, inverse_spacing, inverse_block, x, y, z):
+def _look_up(values, clearance, iors, nested, shell, low, inverse_spacing, inverse_block, x, y, z):
     """Index, gradient and the distance within which the index does not vary."""
     if iors is None:
         n, gx, gy, gz = voxel_index(values, low, inverse_spacing, x, y, z)
         return n, gx, gy, gz, float(block_clearance(clearance, low, inverse_block, x, y, z))
-    return solid_index(values, iors, shell, low, inverse_spacing, x, y, z)
+    return solid_index(values, iors, nested, shell, low, inverse_spacing, x, y, z)
 
 
 @compiled
@@ -201,7 +201,7 @@ def _step_length(iors, step, dx, dy, dz, gx, gy, gz):
 @compiled
 def _march_ray(medium, origin, direction, near, far, step, tolerance, max_steps, row):
     """One ray's vertices into its row: their number, whether the index varied, and whether it took `max_steps`."""
-    values, clearance, iors, shell, low, high, inverse_spacing, inverse_block, _ = medium
+    values, clearance, iors, nested, shell, low, high, inverse_spacing, inverse_block, _ = medium
     positions, directions, lengths = row
     skip = REACHED * step
     dx, dy, dz = float(direction[0]), float(direction[1]), float(direction[2])
@@ -222,7 +222,7 @@ def _march_ray(medium, origin, direction, near, far, step, tolerance, max_steps,
                 free = _free_length(values, clearance, iors, shell, low, inverse_spacing, inverse_block, x, y, z, skip)
                 if free <= skip:
                     n, gx, gy, gz, free = _look_up(
-                        values, clearance, iors, shell, low, inverse_spacing, inverse_block, x, y, z
+                        values, clearance, iors, nested, shell, low, inverse_spacing, inverse_block, x, y, z
                     )
                     vx, vy, vz = n * dx, n * dy, n * dz
                     known = True
@@ -239,7 +239,7 @@ def _march_ray(medium, origin, direction, near, far, step, tolerance, max_steps,
                 s += h * math.sqrt(px * px + py * py + pz * pz)
                 refracted = refracted or varied
                 n, gx, gy, gz, free = _look_up(
-                    values, clearance, iors, shell, low, inverse_spacing, inverse_block, x, y, z
+                    values, clearance, iors, nested, shell, low, inverse_spacing, inverse_block, x, y, z
                 )
                 vx, vy, vz = _kick(h, px, py, pz, vx, vy, vz, n, gx, gy, gz)
                 # A straight step leaves the direction as it is, to the last bit.

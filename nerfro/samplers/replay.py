@@ -110,6 +110,7 @@ def replay(path: Path, rays: Rays, medium: Medium, meet: Meet, branching: Branch
     rows, column = torch.arange(num_paths, device=s.device), torch.zeros_like(path.ray)
     vertices: list[Vertices] = [(rows, column, x, d, s)]
     happens, indices = events(path), indices_of(medium, path.s)
+    nested = isinstance(medium, Solid) and medium.nested
     weight = torch.ones_like(s)
     for i in range(1, num_vertices - 1):
         rows = happens[:, i].nonzero().squeeze(1)
@@ -121,7 +122,8 @@ def replay(path: Path, rays: Rays, medium: Medium, meet: Meet, branching: Branch
         reflected = before == after
         normal = turning_normals(old_d, path.directions[rows, i], indices[before], indices[after]).detach()
         length = path.s[rows, i] - path.s[rows, i - 1]
-        length, normal = meet(old_x, old_d, length, torch.where(reflected, 0, torch.maximum(before, after)), normal)
+        body = torch.where(reflected | nested, 0, torch.maximum(before, after))
+        length, normal = meet(old_x, old_d, length, body, normal)
         turned, _ = refract(old_d, normal, indices[before], indices[after], reflected)
         if i <= branching.num_events and isinstance(medium, Solid):
             with torch.no_grad():
@@ -179,7 +181,7 @@ def assembled(
 def meet_solid(medium: Solid) -> Meet:
     """Meet the zero levels of signed distances: t <- t - phi(x + t d) / (grad phi . d), the divisor without gradient.
 
-    The body of a reflection is the one whose surface is nearest.
+    The body of a reflection, and any of a nested medium, is the one whose surface is nearest.
     """
 
     def meet(x: Tensor, d: Tensor, length: Tensor, body: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:

@@ -60,20 +60,24 @@ def _root(coefficients, low, inverse_spacing, x, y, z, dx, dy, dz, start, end, a
 
 
 @compiled
-def _innermost(inside):
-    """Number of the last body that a point is in, from 1 on; 0 in none."""
+def _innermost(inside, solids):
+    """Number of the body that a point belongs to, from 1 on; 0 in none (`media.solid`)."""
     number = 0
     for body in range(len(inside)):
         if inside[body]:
             number = body + 1
+        elif solids.nested:
+            break
+    if solids.nested and number > 0 and solids.iors[number - 1] == 1.0:
+        return 0
     return number
 
 
 @compiled
-def _index(inside, iors):
-    """Index of the last body that a point is in, 1 in none."""
-    number = _innermost(inside)
-    return iors[number - 1] if number > 0 else 1.0
+def _index(inside, solids):
+    """Index of the body that a point belongs to, 1 in none."""
+    number = _innermost(inside, solids)
+    return solids.iors[number - 1] if number > 0 else 1.0
 
 
 @compiled
@@ -197,7 +201,7 @@ def _trace_ray(
     for body in range(len(inside)):
         value = spline_value(solids.values[body], solids.low, solids.inverse_spacing, x, y, z)
         inside[body] = value < 0.0
-    bodies[0, 0] = _innermost(inside)
+    bodies[0, 0] = _innermost(inside, solids)
     num_events, weight, num_waiting, polyline, most = 0, 1.0, 0, 0, 0
     while True:
         row = min(polyline, room - 1)  # rows beyond the room are counted, not kept
@@ -206,9 +210,9 @@ def _trace_ray(
             hit, before, after = _surface_ahead(solids, inside, known, x, y, z, dx, dy, dz, min_step)
             if hit < 0:
                 break
-            n_before = _index(inside, solids.iors)
+            n_before = _index(inside, solids)
             inside[hit] = not inside[hit]
-            n_after = _index(inside, solids.iors)
+            n_after = _index(inside, solids)
             if n_before == n_after:
                 x, y, z, s = x + after * dx, y + after * dy, z + after * dz, s + after
                 continue
@@ -243,7 +247,7 @@ def _trace_ray(
             x, y, z, s = x + after * dx, y + after * dy, z + after * dz, s + after
             dx, dy, dz = tx, ty, tz
             if count < lengths.shape[1]:
-                bodies[row, count] = _innermost(inside)
+                bodies[row, count] = _innermost(inside, solids)
             count = put_vertex(positions[row], directions[row], lengths[row], count, x, y, z, dx, dy, dz, s)
         count = put_end(
             positions[row], directions[row], lengths[row], count, solids.low, solids.high, num_events > 0,
@@ -264,7 +268,7 @@ def _trace_ray(
             positions[row, i], directions[row, i] = positions[before_row, i], directions[before_row, i]
             lengths[row, i], bodies[row, i] = lengths[before_row, i], bodies[before_row, i]
         if count < lengths.shape[1]:
-            bodies[row, count] = _innermost(inside)
+            bodies[row, count] = _innermost(inside, solids)
         count = put_vertex(positions[row], directions[row], lengths[row], count, x, y, z, dx, dy, dz, s)
 
 

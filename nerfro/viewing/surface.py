@@ -49,9 +49,9 @@ def _zero_level(medium: Solid, body: int, values: Float[Tensor, "X Y Z"]) -> Tri
     """Marching cubes, and a step of Newton's method for each vertex: the grid's own interpolation is not linear."""
     mesh = level_set(-values, medium.box.cpu(), 0.0)
     vertices = torch.from_numpy(mesh.vertices).to(medium.box)
-    phi, gradient = (found[:, body] for found in medium.signed_distances(vertices))
+    phi, gradient = (found[:, body] for found in medium.regions(vertices))
     vertices = vertices - phi[:, None] * gradient / gradient.square().sum(-1, keepdim=True).clamp(min=1e-6)
-    normals = torch.nn.functional.normalize(medium.signed_distances(vertices)[1][:, body], dim=-1).cpu().numpy()
+    normals = torch.nn.functional.normalize(medium.regions(vertices)[1][:, body], dim=-1).cpu().numpy()
     return TriangleMesh(vertices.double().cpu().numpy(), mesh.faces, normals[mesh.faces])
 
 
@@ -59,7 +59,7 @@ def _distances(medium: Solid) -> Float[Tensor, "K X Y Z"]:
     counts = medium.coefficients.shape[1:] if isinstance(medium, SdfGrid) else [_RESOLUTION] * 3
     box = medium.box.cpu()
     axes = [torch.linspace(float(low), float(high), n) for low, high, n in zip(*box, counts, strict=True)]
-    slabs = [medium.signed_distances(torch.cartesian_prod(x[None], *axes[1:]).to(medium.box))[0].cpu() for x in axes[0]]
+    slabs = [medium.regions(torch.cartesian_prod(x[None], *axes[1:]).to(medium.box))[0].cpu() for x in axes[0]]
     return torch.stack(slabs).view(*counts, -1).movedim(-1, 0)
 
 

@@ -12,25 +12,24 @@ import pytest
 import torch
 
 import nerfro.preprocess
-from nerfro.capture.index_search import IndexEstimate, find_index
+from nerfro.capture.index_search import Estimate, find_numbers, indices_of, lengths_of
 from nerfro.capture.surroundings import divide_pixels, learn_surroundings
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
-from nerfro.media.sdf_grid import SdfGrid
-from tests.ball_photographs import NUM_VIEWS, SIZE, cameras, mesh, photographs, save, solid
+from nerfro.media.vessel import SdfVessel
+from tests.ball_photographs import NUM_VIEWS, SIZE, cameras, mesh, photographs, photographs_of, save, solid
 
 
-def search(views: Views, num_bodies: int = 1) -> tuple[IndexEstimate, SdfGrid]:
+def search(views: Views, num_bodies: int = 1) -> Estimate:
     beside, through = divide_pixels(views, mesh())
-    medium = solid([1.5] * num_bodies)
-    return find_index(medium, through, learn_surroundings(beside, mesh(), False)), medium
+    sought = indices_of(solid([1.5] * num_bodies))
+    return find_numbers(sought, through, learn_surroundings(beside, mesh(), False))
 
 
 @pytest.mark.parametrize("ior", [1.2, 1.5])
 def test_index_of_a_ball(ior: float) -> None:
-    found, medium = search(photographs([ior]))
-    assert found.iors[0] == pytest.approx(ior, rel=0.005)
-    assert medium.iors.item() == pytest.approx(found.iors[0])
+    found = search(photographs([ior]))
+    assert found.values[0] == pytest.approx(ior, rel=0.005)
     assert 0 < found.standard_errors[0] < 0.01 * ior
     assert found.curvature[0] > 0
     assert not found.doubts
@@ -38,13 +37,38 @@ def test_index_of_a_ball(ior: float) -> None:
 
 @pytest.mark.slow
 def test_indices_of_water_in_a_wall_of_glass() -> None:
-    found, _ = search(photographs([1.5, 1.33]), 2)
-    assert found.iors.tolist() == pytest.approx([1.5, 1.33], rel=0.01)
+    found = search(photographs([1.5, 1.33]), 2)
+    assert found.values.tolist() == pytest.approx([1.5, 1.33], rel=0.01)
     assert not found.doubts
 
 
+def vessel(folder: Path, **lengths: float) -> SdfVessel:
+    """A closed one with a wall of 0.1, filled to 0.8 over its lowest point, but for the given lengths."""
+    mesh().save(folder / "mesh.ply")
+    known = {"wall": 0.1, "level": 0.8} | lengths
+    return SdfVessel(str(folder / "mesh.ply"), closed=True, resolution=41, box_min=[-0.9] * 3, box_max=[0.9] * 3,
+                     cache=False, **known)  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "true", "guess"), [("level", 0.8, 0.5), ("wall", 0.1, 0.14)])
+def test_lengths_of_a_vessel(tmp_path: Path, name: str, true: float, guess: float) -> None:
+    beside, through = divide_pixels(photographs_of(vessel(tmp_path)), mesh())
+    sought = lengths_of(vessel(tmp_path, **{name: guess}), [name])
+    found = find_numbers(sought, through, learn_surroundings(beside, mesh(), False))
+    assert found.values[0] == pytest.approx(true, abs=0.007)  # a hundredth of the radius
+    assert 0 < found.standard_errors[0] < 0.01
+    assert not found.doubts
+
+
+def test_lengths_that_a_vessel_lacks_are_named(tmp_path: Path) -> None:
+    mesh().save(tmp_path / "mesh.ply")
+    full = SdfVessel(str(tmp_path / "mesh.ply"), 0.1, resolution=24, cache=False)
+    with pytest.raises(NerfroError, match=r"search=\['level'\] is not looked for; .* give a first guess"):
+        lengths_of(full, ["level"])
+
+
 def test_an_opaque_ball_has_no_index() -> None:
-    found, _ = search(photographs([1.5], opaque=True))
+    found = search(photographs([1.5], opaque=True))
     assert found.doubts
 
 
@@ -85,3 +109,21 @@ def test_preprocess_writes_the_index_and_trains_with_it(
     assert 0 < found["standard_error"][0] < 0.02
     assert (out / "index.png").is_file()
     assert f"medium.ior={found['ior'][0]:.4f}".rstrip("0") in capsys.readouterr().out
+
+
+def test_preprocess_finds_a_level_shows_it_and_trains_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save(photographs_of(vessel(tmp_path)), tmp_path)
+    out = tmp_path / "out"
+    options = [f"data.root={tmp_path}", f"mesh={tmp_path / 'mesh.ply'}", f"out={out}", "data.near=0.5", "medium=vessel",
+               "medium.wall=0.1", "medium.level=0.6", "medium.closed=true", "search=[level]"]  # fmt: skip
+    monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", *options, "medium.cache=false", "medium.resolution=48"])
+    nerfro.preprocess.main()
+    found = json.loads((out / "lengths.json").read_text())
+    assert found["lengths"]["level"] == pytest.approx(0.8, abs=0.01)
+    assert (out / "lengths.png").is_file()
+    assert not (out / "index.json").exists()
+    command = capsys.readouterr().out.split("train on it: ")[1].split()
+    assert f"medium.level={found['lengths']['level']}" in command
+    assert {"medium=vessel", "medium.wall=0.1", "medium.closed=true"} <= set(command)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -24,6 +25,16 @@ def _nested_balls(size: int = 48) -> SdfGrid:
     return SdfGrid.from_distances(torch.stack([radius - 0.9, radius - 0.5]), BOX, [1.5, 1.33], 0.1)
 
 
+def _half_full_ball() -> SdfGrid:
+    """Bodies that are where all before them are: a wall of glass, air in it, water in its lower half."""
+    balls = _nested_balls()
+    axis = torch.linspace(-1.5, 1.5, balls.distances.shape[-1])
+    distances = torch.stack([*balls.distances, axis.expand(balls.distances.shape[1:])])
+    medium = SdfGrid.from_distances(distances, BOX, [1.5, 1.0, 1.33], 0.1)
+    medium.nested = True
+    return medium
+
+
 MEDIA = [
     Vacuum(),
     Luneburg(),
@@ -31,6 +42,7 @@ MEDIA = [
     RoundedBox(shell=0.05, edge_radius=0.3),
     Slab(shell=0.1),
     _nested_balls(),
+    _half_full_ball(),
 ]
 
 
@@ -75,8 +87,18 @@ def test_the_innermost_body_decides_the_index() -> None:
     assert gradient[3, 0] > 0.5
 
 
-def test_clearance_reaches_no_shell() -> None:
-    medium = _nested_balls()
+def test_a_nested_body_is_only_within_those_before_it() -> None:
+    medium = _half_full_ball()
+    places = torch.tensor([[0.0, 0.0, -0.3], [0.0, 0.0, 0.3], [0.7, 0.0, -0.2], [0.7, 0.0, 0.0], [1.2, 0.0, -0.5]])
+    n, gradient = medium(places)
+    torch.testing.assert_close(n, torch.tensor([1.33, 1.0, 1.5, 1.5, 1.0]), atol=2e-3, rtol=0)
+    assert (gradient == 0).all()
+    assert medium.innermost(medium.signed_distances(places)[0] < 0).tolist() == [3, 0, 1, 1, 0]
+
+
+@pytest.mark.parametrize("make", [_nested_balls, _half_full_ball])
+def test_clearance_reaches_no_shell(make: Callable[[], SdfGrid]) -> None:
+    medium = make()
     positions = torch.rand(500, 3) * 2.8 - 1.4
     clearance = medium.clearance(positions)
     directions = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)

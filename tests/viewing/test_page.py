@@ -61,21 +61,25 @@ def one_ray(scene: Scene, cameras: Cameras | None = None) -> Float[torch.Tensor,
     return scene.render(cameras or scene.cameras("test"), Supersampling()).rgb
 
 
-@pytest.fixture
-def glass_cube(scene: Scene) -> Scene:
-    """The embedded scene's glass, sky and cameras around the ball inside, and a bubble in the glass."""
+@pytest.fixture(params=["bubble", "vessel"])
+def glass_cube(scene: Scene, request: pytest.FixtureRequest) -> Scene:
+    """The embedded scene's glass, sky and cameras around the ball inside, and a bubble in the glass, or half full."""
     mesh = "embedded:torus/mesh.ply"
     box = torch.tensor([[-1.5] * 3, [1.5] * 3])
     outer = SdfGrid(mesh, resolution=64, cache=False)
     axes = torch.stack(torch.meshgrid(*[torch.linspace(-1.5, 1.5, 64)] * 3, indexing="ij"), -1)
     bubble = torch.linalg.vector_norm(axes - torch.tensor([-0.3, -0.3, 0.2]), dim=-1) - 0.15
-    medium = SdfGrid.from_distances(torch.stack([outer.distances[0], bubble]), box, [1.5, 1.05], outer.shell)
+    bodies, iors = [outer.distances[0], bubble], [1.5, 1.05]
+    if request.param == "vessel":
+        bodies, iors = [bodies[0], bodies[0] + 0.2, axes[..., 2] - 0.1], [1.5, 1.0, 1.33]
+    medium = SdfGrid.from_distances(torch.stack(bodies), box, iors, outer.shell)
+    medium.nested = request.param == "vessel"
     sky = EnvironmentMap([128], str(resolve_path("embedded:torus/sky.png")))
     return Scene(variant(scene.model, medium=medium, boundary=sky), BlenderData("embedded:torus", 2.0, 6.0, 2))
 
 
 @needs_chromium
-def test_five_cameras_of_a_cube_with_a_bubble_agree_with_nerfro(glass_cube: Scene, tmp_path: Path) -> None:
+def test_five_cameras_of_a_cube_with_bodies_inside_agree_with_nerfro(glass_cube: Scene, tmp_path: Path) -> None:
     views = [0, 4, 8, 12, 16]
     page = page_of(glass_cube, 64)
     found = ask(page, f"(() => {{ {SHOT} return {views}.map((view) => shot(view, 64)); }})()", tmp_path)

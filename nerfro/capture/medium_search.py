@@ -1,0 +1,79 @@
+"""From photographs and a surface to the medium: built with what is known, and searched for what is not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import cast
+
+from omegaconf import DictConfig
+
+from nerfro.capture.index_report import CURVE, INDEX, LENGTHS, LENGTHS_CURVE, search_index, search_lengths
+from nerfro.capture.preprocess_options import build_medium, index_settings, searches_index
+from nerfro.data.base import Views
+from nerfro.errors import NerfroError
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.media.base import Medium
+from nerfro.media.solid import Solid
+from nerfro.media.vessel import SdfVessel
+
+
+@dataclass
+class FoundMedium:
+    """A medium, and what its search has told.
+
+    Attributes:
+        medium: with all numbers that were found.
+        settings: options that say them; not those that are doubtful.
+        doubtful: options that the pictures do not tell.
+        written: names of the files.
+    """
+
+    medium: Medium
+    settings: dict[str, object] = field(default_factory=dict)
+    doubtful: list[str] = field(default_factory=list)
+    written: list[str] = field(default_factory=list)
+
+
+def find_medium(
+    config: DictConfig,
+    overrides: list[str],
+    views: Views,
+    mesh: TriangleMesh,
+    location: str,
+    settings: dict[str, object],
+    folder: Path,
+) -> FoundMedium:
+    """The medium with a surface in it, and with the index or the lengths that are searched for.
+
+    Args:
+        config, overrides: of this command line.
+        views: photographs with poses.
+        mesh: the surface, and its `location`.
+        settings: what has to be said beside the overrides, so that the medium holds the surface.
+        folder: to write to.
+    """
+    if config.search and "wall" not in config.medium:
+        raise NerfroError(f"search={list(config.search)}: only a vessel has lengths to find; take medium=vessel")
+    if searches_index(config, overrides):
+        num_bodies = 1 + len(config.medium.get("inner_meshes", []))
+        medium = build_medium(config, settings, location, index_settings([1.5] * num_bodies))
+        if not isinstance(medium, Solid):
+            raise NerfroError("the index of this medium is not searched for; give medium.ior=, or take medium=object")
+        found = search_index(views, mesh, medium, config.room, folder)
+        result = FoundMedium(medium, written=[INDEX, CURVE])
+        named = index_settings(found.values.tolist())
+    else:
+        medium = build_medium(config, settings, location, {})
+        if not config.search:
+            return FoundMedium(medium)
+        vessel = cast(SdfVessel, medium)
+        found = search_lengths(views, mesh, vessel, list(config.search), config.room, folder)
+        lengths = {name: float(f"{value:.5g}") for name, value in zip(found.names, found.values, strict=True)}
+        result = FoundMedium(vessel.with_lengths(lengths), written=[LENGTHS, LENGTHS_CURVE])
+        named = {**lengths}
+    if found.doubts:
+        result.doubtful = [f"medium.{name}=N" for name in named]
+    else:
+        result.settings = {f"medium.{name}": value for name, value in named.items()}
+    return result

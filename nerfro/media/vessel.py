@@ -1,0 +1,186 @@
+"""A vessel with a liquid in it: nested bodies made of one outer surface and a few lengths."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.allowed import Coordinate, NotNegative, Positive, Resolution, corners_of_box
+from nerfro.errors import NerfroError
+from nerfro.geometry.bodies import require_separate
+from nerfro.geometry.lids import find_lid
+from nerfro.geometry.mesh import load_mesh
+from nerfro.kernels.available import require_bytes
+from nerfro.media.sdf_grid import BAND, SdfGrid, cached_distance
+from nerfro.media.solid import Solid
+from nerfro.media.voxel_grid import BYTES_A_VERTEX, check_margin
+from nerfro.paths import resolve_path
+from nerfro.registry import register
+from nerfro.variants import variant
+
+# Walls are searched for from a quarter of the given thickness to twice of it; so deep are distances exact.
+_THINNEST, _THICKEST = 0.25, 2.0
+
+
+@register("medium", "sdf_vessel")
+class SdfVessel(SdfGrid):
+    """A wall of glass around a cavity with a liquid, up to a level, and air above it.
+
+    The bodies are nested: all within the outer surface is wall; in it what is deeper than the wall, and above the foot,
+    is air; of that what is below the level is liquid. So liquid touches glass without a gap. Without a level there is
+    no air. A wall may be much thinner than a voxel, for both its surfaces are smooth ones of their own.
+
+    Lengths are in world units, or where `height` is given in the unit of that: millimetres, say. Heights are measured
+    from the lowest point up.
+
+    Args:
+        mesh: the vessel's outer surface as silhouettes show it, an opening closed: a closed triangle mesh, world units.
+        wall: thickness of the wall.
+        foot: thickness of the bottom; by default the wall's.
+        level: height of the liquid's surface; by default the vessel is full.
+        closed: whether the wall goes on over the top; otherwise what closes the outer surface there, and looks up, is
+            an opening.
+        ior: refractive index of the wall.
+        liquid_ior: refractive index of the liquid; 1 for an empty vessel.
+        up: direction from the bottom to the top, world axes, of any length.
+        height: the vessel's height, outside, in the unit in which lengths are given.
+        resolution, box_min, box_max, shell_voxels, crease_degrees, accept_open_mesh, cache: see `SdfGrid`.
+        absorption, learn_absorption, abbe: of wall and liquid, see `Solid`.
+
+    Attributes:
+        lengths: wall, foot and level as they were given; no level where the vessel is full.
+    """
+
+    nested = True
+    _outer: Float[Tensor, "X Y Z"]  # signed distances to the outer surface, and to it without its lid
+    _side: Float[Tensor, "X Y Z"]
+    _heights: Float[Tensor, "X Y Z"]  # of the vertices over the lowest point
+
+    def __init__(
+        self,
+        mesh: str,
+        wall: Positive,
+        foot: Positive | None = None,
+        level: Positive | None = None,
+        closed: bool = False,
+        ior: Positive = 1.5,
+        liquid_ior: Positive = 1.333,
+        up: list[Coordinate] = [0.0, 0.0, 1.0],  # noqa: B006 (the registry reads and copies it)
+        height: Positive | None = None,
+        resolution: Resolution = 128,
+        box_min: list[float] = [-1.5, -1.5, -1.5],  # noqa: B006
+        box_max: list[float] = [1.5, 1.5, 1.5],  # noqa: B006
+        shell_voxels: Positive = 0.1,
+        crease_degrees: NotNegative = 30.0,
+        accept_open_mesh: bool = False,
+        absorption: list[NotNegative] = [],  # noqa: B006
+        learn_absorption: bool = False,
+        abbe: list[Positive] = [],  # noqa: B006
+        cache: bool = True,
+    ) -> None:
+        require_bytes(BYTES_A_VERTEX * resolution**3, f"medium.resolution={resolution}")
+        box = corners_of_box(box_min, box_max)
+        spacing = float((box[1] - box[0]).min()) / (resolution - 1)
+        iors = [ior, liquid_ior] if level is None else [ior, 1.0, liquid_ior]
+        Solid.__init__(
+            self,
+            iors,
+            shell_voxels * spacing,
+            _of_bodies(absorption, 3, len(iors), 0.0, "absorption"),
+            learn_absorption,
+            _of_bodies(abbe, 1, len(iors), 1.0, "abbe"),
+        )
+        self.meshes = []  # rays bend at distances, not at triangles
+        upwards = _direction(up)
+        surface = load_mesh(resolve_path(mesh), accept_open_mesh)
+        check_margin(surface, box, resolution, 2)
+        if surface.is_closed:
+            require_separate(surface)
+        self._content_box = torch.from_numpy(surface.bounds).float()
+        low, high = (float(end(surface.vertices @ upwards)) for end in (np.min, np.max))
+        self.height = high - low if height is None else height
+        self.unit = (high - low) / self.height
+        self.lengths = {"wall": wall, "foot": wall if foot is None else foot}
+        if level is not None:
+            self.lengths["level"] = level
+        self._require_lengths_within()
+        # Deeper than any surface that is made of these distances.
+        band = min(BAND + _THICKEST * wall * self.unit / spacing, resolution)
+        settings = surface, box, resolution, band, crease_degrees, cache
+        outer = side = torch.from_numpy(cached_distance(*settings))
+        if not closed:
+            side = torch.from_numpy(cached_distance(*settings, find_lid(surface, upwards)))
+        heights = _heights(box, resolution, upwards) - low
+        for name, values in (("_outer", outer), ("_side", side), ("_heights", heights.float())):
+            self.register_buffer(name, values, persistent=False)
+        self._set(self._distances(), torch.from_numpy(box).float())
+        if not (self.distances[:2].amax(0) < 0).any():
+            deepest = -float(side[outer < 0].min()) / self.unit
+            raise NerfroError(
+                f"medium.wall={wall:g} and medium.foot={self.lengths['foot']:g} leave no cavity: no place of the body "
+                f"is deeper than {deepest:.3g}; give smaller ones, in world units, or medium.height= in the same unit"
+            )
+
+    @property
+    def content_box(self) -> Float[Tensor, "2 3"]:
+        return self._content_box
+
+    @property
+    def absorption(self) -> Float[Tensor, "K 3"] | None:
+        """Of each body; air absorbs nothing, whatever is learned."""
+        values = super().absorption
+        return values if values is None or len(values) == 2 else values * values.new_tensor([[1.0], [0.0], [1.0]])
+
+    def with_lengths(self, lengths: dict[str, float]) -> SdfVessel:
+        """The same vessel with some other `lengths`."""
+        changed = variant(self, lengths=self.lengths | lengths)
+        for name in ("_coarse_clearance", "_coarse_slopes"):  # of the surfaces as they were
+            changed._buffers.pop(name, None)
+        changed._set(changed._distances(), changed.box)
+        return changed
+
+    def length_range(self, name: str) -> tuple[float, float]:
+        """Between which a length is looked for, given what the others are."""
+        wall, foot, level = (self.lengths.get(key, self.height) for key in ("wall", "foot", "level"))
+        return {"wall": (_THINNEST * wall, _THICKEST * wall), "foot": (0.0, level), "level": (foot, self.height)}[name]
+
+    def _distances(self) -> Float[Tensor, "K X Y Z"]:
+        """Signed distances of all within the outer surface, of the cavity and of all below the level, world units."""
+        wall, foot, *level = (length * self.unit for length in self.lengths.values())
+        cavity = torch.maximum(self._side + wall, foot - self._heights)
+        return torch.stack([self._outer, cavity, *(self._heights - height for height in level)])
+
+    def _require_lengths_within(self) -> None:
+        heights = {name: value for name, value in self.lengths.items() if name != "wall"}
+        if not 0 < heights["foot"] < heights.get("level", self.height) <= self.height:
+            given = " and ".join(f"medium.{name}={value:g}" for name, value in heights.items())
+            raise NerfroError(
+                f"{given} is not allowed: heights are measured from the vessel's lowest point, the foot is below the "
+                f"level, and the vessel is {self.height:.4g} high, in world units or the unit of medium.height="
+            )
+
+
+def _direction(up: list[float]) -> Float[np.ndarray, "3"]:
+    length = np.linalg.norm(up)
+    if len(up) != 3 or not length > 0:
+        raise NerfroError(f"medium.up={list(up)} is no direction; give three numbers, not all of them 0")
+    return np.array(up, np.float64) / length
+
+
+def _heights(box: Float[np.ndarray, "2 3"], resolution: int, up: Float[np.ndarray, "3"]) -> Float[Tensor, "X Y Z"]:
+    """Of a grid's vertices over the world's origin."""
+    axes = (part * np.linspace(low, high, resolution) for low, high, part in zip(*box, up, strict=True))
+    x, y, z = map(torch.from_numpy, axes)
+    return x[:, None, None] + y[:, None] + z
+
+
+def _of_bodies(given: list[float], each: int, num_bodies: int, air: float, name: str) -> list[float]:
+    """Numbers of all bodies from those of wall and liquid, or from one for both; none where none are given."""
+    if len(given) not in (0, 1, 2 * each):
+        raise NerfroError(
+            f"medium.{name}={list(given)} has {len(given)} numbers; give {2 * each}, of wall and liquid, or one for all"
+        )
+    both = list(given) * (2 * each) if len(given) == 1 else list(given)
+    return both[:each] + [air] * (each * (num_bodies - 2)) + both[each:] if given else []

@@ -1,0 +1,191 @@
+"""Vessels: rays through walls and liquids against formulas, openings, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from nerfro.capture.surface import surfaces_inside
+from nerfro.errors import NerfroError
+from nerfro.geometry.lids import find_lid
+from nerfro.geometry.mesh import load_mesh
+from nerfro.media.vessel import SdfVessel
+from nerfro.samplers.eikonal import Eikonal
+from nerfro.samplers.snell import Snell, trace_interfaces
+from nerfro.variants import variant
+from nerfro.viewing.surface import surface_of
+from tests.closed_forms import angle, make_rays
+from tests.media.vessels import RADIUS, WALL, exit_directions, spherical_vessel
+
+# A glass: its height, its radii below and above, its wall.
+HEIGHT, BELOW, ABOVE, THIN = 1.6, 0.4, 0.55, 0.05
+
+
+def _rays_at_the_ball(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """From a distance of 3, to points spread through the ball."""
+    random = np.random.default_rng(0)
+    origins, targets = random.normal(size=(2, count, 3))
+    origins *= 3 / np.linalg.norm(origins, axis=1, keepdims=True)
+    targets *= 0.97 * RADIUS * random.random((count, 1)) ** (1 / 3) / np.linalg.norm(targets, axis=1, keepdims=True)
+    directions = targets - origins
+    return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def _errors(vessel: SdfVessel, wall: float, surface: float | None) -> torch.Tensor:
+    """Angles to the exit directions of the formulas, degrees, of rays that leave."""
+    origins, directions = _rays_at_the_ball(400)
+    expected, left = exit_directions(origins, directions, wall, surface)
+    assert left.mean() > 0.95
+    rays = make_rays(torch.from_numpy(origins), torch.from_numpy(directions), 0.5, 9.0)
+    found = Snell().trace(rays, vessel).path.exit_directions
+    return angle(found.double(), torch.from_numpy(expected))[left]
+
+
+@pytest.mark.parametrize("wall", [WALL, 0.008], ids=["thick", "thinner than a voxel"])
+def test_rays_through_a_full_spherical_vessel_leave_as_formulas_say(tmp_path: Path, wall: float) -> None:
+    errors = _errors(spherical_vessel(tmp_path, wall=wall), wall, None)
+    assert errors.max() < 0.1
+    assert errors.median() < 0.01
+
+
+@pytest.mark.parametrize("wall", [WALL, 0.008], ids=["thick", "thinner than a voxel"])
+def test_rays_through_a_half_full_spherical_vessel_leave_as_formulas_say(tmp_path: Path, wall: float) -> None:
+    # The level in the ruler's unit: this ball is 160 high.
+    options = {"wall": 100 * wall, "foot": 100 * wall, "level": 90.0, "height": 160.0}
+    errors = _errors(spherical_vessel(tmp_path, **options), wall, 0.1)
+    # Where the liquid meets the wall, and after several total reflections, errors multiply.
+    assert errors.quantile(0.95) < 0.1
+    assert errors.median() < 0.02
+
+
+def test_both_tracers_follow_the_same_paths(tmp_path: Path) -> None:
+    vessel = spherical_vessel(tmp_path, level=0.9, resolution=64)
+    origins, directions = (torch.from_numpy(values) for values in _rays_at_the_ball(60))
+    rays = make_rays(origins, directions, 0.5, 9.0)
+    compiled, plain = Snell().trace(rays, vessel), trace_interfaces(rays, vessel.double(), 16)
+    agree = compiled.num_events == plain[1]
+    assert agree.float().mean() > 0.95
+    assert angle(compiled.path.exit_directions.double(), plain[0].exit_directions)[agree].quantile(0.95) < 0.05
+
+
+def test_the_eikonal_equation_sees_the_same_vessel(tmp_path: Path) -> None:
+    vessel = spherical_vessel(tmp_path, level=0.9, resolution=64, shell_voxels=0.02)
+    origins, directions = (torch.from_numpy(values) for values in _rays_at_the_ball(100))
+    rays = make_rays(origins, directions, 0.5, 9.0)
+    sharp = Snell().trace(rays, vessel)
+    shells = Eikonal()(rays, vessel).exit_directions
+    assert angle(shells.double(), sharp.path.exit_directions.double()).quantile(0.7) < 0.5
+
+
+def _glass(folder: Path, **options: object) -> SdfVessel:
+    """A conical glass of radius 0.4 at the foot and 0.55 at the brim, from z = -0.8 to 0.8."""
+    outline = [[0, -0.5 * HEIGHT], [BELOW, -0.5 * HEIGHT], [ABOVE, 0.5 * HEIGHT], [0, 0.5 * HEIGHT]]
+    trimesh.creation.revolve(np.array(outline), sections=160).export(folder / "glass.ply")
+    known = {"wall": THIN, "foot": 0.2, "level": 1.0, "resolution": 96, "cache": False, "box_min": [-1] * 3,
+             "box_max": [1] * 3}  # fmt: skip
+    return SdfVessel(str(folder / "glass.ply"), **known | options)
+
+
+@pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
+def test_the_inner_wall_is_the_outer_one_moved_in_and_an_opening_has_none(tmp_path: Path, closed: bool) -> None:
+    vessel = _glass(tmp_path, closed=closed)
+    slope = np.arctan2(ABOVE - BELOW, HEIGHT)
+    turn, z = (torch.from_numpy(values) for values in np.meshgrid(np.linspace(0, 6, 40), np.linspace(-0.5, 0.6, 12)))
+    radius = BELOW + (z + 0.5 * HEIGHT) / HEIGHT * (ABOVE - BELOW) - THIN / np.cos(slope)
+    cavity, normals = vessel.signed_distances(torch.stack([radius * turn.cos(), radius * turn.sin(), z], -1).float())
+    assert cavity[..., 1].abs().max() < 2e-3
+    # Of the cavity, the normal points out of it: away from the axis, and down.
+    expected = torch.stack([np.cos(slope) * turn.cos(), np.cos(slope) * turn.sin(), -np.sin(slope) + 0 * turn], -1)
+    assert angle(normals[..., 1, :].double().reshape(-1, 3), expected.reshape(-1, 3)).max() < 1.5
+    below_the_brim = torch.tensor([[0.0, 0.1, 0.5 * HEIGHT - 0.5 * THIN]])
+    assert bool(vessel.signed_distances(below_the_brim)[0][0, 1] > 0) == closed
+
+
+def test_light_enters_an_opening_freely_and_meets_water_glass_and_air(tmp_path: Path) -> None:
+    d = torch.nn.functional.normalize(torch.tensor([[0.06, 0.02, -1.0]], dtype=torch.float64), dim=-1)
+    trace = Snell().trace(make_rays(-2.5 * d, d, 0.5, 9.0), _glass(tmp_path))
+    assert trace.num_events.item() == 3
+    assert trace.path.body[0, :4].tolist() == [0, 3, 1, 0]
+    # Level, foot and bottom are parallel planes.
+    assert angle(trace.path.exit_directions, d).item() < 0.02
+    torch.testing.assert_close(
+        trace.path.positions[0, 1:4, 2], torch.tensor([0.2, -0.6, -0.8]).double(), atol=2e-3, rtol=0
+    )
+
+
+def test_paths_through_a_glass_have_gradients_by_its_indices(tmp_path: Path) -> None:
+    vessel = _glass(tmp_path)
+    random = torch.Generator().manual_seed(0)
+    targets = 0.3 * (2 * torch.rand(80, 3, generator=random, dtype=torch.float64) - 1)
+    origins = torch.nn.functional.normalize(torch.randn(80, 3, generator=random, dtype=torch.float64), dim=-1) * 2.5
+    rays = make_rays(origins, torch.nn.functional.normalize(targets - origins, dim=-1), 0.5, 9.0)
+    sampler, step = Snell(max_events=6), 1e-4
+    iors = vessel.iors.clone().requires_grad_()
+    learning = variant(vessel, iors=iors)
+    path = sampler(rays, learning)
+    weights = torch.randn(80, 3, generator=random, dtype=torch.float64) * sampler.steady(path, learning)[:, None]
+    (found,) = torch.autograd.grad((sampler.refine(path, rays, learning).exit_directions * weights).sum(-1).sum(), iors)
+    for body in (0, 2):
+        change = step * torch.nn.functional.one_hot(torch.tensor(body), 3)
+        low, high = (sampler(rays, vessel.with_indices(vessel.iors + sign * change)) for sign in (-1, 1))
+        same = (low.body.shape == path.body.shape == high.body.shape) and bool(
+            (low.body == path.body).all() and (high.body == path.body).all()
+        )
+        assert same
+        expected = ((high.exit_directions - low.exit_directions) * weights).sum() / (2 * step)
+        assert found[body].item() == pytest.approx(expected.item(), rel=0.02)
+
+
+def test_surfaces_are_those_of_what_is_there(tmp_path: Path) -> None:
+    vessel = spherical_vessel(tmp_path, level=0.9)
+    inner, top = RADIUS - WALL, 0.1
+    below = np.pi * (2 / 3 * inner**3 + inner**2 * top - top**3 / 3)  # of a ball, under a plane
+    for surfaces in (surface_of(vessel, False)[1:], surfaces_inside(vessel)):
+        cavity, liquid = (trimesh.Trimesh(mesh.vertices, mesh.faces) for mesh in surfaces)
+        assert abs(cavity.volume) == pytest.approx(4 / 3 * np.pi * inner**3, rel=0.01)
+        assert abs(liquid.volume) == pytest.approx(below, rel=0.01)
+        assert liquid.bounds[1, 2] == pytest.approx(top, abs=0.01)
+
+
+def test_a_lid_is_what_looks_up_around_the_highest_place(tmp_path: Path) -> None:
+    _glass(tmp_path, resolution=40)
+    mesh = load_mesh(tmp_path / "glass.ply")
+    lid = mesh.triangles[find_lid(mesh, np.array([0.0, 0.0, 1.0]))]
+    assert np.linalg.norm(np.cross(lid[:, 1] - lid[:, 0], lid[:, 2] - lid[:, 0]), axis=1).sum() / 2 == pytest.approx(
+        np.pi * ABOVE**2, rel=0.01
+    )
+    assert np.allclose(lid[..., 2], 0.5 * HEIGHT)
+    bottom = mesh.triangles[find_lid(mesh, np.array([0.0, 0.0, -1.0]))]
+    assert np.allclose(bottom[..., 2], -0.5 * HEIGHT)
+
+
+def test_tint_and_dispersion_are_those_of_wall_and_liquid(tmp_path: Path) -> None:
+    vessel = spherical_vessel(tmp_path, level=0.9, resolution=40, absorption=[1, 2, 3, 4, 5, 6], abbe=[60, 55])
+    assert vessel.absorption.tolist() == [[1, 2, 3], [0, 0, 0], [4, 5, 6]]
+    assert vessel.at_wavelength(486.13).iors[1] == 1
+    learning = spherical_vessel(tmp_path, level=0.9, resolution=40, learn_absorption=True)
+    assert (learning.absorption[1] == 0).all()
+    assert (learning.absorption[[0, 2]] > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"wall": 0.9, "foot": 0.1}, "leave no cavity: no place of the body is deeper than"),
+        ({"level": 1.7}, r"medium\.foot=0\.1 and medium\.level=1\.7 is not allowed: heights .* is 1\.6 high"),
+        ({"level": 0.05}, "the foot is below the level"),
+        ({"foot": 20.0, "height": 16.0}, "the vessel is 16 high"),
+        ({"up": [0.0, 0.0, 0.0]}, "is no direction; give three numbers"),
+        ({"up": [0.0, 1.0]}, "is no direction; give three numbers"),
+        ({"wall": -1.0}, "more than 0"),
+        ({"absorption": [1.0, 2.0]}, "give 6, of wall and liquid, or one for all"),
+    ],
+)
+def test_what_no_vessel_has_is_refused_in_one_line(tmp_path: Path, options: dict[str, object], message: str) -> None:
+    with pytest.raises(NerfroError, match=message) as refused:
+        spherical_vessel(tmp_path, 2, resolution=40, **options)
+    assert "\n" not in str(refused.value)
