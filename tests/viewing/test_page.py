@@ -116,7 +116,7 @@ def test_contracted_surroundings_are_shown(scene: Scene, tmp_path: Path) -> None
     expected, without = one_ray(everywhere), one_ray(everywhere.with_(inside=False))
     for shot, rgb, empty in zip(found, expected, without, strict=True):
         assert float(psnr(picture(shot), rgb)) > 33
-        assert float(psnr(empty, rgb)) < 25, "the surroundings are much of what is seen"
+        assert float(psnr(empty, rgb)) < 28, "the surroundings are much of what is seen"
 
 
 @needs_chromium
