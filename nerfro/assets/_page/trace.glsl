@@ -25,7 +25,6 @@ uniform usampler3D clearance;  // how far blocks of cells are from all surfaces,
 uniform float clearanceStep, blockCells;
 uniform float shortestStep;
 uniform int bodies, maxEvents;
-uniform bool nested;  // whether a body is only where all before it are too
 uniform int startInside;  // bodies that the eye is in, a bit for each
 uniform float index[MAX_BODIES + 1];  // of air and of each body
 uniform vec3 absorption[MAX_BODIES + 1];  // for each world unit
@@ -96,7 +95,6 @@ int innermost(int inside) {
   int number = 0;
   for (int body = 0; body < bodies; ++body) {
     if ((inside >> body & 1) == 1) number = body + 1;
-    else if (nested) break;
   }
   return number;
 }
