@@ -20,6 +20,11 @@ from nerfro.training.callbacks import Throughput
 from nerfro.training.load import scene_of
 from nerfro.training.run_folder import load_checkpoint
 
+# Options of an evaluation that take the place of those that the run was trained with.
+_ADOPTED = (
+    "chunk_size", "lpips_backbone", "lpips_vgg_backbone", "supersample", "divergence", "contrast", "refine_steps",
+)  # fmt: skip
+
 
 @entry_point("evaluate", EvaluateConfig)
 def main(config: DictConfig) -> None:
@@ -34,8 +39,7 @@ def _evaluate_checkpoint(config: DictConfig) -> None:
     checkpoint, trained = load_checkpoint(path)
     if config.root is not None:
         trained.data.root = config.root
-    rays = "supersample", "divergence", "contrast"
-    for name in ("chunk_size", "lpips_backbone", "lpips_vgg_backbone", *rays, "refine_steps"):
+    for name in _ADOPTED:
         if config[name] is not None:
             trained.evaluation[name] = config[name]
     device = find_device(config.device)

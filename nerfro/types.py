@@ -251,6 +251,11 @@ class Exits:
     # The ray that each line belongs to, see `Path`; None where each is one of its own.
     ray: Int[Tensor, "*batch"] | None = None
 
+    @classmethod
+    def unbent(cls, rays: Rays) -> Exits:
+        """Of rays that meet nothing."""
+        return cls(rays.directions, rays.origins + rays.near[:, None] * rays.directions, rays.radii)
+
 
 @dataclass(frozen=True)
 class Samples:

@@ -42,13 +42,15 @@ def search_lengths(
 ) -> Estimate:
     """Find some of a vessel's lengths; write lengths.json and lengths.png. Otherwise as `search_index`."""
     found = _search(views, mesh, lengths_of(vessel, names), room, folder / LENGTHS_CURVE)
-    values, errors = (
-        {name: float(f"{value:.5g}") for name, value in zip(names, of_names, strict=True)}
-        for of_names in (found.values, found.standard_errors)
-    )
+    values, errors = (named_lengths(names, numbers) for numbers in (found.values, found.standard_errors))
     figures = {"lengths": values, "standard_errors": errors, "doubts": found.doubts}
     write_atomically(folder / LENGTHS, json.dumps(figures, indent=1) + "\n")
     return found
+
+
+def named_lengths(names: list[str], values: np.ndarray) -> dict[str, float]:
+    """Lengths by their names, to five digits."""
+    return {name: float(f"{value:.5g}") for name, value in zip(names, values, strict=True)}
 
 
 def _rounded(values: np.ndarray) -> list[float]:

@@ -8,7 +8,15 @@ from typing import cast
 
 from omegaconf import DictConfig
 
-from nerfro.capture.index_report import CURVE, INDEX, LENGTHS, LENGTHS_CURVE, search_index, search_lengths
+from nerfro.capture.index_report import (
+    CURVE,
+    INDEX,
+    LENGTHS,
+    LENGTHS_CURVE,
+    named_lengths,
+    search_index,
+    search_lengths,
+)
 from nerfro.capture.preprocess_options import build_medium, index_settings, searches_index
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
@@ -69,7 +77,7 @@ def find_medium(
             return FoundMedium(medium)
         vessel = cast(SdfVessel, medium)
         found = search_lengths(views, mesh, vessel, list(config.search), config.room, folder)
-        lengths = {name: float(f"{value:.5g}") for name, value in zip(found.names, found.values, strict=True)}
+        lengths = named_lengths(found.names, found.values)
         result = FoundMedium(vessel.with_lengths(lengths), written=[LENGTHS, LENGTHS_CURVE])
         named = {**lengths}
     if found.doubts:

@@ -209,11 +209,6 @@ class Room(Boundary):
         self.sampler.after_step(step, [self.field])
 
 
-def exits_of(rays: Rays) -> Exits:
-    """Of rays that nothing bends."""
-    return Exits(rays.directions, rays.origins + rays.near[:, None] * rays.directions, rays.radii)
-
-
 def _learn(boundary: Boundary, pixels: Pixels, steps: int, batch: int, progress: Callable[[float], None]) -> None:
     batch = min(batch, max(1024, len(pixels) // 16))
     generator = torch.Generator().manual_seed(0)
@@ -224,7 +219,7 @@ def _learn(boundary: Boundary, pixels: Pixels, steps: int, batch: int, progress:
             torch.manual_seed(step)
             optimizer.param_groups[0]["lr"] = first * (last / first) ** (step / steps)
             drawn = pixels[torch.randint(len(pixels), (batch,), generator=generator)]
-            predicted = boundary(exits_of(drawn.rays))
+            predicted = boundary(Exits.unbent(drawn.rays))
             # Brighter than a photograph can tell is not wrong.
             seen = torch.where(drawn.radiance >= 1, predicted.clamp(max=1), predicted)
             optimizer.zero_grad()
@@ -238,7 +233,7 @@ def _learn(boundary: Boundary, pixels: Pixels, steps: int, batch: int, progress:
 
 @torch.no_grad()
 def _unexplained(boundary: Boundary, pixels: Pixels) -> float:
-    error = boundary(exits_of(pixels.rays)).clamp(max=1) - pixels.radiance
+    error = boundary(Exits.unbent(pixels.rays)).clamp(max=1) - pixels.radiance
     return float(error.square().mean() / pixels.radiance.var(0).mean().clamp(min=_LEVEL))
 
 

@@ -10,6 +10,7 @@ from torch.nn.functional import mse_loss
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
 from nerfro.data.base import Views
+from nerfro.data.pixel_store import PixelStore
 from nerfro.models.base import NerfModel
 from nerfro.pixel_parts import pixel_rays
 
@@ -23,7 +24,7 @@ def refine_on_left(model: NerfModel, views: Views, gains: Float[Tensor, "V 3"], 
     cameras, device = views.cameras.to(model.device), model.device
     part = RefinedCamera(hold_world=False).to(device)
     part.begin(cameras)
-    images = torch.stack([views.images[view] for view in range(len(views))]).flatten(0, 2).to(device)
+    photographs = PixelStore(views.images).to(device)
     gains, generator = gains.to(device), torch.Generator().manual_seed(0)
     optimizer = torch.optim.Adam(part.parameters(), lr=_RATE)
     learning = [parameter for parameter in model.parameters() if parameter.requires_grad]
@@ -42,7 +43,7 @@ def refine_on_left(model: NerfModel, views: Views, gains: Float[Tensor, "V 3"], 
                 traced = model.path_sampler(rays.detach(), model.medium)
                 path = model.medium.tinted(model.refined(traced, rays))
                 radiance = model.render_path(path)[-1].rgb * gains[view]
-                loss = mse_loss(*model.difference(radiance, images[pixels]))
+                loss = mse_loss(*model.difference(radiance, photographs[pixels]))
             optimizer.zero_grad()
             loss.backward()
             optimizer.param_groups[0]["lr"] = _RATE * 0.01 ** (step / steps)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from nerfro.geometry.bodies import bodies_of
 from nerfro.geometry.mesh import TriangleMesh
 
 # Triangles count as level whose normals are within 45 degrees of up.
@@ -23,9 +22,8 @@ def find_lid(mesh: TriangleMesh, up: Float[np.ndarray, "3"]) -> Bool[np.ndarray,
     level = normals @ up > _LEVEL * np.linalg.norm(normals, axis=-1)
     if not level.any():
         return level
-    start, end = mesh.faces[level][:, [0, 1, 1, 2]].reshape(-1, 2).T
-    size = len(mesh.vertices)
-    _, part = connected_components(coo_array((np.ones(len(start), bool), (start, end)), (size, size)), directed=False)
-    of_triangle = part[mesh.faces[:, 0]]
-    height = np.where(level, triangles.mean(1) @ up, -np.inf)
-    return level & (of_triangle == of_triangle[height.argmax()])
+    part = bodies_of(TriangleMesh(mesh.vertices, mesh.faces[level]))
+    highest = (triangles[level].mean(1) @ up).argmax()
+    lid = np.zeros_like(level)
+    lid[level] = part == part[highest]
+    return lid

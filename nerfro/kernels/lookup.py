@@ -170,11 +170,18 @@ def voxel_index(table, low, inverse_spacing, x, y, z):
 
 
 @compiled
+def _block(counts, low, inverse_size, x, y, z):
+    """Numbers of the block that a place lies in, or of the nearest one, of so many along each axis."""
+    i = min(max(int((x - low[0]) * inverse_size[0]), 0), counts[0] - 1)
+    j = min(max(int((y - low[1]) * inverse_size[1]), 0), counts[1] - 1)
+    k = min(max(int((z - low[2]) * inverse_size[2]), 0), counts[2] - 1)
+    return i, j, k
+
+
+@compiled
 def block_clearance(clearance, low, inverse_size, x, y, z):
     """Distance within which the index surely does not vary, from the cell (of any size) that holds the point."""
-    i = min(max(int((x - low[0]) * inverse_size[0]), 0), clearance.shape[0] - 1)
-    j = min(max(int((y - low[1]) * inverse_size[1]), 0), clearance.shape[1] - 1)
-    k = min(max(int((z - low[2]) * inverse_size[2]), 0), clearance.shape[2] - 1)
+    i, j, k = _block(clearance.shape, low, inverse_size, x, y, z)
     return clearance[_UINT(i), _UINT(j), _UINT(k)]
 
 
@@ -182,9 +189,7 @@ def block_clearance(clearance, low, inverse_size, x, y, z):
 def monotone_run(slopes, low, inverse_size, x, y, z, dx, dy, dz):
     """Distance ahead to the wall of the block, if every body's spline only grows or only falls till there; else 0."""
     position, direction = (x, y, z), (dx, dy, dz)
-    i = min(max(int((x - low[0]) * inverse_size[0]), 0), slopes.shape[1] - 1)
-    j = min(max(int((y - low[1]) * inverse_size[1]), 0), slopes.shape[2] - 1)
-    k = min(max(int((z - low[2]) * inverse_size[2]), 0), slopes.shape[3] - 1)
+    i, j, k = _block(slopes.shape[1:4], low, inverse_size, x, y, z)
     for body in range(slopes.shape[0]):
         lowest, highest = 0.0, 0.0
         for axis in range(3):

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import jinja2
 import torch
 from markupsafe import Markup
 from omegaconf import OmegaConf
@@ -15,6 +14,7 @@ from omegaconf import OmegaConf
 from nerfro.errors import NerfroError
 from nerfro.evaluation.tables import Table, to_html
 from nerfro.files.drawing import magma
+from nerfro.files.templates import fill_template
 from nerfro.paths import PACKAGE_DIR
 from nerfro.report import curves
 from nerfro.report.comparison import Comparison
@@ -74,8 +74,8 @@ def report_page(compared: Sequence[tuple[Comparison, Table]], unfinished: Sequen
         for number, (comparison, table) in enumerate(compared)
     ]
     ramp = magma(torch.linspace(0, 1, 256)[None], 1)
-    return _render(
-        "page.html.jinja",
+    return fill_template(
+        _TEMPLATES / "page.html.jinja",
         sections=sections,
         unfinished=unfinished,
         chart=curves,
@@ -87,18 +87,7 @@ def report_page(compared: Sequence[tuple[Comparison, Table]], unfinished: Sequen
 
 def table_page(table: Table) -> str:
     """A page with nothing but a table."""
-    return _render("table.html.jinja", title=table.title, table=Markup(to_html(table)))
-
-
-def _render(template: str, **context: object) -> str:
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(_TEMPLATES),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template(template).render(context)
+    return fill_template(_TEMPLATES / "table.html.jinja", title=table.title, table=Markup(to_html(table)))
 
 
 def _scenes(prefix: str, comparison: Comparison, wanted: Wanted) -> list[SceneSection]:

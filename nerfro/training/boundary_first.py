@@ -10,7 +10,6 @@ from torch import Tensor
 from nerfro.fields.base import Field
 from nerfro.models.base import NerfModel, step_seed
 from nerfro.progress import told
-from nerfro.rays import Rays
 from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Exits
 
@@ -54,7 +53,7 @@ class BoundaryFirst(Callback):
                 return
             torch.manual_seed(step_seed(pl_module.seed, -1 - step))
             group["lr"] = group["initial_lr"] * first * (last / first) ** (step / self._num_steps)
-            radiance = pl_module.boundary(_exits(rays))
+            radiance = pl_module.boundary(Exits.unbent(rays))
             gains = pl_module.camera.gains(view)
             radiance = radiance if gains is None else radiance * gains.detach()
             loss = torch.nn.functional.mse_loss(*pl_module.difference(radiance, rgb))
@@ -72,10 +71,8 @@ def _occupied(model: NerfModel) -> Float[Tensor, "2 3"] | None:
     assert isinstance(field, Field)
     if field.bounds is None:
         return None
-    boxes = [box.to(model.device) for box in (field.bounds, model.medium.content_box) if box is not None]
-    return torch.stack([torch.stack([box[0] for box in boxes]).amin(0), torch.stack([box[1] for box in boxes]).amax(0)])
-
-
-def _exits(rays: Rays) -> Exits:
-    """Of rays that nothing bends."""
-    return Exits(rays.directions, rays.origins + rays.far[:, None] * rays.directions, rays.radii)
+    boxes = [field.bounds.to(model.device)]
+    if model.path_sampler.needs_medium:
+        boxes.append(model.medium.content_box.to(model.device))
+    low, high = torch.stack(boxes, 1)
+    return torch.stack([low.amin(0), high.amax(0)])

@@ -15,12 +15,12 @@ from nerfro.allowed import Count, Natural, checked
 from nerfro.cameras import Cameras, Window, central_window
 from nerfro.data.base import Views
 from nerfro.data.pictures import Pictures
+from nerfro.data.pixel_store import PixelStore
 from nerfro.distributed import share_of
 from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.pixel_parts import divergence, part_rays, pixel_rays, rays_beside
 from nerfro.rays import Rays
-from nerfro.training.pixel_store import PixelStore
 from nerfro.types import Batch, Path
 
 Batching = Literal["single_image", "all_images"]

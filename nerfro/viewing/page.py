@@ -6,7 +6,6 @@ import base64
 import io
 from typing import Any
 
-import jinja2
 import torch
 from jaxtyping import Float
 from markupsafe import Markup
@@ -17,6 +16,7 @@ from nerfro.cameras import Cameras
 from nerfro.data.base import DataSource, Views
 from nerfro.errors import NerfroError
 from nerfro.files.images import to_8bit
+from nerfro.files.templates import fill_template
 from nerfro.paths import ASSETS_DIR
 from nerfro.viewing.baking import Baked, bake_sky, bake_surface, volume_arrays
 from nerfro.viewing.scene import Scene
@@ -58,20 +58,13 @@ def parts_of(
 
 def document(title: str, frame: dict[str, Any], parts: dict[str, Baked], live: bool = False) -> str:
     """The page of what was baked (`parts_of`), within its frame (`frame_of`); `live` asks its server for news."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(_TEMPLATES),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     scene = {**frame, **{name: part.facts for name, part in parts.items()}, "live": live}
     arrays = {name: uri for part in parts.values() for name, uri in part.packed().items()}
 
     def asset(name: str) -> Markup:
         return Markup((_TEMPLATES / name).read_text(encoding="utf-8"))
 
-    return environment.get_template("page.html.jinja").render(title=title, scene=scene, arrays=arrays, asset=asset)
+    return fill_template(_TEMPLATES / "page.html.jinja", title=title, scene=scene, arrays=arrays, asset=asset)
 
 
 def frame_of(scene: Scene, views: Views, split: str) -> dict[str, Any]:

@@ -10,10 +10,10 @@ import pytest
 import torch
 from PIL import Image
 
+from nerfro.data import pixel_store
 from nerfro.data.image_files import read_rgb
 from nerfro.data.pictures import Pictures
-from nerfro.training import pixel_store
-from nerfro.training.pixel_store import PixelStore
+from nerfro.data.pixel_store import PixelStore
 
 NUM_VIEWS, HEIGHT, WIDTH = 3, 5, 4
 EVERY = torch.arange(NUM_VIEWS * HEIGHT * WIDTH)

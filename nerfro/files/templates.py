@@ -1,0 +1,19 @@
+"""Pages from templates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jinja2
+
+
+def fill_template(file: Path, **values: object) -> str:
+    """A page of a template, which may include others of its folder; values are escaped, and none may be missing."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(file.parent),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(file.name).render(values)
