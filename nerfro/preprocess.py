@@ -9,17 +9,22 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from nerfro.capture.medium_search import find_medium
+from nerfro.capture.medium_search import find_medium, refinable
 from nerfro.capture.overlaps import REPORT, SHEET, draw_overlays, report_overlaps
 from nerfro.capture.pose_conventions import require_consistent_poses
 from nerfro.capture.preprocess_options import (
     MESH,
     PreprocessConfig,
     claim,
+    searches_index,
     surface_settings,
     train_command,
 )
+from nerfro.capture.refinement_report import FIGURES, PICTURES, refine
+from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.surface import make_mesh, read_silhouettes, surfaces_inside
+from nerfro.capture.surroundings import Around
+from nerfro.capture.visual_hull import Silhouettes
 from nerfro.cli import entry_point
 from nerfro.data.masks import masked_views
 from nerfro.geometry.mesh import load_mesh
@@ -37,7 +42,7 @@ def main(config: DictConfig) -> None:
     views = masked_views(build(config.data).load(config.split))
     box = None if config.box_min is None else np.array([config.box_min, config.box_max], np.float64)
     location, written = config.mesh, []
-    overlaps = None
+    overlaps = silhouettes = None
     if mesh is None or views.masks is not None:
         silhouettes = read_silhouettes(views, box is not None)
         require_consistent_poses(silhouettes, views.names, config.wrong_masks)
@@ -51,7 +56,21 @@ def main(config: DictConfig) -> None:
         overlaps = report_overlaps(config.split, views, mesh, silhouettes, wrong_masks, folder)
         written += [SHEET, REPORT]
     settings = surface_settings(config, views.cameras, mesh, location, overrides)
-    found = find_medium(config, overrides, views, mesh, location, settings, folder)
+    around = Around(views, mesh, config.room)
+    found = find_medium(config, overrides, around, location, settings, folder)
+    if config.refine:
+        if silhouettes is None:
+            silhouettes = Silhouettes.of(views.cameras, mesh_silhouettes(mesh, views.cameras, 1).float())
+        unknown = searches_index(config, overrides)
+        mesh = refine(around, mesh, refinable(found), silhouettes, unknown, folder).mesh
+        location = str(folder / MESH)
+        mesh.save(folder / MESH)
+        written = [MESH, FIGURES, PICTURES]
+        if overlaps is not None:
+            overlaps = report_overlaps(config.split, views, mesh, silhouettes, None, folder, False)
+            written += [SHEET, REPORT]
+        settings = surface_settings(config, views.cameras, mesh, location, overrides)
+        found = find_medium(config, overrides, around, location, settings, folder)
     inside = surfaces_inside(found.medium)
     if overlaps is not None and inside:
         draw_overlays(views, mesh, overlaps, inside, folder)

@@ -51,6 +51,13 @@ class EnvironmentMap(Boundary):
         if image is not None:
             self.set_lat_long(lat_long.load_lat_long(image))
 
+    @classmethod
+    def of_texels(cls, radiance: Float[Tensor, "6*n*n 3"]) -> EnvironmentMap:
+        """A sky that learns no more: the linear radiance of each texel, see `cube_map.texel_directions`."""
+        sky = cls([math.isqrt(len(radiance) // 6)])
+        sky.requires_grad_(False).texels.copy_(_raw(radiance))
+        return sky.eval()
+
     def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
         face, coordinates = cube_map.project(exits.directions.float().reshape(-1, 3))
         if face.device.type == "cpu":

@@ -6,42 +6,36 @@ import json
 from pathlib import Path
 
 import numpy as np
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from nerfro.capture.index_search import Estimate, Sought, find_numbers, indices_of, lengths_of
-from nerfro.capture.surroundings import Room, divide_pixels, learn_surroundings
+from nerfro.capture.surroundings import Around
 from nerfro.cli import warn
-from nerfro.data.base import Views
 from nerfro.files.atomic import atomic_file, write_atomically
-from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.solid import Solid
 from nerfro.media.vessel import SdfVessel
+from nerfro.progress import bar
 
 INDEX, CURVE = "index.json", "index.png"
 LENGTHS, LENGTHS_CURVE = "lengths.json", "lengths.png"
 
 
-def search_index(views: Views, mesh: TriangleMesh, medium: Solid, room: bool | None, folder: Path) -> Estimate:
+def search_index(around: Around, medium: Solid, folder: Path) -> Estimate:
     """Find the indices of a medium's bodies; write index.json and index.png, and print what was found.
 
     Args:
-        views: photographs with poses.
-        mesh: outer surface of the medium.
+        around: what photographs show.
         medium: the bodies.
-        room: whether the surroundings are near; None finds out.
         folder: to write to.
     """
-    found = _search(views, mesh, indices_of(medium), room, folder / CURVE)
+    found = _search(around, indices_of(medium), folder / CURVE)
     figures = {"ior": _rounded(found.values), "standard_error": _rounded(found.standard_errors), "doubts": found.doubts}
     write_atomically(folder / INDEX, json.dumps(figures, indent=1) + "\n")
     return found
 
 
-def search_lengths(
-    views: Views, mesh: TriangleMesh, vessel: SdfVessel, names: list[str], room: bool | None, folder: Path
-) -> Estimate:
+def search_lengths(around: Around, vessel: SdfVessel, names: list[str], folder: Path) -> Estimate:
     """Find some of a vessel's lengths; write lengths.json and lengths.png. Otherwise as `search_index`."""
-    found = _search(views, mesh, lengths_of(vessel, names), room, folder / LENGTHS_CURVE)
+    found = _search(around, lengths_of(vessel, names), folder / LENGTHS_CURVE)
     values, errors = (named_lengths(names, numbers) for numbers in (found.values, found.standard_errors))
     figures = {"lengths": values, "standard_errors": errors, "doubts": found.doubts}
     write_atomically(folder / LENGTHS, json.dumps(figures, indent=1) + "\n")
@@ -57,16 +51,11 @@ def _rounded(values: np.ndarray) -> list[float]:
     return [round(float(x), 5) for x in values]
 
 
-def _search(views: Views, mesh: TriangleMesh, sought: Sought, room: bool | None, curve: Path) -> Estimate:
+def _search(around: Around, sought: Sought, curve: Path) -> Estimate:
     """Search with a progress bar, print what was found, and draw it into a file."""
-    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
-    with Progress(*columns) as progress:
-        learning, searching = progress.add_task("surroundings", total=1), progress.add_task("search", total=1)
-        beside, through = divide_pixels(views, mesh)
-        surroundings = learn_surroundings(beside, mesh, room, lambda done: progress.update(learning, completed=done))
-        found = find_numbers(sought, through, surroundings, lambda done: progress.update(searching, completed=done))
-    what = "near" if isinstance(surroundings.boundary, Room) else "far away"
-    print(f"surroundings: {what}; {surroundings.unexplained:.1%} of other views' variance unexplained")
+    through, surroundings = around.through, around.surroundings
+    with bar("search") as told:
+        found = find_numbers(sought, through, surroundings, told)
     for name, value, error, bend in zip(found.names, found.values, found.standard_errors, found.curvature, strict=True):
         print(f"{name}: {value:.5g} +- {error:.2g} (views resampled); curvature of the error {bend:.3g}")
     for doubt in found.doubts:

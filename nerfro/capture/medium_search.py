@@ -18,10 +18,10 @@ from nerfro.capture.index_report import (
     search_lengths,
 )
 from nerfro.capture.preprocess_options import build_medium, index_settings, searches_index
-from nerfro.data.base import Views
+from nerfro.capture.surroundings import Around
 from nerfro.errors import NerfroError
-from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.base import Medium
+from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
 from nerfro.media.vessel import SdfVessel
 
@@ -43,11 +43,21 @@ class FoundMedium:
     written: list[str] = field(default_factory=list)
 
 
+def refinable(found: FoundMedium) -> SdfGrid:
+    """The medium, if its surface can be refined.
+
+    Raises:
+        NerfroError: it cannot, and why.
+    """
+    if found.doubtful:
+        raise NerfroError(f"refine=true needs the index, and the pictures do not tell it; give {found.doubtful[0]}")
+    return cast(SdfGrid, found.medium)
+
+
 def find_medium(
     config: DictConfig,
     overrides: list[str],
-    views: Views,
-    mesh: TriangleMesh,
+    around: Around,
     location: str,
     settings: dict[str, object],
     folder: Path,
@@ -56,8 +66,8 @@ def find_medium(
 
     Args:
         config, overrides: of this command line.
-        views: photographs with poses.
-        mesh: the surface, and its `location`.
+        around: what photographs show around the surface and through it.
+        location: of the surface's file.
         settings: what has to be said beside the overrides, so that the medium holds the surface.
         folder: to write to.
     """
@@ -68,7 +78,7 @@ def find_medium(
         medium = build_medium(config, settings, location, index_settings([1.5] * num_bodies))
         if not isinstance(medium, Solid):
             raise NerfroError("the index of this medium is not searched for; give medium.ior=, or take medium=object")
-        found = search_index(views, mesh, medium, config.room, folder)
+        found = search_index(around, medium, folder)
         result = FoundMedium(medium, written=[INDEX, CURVE])
         named = index_settings(found.values.tolist())
     else:
@@ -76,7 +86,7 @@ def find_medium(
         if not config.search:
             return FoundMedium(medium)
         vessel = cast(SdfVessel, medium)
-        found = search_lengths(views, mesh, vessel, list(config.search), config.room, folder)
+        found = search_lengths(around, vessel, list(config.search), folder)
         lengths = named_lengths(found.names, found.values)
         result = FoundMedium(vessel.with_lengths(lengths), written=[LENGTHS, LENGTHS_CURVE])
         named = {**lengths}

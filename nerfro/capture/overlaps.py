@@ -23,7 +23,13 @@ _MAX_PIXELS = 256
 
 
 def report_overlaps(
-    split: str, views: Views, mesh: TriangleMesh, silhouettes: Silhouettes, wrong_masks: int | None, folder: Path
+    split: str,
+    views: Views,
+    mesh: TriangleMesh,
+    silhouettes: Silhouettes,
+    wrong_masks: int | None,
+    folder: Path,
+    list_all: bool = True,
 ) -> Float[np.ndarray, "V"]:
     """Print, write and return how well a surface's silhouettes are the masks.
 
@@ -34,10 +40,11 @@ def report_overlaps(
         silhouettes: of the masks.
         wrong_masks: with which the surface was carved; None for one that was not.
         folder: to write to.
+        list_all: whether the overlap of every view is printed.
     """
     overlaps = overlap(mesh, silhouettes, _MAX_PIXELS)
     print("overlap (intersection over union) of the surface's silhouette with each mask:")
-    for name, value in zip(views.names, overlaps, strict=True):
+    for name, value in zip(views.names, overlaps, strict=True) if list_all else ():
         print(f"  {value:.4f}  {name}")
     worst = int(overlaps.argmin())
     print(f"  {overlaps.mean():.4f}  mean; {overlaps[worst]:.4f} lowest, {views.names[worst]}")

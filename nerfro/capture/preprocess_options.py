@@ -15,6 +15,7 @@ from nerfro.allowed import Count, Natural, NotNegative, Range, corners_of_box
 from nerfro.cameras import Cameras
 from nerfro.capture.index_report import CURVE, INDEX, LENGTHS, LENGTHS_CURVE
 from nerfro.capture.overlaps import REPORT, SHEET
+from nerfro.capture.refinement_report import FIGURES, PICTURES
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing
 from nerfro.geometry.mesh import TriangleMesh
@@ -35,6 +36,8 @@ class PreprocessConfig:
         data: the views (options of the group `data`).
         medium: what becomes of the surface (options of the group `medium`).
         search: lengths of a vessel, one or two, that are found from the photographs: wall, foot, level.
+        refine: whether the surface is moved, after the index was found, until the photographs fit what is seen through
+            it.
         split: whose masks are used.
         mesh: a surface that was made elsewhere; it is checked against the masks, and no hull is made.
         room: whether the surroundings are near, for the search of the index; by default found out.
@@ -50,6 +53,7 @@ class PreprocessConfig:
     data: Any = MISSING
     medium: Any = MISSING
     search: list[str] = field(default_factory=list)
+    refine: bool = False
     split: str = "train"
     mesh: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     room: Optional[bool] = None  # noqa: UP045
@@ -79,10 +83,13 @@ def claim(config: DictConfig, overrides: list[str]) -> Path:
         raise NerfroError("give both box_min and box_max, or neither to have the box found")
     if config.box_min is not None:
         corners_of_box(config.box_min, config.box_max)
+    if config.refine and "shell_voxels" not in config.medium:
+        raise NerfroError("refine=true moves a surface that is a distance; take medium=object or medium=vessel for it")
     if config.out is None and str(config.data.root).startswith(EMBEDDED_PREFIX):
         raise NerfroError(f"data.root={config.data.root} ships with nerfro and is not written to; add out=FOLDER")
     folder = resolve_path(config.data.root) if config.out is None else user_path(config.out)
     names = [SHEET, REPORT] if config.mesh is not None else [MESH, SHEET, REPORT]
+    names += [MESH, FIGURES, PICTURES] if config.refine else []
     names += [LENGTHS, LENGTHS_CURVE] if config.search else []
     names += [INDEX, CURVE] if searches_index(config, overrides) else []
     refuse_existing([folder / name for name in names], config.overwrite)

@@ -13,6 +13,7 @@ from scipy import sparse
 from scipy.ndimage import binary_erosion, distance_transform_edt
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from nerfro.cameras import Cameras
 from nerfro.capture.visual_hull import Silhouettes
@@ -102,6 +103,19 @@ def fit_surface(
     return flat if flat_misfit < _CONVINCING * rounded_misfit else rounded
 
 
+def rim_points(mesh: TriangleMesh, silhouettes: Silhouettes) -> Float[Tensor, "K 3"]:
+    """Points of a surface, world units, that views see on the outlines of their masks."""
+    faces, vertices = mesh.faces, mesh.vertices
+    outlines = [_nearest_outline_pixel(mask) for mask in (silhouettes.masks > 0.5).numpy()]
+    rims = _find_rims(vertices, _vertex_normals(vertices, faces), _edges(faces), silhouettes, outlines)
+    share = rims.share[:, None]
+    return torch.from_numpy((1 - share) * vertices[rims.first] + share * vertices[rims.second]).float()
+
+
+def _edges(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "E 2"]:
+    return np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+
+
 def _fit(
     mesh: TriangleMesh,
     silhouettes: Silhouettes,
@@ -112,7 +126,7 @@ def _fit(
 ) -> tuple[TriangleMesh, float]:
     """The surface that is likeliest by a prior, and its outlines' mean distance from the masks', world units."""
     faces, vertices = mesh.faces, mesh.vertices.copy()
-    edges = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+    edges = _edges(faces)
     size = float(np.ptp(vertices, axis=0).max())
     both, degree = np.concatenate([edges, edges[:, ::-1]]), np.bincount(edges.ravel())
     # These take values at vertices to the means of their neighbours', and to their differences along edges.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -23,6 +24,7 @@ from nerfro.fields.hash_grid import HashGridField
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.light import to_linear
 from nerfro.pixel_parts import pixel_rays
+from nerfro.progress import bar
 from nerfro.rays import Rays
 from nerfro.rendering import composite
 from nerfro.samplers.density_grid import DensityGridSampler
@@ -36,7 +38,7 @@ _SKY_STEPS, _SKY_PIXELS = 300, 16384
 _NEAR_STEPS, _NEAR_PIXELS = 400, 2048
 _RATES = (0.03, 0.0015)
 # Every so many-th view is held back, to see how well the surroundings are known where they were not learned.
-_HELD_BACK = 8
+HELD_BACK = 8
 # A sky that leaves more than this share of the held-back views' variance unexplained is no sky: then things are near.
 _NO_SKY = 0.25
 # Less variance than this, of linear radiance, is none.
@@ -153,7 +155,7 @@ def learn_surroundings(
         near: whether things are so near that rays of equal direction see different ones; None finds out.
         progress: is told the share done.
     """
-    held_back = beside.view % _HELD_BACK == _HELD_BACK - 1
+    held_back = beside.view % HELD_BACK == HELD_BACK - 1
     learned, judges = beside[~held_back], beside[held_back] if held_back.any() else beside
     judges = judges.some(_SKY_PIXELS)
     found = None
@@ -177,6 +179,37 @@ def learn_surroundings(
             found = Surroundings(field, None, unexplained, judges.radiance)
     assert found is not None
     return found
+
+
+class Around:
+    """What photographs show through an object and around it, found out when it is first asked for.
+
+    Args:
+        views: photographs with poses.
+        mesh: the object.
+        room: whether its surroundings are near; None finds out.
+    """
+
+    def __init__(self, views: Views, mesh: TriangleMesh, room: bool | None) -> None:
+        self.views, self._mesh, self._room = views, mesh, room
+
+    @cached_property
+    def through(self) -> Pixels:
+        """Pixels that the object fills."""
+        return self._divided[1]
+
+    @cached_property
+    def surroundings(self) -> Surroundings:
+        """Learned, with a bar; how well they are known is printed."""
+        with bar("surroundings") as told:
+            found = learn_surroundings(self._divided[0], self._mesh, self._room, told)
+        what = "near" if isinstance(found.boundary, Room) else "far away"
+        print(f"surroundings: {what}; {found.unexplained:.1%} of other views' variance unexplained")
+        return found
+
+    @cached_property
+    def _divided(self) -> tuple[Pixels, Pixels]:
+        return divide_pixels(self.views, self._mesh)
 
 
 class Room(Boundary):

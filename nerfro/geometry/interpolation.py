@@ -93,6 +93,13 @@ def quadratic_spline(
     return value.reshape(positions.shape[:-1]), torch.stack(gradient, -1).reshape(positions.shape)
 
 
+def bspline_basis(num_control: int, num_places: int) -> Float[Tensor, "num_places num_control"]:
+    """Cubic B-splines of evenly spaced control points, at evenly spaced places from the second to the last but one."""
+    place = torch.linspace(1, num_control - 2, num_places)
+    t = (place[:, None] - torch.arange(num_control)).abs()
+    return torch.where(t < 1, 2 / 3 - t**2 + t**3 / 2, (2 - t).clamp(min=0) ** 3 / 6)
+
+
 def smooth(values: Float[Tensor, "X Y Z"], size: int, sigma: float) -> Float[Tensor, "X Y Z"]:
     """Convolve with a normalised Gaussian of size^3 taps; the border repeats outwards. Size 0 changes nothing.
 

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import max_pool3d
 
 from nerfro.allowed import NotNegative, Positive, Range, Resolution, corners_of_box
 from nerfro.errors import NerfroError
@@ -25,6 +24,7 @@ from nerfro.media.solid import Solid
 from nerfro.media.voxel_grid import BYTES_A_VERTEX, check_margin
 from nerfro.paths import resolve_path
 from nerfro.registry import register
+from nerfro.variants import variant
 
 # Voxels around the surface in which the distance is exact: the spline's support and the step that finds the surface.
 BAND = 3.0
@@ -138,6 +138,20 @@ class SdfGrid(Solid):
         """Bounds of the outer mesh; the grid's box where there is none."""
         return torch.from_numpy(self.meshes[0].bounds).float() if self.meshes else self.box
 
+    def grown(self, outwards: Float[Tensor, "X Y Z"]) -> SdfGrid:
+        """The same glass with its outer surface moved outwards by so much at the grid's vertices, world units.
+
+        It is made of distances, which are exact near the surface as long as that has not moved far.
+        """
+        return self._of_distances(torch.cat([self.distances[:1] - outwards, self.distances[1:]]), meshes=[])
+
+    def _of_distances(self, distances: Float[Tensor, "K X Y Z"], **changes: Any) -> Any:
+        changed = variant(self, **changes)
+        for name in ("_coarse_clearance", "_coarse_slopes"):  # of the surfaces as they were
+            changed._buffers.pop(name, None)
+        changed._set(distances, self.box)
+        return changed
+
     def at_wavelength(self, wavelength: float) -> SdfGrid:
         self.coarse_clearance, self.coarse_slopes  # noqa: B018 (made before they are shared)
         return super().at_wavelength(wavelength)
@@ -186,9 +200,11 @@ class SdfGrid(Solid):
             values = values.index_select(axis + 1, index)
         bounds = []
         for axis in range(3):
-            differences = values.diff(dim=axis + 1)[:, None] / spacing[axis]
-            kernel = [BLOCK + 3 - (other == axis) for other in range(3)]
-            lowest, highest = (sign * max_pool3d(sign * differences, kernel, BLOCK)[:, 0] for sign in (-1, 1))
+            lowest = highest = values.diff(dim=axis + 1) / spacing[axis]
+            for other in range(3):
+                window = BLOCK + 3 - (other == axis)
+                lowest = lowest.unfold(other + 1, window, BLOCK).amin(-1)
+                highest = highest.unfold(other + 1, window, BLOCK).amax(-1)
             bounds.append(torch.stack([lowest, highest], -1))
         slopes = torch.stack(bounds, -2)
         for axis, count in enumerate(counts.tolist()):

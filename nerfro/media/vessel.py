@@ -136,10 +136,12 @@ class SdfVessel(SdfGrid):
     def with_lengths(self, lengths: dict[str, float]) -> SdfVessel:
         """The same vessel with some other `lengths`."""
         changed = variant(self, lengths=self.lengths | lengths)
-        for name in ("_coarse_clearance", "_coarse_slopes"):  # of the surfaces as they were
-            changed._buffers.pop(name, None)
-        changed._set(changed._distances(), changed.box)
-        return changed
+        return changed._of_distances(changed._distances())
+
+    def grown(self, outwards: Float[Tensor, "X Y Z"]) -> SdfVessel:
+        """See `SdfGrid`; the cavity moves too, for the wall is as thick as it was."""
+        changed = variant(self, _outer=self._outer - outwards, _side=self._side - outwards)
+        return changed._of_distances(changed._distances())
 
     def length_range(self, name: str) -> tuple[float, float]:
         """Between which a length is looked for, given what the others are."""

@@ -1,0 +1,339 @@
+"""A surface moved until what is seen through it is seen where it is: descent on the photographs' error.
+
+Pixels that look through a clear body show its surroundings, in the direction in which their rays leave. The surface
+moves so that these are the directions in which the surroundings have the pixels' colours, by the derivative of the
+exact paths (`samplers.replay`). Three things keep it on the way:
+
+- Blurred surroundings first. Their slope tells the way over as many degrees as they are blurred.
+- Opaque things inside. Space is empty where many of the rays through it show the surroundings, whatever else is on
+  their ways; pixels whose rays cross space where few do are left out.
+- Outlines. Where a surface is seen from its side, the masks have told where it is, and it stays there.
+
+Photographs of some views are held back and judge: the surface is the one that explains them best.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerfro.boundaries.cube_map import texel_directions
+from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.capture.silhouette_fit import rim_points
+from nerfro.capture.surroundings import HELD_BACK, Pixels, Room, Surroundings
+from nerfro.capture.visual_hull import Silhouettes
+from nerfro.errors import NerfroError
+from nerfro.geometry.interpolation import bspline_basis, quadratic_spline
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.samplers.snell import Snell
+from nerfro.types import Exits, Path
+from nerfro.variants import variant
+
+# Control points a side of the splines whose sum moves the surface.
+_LEVELS = (12, 24, 48)
+_PIXELS = 6000  # of a step
+_JUDGED = 20_000  # held-back pixels, at most
+# Pixels that are looked at to tell what is clear, and after how many steps that is told anew.
+_LOOKED_AT, _LOOK_EVERY = 150_000, 100
+# Voxels a side of the object's bounds in which it is told, samples of a ray in them, rays that a voxel needs.
+_VOXELS, _SAMPLES, _FEWEST_RAYS = 48, 64, 20
+# A ray counts fully if in every voxel that it crosses so large a share of rays shows the surroundings, in units of what
+# is usual in clear space; not at all below the first.
+_CLEAR = (0.4, 0.6)
+# Residuals of linear radiance count half at this.
+_HALF = 0.1
+# An outline is known to about this, pixels; weights of outlines and of smoothness.
+_OUTLINE, _OUTLINES, _SMOOTH = 0.25, 0.1, 0.1
+_RIMS = 4000  # points of outlines of a step
+
+
+# The first and the last rate, and the blur of the surroundings (standard deviation, degrees) that goes with the first.
+# A rate is how far a step moves the coarsest spline, in shares of the object's size, and an index; it moves finer
+# splines as much less as their control points are nearer, so that all turn the surface alike.
+_RATES, _BLUR, _LEAST_BLUR = (2e-4, 8e-6), 3.0, 0.35
+# Steps after which held-back pixels are asked. Their error is a little uncertain: where it is not lower, the surface
+# has another try, unless it is higher by this share. Then it goes back, and on at so much of the rate, with less blur.
+_JUDGE_EVERY, _WORSE, _SLOWER, _LESS_BLUR = 40, 0.01, 0.4, 0.55
+_MOST_STEPS = 800
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A surface that was moved.
+
+    Attributes:
+        mesh: the surface.
+        medium: made of it.
+        steps, errors: after which steps it was judged, and the robust error of held-back pixels then: 0 where
+            all is explained, 1 where nothing is. The first is that of the surface as it was.
+        used: share of the object's pixels that have taught it.
+    """
+
+    mesh: TriangleMesh
+    medium: SdfGrid
+    steps: list[int]
+    errors: list[float]
+    used: float
+
+
+def refine_surface(
+    mesh: TriangleMesh,
+    medium: SdfGrid,
+    silhouettes: Silhouettes,
+    through: Pixels,
+    surroundings: Surroundings,
+    learn_index: bool = False,
+    progress: Callable[[float], None] = lambda done: None,
+) -> Refined:
+    """Move the outer surface of a medium by what photographs show through it.
+
+    Args:
+        mesh: the surface.
+        medium: the bodies, with the indices that they have; white light alone is followed.
+        silhouettes: of the surface; its outlines stay where they are.
+        through: pixels that the object fills.
+        surroundings: what is seen around it.
+        learn_index: whether the indices are not known for sure, and learned along with the surface.
+        progress: is told the share done.
+
+    Raises:
+        NerfroError: the surroundings are near, or too few pixels show them through the object.
+    """
+    if isinstance(surroundings.boundary, Room):
+        raise NerfroError(
+            "refine=true needs surroundings that are far away, and these photographs show near ones; leave it out, or "
+            "say room=false if they are far"
+        )
+    descent = _Descent(mesh, medium, silhouettes, through, surroundings, learn_index)
+    best, lowest = descent.state(), descent.judged(medium)
+    steps, errors = [0], [lowest]
+    rate, blur = _RATES[0], _BLUR
+    while rate >= _RATES[1] and steps[-1] < _MOST_STEPS:
+        sky, tries = _blurred(surroundings, blur), 2
+        while tries and steps[-1] < _MOST_STEPS:
+            for step in range(_JUDGE_EVERY):
+                descent.step(sky, rate)
+                progress(max((steps[-1] + step) / _MOST_STEPS, math.log(rate / _RATES[0], _RATES[1] / _RATES[0])))
+            steps.append(steps[-1] + _JUDGE_EVERY)
+            errors.append(descent.judged(descent.moved()))
+            tries -= 1
+            if errors[-1] < lowest:
+                best, lowest, tries = descent.state(), errors[-1], 2
+            elif errors[-1] > (1 + _WORSE) * lowest:
+                break
+        descent.set(best)
+        rate, blur = _SLOWER * rate, max(_LESS_BLUR * blur, _LEAST_BLUR)
+    progress(1.0)
+    moved = descent.moved()
+    used = len(descent.clear) / max(1, len(descent.looked_at))
+    return Refined(_onto(mesh, moved), moved, steps, errors, used)
+
+
+class _Offsets(nn.Module):
+    """How far a surface has moved outwards: a sum of cubic B-splines on grids over its medium's box.
+
+    Args:
+        shape: vertices of the medium's grid.
+    """
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        super().__init__()
+        self.levels = nn.ParameterList(nn.Parameter(torch.zeros(n, n, n)) for n in _LEVELS)
+        self._bases = [[bspline_basis(n, length) for length in shape] for n in _LEVELS]
+
+    def forward(self) -> Float[Tensor, "X Y Z"]:
+        total: Tensor | float = 0.0
+        for values, (x, y, z) in zip(self.levels, self._bases, strict=True):
+            for axis, basis in ((2, z), (1, y), (0, x)):
+                values = torch.tensordot(values, basis, ([axis], [1])).movedim(-1, axis)
+            total = total + values
+        return total  # type: ignore[return-value]
+
+    def roughness(self, spacing: float) -> Tensor:
+        """Mean squares of second differences, as slopes; `spacing` is between control points of a grid of one cell."""
+        return sum(  # type: ignore[return-value]
+            (values.diff(n=2, dim=axis) * (len(values) - 3) / spacing).square().mean()
+            for values in self.levels
+            for axis in range(3)
+        )
+
+
+class _Descent:
+    """The surface on its way, and the pixels that teach and judge it."""
+
+    def __init__(
+        self,
+        mesh: TriangleMesh,
+        medium: SdfGrid,
+        silhouettes: Silhouettes,
+        through: Pixels,
+        surroundings: Surroundings,
+        learn_index: bool,
+    ) -> None:
+        self.medium, self.surroundings = medium, surroundings
+        self.iors = nn.Parameter(medium.iors.clone(), requires_grad=learn_index)
+        self.bounds = torch.from_numpy(mesh.bounds).float()
+        self.size = float(np.ptp(mesh.bounds, axis=0).max())
+        # Rays that are reflected inside are no help: tiny errors of the surface turn them anywhere.
+        self.sampler = Snell(max_events=2 * len(medium.iors))
+        self.offsets = _Offsets(tuple(medium.distances.shape[1:]))
+        held_back = through.view % HELD_BACK == HELD_BACK - 1
+        self.looked_at = through[~held_back].some(_LOOKED_AT)
+        self.judges = (through[held_back] if held_back.any() else through).some(_JUDGED)
+        self.first_errors: Tensor | None = None
+        self.rims = rim_points(mesh, silhouettes)
+        cameras = silhouettes.cameras
+        distance = (cameras.camera_to_world[:, :, 3] - self.bounds.mean(0)).norm(dim=-1)
+        self.outline = _OUTLINE * float((distance / cameras.fx).mean())
+        self.generator = torch.Generator().manual_seed(0)
+        self.paces = [self.size * _LEVELS[0] / n for n in _LEVELS] + [1.0]
+        self.num_steps = 0
+        self.set(self.state())
+        self._look(medium)
+
+    def moved(self) -> SdfGrid:
+        """The medium as it is now, without gradients."""
+        with torch.no_grad():
+            return self._moved()
+
+    def state(self) -> list[Tensor]:
+        return [values.detach().clone() for values in self._learned()]
+
+    @torch.no_grad()
+    def set(self, state: list[Tensor]) -> None:
+        """Go on from a state, at rest."""
+        for learned, values in zip(self._learned(), state, strict=True):
+            learned.copy_(values)
+        groups = [{"params": [values], "lr": 0.0} for values in self._learned()]
+        self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12)
+
+    def _learned(self) -> list[nn.Parameter]:
+        return [*self.offsets.levels, self.iors]
+
+    def _moved(self) -> SdfGrid:
+        return variant(self.medium.grown(self.offsets()), iors=1.0 * self.iors)
+
+    def step(self, sky: EnvironmentMap, rate: float) -> None:
+        """Follow the slope of the error, with surroundings that are blurred."""
+        if self.num_steps and self.num_steps % _LOOK_EVERY == 0:
+            self._look(self.moved())
+        self.num_steps += 1
+        for group, pace in zip(self.optimizer.param_groups, self.paces, strict=True):
+            group["lr"] = rate * pace
+        self.optimizer.zero_grad()
+        with torch.enable_grad():
+            self._loss(sky).backward()
+        self.optimizer.step()
+
+    def _loss(self, sky: EnvironmentMap) -> Tensor:
+        medium = self._moved()
+        drawn = torch.randint(len(self.clear), (_PIXELS,), generator=self.generator)
+        pixels, weight = self.clear[drawn], self.weight[drawn]
+        path, usable = self._traced(pixels, medium)
+        rays = pixels.rays[usable]
+        path = self.sampler.refine(path[usable], rays, medium)
+        residual = sky(path.exits()).clamp(max=1) - pixels.radiance[usable]
+        weight = weight[usable]
+        photometric = (weight * _robust(residual)).sum() / weight.sum().clamp(min=1e-6)
+        rims = self.rims[torch.randint(len(self.rims), (_RIMS,), generator=self.generator)]
+        now, before = (quadratic_spline(each.coefficients[0], each.box, rims)[0] for each in (medium, self.medium))
+        left = ((now - before) / self.outline).square()
+        outlines = (left / (1 + left)).mean()
+        return photometric + _OUTLINES * outlines + _SMOOTH * self.offsets.roughness(self.size)
+
+    @torch.no_grad()
+    def judged(self, medium: SdfGrid) -> float:
+        """The robust error of held-back pixels whose light came from known surroundings at first.
+
+        Where it does no more, the first error counts: a surface is neither better nor worse for that.
+        """
+        trace = self.sampler.trace(self.judges.rays, medium)
+        radiance, known = self.surroundings.radiance(trace.path.exits())
+        known &= ~trace.exceeded & trace.path.refracted
+        errors = _robust(radiance - self.judges.radiance)
+        if self.first_errors is None:
+            self.judges, errors = self.judges[known], errors[known]
+            self.first_errors, known = errors, known[known]
+        return float(torch.where(known, errors, self.first_errors).mean())
+
+    def _traced(self, pixels: Pixels, medium: SdfGrid) -> tuple[Path, Tensor]:
+        """Paths of pixels, and which are bent, end in known surroundings and have sound derivatives."""
+        with torch.no_grad():
+            trace = self.sampler.trace(pixels.rays, medium)
+            _, known = self.surroundings.radiance(trace.path.exits())
+            usable = known & ~trace.exceeded & trace.path.refracted & self.sampler.steady(trace.path, medium)
+        return trace.path, usable
+
+    @torch.no_grad()
+    def _look(self, medium: SdfGrid) -> None:
+        """Tell which pixels see the surroundings, and nothing opaque."""
+        path, usable = self._traced(self.looked_at, medium)
+        pixels, path = self.looked_at[usable], path[usable]
+        if not len(pixels):
+            raise NerfroError("no pixel shows known surroundings through the object; refine=true cannot help here")
+        residual = self.surroundings.radiance(path.exits())[0] - pixels.radiance
+        voxels = self._voxels(path)
+        beyond = _VOXELS**3
+        crossing = torch.bincount(voxels.flatten(), minlength=beyond + 1)
+        agreeing = (1 - _robust(residual))[:, None].expand_as(voxels)
+        share = torch.bincount(voxels.flatten(), agreeing.flatten().double(), beyond + 1) / crossing.clamp(min=1)
+        told = crossing >= _FEWEST_RAYS
+        told[beyond] = False
+        usual = share[told].quantile(0.9) if told.any() else share.new_ones(())
+        share = torch.where(told, share / usual.clamp(min=1e-6), 1.0).float()
+        least, enough = _CLEAR
+        weight = ((share[voxels].amin(1) - least) / (enough - least)).clamp(0, 1)
+        self.clear, self.weight = pixels[weight > 0], weight[weight > 0]
+        if not len(self.clear):
+            raise NerfroError("opaque things hide the surroundings in all pixels; refine=true cannot help here")
+
+    def _voxels(self, path: Path) -> Tensor:
+        """Numbers of the voxels that each path crosses in the object's bounds [P, S]; one more for none."""
+        low, high = self.bounds
+        numbers = []
+        for chosen in torch.arange(len(path.s)).split(1 << 14):
+            part = path[chosen]
+            enter, leave = part.span(self.bounds)
+            shares = (torch.arange(_SAMPLES) + 0.5) / _SAMPLES
+            positions, _ = part.at(enter[:, None] + (leave - enter)[:, None] * shares)
+            voxel = ((positions - low) / (high - low) * _VOXELS).long()
+            inside = ((voxel >= 0) & (voxel < _VOXELS)).all(-1)
+            x, y, z = voxel.unbind(-1)
+            numbers.append(torch.where(inside, (x * _VOXELS + y) * _VOXELS + z, _VOXELS**3))
+        return torch.cat(numbers)
+
+
+def _robust(residual: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
+    """r^2 / (r^2 + s^2)."""
+    square = residual.square().mean(-1)
+    return square / (square + _HALF**2)
+
+
+@torch.no_grad()
+def _blurred(surroundings: Surroundings, degrees: float) -> EnvironmentMap:
+    """Surroundings far away, as photographs show them, convolved with a Gaussian of that standard deviation."""
+    count, generator = 32, torch.Generator().manual_seed(0)
+    directions = texel_directions(max(16, round(135 / degrees)))
+    total = torch.zeros_like(directions)
+    for _ in range(count):
+        turned = directions + math.radians(degrees) * torch.randn(3, generator=generator)
+        total += surroundings.boundary(Exits(turned / turned.norm(dim=-1, keepdim=True))).clamp(max=1)
+    return EnvironmentMap.of_texels(total / count)
+
+
+def _onto(mesh: TriangleMesh, medium: SdfGrid) -> TriangleMesh:
+    """The mesh with its vertices moved onto the zero level of a medium's first body, by Newton's steps."""
+    vertices = torch.from_numpy(mesh.vertices).float()
+    spacing = float(((medium.box[1] - medium.box[0]) / (torch.tensor(medium.distances.shape[1:]) - 1)).min())
+    for _ in range(5):
+        phi, gradient = quadratic_spline(medium.coefficients[0], medium.box, vertices)
+        square = gradient.square().sum(-1, keepdim=True).clamp(min=0.25)
+        vertices = vertices - (phi[:, None] * gradient / square).clamp(-spacing, spacing)
+    return TriangleMesh(vertices.double().numpy(), mesh.faces)

@@ -1,0 +1,114 @@
+"""A dent that no outline shows, from photographs of what is seen through it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import nerfro.preprocess
+from nerfro.capture import refinement
+from nerfro.capture.refinement import Refined, refine_surface
+from nerfro.capture.silhouettes import mesh_silhouettes
+from nerfro.capture.surroundings import Room, Surroundings, divide_pixels, learn_surroundings
+from nerfro.capture.visual_hull import Silhouettes
+from nerfro.errors import NerfroError
+from nerfro.geometry.mesh import load_mesh
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.samplers.snell import Snell
+from tests.ball_photographs import BOX, RADIUS, cameras, mesh, photographs_of, save, solid
+
+DEPTH, WIDTH, AXIS = 0.05, 0.12, torch.tensor([0.6, 0.0, 0.8])
+
+
+def dented() -> SdfGrid:
+    """The ball, flattened on one side."""
+    ball = solid([1.5])
+    axis = torch.linspace(-0.9, 0.9, ball.distances.shape[-1])
+    directions = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    directions = torch.nn.functional.normalize(directions, dim=-1)
+    dent = DEPTH * torch.exp((directions @ AXIS - 1) / WIDTH)
+    return SdfGrid.from_distances(ball.distances + dent, BOX, [1.5], 0.01)
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(refinement, "_RATES", (1e-3, 1e-4))
+    monkeypatch.setattr(refinement, "_MOST_STEPS", 160)
+    monkeypatch.setattr(refinement, "_JUDGE_EVERY", 20)
+    monkeypatch.setattr(refinement, "_LEVELS", (8, 16))
+    monkeypatch.setattr(refinement, "_PIXELS", 2000)
+    monkeypatch.setattr(refinement, "_VOXELS", 12)
+
+
+def refined(start: SdfGrid, learn_index: bool = False) -> Refined:
+    silhouettes = Silhouettes.of(cameras(), mesh_silhouettes(mesh(), cameras(), 1).float())
+    beside, through = divide_pixels(photographs_of(dented()), mesh())
+    surroundings = learn_surroundings(beside, mesh(), False)
+    return refine_surface(mesh(), start, silhouettes, through, surroundings, learn_index)
+
+
+def degrees_off(medium: SdfGrid, num_views: int = 6) -> float:
+    """Median angle between exit directions and the right ones, of rays that the dent turns by a degree or more."""
+    errors, right = [], dented()
+    for view in range(num_views):
+        rays = cameras().image_rays(view)
+        ours, ball, true = (Snell()(rays, m).exit_directions for m in (medium, solid([1.5]), right))
+        turned = (ball - true).norm(dim=-1) > 0.017
+        errors.append((ours - true)[turned].norm(dim=-1))
+    return float(torch.rad2deg(torch.cat(errors)).median())
+
+
+def test_a_dent_is_found(short: None) -> None:
+    before = solid([1.5])
+    found = refined(before)
+    assert degrees_off(found.medium) < 0.4 * degrees_off(before)
+    assert min(found.errors) < 0.6 * found.errors[0]
+    # The mesh is the medium's surface, dented where the ball was.
+    vertices = torch.from_numpy(found.mesh.vertices).float()
+    assert found.medium.signed_distances(vertices)[0].abs().max() < 1e-3
+    radius = vertices.norm(dim=-1)
+    assert radius[(vertices / radius[:, None]) @ AXIS > 0.97].mean() < RADIUS - 0.3 * DEPTH
+    assert abs(radius[(vertices / radius[:, None]) @ AXIS < 0].mean() - RADIUS) < 0.1 * DEPTH
+
+
+def test_a_surface_that_is_right_is_not_made_worse(short: None) -> None:
+    found = refined(dented())
+    assert degrees_off(found.medium) < 0.1 * degrees_off(solid([1.5]))
+
+
+def test_near_surroundings_are_refused(short: None) -> None:
+    beside, through = divide_pixels(photographs_of(dented()), mesh())
+    near = Surroundings(Room(mesh().bounds, 2.0), None, 0.0, beside.radiance)
+    silhouettes = Silhouettes.of(cameras(), mesh_silhouettes(mesh(), cameras(), 1).float())
+    with pytest.raises(NerfroError, match="far away"):
+        refine_surface(mesh(), solid([1.5]), silhouettes, through, near)
+
+
+def test_preprocess_writes_the_refined_surface(
+    short: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save(photographs_of(dented()), tmp_path)
+    out = tmp_path / "out"
+    options = [f"data.root={tmp_path}", f"mesh={tmp_path / 'mesh.ply'}", f"out={out}", "data.near=0.5", "room=false"]
+    options += ["refine=true", "medium.ior=1.5", "medium.cache=false", "medium.resolution=41"]
+    monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", *options])
+    nerfro.preprocess.main()
+    assert "surface refined" in (printed := capsys.readouterr().out)
+    assert f"medium.mesh={out / 'mesh.ply'}" in printed
+    assert load_mesh(out / "mesh.ply").vertices.shape == mesh().vertices.shape
+    figures = json.loads((out / "refinement.json").read_text())
+    assert min(figures["held_back_error"]) < 0.6 * figures["held_back_error"][0]
+    assert (out / "refinement.png").is_file()
+
+
+def test_what_cannot_be_refined_is_refused_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", f"out={tmp_path}", "refine=true", "medium=object_voxels"])
+    with pytest.raises(SystemExit):
+        nerfro.preprocess.main()
+    assert "take medium=object or medium=vessel" in capsys.readouterr().err
