@@ -6,6 +6,7 @@ from omegaconf import DictConfig
 
 from nerfro.cli import entry_point
 from nerfro.files.cache import file_hash
+from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.paths import CONF_DIR, user_path
 from nerfro.training.load import checkpoint_of, load
 from nerfro.viewing.film import write_film
@@ -19,6 +20,7 @@ from nerfro.viewing.sweep import read_sweep
 def main(config: DictConfig) -> None:
     """Refuse what cannot be rendered, load the scenes, render the frames that are missing, make films of them."""
     check_request(config)
+    keep_freed_memory()
     sweep = None if config.sweep is None else read_sweep(config.sweep)
     runs = checkpoints(config)
     scenes = [prepared(config, load(run, config.device, config.root)) for run in runs]

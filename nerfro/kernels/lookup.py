@@ -186,10 +186,20 @@ def block_clearance(clearance, low, inverse_size, x, y, z):
 
 
 @compiled
-def monotone_run(slopes, low, inverse_size, x, y, z, dx, dy, dz):
-    """Distance ahead to the wall of the block, if every body's spline only grows or only falls till there; else 0."""
+def block_ahead(slopes, inside, values, low, inverse_size, x, y, z, dx, dy, dz):
+    """What is known of a line up to the wall of its block.
+
+    Takes for each body whether the line begins inside, and its spline's value there. Returns the distance to the wall,
+    a distance before which there is no surface, and whether every spline only grows or only falls till the wall.
+    """
     position, direction = (x, y, z), (dx, dy, dz)
-    i, j, k = _block(slopes.shape[1:4], low, inverse_size, x, y, z)
+    i, j, k = block = _block(slopes.shape[1:4], low, inverse_size, x, y, z)
+    wall = math.inf
+    for axis in range(3):
+        if direction[axis] != 0.0:
+            end = block[axis] + (1 if direction[axis] > 0.0 else 0)
+            wall = min(wall, (end / inverse_size[axis] + low[axis] - position[axis]) / direction[axis])
+    free, monotone = wall, True
     for body in range(slopes.shape[0]):
         lowest, highest = 0.0, 0.0
         for axis in range(3):
@@ -197,14 +207,13 @@ def monotone_run(slopes, low, inverse_size, x, y, z, dx, dy, dz):
             one, other = direction[axis] * bounds[0], direction[axis] * bounds[1]
             lowest += min(one, other)
             highest += max(one, other)
-        if not (lowest > 0.0 or highest < 0.0):
-            return 0.0
-    out, block = math.inf, (i, j, k)
-    for axis in range(3):
-        if direction[axis] != 0.0:
-            wall = block[axis] + (1 if direction[axis] > 0.0 else 0)
-            out = min(out, (wall / inverse_size[axis] + low[axis] - position[axis]) / direction[axis])
-    return out
+        monotone = monotone and (lowest > 0.0 or highest < 0.0)
+        # The fastest that the value may go to zero; not a number at the grid's border, where nothing is known.
+        towards = highest if inside[body] else -lowest
+        if not towards <= 0.0:
+            reached = abs(values[body]) / towards
+            free = min(free, reached) if reached >= 0.0 else 0.0
+    return wall, free, monotone
 
 
 @compiled

@@ -24,7 +24,7 @@ from nerfro.samplers.stepfun import invert_cdf, midpoints, spread_uniform
 from nerfro.samplers.stratified import cone_samples
 from nerfro.types import Path, Rendering, Samples
 
-# Remembered optical depth below which a sample of a picture is not worth asking the field, and a path not sampling.
+# Remembered optical depth below which a sample of a picture is not worth asking the field.
 _EMPTY = 0.005
 # In training: samples of the faintest branches, and the weight from which a branch is asked everywhere.
 _FEWEST, _HEAVY = 8, 0.5
@@ -147,7 +147,7 @@ class DensityGridSampler(PointSampler):
     def remembers(self, path: Path) -> Bool[Tensor, "P"]:
         """Whether polylines cross what is remembered: the plain reference of the compiled kernel."""
         _, places, density = self._bins(path)
-        return (density * places.diff(dim=1)).sum(-1) >= _EMPTY
+        return (density * places.diff(dim=1)).sum(-1) >= self._thin
 
     def remembers_compiled(self, path: Path) -> Bool[Tensor, "P"]:
         """The same as `remembers`, on the CPU."""
@@ -155,7 +155,7 @@ class DensityGridSampler(PointSampler):
         from nerfro.samplers.density_grid_cpu import remembers  # compiled code, so only where it is used
 
         use_threads()
-        settings = self.num_bins, _EMPTY, self.radius or 0.0, self.near
+        settings = self.num_bins, self._thin, self.radius or 0.0, self.near
         return torch.from_numpy(remembers(*self._for_kernels(path), *settings))
 
     def _for_kernels(self, path: Path) -> list[np.ndarray]:
@@ -186,6 +186,11 @@ class DensityGridSampler(PointSampler):
     def contracted(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Where the grid has what is at these positions of the world."""
         return positions if self.radius is None else contract(positions, self.centre, self.radius)
+
+    @property
+    def _thin(self) -> float:
+        """Optical depth of a path below which no sample has `_EMPTY`: its weight is spread over all of them."""
+        return _EMPTY * (self.num_samples + 1) * (1 - self.uniform)
 
     @property
     def _floor(self) -> float:

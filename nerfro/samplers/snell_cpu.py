@@ -12,9 +12,9 @@ from numba import prange
 
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.lookup import (
+    block_ahead,
     block_clearance,
     box_span,
-    monotone_run,
     put_end,
     put_vertex,
     spline_value,
@@ -84,9 +84,10 @@ def _index(inside, solids):
 def _surface_ahead(solids, inside, known, x, y, z, dx, dy, dz, min_step):
     """The first surface on a line: body (-1 where there is none), and arc lengths before and after it.
 
-    Steps are as long as the distance to the nearest surface, as in sphere tracing, or longer: across a block of cells
-    in which the distance only grows or only falls, there is at most one surface of each body, between values of other
-    signs. `known` is scratch memory: values of the bodies at the last two places.
+    Steps are as long as the distance to the nearest surface, as in sphere tracing, or longer. Within a block of cells
+    the distance changes no faster than its slopes there; and across a block in which it only grows or only falls, there
+    is at most one surface of each body, between values of other signs. `known` is scratch memory: values of the bodies
+    at the last two places.
     """
     clearance, low, inverse_spacing, inverse_block = (
         solids.clearance,
@@ -120,10 +121,13 @@ def _surface_ahead(solids, inside, known, x, y, z, dx, dy, dz, min_step):
         if t >= leave:
             return -1, 0.0, 0.0
         before = t
-        run = monotone_run(solids.slopes, low, inverse_block, px, py, pz, dx, dy, dz)
-        across = run > max(distance, min_step)
+        wall, free, monotone = block_ahead(
+            solids.slopes, inside, known[1], low, inverse_block, px, py, pz, dx, dy, dz
+        )  # fmt: skip
+        step = max(distance, min_step, free)
+        across = monotone and wall > step
         # A little beyond the wall, to be in the next block for sure.
-        t = min(t + (run + _BEYOND_WALL * min_step if across else max(distance, min_step)), leave)
+        t = min(t + (wall if across else step) + _BEYOND_WALL * min_step, leave)
     # The first of the surfaces that were crossed in this step.
     hit, hit_before, hit_after = -1, 0.0, math.inf
     tolerance = _ROOT_TOLERANCE * min_step

@@ -18,8 +18,16 @@ def first_normals(path: Path, medium: Medium) -> Float[Tensor, "R 3"]:
     Snell's law says that n' d' - n d is along the normal, for reflected light with n' = n. Where the index varies
     continuously, the normal is that of its level surfaces at the first vertex where the path turns.
     """
+    normals = path.directions.new_zeros(len(path.s), 3)
+    rows = path.refracted.nonzero()[:, 0]  # which few rays of a picture are
+    normals[rows] = _turning_normals(path[rows], medium)
+    return path.first_of_ray(normals)
+
+
+def _turning_normals(path: Path, medium: Medium) -> Float[Tensor, "P 3"]:
+    """The same of polylines that meet the medium."""
     before, after = path.directions[:, :-1], path.directions[:, 1:]
-    turns = (before != after).any(-1) & path.refracted[:, None]
+    turns = (before != after).any(-1)
     first = turns.byte().argmax(-1)[:, None]
 
     def there(values: Tensor) -> Tensor:
@@ -36,4 +44,4 @@ def first_normals(path: Path, medium: Medium) -> Float[Tensor, "R 3"]:
         _, normals = medium(there(path.positions[:, 1:]))
     towards = -(normals * arriving).sum(-1, keepdim=True).sign()
     normals = functional.normalize(normals * towards, dim=-1)
-    return path.first_of_ray(torch.where(turns.any(-1, keepdim=True), normals, 0.0))
+    return torch.where(turns.any(-1, keepdim=True), normals, 0.0)
