@@ -101,7 +101,8 @@ class Page {
 
   tell(milliseconds) {
     const [width, height] = this.traced;
-    $("frame").value = `${width} x ${height}, ${milliseconds.toFixed(0)} ms, ${this.shown} rays a pixel`;
+    const rays = this.shown === 1 ? "1 ray" : `${this.shown} rays`;
+    $("frame").value = `${width} x ${height}, ${milliseconds.toFixed(0)} ms, ${rays} a pixel`;
   }
 
   // Show the picture of one of the data's cameras beside its photograph, or the orbit (null) from where the eye is.
