@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -155,8 +155,8 @@ class DensityGridSampler(PointSampler):
         from nerfro.samplers.density_grid_cpu import remembers  # compiled code, so only where it is used
 
         use_threads()
-        settings = self.num_bins, self._thin, self.radius or 0.0, self.near
-        return torch.from_numpy(remembers(*self._for_kernels(path), *settings))
+        arguments: list[Any] = [*self._for_kernels(path), self.num_bins, self._thin, self.radius or 0.0, self.near]
+        return torch.from_numpy(remembers(*arguments))
 
     def _for_kernels(self, path: Path) -> list[np.ndarray]:
         return arrays(path.positions, path.directions, path.s, *self.box, self.density)
@@ -173,8 +173,8 @@ class DensityGridSampler(PointSampler):
         from nerfro.samplers.density_grid_cpu import draw  # compiled code, so only where it is used
 
         use_threads()
-        settings = self.num_bins, self._floor, _EMPTY, self.radius or 0.0, self.near
-        drawn = draw(*self._for_kernels(path), *arrays(u), *settings)
+        arguments: list[Any] = [*self._for_kernels(path), *arrays(u), self.num_bins, self._floor, _EMPTY]
+        drawn = draw(*arguments, self.radius or 0.0, self.near)
         edges, s, positions, directions, occupied, *of_measure = (torch.from_numpy(array) for array in drawn)
         lengths, measure = (None, None) if self.radius is None else of_measure
         return Samples(positions, directions, s, edges, path.radii, occupied, lengths, measure)
