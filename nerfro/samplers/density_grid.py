@@ -173,8 +173,9 @@ class DensityGridSampler(PointSampler):
         from nerfro.samplers.density_grid_cpu import draw  # compiled code, so only where it is used
 
         use_threads()
-        arguments: list[Any] = [*self._for_kernels(path), *arrays(u), self.num_bins, self._floor, _EMPTY]
-        drawn = draw(*arguments, self.radius or 0.0, self.near)
+        settings = self.num_bins, self._floor, _EMPTY, self.radius or 0.0, self.near
+        arguments: list[Any] = [*self._for_kernels(path), *arrays(u), *settings]
+        drawn = draw(*arguments)
         edges, s, positions, directions, occupied, *of_measure = (torch.from_numpy(array) for array in drawn)
         lengths, measure = (None, None) if self.radius is None else of_measure
         return Samples(positions, directions, s, edges, path.radii, occupied, lengths, measure)
