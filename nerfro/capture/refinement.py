@@ -23,6 +23,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.cube_map import texel_directions
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.capture.silhouette_fit import rim_points
@@ -54,14 +55,33 @@ _OUTLINE, _OUTLINES, _SMOOTH = 0.25, 0.1, 0.1
 _RIMS = 4000  # points of outlines of a step
 
 
-# The first and the last rate, and the blur of the surroundings (standard deviation, degrees) that goes with the first.
-# A rate is how far a step moves the coarsest spline, in shares of the object's size, and an index; it moves finer
-# splines as much less as their control points are nearer, so that all turn the surface alike.
-_RATES, _BLUR, _LEAST_BLUR = (2e-4, 8e-6), 3.0, 0.35
-# Steps after which held-back pixels are asked. Their error is a little uncertain: where it is not lower, the surface
-# has another try, unless it is higher by this share. Then it goes back, and on at so much of the rate, with less blur.
-_JUDGE_EVERY, _WORSE, _SLOWER, _LESS_BLUR = 40, 0.01, 0.4, 0.55
-_MOST_STEPS = 800
+@dataclass(frozen=True)
+class _Stage:
+    """Steps at one pace.
+
+    Attributes:
+        steps: their number.
+        rate: how far the first step moves the coarsest spline, in shares of the object's size, and an index; it falls
+            along half a cosine. Finer splines move as much less as their control points are nearer, so that all turn
+            the surface alike.
+        blur: standard deviation of the surroundings' blur at the beginning and at the end, degrees; 0 for none.
+    """
+
+    steps: int
+    rate: float
+    blur: tuple[float, float]
+
+
+# The first stages are too bold for a surface that is nearly right. They are left when it is worse by a share, and so
+# is whatever is not the best when a stage ends.
+_STAGES = (
+    _Stage(200, 2e-4, (3.0, 1.4)),
+    _Stage(300, 1.5e-4, (1.4, 0.5)),
+    _Stage(150, 4e-5, (0.7, 0.35)),
+    _Stage(100, 1e-5, (0.0, 0.0)),
+)
+_WORSE = 0.01
+_JUDGE_EVERY = 25  # steps
 
 
 @dataclass(frozen=True)
@@ -113,23 +133,23 @@ def refine_surface(
         )
     descent = _Descent(mesh, medium, silhouettes, through, surroundings, learn_index)
     best, lowest = descent.state(), descent.judged(medium)
-    steps, errors = [0], [lowest]
-    rate, blur = _RATES[0], _BLUR
-    while rate >= _RATES[1] and steps[-1] < _MOST_STEPS:
-        sky, tries = _blurred(surroundings, blur), 2
-        while tries and steps[-1] < _MOST_STEPS:
-            for step in range(_JUDGE_EVERY):
-                descent.step(sky, rate)
-                progress(max((steps[-1] + step) / _MOST_STEPS, math.log(rate / _RATES[0], _RATES[1] / _RATES[0])))
-            steps.append(steps[-1] + _JUDGE_EVERY)
-            errors.append(descent.judged(descent.moved()))
-            tries -= 1
-            if errors[-1] < lowest:
-                best, lowest, tries = descent.state(), errors[-1], 2
-            elif errors[-1] > (1 + _WORSE) * lowest:
-                break
+    steps, errors, done = [0], [lowest], 0
+    for stage in _STAGES:
+        for step in range(stage.steps):
+            if step % _JUDGE_EVERY == 0:
+                share = step / stage.steps
+                sky = _blurred(surroundings, stage.blur[0] + (stage.blur[1] - stage.blur[0]) * share)
+            descent.step(sky, stage.rate * 0.5 * (1 + math.cos(math.pi * step / stage.steps)))
+            progress((done + step) / sum(other.steps for other in _STAGES))
+            if (step + 1) % _JUDGE_EVERY == 0:
+                steps.append(steps[-1] + _JUDGE_EVERY)
+                errors.append(descent.judged(descent.moved()))
+                if errors[-1] < lowest:
+                    best, lowest = descent.state(), errors[-1]
+                elif errors[-1] > (1 + _WORSE) * lowest:
+                    break
         descent.set(best)
-        rate, blur = _SLOWER * rate, max(_LESS_BLUR * blur, _LEAST_BLUR)
+        done += stage.steps
     progress(1.0)
     moved = descent.moved()
     used = len(descent.clear) / max(1, len(descent.looked_at))
@@ -220,7 +240,7 @@ class _Descent:
     def _moved(self) -> SdfGrid:
         return variant(self.medium.grown(self.offsets()), iors=1.0 * self.iors)
 
-    def step(self, sky: EnvironmentMap, rate: float) -> None:
+    def step(self, sky: Boundary, rate: float) -> None:
         """Follow the slope of the error, with surroundings that are blurred."""
         if self.num_steps and self.num_steps % _LOOK_EVERY == 0:
             self._look(self.moved())
@@ -232,7 +252,7 @@ class _Descent:
             self._loss(sky).backward()
         self.optimizer.step()
 
-    def _loss(self, sky: EnvironmentMap) -> Tensor:
+    def _loss(self, sky: Boundary) -> Tensor:
         medium = self._moved()
         drawn = torch.randint(len(self.clear), (_PIXELS,), generator=self.generator)
         pixels, weight = self.clear[drawn], self.weight[drawn]
@@ -317,8 +337,10 @@ def _robust(residual: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
 
 
 @torch.no_grad()
-def _blurred(surroundings: Surroundings, degrees: float) -> EnvironmentMap:
-    """Surroundings far away, as photographs show them, convolved with a Gaussian of that standard deviation."""
+def _blurred(surroundings: Surroundings, degrees: float) -> Boundary:
+    """Surroundings far away, convolved with a Gaussian of that standard deviation; themselves for none."""
+    if degrees == 0:
+        return surroundings.boundary
     count, generator = 32, torch.Generator().manual_seed(0)
     directions = texel_directions(max(16, round(135 / degrees)))
     total = torch.zeros_like(directions)

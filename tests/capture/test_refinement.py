@@ -36,9 +36,8 @@ def dented() -> SdfGrid:
 
 @pytest.fixture
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(refinement, "_RATES", (1e-3, 1e-4))
-    monkeypatch.setattr(refinement, "_MOST_STEPS", 160)
-    monkeypatch.setattr(refinement, "_JUDGE_EVERY", 20)
+    stages = (refinement._Stage(150, 5e-4, (3.0, 1.0)), refinement._Stage(50, 1e-4, (0.0, 0.0)))
+    monkeypatch.setattr(refinement, "_STAGES", stages)
     monkeypatch.setattr(refinement, "_LEVELS", (8, 16))
     monkeypatch.setattr(refinement, "_PIXELS", 2000)
     monkeypatch.setattr(refinement, "_VOXELS", 12)
