@@ -25,8 +25,9 @@ from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.surface import make_mesh, read_silhouettes, surfaces_inside
 from nerfro.capture.surroundings import Around
 from nerfro.capture.visual_hull import Silhouettes
-from nerfro.cli import entry_point
+from nerfro.cli import entry_point, warn
 from nerfro.data.masks import masked_views
+from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import load_mesh
 from nerfro.paths import resolve_path
 from nerfro.registry import build
@@ -61,14 +62,16 @@ def main(config: DictConfig) -> None:
     if config.refine:
         if silhouettes is None:
             silhouettes = Silhouettes.of(views.cameras, mesh_silhouettes(mesh, views.cameras, 1).float())
-        unknown = searches_index(config, overrides)
-        mesh = refine(around, mesh, refinable(found), silhouettes, unknown, folder).mesh
+        written = [MESH, *(name for name in written if name != MESH)]
+        try:
+            mesh = refine(around, mesh, refinable(found), silhouettes, searches_index(config, overrides), folder).mesh
+            written += [FIGURES, PICTURES]
+        except NerfroError as reason:  # all that is known by now is worth keeping
+            warn(f"the surface stays as it is: {reason}")
         location = str(folder / MESH)
         mesh.save(folder / MESH)
-        written = [MESH, FIGURES, PICTURES]
         if overlaps is not None:
-            overlaps = report_overlaps(config.split, views, mesh, silhouettes, None, folder, False)
-            written += [SHEET, REPORT]
+            overlaps = report_overlaps(config.split, views, mesh, silhouettes, None, folder, list_all=False)
         settings = surface_settings(config, views.cameras, mesh, location, overrides)
         found = find_medium(config, overrides, around, location, settings, folder)
     inside = surfaces_inside(found.medium)

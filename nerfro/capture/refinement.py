@@ -128,8 +128,7 @@ def refine_surface(
     """
     if isinstance(surroundings.boundary, Room):
         raise NerfroError(
-            "refine=true needs surroundings that are far away, and these photographs show near ones; leave it out, or "
-            "say room=false if they are far"
+            "refine=true needs surroundings that are far away, and these are near; say room=false if they are not"
         )
     descent = _Descent(mesh, medium, silhouettes, through, surroundings, learn_index)
     best, lowest = descent.state(), descent.judged(medium)

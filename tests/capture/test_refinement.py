@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import nerfro.preprocess
-from nerfro.capture import refinement
+from nerfro.capture import refinement, surroundings
 from nerfro.capture.refinement import Refined, refine_surface
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.surroundings import Room, Surroundings, divide_pixels, learn_surroundings
@@ -46,8 +46,8 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 def refined(start: SdfGrid, learn_index: bool = False) -> Refined:
     silhouettes = Silhouettes.of(cameras(), mesh_silhouettes(mesh(), cameras(), 1).float())
     beside, through = divide_pixels(photographs_of(dented()), mesh())
-    surroundings = learn_surroundings(beside, mesh(), False)
-    return refine_surface(mesh(), start, silhouettes, through, surroundings, learn_index)
+    around = learn_surroundings(beside, mesh(), False)
+    return refine_surface(mesh(), start, silhouettes, through, around, learn_index)
 
 
 def degrees_off(medium: SdfGrid, num_views: int = 6) -> float:
@@ -102,6 +102,21 @@ def test_preprocess_writes_the_refined_surface(
     figures = json.loads((out / "refinement.json").read_text())
     assert min(figures["held_back_error"]) < 0.6 * figures["held_back_error"][0]
     assert (out / "refinement.png").is_file()
+
+
+def test_a_surface_that_cannot_be_refined_stays_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(surroundings, "_NEAR_STEPS", 2)
+    monkeypatch.setattr(surroundings, "_NEAR_PIXELS", 64)
+    save(photographs_of(dented()), tmp_path)
+    out = tmp_path / "out"
+    options = [f"data.root={tmp_path}", f"mesh={tmp_path / 'mesh.ply'}", f"out={out}", "data.near=0.5", "room=true"]
+    options += ["refine=true", "medium.ior=1.5", "medium.cache=false", "medium.resolution=41"]
+    monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", *options])
+    nerfro.preprocess.main()
+    assert "the surface stays as it is" in capsys.readouterr().out
+    assert load_mesh(out / "mesh.ply").vertices.shape == mesh().vertices.shape
 
 
 def test_what_cannot_be_refined_is_refused_at_once(
