@@ -152,8 +152,12 @@ def _refusal(value: Any, hint: Any) -> str | None:
         return f"take {hints[1]}" if value not in hints[1] else None
     if origin is Annotated:
         return _refusal(value, hints[1])
+    if hint in (float, int) and isinstance(value, str):  # what an interpolation may bring
+        return "take a number"
     if hint is float:
         return None if _is_finite(value) else "take a finite number"
+    if origin is list and isinstance(value, str):
+        return "take a list"
     if origin in (list, tuple) and isinstance(value, Sequence):
         return next((reason for each in value if (reason := _refusal(each, hints[0]))), None)
     if origin in (Union, types.UnionType):

@@ -33,7 +33,7 @@ class SkipMLP(nn.Module):
         self.num_outputs = width + num_inputs * (skip == depth)
 
     def forward(self, x: Float[Tensor, "*batch I"]) -> Float[Tensor, "*batch O"]:
-        y = x
+        y = x = x.to(self.layers[0].weight.dtype)  # type: ignore[arg-type]  # rays are in single precision
         for i, layer in enumerate(self.layers, start=1):
             y = F.relu(layer(y))
             if i == self.skip:

@@ -20,7 +20,7 @@ def first_normals(path: Path, medium: Medium) -> Float[Tensor, "R 3"]:
     """
     normals = path.directions.new_zeros(len(path.s), 3)
     rows = path.refracted.nonzero()[:, 0]  # which few rays of a picture are
-    normals[rows] = _turning_normals(path[rows], medium)
+    normals[rows] = _turning_normals(path[rows], medium).to(normals)
     return path.first_of_ray(normals)
 
 
