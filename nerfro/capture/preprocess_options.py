@@ -16,6 +16,7 @@ from nerfro.cameras import Cameras
 from nerfro.capture.index_report import CURVE, INDEX, LENGTHS, LENGTHS_CURVE
 from nerfro.capture.overlaps import REPORT, SHEET
 from nerfro.capture.refinement_report import FIGURES, PICTURES
+from nerfro.capture.upright import find_up
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing
 from nerfro.geometry.mesh import TriangleMesh
@@ -117,7 +118,20 @@ def surface_settings(
         settings["data.near"] = float(f"{0.8 * distance.min():.3g}")
     if cameras.far <= distance.max():
         settings["data.far"] = float(f"{1.2 * distance.max():.3g}")
+    if "wall" in config.medium and not is_given("medium.up", overrides):
+        settings |= _up_settings(cameras, mesh)
     return settings
+
+
+def _up_settings(cameras: Cameras, mesh: TriangleMesh) -> dict[str, object]:
+    """What has to be said so that a vessel stands upright in a world whose z points elsewhere; it is printed too."""
+    found = find_up(cameras, mesh)
+    if found is None:
+        return {}
+    up, told = found
+    given = [round(float(x), 4) for x in up]
+    print(f"up is {given}, {told}; medium.up= says it otherwise")
+    return {"medium.up": given}
 
 
 def build_medium(config: DictConfig, settings: dict[str, object], location: str, numbers: dict[str, object]) -> Medium:
