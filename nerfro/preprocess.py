@@ -49,7 +49,9 @@ def main(config: DictConfig) -> None:
         require_consistent_poses(silhouettes, views.names, config.wrong_masks)
         carved = mesh is None
         if mesh is None:
-            mesh = make_mesh(silhouettes, box, config.resolution, config.wrong_masks, config.keep, config.smoothing)
+            mesh = make_mesh(
+                silhouettes, box, config.resolution, config.wrong_masks, config.keep, config.smoothing, config.symmetry
+            )
             location, written = str(folder / MESH), [MESH]
             mesh.save(folder / MESH)
         # Pictures and figures first: they help to find out what is wrong with a mesh that the medium then refuses.

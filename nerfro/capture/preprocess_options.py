@@ -6,7 +6,7 @@ import typing
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any, Literal, Optional
 
 import numpy as np
 from omegaconf import MISSING, DictConfig, OmegaConf
@@ -48,6 +48,7 @@ class PreprocessConfig:
         wrong_masks: number of views that may be wrong about any point of space.
         keep: number of separate parts to keep, the largest; by default all but strays.
         smoothing: how smooth the surface is where the masks leave it open; 0 for the carved hull itself.
+        symmetry: axis for what came off a wheel or a lathe: a body of revolution, where that looks like the masks.
         overwrite: whether files that exist may be replaced.
     """
 
@@ -65,6 +66,7 @@ class PreprocessConfig:
     wrong_masks: Natural = 0
     keep: Optional[Count] = None  # noqa: UP045
     smoothing: NotNegative = 1.0
+    symmetry: Annotated[Optional[str], Literal["axis"]] = None  # noqa: UP045
     overwrite: bool = False
 
 

@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from nerfro.capture.pose_conventions import overlap
+from nerfro.capture.revolution import Symmetry, fit_revolution
 from nerfro.capture.silhouette_fit import fit_surface
 from nerfro.capture.silhouettes import frame_pixels
 from nerfro.capture.visual_hull import Silhouettes, carve_grid, extract_surface, find_box, reaches_border, remove_strays
@@ -21,6 +23,8 @@ _FEWEST_VIEWS, _FEW_VIEWS = 3, 12
 _COARSE_VOXELS = 64
 # The object's box is found to this many coarse voxels.
 _MARGIN_VOXELS = 2
+# Of a body of revolution, which is truer where nothing tells, so much less overlap is taken; pixels a side to see it.
+_LESS_ALIKE, _MAX_PIXELS = 0.01, 256
 # Cameras whose directions to the object lie within this angle see it from one side, degrees.
 _ONE_SIDE = 75.0
 
@@ -71,8 +75,12 @@ def make_mesh(
     wrong_masks: int,
     keep: int | None,
     smoothing: float,
+    symmetry: Symmetry | None = None,
 ) -> TriangleMesh:
-    """Carve the hull and fit a smooth surface into it, see `PreprocessConfig`; the box is found where none is given."""
+    """Carve the hull and fit a smooth surface into it, see `PreprocessConfig`; the box is found where none is given.
+
+    With `symmetry` a body of revolution is fitted too, and taken where it looks as much like the masks.
+    """
     with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()) as progress:
         box = _object_box(silhouettes, wrong_masks) if corners is None else corners
         carving = progress.add_task("carving", total=3)
@@ -84,12 +92,31 @@ def make_mesh(
         if smoothing > 0:
             fitting = progress.add_task("fitting", total=1)
             mesh = fit_surface(mesh, silhouettes, smoothing, lambda done: progress.update(fitting, completed=done))
+        if symmetry is not None:
+            turning = progress.add_task("finding the axis", total=1)
+            turned = fit_revolution(mesh, silhouettes, lambda done: progress.update(turning, completed=done))
+    if symmetry is not None:
+        mesh = _as_alike(turned, mesh, silhouettes)
     if num_kept < num_parts:
         print(f"{num_kept} of {num_parts} separate parts kept, the largest")
     if reaches_border(distances):
         _warn_of_open_hull(silhouettes, box)
     print(f"{len(mesh.faces)} triangles, voxels of {spacing:.4g}")
     return mesh
+
+
+def _as_alike(turned: TriangleMesh, free: TriangleMesh, silhouettes: Silhouettes) -> TriangleMesh:
+    """The body of revolution, unless its silhouettes are clearly less like the masks' than the free surface's.
+
+    Medians are compared: masks from which something before the object is cut out should not decide.
+    """
+    of_turned, of_free = (float(np.median(overlap(mesh, silhouettes, _MAX_PIXELS))) for mesh in (turned, free))
+    told = f"overlap with the masks, median: {of_turned:.4f} as a body of revolution, {of_free:.4f} without"
+    if of_turned < of_free - _LESS_ALIKE:
+        warn(f"{told}; so it is none, and symmetry=axis is not used")
+        return free
+    print(told)
+    return turned
 
 
 def surfaces_inside(medium: Medium) -> list[TriangleMesh]:
