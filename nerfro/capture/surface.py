@@ -21,6 +21,8 @@ from nerfro.media.sdf_grid import SdfGrid
 
 _FEWEST_VIEWS, _FEW_VIEWS = 3, 12
 _COARSE_VOXELS = 64
+# Masks that are wrong shift the place where all seem to meet, so boxes so much wider are tried.
+_WIDER = (1.0, 1.3, 1.7)
 # The object's box is found to this many coarse voxels.
 _MARGIN_VOXELS = 2
 # Of a body of revolution, which is truer where nothing tells, so much less overlap is taken; pixels a side to see it.
@@ -130,10 +132,14 @@ def surfaces_inside(medium: Medium) -> list[TriangleMesh]:
 
 
 def _object_box(silhouettes: Silhouettes, wrong_masks: int) -> Float[np.ndarray, "2 3"]:
-    """Bounds of a coarse hull, with a margin."""
-    box = find_box(silhouettes, wrong_masks)
-    distances, corner, spacing = carve_grid(silhouettes, box, _COARSE_VOXELS, wrong_masks)
-    remove_strays(distances)
+    """Bounds of a coarse hull, with a margin; a box that cuts the hull off is made larger if that helps."""
+    first = find_box(silhouettes, wrong_masks)
+    for wider in (*_WIDER, 1.0):
+        box = first.mean(0) + wider * (first - first.mean(0))
+        distances, corner, spacing = carve_grid(silhouettes, box, _COARSE_VOXELS, wrong_masks)
+        remove_strays(distances)
+        if not reaches_border(distances):
+            break
     inside = np.argwhere(distances < 0)
     low, high = inside.min(0) - _MARGIN_VOXELS, inside.max(0) + _MARGIN_VOXELS
     return np.stack([corner + spacing * low, corner + spacing * high]).clip(*box)

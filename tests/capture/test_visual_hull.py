@@ -10,9 +10,11 @@ import torch
 import trimesh
 
 from nerfro.cameras import Cameras
+from nerfro.capture import surface
 from nerfro.capture.pose_conventions import overlap, require_consistent_poses
 from nerfro.capture.silhouette_fit import fit_surface
 from nerfro.capture.silhouettes import mesh_silhouettes, outline_distance
+from nerfro.capture.surface import make_mesh
 from nerfro.capture.visual_hull import (
     Silhouettes,
     carve_grid,
@@ -110,6 +112,15 @@ def test_wrong_masks_are_tolerated_when_told(odd_shape: trimesh.Trimesh) -> None
     box, expected = find_box(right), volume(hull(right, 40))
     assert (carve_grid(wrong, box, 40)[0] < 0).sum() < 0.3 * (carve_grid(right, box, 40)[0] < 0).sum()
     assert volume(hull(wrong, 40, wrong_masks=1)) == pytest.approx(expected, rel=0.25)
+
+
+def test_a_box_that_is_too_small_grows(odd_shape: trimesh.Trimesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wrong masks shift the place where all seem to meet."""
+    silhouettes = photographed(odd_shape, cameras_around(12, 48))
+    whole = make_mesh(silhouettes, None, 32, 0, None, 0.0)
+    small = whole.bounds.mean(0) + 0.4 * np.ptp(whole.bounds, axis=0).max() * np.array([[-1.0], [1.0]])
+    monkeypatch.setattr(surface, "find_box", lambda *given: small)
+    assert make_mesh(silhouettes, None, 32, 0, None, 0.0).bounds == pytest.approx(whole.bounds, abs=0.05)
 
 
 def test_strays_go_and_voids_are_filled() -> None:
