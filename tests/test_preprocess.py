@@ -108,6 +108,25 @@ def test_printed_command_trains(
     assert finished.code == 0, finished.err
 
 
+def test_a_vessel_stands_upright_in_a_world_whose_z_points_elsewhere(preprocess: Callable[..., str]) -> None:
+    lengths = ["medium=vessel", "medium.wall=0.1", "medium.level=1.0"]
+    printed = preprocess(*lengths)
+    # The cameras' right-hand axes are perpendicular to it, see `capture`.
+    held = np.array([0.3, 0.9, 0.1]) / np.linalg.norm([0.3, 0.9, 0.1])
+    (found,) = (part for part in shlex.split(printed.split("train on it: ")[1]) if part.startswith("medium.up="))
+    assert np.array(json.loads(found.split("=")[1])) @ held > 0.99
+    assert "medium.up= says it otherwise" in printed
+    given = preprocess(*lengths, "medium.up=[0,0,1]", "overwrite=true")
+    assert "medium.up=[0,0,1]" in given
+    assert "says it otherwise" not in given
+
+
+def test_a_body_of_revolution_is_fitted_where_it_is_asked_for(preprocess: Callable[..., str], capture: Path) -> None:
+    assert "as a body of revolution" in preprocess("medium.ior=1.33", "symmetry=axis")
+    radii = np.linalg.norm(load_mesh(capture / "mesh.ply").vertices - CENTRE, axis=1)
+    assert abs(radii.mean() - RADIUS) < 0.06
+
+
 def test_bounds_that_the_loader_finds_are_left_to_it(preprocess: Callable[..., str], capture: Path) -> None:
     frames = json.loads((capture / "transforms_train.json").read_text())["frames"]
     rows = []
