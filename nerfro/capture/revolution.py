@@ -167,8 +167,8 @@ def _first_guess(mesh: TriangleMesh) -> Profile:
         outer = np.interp(np.arange(_KNOTS), np.flatnonzero(known), outer[known])
         outer[:_END], outer[-_END:] = outer[_END], outer[-_END - 1]
         spread = np.abs(radius - outer[number])[(number > _END) & (number < _KNOTS - _END)].mean() / outer.mean()
-        parts = middle + low * axis, axis, np.array(high - low), outer
-        found.append((float(spread), Profile(*(torch.from_numpy(np.asarray(part)).float() for part in parts))))
+        foot, along_axis, radii = (torch.from_numpy(part).float() for part in (middle + low * axis, axis, outer))
+        found.append((float(spread), Profile(foot, along_axis, torch.tensor(float(high - low)), radii)))
     if not found:
         raise NerfroError("symmetry=axis: the hull has no axis; leave it out")
     return min(found, key=lambda each: each[0])[1]
@@ -195,10 +195,10 @@ def _rays(
             views.append(torch.full((len(chosen),), view))
             places.append(torch.from_numpy(chosen))
             sides.append(torch.full((len(chosen),), side))
-    view, place = torch.cat(views), torch.cat(places)
+    of_view, place = torch.cat(views), torch.cat(places)
     # Whole numbers are pixels' centres.
-    rays = cameras.rays(view, place[:, 0], place[:, 1])
-    width = 1 / (0.5 * (cameras.fx + cameras.fy))[view]
+    rays = cameras.rays(of_view, place[:, 0], place[:, 1])
+    width = 1 / (0.5 * (cameras.fx + cameras.fy))[of_view]
     return rays.origins.float(), rays.directions.float(), width, torch.cat(sides)
 
 
