@@ -116,8 +116,18 @@ def test_preprocess_finds_a_level_shows_it_and_trains_with_it(
 ) -> None:
     save(photographs_of(vessel(tmp_path)), tmp_path)
     out = tmp_path / "out"
-    options = [f"data.root={tmp_path}", f"mesh={tmp_path / 'mesh.ply'}", f"out={out}", "data.near=0.5", "medium=vessel",
-               "medium.wall=0.1", "medium.level=0.6", "medium.closed=true", "search=[level]"]  # fmt: skip
+    options = [
+        f"data.root={tmp_path}",
+        f"mesh={tmp_path / 'mesh.ply'}",
+        f"out={out}",
+        "data.near=0.5",
+        "medium=vessel",
+        "medium.wall=0.1",
+        "medium.level=0.6",
+        "medium.closed=true",
+        "search=[level]",
+        "medium.up=[0,0,1]",
+    ]  # fmt: skip; the cameras are level across another axis
     monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", *options, "medium.cache=false", "medium.resolution=48"])
     nerfro.preprocess.main()
     found = json.loads((out / "lengths.json").read_text())
