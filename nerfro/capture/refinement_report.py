@@ -38,14 +38,18 @@ def refine(
         folder: to write to.
     """
     through, surroundings = around.through, around.surroundings
-    with bar("surface") as told:
-        refined = refine_surface(mesh, medium, silhouettes, through, surroundings, learn_index, told)
+    with bar("surface") as done:
+        refined = refine_surface(mesh, medium, silhouettes, through, surroundings, learn_index, done)
     before, after = refined.errors[0], min(refined.errors)
-    moved = torch.from_numpy(refined.mesh.vertices - mesh.vertices).norm(dim=-1).median()
-    print(
-        f"surface refined: held-back pixels are off by {after:.4f} instead of {before:.4f} (0 right, 1 unrelated); "
-        f"half of it moved by {float(moved):.2g} or more; {refined.used:.0%} of the object's pixels told how"
-    )
+    told = f"held-back pixels are off by {after:.4f} instead of {before:.4f} (0 right, 1 unrelated)"
+    if refined.mesh is mesh:
+        print(f"the surface stays as it is: at best {told}, which is too little to trust")
+    else:
+        moved = float(torch.from_numpy(refined.mesh.vertices - mesh.vertices).norm(dim=-1).median())
+        print(
+            f"surface refined: {told}; half of it moved by {moved:.2g} or more; "
+            f"{refined.used:.0%} of the object's pixels told how"
+        )
     figures = {"steps": refined.steps, "held_back_error": [round(error, 5) for error in refined.errors]}
     write_atomically(folder / FIGURES, json.dumps(figures | {"pixels_used": round(refined.used, 3)}, indent=1) + "\n")
     _draw(around, medium, refined.medium, folder / PICTURES)

@@ -74,9 +74,11 @@ def test_a_dent_is_found(short: None) -> None:
     assert abs(radius[(vertices / radius[:, None]) @ AXIS < 0].mean() - RADIUS) < 0.1 * DEPTH
 
 
-def test_a_surface_that_is_right_is_not_made_worse(short: None) -> None:
-    found = refined(dented())
-    assert degrees_off(found.medium) < 0.1 * degrees_off(solid([1.5]))
+def test_a_surface_that_is_right_stays(short: None) -> None:
+    before = dented()
+    found = refined(before)
+    assert found.medium is before
+    assert len(found.errors) > 2  # others were tried
 
 
 def test_near_surroundings_are_refused(short: None) -> None:
