@@ -55,9 +55,10 @@ def main(config: DictConfig) -> None:
         seen = np.concatenate(quads)
     _report(calibration, "points" if target is None else target.feature, config.lens == "pinhole" and given is None)
     splits = split_views([image.name for image in images if image.name in calibration.poses], config.test_every)
-    written = write_calibrated(out, images, size, calibration, splits, config.target, quads, points)
+    reach = ray_range(calibration, seen)
+    written = write_calibrated(out, images, size, calibration, splits, config.target, quads, points, reach)
     print(f"wrote {', '.join(written)}")
-    options = ["data=opencv", f"data.root={out}", *ray_range(calibration, seen)]
+    options = ["data=opencv", f"data.root={out}", *reach]
     if any(masks):
         command = ["nerfro.preprocess", *options, "medium.ior=1.33"]
     else:

@@ -46,7 +46,7 @@ def entry_point(
         config_name: file in `config_dir`, without extension.
         schema: dataclass of the root.
         config_dir: conf/, or a folder in it whose entry point must not see the groups of conf/.
-        verbatim: keys of texts that may have commas, which Hydra would take for several values.
+        verbatim: keys of texts that may have commas and equals signs, which Hydra takes for more than text.
     """
 
     def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
@@ -152,7 +152,7 @@ def _unforeseen(error: Exception) -> str:
 def _quoted(argument: str, keys: tuple[str, ...]) -> str:
     """An override of one of some keys, with its value as a quoted text."""
     key, _, value = argument.partition("=")
-    if key not in keys or "," not in value or value[0] in "\"'":
+    if key not in keys or not set(",=") & set(value) or value[0] in "\"'":
         return argument
     return f"{key}='{value}'"
 

@@ -13,12 +13,14 @@ from nerfro.capture.medium_search import find_medium, refinable
 from nerfro.capture.overlaps import REPORT, SHEET, draw_overlays, report_overlaps
 from nerfro.capture.pose_conventions import require_consistent_poses
 from nerfro.capture.preprocess_options import (
+    FOUND,
     MESH,
     PreprocessConfig,
     claim,
     searches_index,
     surface_settings,
     train_command,
+    write_found,
 )
 from nerfro.capture.refinement_report import FIGURES, PICTURES, refine
 from nerfro.capture.silhouettes import mesh_silhouettes
@@ -79,13 +81,15 @@ def main(config: DictConfig) -> None:
     inside = surfaces_inside(found.medium)
     if overlaps is not None and inside:
         draw_overlays(views, mesh, overlaps, inside, folder)
-    written += found.written
+    settings |= found.settings
+    command = train_command(settings, overrides)
+    write_found(folder, command, found.doubtful, around.near, views.cameras)
+    written += [*found.written, FOUND]
     print(f"wrote {', '.join(str(folder / name) for name in written)}")
     if found.doubtful:
-        print(f"give {' '.join(found.doubtful)} yourself")
-    settings |= found.settings
+        print(f"give {' '.join(f'{option}=N' for option in found.doubtful)} yourself")
     print("where the surroundings are near, add +experiment=refractive_room; the baseline is +experiment=mipnerf")
-    print(f"train on it: {shlex.join(train_command(settings, overrides))}")
+    print(f"train on it: {shlex.join(command)}")
 
 
 if __name__ == "__main__":

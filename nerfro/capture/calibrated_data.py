@@ -41,10 +41,12 @@ def write_calibrated(
     target: str,
     quads: list[Float[np.ndarray, "4 3"]],
     points: Float[np.ndarray, "P 3"],
+    options: list[str],
 ) -> list[str]:
     """Write the data set (see docs/data.md) of images of a size (width, height), calibration.json and cameras.png.
 
-    The quads are the board's sheets and the points the scene's, for the plot. Returns what was written, in words.
+    The quads are the board's sheets and the points the scene's, for the plot; the options are those that the next
+    commands need to hold all that was seen. Returns what was written, in words.
     """
     files = {image.name: image for image in images}
     lens = calibration.intrinsics
@@ -65,6 +67,7 @@ def write_calibrated(
         written.append(f"{path} ({len(names)} views)")
     report = {
         "target": target,
+        "options": options,
         **document,
         "focal_deviation": lens.focal_deviation,
         "images": {

@@ -33,13 +33,13 @@ class FoundMedium:
     Attributes:
         medium: with all numbers that were found.
         settings: options that say them; not those that are doubtful.
-        doubtful: options that the pictures do not tell.
+        doubtful: options that the pictures do not tell, with what fits best.
         written: names of the files.
     """
 
     medium: Medium
     settings: dict[str, object] = field(default_factory=dict)
-    doubtful: list[str] = field(default_factory=list)
+    doubtful: dict[str, object] = field(default_factory=dict)
     written: list[str] = field(default_factory=list)
 
 
@@ -50,7 +50,8 @@ def refinable(found: FoundMedium) -> SdfGrid:
         NerfroError: it cannot, and why.
     """
     if found.doubtful:
-        raise NerfroError(f"refine=true needs the index, and the pictures do not tell it; give {found.doubtful[0]}")
+        option = next(iter(found.doubtful))
+        raise NerfroError(f"refine=true needs the index, and the pictures do not tell it; give {option}=N")
     return cast(SdfGrid, found.medium)
 
 
@@ -90,8 +91,9 @@ def find_medium(
         lengths = named_lengths(found.names, found.values)
         result = FoundMedium(vessel.with_lengths(lengths), written=[LENGTHS, LENGTHS_CURVE])
         named = {**lengths}
+    options: dict[str, object] = {f"medium.{name}": value for name, value in named.items()}
     if found.doubts:
-        result.doubtful = [f"medium.{name}=N" for name in named]
+        result.doubtful = options
     else:
-        result.settings = {f"medium.{name}": value for name, value in named.items()}
+        result.settings = options
     return result

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import typing
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -18,13 +19,13 @@ from nerfro.capture.overlaps import REPORT, SHEET
 from nerfro.capture.refinement_report import FIGURES, PICTURES
 from nerfro.capture.upright import find_up
 from nerfro.errors import NerfroError
-from nerfro.files.atomic import refuse_existing
+from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.base import Medium
 from nerfro.paths import EMBEDDED_PREFIX, resolve_path, user_path
 from nerfro.registry import build
 
-MESH = "mesh.ply"
+MESH, FOUND = "mesh.ply", "preprocess.json"
 # The medium's grid is this much wider than the object.
 _MARGIN_SHARE = 0.15
 
@@ -95,7 +96,7 @@ def claim(config: DictConfig, overrides: list[str]) -> Path:
     names += [MESH, FIGURES, PICTURES] if config.refine else []
     names += [LENGTHS, LENGTHS_CURVE] if config.search else []
     names += [INDEX, CURVE] if searches_index(config, overrides) else []
-    refuse_existing([folder / name for name in names], config.overwrite)
+    refuse_existing([folder / name for name in [*names, FOUND]], config.overwrite)
     return folder
 
 
@@ -153,5 +154,29 @@ def train_command(settings: dict[str, object], overrides: list[str]) -> list[str
     """The command that trains with these settings and what this command line said of data and medium."""
     kept = [text for text in overrides if text.lstrip("+").startswith(("data=", "data.", "medium=", "medium."))]
     kept = [text for text in kept if text.lstrip("+").split("=")[0] not in {*settings, "medium.mesh"}]
-    written = [f"{name}={str(value).replace(' ', '')}" for name, value in settings.items()]
-    return ["python", "-m", "nerfro.train", *kept, *written]
+    return ["python", "-m", "nerfro.train", *kept, *_written(settings)]
+
+
+def write_found(
+    folder: Path, command: list[str], doubtful: dict[str, object], near: bool | None, cameras: Cameras
+) -> None:
+    """Write preprocess.json: what training needs to know.
+
+    Args:
+        folder: to write to.
+        command: that trains.
+        doubtful: settings that it leaves out, because the photographs do not tell them, with what fits best.
+        near: whether the surroundings are near, if that was found out.
+        cameras: of the photographs.
+    """
+    found = {
+        "options": command[3:],
+        "doubtful": _written(doubtful),
+        "near": near,
+        "pixels": [cameras.width, cameras.height],
+    }
+    write_atomically(folder / FOUND, json.dumps(found, indent=1) + "\n")
+
+
+def _written(settings: dict[str, object]) -> list[str]:
+    return [f"{name}={str(value).replace(' ', '')}" for name, value in settings.items()]

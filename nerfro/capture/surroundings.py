@@ -193,6 +193,12 @@ class Around:
     def __init__(self, views: Views, mesh: TriangleMesh, room: bool | None) -> None:
         self.views, self._mesh, self._room = views, mesh, room
 
+    @property
+    def near(self) -> bool | None:
+        """Whether the surroundings are near; None where nothing has asked for them."""
+        known = self.__dict__.get("surroundings")
+        return None if known is None else isinstance(known.boundary, Room)
+
     @cached_property
     def through(self) -> Pixels:
         """Pixels that the object fills."""

@@ -113,11 +113,13 @@ class NerfModel(LightningModule, ABC):
 
     def parameter_groups(self) -> dict[str, tuple[list[nn.Parameter], float]]:
         """All that learns: parameters and initial learning rate by name. A model that adds parameters adds a group."""
-        config = self.optimizer_config
+        config, bending = self.optimizer_config, self.medium.bending_parameters()
+        tint = [own for own in self.medium.parameters() if all(own is not other for other in bending)]
         groups = {
             "fields": (list(self.fields.parameters()), config.learning_rate),
             "boundary": (list(self.boundary.parameters()), config.rate("boundary")),
-            "medium": ([*self.medium.parameters(), *self.path_sampler.parameters()], config.rate("medium")),
+            "medium": ([*bending, *self.path_sampler.parameters()], config.rate("medium")),
+            "tint": (tint, config.rate("tint")),
             "camera": (self.camera.bending_parameters(), config.rate("camera")),
             "exposure": (self.camera.brightness_parameters(), config.rate("exposure")),
         }

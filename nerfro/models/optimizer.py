@@ -22,7 +22,8 @@ class OptimizerConfig:
     final_learning_rate: Positive = 5e-6
     # Of the other parts that learn, at the beginning, decaying in proportion; none for the same.
     boundary_learning_rate: Optional[Positive] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    medium_learning_rate: Optional[Positive] = None  # noqa: UP045
+    medium_learning_rate: Optional[Positive] = None  # noqa: UP045 - of what bends rays: indices
+    tint_learning_rate: Optional[Positive] = None  # noqa: UP045 - of what absorbs light
     camera_learning_rate: Optional[Positive] = None  # noqa: UP045
     exposure_learning_rate: Optional[Positive] = None  # noqa: UP045
     medium_start: Natural = 0  # steps before what bends rays learns, so that it is not misled by an unlearned scene

@@ -1,0 +1,275 @@
+"""`python -m nerfro.reconstruct`: stages in their order, what is kept, what is made again, and how it fails."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.core.global_hydra import GlobalHydra
+
+import nerfro.reconstruct
+import nerfro.train
+from nerfro.capture import refinement, stages
+from nerfro.capture.stages import finished, option
+from nerfro.files.images import save_png
+from tests.ball_photographs import RADIUS, SIZE, cameras, photographs, save
+from tests.conftest import Finished, finish
+
+Reconstruct = Callable[..., Finished]
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    """Three photographs; a folder `silhouettes` beside theirs has a mask of each."""
+    for i in range(3):
+        save_png(tmp_path / "photos" / f"IMG_{i}.png", torch.full((8, 8, 3), 0.2 * i))
+        mask = tmp_path / "silhouettes" / f"IMG_{i}.png"
+        save_png(mask, torch.ones(8, 8, 3))
+        os.utime(mask, (0, 0))
+    return tmp_path / "photos"
+
+
+@pytest.fixture
+def reconstruct(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Reconstruct:
+    return lambda *overrides: finish(nerfro.reconstruct.main, overrides, monkeypatch, capsys)
+
+
+class Pretended:
+    """Commands that do nothing but write their results, a second after each other by their files' times.
+
+    Attributes:
+        ran: name of each command with its options.
+        ends: exit status of commands that do not reach their end, by name.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self.out, self.near, self.doubtful = out, False, []
+        self.ran: list[tuple[str, list[str]]] = []
+        self.ends: dict[str, int] = {}
+        self._now = time.time() - 1000
+
+    @property
+    def names(self) -> list[str]:
+        return [name for name, _ in self.ran]
+
+    def write(self, file: str, content: object = None) -> None:
+        path = self.out / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(content))
+        self._now += 1
+        os.utime(path, (self._now, self._now))
+
+    def __call__(self, command: list[str]) -> int:
+        name, options = command[2].removeprefix("nerfro."), command[3:]
+        self.ran.append((name, options))
+        if name == "train":
+            self.write("run/config.yaml")
+        if name in self.ends:
+            return self.ends[name]
+        if name == "calibrate":
+            self.write("transforms_train.json")
+            self.write("calibration.json", {"options": ["data.near=0.1", "data.far=7"]})
+        if name == "mask":
+            self.write("masks.png")
+        if name == "preprocess":
+            found = {"options": ["data=opencv", "medium.ior=1.4"], "doubtful": self.doubtful, "near": self.near}
+            self.write("surface/mesh.ply")
+            self.write("surface/preprocess.json", {**found, "pixels": [512, 384]})
+        if name == "train":
+            self.write("run/metrics.json")
+        if name == "summary":
+            self.write("report/report.html")
+        return 0
+
+
+@pytest.fixture
+def pretended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pretended:
+    made = Pretended(tmp_path / "out")
+    monkeypatch.setattr(stages, "finished", made)
+    return made
+
+
+ALL = ["calibrate", "preprocess", "train", "summary"]
+
+
+def test_photographs_pass_all_stages_once(reconstruct: Reconstruct, pretended: Pretended, photos: Path) -> None:
+    asked = f"images={photos}", f"masks={photos.parent / 'silhouettes'}", f"out={pretended.out}", "data.far=9"
+    done = reconstruct(*asked, "medium.resolution=64", "train=trainer.max_steps=3 logger=none", "preprocess=keep=1")
+    assert done.code == 0, done.err
+    assert pretended.names == ALL
+    links = sorted(path.relative_to(pretended.out).as_posix() for path in pretended.out.glob("*/IMG*"))
+    assert links == [f"{folder}/IMG_{i}.png" for folder in ("images", "masks") for i in range(3)]
+    calibrate, preprocess, train, _ = (options for _, options in pretended.ran)
+    assert "target=colmap" in calibrate
+    data = ["data=opencv", f"data.root={pretended.out}", "data.near=0.1", "data.far=9"]
+    assert preprocess[:5] == [*data, "medium.resolution=64"]
+    assert preprocess[-1] == "keep=1"
+    assert train == ["+experiment=unknown", "data=opencv", "medium.ior=1.4", "data.downscale=2", "trainer.max_steps=3",
+                     "logger=none", f"hydra.run.dir={pretended.out / 'run'}"]  # fmt: skip
+    assert f"python -m nerfro.train {' '.join(train)}" in done.out
+    again = reconstruct(*asked)
+    assert again.code == 0, again.err
+    assert pretended.names == ALL
+    assert again.out.count(" is kept (to make it again, delete it)") == 4
+
+
+def test_what_changed_is_followed_by_what_is_made_of_it(
+    reconstruct: Reconstruct, pretended: Pretended, photos: Path
+) -> None:
+    asked = f"images={photos}", f"masks={photos.parent / 'silhouettes'}", f"out={pretended.out}"
+    reconstruct(*asked)
+    pretended.write("../silhouettes/IMG_1.png")
+    done = reconstruct(*asked)
+    assert pretended.names == [*ALL, *ALL[1:]]
+    # The training that was there is another one's.
+    assert (pretended.out / "run_1" / "metrics.json").is_file()
+    assert f"which is kept as {pretended.out / 'run_1'}" in done.out
+    assert "ckpt_path=last" not in pretended.ran[-2][1]
+    (pretended.out / "report" / "report.html").unlink()
+    reconstruct(*asked)
+    assert pretended.names == [*ALL, *ALL[1:], "summary"]
+
+
+def test_an_interrupted_training_goes_on(reconstruct: Reconstruct, pretended: Pretended, photos: Path) -> None:
+    pretended.ends["train"] = 130
+    asked = f"images={photos}", f"out={pretended.out}"
+    stopped = reconstruct(*asked)
+    assert stopped.code == 130
+    assert stopped.err == "nerfro: interrupted; to go on, start the same command again; train is not done\n"
+    pretended.ends.clear()
+    assert reconstruct(*asked).code == 0
+    assert pretended.names == ["calibrate", "preprocess", "train", "train", "summary"]
+    assert "ckpt_path=last" not in pretended.ran[2][1]
+    assert pretended.ran[3][1] == [*pretended.ran[2][1], "ckpt_path=last"]
+
+
+def test_a_stage_that_fails_is_named_and_the_others_wait(
+    reconstruct: Reconstruct, pretended: Pretended, photos: Path
+) -> None:
+    pretended.ends["preprocess"] = 1
+    failed = reconstruct(f"images={photos}", f"out={pretended.out}")
+    assert failed.code == 1
+    assert failed.err.startswith("nerfro: error: preprocess failed, and the line above says why; ")
+    assert "give preprocess='OPTIONS'" in failed.err
+    assert failed.err.count("\n") == 1
+    assert pretended.names == ["calibrate", "preprocess"]
+    pretended.ends["preprocess"] = 0
+    assert "preprocess failed" in reconstruct(f"images={photos}", f"out={pretended.out}").err, "no result was written"
+    assert pretended.names == ["calibrate", "preprocess", "preprocess"]
+
+
+def test_what_was_found_chooses_the_experiment(
+    reconstruct: Reconstruct, pretended: Pretended, tiny_scene: Path
+) -> None:
+    asked = "data=blender", f"data.root={tiny_scene}", "outlines={r_0:[1,2,9,9]}", "medium=vessel", "medium.wall=0.1"
+    (pretended.near, pretended.doubtful) = True, ["medium.ior=1.37"]
+    done = reconstruct(*asked, f"out={pretended.out}")
+    assert pretended.names == ["mask"], "its sheet lies in the data's folder"
+    assert "mask failed" in done.err
+    done = reconstruct(*asked[:2], *asked[3:], f"out={pretended.out}")
+    assert pretended.names[1:] == ["preprocess", "train", "summary"]
+    assert pretended.ran[1][1][:4] == ["data=blender", f"data.root={tiny_scene}", "medium=vessel", "medium.wall=0.1"]
+    train = pretended.ran[2][1]
+    assert train[0] == "+experiment=[refractive_room,glass]"
+    assert train[1:4] == ["data=opencv", "medium.ior=1.4", "medium.ior=1.37"]
+    assert "medium.ior=1.37 fits best, but the photographs do not tell for sure" in done.out
+
+
+@pytest.mark.parametrize(
+    ("overrides", "told"),
+    [
+        ((), "set out=FOLDER, and images=PHOTOS"),
+        (("images=PHOTOS", "data.root=PHOTOS"), "set out=FOLDER, and images=PHOTOS"),
+        (("images=PHOTOS", "data=blender"), "images= are photographs without poses"),
+        (("data.root=PHOTOS", "masks=PHOTOS"), "masks= belongs to images="),
+        (("images=PHOTOS", "masks=PHOTOS/none"), "none is not a folder; give the one that holds"),
+        (("images=PHOTOS/none",), "none is not a folder; it should hold the images"),
+    ],
+)
+def test_what_contradicts_itself_is_refused(
+    reconstruct: Reconstruct, pretended: Pretended, photos: Path, overrides: tuple[str, ...], told: str
+) -> None:
+    refused = reconstruct(f"out={pretended.out}", *(text.replace("PHOTOS", str(photos)) for text in overrides))
+    assert refused.code == 1
+    assert told in refused.err
+    assert pretended.names == []
+
+
+def test_a_result_that_was_spoilt_is_refused(reconstruct: Reconstruct, pretended: Pretended, photos: Path) -> None:
+    asked = f"images={photos}", f"out={pretended.out}"
+    reconstruct(*asked)
+    pretended.write("surface/preprocess.json", {"options": []})
+    assert "lacks one of doubtful, near, options, pixels; delete it to have it made again" in reconstruct(*asked).err
+
+
+def test_paths_are_quoted_for_hydra() -> None:
+    assert option("out", Path("a/b_c.d")) == "out=a/b_c.d"
+    assert option("out", 'a, "b') == 'out="a, \\"b"'
+
+
+def test_a_command_is_left_time_to_save_when_this_process_is_asked_to_end() -> None:
+    program = (
+        "from nerfro.capture.stages import finished; import sys; print(finished([sys.executable, '-c', '''{}''']))"
+    )
+    saving = "import signal,time; signal.signal(15, lambda *_: exit(130)); print(0, flush=True); time.sleep(60)"
+    process = subprocess.Popen([sys.executable, "-c", program.format(saving)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "0\n"
+    time.sleep(0.2)
+    process.send_signal(signal.SIGINT)  # Ctrl-C would have reached the command too
+    process.send_signal(signal.SIGTERM)
+    assert process.communicate(timeout=30)[0] == "130\n"
+    assert finished([sys.executable, "-c", "exit(3)"]) == 3
+
+
+def test_posed_photographs_of_a_ball_become_a_scene(
+    reconstruct: Reconstruct, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All stages but that of poses, each in this process."""
+    data, out = tmp_path / "ball", tmp_path / "out"
+    save(photographs([1.45]), data)
+    for view in range(len(cameras())):
+        rays = cameras().image_rays(view)
+        from_middle = torch.linalg.cross(rays.origins, rays.directions).norm(dim=-1)
+        share = (0.5 + (RADIUS - from_middle) / (3 / (0.8 * SIZE))).clamp(0, 1)  # of a pixel
+        save_png(data / "masks" / "train" / f"r_{view}.png", share.view(SIZE, SIZE, 1).expand(-1, -1, 3))
+
+    def here(command: list[str]) -> int:
+        GlobalHydra.instance().clear()
+        monkeypatch.setattr(sys, "argv", command[2:])
+        try:
+            importlib.import_module(command[2]).main()
+        except SystemExit as end:
+            return int(end.code or 0)
+        return 0
+
+    monkeypatch.setattr(stages, "finished", here)
+    monkeypatch.setattr(nerfro.train, "find_lpips_networks", lambda *files: ({}, {}))
+    monkeypatch.setattr(refinement, "_STAGES", (refinement._Stage(20, 1e-4, (3.0, 1.0)),))
+    monkeypatch.setattr(refinement, "_PIXELS", 1000)
+    train = ["evaluation.split=train", "evaluation.every=0", "evaluation.supersample=1", "logger=none",
+             "trainer.accelerator=cpu", "trainer.max_steps=2", "trainer.max_time=null", "batches.size=64",
+             "boundary.resolutions=[4,8]", "field.num_levels=2", "field.log2_table_size=8",
+             "sampler.points.num_samples=4", "sampler.points.resolution=16",
+             "optimizer.boundary_first=100"]  # fmt: skip
+    asked = ["data=blender", f"data.root={data}", "data.near=0.5", f"out={out}", "medium.resolution=32",
+             "medium.cache=false", "preprocess=resolution=24", f"train={' '.join(train)}"]  # fmt: skip
+    done = reconstruct(*asked)
+    assert done.code == 0, done.err
+    assert json.loads((out / "surface" / "index.json").read_text())["ior"] == [pytest.approx(1.45, rel=0.02)]
+    found = json.loads((out / "surface" / "preprocess.json").read_text())
+    assert found["near"] is False
+    assert found["doubtful"] == []
+    assert (out / "surface" / "refinement.png").is_file()
+    assert json.loads((out / "run" / "metrics.json").read_text())["steps"] == 2
+    assert "unknown" in (out / "report" / "report.html").read_text()
+    assert reconstruct(*asked).out.count(" is kept (to make it again, delete it)") == 3
