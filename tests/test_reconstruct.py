@@ -188,7 +188,7 @@ def test_what_was_found_chooses_the_experiment(
     ("overrides", "told"),
     [
         ((), "set out=FOLDER, and images=PHOTOS"),
-        (("images=PHOTOS", "data.root=PHOTOS"), "set out=FOLDER, and images=PHOTOS"),
+        (("images=PHOTOS", "data.root=PHOTOS"), "images= are photographs without poses"),
         (("images=PHOTOS", "data=blender"), "images= are photographs without poses"),
         (("data.root=PHOTOS", "masks=PHOTOS"), "masks= belongs to images="),
         (("images=PHOTOS", "masks=PHOTOS/none"), "none is not a folder; give the one that holds"),

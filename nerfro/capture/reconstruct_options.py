@@ -46,13 +46,11 @@ class ReconstructConfig:
 
 def have_poses(config: DictConfig, overrides: list[str]) -> bool:
     """Whether the photographs have poses; what contradicts itself is refused."""
-    posed = not OmegaConf.is_missing(config.data, "root")
-    if config.out is None or posed == (config.images is not None):
-        raise NerfroError(
-            "set out=FOLDER, and images=PHOTOS or, where they have poses, data=FORMAT and data.root=FOLDER"
-        )
-    if not posed and is_given("data", overrides):
-        raise NerfroError("images= are photographs without poses; data=FORMAT is for data.root=FOLDER, leave it out")
+    posed = config.images is None
+    if config.out is None or (posed and OmegaConf.is_missing(config.data, "root")):
+        raise NerfroError("set out=FOLDER, and images=PHOTOS or, where they have poses, data=FORMAT data.root=FOLDER")
+    if not posed and (is_given("data", overrides) or is_given("data.root", overrides)):
+        raise NerfroError("images= are photographs without poses, data= and data.root= such with poses; give one")
     if posed and config.masks is not None:
         raise NerfroError("masks= belongs to images=; the masks of data.root= lie in it, as docs/data.md tells")
     return posed
