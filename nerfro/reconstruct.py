@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
@@ -73,7 +74,7 @@ def _train(config: DictConfig, overrides: list[str], surface: Path, run: Path) -
         if is_older(begun, made_of):
             print(f"\ntrain: the surface is newer than {run}, which is kept as {move_aside(run)}")
         else:
-            options.append("ckpt_path=last")
+            stage = replace(stage, options=[*options, "ckpt_path=last"])
     stage.run()
 
 
