@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -89,16 +90,25 @@ def test_near_surroundings_are_refused(short: None) -> None:
         refine_surface(mesh(), solid([1.5]), silhouettes, through, near)
 
 
-def test_preprocess_writes_the_refined_surface(
-    short: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    save(photographs_of(dented()), tmp_path)
-    out = tmp_path / "out"
-    options = [f"data.root={tmp_path}", f"mesh={tmp_path / 'mesh.ply'}", f"out={out}", "data.near=0.5", "room=false"]
-    options += ["refine=true", "medium.ior=1.5", "medium.cache=false", "medium.resolution=41"]
-    monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", *options])
-    nerfro.preprocess.main()
-    assert "surface refined" in (printed := capsys.readouterr().out)
+@pytest.fixture
+def preprocess(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable:
+    """Refine the ball's mesh by photographs of the dented one; returns the folder, and what was printed."""
+
+    def run(*overrides: str) -> tuple[Path, str]:
+        save(photographs_of(dented()), tmp_path)
+        out = tmp_path / "out"
+        options = [f"data.root={tmp_path}", f"mesh={tmp_path / 'mesh.ply'}", f"out={out}", "data.near=0.5"]
+        options += ["refine=true", "medium.ior=1.5", "medium.cache=false", "medium.resolution=41"]
+        monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", *options, *overrides])
+        nerfro.preprocess.main()
+        return out, capsys.readouterr().out
+
+    return run
+
+
+def test_preprocess_writes_the_refined_surface(short: None, preprocess: Callable) -> None:
+    out, printed = preprocess("room=false")
+    assert "surface refined" in printed
     assert f"medium.mesh={out / 'mesh.ply'}" in printed
     assert load_mesh(out / "mesh.ply").vertices.shape == mesh().vertices.shape
     figures = json.loads((out / "refinement.json").read_text())
@@ -106,18 +116,11 @@ def test_preprocess_writes_the_refined_surface(
     assert (out / "refinement.png").is_file()
 
 
-def test_a_surface_that_cannot_be_refined_stays_as_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_surface_that_cannot_be_refined_stays_as_it_is(preprocess: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(surroundings, "_NEAR_STEPS", 2)
     monkeypatch.setattr(surroundings, "_NEAR_PIXELS", 64)
-    save(photographs_of(dented()), tmp_path)
-    out = tmp_path / "out"
-    options = [f"data.root={tmp_path}", f"mesh={tmp_path / 'mesh.ply'}", f"out={out}", "data.near=0.5", "room=true"]
-    options += ["refine=true", "medium.ior=1.5", "medium.cache=false", "medium.resolution=41"]
-    monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", *options])
-    nerfro.preprocess.main()
-    assert "the surface stays as it is" in capsys.readouterr().out
+    out, printed = preprocess("room=true")
+    assert "the surface stays as it is" in printed
     assert load_mesh(out / "mesh.ply").vertices.shape == mesh().vertices.shape
 
 

@@ -189,3 +189,16 @@ def test_what_no_vessel_has_is_refused_in_one_line(tmp_path: Path, options: dict
     with pytest.raises(NerfroError, match=message) as refused:
         spherical_vessel(tmp_path, 2, resolution=40, **options)
     assert "\n" not in str(refused.value)
+
+
+def test_a_vessel_that_grows_keeps_its_wall(tmp_path: Path) -> None:
+    vessel = spherical_vessel(tmp_path, wall=WALL)
+    before = vessel.coarse_clearance
+    larger = vessel.grown(torch.full_like(vessel.distances[0], 0.02))
+    torch.testing.assert_close(larger.distances[0], vessel.distances[0] - 0.02)
+    # Where the wall and not the foot bounds the cavity, before and after.
+    by_wall = (vessel.distances[1] == vessel._side + WALL) & (larger.distances[1] == larger._side + WALL)
+    assert by_wall.float().mean() > 0.5
+    torch.testing.assert_close(larger.distances[1][by_wall], vessel.distances[1][by_wall] - 0.02)
+    assert vessel.coarse_clearance is before
+    assert not torch.equal(larger.coarse_clearance, before)
