@@ -35,14 +35,9 @@ def composite(samples: Samples, radiance: Radiance, boundary_rgb: Float[Tensor, 
     """
     density, rgb = radiance.density.float(), radiance.rgb.float()  # sums over a ray stay in single precision
     weights, transmittance = volume_weights(density, samples.deltas)
+    boundary_rgb = boundary_rgb.float()
     if path.absorbs:
         rgb = rgb * path.transmitted(samples.s)
-    boundary_rgb = tinted_boundary(boundary_rgb, path)
+        boundary_rgb = boundary_rgb * path.transmitted(path.far[:, None])[:, 0]
     colour = (weights[..., None] * rgb).sum(-2) + transmittance[:, None] * boundary_rgb
     return Rendering(path.per_ray(colour), weights, transmittance, boundary_rgb, samples, path)
-
-
-def tinted_boundary(boundary_rgb: Float[Tensor, "P 3"], path: Path) -> Float[Tensor, "P 3"]:
-    """What arrives of the boundary's radiance through what absorbs on the path."""
-    boundary_rgb = boundary_rgb.float()
-    return boundary_rgb * path.transmitted(path.far[:, None])[:, 0] if path.absorbs else boundary_rgb

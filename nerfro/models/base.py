@@ -24,7 +24,6 @@ from nerfro.light import clipped_alike, to_linear, to_srgb
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.models.optimizer import OptimizerConfig, learning_rate_factor, training_progress
-from nerfro.rendering import tinted_boundary
 from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.surface_normals import first_normals
 from nerfro.types import Batch, Path, Rays, Rendering
@@ -56,9 +55,6 @@ class NerfModel(LightningModule, ABC):
         fields: radiance field of each sampling level, or one for all.
         colour: what fields and boundary return and rays add up: `linear` radiance, or `srgb` as in the authors' code.
     """
-
-    # Whether a path that meets nothing shows what `boundary` is where it leaves; then pictures need no samples on it.
-    empty_shows_boundary = False
 
     def __init__(self, parts: Parts, fields: list[Field], colour: Literal["linear", "srgb"] = "linear") -> None:
         super().__init__()
@@ -222,21 +218,9 @@ class NerfModel(LightningModule, ABC):
         return RenderedRays(*(torch.cat(parts) for parts in zip(*chunks, strict=True)))
 
     def _render_chunk(self, rays: Rays) -> tuple[Tensor, ...]:
-        path = self.trace(rays)
-        exits, normals = path.first_of_ray(path.exit_directions), first_normals(path, self.medium)
-        meets = self.point_sampler.may_meet(path) if self.empty_shows_boundary else None
-        if meets is None:
-            rendering = self.render_path(path)[-1]
-            return rendering.rgb, rendering.depth, rendering.opacity, exits, normals
-        # Most rays of a picture meet nothing inside.
-        rgb = path.per_ray(tinted_boundary(self.boundary(path.exits()), path))
-        depth = path.first_of_ray(path.far).clone()
-        opacity = torch.zeros_like(depth)
-        rows = path.ray[meets].unique_consecutive()
-        if len(rows):
-            rendering = self.render_path(path.of_rays(rows))[-1]
-            rgb[rows], depth[rows], opacity[rows] = rendering.rgb, rendering.depth, rendering.opacity
-        return rgb, depth, opacity, exits, normals
+        rendering = self(rays)[-1]
+        normals = first_normals(rendering.path, self.medium)
+        return rendering.rgb, rendering.depth, rendering.opacity, rendering.exit_directions, normals
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,6 @@ class RefractiveModel(NerfModel):
     ) -> None:
         super().__init__(parts, [parts.make_field() for _ in range(parts.point_sampler.num_levels)], colour)
         self.boundary_direction = boundary_direction
-        self.empty_shows_boundary = boundary_direction == "exit"
 
     def render_path(self, path: Path) -> list[Rendering]:
         samples = self.point_sampler(path, None)

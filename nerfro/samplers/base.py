@@ -55,9 +55,5 @@ class PointSampler(nn.Module, ABC):
     def forward(self, path: Path, previous: Rendering | None) -> Samples:
         """Sample the path, first without and then with the previous level's rendering."""
 
-    def may_meet(self, path: Path) -> Bool[Tensor, "P"] | None:
-        """Which polylines of a picture may meet anything inside; the others show the boundary. None for all of them."""
-        return None
-
     def after_step(self, step: int, fields: Sequence[Field]) -> None:
         """Learn from the radiance fields after a training step, if the sampler remembers anything of them."""

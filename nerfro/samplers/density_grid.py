@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import Annotated
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -15,7 +14,6 @@ from nerfro.allowed import Count, NotNegative, Positive, Range, Share, corners_o
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.geometry.contraction import contract, contracted_box, expand, shrinkage
-from nerfro.kernels.arrays import arrays
 from nerfro.registry import register
 from nerfro.rendering import volume_weights
 from nerfro.samplers.base import PointSampler
@@ -91,10 +89,6 @@ class DensityGridSampler(PointSampler):
         along = Samples.along(path, samples.s, samples.edges)
         return replace(along, occupied=samples.occupied, lengths=samples.lengths, measure=samples.measure)
 
-    @torch.no_grad()
-    def may_meet(self, path: Path) -> Bool[Tensor, "P"]:
-        return self.remembers_compiled(path) if path.s.device.type == "cpu" else self.remembers(path)
-
     def _places(self, path: Path) -> Float[Tensor, "P N+1"]:
         """Where in the cumulative weights the edges of samples lie.
 
@@ -119,8 +113,13 @@ class DensityGridSampler(PointSampler):
 
     def draw(self, path: Path, u: Float[Tensor, "R N+1"]) -> Samples:
         """Samples at places `u` of the cumulative weights: the plain reference of the compiled kernel."""
-        measure, places, density = self._bins(path)
-        weights, _ = volume_weights(density, places.diff(dim=1))
+        if self.radius is None:
+            measure: WithinBox | Contracted = WithinBox.of(path, self.box)
+        else:
+            measure = Contracted.of(path, self.centre, self.radius, self.near)
+        places = torch.linspace(0, 1, self.num_bins + 1, device=u.device) * measure.total[:, None]
+        positions, _ = path.at(measure.arc_length(midpoints(places)).to(path.s.dtype))
+        weights, _ = volume_weights(self.lookup(self.contracted(positions)), places.diff(dim=1))
         share = weights / weights.sum(-1, keepdim=True).clamp(min=1e-6)
         places = invert_cdf(places, share + self._floor, u)
         edges = measure.arc_length(places).to(path.s.dtype)
@@ -134,33 +133,6 @@ class DensityGridSampler(PointSampler):
         depth = self.lookup(self.contracted(samples.positions)) * places.diff(dim=1)
         return replace(samples, occupied=depth >= _EMPTY)
 
-    def _bins(self, path: Path) -> tuple[WithinBox | Contracted, Float[Tensor, "P B+1"], Float[Tensor, "P B"]]:
-        """The measure along paths, places of even bins in it, and the density that is remembered in their middles."""
-        if self.radius is None:
-            measure: WithinBox | Contracted = WithinBox.of(path, self.box)
-        else:
-            measure = Contracted.of(path, self.centre, self.radius, self.near)
-        places = torch.linspace(0, 1, self.num_bins + 1, device=path.s.device) * measure.total[:, None]
-        positions, _ = path.at(measure.arc_length(midpoints(places)).to(path.s.dtype))
-        return measure, places, self.lookup(self.contracted(positions))
-
-    def remembers(self, path: Path) -> Bool[Tensor, "P"]:
-        """Whether polylines cross what is remembered: the plain reference of the compiled kernel."""
-        _, places, density = self._bins(path)
-        return (density * places.diff(dim=1)).sum(-1) >= self._thin
-
-    def remembers_compiled(self, path: Path) -> Bool[Tensor, "P"]:
-        """The same as `remembers`, on the CPU."""
-        from nerfro.kernels.threads import use_threads
-        from nerfro.samplers.density_grid_cpu import remembers  # compiled code, so only where it is used
-
-        use_threads()
-        arguments: list[Any] = [*self._for_kernels(path), self.num_bins, self._thin, self.radius or 0.0, self.near]
-        return torch.from_numpy(remembers(*arguments))
-
-    def _for_kernels(self, path: Path) -> list[np.ndarray]:
-        return arrays(path.positions, path.directions, path.s, *self.box, self.density)
-
     def draw_compiled(self, path: Path, u: Float[Tensor, "R N+1"]) -> Samples:
         """The same as `draw`, on the CPU.
 
@@ -173,9 +145,20 @@ class DensityGridSampler(PointSampler):
         from nerfro.samplers.density_grid_cpu import draw  # compiled code, so only where it is used
 
         use_threads()
-        settings = self.num_bins, self._floor, _EMPTY, self.radius or 0.0, self.near
-        arguments: list[Any] = [*self._for_kernels(path), *arrays(u), *settings]
-        drawn = draw(*arguments)
+        drawn = draw(
+            path.positions.detach().contiguous().numpy(),
+            path.directions.detach().contiguous().numpy(),
+            path.s.detach().contiguous().numpy(),
+            self.box[0].numpy(),
+            self.box[1].numpy(),
+            self.density.numpy(),
+            u.contiguous().numpy(),
+            self.num_bins,
+            self._floor,
+            _EMPTY,
+            self.radius or 0.0,
+            self.near,
+        )
         edges, s, positions, directions, occupied, *of_measure = (torch.from_numpy(array) for array in drawn)
         lengths, measure = (None, None) if self.radius is None else of_measure
         return Samples(positions, directions, s, edges, path.radii, occupied, lengths, measure)
@@ -187,11 +170,6 @@ class DensityGridSampler(PointSampler):
     def contracted(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Where the grid has what is at these positions of the world."""
         return positions if self.radius is None else contract(positions, self.centre, self.radius)
-
-    @property
-    def _thin(self) -> float:
-        """Optical depth of a path below which no sample has `_EMPTY`: its weight is spread over all of them."""
-        return _EMPTY * (self.num_samples + 1) * (1 - self.uniform)
 
     @property
     def _floor(self) -> float:

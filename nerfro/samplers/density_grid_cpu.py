@@ -131,51 +131,6 @@ def _stopped(depth):
     return depth - 0.5 * depth * depth if depth < _THIN else 1.0 - np.exp(-depth)
 
 
-@compiled
-def _measured(positions, directions, s, low, high, centre, radius, near, runs):
-    """Places of the measure between which one polyline is sampled; its runs are written for `_arc_length`."""
-    if radius > 0.0:
-        return 0.0, _contracted_runs(positions, directions, s, centre, radius, near, runs[0], runs[1], runs[2], runs[3])
-    _even_runs(s, runs[0])
-    return _span(positions, directions, s, low, high)
-
-
-@compiled
-def _grid(low, high, cells):
-    """A grid's middle, and its cells a unit along each axis."""
-    centre, per_unit = np.empty(3), np.empty(3)
-    for axis in range(3):
-        centre[axis] = 0.5 * (low[axis] + high[axis])
-        per_unit[axis] = cells / (high[axis] - low[axis])
-    return centre, per_unit
-
-
-@compiled_parallel
-def remembers(positions, directions, s, low, high, density, num_bins, empty, radius, near):
-    """Whether each polyline crosses an optical depth of `empty` or more; takes what `draw` takes of that name."""
-    num_rays, cells = s.shape[0], density.shape[0]
-    found, flat = np.empty(num_rays, np.bool_), density.ravel()
-    centre, per_unit = _grid(low, high, cells)
-    for block in prange((num_rays + _BLOCK - 1) // _BLOCK):
-        runs = np.empty((4, s.shape[1]))
-        for ray in range(block * _BLOCK, min((block + 1) * _BLOCK, num_rays)):
-            first, last = _measured(positions[ray], directions[ray], s[ray], low, high, centre, radius, near, runs)
-            width = (last - first) / num_bins
-            depth, run, index = 0.0, 0, 0
-            while width > 0.0 and depth < empty and index < num_bins:
-                place = first + (index + 0.5) * width
-                run = _segment(runs[0], run, place)
-                ahead = _arc_length(place, run, runs[0], runs[1], runs[2], runs[3], radius) - s[ray, run]
-                x = positions[ray, run, 0] + ahead * directions[ray, run, 0]
-                y = positions[ray, run, 1] + ahead * directions[ray, run, 1]
-                z = positions[ray, run, 2] + ahead * directions[ray, run, 2]
-                smaller = _shrinkage(x, y, z, centre, radius)
-                depth += flat[_cell(x, y, z, smaller, centre, low, per_unit, cells)] * width
-                index += 1
-            found[ray] = depth >= empty
-    return found
-
-
 @compiled_parallel
 def draw(positions, directions, s, low, high, density, u, num_bins, floor, empty, radius, near):
     """Edges and middles of samples drawn in proportion to the weights that the density gives, plus a floor.
@@ -196,12 +151,22 @@ def draw(positions, directions, s, low, high, density, u, num_bins, floor, empty
     lengths = np.empty((num_rays, num_edges - 1), np.float32)
     measure = np.empty((num_rays, num_edges), np.float32)
     flat = density.ravel()
-    centre, per_unit = _grid(low, high, cells)
     for block in prange((num_rays + _BLOCK - 1) // _BLOCK):
         runs, weights = np.empty((4, num_runs)), np.empty(num_bins, np.float32)
         marks, begin, passing, aside = runs[0], runs[1], runs[2], runs[3]
+        centre, per_unit = np.empty(3), np.empty(3)
+        for axis in range(3):
+            centre[axis] = 0.5 * (low[axis] + high[axis])
+            per_unit[axis] = cells / (high[axis] - low[axis])
         for ray in range(block * _BLOCK, min((block + 1) * _BLOCK, num_rays)):
-            first, last = _measured(positions[ray], directions[ray], s[ray], low, high, centre, radius, near, runs)
+            if radius > 0.0:
+                first = 0.0
+                last = _contracted_runs(
+                    positions[ray], directions[ray], s[ray], centre, radius, near, marks, begin, passing, aside
+                )
+            else:
+                first, last = _span(positions[ray], directions[ray], s[ray], low, high)
+                _even_runs(s[ray], marks)
             width = (last - first) / num_bins
             if width == 0.0:  # most rays of a picture miss the object
                 run = _segment(marks, 0, last)

@@ -51,17 +51,6 @@ def test_compiled_kernel_draws_what_the_plain_twin_draws(space: dict) -> None:
         assert close.float().mean() > 0.99  # a sample within rounding of a vertex may lie on either side
 
 
-@pytest.mark.parametrize("space", [{}, ALL_OF_SPACE])
-def test_compiled_kernel_remembers_what_the_plain_twin_remembers(space: dict) -> None:
-    sampler, path = trained_sampler(**space).eval(), example_path(64)
-    plain = sampler.remembers(path)
-    assert 5 < plain.sum() < 60
-    assert torch.equal(sampler.remembers_compiled(path), plain)
-    assert torch.equal(sampler.may_meet(path), plain)
-    asked = sampler(path, None).occupied.any(-1)
-    assert not (asked & ~plain).any(), "no ray is left out on which the field would be asked"
-
-
 @pytest.mark.parametrize("num_rows", [63, 65])
 def test_kernel_refuses_other_numbers_of_rows_than_of_paths(num_rows: int) -> None:
     sampler, u = DensityGridSampler(num_samples=16), torch.zeros(num_rows, 17)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -11,9 +10,6 @@ import torch
 from nerfro.errors import NerfroError
 from nerfro.evaluation.render_view import Supersampling
 from nerfro.files import lat_long
-from nerfro.samplers.density_grid import DensityGridSampler
-from nerfro.samplers.snell import Snell
-from nerfro.variants import variant
 from nerfro.viewing.scene import Scene
 from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, colour, sky_of
 
@@ -117,27 +113,6 @@ def test_pictures_do_not_depend_on_chunks_and_carry_their_supersampling(scene: S
     mean = fine.view(1, 32, 3, 32, 3, 3).mean((2, 4))
     parts = scene.render(camera, Supersampling(3)).radiance
     torch.testing.assert_close(parts, mean, atol=1e-5, rtol=1e-5)
-
-
-@pytest.mark.parametrize("branches", ["none", "all"])
-def test_rays_that_meet_nothing_are_not_sampled_and_look_the_same(
-    scene: Scene, branches: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sampler = DensityGridSampler(64, 128, [-RADIUS] * 3, [RADIUS] * 3, resolution=48, every=1, looks=0.5)
-    for step in range(20):
-        sampler.after_step(step, [scene.field])
-    model = variant(scene.model, point_sampler=sampler.eval(), path_sampler=Snell(branches=branches))
-    tinted = replace(scene, model=model).with_(absorption=[0.1, 0.5, 1.0])
-    sampled, draw = [], sampler.draw_compiled
-    monkeypatch.setattr(sampler, "draw_compiled", lambda path, u: (sampled.append(len(path.s)), draw(path, u))[1])
-    skipped = tinted.render(scene.cameras())
-    num_of_skipped = sum(sampled)
-    monkeypatch.setattr(sampler, "may_meet", lambda path: None)
-    whole = tinted.render(scene.cameras())
-    assert 0 < num_of_skipped < (sum(sampled) - num_of_skipped) / 3
-    for one, other in zip(skipped, whole, strict=True):
-        torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
-    assert (skipped.opacity > 0.9).any()
 
 
 def test_the_surface_is_that_of_the_ball_with_its_normals(scene: Scene) -> None:
