@@ -77,8 +77,9 @@ class Cameras:
     def device(self) -> torch.device:
         return self.camera_to_world.device
 
-    def to(self, device: torch.device | str) -> Cameras:
-        return self._each(lambda tensor: tensor.to(device))
+    def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> Cameras:
+        """The same cameras on another device, or in another precision."""
+        return self._each(lambda tensor: tensor.to(device, dtype))
 
     def select(self, views: list[int]) -> Cameras:
         """Some of the cameras, in the order that is asked for."""
@@ -120,8 +121,10 @@ class Cameras:
         Returns:
             Rays in world space with unit directions.
         """
-        offset_x, offset_y = (0.5, 0.5) if jitter is None else jitter.unbind(-1)
         fx = self.fx[view]
+        # Not in PyTorch's default type, which Lightning changes for moments while another thread makes rays.
+        offset_x, offset_y = (0.5, 0.5) if jitter is None else jitter.to(fx).unbind(-1)
+        row, column = row.to(fx), column.to(fx)
         x = (column + offset_x - self.cx[view]) / fx
         y = (self.cy[view] - row - offset_y) / self.fy[view]
         width = 1 / fx

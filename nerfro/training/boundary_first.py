@@ -45,7 +45,7 @@ class BoundaryFirst(Callback):
         optimizer = trainer.optimizers[0]
         group = next(group for group in optimizer.param_groups if group["name"] == "boundary")
         first, last = _RATES
-        batches = self._batches.to(pl_module.device)
+        batches = self._batches.to(pl_module.device, learning[0].dtype)
         num_pixels = min(_NUM_PIXELS, int(_SHARE * batches.num_pixels))
         for step in told("boundary", range(self._num_steps)):
             rays, view, rgb = batches.missing(box, num_pixels, step)

@@ -6,6 +6,7 @@ import itertools
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import cast
 
 import torch
 from lightning.pytorch import LightningDataModule
@@ -31,10 +32,10 @@ class RayDataModule(LightningDataModule):
 
     def train_dataloader(self) -> Iterator[int]:
         assert self.trainer is not None  # Lightning attaches it before it asks
-        device = self.trainer.strategy.root_device
-        self._batches = self.batches.to(device)
+        device, model = self.trainer.strategy.root_device, cast(NerfModel, self.trainer.lightning_module)
+        self._batches = self.batches.to(device, cast(torch.dtype, model.dtype))
         self.end_thread()
-        if device.type == "cpu" and can_trace_ahead(self.trainer.lightning_module):  # type: ignore[arg-type]
+        if device.type == "cpu" and can_trace_ahead(model):
             self._ahead = OneAhead(self._batches.batch)
         # Lightning asks after it has restored a checkpoint, so a resumed run goes on with the batch it would have had.
         return itertools.count(self.trainer.global_step)

@@ -74,10 +74,10 @@ class RayBatches:
             self._usable = {window: _Usable(views.usable, window) for window in windows}
             self._check_usable(np.diff(self._usable[self._crop].starts), views.names)
 
-    def to(self, device: torch.device | str) -> RayBatches:
-        """The same sequence with cameras and pixels on another device."""
+    def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> RayBatches:
+        """The same sequence with cameras and pixels on another device, its rays in another precision."""
         moved = copy.copy(self)
-        moved._cameras, moved._pixels = self._cameras.to(device), self._pixels.to(device)
+        moved._cameras, moved._pixels = self._cameras.to(device, dtype), self._pixels.to(device)
         return moved
 
     def traced(

@@ -61,7 +61,7 @@ def test_a_reflection_past_the_ball_is_not_tinted() -> None:
 def test_absorption_learns_without_tracing_again() -> None:
     model = RefractiveModel(replace(example_parts(), medium=Ball(learn_absorption=True), path_sampler=Snell()))
     assert not model.paths_learn, "paths may be traced ahead"
-    parameters, _ = model.parameter_groups()["medium"]
+    parameters, _ = model.parameter_groups()["tint"]
     assert [tuple(parameter.shape) for parameter in parameters] == [(1, 3)]
     with torch.no_grad():
         path = model.trace(example_rays())

@@ -153,10 +153,10 @@ def test_a_batch_is_made_when_its_step_begins_if_paths_learn(
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1}, raising=False)
     made: list[int] = []
     batches: Any = SimpleNamespace(batch=lambda step: made.append(step) or step * 10)
-    batches.to = lambda device: batches
+    batches.to = lambda device, dtype: batches
     batches.forget = lambda: None
     data = RayDataModule(batches, None, 0)
-    model = SimpleNamespace(path_sampler=Snell(), medium=ball, paths_learn=learns)
+    model = SimpleNamespace(path_sampler=Snell(), medium=ball, paths_learn=learns, dtype=torch.float32)
     strategy = SimpleNamespace(root_device=torch.device("cpu"))
     data.trainer = SimpleNamespace(strategy=strategy, lightning_module=model, global_step=5, training=True)  # type: ignore[assignment]
     steps = iter(data.train_dataloader())

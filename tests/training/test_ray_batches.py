@@ -285,3 +285,21 @@ def test_smaller_sequence_has_its_share_of_a_process(views):
     assert len(batches.smaller(10).batch(0).rays) == 10
     assert [len(batches.share(rank, 2).smaller(10).batch(0).rays) for rank in range(2)] == [5, 5]
     assert len(batches.batch(0).rays) == 40, "the sequence itself stays"
+
+
+@pytest.mark.parametrize("jitter", [False, True])
+def test_batches_made_ahead_do_not_depend_on_the_default_type(views, jitter):
+    """Lightning sets it for each step of `trainer.precision=64-true`, while a thread makes the next batch."""
+    medium, sampler = Ball().double(), Snell()
+    batches = RayBatches(views, 60, "all_images", 1, jitter=jitter).to("cpu", torch.float64)
+    batches = batches.traced(lambda rays, _: sampler(rays, medium), 2, 0.0)
+    expected = batches.batch(0)
+    torch.set_default_dtype(torch.float64)
+    try:
+        batch = batches.batch(0)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert batch.num_whole == 0, "all pixels are divided"
+    assert batch.rays.directions.dtype == batch.path.positions.dtype == torch.float64
+    assert torch.equal(batch.rays.directions, expected.rays.directions)
+    assert torch.equal(batch.path.positions, expected.path.positions)
