@@ -66,18 +66,19 @@ def main(config: DictConfig) -> None:
     if config.refine:
         if silhouettes is None:
             silhouettes = Silhouettes.of(views.cameras, mesh_silhouettes(mesh, views.cameras, 1).float())
+        before, location = mesh, str(folder / MESH)
         written = [MESH, *(name for name in written if name != MESH)]
         try:
             mesh = refine(around, mesh, refinable(found), silhouettes, searches_index(config, overrides), folder).mesh
             written += [FIGURES, PICTURES]
         except NerfroError as reason:  # all that is known by now is worth keeping
             warn(f"the surface stays as it is: {reason}")
-        location = str(folder / MESH)
         mesh.save(folder / MESH)
-        if overlaps is not None:
-            overlaps = report_overlaps(config.split, views, mesh, silhouettes, None, folder, list_all=False)
         settings = surface_settings(config, views.cameras, mesh, location, overrides)
-        found = find_medium(config, overrides, around, location, settings, folder)
+        if mesh is not before:
+            if overlaps is not None:
+                overlaps = report_overlaps(config.split, views, mesh, silhouettes, None, folder, list_all=False)
+            found = find_medium(config, overrides, around, location, settings, folder)
     inside = surfaces_inside(found.medium)
     if overlaps is not None and inside:
         draw_overlays(views, mesh, overlaps, inside, folder)

@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
-from nerfro.capture.surroundings import Pixels, Room, Surroundings
+from nerfro.capture.surroundings import Pixels, Room, Surroundings, robust
 from nerfro.errors import NerfroError
 from nerfro.media.solid import Solid
 from nerfro.media.vessel import SdfVessel
@@ -240,9 +239,9 @@ class _Search:
         if not self.num_pixels:
             raise NerfroError("no ray of the object's pixels meets its surface; mesh and poses do not belong together")
         colours = surroundings.colours
-        self._square = float((_HALF * colours.std(0).mean()) ** 2) + 1e-6
+        self._half = max(_HALF * float(colours.std(0).mean()), 1e-3)
         other = colours[torch.randint(len(colours), (len(self._pixels),), generator=torch.Generator().manual_seed(1))]
-        self.unrelated = float(self._robust(other - self._pixels.radiance).mean())
+        self.unrelated = float(robust(other - self._pixels.radiance, self._half).mean())
 
     def costs(
         self, candidates: Float[np.ndarray, "C K"], num_pixels: int, alike: bool, progress: Callable[[float], None]
@@ -260,14 +259,9 @@ class _Search:
             radiance, known = self._surroundings.radiance(trace.path.exits())
             known &= ~trace.exceeded
             everywhere &= known
-            errors.append(torch.where(known, self._robust(radiance - pixels.radiance), self.unrelated))
+            errors.append(torch.where(known, robust(radiance - pixels.radiance, self._half), self.unrelated))
             progress((number + 1) / len(candidates))
         used = everywhere if alike else torch.ones_like(everywhere)
         view, num_views = pixels.view[used], len(pixels.cameras)
         sums = [torch.bincount(view, error[used].double(), num_views).numpy() for error in errors]
         return _Costs(np.stack(sums), torch.bincount(view, minlength=num_views).double().numpy())
-
-    def _robust(self, residual: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
-        """r^2 / (r^2 + s^2)."""
-        square = residual.square().mean(-1)
-        return square / (square + self._square)

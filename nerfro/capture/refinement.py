@@ -27,7 +27,7 @@ from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.cube_map import texel_directions
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.capture.silhouette_fit import rim_points
-from nerfro.capture.surroundings import HELD_BACK, Pixels, Room, Surroundings
+from nerfro.capture.surroundings import HELD_BACK, Pixels, Room, Surroundings, robust
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import bspline_basis, quadratic_spline
@@ -266,7 +266,7 @@ class _Descent:
         path = self.sampler.refine(path[usable], rays, medium)
         residual = sky(path.exits()).clamp(max=1) - pixels.radiance[usable]
         weight = weight[usable]
-        photometric = (weight * _robust(residual)).sum() / weight.sum().clamp(min=1e-6)
+        photometric = (weight * robust(residual, _HALF)).sum() / weight.sum().clamp(min=1e-6)
         rims = self.rims[torch.randint(len(self.rims), (_RIMS,), generator=self.generator)]
         now, before = (quadratic_spline(each.coefficients[0], each.box, rims)[0] for each in (medium, self.medium))
         left = ((now - before) / self.outline).square()
@@ -282,7 +282,7 @@ class _Descent:
         trace = self.sampler.trace(self.judges.rays, medium)
         radiance, known = self.surroundings.radiance(trace.path.exits())
         known &= ~trace.exceeded & trace.path.refracted
-        errors = _robust(radiance - self.judges.radiance)
+        errors = robust(radiance - self.judges.radiance, _HALF)
         if self.first_errors is None:
             self.judges, errors = self.judges[known], errors[known]
             self.first_errors, known = errors, known[known]
@@ -307,7 +307,7 @@ class _Descent:
         voxels = self._voxels(path)
         beyond = _VOXELS**3
         crossing = torch.bincount(voxels.flatten(), minlength=beyond + 1)
-        agreeing = (1 - _robust(residual))[:, None].expand_as(voxels)
+        agreeing = (1 - robust(residual, _HALF))[:, None].expand_as(voxels)
         share = torch.bincount(voxels.flatten(), agreeing.flatten().double(), beyond + 1) / crossing.clamp(min=1)
         told = crossing >= _FEWEST_RAYS
         told[beyond] = False
@@ -333,12 +333,6 @@ class _Descent:
             x, y, z = voxel.unbind(-1)
             numbers.append(torch.where(inside, (x * _VOXELS + y) * _VOXELS + z, _VOXELS**3))
         return torch.cat(numbers)
-
-
-def _robust(residual: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
-    """r^2 / (r^2 + s^2)."""
-    square = residual.square().mean(-1)
-    return square / (square + _HALF**2)
 
 
 @torch.no_grad()

@@ -83,6 +83,12 @@ class Pixels:
         return self[chosen.sort().values]
 
 
+def robust(residual: Float[Tensor, "P 3"], half: float) -> Float[Tensor, "P"]:
+    """r^2 / (r^2 + half^2), r^2 the mean over channels: 0 right, 1/2 at `half`, 1 unrelated (Geman and McClure)."""
+    square = residual.square().mean(-1)
+    return square / (square + half**2)
+
+
 def divide_pixels(views: Views, mesh: TriangleMesh, max_pixels: int = _MAX_PIXELS) -> tuple[Pixels, Pixels]:
     """Pixels beside the object and pixels that it fills, by its masks, or by its mesh where there are none.
 
