@@ -101,7 +101,7 @@ def test_glb_is_laid_out_as_the_specification_asks(scene: Scene, tmp_path: Path)
         outwards = (np.cross(b - a, c - a) * named["NORMAL"][faces.reshape(-1, 3)[:, 0]]).sum(-1)
         assert (outwards > -1e-9).mean() > 0.99
         if "COLOR_0" in named:
-            np.testing.assert_allclose(named["COLOR_0"], colour(torch.from_numpy(places)), atol=1e-4)
+            np.testing.assert_allclose(named["COLOR_0"], colour(torch.tensor(places)), atol=1e-4)
 
 
 VALIDATE = """const bytes = new Uint8Array(require("fs").readFileSync(process.argv[1]));
