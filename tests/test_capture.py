@@ -50,7 +50,7 @@ def outline_of(points: np.ndarray, height: int, width: int) -> np.ndarray:
 def few(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two photographs, large enough to find tags in."""
     pytest.importorskip("mitsuba")
-    pytest.importorskip("pupil_apriltags")
+    pytest.importorskip("pyapriltags")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dataset, "BAKING_SPP", 8)
         return photograph(tmp_path_factory.mktemp("few"), resolution=320, photographs=2, spp=4)
@@ -119,7 +119,7 @@ def test_from_photographs_to_a_table(
 ) -> None:
     """The commands of docs/capture.md as each prints the next, on fewer and smaller photographs, which are kept."""
     pytest.importorskip("mitsuba")
-    pytest.importorskip("pupil_apriltags")
+    pytest.importorskip("pyapriltags")
     kept = request.config.cache.mkdir("dolphin_capture") / "photographs"
     photograph(kept, resolution=400, photographs=24, spp=4, overwrite=True)
     data = tmp_path / "data"

@@ -130,19 +130,19 @@ def draw_tag(family: Family, number: int) -> UInt8[np.ndarray, "S S"]:
     tag[start : start + white, start : start + white] = np.pad(np.zeros((white - 2,) * 2), 1, constant_values=255)
     start = (side - codes.width_at_border) // 2
     for bit in range(codes.nbits):
-        # Bits outside the border have negative places, which the struct holds as unsigned numbers.
-        column, row = (int(np.uint32(places[bit]).astype(np.int32)) + start for places in (codes.bit_x, codes.bit_y))
+        column, row = codes.bit_x[bit] + start, codes.bit_y[bit] + start
         tag[row, column] = 255 * (codes.codes[number] >> (codes.nbits - 1 - bit) & 1)
     return tag
 
 
 @functools.cache
 def tag_detector(family: Family) -> Any:
-    """The pupil_apriltags.Detector of a family, which also holds its codes."""
+    """The pyapriltags.Detector of a family, which also holds its codes."""
     try:
-        from pupil_apriltags import Detector
+        from pyapriltags import Detector
     except ImportError as error:
-        raise NerfroError(f"AprilTags need pupil-apriltags ({error}); pip install 'nerfro[capture]'") from error
+        raise NerfroError(f"AprilTags need pyapriltags ({error}); pip install 'nerfro[capture]'") from error
+    # Not pupil-apriltags: its old library writes past its memory where a picture is full of detail.
     # Full resolution: decimated edges cost accuracy, and calibration is in no hurry.
     return Detector(families=family, nthreads=1, quad_decimate=1.0)
 

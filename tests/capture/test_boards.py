@@ -50,7 +50,7 @@ def test_a_grids_tags_lie_as_printed() -> None:
 
 def test_tags_are_those_of_opencv() -> None:
     cv2 = pytest.importorskip("cv2")
-    pytest.importorskip("pupil_apriltags")
+    pytest.importorskip("pyapriltags")
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     for number in (0, 5, 586):
         tag = draw_tag("tag36h11", number)
@@ -62,7 +62,7 @@ def test_tags_are_those_of_opencv() -> None:
 
 def test_detected_corners_are_those_of_the_drawing() -> None:
     cv2 = pytest.importorskip("cv2")
-    pytest.importorskip("pupil_apriltags")
+    pytest.importorskip("pyapriltags")
     for board in (twelve_faces(), tag_grid("tag36h11", 3, 4, 0.05)):
         face = board.faces[-1]
         drawn = np.pad(board.draw(face, 12), 36, constant_values=255)

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 pytest.importorskip("cv2")
-pytest.importorskip("pupil_apriltags")
+pytest.importorskip("pyapriltags")
 
 from nerfro.capture.boards import tag_grid, twelve_faces
 from nerfro.capture.calibration import Intrinsics, calibrate
