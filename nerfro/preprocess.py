@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 
 from nerfro.capture.medium_search import find_medium, refinable
 from nerfro.capture.overlaps import REPORT, SHEET, draw_overlays, report_overlaps
-from nerfro.capture.pose_conventions import require_consistent_poses
+from nerfro.capture.pose_conventions import better_wrong_masks, require_consistent_poses
 from nerfro.capture.preprocess_options import (
     FOUND,
     MESH,
@@ -48,17 +48,20 @@ def main(config: DictConfig) -> None:
     overlaps = silhouettes = None
     if mesh is None or views.masks is not None:
         silhouettes = read_silhouettes(views, box is not None)
-        require_consistent_poses(silhouettes, views.names, config.wrong_masks)
+        wrong_masks = config.wrong_masks
+        if wrong_masks is None:
+            wrong_masks = better_wrong_masks(silhouettes, 0) or 0
+            print(f"wrong_masks={wrong_masks}: a coarse hull looks most like the masks if so many views may be wrong")
+        require_consistent_poses(silhouettes, views.names, wrong_masks)
         carved = mesh is None
         if mesh is None:
             mesh = make_mesh(
-                silhouettes, box, config.resolution, config.wrong_masks, config.keep, config.smoothing, config.symmetry
+                silhouettes, box, config.resolution, wrong_masks, config.keep, config.smoothing, config.symmetry
             )
             location, written = str(folder / MESH), [MESH]
             mesh.save(folder / MESH)
         # Pictures and figures first: they help to find out what is wrong with a mesh that the medium then refuses.
-        wrong_masks = config.wrong_masks if carved else None
-        overlaps = report_overlaps(config.split, views, mesh, silhouettes, wrong_masks, folder)
+        overlaps = report_overlaps(config.split, views, mesh, silhouettes, wrong_masks if carved else None, folder)
         written += [SHEET, REPORT]
     settings = surface_settings(config, views.cameras, mesh, location, overrides)
     around = Around(views, mesh, config.room)

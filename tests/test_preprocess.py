@@ -248,3 +248,6 @@ def test_disagreeing_masks_name_the_number_that_may_be_wrong(preprocess: Callabl
     after = json.loads((capture / "overlaps.json").read_text())["views"]
     whole = [f"train/r_{view}" for view in range(1, NUM_VIEWS)]
     assert np.mean([after[name] for name in whole]) > np.mean([before[name] for name in whole]) + 0.01
+    found = preprocess("wrong_masks=null", "overwrite=true")
+    assert f"wrong_masks={told[1]}: a coarse hull" in found
+    assert json.loads((capture / "overlaps.json").read_text())["views"] == after

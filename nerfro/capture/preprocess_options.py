@@ -46,7 +46,8 @@ class PreprocessConfig:
         out: folder that the results are written to; by default data.root.
         resolution: voxels along the longest side of the hull.
         box_min, box_max: box that the hull is carved in, world units; by default found from cameras and masks.
-        wrong_masks: number of views that may be wrong about any point of space.
+        wrong_masks: number of views that may be wrong about any point of space; null for the number with which the
+            hull looks most like the masks.
         keep: number of separate parts to keep, the largest; by default all but strays.
         smoothing: how smooth the surface is where the masks leave it open; 0 for the carved hull itself.
         symmetry: axis for what came off a wheel or a lathe: a body of revolution, where that looks like the masks.
@@ -64,7 +65,7 @@ class PreprocessConfig:
     resolution: Annotated[int, Range(at_least=16, at_most=1024)] = 96
     box_min: Optional[list[float]] = None  # noqa: UP045
     box_max: Optional[list[float]] = None  # noqa: UP045
-    wrong_masks: Natural = 0
+    wrong_masks: Optional[Natural] = 0  # noqa: UP045
     keep: Optional[Count] = None  # noqa: UP045
     smoothing: NotNegative = 1.0
     symmetry: Annotated[Optional[str], Literal["axis"]] = None  # noqa: UP045
