@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from nerfro.fields.base import Field
 from nerfro.media.base import Medium
+from nerfro.samplers.branching import ONE_PATH
 from nerfro.types import Path, Rays, Rendering, Samples
 
 
@@ -18,6 +19,7 @@ class PathSampler(nn.Module, ABC):
     """Bends rays into paths: traced without gradients, and refined where something learns from them."""
 
     needs_medium = True  # whether it asks the medium at all; if not, none is built
+    branching = ONE_PATH  # which parts of light that is partly reflected are followed
 
     @abstractmethod
     def forward(self, rays: Rays, medium: Medium) -> Path:

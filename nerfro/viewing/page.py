@@ -79,7 +79,7 @@ def frame_of(scene: Scene, views: Views, split: str) -> dict[str, Any]:
     near = float(cameras.near) if contracted_beyond(scene) is None else float(model.point_sampler.near)  # type: ignore[arg-type]
     return {
         "linear": model.colour == "linear",
-        "reflection": getattr(model.path_sampler, "branches", "none") != "none",
+        "reflection": model.path_sampler.branching.num_events > 0,
         "orbit": {
             "target": box.mean(0).tolist(),
             "radius": float((box[1] - box[0]).norm() / 2),

@@ -26,6 +26,7 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.models.base import psnr
 from nerfro.paths import resolve_path
 from nerfro.samplers.density_grid import DensityGridSampler
+from nerfro.samplers.snell import Snell
 from nerfro.types import Radiance, Samples
 from nerfro.variants import variant
 from nerfro.viewing.page import page_of, upwards
@@ -210,6 +211,12 @@ def test_page_loads_nothing_and_names_its_cameras(scene: Scene) -> None:
     assert 'src="http' not in page
     assert "import " not in page.partition("<script>")[2]
     assert page.count('"name": "test_') == 3
+
+
+@pytest.mark.parametrize(("branches", "begins"), [("none", "false"), ("all", "true")])
+def test_page_begins_with_the_light_that_the_model_follows(scene: Scene, branches: str, begins: str) -> None:
+    scene = replace(scene, model=variant(scene.model, path_sampler=Snell(branches=branches)))
+    assert f'"reflection": {begins}' in page_of(scene, 8)
 
 
 def test_page_of_a_medium_without_surface_is_refused(scene: Scene) -> None:
