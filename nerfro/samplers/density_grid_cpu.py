@@ -9,7 +9,8 @@ from nerfro.geometry.contraction import FAR, NEAREST
 from nerfro.kernels.compilation import compiled, compiled_parallel
 
 _BLOCK = 64  # rays that share a thread's scratch memory
-_THIN = 5e-4  # optical depth whose cube is nothing in single precision
+_THIN = 0.05  # optical depth whose fifth power is nothing in single precision
+_DARK = 1e-9  # transmittance behind which nothing is seen
 
 
 @compiled
@@ -127,8 +128,10 @@ def _cell(x, y, z, smaller, centre, low, per_unit, cells):
 
 @compiled
 def _stopped(depth):
-    """1 - exp(-depth), in single precision; most bins are next to empty, and need no exponential."""
-    return depth - 0.5 * depth * depth if depth < _THIN else 1.0 - np.exp(-depth)
+    """1 - exp(-depth), in single precision; most bins are next to empty or fog, and need no exponential."""
+    if depth < _THIN:
+        return depth * (1.0 - depth * (1.0 / 2.0 - depth * (1.0 / 6.0 - depth / 24.0)))
+    return 1.0 - np.exp(-depth)
 
 
 @compiled_parallel
@@ -190,6 +193,9 @@ def draw(positions, directions, s, low, high, density, u, num_bins, floor, empty
                 weights[index] = passed * stopped
                 passed *= 1.0 - stopped
                 total += weights[index]
+                if passed < _DARK:
+                    weights[index + 1 :] = 0.0
+                    break
             per_total, norm = 1.0 / max(total, 1e-6), 0.0
             for index in range(num_bins):
                 weights[index] = weights[index] * per_total + floor
