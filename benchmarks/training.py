@@ -389,7 +389,7 @@ def report_view(path: Path, side: int = 400, turns: int = 5) -> None:
         print(f"| {name} | {min(wall for wall, _ in measured):.2f} | {min(busy for _, busy in measured):.2f} |")
     parts: dict[str, list[tuple[object, str]]] = {
         "tracing": [(model.path_sampler, "forward")],
-        "which rays meet anything": [(model.point_sampler, "may_meet")],
+        "which rays may meet anything": [(model, "_may_meet")],
         "choosing samples": [(model.point_sampler, "forward")],
         "field": [(field, "forward") for field in model.fields],
         "sky": [(model.boundary, "forward")],

@@ -36,20 +36,28 @@ class _ReluMLP(torch.autograd.Function):
     def forward(ctx: Any, dtype: torch.dtype, num_parts: int, *tensors: Tensor) -> Float[Tensor, "P O"]:
         parts, weights = tensors[:num_parts], tensors[num_parts:]
         layers = [weight.to(dtype) for weight in weights]
-        num_points, start = len(parts[0]), 0
+        num_points, learns = len(parts[0]), any(ctx.needs_input_grad)
         num_rows = -(-num_points // _STEP) * _STEP
-        joined = parts[0].new_zeros(num_rows, sum(part.shape[1] for part in parts), dtype=dtype)
-        for part in parts:
-            joined[:num_points, start : start + part.shape[1]] = part
-            start += part.shape[1]
-        activations = [joined]
-        for layer in layers[:-1]:
-            hidden = _product(activations[-1], layer.t())
-            _comparable(hidden).relu_()
-            activations.append(hidden)
-        ctx.save_for_backward(*activations, *layers)
+        # Nothing is kept of a block where nothing learns, so that the next one finds its memory in the cache.
+        kept = num_rows if learns else min(num_rows, _BLOCK)
+        activations = [parts[0].new_zeros(kept, sum(part.shape[1] for part in parts), dtype=dtype)]
+        activations += [parts[0].new_empty(kept, len(layer), dtype=dtype) for layer in layers[:-1]]
+        result = parts[0].new_empty(num_rows, len(layers[-1]), dtype=dtype)
+        for first in range(0, num_rows, _BLOCK):
+            of_block = result[first : first + _BLOCK]
+            joined, *hidden = (a.narrow(0, first if learns else 0, len(of_block)) for a in activations)
+            start, size = 0, min(num_points - first, _BLOCK)
+            for part in parts:
+                joined[:size, start : start + part.shape[1]] = part[first : first + size]
+                start += part.shape[1]
+            for rows, layer, product in zip([joined, *hidden], layers, [*hidden, of_block], strict=True):
+                torch.mm(rows, layer.t(), out=product)
+                if product is not of_block:
+                    _comparable(product).relu_()
+        if learns:
+            ctx.save_for_backward(*activations, *layers)
         ctx.parts, ctx.weight_dtype = [(part.shape[1], part.dtype) for part in parts], weights[0].dtype
-        return _product(activations[-1], layers[-1].t())[:num_points]
+        return result[:num_points]
 
     @staticmethod
     @once_differentiable

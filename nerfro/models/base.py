@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 
@@ -20,13 +20,14 @@ from nerfro.camera.given import GivenCamera
 from nerfro.distributed import drawing_for
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
+from nerfro.geometry.interpolation import intersect_box
 from nerfro.light import clipped_alike, to_linear, to_srgb
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.models.optimizer import OptimizerConfig, learning_rate_factor, training_progress
 from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.surface_normals import first_normals
-from nerfro.types import Batch, Path, Rays, Rendering
+from nerfro.types import Batch, Exits, Path, Rays, Rendering
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,9 @@ class NerfModel(LightningModule, ABC):
         fields: radiance field of each sampling level, or one for all.
         colour: what fields and boundary return and rays add up: `linear` radiance, or `srgb` as in the authors' code.
     """
+
+    # Whether a straight path that meets nothing shows the boundary in its direction: pictures need no samples on it.
+    empty_shows_boundary = False
 
     def __init__(self, parts: Parts, fields: list[Field], colour: Literal["linear", "srgb"] = "linear") -> None:
         super().__init__()
@@ -218,9 +222,35 @@ class NerfModel(LightningModule, ABC):
         return RenderedRays(*(torch.cat(parts) for parts in zip(*chunks, strict=True)))
 
     def _render_chunk(self, rays: Rays) -> tuple[Tensor, ...]:
-        rendering = self(rays)[-1]
-        normals = first_normals(rendering.path, self.medium)
-        return rendering.rgb, rendering.depth, rendering.opacity, rendering.exit_directions, normals
+        path = self.trace(rays)
+        exits, normals = path.first_of_ray(path.exit_directions), first_normals(path, self.medium)
+        meets = self._may_meet(rays, path)
+        if meets.all():
+            rendering = self.render_path(path)[-1]
+            return rendering.rgb, rendering.depth, rendering.opacity, exits, normals
+        # Most rays of a picture pass by the object, unbent.
+        rgb, depth = torch.empty_like(rays.directions), path.first_of_ray(path.far).clone()
+        opacity = torch.zeros_like(depth)
+        passing, rows = (~meets).nonzero()[:, 0], meets.nonzero()[:, 0]
+        rgb[passing] = self.boundary(Exits.unbent(rays[passing])).to(rgb)
+        if len(rows):
+            rendering = self.render_path(path.of_rays(rows))[-1]
+            rgb[rows], depth[rows], opacity[rows] = (
+                part.to(rgb) for part in (rendering.rgb, rendering.depth, rendering.opacity)
+            )
+        return rgb, depth, opacity, exits, normals
+
+    def _may_meet(self, rays: Rays, path: Path) -> Bool[Tensor, "R"]:
+        """Which rays may meet what the fields hold; the others are straight, and show the boundary."""
+        boxes = [field.bounds for field in self.fields]  # type: ignore[operator, union-attr]
+        meets = torch.full((len(rays),), not self.empty_shows_boundary, device=rays.near.device)
+        for box in boxes:
+            if box is None:
+                return torch.ones_like(meets)
+            enter, leave = intersect_box(box, rays.origins, rays.directions)
+            meets |= (enter <= leave) & (leave >= 0)
+        meets[path.ray[path.refracted]] = True
+        return meets
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,8 @@ class MipNerfModel(NerfModel):
         colour: see `model=refractive`.
     """
 
+    empty_shows_boundary = True
+
     def __init__(self, parts: Parts, colour: Literal["linear", "srgb"] = "linear") -> None:
         super().__init__(parts, [parts.make_field()], colour)
 

@@ -20,6 +20,8 @@ class RefractiveModel(NerfModel):
         colour: what fields and boundary return and rays add up: `linear` radiance, or `srgb` as in the authors' code.
     """
 
+    empty_shows_boundary = True
+
     def __init__(
         self,
         parts: Parts,

@@ -31,7 +31,7 @@ _SECANTS = 6  # without bisection between them
 
 @compiled
 def _root(coefficients, low, inverse_spacing, x, y, z, dx, dy, dz, start, end, at_start, at_end, tolerance):
-    """Shrink [start, end] around a change of sign (Illinois method); start keeps its sign, so does end.
+    """Shrink [start, end] around a change of sign (Anderson and Bjorck's method); start keeps its sign, so does end.
 
     The value at the end is known, that at the start too or not a number. Secants close in from one side until one steps
     over the root; bisection takes turns with them where they do not.
@@ -39,7 +39,7 @@ def _root(coefficients, low, inverse_spacing, x, y, z, dx, dy, dz, start, end, a
     if math.isnan(at_start):
         at_start = spline_value(coefficients, low, inverse_spacing, x + start * dx, y + start * dy, z + start * dz)
     start_inside = at_start < 0.0
-    weight_start, weight_end = at_start, at_end
+    weight_start, weight_end, moved = at_start, at_end, 0
     for iteration in range(_ROOT_ITERATIONS):
         if end - start <= tolerance:
             break
@@ -50,12 +50,15 @@ def _root(coefficients, low, inverse_spacing, x, y, z, dx, dy, dz, start, end, a
             # A step past the root brings the far end in as well.
             middle = min(max(middle, start + 0.25 * tolerance), end - 0.25 * tolerance)
         value = spline_value(coefficients, low, inverse_spacing, x + middle * dx, y + middle * dy, z + middle * dz)
+        # The end that stays loses weight, or it would stay for ever: as much as the function bends.
         if (value < 0.0) == start_inside:
-            start, weight_start = middle, value
-            weight_end *= 0.5
+            if moved == 1:
+                weight_end *= 1.0 - value / weight_start if abs(value) < abs(weight_start) else 0.5
+            start, weight_start, moved = middle, value, 1
         else:
-            end, weight_end = middle, value
-            weight_start *= 0.5
+            if moved == 2:
+                weight_start *= 1.0 - value / weight_end if abs(value) < abs(weight_end) else 0.5
+            end, weight_end, moved = middle, value, 2
     return start, end
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,8 +11,10 @@ import torch
 from nerfro.errors import NerfroError
 from nerfro.evaluation.render_view import Supersampling
 from nerfro.files import lat_long
+from nerfro.samplers.snell import Snell
+from nerfro.variants import variant
 from nerfro.viewing.scene import Scene
-from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, colour, sky_of
+from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, SolidBall, colour, sky_of
 
 
 def rays_of(scene: Scene) -> tuple[torch.Tensor, torch.Tensor]:
@@ -113,6 +116,42 @@ def test_pictures_do_not_depend_on_chunks_and_carry_their_supersampling(scene: S
     mean = fine.view(1, 32, 3, 32, 3, 3).mean((2, 4))
     parts = scene.render(camera, Supersampling(3)).radiance
     torch.testing.assert_close(parts, mean, atol=1e-5, rtol=1e-5)
+
+
+class Bounded(SolidBall):
+    """The same ball, which says where it is."""
+
+    bounds = torch.tensor([[-0.5] * 3, [0.5] * 3])
+
+
+@pytest.mark.parametrize(("branches", "glass"), [("none", True), ("all", True), ("none", False)])
+def test_rays_that_pass_the_object_are_not_sampled_and_look_the_same(
+    scene: Scene, branches: str, glass: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fields = torch.nn.ModuleList([Bounded()])
+    model = variant(scene.model, fields=fields, path_sampler=Snell(branches=branches))
+    tinted = replace(scene, model=model).with_(absorption=[0.1, 0.5, 1.0] if glass else None, glass=glass)
+    sampled: list[int] = []
+    counted = tinted.model.point_sampler.register_forward_hook(lambda _, inputs, __: sampled.append(inputs[0].num_rays))
+    skipped = tinted.render(scene.cameras())
+    num_sampled = sum(sampled)
+    monkeypatch.setattr(tinted.model, "_may_meet", lambda rays, path: torch.ones(len(rays)).bool())
+    whole = tinted.render(scene.cameras())
+    counted.remove()
+    assert 0 < num_sampled < 0.7 * (sum(sampled) - num_sampled)
+    for one, other in zip(skipped, whole, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-6, rtol=1e-5)
+    assert (skipped.opacity > 0.9).any()
+
+
+def test_all_rays_are_sampled_where_a_field_has_no_bounds(scene: Scene) -> None:
+    rays = scene.cameras().image_rays(0)
+    path = scene.model.trace(rays)
+    assert scene.model._may_meet(rays, path).all()
+    bounded = variant(scene.model, fields=torch.nn.ModuleList([Bounded()]))
+    assert not bounded._may_meet(rays, path).all()
+    both = variant(scene.model, fields=torch.nn.ModuleList([Bounded(), scene.field]))
+    assert both._may_meet(rays, path).all()
 
 
 def test_the_surface_is_that_of_the_ball_with_its_normals(scene: Scene) -> None:
