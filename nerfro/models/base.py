@@ -242,9 +242,9 @@ class NerfModel(LightningModule, ABC):
 
     def _may_meet(self, rays: Rays, path: Path) -> Bool[Tensor, "R"]:
         """Which rays may meet what the fields hold; the others are straight, and show the boundary."""
-        boxes = [field.bounds for field in self.fields]  # type: ignore[operator, union-attr]
         meets = torch.full((len(rays),), not self.empty_shows_boundary, device=rays.near.device)
-        for box in boxes:
+        for field in self.fields:
+            box: Tensor | None = field.bounds  # type: ignore[assignment]
             if box is None:
                 return torch.ones_like(meets)
             enter, leave = intersect_box(box, rays.origins, rays.directions)
