@@ -10,8 +10,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from nerfro.capture.medium_search import find_medium, refinable
-from nerfro.capture.overlaps import REPORT, SHEET, draw_overlays, report_overlaps
-from nerfro.capture.pose_conventions import better_wrong_masks, require_consistent_poses
+from nerfro.capture.overlaps import REPORT, SHEET, draw_overlays, report_overlaps, settled_wrong_masks
+from nerfro.capture.pose_conventions import require_consistent_poses
 from nerfro.capture.preprocess_options import (
     FOUND,
     MESH,
@@ -48,10 +48,7 @@ def main(config: DictConfig) -> None:
     overlaps = silhouettes = None
     if mesh is None or views.masks is not None:
         silhouettes = read_silhouettes(views, box is not None)
-        wrong_masks = config.wrong_masks
-        if wrong_masks is None:
-            wrong_masks = better_wrong_masks(silhouettes, 0) or 0
-            print(f"wrong_masks={wrong_masks}: a coarse hull looks most like the masks if so many views may be wrong")
+        wrong_masks = settled_wrong_masks(silhouettes, config.wrong_masks)
         require_consistent_poses(silhouettes, views.names, wrong_masks)
         carved = mesh is None
         if mesh is None:

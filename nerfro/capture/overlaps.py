@@ -22,6 +22,14 @@ SHEET, REPORT = "overlays.png", "overlaps.json"
 _MAX_PIXELS = 256
 
 
+def settled_wrong_masks(silhouettes: Silhouettes, wrong_masks: int | None) -> int:
+    """How many views may be wrong: as it is said, or that with which the hull looks most like the masks; printed."""
+    if wrong_masks is None:
+        wrong_masks = better_wrong_masks(silhouettes, 0) or 0
+        print(f"wrong_masks={wrong_masks}: a coarse hull looks most like the masks if so many views may be wrong")
+    return wrong_masks
+
+
 def report_overlaps(
     split: str,
     views: Views,
