@@ -1,9 +1,11 @@
 """What a pixel of glass needs: rays, or a sky that answers with the level that fits a ray's footprint.
 
-    python benchmarks/footprints.py [--sky torus] [--views 3]
+    python benchmarks/footprints.py [--sky torus] [--views 2]
+    python benchmarks/footprints.py --run RUN [--views 3]
 
-An empty rounded cube under a sky that is known exactly, without partial reflection; the truth has 256 rays a pixel.
-Rows differ in the number of rays alone, columns in what the sky is asked. Scores are of the glass's pixels (sRGB).
+The first: an empty rounded cube under a sky that is known exactly, without partial reflection; the truth has 256 rays
+a pixel. Rows differ in the number of rays alone, columns in what the sky is asked. Scores are of the glass's pixels.
+The second: test views of a trained run, whose learned sky answers by footprint in the rays of divided pixels.
 """
 
 from __future__ import annotations
@@ -12,21 +14,31 @@ import argparse
 import importlib
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from tracing import BOX, EDGE, HALF_SIDE, N_CUBE, grid_distances
 
+import nerfro
 from nerfro.boundaries import cube_map
+from nerfro.boundaries.base import Boundary
+from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.boundaries.envmap import _radiance as radiance_of
+from nerfro.cameras import Cameras
 from nerfro.data.blender import BlenderData
+from nerfro.evaluation.render_view import Supersampling
 from nerfro.files import lat_long
 from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import RoundedBox
+from nerfro.models.base import NerfModel
 from nerfro.pixel_parts import contrast, divergence, part_rays, pixel_rays, rays_beside
+from nerfro.rays import Rays
 from nerfro.samplers.snell import Snell
 from nerfro.scenes.skies import lat_long_texture
+from nerfro.types import Exits
 
 TRUTH = 16  # rays a side of a pixel
 SIDES = (1, 2, 3, 4, 6, 8)  # rays a side
@@ -37,8 +49,9 @@ CHUNK = 200_000
 class Pyramid:
     """A sky as averages over ever larger texels; every level is looked up bilinearly."""
 
-    def __init__(self, radiance: Float[Tensor, "H 2*H 3"]) -> None:
-        picture = lat_long.sample(radiance, cube_map.texel_directions(FINEST), 4 * FINEST).view(6, FINEST, FINEST, 3)
+    def __init__(self, texels: Float[Tensor, "6*n*n 3"]) -> None:
+        n = math.isqrt(len(texels) // 6)
+        picture = texels.view(6, n, n, 3)
         self.resolutions, self._texels = [], []
         while True:
             n = picture.shape[1]
@@ -57,15 +70,10 @@ class Pyramid:
         result = self._level(0, directions)
         if widths is None:
             return result
-        previous = torch.ones_like(widths)  # weight of the level that is one finer, counted from the finest
-        total = torch.zeros_like(result)
+        previous, total = torch.zeros_like(widths), torch.zeros_like(result)
         for level, n in enumerate(self.resolutions):
-            # The detail that this level adds to the next coarser one is shown in full where its texel is as wide as
-            # the footprint, and not at all where it is half as wide; the coarsest level is always there.
-            x = (2 * (0.5 * math.pi / n) / widths.clamp(min=1e-9) - 1).clamp(0, 1)
-            shown = torch.ones_like(x) if level == len(self.resolutions) - 1 else x * x * (3 - 2 * x)
-            weight = shown if level == 0 else shown - previous
-            previous = shown
+            shown = torch.ones_like(widths) if n == self.resolutions[-1] else detail_shown(n, widths)
+            weight, previous = shown - previous, shown
             some = weight > 0
             total[some] += weight[some, None] * self._level(level, directions[some])
         return total
@@ -79,14 +87,55 @@ class Pyramid:
         return torch.cat(found) if found else torch.zeros(0, 3)
 
 
+def detail_shown(resolution: int, widths: Float[Tensor, "P"]) -> Float[Tensor, "P"]:
+    """How much of what a level adds to the next coarser one is shown: all where its texel is as wide as the footprint,
+    nothing where it is half as wide or less."""
+    x = (2 * (0.5 * math.pi / resolution) / widths.clamp(min=1e-9) - 1).clamp(0, 1)
+    return x * x * (3 - 2 * x)
+
+
+class ByFootprint(Boundary):
+    """A learned sky that takes the `radii` of exits for the widths of footprints, radians.
+
+    Args:
+        sky: as it was trained.
+        averaged: whether its finest texels are averaged to a pyramid, or its learned levels are weighted.
+    """
+
+    def __init__(self, sky: EnvironmentMap, averaged: bool) -> None:
+        super().__init__()
+        self._sky, self._averaged = sky, averaged
+        self._pyramid = Pyramid(sky(Exits(cube_map.texel_directions(sky.levels.resolutions[-1]))))
+
+    def forward(self, exits: Exits) -> Tensor:
+        finest, sky = self._sky(exits), self._sky
+        assert isinstance(exits.radii, Tensor)
+        some = (detail_shown(sky.levels.resolutions[-1], exits.radii) < 1).nonzero()[:, 0]
+        directions, widths = exits.directions[some].float(), exits.radii[some]
+        if self._averaged:
+            return finest.index_copy(0, some, self._pyramid(directions, widths))
+        raw, first = torch.zeros_like(directions), 0
+        for n, offset, size in zip(sky.levels.resolutions, sky.levels.offsets, sky.levels.sizes, strict=True):
+            end = first + 6 * (n + 2) ** 2
+            texels, padded = sky.texels[offset : offset + size], sky.padded[first:end]
+            level = cube_map.lookup(*cube_map.project(directions), texels, padded, cube_map.CubeLevels((n,)))
+            raw += level if first == 0 else detail_shown(n, widths)[:, None] * level
+            first = end
+        return finest.index_copy(0, some, radiance_of(raw))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sky", default="torus", help="scene whose sky is taken")
-    parser.add_argument("--views", type=int, default=3, help="test views of the embedded scene")
+    parser.add_argument("--views", type=int, default=2, help="test views")
+    parser.add_argument("--run", type=Path, help="folder of a trained run")
     arguments = parser.parse_args()
     torch.set_grad_enabled(False)
-    sky = importlib.import_module(f"nerfro.scenes.{arguments.sky}").sky
-    pyramid = Pyramid(torch.from_numpy(lat_long_texture(sky, 1024)).float())
+    if arguments.run is not None:
+        trained_run(arguments.run, arguments.views)
+        return
+    sky = torch.from_numpy(lat_long_texture(importlib.import_module(f"nerfro.scenes.{arguments.sky}").sky, 1024))
+    pyramid = Pyramid(lat_long.sample(sky.float(), cube_map.texel_directions(FINEST), 4 * FINEST))
     medium = SdfGrid.from_distances(
         grid_distances(RoundedBox(HALF_SIDE, EDGE, N_CUBE).double(), 256), BOX, [N_CUBE], 0.002
     )
@@ -116,10 +165,61 @@ def main() -> None:
         print(f"| by need, from 2x2 | {needed[0][1]:.1f} | | " + " | ".join(row) + " |", flush=True)
 
 
+def trained_run(run: Path, num_views: int) -> None:
+    """Print the mean PSNR of test views by rays a side of divided pixels, and by what the sky is asked in these."""
+    scene = nerfro.load(run, device="cpu")
+    model, views = scene.model, scene.views().checked()
+    sky = model.boundary
+    assert isinstance(sky, EnvironmentMap)
+    chosen = range(0, len(views), len(views) // num_views)[:num_views]
+    print(f"{run}, test views {', '.join(map(str, chosen))}\n")
+    print("| rays in divided pixels | a pixel, mean | sky as learned | levels averaged | levels left out |")
+    print("|---|---|---|---|---|")
+    for side in (2, 3):
+        row, rays = [], 0.0
+        for boundary in (sky, ByFootprint(sky, averaged=True), ByFootprint(sky, averaged=False)):
+            model.boundary = boundary
+            shown = [rendered(model, views.cameras, view, replace(scene.supersampling, side=side)) for view in chosen]
+            errors = [
+                (rgb - views.images[view].reshape(-1, 3)).square().mean()
+                for view, (rgb, _) in zip(chosen, shown, strict=True)
+            ]
+            row.append(f"{sum(-10 * math.log10(float(error)) for error in errors) / len(errors):.2f}")
+            rays = sum(number for _, number in shown) / len(shown)
+        print(f"| {side}x{side} | {rays:.1f} | " + " | ".join(row) + " |", flush=True)
+
+
+def rendered(model: NerfModel, cameras: Cameras, view: int, supersampling: Supersampling) -> tuple[Tensor, float]:
+    """A view (sRGB) as `render_view` makes it, but for the footprints of parts, half their spacing; rays a pixel."""
+    size = cameras.height * cameras.width
+    pixels = torch.arange(view * size, (view + 1) * size)
+    rays = cameras.image_rays(view)
+    central = model.render(replace(rays, radii=torch.zeros_like(rays.radii)))
+    beside = torch.cat([model.exit_directions(rays_beside(cameras, some)) for some in pixels.split(model.chunk_size)])
+    shown, radiance = model.encode(central.radiance).clamp(0, 1), central.radiance.clone()
+    divided = divergence(cameras, pixels, central.exit_directions, beside) >= supersampling.divergence
+    divided |= contrast(lambda some: shown[some - pixels[0]], cameras, pixels) >= (supersampling.contrast or math.inf)
+    side = supersampling.side
+    for some in divided.nonzero()[:, 0].split(model.chunk_size // side**2):
+        parts = part_rays(cameras, pixels[some], side)
+        exits = model.exit_directions(parts).view(-1, side, side, 3)
+        widths = 0.5 * torch.maximum(*(spacing(exits, axis) for axis in (1, 2))).flatten()
+        radiance[some] = model.render(replace(parts, radii=widths)).radiance.view(-1, side**2, 3).mean(1)
+    return model.encode(radiance).clamp(0, 1), 2 + side**2 * float(divided.float().mean())
+
+
+def spacing(directions: Float[Tensor, "*batch 3"], axis: int) -> Float[Tensor, "*batch"]:
+    """Chords towards the neighbours before and after along an axis, the smaller of both: across an edge of the glass a
+    neighbour says nothing about the own side of it. Those that are not a number are passed over."""
+    steps = torch.linalg.vector_norm(directions.diff(dim=axis), dim=-1)
+    none = torch.full_like(steps.narrow(axis, 0, 1), float("nan"))
+    return torch.fmin(torch.cat([none, steps], axis), torch.cat([steps, none], axis))
+
+
 class View:
     """The glass's pixels of a view: exits of their parts, and their true colours."""
 
-    def __init__(self, cameras, view: int, medium: SdfGrid, pyramid: Pyramid) -> None:  # type: ignore[no-untyped-def]
+    def __init__(self, cameras: Cameras, view: int, medium: SdfGrid, pyramid: Pyramid) -> None:
         self._cameras, self._pyramid = cameras, pyramid
         self._snell, self._medium = Snell(), medium
         size = cameras.height * cameras.width
@@ -135,7 +235,7 @@ class View:
         ])  # fmt: skip
         self.truth = to_srgb(truth).clamp(0, 1)
 
-    def _trace(self, rays) -> tuple[Tensor, Tensor]:  # type: ignore[no-untyped-def]
+    def _trace(self, rays: Rays) -> tuple[Tensor, Tensor]:
         rays = replace(rays, far=torch.full_like(rays.far, 30.0))
         paths = [self._snell(rays[i : i + CHUNK], self._medium) for i in range(0, len(rays), CHUNK)]
         return torch.cat([p.exit_directions for p in paths]), torch.cat([p.refracted for p in paths])
@@ -149,11 +249,7 @@ class View:
         return self._exits[side]
 
     def widths(self, side: int) -> Tensor:
-        """Widths [P, side, side] of the footprints of parts, in radians.
-
-        The larger of the angles towards the neighbours along the two axes, and along each axis the smaller of the two
-        to either side: across an edge of the glass a neighbour says nothing about the own side of it.
-        """
+        """Widths [P, side, side] of the footprints of parts, radians: the larger of their spacings along two axes."""
         cameras, pixels = self._cameras, self.pixels
         height, width = cameras.height * side, cameras.width * side
         image = torch.full((height, width, 3), float("nan"))
@@ -163,12 +259,7 @@ class View:
         rows = (row[:, None, None] * side + ticks[None, None, :]).expand(-1, side, side)
         columns = (column[:, None, None] * side + ticks[None, :, None]).expand(-1, side, side)
         image[rows, columns] = self.exits(side)
-        both = []
-        for axis in (0, 1):
-            steps = torch.linalg.vector_norm(image.diff(dim=axis), dim=-1)
-            padding = torch.full_like(steps.narrow(axis, 0, 1), float("nan"))
-            before, after = torch.cat([padding, steps], axis), torch.cat([steps, padding], axis)
-            both.append(torch.fmin(before, after))
+        both = [spacing(image, axis) for axis in (0, 1)]
         return torch.fmax(*both).nan_to_num(0.0)[rows, columns]
 
     def colours(self, side: int, scale: float | None) -> Tensor:

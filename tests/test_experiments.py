@@ -137,6 +137,19 @@ def test_ablation_without_regulariser_keeps_the_skybox() -> None:
     assert composed("+experiment=paper_refractive").loss.boundary.weight == 0.025
 
 
+def test_ablations_of_glass_take_one_part_of_it_back() -> None:
+    glass, plain = composed("+experiment=glass"), composed()
+    for name, group, part, taken_back in (
+        ("ablation_noReflection", "sampler", "path", plain.sampler.path.branches),
+        ("ablation_noTint", "medium", None, plain.medium.learn_absorption),
+    ):
+        ablated = composed(f"+experiment={name}")
+        assert {key for key in glass if glass[key] != ablated[key]} == {"name", group}
+        whole, less = (config[group] if part is None else config[group][part] for config in (glass, ablated))
+        (key,) = {key for key in whole if whole[key] != less[key]}
+        assert less[key] == taken_back != whole[key]
+
+
 def test_the_fair_baseline_differs_from_the_baseline_in_its_sky_and_its_bounds_alone() -> None:
     plain, sky = composed("+experiment=mipnerf"), composed("+experiment=mipnerf_sky")
     differing = {key for key in plain if plain[key] != sky[key]}
