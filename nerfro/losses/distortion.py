@@ -18,7 +18,8 @@ class Distortion(Loss):
     """Spread of the last level's weights along each path, which fog has and surfaces have not (mip-NeRF 360, Eqn. 15).
 
     Arc length is measured in units of the path's length, far - near, so that the weight does not depend on the scene's
-    scale; contracted length, where space is contracted, in units of all of it.
+    scale; contracted length, where space is contracted, in units of all of it. There what passes all samples counts as
+    well, at infinity: a loss of what is stopped alone would make things transparent.
     """
 
     def __init__(self, weight: NotNegative = 1e-2, start: Natural = 0, ramp: Natural = 0) -> None:
@@ -26,12 +27,14 @@ class Distortion(Loss):
 
     def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
         rendering = renderings[-1]
-        edges, near, far = rendering.samples.edges, rendering.path.near[:, None], rendering.path.far[:, None]
-        if rendering.samples.measure is not None:
-            edges, near, far = rendering.samples.measure, torch.zeros_like(near), rendering.samples.measure[:, -1:]
+        weights, edges = rendering.weights, rendering.samples.edges
+        near, far = rendering.path.near[:, None], rendering.path.far[:, None]
+        if (measure := rendering.samples.measure) is not None:
+            near, far = torch.zeros_like(near), measure[:, -1:]
+            weights, edges = torch.cat([weights, rendering.transmittance[:, None]], -1), torch.cat([measure, far], -1)
         # A path of no length has no weights either; the clamp only keeps the quotient a number.
         edges = (edges - near) / (far - near).clamp(min=1e-6)
-        return mean_over_rays(rendering.path.per_ray(distortion(rendering.weights, edges)), batch.num_rows)
+        return mean_over_rays(rendering.path.per_ray(distortion(weights, edges)), batch.num_rows)
 
 
 def distortion(weights: Float[Tensor, "R N"], edges: Float[Tensor, "R N+1"]) -> Float[Tensor, "R"]:

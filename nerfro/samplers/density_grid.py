@@ -15,7 +15,6 @@ from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.geometry.contraction import contract, contracted_box, expand, shrinkage
 from nerfro.registry import register
-from nerfro.rendering import volume_weights
 from nerfro.samplers.base import PointSampler
 from nerfro.samplers.measures import Contracted, WithinBox
 from nerfro.samplers.stepfun import invert_cdf, midpoints, spread_uniform
@@ -49,6 +48,9 @@ class DensityGridSampler(PointSampler):
         every: steps between two looks at the field.
         looks: share of the cells that are looked at then, drawn at random.
         decay: factor of a cell's remembered density at each look.
+        trust: most of the light that one bin is believed to stop. A cell remembers its densest place, but many rays
+            cross it elsewhere, and what they meet behind it would get next to no samples if the cell were opaque.
+        num_shown: intervals in evaluation, where noise does not average out over steps; none for as many.
     """
 
     num_levels = 1
@@ -68,10 +70,13 @@ class DensityGridSampler(PointSampler):
         every: Count = 16,
         looks: Share = 1 / 16,
         decay: Share = 0.9,
+        trust: Annotated[float, Range(more_than=0, at_most=1)] = 1.0,
+        num_shown: Annotated[int, Range(at_least=1, at_most=8192)] | None = None,
     ) -> None:
         super().__init__()
         self.num_samples, self.num_bins, self.resolution = num_samples, num_bins, resolution
         self.uniform, self.every, self.looks, self.decay = uniform, every, looks, decay
+        self.trust, self.num_shown = trust, num_shown
         self.radius, self.near = radius, near
         box = torch.from_numpy(corners_of_box(box_min, box_max)).float()
         self.register_buffer("box", box if radius is None else contracted_box(box, radius), persistent=False)
@@ -95,7 +100,8 @@ class DensityGridSampler(PointSampler):
         In training a branch is given samples by its weight. The intervals that it lacks are at its end, of no length.
         """
         if not (self.training and path.splits):
-            return spread_uniform(path, self.num_samples + 1, self.training)
+            num_samples = self.num_samples if self.training else self.num_shown or self.num_samples
+            return spread_uniform(path, num_samples + 1, self.training)
         num = (self.num_samples * _weight(path)).ceil().clamp(min=min(self.num_samples, _FEWEST)).long()[:, None]
         edge = torch.arange(self.num_samples + 1, device=num.device).minimum(num)
         return (edge + path.rand(self.num_samples + 1).gather(1, edge)) / (num + 1)
@@ -119,7 +125,9 @@ class DensityGridSampler(PointSampler):
             measure = Contracted.of(path, self.centre, self.radius, self.near)
         places = torch.linspace(0, 1, self.num_bins + 1, device=u.device) * measure.total[:, None]
         positions, _ = path.at(measure.arc_length(midpoints(places)).to(path.s.dtype))
-        weights, _ = volume_weights(self.lookup(self.contracted(positions)), places.diff(dim=1))
+        stopped = -torch.expm1(-self.lookup(self.contracted(positions)) * places.diff(dim=1))
+        passed = 1 - stopped.clamp(max=self.trust)
+        weights = torch.cat([torch.ones_like(passed[:, :1]), passed[:, :-1].cumprod(1)], 1) * (1 - passed)
         share = weights / weights.sum(-1, keepdim=True).clamp(min=1e-6)
         places = invert_cdf(places, share + self._floor, u)
         edges = measure.arc_length(places).to(path.s.dtype)
@@ -155,6 +163,7 @@ class DensityGridSampler(PointSampler):
             u.contiguous().numpy(),
             self.num_bins,
             self._floor,
+            self.trust,
             _EMPTY,
             self.radius or 0.0,
             self.near,

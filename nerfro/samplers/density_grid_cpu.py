@@ -135,11 +135,11 @@ def _stopped(depth):
 
 
 @compiled_parallel
-def draw(positions, directions, s, low, high, density, u, num_bins, floor, empty, radius, near):
+def draw(positions, directions, s, low, high, density, u, num_bins, floor, trust, empty, radius, near):
     """Edges and middles of samples drawn in proportion to the weights that the density gives, plus a floor.
 
     `u` are places in the cumulative distribution, ascending on each ray [R, N + 1]; `floor` is the weight that every
-    bin has beside its share, which sums to one. With a `radius` above 0 what is beyond it is contracted, and `low` and
+    bin has beside its share, which sums to one, and no bin is believed to stop more than `trust`. With a `radius` above 0 what is beyond it is contracted, and `low` and
     `high` are the corners of the cube around contracted space. Returns edges [R, N + 1], arc lengths [R, N], positions
     and directions [R, N, 3], whether the optical depth there is `empty` or more [R, N], and the samples' `lengths`
     [R, N] and `measure` [R, N + 1].
@@ -189,7 +189,7 @@ def draw(positions, directions, s, low, high, density, u, num_bins, floor, empty
                 y = positions[ray, run, 1] + ahead * directions[ray, run, 1]
                 z = positions[ray, run, 2] + ahead * directions[ray, run, 2]
                 smaller = _shrinkage(x, y, z, centre, radius)
-                stopped = _stopped(flat[_cell(x, y, z, smaller, centre, low, per_unit, cells)] * width)
+                stopped = min(_stopped(flat[_cell(x, y, z, smaller, centre, low, per_unit, cells)] * width), trust)
                 weights[index] = passed * stopped
                 passed *= 1.0 - stopped
                 total += weights[index]

@@ -27,6 +27,8 @@ _RADIUS_SHARE = 0.5
 # Samples begin at this share of the nearest camera's distance. Few rays cross what is close before a camera, so that
 # what is learned there explains its photograph and no other.
 _NEAR_SHARE = 0.3
+# A pixel's detail takes two cells of the finest grid along each side, as a wave takes two samples.
+_CELLS_PER_PIXEL = 2
 # Cells of the finest grid; memory bounds them above.
 _FEWEST_CELLS, _MOST_CELLS = 128, 4096
 # Below this share of cameras' directions across it, a place is not told by where optical axes meet.
@@ -113,7 +115,7 @@ def _settle_ball(content: DictConfig, cameras: Cameras) -> None:
         content.near = float(f"{_NEAR_SHARE * distances.min():.4g}")
     if content.cells is None:
         pixel = np.median(distances / cameras.fx.double().cpu().numpy())
-        content.cells = int(np.clip(math.ceil(4 * radius / pixel), _FEWEST_CELLS, _MOST_CELLS))
+        content.cells = int(np.clip(math.ceil(_CELLS_PER_PIXEL * 4 * radius / pixel), _FEWEST_CELLS, _MOST_CELLS))
 
 
 def looked_at(

@@ -61,7 +61,7 @@ def loss(weights: torch.Tensor, s: torch.Tensor, measure: torch.Tensor | None = 
     positions = torch.zeros(5, 6, 3)
     samples = Samples(positions, positions, s[:, :-1], s, torch.ones(5), measure=measure)
     colour = torch.zeros(5, 3)
-    rendering = Rendering(colour, weights, torch.zeros(5), colour, samples, path)
+    rendering = Rendering(colour, weights, 1 - weights.sum(-1), colour, samples, path)
     batch = Batch(None, colour, None, None)  # type: ignore[arg-type]  # nor is the model asked
     return Distortion()([rendering], batch, None)  # type: ignore[arg-type]
 
@@ -75,8 +75,18 @@ def test_distances_are_contracted_where_space_is() -> None:
     weights, edges = random_intervals(5, 6, torch.float32)
     edges[:, 0] = 0.0
     far_away = torch.tan(edges * 1.57)  # however long the last interval is
+    weights = weights / weights.sum(-1, keepdim=True)  # nothing passes
     contracted = loss(weights, far_away, measure=3.0 * edges)
     torch.testing.assert_close(contracted, loss(weights, edges), rtol=1e-4, atol=0)
+
+
+def test_what_passes_all_samples_of_all_space_counts_at_infinity() -> None:
+    edges = torch.linspace(0, 1, 7).expand(5, -1)
+    half = torch.tensor([0.0, 0.5, 0.0, 0.0, 0.0, 0.0]).expand(5, -1)
+    # 2 x 1/2 x 1/2 x 3/4 between the two, and 1/3 x 1/4 x 1/6 within the first.
+    assert float(loss(half, edges, measure=edges)) == pytest.approx(0.375 + 1 / 72, rel=1e-4)
+    assert float(loss(half, edges)) == pytest.approx(1 / 72, rel=1e-4)  # a sky stands beyond the path
+    assert float(loss(0 * half, edges, measure=edges)) == pytest.approx(0, abs=1e-6)
 
 
 def test_a_single_sharp_sample_has_none() -> None:

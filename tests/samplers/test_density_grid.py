@@ -25,7 +25,7 @@ class DenseBall(Field):
         return Radiance(50.0 * inside, torch.zeros_like(samples.positions))
 
 
-ALL_OF_SPACE = {"radius": 0.7, "near": 0.3}
+ALL_OF_SPACE = {"radius": 0.7, "near": 0.3, "trust": 0.4}
 
 
 def trained_sampler(**space: float) -> DensityGridSampler:
@@ -67,6 +67,18 @@ def test_samples_gather_where_the_density_is() -> None:
     assert inside[dense].mean() > 0.6
 
 
+@pytest.mark.parametrize(("trust", "behind"), [(1.0, 0.0), (0.4, 0.26)])
+def test_what_stands_behind_a_cell_of_which_a_ray_meets_the_empty_part_gets_samples(
+    trust: float, behind: float
+) -> None:
+    sampler = DensityGridSampler(num_samples=64, num_bins=64, resolution=32, uniform=0.01, trust=trust).eval()
+    sampler.density[15:17] = 1e3  # four bins look opaque: two of a cell that something fills in part, and two behind
+    path = straight(torch.tensor([0.0, 8.0]), 0.1)
+    drawn = sampler(path, None)
+    share = (drawn.positions[..., 0] > 0).float().mean()  # of the last two
+    assert share == pytest.approx(behind, abs=0.05)
+
+
 def straight(s: torch.Tensor, aside: float) -> Path:
     """One line along x past the origin, with vertices at arc lengths `s` from a camera at x = -4."""
     ones = torch.ones_like(s)
@@ -92,6 +104,12 @@ def test_samples_of_all_space_do_not_depend_on_where_a_line_has_vertices() -> No
     few, many = (sampler(straight(s, 0.2), None) for s in (torch.tensor([1.0, 9.0]), torch.linspace(0.5, 7, 12)))
     torch.testing.assert_close(sampler.contracted(few.positions), sampler.contracted(many.positions), rtol=0, atol=1e-5)
     torch.testing.assert_close(few.deltas[:, :-1], many.deltas[:, :-1], rtol=1e-3, atol=1e-5)
+
+
+def test_pictures_have_their_own_number_of_samples() -> None:
+    sampler = DensityGridSampler(num_samples=16, num_shown=40)
+    assert sampler(example_path(4), None).s.shape == (4, 16)
+    assert sampler.eval()(example_path(4), None).s.shape == (4, 40)
 
 
 def test_grid_remembers_the_field_it_looked_at() -> None:

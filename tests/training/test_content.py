@@ -78,9 +78,10 @@ def test_ball_lies_where_the_cameras_look() -> None:
     np.testing.assert_allclose(np.mean([content.box_min, content.box_max], axis=0), MIDDLE, atol=1e-4)
     assert content.radius == 1.5
     assert content.near == pytest.approx(0.9)
-    # A pixel is 3 / 40 wide there, and contracted space 6; 80 cells would be too few.
-    assert content.cells == 128
-    assert of_all_space(radius=6.0).cells == pytest.approx(320, abs=1)
+    # A pixel is 3 / 40 wide there, and contracted space 6; two cells a pixel.
+    assert content.cells == pytest.approx(160, abs=1)
+    assert of_all_space(radius=6.0).cells == pytest.approx(640, abs=1)
+    assert of_all_space(radius=0.75).cells == 128  # 80 would be too few
     assert "contracted beyond 1.5 around (0.4, -2, 1)" in describe(content)
 
 

@@ -1,0 +1,28 @@
+"""Light that passes all of the volume."""
+
+from __future__ import annotations
+
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.allowed import Natural, NotNegative
+from nerfro.distributed import mean_over_rays
+from nerfro.losses.base import Loss, Model
+from nerfro.registry import register
+from nerfro.types import Batch, Rendering
+
+
+@register("loss", "opaque")
+class Opaque(Loss):
+    """Mean square of the transmittance at the end of each ray: where the field is all of space, every ray ends in it.
+
+    A boundary beyond of any colour would otherwise explain things of that colour, and show through where they stand.
+    The loss is what a background of random grey of that variance would cost on average.
+    """
+
+    def __init__(self, weight: NotNegative = 0.1, start: Natural = 0, ramp: Natural = 0) -> None:
+        super().__init__(weight, start, ramp)
+
+    def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
+        passed = renderings[-1].transmittance.square()
+        return mean_over_rays(renderings[-1].path.per_ray(passed), batch.num_rows)
