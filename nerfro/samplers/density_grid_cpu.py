@@ -139,10 +139,10 @@ def draw(positions, directions, s, low, high, density, u, num_bins, floor, trust
     """Edges and middles of samples drawn in proportion to the weights that the density gives, plus a floor.
 
     `u` are places in the cumulative distribution, ascending on each ray [R, N + 1]; `floor` is the weight that every
-    bin has beside its share, which sums to one, and no bin is believed to stop more than `trust`. With a `radius` above 0 what is beyond it is contracted, and `low` and
-    `high` are the corners of the cube around contracted space. Returns edges [R, N + 1], arc lengths [R, N], positions
-    and directions [R, N, 3], whether the optical depth there is `empty` or more [R, N], and the samples' `lengths`
-    [R, N] and `measure` [R, N + 1].
+    bin has beside its share, which sums to one, and no bin is believed to stop more than `trust`. With a `radius` above
+    0 what is beyond it is contracted, and `low` and `high` are the corners of the cube around contracted space. Returns
+    edges [R, N + 1], arc lengths [R, N], positions and directions [R, N, 3], whether the optical depth there is `empty`
+    or more [R, N], and the samples' `lengths` [R, N] and `measure` [R, N + 1].
     """
     num_rays, num_edges = u.shape
     cells, num_runs = density.shape[0], s.shape[1]
