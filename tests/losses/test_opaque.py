@@ -25,7 +25,7 @@ def learned_opacity(weight: float, num_steps: int = 200) -> float:
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    return float(rendering.opacity.mean())
+    return float(rendering.opacity.detach().mean())
 
 
 def test_what_is_as_black_as_the_boundary_becomes_opaque() -> None:
