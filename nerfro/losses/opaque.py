@@ -20,7 +20,7 @@ class Opaque(Loss):
     The loss is what a background of random grey of that variance would cost on average.
     """
 
-    def __init__(self, weight: NotNegative = 0.1, start: Natural = 0, ramp: Natural = 0) -> None:
+    def __init__(self, weight: NotNegative = 1e-2, start: Natural = 0, ramp: Natural = 0) -> None:
         super().__init__(weight, start, ramp)
 
     def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
