@@ -140,8 +140,8 @@ def test_ablation_without_regulariser_keeps_the_skybox() -> None:
 def test_ablations_of_glass_take_one_part_of_it_back() -> None:
     glass, plain = composed("+experiment=glass"), composed()
     for name, group, part, taken_back in (
-        ("ablation_noReflection", "sampler", "path", plain.sampler.path.branches),
-        ("ablation_noTint", "medium", None, plain.medium.learn_absorption),
+        ("glass_noReflection", "sampler", "path", plain.sampler.path.branches),
+        ("glass_noTint", "medium", None, plain.medium.learn_absorption),
     ):
         ablated = composed(f"+experiment={name}")
         assert {key for key in glass if glass[key] != ablated[key]} == {"name", group}

@@ -110,7 +110,7 @@ def test_a_motion_that_all_cameras_share_is_taken_out() -> None:
         made.motions.motion += torch.cat([vector, shifts[..., 0]], -1) / made.motions.units
     turned, shifted = motion_between(before, made.motions.moved())
     moved = motion_between(poses, shared)
-    assert float(turned.max()) < 1e-3 * float(moved[0].max())
+    assert turned.max().item() < 1e-3 * moved[0].max().item()
     assert float(shifted.max()) < 1e-3 * float(moved[1].max())
 
 
