@@ -133,7 +133,7 @@ def test_from_photographs_to_a_table(
     for name in ("images", "masks", "truth"):
         shutil.copytree(kept / name, data / name)
     printed = run("calibrate", f"images={data / 'images'}", "target=apriltag", f"out={data}")
-    hull = ["resolution=48", "medium.resolution=48", "medium.cache=false", "medium.ior=1.5"]
+    hull = ["resolution=48", "medium.resolution=48", "medium.cache=false", "medium.ior=1.33"]
     printed = run("preprocess", *printed_command("next", printed), *hull)
     figures = measure(data, data)
     assert figures["photographs with a pose"] == 24
