@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,7 +15,9 @@ from nerfro.allowed import Count, NotNegative, Positive, Range, Share, corners_o
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.geometry.contraction import contract, contracted_box, expand, shrinkage
+from nerfro.kernels.arrays import arrays
 from nerfro.registry import register
+from nerfro.rendering import volume_weights
 from nerfro.samplers.base import PointSampler
 from nerfro.samplers.measures import Contracted, WithinBox
 from nerfro.samplers.stepfun import invert_cdf, midpoints, spread_uniform
@@ -125,9 +128,8 @@ class DensityGridSampler(PointSampler):
             measure = Contracted.of(path, self.centre, self.radius, self.near)
         places = torch.linspace(0, 1, self.num_bins + 1, device=u.device) * measure.total[:, None]
         positions, _ = path.at(measure.arc_length(midpoints(places)).to(path.s.dtype))
-        stopped = -torch.expm1(-self.lookup(self.contracted(positions)) * places.diff(dim=1))
-        passed = 1 - stopped.clamp(max=self.trust)
-        weights = torch.cat([torch.ones_like(passed[:, :1]), passed[:, :-1].cumprod(1)], 1) * (1 - passed)
+        believed = (self.lookup(self.contracted(positions)) * places.diff(dim=1)).clamp(max=self._deepest)
+        weights, _ = volume_weights(believed, torch.ones_like(believed))
         share = weights / weights.sum(-1, keepdim=True).clamp(min=1e-6)
         places = invert_cdf(places, share + self._floor, u)
         edges = measure.arc_length(places).to(path.s.dtype)
@@ -153,21 +155,9 @@ class DensityGridSampler(PointSampler):
         from nerfro.samplers.density_grid_cpu import draw  # compiled code, so only where it is used
 
         use_threads()
-        drawn = draw(
-            path.positions.detach().contiguous().numpy(),
-            path.directions.detach().contiguous().numpy(),
-            path.s.detach().contiguous().numpy(),
-            self.box[0].numpy(),
-            self.box[1].numpy(),
-            self.density.numpy(),
-            u.contiguous().numpy(),
-            self.num_bins,
-            self._floor,
-            self.trust,
-            _EMPTY,
-            self.radius or 0.0,
-            self.near,
-        )
+        settings = self.num_bins, self._floor, self.trust, _EMPTY, self.radius or 0.0, self.near
+        arguments: list[Any] = [*arrays(path.positions, path.directions, path.s, *self.box, self.density, u), *settings]
+        drawn = draw(*arguments)
         edges, s, positions, directions, occupied, *of_measure = (torch.from_numpy(array) for array in drawn)
         lengths, measure = (None, None) if self.radius is None else of_measure
         return Samples(positions, directions, s, edges, path.radii, occupied, lengths, measure)
@@ -179,6 +169,11 @@ class DensityGridSampler(PointSampler):
     def contracted(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Where the grid has what is at these positions of the world."""
         return positions if self.radius is None else contract(positions, self.centre, self.radius)
+
+    @property
+    def _deepest(self) -> float:
+        """Optical depth of a bin that stops as much light as one is believed to stop."""
+        return -math.log1p(-self.trust) if self.trust < 1 else math.inf
 
     @property
     def _floor(self) -> float:
