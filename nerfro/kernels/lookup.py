@@ -9,7 +9,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from nerfro.kernels.compilation import compiled
 from nerfro.kernels.tolerances import BEYOND_BOX, SAFE_SHARE
@@ -34,8 +34,11 @@ class MediumGrid(NamedTuple):
     # Cells and blocks a world unit.
     inverse_spacing: Float[np.ndarray, "3"]
     inverse_block: Float[np.ndarray, "3"]
-    # Lowest and highest derivatives of the bodies' splines in the blocks; None where there are no bodies.
+    # Of the smaller blocks in which surfaces are looked for; None where there are no bodies: lowest and highest
+    # derivatives of the bodies' splines, how many blocks away a surface may be, and blocks a world unit.
     slopes: Float[np.ndarray, "K x y z 3 2"] | None
+    empty: UInt8[np.ndarray, "x y z"] | None
+    inverse_small: Float[np.ndarray, "3"] | None
 
 
 @compiled
@@ -170,50 +173,64 @@ def voxel_index(table, low, inverse_spacing, x, y, z):
 
 
 @compiled
-def _block(counts, low, inverse_size, x, y, z):
+def block_at(counts, bx, by, bz):
     """Numbers of the block that a place lies in, or of the nearest one, of so many along each axis."""
-    i = min(max(int((x - low[0]) * inverse_size[0]), 0), counts[0] - 1)
-    j = min(max(int((y - low[1]) * inverse_size[1]), 0), counts[1] - 1)
-    k = min(max(int((z - low[2]) * inverse_size[2]), 0), counts[2] - 1)
-    return i, j, k
+    i = min(max(int(bx), 0), counts[0] - 1)
+    j = min(max(int(by), 0), counts[1] - 1)
+    k = min(max(int(bz), 0), counts[2] - 1)
+    return _UINT(i), _UINT(j), _UINT(k)
+
+
+@compiled
+def blocks_from(low, inverse_size, x, y, z):
+    """How many blocks (of any size) from the grid's corner a place lies, along each axis."""
+    return (x - low[0]) * inverse_size[0], (y - low[1]) * inverse_size[1], (z - low[2]) * inverse_size[2]
 
 
 @compiled
 def block_clearance(clearance, low, inverse_size, x, y, z):
     """Distance within which the index surely does not vary, from the cell (of any size) that holds the point."""
-    i, j, k = _block(clearance.shape, low, inverse_size, x, y, z)
-    return clearance[_UINT(i), _UINT(j), _UINT(k)]
+    bx, by, bz = blocks_from(low, inverse_size, x, y, z)
+    return clearance[block_at(clearance.shape, bx, by, bz)]
 
 
 @compiled
-def block_ahead(slopes, inside, values, low, inverse_size, x, y, z, dx, dy, dz):
-    """What is known of a line up to the wall of its block.
+def lengths_of_block(rx, ry, rz):
+    """How far a line goes for one block along each axis, of which it crosses so many in a unit of length."""
+    qx, qy, qz = math.inf, math.inf, math.inf
+    if rx != 0.0:
+        qx = 1.0 / rx
+    if ry != 0.0:
+        qy = 1.0 / ry
+    if rz != 0.0:
+        qz = 1.0 / rz
+    return qx, qy, qz
 
-    Takes for each body whether the line begins inside, and its spline's value there. Returns the distance to the wall,
-    a distance before which there is no surface, and whether every spline only grows or only falls till the wall.
-    """
-    position, direction = (x, y, z), (dx, dy, dz)
-    i, j, k = block = _block(slopes.shape[1:4], low, inverse_size, x, y, z)
-    wall = math.inf
-    for axis in range(3):
-        if direction[axis] != 0.0:
-            end = block[axis] + (1 if direction[axis] > 0.0 else 0)
-            wall = min(wall, (end / inverse_size[axis] + low[axis] - position[axis]) / direction[axis])
-    free, monotone = wall, True
+
+@compiled
+def end_of_blocks(i, j, k, reach, bx, by, bz, qx, qy, qz):
+    """Distance at which a line from a place in blocks leaves those less than `reach` away from one of them."""
+    i, j, k, reach = float(i), float(j), float(k), float(reach)
+    end_x = ((i + reach if qx > 0.0 else i + 1.0 - reach) - bx) * qx
+    end_y = ((j + reach if qy > 0.0 else j + 1.0 - reach) - by) * qy
+    end_z = ((k + reach if qz > 0.0 else k + 1.0 - reach) - bz) * qz
+    return min(end_x, min(end_y, end_z))
+
+
+@compiled
+def slopes_along(slopes, i, j, k, dx, dy, dz, lowest, highest):
+    """Bounds of each body's slope along a line in a block; returns whether every spline only grows or only falls."""
+    monotone, direction = True, (dx, dy, dz)
     for body in range(slopes.shape[0]):
-        lowest, highest = 0.0, 0.0
+        least, most = 0.0, 0.0
         for axis in range(3):
-            bounds = slopes[_UINT(body), _UINT(i), _UINT(j), _UINT(k), _UINT(axis)]
+            bounds = slopes[_UINT(body), i, j, k, _UINT(axis)]
             one, other = direction[axis] * bounds[0], direction[axis] * bounds[1]
-            lowest += min(one, other)
-            highest += max(one, other)
-        monotone = monotone and (lowest > 0.0 or highest < 0.0)
-        # The fastest that the value may go to zero; not a number at the grid's border, where nothing is known.
-        towards = highest if inside[body] else -lowest
-        if not towards <= 0.0:
-            reached = abs(values[body]) / towards
-            free = min(free, reached) if reached >= 0.0 else 0.0
-    return wall, free, monotone
+            least += min(one, other)
+            most += max(one, other)
+        lowest[body], highest[body] = least, most
+        monotone = monotone and (least > 0.0 or most < 0.0)
+    return monotone
 
 
 @compiled

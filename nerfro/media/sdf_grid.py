@@ -6,7 +6,8 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
+from scipy.ndimage import distance_transform_cdt
 from torch import Tensor
 
 from nerfro.allowed import NotNegative, Positive, Range, Resolution, corners_of_box
@@ -28,8 +29,12 @@ from nerfro.variants import variant
 
 # Voxels around the surface in which the distance is exact: the spline's support and the step that finds the surface.
 BAND = 3.0
-# Cells a side of the blocks in which rays look up how far they may jump before they look up distances themselves.
-BLOCK = 4
+# Cells a side of the blocks in which bent rays look up how far they may jump before they look up distances themselves,
+# and of those in which straight runs look up where a surface may be.
+BLOCK, SURFACE_BLOCK = 4, 3
+# A quadratic spline that is continued by half a cell at a corner is a sum of coefficients whose weights are 2.19 and
+# -1.19 together: it is above 0 where the largest coefficient is less than 1.84 times the least.
+_CONTINUED = 1.8
 # Part of the cache's key: raise it when the same mesh and settings give other distances than before.
 _VERSION = 3
 
@@ -147,13 +152,13 @@ class SdfGrid(Solid):
 
     def _of_distances(self, distances: Float[Tensor, "K X Y Z"], **changes: Any) -> Any:
         changed = variant(self, **changes)
-        for name in ("_coarse_clearance", "_coarse_slopes"):  # of the surfaces as they were
+        for name in ("_coarse_clearance", "_coarse_slopes", "_empty_blocks"):  # of the surfaces as they were
             changed._buffers.pop(name, None)
         changed._set(distances, self.box)
         return changed
 
     def at_wavelength(self, wavelength: float) -> SdfGrid:
-        self.coarse_clearance, self.coarse_slopes  # noqa: B018 (made before they are shared)
+        self.coarse_clearance, self.coarse_slopes, self.empty_blocks  # noqa: B018 (made before they are shared)
         return super().at_wavelength(wavelength)
 
     @torch.no_grad()
@@ -186,32 +191,50 @@ class SdfGrid(Solid):
 
     @lazy_buffer
     def coarse_slopes(self) -> Float[Tensor, "K x y z 3 2"]:
-        """Lowest and highest derivative of each body's spline along the axes in each block of `BLOCK`^3 cells.
+        """Lowest and highest derivative of each body's spline along the axes in each block of `SURFACE_BLOCK`^3 cells.
 
         A derivative is a mean of differences of neighbouring coefficients, so that these bound it. Nothing bounds it
         at the grid's border, where splines are continued.
         """
-        counts = torch.tensor(self.coefficients.shape[1:])
-        blocks = counts.sub(1).div(BLOCK, rounding_mode="floor").add(1).tolist()
-        spacing = (self.box[1] - self.box[0]).cpu() / (counts - 1)
-        values = self.coefficients.detach().cpu()
-        for axis, count in enumerate(blocks):  # the vertices from one before each block to one after it
-            index = torch.arange(-1, count * BLOCK + 2).clamp(0, values.shape[axis + 1] - 1)
-            values = values.index_select(axis + 1, index)
+        spacing = (self.box[1] - self.box[0]).cpu() / (torch.tensor(self.coefficients.shape[1:]) - 1)
+        values = self._coefficients_of_blocks()
         bounds = []
         for axis in range(3):
-            lowest = highest = values.diff(dim=axis + 1) / spacing[axis]
-            for other in range(3):
-                window = BLOCK + 3 - (other == axis)
-                lowest = lowest.unfold(other + 1, window, BLOCK).amin(-1)
-                highest = highest.unfold(other + 1, window, BLOCK).amax(-1)
-            bounds.append(torch.stack([lowest, highest], -1))
-        slopes = torch.stack(bounds, -2)
-        for axis, count in enumerate(counts.tolist()):
-            border = [block for block in range(blocks[axis]) if block == 0 or (block + 1) * BLOCK > count - 2]
-            slopes.index_fill_(axis + 1, torch.tensor(border), torch.inf)
-        slopes[..., 0] = torch.where(slopes[..., 0] == torch.inf, -torch.inf, slopes[..., 0])
-        return slopes.contiguous()
+            slopes = values.diff(dim=axis + 1) / spacing[axis]
+            windows = [SURFACE_BLOCK + 3 - (other == axis) for other in range(3)]
+            bounds.append(torch.stack(_extremes(slopes, windows), -1))
+        found = torch.stack(bounds, -2)
+        found[:, self._border_blocks()] = torch.tensor([-torch.inf, torch.inf])
+        return found
+
+    @lazy_buffer
+    def empty_blocks(self) -> UInt8[Tensor, "x y z"]:
+        """How many blocks of `SURFACE_BLOCK`^3 cells away, along the axes or diagonally, a surface may be at least.
+
+        0 where one may be in the block itself: a spline's values lie between its coefficients, so that there is none
+        where these have one sign. At the grid's border, where splines are continued, they may not lie between them.
+        """
+        lowest, highest = _extremes(self._coefficients_of_blocks(), [SURFACE_BLOCK + 3] * 3)
+        outside = lowest > torch.where(self._border_blocks(), highest / _CONTINUED, 0)
+        empty = (outside | ((highest < 0) & ~self._border_blocks())).all(0)
+        return torch.from_numpy(distance_transform_cdt(empty.numpy(), "chessboard").clip(0, 255).astype(np.uint8))
+
+    def _coefficients_of_blocks(self) -> Float[Tensor, "K X Y Z"]:
+        """Coefficients from one before each block of `SURFACE_BLOCK`^3 cells to one after it; on the CPU."""
+        values = self.coefficients.detach().cpu()
+        for axis, count in enumerate(values.shape[1:], start=1):
+            blocks = (count - 1) // SURFACE_BLOCK + 1
+            values = values.index_select(axis, torch.arange(-1, blocks * SURFACE_BLOCK + 2).clamp(0, count - 1))
+        return values
+
+    def _border_blocks(self) -> Bool[Tensor, "x y z"]:
+        """Blocks of `SURFACE_BLOCK`^3 cells in which splines are continued beyond the grid."""
+        axes = []
+        for count in self.coefficients.shape[1:]:
+            block = torch.arange((count - 1) // SURFACE_BLOCK + 1)
+            axes.append((block == 0) | ((block + 1) * SURFACE_BLOCK > count - 2))
+        x, y, z = axes
+        return x[:, None, None] | y[:, None] | z
 
     def clearance(self, positions: Vectors) -> Scalars:
         """Distance to the nearest shell: a lower bound from the blocks, or where that is none the distance itself."""
@@ -238,6 +261,15 @@ class SdfGrid(Solid):
         """Splines of the distances and their exact gradients."""
         splines = [quadratic_spline(coefficients, self.box, positions) for coefficients in self.coefficients]
         return torch.stack([phi for phi, _ in splines], -1), torch.stack([gradient for _, gradient in splines], -2)
+
+
+def _extremes(values: Float[Tensor, "K X Y Z"], windows: list[int]) -> tuple[Tensor, Tensor]:
+    """Lowest and highest value [K, x, y, z] in windows of so many places along each axis, `SURFACE_BLOCK` apart."""
+    lowest = highest = values
+    for axis, window in enumerate(windows, start=1):
+        lowest = lowest.unfold(axis, window, SURFACE_BLOCK).amin(-1)
+        highest = highest.unfold(axis, window, SURFACE_BLOCK).amax(-1)
+    return lowest, highest
 
 
 def cached_distance(

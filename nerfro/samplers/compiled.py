@@ -138,7 +138,7 @@ def _ray_arrays(rays: Rays) -> list[np.ndarray]:
 
 def _for_kernels(medium: VoxelGrid | SdfGrid) -> MediumGrid:
     from nerfro.kernels.lookup import MediumGrid
-    from nerfro.media.sdf_grid import BLOCK, SdfGrid
+    from nerfro.media.sdf_grid import BLOCK, SURFACE_BLOCK, SdfGrid
 
     low, high = medium.box.double().numpy()
     if isinstance(medium, SdfGrid):
@@ -155,10 +155,13 @@ def _for_kernels(medium: VoxelGrid | SdfGrid) -> MediumGrid:
             inverse_spacing,
             inverse_spacing / BLOCK,
             medium.coarse_slopes.numpy(),
+            medium.empty_blocks.numpy(),
+            inverse_spacing / SURFACE_BLOCK,
         )
     inverse_spacing = (np.array(medium.table.shape[:3]) - 1) / (high - low)
     values, clearance = medium.table.detach().numpy(), medium.clearance_grid.numpy()
-    return MediumGrid(values, clearance, None, False, 0.0, low, high, inverse_spacing, inverse_spacing, None)
+    no_bodies = (None, None, None)
+    return MediumGrid(values, clearance, None, False, 0.0, low, high, inverse_spacing, inverse_spacing, *no_bodies)
 
 
 def _path(

@@ -12,11 +12,14 @@ from numba import prange
 
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.lookup import (
-    block_ahead,
-    block_clearance,
+    block_at,
+    blocks_from,
     box_span,
+    end_of_blocks,
+    lengths_of_block,
     put_end,
     put_vertex,
+    slopes_along,
     spline_value,
     spline_value_gradient,
 )
@@ -87,50 +90,65 @@ def _index(inside, solids):
 def _surface_ahead(solids, inside, known, x, y, z, dx, dy, dz, min_step):
     """The first surface on a line: body (-1 where there is none), and arc lengths before and after it.
 
-    Steps are as long as the distance to the nearest surface, as in sphere tracing, or longer. Within a block of cells
-    the distance changes no faster than its slopes there; and across a block in which it only grows or only falls, there
-    is at most one surface of each body, between values of other signs. `known` is scratch memory: values of the bodies
-    at the last two places.
+    Blocks in which there is no surface are jumped over. In the others steps are as long as the distance to the nearest
+    surface, as in sphere tracing, or longer: within a block the distance changes no faster than its slopes there; and
+    across a block in which it only grows or only falls, there is at most one surface of each body, between values of
+    other signs. `known` is scratch memory: values of the bodies at the last two places, and the lowest and highest
+    slopes along the line in the present block.
     """
-    clearance, low, inverse_spacing, inverse_block = (
-        solids.clearance,
-        solids.low,
-        solids.inverse_spacing,
-        solids.inverse_block,
-    )
-    splines, bodies = solids.values, len(inside)
+    low, inverse_spacing, splines, bodies = solids.low, solids.inverse_spacing, solids.values, len(inside)
     _, leave = box_span(low, solids.high, x, y, z, dx, dy, dz)
+    small = solids.inverse_small
+    # The line in blocks, and how far it goes for one of them.
+    rx, ry, rz = dx * small[0], dy * small[1], dz * small[2]
+    bx, by, bz = blocks_from(low, small, x, y, z)
+    qx, qy, qz = lengths_of_block(rx, ry, rz)
+    beyond = _BEYOND_WALL * min_step
     t, before, crossed, across = 0.0, 0.0, False, False
-    while True:
-        px, py, pz = x + t * dx, y + t * dy, z + t * dz
-        # Behind a block there may be a surface in it, even where none is near any more.
-        free = 0.0 if across else block_clearance(clearance, low, inverse_block, px, py, pz)
-        if free > 2.0 * min_step:
+    wall, monotone = 0.0, False
+    while not crossed:
+        i, j, k = block_at(solids.empty.shape, bx + t * rx, by + t * ry, bz + t * rz)
+        reach = solids.empty[i, j, k]
+        # Behind a block there may be a surface in it, even where there is none any more.
+        if reach > 0 and not across:
             before = t
             known[1, :] = math.nan
-            t += free
+            t = max(t, end_of_blocks(i, j, k, reach, bx, by, bz, qx, qy, qz)) + beyond
             if t >= leave:
                 return -1, 0.0, 0.0
             continue
-        distance = math.inf
-        for body in range(bodies):
-            known[0, body] = known[1, body]
-            value = spline_value(splines[body], low, inverse_spacing, px, py, pz)
-            known[1, body] = value
-            crossed = crossed or (value < 0.0) != inside[body]
-            distance = min(distance, abs(value))
-        if crossed:
-            break
-        if t >= leave:
-            return -1, 0.0, 0.0
-        before = t
-        wall, free, monotone = block_ahead(
-            solids.slopes, inside, known[1], low, inverse_block, px, py, pz, dx, dy, dz
-        )  # fmt: skip
-        step = max(distance, min_step, free)
-        across = monotone and wall > step
-        # A little beyond the wall, to be in the next block for sure.
-        t = min(t + (wall if across else step) + _BEYOND_WALL * min_step, leave)
+        if reach == 0:
+            wall = max(t, end_of_blocks(i, j, k, 1, bx, by, bz, qx, qy, qz))
+            monotone = slopes_along(solids.slopes, i, j, k, dx, dy, dz, known[2], known[3])
+        while True:
+            px, py, pz = x + t * dx, y + t * dy, z + t * dz
+            distance = math.inf
+            for body in range(bodies):
+                known[0, body] = known[1, body]
+                value = spline_value(splines[body], low, inverse_spacing, px, py, pz)
+                known[1, body] = value
+                crossed = crossed or (value < 0.0) != inside[body]
+                distance = min(distance, abs(value))
+            if crossed:
+                break
+            if t >= leave:
+                return -1, 0.0, 0.0
+            before, across = t, False
+            if reach > 0:
+                break
+            free = wall - t
+            for body in range(bodies):
+                # The fastest that the value may go to zero; not a number at the border, where nothing is known.
+                towards = known[3, body] if inside[body] else -known[2, body]
+                if not towards <= 0.0:
+                    reached = abs(known[1, body]) / towards
+                    free = min(free, reached) if reached >= 0.0 else 0.0
+            step = max(distance, min_step, free)
+            across = monotone and wall - t > step
+            # A little beyond the wall, to be in the next block for sure.
+            t = min((wall if across else t + step) + beyond, leave)
+            if t > wall:
+                break
     # The first of the surfaces that were crossed in this step.
     hit, hit_before, hit_after = -1, 0.0, math.inf
     tolerance = _ROOT_TOLERANCE * min_step
@@ -241,7 +259,8 @@ def _trace_ray(
                         waiting[num_waiting, 3], waiting[num_waiting, 4], waiting[num_waiting, 5] = mx, my, mz
                         waiting[num_waiting, 6], waiting[num_waiting, 7] = s + before, weight * share
                         waiting_numbers[num_waiting, 0], waiting_numbers[num_waiting, 1] = count, num_events + 1
-                        waiting_inside[num_waiting] = inside
+                        for body in range(len(inside)):
+                            waiting_inside[num_waiting, body] = inside[body]
                         waiting_inside[num_waiting, hit] = not inside[hit]
                         num_waiting += 1
                     weight *= 1.0 - share
@@ -269,10 +288,13 @@ def _trace_ray(
         dx, dy, dz = waiting[num_waiting, 3], waiting[num_waiting, 4], waiting[num_waiting, 5]
         s, weight = waiting[num_waiting, 6], waiting[num_waiting, 7]
         count, num_events = waiting_numbers[num_waiting, 0], waiting_numbers[num_waiting, 1]
-        inside[:] = waiting_inside[num_waiting]
+        for body in range(len(inside)):
+            inside[body] = waiting_inside[num_waiting, body]
         before_row, row = row, min(polyline, room - 1)
         for i in range(min(count, lengths.shape[1])):
-            positions[row, i], directions[row, i] = positions[before_row, i], directions[before_row, i]
+            for axis in range(3):
+                positions[row, i, axis] = positions[before_row, i, axis]
+                directions[row, i, axis] = directions[before_row, i, axis]
             lengths[row, i], bodies[row, i] = lengths[before_row, i], bodies[before_row, i]
         if count < lengths.shape[1]:
             bodies[row, count] = _innermost(inside, solids)
@@ -305,7 +327,7 @@ def trace_snell(
     counts = np.empty((num_rays, 2), np.int64)
     for block in prange((num_rays + _BLOCK - 1) // _BLOCK):
         scratch = (
-            np.empty(num_bodies, np.bool_), np.empty((2, num_bodies)), np.empty((num_splits, 8)),
+            np.empty(num_bodies, np.bool_), np.empty((4, num_bodies)), np.empty((num_splits, 8)),
             np.empty((num_splits, 2), np.int64), np.empty((num_splits, num_bodies), np.bool_),
         )  # fmt: skip
         for ray in range(block * _BLOCK, min((block + 1) * _BLOCK, num_rays)):

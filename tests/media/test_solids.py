@@ -12,7 +12,7 @@ import trimesh
 from nerfro.errors import NerfroError
 from nerfro.media.analytic import Luneburg, Vacuum
 from nerfro.media.base import Medium
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.sdf_grid import SURFACE_BLOCK, SdfGrid
 from nerfro.media.shapes import Ball, RoundedBox, Slab
 from nerfro.media.solid import Solid
 
@@ -121,7 +121,7 @@ def test_coarse_clearance_is_a_lower_bound() -> None:
 
 def test_coarse_slopes_bound_all_derivatives() -> None:
     medium = _nested_balls(43)
-    block = 4 * 3 / 42
+    block = SURFACE_BLOCK * 3 / 42
     positions = torch.rand(20000, 3, dtype=torch.float64) * 3 - 1.5
     x, y, z = ((positions + 1.5) / block).long().unbind(-1)
     bounds = medium.coarse_slopes.double()[:, x, y, z].movedim(0, 1)
@@ -132,6 +132,27 @@ def test_coarse_slopes_bound_all_derivatives() -> None:
     bounded = bounds[:, 0].isfinite().all(-1).all(-1) & ((positions.norm(dim=-1) - 0.9).abs() < 0.05)
     assert bounded.sum() > 500
     assert (bounds[bounded, 0, :, 1] - bounds[bounded, 0, :, 0]).median() < 0.9
+
+
+def test_no_surface_is_in_blocks_that_are_said_to_be_empty() -> None:
+    medium = _nested_balls(43)
+    block = SURFACE_BLOCK * 3 / 42
+    empty = medium.empty_blocks
+    positions = torch.rand(20000, 3, dtype=torch.float64) * 3 - 1.5
+    places = ((positions + 1.5) / block).long().clamp(max=len(empty) - 1)
+    signs = medium.signed_distances(positions)[0] < 0
+    reach = empty[places.unbind(-1)].long()
+    # As far as the blocks around are empty, every body is on the same side of a place as of that block's middle.
+    moved = (places + (torch.rand(20000, 3) * 2 - 1) * (reach[:, None] - 1) + torch.rand(20000, 3)) * block - 1.5
+    moved = moved.round(decimals=6).clamp(-1.5, 1.5)
+    rows = (reach > 0) & (((moved + 1.5) / block - (places + 0.5)).abs().amax(-1) < reach - 0.5)
+    assert rows.sum() > 10000
+    assert torch.equal(signs[rows], medium.signed_distances(moved[rows])[0] < 0)
+    # Blocks are empty but for those around the two surfaces, and some at the border.
+    radius = positions.norm(dim=-1)
+    near = torch.minimum((radius - 0.9).abs(), (radius - 0.5).abs())
+    assert (reach[near < 0.01] == 0).all()
+    assert (reach[(near > 3**0.5 * (block + 2 * 3 / 42)) & (positions.abs().amax(-1) < 1.2)] > 0).all()
 
 
 def test_mesh_becomes_a_distance_that_is_smooth_where_the_mesh_is(tmp_path: Path) -> None:
