@@ -204,7 +204,7 @@ class SdfGrid(Solid):
             windows = [SURFACE_BLOCK + 3 - (other == axis) for other in range(3)]
             bounds.append(torch.stack(_extremes(slopes, windows), -1))
         found = torch.stack(bounds, -2)
-        found[:, self._border_blocks()] = torch.tensor([-torch.inf, torch.inf])
+        found[:, self._border_blocks()] = found.new_tensor([-torch.inf, torch.inf])
         return found
 
     @lazy_buffer

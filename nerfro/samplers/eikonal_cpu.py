@@ -201,7 +201,7 @@ def _step_length(iors, step, dx, dy, dz, gx, gy, gz):
 @compiled
 def _march_ray(medium, origin, direction, near, far, step, tolerance, max_steps, row):
     """One ray's vertices into its row: their number, whether the index varied, and whether it took `max_steps`."""
-    values, clearance, iors, nested, shell, low, high, inverse_spacing, inverse_block, _ = medium
+    values, clearance, iors, nested, shell, low, high, inverse_spacing, inverse_block = medium[:9]
     positions, directions, lengths = row
     skip = REACHED * step
     dx, dy, dz = float(direction[0]), float(direction[1]), float(direction[2])
