@@ -45,6 +45,9 @@ class HashGridField(Field):
         width: of the hidden layers.
         direction_bands: bands of spherical harmonics that encode the direction; 1 makes colour independent of it.
         initial_depth: optical depth of the untrained field along the box's longest side.
+        shortcut: add three features of the density network to the colour before its sigmoid. A picture that is mostly
+            of one colour drives all units of the colour network below zero where another colour is needed; what is
+            there would stay grey, for no gradient comes through them.
         precision: of the MLPs' matrix products; `float32` for processors without bfloat16 units.
     """
 
@@ -63,6 +66,7 @@ class HashGridField(Field):
         width: Count = 64,
         direction_bands: Annotated[int, Range(at_least=1, at_most=harmonics.MAX_BANDS)] = 4,
         initial_depth: Positive = 0.1,
+        shortcut: bool = False,
         precision: Literal["bfloat16", "float32"] = "bfloat16",
     ) -> None:
         super().__init__()
@@ -72,7 +76,7 @@ class HashGridField(Field):
         self.register_buffer("box_max", box[1].float(), persistent=False)
         self.side = float((box[1] - box[0]).max())
         self.initial_density = initial_depth / self.side
-        self.direction_bands, self.precision = direction_bands, precision
+        self.direction_bands, self.shortcut, self.precision = direction_bands, shortcut, precision
         self.levels = hash_encoding.grid_levels(num_levels, base_resolution, finest_resolution, log2_table_size)
         self.table = nn.Parameter(torch.empty(self.levels.num_entries, hash_encoding.NUM_FEATURES))
         nn.init.uniform_(self.table, -1e-4, 1e-4)
@@ -98,6 +102,8 @@ class HashGridField(Field):
         """Density, per length there, and colour at positions within the box, which are contracted with a `radius`."""
         geometry = self.apply_mlp(self.density_mlp, self.encode(positions))
         raw = self.apply_mlp(self.colour_mlp, geometry, self.encode_directions(directions))
+        if self.shortcut:
+            raw = raw + geometry[:, 1:4]
         return self._to_density(geometry), radiance(raw)
 
     def density(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:

@@ -165,11 +165,11 @@ def build_model(config: DictConfig, training: Views | None = None) -> NerfModel:
         config: of the run.
         training: views, where they are loaded already; without them, a checkpoint must tell what was believed of them.
     """
-    losses = build_losses(config.loss)
     optimizer = OptimizerConfig(**config.optimizer)
     path_sampler = build(config.sampler.path)
     medium = build(config.medium) if path_sampler.needs_medium else Vacuum()
     settle_content(config, medium, None if training is None else training.cameras)
+    losses = build_losses(config.loss)
     camera = build(config.camera)
     if training is not None:
         exposures = None if camera.exposure is None else exif_exposures([f.image for f in training.frames])

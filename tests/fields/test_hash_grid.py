@@ -116,6 +116,18 @@ def test_positions_and_directions_get_the_gradients_that_autograd_finds() -> Non
     assert torch.autograd.gradcheck(lambda p, d: decoded_in_double(field, p, d), few)
 
 
+def test_a_dead_colour_network_still_learns_by_the_shortcut() -> None:
+    for shortcut in (False, True):
+        field = make_field(shortcut=shortcut)
+        with torch.no_grad():  # all units below zero in the first layer, wherever it is asked
+            field.colour_mlp[0].weight[:] = 0
+            field.colour_mlp[0].weight[:, 16] = -1  # the first harmonic is the same in all directions
+        rgb = field(make_samples(scale=1.0)).rgb
+        rgb.square().sum().backward()
+        assert (field.table.grad.abs().sum() > 0) == shortcut
+        assert bool(rgb.std(dim=(0, 1)).gt(1e-3).all()) == shortcut  # one grey everywhere without it
+
+
 def test_bfloat16_products_stay_close_to_single_precision() -> None:
     # bfloat16 keeps 8 significant bits; three layers may lose a few of them.
     exact, rounded = make_field("float32")(make_samples()), make_field("bfloat16")(make_samples())
