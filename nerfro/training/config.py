@@ -146,16 +146,20 @@ class TrainConfig:
 
 def build_losses(nodes: DictConfig) -> dict[str, Loss]:
     """Build the training losses from `loss.<registered name>.<field>`."""
+    return {name: find("loss", name).cls(**fields) for name, fields in loss_fields(nodes).items()}
+
+
+def loss_fields(nodes: DictConfig) -> dict[str, dict[str, Any]]:
+    """The fields of each training loss by its registered name; refuses losses and fields that there are not."""
     if not nodes:
         raise NerfroError("there is no loss to train with; give one, such as +loss.photometric.weight=1")
-    losses = {}
+    fields = {}
     for name in map(str, nodes):
         node = {} if nodes[name] is None else nodes[name]
         if not isinstance(node, Mapping):
             raise NerfroError(f"loss.{name}={node} is no set of fields; write loss.{name}.weight={node} for its weight")
-        plugin = find("loss", name)
-        losses[name] = plugin.cls(**configure(plugin, node))
-    return losses
+        fields[name] = configure(find("loss", name), node)
+    return fields
 
 
 def build_model(config: DictConfig, training: Views | None = None) -> NerfModel:
@@ -165,6 +169,7 @@ def build_model(config: DictConfig, training: Views | None = None) -> NerfModel:
         config: of the run.
         training: views, where they are loaded already; without them, a checkpoint must tell what was believed of them.
     """
+    loss_fields(config.loss)  # mistakes are told before anything is read
     optimizer = OptimizerConfig(**config.optimizer)
     path_sampler = build(config.sampler.path)
     medium = build(config.medium) if path_sampler.needs_medium else Vacuum()
