@@ -8,7 +8,6 @@ from torch import Tensor
 
 from nerfro.allowed import Natural, NotNegative, corners_of_box
 from nerfro.distributed import mean_over_rays
-from nerfro.errors import NerfroError
 from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
 from nerfro.types import Batch, Rendering
@@ -23,22 +22,20 @@ class Nearby(Loss):
     other places contradicts no photograph (compare the occlusion loss of FreeNeRF, Yang et al. 2023, Eqn. 8).
 
     Args:
-        box_min, box_max: corners of the content's box, world units; needed, and known once the cameras are read.
+        box_min, box_max: corners of the content's box, world units.
     """
 
     middle: Float[Tensor, "3"]
 
     def __init__(
         self,
-        box_min: list[float] | None = None,
-        box_max: list[float] | None = None,
+        box_min: list[float] = (-1.0, -1.0, -1.0),  # type: ignore[assignment]
+        box_max: list[float] = (1.0, 1.0, 1.0),  # type: ignore[assignment]
         weight: NotNegative = 1e-2,
         start: Natural = 0,
         ramp: Natural = 0,
     ) -> None:
         super().__init__(weight, start, ramp)
-        if box_min is None or box_max is None:
-            raise NerfroError("loss=nearby needs box_min and box_max: what do the cameras look at?")
         middle = torch.from_numpy(corners_of_box(box_min, box_max)).float().mean(0)
         self.register_buffer("middle", middle, persistent=False)
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Optional
 
-from omegaconf import MISSING, DictConfig
+from omegaconf import MISSING, DictConfig, OmegaConf
 
 from nerfro.allowed import Count, Natural, NotNegative, NumRays, Positive, Range, Resolution, Side
 from nerfro.data.base import Views
@@ -144,22 +144,25 @@ class TrainConfig:
     compile: Optional[str] = None  # noqa: UP045
 
 
-def build_losses(nodes: DictConfig) -> dict[str, Loss]:
-    """Build the training losses from `loss.<registered name>.<field>`."""
-    return {name: find("loss", name).cls(**fields) for name, fields in loss_fields(nodes).items()}
+def build_losses(nodes: DictConfig, known: bool = True) -> dict[str, Loss]:
+    """Build the training losses from `loss.<registered name>.<field>`.
 
-
-def loss_fields(nodes: DictConfig) -> dict[str, dict[str, Any]]:
-    """The fields of each training loss by its registered name; refuses losses and fields that there are not."""
+    Args:
+        nodes: of all losses.
+        known: whether what the fields follow from is known; if not, those keep their defaults.
+    """
     if not nodes:
         raise NerfroError("there is no loss to train with; give one, such as +loss.photometric.weight=1")
-    fields = {}
+    losses = {}
     for name in map(str, nodes):
         node = {} if nodes[name] is None else nodes[name]
         if not isinstance(node, Mapping):
             raise NerfroError(f"loss.{name}={node} is no set of fields; write loss.{name}.weight={node} for its weight")
-        fields[name] = configure(find("loss", name), node)
-    return fields
+        plugin = find("loss", name)
+        if not known:
+            node = {field: node[field] for field in node if not OmegaConf.is_interpolation(node, field)}
+        losses[name] = plugin.cls(**configure(plugin, node))
+    return losses
 
 
 def build_model(config: DictConfig, training: Views | None = None) -> NerfModel:
@@ -169,7 +172,7 @@ def build_model(config: DictConfig, training: Views | None = None) -> NerfModel:
         config: of the run.
         training: views, where they are loaded already; without them, a checkpoint must tell what was believed of them.
     """
-    loss_fields(config.loss)  # mistakes are told before anything is read
+    build_losses(config.loss, known=False)  # mistakes are told before anything is read
     optimizer = OptimizerConfig(**config.optimizer)
     path_sampler = build(config.sampler.path)
     medium = build(config.medium) if path_sampler.needs_medium else Vacuum()
