@@ -171,7 +171,7 @@ class NerfModel(LightningModule, ABC):
         progress = self.trainer.strategy.broadcast(training_progress(self.trainer))
         factor = learning_rate_factor(self.global_step, progress, self.optimizer_config)
         for group in self.trainer.optimizers[0].param_groups:
-            waits = group["name"] == "medium" and self.global_step < self.optimizer_config.medium_start
+            waits = self.global_step < self.optimizer_config.start(group["name"])
             group["lr"] = 0.0 if waits else group["initial_lr"] * factor
         for part in (self.boundary, *self.fields):
             part.detail = self.camera.detail(self.global_step)  # type: ignore[assignment]

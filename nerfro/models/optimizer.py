@@ -27,8 +27,10 @@ class OptimizerConfig:
     camera_learning_rate: Optional[Positive] = None  # noqa: UP045
     exposure_learning_rate: Optional[Positive] = None  # noqa: UP045
     medium_start: Natural = 0  # steps before what bends rays learns, so that it is not misled by an unlearned scene
-    # Steps before the first in which the boundary alone learns, from rays that miss the content's box.
+    # Steps before the first in which the boundary alone learns, from rays that miss the content's box; and steps after
+    # which it learns again, from all rays: a scene that is not learned would be painted on it.
     boundary_first: Natural = 0
+    boundary_start: Natural = 0
     warmup_steps: Natural = 2500  # length of the warm-up; 0 for none
     warmup_factor: NotNegative = 0.01  # factor of the learning rate at its first step
     adam_epsilon: Positive = 1e-8  # of Adam
@@ -37,6 +39,10 @@ class OptimizerConfig:
         """Learning rate of a part at the beginning."""
         own: float | None = getattr(self, f"{part}_learning_rate", None)
         return self.learning_rate if own is None else own
+
+    def start(self, part: str) -> int:
+        """Step from which a part learns."""
+        return getattr(self, f"{part}_start", 0)
 
 
 def learning_rate_factor(step: int, progress: float, config: OptimizerConfig) -> float:

@@ -18,7 +18,7 @@ _NUM_PIXELS, _SHARE = 16384, 0.01
 # A step with fewer pixels beside the object is no step.
 _FEWEST = 64
 # Of the boundary's learning rate, in the first and in the last of these steps.
-_RATES = 4.0, 0.4
+_RATES = 25.0, 1.0
 
 
 class BoundaryFirst(Callback):
