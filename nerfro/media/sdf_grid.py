@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import distance_transform_cdt
 from torch import Tensor
 
-from nerfro.allowed import NotNegative, Positive, Range, Resolution, corners_of_box
+from nerfro.allowed import NotNegative, Positive, Range, Resolution
 from nerfro.errors import NerfroError
 from nerfro.files.cache import cached_arrays, content_hash
 from nerfro.geometry.bodies import require_separate
@@ -22,10 +22,13 @@ from nerfro.kernels.available import require_bytes
 from nerfro.kernels.constants import constant
 from nerfro.media.base import Scalars, Vectors, lazy_buffer
 from nerfro.media.solid import Solid
-from nerfro.media.voxel_grid import BYTES_A_VERTEX, check_margin
+from nerfro.media.voxel_grid import BYTES_A_VERTEX, check_margin, grid_box
 from nerfro.paths import resolve_path
 from nerfro.registry import register
 from nerfro.variants import variant
+
+# Voxels of air around the object, where its box is not given.
+AIR = 4
 
 # Voxels around the surface in which the distance is exact: the spline's support and the step that finds the surface.
 BAND = 3.0
@@ -51,7 +54,7 @@ class SdfGrid(Solid):
         inner_iors: their refractive indices.
         learn_ior: refine all indices in training, by the replay of paths.
         resolution: grid vertices a side.
-        box_min, box_max: corners of the grid, world units; the object needs a margin of air inside.
+        box_min, box_max: corners of the grid, world units; none for the mesh's bounds and a margin of air.
         shell_voxels: half width of the smooth interface that the Eikonal equation sees, voxels.
         crease_degrees: edges with larger angles between their faces stay sharp.
         smoothing_size, smoothing_sigma: Gaussian taps a side and standard deviation (voxels) that the distance is
@@ -79,8 +82,8 @@ class SdfGrid(Solid):
         inner_meshes: list[str] = [],  # noqa: B006 (the registry reads and copies it)
         inner_iors: list[Positive] = [],  # noqa: B006
         resolution: Resolution = 128,
-        box_min: list[float] = [-1.5, -1.5, -1.5],  # noqa: B006
-        box_max: list[float] = [1.5, 1.5, 1.5],  # noqa: B006
+        box_min: list[float] | None = None,
+        box_max: list[float] | None = None,
         shell_voxels: Positive = 0.1,
         crease_degrees: NotNegative = 30.0,
         smoothing_size: Annotated[int, Range(at_least=0, at_most=99)] = 0,
@@ -98,12 +101,13 @@ class SdfGrid(Solid):
                 "give one index for each inner mesh"
             )
         require_bytes(BYTES_A_VERTEX * resolution**3, f"medium.resolution={resolution}")
-        box = corners_of_box(box_min, box_max)
+        meshes = [load_mesh(resolve_path(path), accept_open_mesh) for path in (mesh, *inner_meshes)]
+        box = grid_box(box_min, box_max, meshes, resolution, AIR + smoothing_size // 2)
         spacing = (box[1] - box[0]) / (resolution - 1)
         shell = shell_voxels * float(spacing.min())
         super().__init__([ior, *inner_iors], shell, absorption, learn_absorption, abbe, learn_ior)
         self.crease_degrees = crease_degrees
-        self.meshes = [load_mesh(resolve_path(path), accept_open_mesh) for path in (mesh, *inner_meshes)]
+        self.meshes = meshes
         band = BAND + smoothing_size
         distances = []
         for body in self.meshes:

@@ -7,15 +7,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Coordinate, NotNegative, Positive, Resolution, corners_of_box
+from nerfro.allowed import Coordinate, NotNegative, Positive, Resolution
 from nerfro.errors import NerfroError
 from nerfro.geometry.bodies import require_separate
 from nerfro.geometry.lids import find_lid
 from nerfro.geometry.mesh import load_mesh
 from nerfro.kernels.available import require_bytes
-from nerfro.media.sdf_grid import BAND, SdfGrid, cached_distance
+from nerfro.media.sdf_grid import AIR, BAND, SdfGrid, cached_distance
 from nerfro.media.solid import Solid
-from nerfro.media.voxel_grid import BYTES_A_VERTEX, check_margin
+from nerfro.media.voxel_grid import BYTES_A_VERTEX, check_margin, grid_box
 from nerfro.paths import resolve_path
 from nerfro.registry import register
 from nerfro.variants import variant
@@ -70,8 +70,8 @@ class SdfVessel(SdfGrid):
         up: list[Coordinate] = [0.0, 0.0, 1.0],  # noqa: B006 (the registry reads and copies it)
         height: Positive | None = None,
         resolution: Resolution = 128,
-        box_min: list[float] = [-1.5, -1.5, -1.5],  # noqa: B006
-        box_max: list[float] = [1.5, 1.5, 1.5],  # noqa: B006
+        box_min: list[float] | None = None,
+        box_max: list[float] | None = None,
         shell_voxels: Positive = 0.1,
         crease_degrees: NotNegative = 30.0,
         accept_open_mesh: bool = False,
@@ -81,7 +81,8 @@ class SdfVessel(SdfGrid):
         cache: bool = True,
     ) -> None:
         require_bytes(BYTES_A_VERTEX * resolution**3, f"medium.resolution={resolution}")
-        box = corners_of_box(box_min, box_max)
+        surface = load_mesh(resolve_path(mesh), accept_open_mesh)
+        box = grid_box(box_min, box_max, [surface], resolution, AIR)
         spacing = float((box[1] - box[0]).min()) / (resolution - 1)
         iors = [ior, liquid_ior] if level is None else [ior, 1.0, liquid_ior]
         Solid.__init__(
@@ -94,7 +95,6 @@ class SdfVessel(SdfGrid):
         )
         self.meshes = []  # rays bend at distances, not at triangles
         upwards = _direction(up)
-        surface = load_mesh(resolve_path(mesh), accept_open_mesh)
         check_margin(surface, box, resolution, 2)
         if surface.is_closed:
             require_separate(surface)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, get_type_hints
 
@@ -183,6 +184,26 @@ class VoxelGrid(Medium):
                 "smoothing": np.array([self.smoothing_size, self.smoothing_sigma]),
             },
         )
+
+
+def grid_box(
+    box_min: list[float] | None, box_max: list[float] | None, meshes: Sequence[TriangleMesh], resolution: int, air: int
+) -> Float[np.ndarray, "2 3"]:
+    """Corners of a medium's grid: the given ones, or the meshes' bounds and so many voxels of air on each side.
+
+    A flat object gets a box at least half as thick as it is long, so that voxels are not much longer than wide.
+
+    Raises:
+        NerfroError: one corner is given without the other, or they are no corners of a box.
+    """
+    if box_min is not None and box_max is not None:
+        return corners_of_box(box_min, box_max)
+    if box_min is not None or box_max is not None:
+        raise NerfroError("give both medium.box_min and medium.box_max, or neither to have the box found")
+    low, high = np.min([mesh.bounds[0] for mesh in meshes], 0), np.max([mesh.bounds[1] for mesh in meshes], 0)
+    sides = np.maximum(high - low, 0.5 * (high - low).max())
+    share = min(2 * air / (resolution - 1), 0.5)
+    return 0.5 * (low + high) + np.array([[-0.5], [0.5]]) * sides / (1 - share)
 
 
 def check_margin(mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], resolution: int, voxels: int) -> None:

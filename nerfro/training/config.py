@@ -102,7 +102,10 @@ class TrainerConfig:
 class AuthorsConfig:
     """What the authors of the paper set for a scene, taken up by the `paper_*` experiments alone."""
 
-    resolution: Resolution = 512  # vertices a side of the index grid
+    # Corners of the index grid, world units, and its vertices a side.
+    box_min: list[float] = dataclasses.field(default_factory=lambda: [-1.5] * 3)
+    box_max: list[float] = dataclasses.field(default_factory=lambda: [1.5] * 3)
+    resolution: Resolution = 512
     # Taps and standard deviation (voxels) of its smoothing.
     smoothing_size: Natural = 9
     smoothing_sigma: Positive = 1.0

@@ -198,4 +198,20 @@ def test_bad_solids_are_named(tmp_path: Path) -> None:
     with pytest.raises(NerfroError, match=r"shell=0\.0 is not allowed"):
         Ball(shell=0.0)
     with pytest.raises(NerfroError, match=r"box_min=.*box_max="):
-        SdfGrid(mesh, box_max=[0.7] * 3, resolution=16, cache=False)
+        SdfGrid(mesh, box_min=[-1.5] * 3, box_max=[0.7] * 3, resolution=16, cache=False)
+    with pytest.raises(NerfroError, match=r"give both medium\.box_min and medium\.box_max"):
+        SdfGrid(mesh, box_max=[1.5] * 3, resolution=16, cache=False)
+
+
+@pytest.mark.parametrize("sides", [(2.0, 2.0, 2.0), (3.0, 1.0, 0.6)])
+@pytest.mark.parametrize("resolution", [12, 33])
+def test_the_grid_that_is_found_holds_the_object_and_little_else(
+    sides: tuple[float, ...], resolution: int, tmp_path: Path
+) -> None:
+    trimesh.creation.box(sides, trimesh.transformations.translation_matrix([5, -7, 9])).export(tmp_path / "box.ply")
+    medium = SdfGrid(str(tmp_path / "box.ply"), resolution=resolution, cache=False)
+    spacing = (medium.box[1] - medium.box[0]) / (resolution - 1)
+    assert spacing.max() < 2.01 * spacing.min()
+    air = torch.stack([medium.content_box[0] - medium.box[0], medium.box[1] - medium.content_box[1]])
+    assert (air > (2 if resolution == 12 else 3.9) * spacing).all()
+    assert air.min() < 4.1 * spacing.max()
