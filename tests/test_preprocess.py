@@ -91,7 +91,12 @@ def test_ball_from_its_silhouettes(preprocess: Callable[..., str], capture: Path
     command = shlex.split(printed.split("train on it: ")[1])
     assert command[:3] == ["python", "-m", "nerfro.train"]
     assert {f"data.root={capture}", "medium.ior=1.33"} <= set(command)
-    assert not any("box" in part for part in command)  # the grid finds its own
+    box = [
+        json.loads(next(a for a in command if a.startswith(f"medium.{n}=")).split("=")[1])
+        for n in ("box_min", "box_max")
+    ]
+    assert (np.array(box[0]) < mesh.bounds[0]).all()
+    assert (np.array(box[1]) > mesh.bounds[1]).all()
 
 
 def test_printed_command_trains(

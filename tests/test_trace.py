@@ -41,13 +41,14 @@ def _write_rays(file: Path, num: int = 40) -> tuple[np.ndarray, np.ndarray]:
     return heights, np.stack([np.cos(deviation), -np.sin(deviation), 0 * heights], -1)
 
 
+BOX = ["medium.box_min=[-1.5,-1.5,-1.5]", "medium.box_max=[1.5,1.5,1.5]"]
 SAMPLERS = [["sampler/path=snell"], ["sampler.path.interface=mesh"], ["sampler/path=eikonal"]]
 
 
 @pytest.mark.parametrize("options", SAMPLERS, ids=["snell", "mesh", "eikonal"])
 def test_rays_leave_a_ball_as_in_closed_form(trace: Callable[..., str], tmp_path: Path, options: list[str]) -> None:
     heights, exact = _write_rays(tmp_path / "rays.npz")
-    assert "40 rays traced" in trace("medium.ior=1.5", *options)
+    assert "40 rays traced" in trace("medium.ior=1.5", *BOX, *options)
     with np.load(tmp_path / "out.npz") as out:
         clear = np.abs(np.abs(heights) - 0.8) > 0.01  # the eikonal shell has a width
         assert out["hit"][clear].tolist() == (np.abs(heights) < 0.8)[clear].tolist()
@@ -64,7 +65,7 @@ def test_rays_leave_a_ball_as_in_closed_form(trace: Callable[..., str], tmp_path
 
 def test_far_ends_straight_paths_and_bent_ones_outside_the_box(trace: Callable[..., str], tmp_path: Path) -> None:
     _write_rays(tmp_path / "rays.npz")
-    trace("sampler/path=eikonal", "near=2", "far=6")
+    trace("sampler/path=eikonal", "near=2", "far=6", *BOX)
     with np.load(tmp_path / "out.npz") as out:
         np.testing.assert_allclose(out["path_lengths"][~out["hit"]], 6, atol=1e-5)
         lengths, ends = out["path_lengths"][out["hit"]], out["exit_positions"][out["hit"]]

@@ -111,8 +111,7 @@ def surface_settings(
     settings: dict[str, object] = {}
     if location != f"{config.data.root}/{MESH}":
         settings["medium.mesh"] = location
-    finds_its_box = config.medium.get("box_min", ()) is None
-    if not (finds_its_box or is_given("medium.box_min", overrides) or is_given("medium.box_max", overrides)):
+    if not (is_given("medium.box_min", overrides) or is_given("medium.box_max", overrides)):
         centre, half_side = mesh.bounds.mean(0), (0.5 + _MARGIN_SHARE) * float(np.ptp(mesh.bounds, axis=0).max())
         digits = max(0, 3 - int(np.floor(np.log10(half_side))))
         for name, corner in (("box_min", centre - half_side), ("box_max", centre + half_side)):

@@ -28,7 +28,7 @@ SMALL = [
     "sampler.points.num_samples=4", "sampler.points.num_bins=16", "sampler.points.resolution=16",
     "field.num_levels=2", "field.log2_table_size=8", "field.width=16", "loss.boundary.start=0", "evaluation.every=0",
     "trainer.accelerator=cpu", "trainer.max_time=null", "evaluation.supersample=1", "batches.supersample=1",
-    "medium.ior=1.45",
+    "medium.ior=1.45", "optimizer.boundary_learning_rate=5e-3", "optimizer.boundary_start=0",
 ]  # fmt: skip
 
 

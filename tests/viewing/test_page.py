@@ -67,7 +67,7 @@ def glass_cube(scene: Scene) -> Scene:
     """The embedded scene's glass, sky and cameras around the ball inside, and a bubble in the glass."""
     mesh = "embedded:torus/mesh.ply"
     box = torch.tensor([[-1.5] * 3, [1.5] * 3])
-    outer = SdfGrid(mesh, resolution=64, cache=False)
+    outer = SdfGrid(mesh, resolution=64, box_min=[-1.5] * 3, box_max=[1.5] * 3, cache=False)
     axes = torch.stack(torch.meshgrid(*[torch.linspace(-1.5, 1.5, 64)] * 3, indexing="ij"), -1)
     bubble = torch.linalg.vector_norm(axes - torch.tensor([-0.3, -0.3, 0.2]), dim=-1) - 0.15
     medium = SdfGrid.from_distances(torch.stack([outer.distances[0], bubble]), box, [1.5, 1.05], outer.shell)
