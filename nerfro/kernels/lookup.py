@@ -208,13 +208,19 @@ def lengths_of_block(rx, ry, rz):
 
 
 @compiled
+def _end_along(i, reach, b, q):
+    """Distance at which a line leaves along one axis; never where it runs parallel, even on the last block's face."""
+    if math.isinf(q):
+        return math.inf
+    return ((i + reach if q > 0.0 else i + 1.0 - reach) - b) * q
+
+
+@compiled
 def end_of_blocks(i, j, k, reach, bx, by, bz, qx, qy, qz):
     """Distance at which a line from a place in blocks leaves those less than `reach` away from one of them."""
     i, j, k, reach = float(i), float(j), float(k), float(reach)
-    end_x = ((i + reach if qx > 0.0 else i + 1.0 - reach) - bx) * qx
-    end_y = ((j + reach if qy > 0.0 else j + 1.0 - reach) - by) * qy
-    end_z = ((k + reach if qz > 0.0 else k + 1.0 - reach) - bz) * qz
-    return min(end_x, min(end_y, end_z))
+    end_y, end_z = _end_along(j, reach, by, qy), _end_along(k, reach, bz, qz)
+    return min(_end_along(i, reach, bx, qx), min(end_y, end_z))
 
 
 @compiled

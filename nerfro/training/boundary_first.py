@@ -22,7 +22,7 @@ _RATES = 25.0, 1.0
 
 
 class BoundaryFirst(Callback):
-    """Lets the boundary alone learn, for some steps, from rays that miss the boxes of content and object.
+    """Lets the boundary learn, for some steps, from rays that miss the boxes of content and object.
 
     Their pixels cost one look-up each and no tracing, and a sky that is known lets the first gradients of the field be
     about the object. The run's own optimiser does it, so that the boundary's moments are warm as well. A run that goes
@@ -42,6 +42,8 @@ class BoundaryFirst(Callback):
         box = _occupied(pl_module)
         if trainer.global_step > 0 or not learning or box is None:
             return
+        # The views' gains as well: a sky that is the mean of photographs of unlike brightness would hold them back.
+        learning += [parameter for parameter in pl_module.camera.parameters() if parameter.requires_grad]
         optimizer = trainer.optimizers[0]
         group = next(group for group in optimizer.param_groups if group["name"] == "boundary")
         first, last = _RATES
@@ -55,7 +57,7 @@ class BoundaryFirst(Callback):
             group["lr"] = group["initial_lr"] * first * (last / first) ** (step / self._num_steps)
             radiance = pl_module.boundary(Exits.unbent(rays))
             gains = pl_module.camera.gains(view)
-            radiance = radiance if gains is None else radiance * gains.detach()
+            radiance = radiance if gains is None else radiance * gains
             loss = torch.nn.functional.mse_loss(*pl_module.difference(radiance, rgb))
             # Not by backward(): gradients of several processes would be waited for.
             gradients = torch.autograd.grad(loss, learning, allow_unused=True)

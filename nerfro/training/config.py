@@ -100,7 +100,7 @@ class TrainerConfig:
 
 @dataclass
 class AuthorsConfig:
-    """What the authors of the paper set for a scene, taken up by the `paper_*` experiments alone."""
+    """What the authors of the paper set for a scene, taken up by their experiments: `paper_*`, `ablation_euler`."""
 
     # Corners of the index grid, world units, and its vertices a side.
     box_min: list[float] = dataclasses.field(default_factory=lambda: [-1.5] * 3)
