@@ -57,15 +57,13 @@ def bake_surface(model: NerfModel) -> Baked:
     """
     medium: Medium = model.medium
     if isinstance(medium, Vacuum):
-        return Baked({"iors": [], "absorption": [], "vertices": [2, 2, 2], "low": [0, 0, 0], "high": [1, 1, 1],
-                      "step": 1.0, "clearance": 1.0, "block": BLOCK, "shortest": 1.0, "events": 0})  # fmt: skip
+        return Baked({"iors": [], "nested": False, "absorption": [], "vertices": [2, 2, 2], "low": [0, 0, 0],
+                      "high": [1, 1, 1], "step": 1.0, "clearance": 1.0, "block": BLOCK, "shortest": 1.0, "events": 0})  # fmt: skip
     if not isinstance(medium, Solid):
         raise NerfroError(
             f"an interactive page shows bodies with a surface, and the index of {type(medium).__name__} varies "
             "in space; render a film of this run, or train with medium=sdf_grid"
         )
-    if medium.nested:
-        raise NerfroError("an interactive page cannot show a vessel yet; render a film of this run")
     grid = medium if isinstance(medium, SdfGrid) else _on_grid(medium)
     coefficients = grid.coefficients.detach().cpu().double().numpy()
     low, high = grid.box.detach().cpu().double().numpy()
@@ -82,6 +80,7 @@ def bake_surface(model: NerfModel) -> Baked:
     return Baked(
         {
             "iors": [float(ior) for ior in medium.indices],
+            "nested": medium.nested,
             "absorption": absorption.tolist(),
             "vertices": vertices.tolist(),
             "size": list(slices.shape[::-1]),

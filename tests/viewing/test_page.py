@@ -31,6 +31,7 @@ from nerfro.types import Radiance, Samples
 from nerfro.variants import variant
 from nerfro.viewing.page import page_of, upwards
 from nerfro.viewing.scene import Scene
+from tests.media.vessels import spherical_vessel
 from tests.viewing.chromium import ask, needs_chromium, open_page
 from tests.viewing.conftest import IOR, RADIUS, sky_of
 
@@ -85,10 +86,27 @@ def test_five_cameras_of_a_cube_with_bodies_inside_agree_with_nerfro(glass_cube:
     assert min(scores) > 30, scores
 
 
-def test_a_vessel_is_refused(glass_cube: Scene) -> None:
-    medium = variant(glass_cube.model.medium, nested=True)
-    with pytest.raises(NerfroError, match="cannot show a vessel yet"):
-        page_of(replace(glass_cube, model=variant(glass_cube.model, medium=medium)), 16)
+@needs_chromium
+def test_a_vessel_agrees_with_nerfro(scene: Scene, tmp_path: Path) -> None:
+    vessel = spherical_vessel(tmp_path, level=0.9, resolution=64)
+    sky = EnvironmentMap([128], str(resolve_path("embedded:torus/sky.png")))
+    vessel_scene = Scene(variant(scene.model, medium=vessel, boundary=sky), BlenderData("embedded:torus", 2.0, 6.0, 2))
+    # A liquid of the wall's index must change the picture, and air has no index to change.
+    code = f"""(() => {{ {SHOT}
+      const seen = [shot(0, 64), shot(9, 64)];
+      const indices = [...document.querySelectorAll("[id^=ior][type=range]")].map((slider) => slider.id);
+      set(indices.at(-1), 1.5);
+      return {{ seen, indices, filled: shot(9, 64) }};
+    }})()"""
+    found = ask(page_of(vessel_scene, 64), code, tmp_path)
+    assert found["indices"] == ["ior0", "ior2"]
+    expected = one_ray(vessel_scene, vessel_scene.cameras("test").select([0, 9]))
+    assert min(float(psnr(picture(shot), rgb)) for shot, rgb in zip(found["seen"], expected, strict=True)) > 30
+    with_glass = vessel.with_indices(torch.tensor([1.5, 1.0, 1.5]))
+    expected = one_ray(replace(vessel_scene, model=variant(vessel_scene.model, medium=with_glass)),
+                       vessel_scene.cameras("test").select([9]))  # fmt: skip
+    assert psnr(picture(found["filled"]), expected[0]) > 30
+    assert psnr(picture(found["filled"]), picture(found["seen"][1])) < 30
 
 
 class Surroundings(Field):

@@ -132,7 +132,7 @@ function jitter(number) {
 
 // What the controls say.
 function settings(scene) {
-  const iors = scene.surface.iors.map((_, body) => Number($(`ior${body}`).value));
+  const iors = scene.surface.iors.map((own, body) => Number($(`ior${body}`)?.value ?? own));
   // The share of sRGB light that is left of each channel after half the object's width.
   const colour = [1, 3, 5].map((at) => parseInt($("tint-colour").value.slice(at, at + 2), 16) / 255);
   const strength = Number($("tint").value) / scene.orbit.halfWidth;
@@ -146,6 +146,7 @@ function fillControls(page) {
   const set = (id, value) => ($(id).value = value);
   const say = (id) => ($(`${id}-value`).value = Number($(id).value).toFixed(2));
   scene.surface.iors.forEach((ior, body) => {
+    if (!$(`ior${body}`)) return;
     set(`ior${body}`, ior);
     say(`ior${body}`);
   });

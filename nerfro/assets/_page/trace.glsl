@@ -25,6 +25,7 @@ uniform usampler3D clearance;  // how far blocks of cells are from all surfaces,
 uniform float clearanceStep, blockCells;
 uniform float shortestStep;
 uniform int bodies, maxEvents;
+uniform bool nested;  // whether a body is only where all before it are too; one of index 1 is air then
 uniform int startInside;  // bodies that the eye is in, a bit for each
 uniform float index[MAX_BODIES + 1];  // of air and of each body
 uniform vec3 absorption[MAX_BODIES + 1];  // for each world unit
@@ -95,8 +96,9 @@ int innermost(int inside) {
   int number = 0;
   for (int body = 0; body < bodies; ++body) {
     if ((inside >> body & 1) == 1) number = body + 1;
+    else if (nested) break;
   }
-  return number;
+  return nested && index[number] == 1.0 ? 0 : number;
 }
 
 struct Hit {
@@ -197,7 +199,8 @@ void march(vec3 x, vec3 d, float start, float end, vec3 absorbed, inout vec3 lef
   vec3 bricks = vec3(textureSize(occupied, 0)), texels = vec3(textureSize(volume, 0));
   float transmittance = 1.0;
   if (first < last) {
-    float delta = (last - first) / ceil((last - first) / marchStep);
+    // Where a run only just enters the volume a step must still be one in single precision, or the loop never ends.
+    float delta = max((last - first) / ceil((last - first) / marchStep), 1e-6 * last);
     // Steps are even in the volume, and wider in the world where it contracts space.
     for (float t = first + 0.5 * delta / shrinkage(x + first * d); t < last && transmittance > 1e-3;) {
       vec3 here = x + t * d;

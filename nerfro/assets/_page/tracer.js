@@ -94,7 +94,7 @@ class Tracer {
       jitter, height, axes: view.axes, eye: view.eye, near: view.near,
       vertices: surface.vertices, gridLow: surface.low, gridHigh: surface.high, distanceStep: surface.step,
       clearanceStep: surface.clearance, blockCells: surface.block, shortestStep: surface.shortest,
-      bodies: shown, maxEvents: surface.events, startInside: shown ? this.bodiesAt(view.eye) : 0,
+      bodies: shown, nested: surface.nested, maxEvents: surface.events, startInside: shown ? this.bodiesAt(view.eye) : 0,
       index: [1, ...settings.iors], absorption: [0, 0, 0, ...settings.absorption.flat()],
       reflection: settings.reflection,
       volumeLow: volume.low, volumeHigh: volume.high, logDensity: volume.density, brightest: volume.brightest,
