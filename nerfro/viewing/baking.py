@@ -58,7 +58,8 @@ def bake_surface(model: NerfModel) -> Baked:
     medium: Medium = model.medium
     if isinstance(medium, Vacuum):
         return Baked({"iors": [], "nested": False, "absorption": [], "vertices": [2, 2, 2], "low": [0, 0, 0],
-                      "high": [1, 1, 1], "step": 1.0, "clearance": 1.0, "block": BLOCK, "shortest": 1.0, "events": 0})  # fmt: skip
+                      "high": [1, 1, 1], "step": 1.0, "clearance": 1.0, "block": BLOCK, "shortest": 1.0,
+                      "events": 0})  # fmt: skip
     if not isinstance(medium, Solid):
         raise NerfroError(
             f"an interactive page shows bodies with a surface, and the index of {type(medium).__name__} varies "
