@@ -66,7 +66,7 @@ class HashGridField(Field):
         width: Count = 64,
         direction_bands: Annotated[int, Range(at_least=1, at_most=harmonics.MAX_BANDS)] = 4,
         initial_depth: Positive = 0.1,
-        shortcut: bool = False,
+        shortcut: bool = True,
         precision: Literal["bfloat16", "float32"] = "bfloat16",
     ) -> None:
         super().__init__()
