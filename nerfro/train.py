@@ -18,10 +18,9 @@ from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.score_tables import report
 from nerfro.evaluation.treatments import score_split
 from nerfro.fields.mlp import compile_networks
-from nerfro.registry import build
 from nerfro.training.boundary_first import BoundaryFirst
 from nerfro.training.callbacks import StopOnSignal, Throughput
-from nerfro.training.config import TrainConfig, build_model
+from nerfro.training.config import TrainConfig, build_data, build_model
 from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.memory import require_memory
 from nerfro.training.ray_batches import RayBatches
@@ -29,6 +28,7 @@ from nerfro.training.reach import require_reach
 from nerfro.training.run_folder import LAST_CHECKPOINT, begin, own, require_same_run
 from nerfro.training.trainer import finish_logs, make_trainer, prepare_process
 from nerfro.training.viewer import Viewer
+from nerfro.training.watched import FallingBehind
 from nerfro.viewing.camera_files import write_cameras
 
 
@@ -42,7 +42,7 @@ def main(config: DictConfig) -> None:
 
 def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     prepare_process(config.seed)
-    source = build(config.data)
+    source = build_data(config)
     test = source.load(config.evaluation.split).checked()
     validation = source.load("val").checked() if config.evaluation.every > 0 and "val" in source.splits else None
     wanted, training = config.batches, source.load("train")
@@ -54,7 +54,9 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     require_same_run(folder, checkpoint, config)
     throughput, interruption = Throughput(), StopOnSignal()
     boundary_first = BoundaryFirst(batches, config.optimizer.boundary_first)
-    trainer = make_trainer(config, folder, [throughput, interruption, boundary_first, Viewer(config, source, test)])
+    behind = FallingBehind(comparable=not any(True for _ in model.camera.parameters()))
+    watching = [throughput, behind, interruption, boundary_first, Viewer(config, source, test)]
+    trainer = make_trainer(config, folder, watching)
     batches = batches.share(trainer.global_rank, trainer.world_size)
     batches = traced(batches, model, config)
     few = batches.smaller(4096)

@@ -61,7 +61,7 @@ def test_training_and_rendering_stay_on_the_gpu(
         model.to(GPU)
         batches, cameras = RayBatches(views, 8, config.batches.batching).to(GPU), views.cameras.to(GPU)
         gpu.waits.clear()
-        loss = model.training_step(batches.batch(STEP), 0)
+        loss = model.training_step(batches.batch(STEP), 0)["loss"]
         loss.backward()
         model.point_sampler.after_step(STEP, list(model.fields))
         assert {wait for wait in gpu.waits if not wait.startswith(TRACING)} == waits

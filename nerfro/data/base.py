@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +49,15 @@ class Views:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def select(self, views: Sequence[int]) -> Views:
+        """Some of the views, in the order that is asked for."""
+        chosen = list(views)
+        given = {name: getattr(self, name) for name in ("images", "masks", "usable")}
+        pictures = {name: p.select(chosen) if isinstance(p, Pictures) else p for name, p in given.items()}
+        pictures = {name: p[chosen] if isinstance(p, Tensor) else p for name, p in pictures.items()}
+        names, frames = [self.names[view] for view in chosen], [self.frames[view] for view in chosen if self.frames]
+        return replace(self, cameras=self.cameras.select(chosen), names=names, frames=frames, **pictures)
 
     def checked(self) -> Views:
         """These views, of which every picture has been decoded once, to refuse what is corrupt, and forgotten."""

@@ -120,6 +120,10 @@ class Pictures:
             while ahead:
                 yield ahead.popleft().result()
 
+    def select(self, views: Sequence[int]) -> Pictures:
+        """Some of the pictures, in the order that is asked for."""
+        return replace(self, files=[self.files[view] for view in views])
+
     def cut(self, window: Window) -> Pictures:
         """The window of each picture."""
         return replace(self, window=window)

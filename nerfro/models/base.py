@@ -141,7 +141,8 @@ class NerfModel(LightningModule, ABC):
         prediction = self.encode(radiance)
         return prediction, rgb if self.colour == "srgb" else clipped_alike(rgb, prediction)
 
-    def training_step(self, batch: Batch, batch_index: int) -> Float[Tensor, ""]:
+    def training_step(self, batch: Batch, batch_index: int) -> dict[str, Tensor]:
+        """The loss of a batch, and the mean squared error of its pixels (sRGB)."""
         with drawing_for(batch.rows, batch.num_rows):
             renderings = self.render_path(self.trace(self.camera(batch.rays, batch.view), batch.path))
         if (gains := self.camera.gains(batch.view)) is not None:
@@ -155,13 +156,14 @@ class NerfModel(LightningModule, ABC):
                 self.log(f"loss/{name}", value)
                 total = total + weight * value
         shown = self.encode(batch.of_pixels(renderings[-1].rgb.detach())).clamp(0, 1)
-        self.log("train/psnr", psnr(shown, batch.of_pixels(batch.rgb)), prog_bar=True)
+        error = (shown - batch.of_pixels(batch.rgb)).square().mean()
+        self.log("train/psnr", -10 * torch.log10(error), prog_bar=True)
         self.log("loss/total", total)
         for name, value in self.medium.learned().items():
             self.log(f"medium/{name}", value)
         for name, value in self.camera.learned().items():
             self.log(f"camera/{name}", value)
-        return total
+        return {"loss": total, "squared_error": error}
 
     def on_train_batch_start(self, batch: Batch, batch_index: int) -> None:
         # Every step draws from its own seed, so that a resumed run repeats the steps of an undisturbed one.
@@ -197,13 +199,19 @@ class NerfModel(LightningModule, ABC):
     def validation_step(self, view: int, batch_index: int) -> dict[str, Tensor] | None:
         if not self.trainer.is_global_zero:
             return None  # one process looks, the others wait
-        views = self.trainer.datamodule.validation  # type: ignore[attr-defined]
-        target = views.images[view].to(self.device)
+        data = self.trainer.datamodule  # type: ignore[attr-defined]
         with torch.autocast(self.device.type, enabled=False):  # directions in half precision would miss their pixels
+            rays = data.watched.rays(self.device)
+        held = psnr(self.encode(self.render(rays).radiance).clamp(0, 1), data.watched.rgb.to(self.device))
+        self.log("val/psnr", held, prog_bar=True, batch_size=1, rank_zero_only=True)
+        if view < 0:
+            return None  # no picture is due
+        views = data.validation
+        target = views.images[view].to(self.device)
+        with torch.autocast(self.device.type, enabled=False):
             rays = views.cameras.to(self.device).image_rays(view)
         rendered = self.render(rays)
         prediction = self.encode(rendered.radiance).clamp(0, 1).reshape(target.shape)
-        self.log("val/psnr", psnr(prediction, target), prog_bar=True, batch_size=1, rank_zero_only=True)
         depth, opacity = (m.reshape(target.shape[:2]) for m in (rendered.depth / views.cameras.far, rendered.opacity))
         return {"prediction": prediction, "target": target, "depth": depth, "opacity": opacity}
 

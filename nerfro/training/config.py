@@ -10,8 +10,9 @@ from typing import Annotated, Any, Literal, Optional
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from nerfro.allowed import Count, Natural, NotNegative, NumRays, Positive, Range, Resolution, Side
-from nerfro.data.base import Views
+from nerfro.data.base import DataSource, Views
 from nerfro.data.exposure import exif_exposures
+from nerfro.data.held_back import HeldBack
 from nerfro.errors import NerfroError
 from nerfro.losses.base import Loss
 from nerfro.media.analytic import Vacuum
@@ -37,6 +38,8 @@ class BatchesConfig:
     # Pixels of `single_image` at a time, or of `all_images`.
     batching: Annotated[str, Literal["single_image", "all_images"]] = "single_image"
     jitter: bool = False  # draw each ray anywhere inside its pixel instead of through its centre
+    # Training views, spread over the cameras' places, that are not trained on: they are the `val` split then.
+    hold_back: Natural = 0
     precrop_steps: Natural = 0  # number of first steps that see only the central window of the images
     precrop_fraction: Annotated[float, Range(more_than=0, at_most=1)] = 0.5  # side of that window
     # Rays in each direction of a pixel whose ray leaves `divergence` pixels or more away from the ray beside it;
@@ -55,7 +58,9 @@ class EvaluationConfig:
     lpips_backbone: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     # File of VGG-16 weights; none looks in torch's hub cache only.
     lpips_vgg_backbone: Optional[str] = None  # noqa: UP045
-    every: Natural = 500  # steps between two looks at one validation image while training; 0 for never
+    # Steps between two pictures of validation views while training; PSNR of some of their pixels is taken five times as
+    # often. 0 for never.
+    every: Natural = 500
     # Rays along each side of a pixel that is supersampled, see `divergence`; 1 for one central ray.
     supersample: Side = 1
     # Supersample pixels whose ray leaves this many pixels or more away from the one beside it; 0 for all.
@@ -145,6 +150,12 @@ class TrainConfig:
     # Backend of torch.compile for the networks, such as inductor or cudagraphs on a GPU; none runs them as they
     # are. Compiling takes a minute or more at the start.
     compile: Optional[str] = None  # noqa: UP045
+
+
+def build_data(config: DictConfig) -> DataSource:
+    """The data of a run; views that it holds back are their `val` split."""
+    source, number = build(config.data), config.batches.get("hold_back", 0)  # which older checkpoints lack
+    return HeldBack(source, number) if number else source
 
 
 def build_losses(nodes: DictConfig, known: bool = True) -> dict[str, Loss]:

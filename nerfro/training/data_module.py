@@ -15,11 +15,20 @@ from omegaconf import DictConfig
 from nerfro.data.base import Views
 from nerfro.models.base import NerfModel
 from nerfro.training.ray_batches import RayBatches
+from nerfro.training.watched import WatchedPixels
 from nerfro.types import Batch
+
+# Looks at pixels for one at a picture: two tell less of a curve than ten, and cost a few steps each.
+_LOOKS_PER_PICTURE = 5
+# A look without a picture, where the number of a validation view would be.
+NO_PICTURE = -1
 
 
 class RayDataModule(LightningDataModule):
     """Random training pixels, resident on the training device, and one validation view at a time.
+
+    Every fifth look at the validation views (`looks_every`) is a picture of one of them; some of their pixels are
+    looked at each time.
 
     Lightning fetches data a step early. It is given the numbers of the steps, and each step's batch when it begins: so
     paths that bend in a medium that learns bend in it as it is then.
@@ -28,6 +37,7 @@ class RayDataModule(LightningDataModule):
     def __init__(self, batches: RayBatches, validation: Views | None, every: int) -> None:
         super().__init__()
         self.batches, self.validation, self.every = batches, validation, every
+        self.watched = None if validation is None else WatchedPixels.of(validation)
         self._ahead: OneAhead | None = None
 
     def train_dataloader(self) -> Iterator[int]:
@@ -46,7 +56,7 @@ class RayDataModule(LightningDataModule):
     def transfer_batch_to_device(self, batch: int, device: torch.device, dataloader_idx: int) -> Batch | int:
         assert self.trainer is not None
         if not self.trainer.training:
-            return batch  # the number of a validation view
+            return batch  # the number of a validation view, or none
         if self._ahead is not None:
             return self._ahead(batch)
         with torch.no_grad():
@@ -115,8 +125,13 @@ def traced(batches: RayBatches, model: NerfModel, config: DictConfig) -> RayBatc
     )
 
 
+def looks_every(every: int) -> int:
+    """Steps between two looks at validation pixels, where so many are between two pictures; 0 for never."""
+    return 0 if every == 0 else max(1, every // _LOOKS_PER_PICTURE)
+
+
 class RotatingView:
-    """One validation view each time it is iterated, the next one at the next look."""
+    """One validation view each time that a picture is due, the next one at the next time; else `NO_PICTURE`."""
 
     def __init__(self, module: RayDataModule) -> None:
         self._module = module
@@ -127,5 +142,6 @@ class RotatingView:
     def __iter__(self) -> Iterator[int]:
         module = self._module
         assert module.trainer is not None
-        look = module.trainer.global_step // max(module.every, 1)
-        yield look % len(module.validation or [0])
+        picture, since = divmod(module.trainer.global_step, max(module.every, 1))
+        due = since < looks_every(module.every)
+        yield picture % len(module.validation or [0]) if due else NO_PICTURE

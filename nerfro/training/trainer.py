@@ -20,6 +20,7 @@ from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.registry import build
 from nerfro.training.callbacks import ConfigInCheckpoint, TrainingProgress
 from nerfro.training.checkpoint_files import CheckpointFiles
+from nerfro.training.data_module import looks_every
 from nerfro.training.log import TrainingLog
 from nerfro.training.run_folder import CONFIG_FILE, LAST_CHECKPOINT
 
@@ -44,7 +45,7 @@ def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.
         "plugins": [CheckpointFiles()],
         "logger": [build(node, save_dir=str(folder)) for node in (config.logger or {}).values()],
         "max_epochs": -1,
-        "val_check_interval": every if every > 0 else None,
+        "val_check_interval": looks_every(every) or None,
         "check_val_every_n_epoch": None,
         "limit_val_batches": 1 if every > 0 else 0,
         "num_sanity_val_steps": 0,

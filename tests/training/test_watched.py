@@ -1,0 +1,155 @@
+"""Views that are not trained on are looked at, and a run says when they fall behind."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from nerfro.data.base import Views
+from nerfro.data.blender import BlenderData
+from nerfro.training.data_module import NO_PICTURE, RayDataModule, RotatingView, looks_every
+from nerfro.training.watched import FallingBehind, WatchedPixels
+
+LINE = "views that are not trained on fall behind"
+
+
+@pytest.fixture
+def noise(tiny_scene: Path, tmp_path: Path) -> Path:
+    """The tiny scene with photographs that have nothing in common: each pixel black or white."""
+    generator = np.random.default_rng(0)
+    for split in ("train", "val", "test"):
+        manifest = json.loads((tiny_scene / f"transforms_{split}.json").read_text())
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(manifest))
+        (tmp_path / split).mkdir()
+        for frame in manifest["frames"]:
+            levels = generator.integers(2, size=(16, 16, 1), dtype=np.uint8).repeat(3, -1) * 255
+            Image.fromarray(levels).save(tmp_path / f"{frame['file_path']}.png")
+    (tmp_path / "mesh.ply").write_bytes((tiny_scene / "mesh.ply").read_bytes())
+    return tmp_path
+
+
+@pytest.fixture
+def learn(train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path) -> Callable[..., Any]:
+    """Trains along straight rays through a fine grid, long enough to know few photographs by heart."""
+    box = ["content.box_min=[-1.6,-1.6,-1.6]", "content.box_max=[1.6,1.6,1.6]"]
+    quick = ["batches.size=256", "optimizer.learning_rate=3e-2", "optimizer.boundary_first=0", "evaluation.every=50"]
+    parts = [
+        "sampler/path=straight",
+        "field.log2_table_size=14",
+        "field.finest_resolution=64",
+        "loss.boundary.weight=0",
+    ]
+    steps = ["trainer.max_steps=150", "evaluation.supersample=1", f"hydra.run.dir={tmp_path / 'run'}"]
+    return lambda *more: train_here(*tiny_default_run, *box, *quick, *parts, *steps, *more)
+
+
+def test_photographs_known_by_heart_are_told_once(learn: Callable[..., Any], noise: Path, tmp_path: Path) -> None:
+    finished = learn(f"data.root={noise}", "logger=tensorboard", "trainer.log_every_n_steps=1")
+    assert finished.code == 0, finished.err
+    told = [line for line in finished.out.splitlines() if LINE in line]
+    assert len(told) == 1
+    assert "docs/real.md, Few photographs" in told[0]
+    with (tmp_path / "run" / "csv" / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    held = [float(row["val/psnr"]) for row in rows if row["val/psnr"]]
+    assert len(held) == 15, "a look every ten steps"
+    training = [float(row["train/psnr"]) for row in rows if row["train/psnr"]]
+    assert held[-1] + 4 < np.mean(training[-10:])
+
+
+def test_a_healthy_run_says_nothing(learn: Callable[..., Any]) -> None:
+    finished = learn()
+    assert finished.code == 0, finished.err
+    assert LINE not in finished.out
+
+
+def judged(looks: list[tuple[float, float]], **options: bool) -> list[int]:
+    """At which looks (held-back and training PSNR) something is told."""
+    behind = FallingBehind(**options)
+    return [step for step, look in enumerate(looks) if behind.judge(step, *look) is not None]
+
+
+@pytest.mark.parametrize(
+    ("looks", "told"),
+    [
+        ([(20, 21), (22, 23), (20.9, 24), (20.8, 25), (20, 26)], [3]),  # worse, twice, while training improves
+        ([(20, 21), (22, 23), (20.9, 24), (21.5, 25), (20, 26), (22.1, 27)], []),  # never twice
+        ([(20, 21), (22, 23), (20, 23.2), (20, 23.4), (20, 23)], []),  # training does not improve either
+        ([(20, 21), (20, 23.9), (20.1, 24.2), (20.1, 24.3), (20.1, 27)], [3]),  # 4 dB below, twice
+        ([(8, 9), (20, 21), (24, 27.9), (25, 28.9), (26, 29.9)], []),  # behind, but improving and within 4 dB
+    ],
+)
+def test_what_is_behind(looks: list[tuple[float, float]], told: list[int]) -> None:
+    assert judged(looks) == told
+
+
+def test_where_cameras_learn_only_a_loss_is_told() -> None:
+    assert judged([(20, 21), (20, 25), (20, 26), (20, 26)], comparable=False) == []
+    assert judged([(22, 23), (20.9, 24), (20.8, 25)], comparable=False) == [2]
+
+
+def test_a_resumed_run_remembers_and_says_nothing_twice() -> None:
+    behind, later = FallingBehind(), FallingBehind()
+    assert behind.judge(1, 22, 23) is None
+    assert behind.judge(2, 20, 24) is None
+    later.load_state_dict(behind.state_dict())
+    assert "20.0 dB after 3 steps, 2.0 less than after 1" in (later.judge(3, 20, 25) or "")
+    again = FallingBehind()
+    again.load_state_dict(later.state_dict())
+    assert again.judge(4, 20, 26) is None
+
+
+def test_the_same_usable_pixels_are_watched_each_time(tiny_scene: Path) -> None:
+    views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val")
+    usable = torch.zeros(2, 16, 16, dtype=torch.bool)
+    usable[:, 3:7] = True
+    masked = replace(views, usable=usable)
+    one, other = WatchedPixels.of(masked), WatchedPixels.of(masked)
+    assert torch.equal(one.index, other.index)
+    assert len(one.index.unique()) == len(one.index) == usable.sum()
+    assert bool(usable.flatten()[one.index].all())
+    images = torch.stack(list(views.images)).view(-1, 3)
+    assert torch.equal(one.rgb, images[one.index])
+    rays = views.cameras.image_rays(1)
+    assert torch.allclose(one.rays(torch.device("cpu")).directions[-64:], rays.directions[one.index[-64:] - 256])
+
+
+def test_many_views_cost_no_more_than_few(tiny_scene: Path) -> None:
+    views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val")
+    many = Views(views.cameras.select([0] * 100), torch.rand(100, 16, 16, 3), None, ["a"] * 100)
+    watched = WatchedPixels.of(many)
+    seen = (watched.index // 256).unique()
+    assert len(watched.index) == 2048
+    assert (len(seen), seen[0], seen[-1]) == (32, 0, 99)
+
+
+@pytest.mark.parametrize(("every", "looks"), [(0, 0), (1, 1), (4, 1), (11, 2), (500, 100)])
+def test_looks_come_five_times_as_often_as_pictures(every: int, looks: int, tiny_scene: Path) -> None:
+    assert looks_every(every) == looks
+    if not every:
+        return
+    module = RayDataModule(None, BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val"), every)  # type: ignore[arg-type]
+    shown = {}
+    for step in range(looks, 10 * every + 1, looks):
+        module.trainer = Steps(step)  # type: ignore[assignment]
+        (view,) = RotatingView(module)
+        if view != NO_PICTURE:
+            shown[step] = view
+    assert len(shown) == 10
+    assert list(shown.values()) == [1, 0] * 5, "one view after the other"
+
+
+class Steps:
+    """A trainer that has done so many steps."""
+
+    def __init__(self, step: int) -> None:
+        self.global_step = step
