@@ -105,10 +105,11 @@ class FallingBehind(Callback):
             return None
         self.told = True
         fallen = f", {self._best - held:.1f} less than after {self._best_step}" if lost else ""
+        shorter = f", or train for {self._best_step} steps" if lost else ""
         return (
             f"views that are not trained on fall behind: {held:.1f} dB after {step} steps{fallen}; training pixels "
-            f"have {training:.1f}. So the scene fits its photographs and no others. Take more photographs, tell more "
-            "of the object (medium...), or train for a shorter time; see docs/real.md, Few photographs"
+            f"have {training:.1f}. Take more photographs, check poses and, of glass, surface and index "
+            f"(medium...){shorter}; see docs/real.md, Few photographs"
         )
 
     def state_dict(self) -> dict[str, Any]:
