@@ -28,7 +28,6 @@ from nerfro.training.reach import require_reach
 from nerfro.training.run_folder import LAST_CHECKPOINT, begin, own, require_same_run
 from nerfro.training.trainer import finish_logs, make_trainer, prepare_process
 from nerfro.training.viewer import Viewer
-from nerfro.training.watched import FallingBehind
 from nerfro.viewing.camera_files import write_cameras
 
 
@@ -54,9 +53,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     require_same_run(folder, checkpoint, config)
     throughput, interruption = Throughput(), StopOnSignal()
     boundary_first = BoundaryFirst(batches, config.optimizer.boundary_first)
-    behind = FallingBehind(comparable=not any(True for _ in model.camera.parameters()))
-    watching = [throughput, behind, interruption, boundary_first, Viewer(config, source, test)]
-    trainer = make_trainer(config, folder, watching)
+    trainer = make_trainer(config, folder, [throughput, interruption, boundary_first, Viewer(config, source, test)])
     batches = batches.share(trainer.global_rank, trainer.world_size)
     batches = traced(batches, model, config)
     few = batches.smaller(4096)

@@ -23,6 +23,7 @@ from nerfro.training.checkpoint_files import CheckpointFiles
 from nerfro.training.data_module import looks_every
 from nerfro.training.log import TrainingLog
 from nerfro.training.run_folder import CONFIG_FILE, LAST_CHECKPOINT
+from nerfro.training.watched import FallingBehind
 
 
 def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.Trainer:
@@ -41,7 +42,7 @@ def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.
     in_checkpoint = ConfigInCheckpoint(OmegaConf.to_yaml(config, resolve=True))
     ours = {
         "default_root_dir": str(folder),
-        "callbacks": [checkpoints, TrainingProgress(), in_checkpoint, TrainingLog(), *extra],
+        "callbacks": [checkpoints, TrainingProgress(), in_checkpoint, TrainingLog(), FallingBehind(), *extra],
         "plugins": [CheckpointFiles()],
         "logger": [build(node, save_dir=str(folder)) for node in (config.logger or {}).values()],
         "max_epochs": -1,

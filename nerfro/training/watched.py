@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from nerfro.cameras import Cameras
 from nerfro.data.base import Views
+from nerfro.models.base import NerfModel
 from nerfro.pixel_parts import pixel_rays
 from nerfro.rays import Rays
 from nerfro.types import Batch
@@ -63,16 +64,21 @@ class FallingBehind(Callback):
     gained half a dB since; or if they are 4 dB below them. PSNR of training pixels is that of all batches since the
     last look.
 
-    Args:
+    Attributes:
         comparable: whether the difference of both tells anything. Where cameras or exposures of training views learn,
             those of other views do not.
+        told: whether it has said so.
     """
 
-    def __init__(self, comparable: bool = True) -> None:
-        self._comparable = comparable
+    def __init__(self) -> None:
+        self.comparable = True
         self._error, self._steps = 0.0, 0  # of batches since the last look: sum of mean squared errors, and how many
         self._best, self._best_step, self._training_then = -math.inf, 0, -math.inf
         self._behind = self.told = False
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        assert isinstance(pl_module, NerfModel)
+        self.comparable = not list(pl_module.camera.parameters())
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Batch, batch_idx: int
@@ -99,7 +105,7 @@ class FallingBehind(Callback):
         if held > self._best:
             self._best, self._best_step, self._training_then = held, step, training
         lost = self._best - held >= _LOST and training - self._training_then >= _GAINED
-        behind = lost or (self._comparable and training - held >= _LAG)
+        behind = lost or (self.comparable and training - held >= _LAG)
         told, self._behind = behind and self._behind and not self.told, behind
         if not told:
             return None

@@ -72,9 +72,10 @@ def test_a_healthy_run_says_nothing(learn: Callable[..., Any]) -> None:
     assert LINE not in finished.out
 
 
-def judged(looks: list[tuple[float, float]], **options: bool) -> list[int]:
+def judged(looks: list[tuple[float, float]], comparable: bool = True) -> list[int]:
     """At which looks (held-back and training PSNR) something is told."""
-    behind = FallingBehind(**options)
+    behind = FallingBehind()
+    behind.comparable = comparable
     return [step for step, look in enumerate(looks) if behind.judge(step, *look) is not None]
 
 
@@ -95,6 +96,17 @@ def test_what_is_behind(looks: list[tuple[float, float]], told: list[int]) -> No
 def test_where_cameras_learn_only_a_loss_is_told() -> None:
     assert judged([(20, 21), (20, 25), (20, 26), (20, 26)], comparable=False) == []
     assert judged([(22, 23), (20.9, 24), (20.8, 25)], comparable=False) == [2]
+
+
+@pytest.mark.parametrize(("camera", "comparable"), [("false", True), ("true", False)])
+def test_exposures_that_learn_are_those_of_training_views_alone(
+    learn: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, camera: str, comparable: bool
+) -> None:
+    begun: list[FallingBehind] = []
+    monkeypatch.setattr(FallingBehind, "on_train_end", lambda self, *given: begun.append(self))
+    finished = learn(f"camera.exposure={camera}", "trainer.max_steps=1")
+    assert finished.code == 0, finished.err
+    assert [behind.comparable for behind in begun] == [comparable]
 
 
 def test_a_resumed_run_remembers_and_says_nothing_twice() -> None:
