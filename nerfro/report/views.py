@@ -23,9 +23,9 @@ from nerfro.evaluation.pictures import Crop, most_telling_crop
 from nerfro.evaluation.results import FULL, METRICS, Metric, Region, Score
 from nerfro.evaluation.tables import MISSING
 from nerfro.files.images import load_png, to_8bit
-from nerfro.registry import build
 from nerfro.report.comparison import Comparison
 from nerfro.report.runs import Run, Scored
+from nerfro.training.config import build_data
 
 ERROR_MAPS = ("squared_error", "ssim", "lpips", "lpips_vgg", "flip")
 NUM_CROPS = 2
@@ -141,7 +141,7 @@ def scene_pictures(comparison: Comparison, scored: Scored, wanted: Wanted) -> Sc
     runs = {number: cell[0] for number, cell in enumerate(cells) if cell}
     titles = {number: comparison.methods[number] for number in runs}
     first = next(iter(runs.values()))
-    references: Views = build(OmegaConf.create(dict(first.config["data"]))).load(scored.split)
+    references: Views = build_data(OmegaConf.create(dict(first.config))).load(scored.split)
     cameras = references.cameras
     if (len(references), cameras.height, cameras.width) != (scored.num_views, scored.height, scored.width):
         raise NerfroError(f"{scored.root} does not hold the views that were scored; has it been changed since?")

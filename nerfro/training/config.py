@@ -154,7 +154,7 @@ class TrainConfig:
 
 def build_data(config: DictConfig) -> DataSource:
     """The data of a run; views that it holds back are their `val` split."""
-    source, number = build(config.data), config.batches.get("hold_back", 0)  # which older checkpoints lack
+    source, number = build(config.data), OmegaConf.select(config, "batches.hold_back")  # which older checkpoints lack
     return HeldBack(source, number) if number else source
 
 
