@@ -28,7 +28,7 @@ from nerfro.training.reach import require_reach
 from nerfro.training.run_folder import LAST_CHECKPOINT, begin, own, require_same_run
 from nerfro.training.trainer import finish_logs, make_trainer, prepare_process
 from nerfro.training.viewer import Viewer
-from nerfro.viewing.camera_files import write_cameras
+from nerfro.viewing.learned_files import write_learned
 
 
 @entry_point("train", TrainConfig)
@@ -80,7 +80,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
         sys.exit(EXIT_INTERRUPTED)
 
     model.to(trainer.strategy.root_device)
-    write_cameras(folder / "cameras.json", model.camera, training)
+    write_learned(folder, model, training)
     metrics = ImageMetrics(*lpips, prefix=config.evaluation.split)
     result, treated = score_split(model, test, metrics, folder, supersampling, config.evaluation.refine_steps)
     title = f"{config.name} on {config.data.root}, {config.evaluation.split} views"

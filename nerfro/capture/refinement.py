@@ -14,13 +14,15 @@ Photographs of some views are held back and judge: the surface is the one that e
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
+from pathlib import Path as FilePath
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfro.boundaries.base import Boundary
@@ -30,15 +32,17 @@ from nerfro.capture.silhouette_fit import rim_points
 from nerfro.capture.surroundings import HELD_BACK, Pixels, Room, Surroundings, robust
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import NerfroError
-from nerfro.geometry.interpolation import bspline_basis, quadratic_spline
+from nerfro.files.atomic import write_atomically
+from nerfro.files.cache import content_hash
+from nerfro.geometry.interpolation import quadratic_spline
 from nerfro.geometry.mesh import TriangleMesh
+from nerfro.media import displacement
+from nerfro.media.displacement import Displacement
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.snell import Snell
 from nerfro.types import Exits, Path
 from nerfro.variants import variant
 
-# Control points a side of the splines whose sum moves the surface.
-_LEVELS = (12, 24, 48)
 _PIXELS = 6000  # of a step
 _JUDGED = 20_000  # held-back pixels, at most
 # Pixels that are looked at to tell what is clear, and after how many steps that is told anew.
@@ -50,6 +54,8 @@ _VOXELS, _SAMPLES, _FEWEST_RAYS = 48, 64, 20
 _CLEAR = (0.4, 0.6)
 # Residuals of linear radiance count half at this.
 _HALF = 0.1
+# Part of the key of a record: raise it when the same inputs lead elsewhere than before.
+_VERSION = 1
 # An outline is known to about this, pixels; weights of outlines and of smoothness.
 _OUTLINE, _OUTLINES, _SMOOTH = 0.25, 0.1, 0.1
 _RIMS = 4000  # points of outlines of a step
@@ -61,9 +67,7 @@ class _Stage:
 
     Attributes:
         steps: their number.
-        rate: how far the first step moves the coarsest spline, in shares of the object's size, and an index; it falls
-            along half a cosine. Finer splines move as much less as their control points are nearer, so that all turn
-            the surface alike.
+        rate: how far the first step moves the surface, see `Displacement`, and an index; it falls along half a cosine.
         blur: standard deviation of the surroundings' blur at the beginning and at the end, degrees; 0 for none.
     """
 
@@ -115,6 +119,7 @@ def refine_surface(
     surroundings: Surroundings,
     learn_index: bool = False,
     progress: Callable[[float], None] = lambda done: None,
+    record: FilePath | None = None,
 ) -> Refined:
     """Move the outer surface of a medium by what photographs show through it.
 
@@ -126,6 +131,8 @@ def refine_surface(
         surroundings: what is seen around it.
         learn_index: whether the indices are not known for sure, and learned along with the surface.
         progress: is told the share done.
+        record: file in which the state is kept now and then, and from which a descent on the same pixels that was
+            interrupted goes on; it is removed at the end.
 
     Raises:
         NerfroError: the surroundings are near, or too few pixels show them through the object.
@@ -135,59 +142,82 @@ def refine_surface(
             "refine=true needs surroundings that are far away, and these are near; say room=false if they are not"
         )
     descent = _Descent(mesh, medium, silhouettes, through, surroundings, learn_index)
-    best, lowest = descent.state(), descent.judged(medium)
-    steps, errors, done = [0], [lowest], 0
-    for stage in _STAGES:
-        for step in range(stage.steps):
-            if step % _JUDGE_EVERY == 0:
-                share = step / stage.steps
+    at = _Position(descent.state(), [descent.judged(medium)])
+    key = "" if record is None else _key(mesh, medium, through, learn_index)
+    if record is not None:
+        at = _read(record, key, descent) or at
+    while at.stage < len(_STAGES):
+        stage = _STAGES[at.stage]
+        while at.step < stage.steps:
+            if at.step % _JUDGE_EVERY == 0:
+                share = at.step / stage.steps
                 sky = _blurred(surroundings, stage.blur[0] + (stage.blur[1] - stage.blur[0]) * share)
-            descent.step(sky, stage.rate * 0.5 * (1 + math.cos(math.pi * step / stage.steps)))
-            progress((done + step) / sum(other.steps for other in _STAGES))
-            if (step + 1) % _JUDGE_EVERY == 0:
-                steps.append(steps[-1] + _JUDGE_EVERY)
-                errors.append(descent.judged(descent.moved()))
-                if errors[-1] < lowest:
-                    best, lowest = descent.state(), errors[-1]
-                elif errors[-1] > (1 + _WORSE) * lowest:
+            descent.step(sky, stage.rate * 0.5 * (1 + math.cos(math.pi * at.step / stage.steps)))
+            at.step += 1
+            progress(at.share)
+            if at.step % _JUDGE_EVERY == 0:
+                at.steps.append(at.steps[-1] + _JUDGE_EVERY)
+                at.errors.append(descent.judged(descent.moved()))
+                if at.errors[-1] == min(at.errors):
+                    at.best = descent.state()
+                elif at.errors[-1] > (1 + _WORSE) * min(at.errors):
                     break
-        descent.set(best)
-        done += stage.steps
+                if record is not None:
+                    _write(record, key, descent, at)
+        descent.set(at.best)
+        at.stage, at.step = at.stage + 1, 0
     progress(1.0)
+    if record is not None:
+        record.unlink(missing_ok=True)
     used = len(descent.clear) / max(1, len(descent.looked_at))
-    if lowest > (1 - _LEAST_GAIN) * errors[0]:
-        return Refined(mesh, medium, steps, errors, used)
+    if min(at.errors) > (1 - _LEAST_GAIN) * at.errors[0]:
+        return Refined(mesh, medium, at.steps, at.errors, used)
     moved = descent.moved()
-    return Refined(_onto(mesh, moved), moved, steps, errors, used)
+    return Refined(_onto(mesh, moved), moved, at.steps, at.errors, used)
 
 
-class _Offsets(nn.Module):
-    """How far a surface has moved outwards: a sum of cubic B-splines on grids over its medium's box.
+@dataclass
+class _Position:
+    """How far a descent is, and the best of its states; see `Refined` for the others."""
 
-    Args:
-        shape: vertices of the medium's grid.
-    """
+    best: list[Tensor]
+    errors: list[float]
+    steps: list[int] = field(default_factory=lambda: [0])
+    stage: int = 0
+    step: int = 0  # of the stage
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        super().__init__()
-        self.levels = nn.ParameterList(nn.Parameter(torch.zeros(n, n, n)) for n in _LEVELS)
-        self._bases = [[bspline_basis(n, length) for length in shape] for n in _LEVELS]
+    @property
+    def share(self) -> float:
+        """Of all steps."""
+        done = sum(stage.steps for stage in _STAGES[: self.stage]) + self.step
+        return done / sum(stage.steps for stage in _STAGES)
 
-    def forward(self) -> Float[Tensor, "X Y Z"]:
-        total: Tensor | float = 0.0
-        for values, (x, y, z) in zip(self.levels, self._bases, strict=True):
-            for axis, basis in ((2, z), (1, y), (0, x)):
-                values = torch.tensordot(values, basis, ([axis], [1])).movedim(-1, axis)
-            total = total + values
-        return total  # type: ignore[return-value]
 
-    def roughness(self, spacing: float) -> Tensor:
-        """Mean squares of second differences, as slopes; `spacing` is between control points of a grid of one cell."""
-        return sum(  # type: ignore[return-value]
-            (values.diff(n=2, dim=axis) * (len(values) - 3) / spacing).square().mean()
-            for values in self.levels
-            for axis in range(3)
-        )
+def _key(mesh: TriangleMesh, medium: SdfGrid, through: Pixels, learn_index: bool) -> str:
+    """Hash of what a descent depends on; surroundings are learned from the same photographs."""
+    tensors = medium.box, medium.distances, medium.iors.float(), through.index, through.radiance
+    arrays = (tensor.detach().numpy() for tensor in tensors)
+    settings = (_VERSION, repr(_STAGES), repr(displacement.LEVELS), _PIXELS, learn_index)
+    return content_hash(*settings, mesh.vertices, mesh.faces, *arrays)
+
+
+def _write(record: FilePath, key: str, descent: _Descent, at: _Position) -> None:
+    content = io.BytesIO()
+    torch.save({"key": key, "at": asdict(at), "descent": descent.record()}, content)
+    write_atomically(record, content.getvalue())
+
+
+def _read(record: FilePath, key: str, descent: _Descent) -> _Position | None:
+    """Go on from a record; None if there is none, or it is of something else."""
+    try:
+        found = torch.load(record, weights_only=True)
+        known = found["key"]
+    except Exception:  # torch.load raises nearly anything on a damaged file
+        return None
+    if known != key:
+        return None
+    descent.go_on(found["descent"])
+    return _Position(**found["at"])
 
 
 class _Descent:
@@ -205,20 +235,19 @@ class _Descent:
         self.medium, self.surroundings = medium, surroundings
         self.iors = nn.Parameter(medium.iors.clone(), requires_grad=learn_index)
         self.bounds = torch.from_numpy(mesh.bounds).float()
-        self.size = float(np.ptp(mesh.bounds, axis=0).max())
         # Rays that are reflected inside are no help: tiny errors of the surface turn them anywhere.
         self.sampler = Snell(max_events=2 * len(medium.iors))
-        self.offsets = _Offsets(tuple(medium.distances.shape[1:]))
+        size = float(np.ptp(mesh.bounds, axis=0).max())
+        self.offsets = Displacement(tuple(medium.distances.shape[1:]), medium.box, size)
         held_back = through.view % HELD_BACK == HELD_BACK - 1
         self.looked_at = through[~held_back].some(_LOOKED_AT)
         self.judges = (through[held_back] if held_back.any() else through).some(_JUDGED)
         self.first_errors: Tensor | None = None
-        self.rims = rim_points(mesh, silhouettes)
+        self.rims, _, _ = rim_points(mesh, silhouettes)
         cameras = silhouettes.cameras
         distance = (cameras.camera_to_world[:, :, 3] - self.bounds.mean(0)).norm(dim=-1)
         self.outline = _OUTLINE * float((distance / cameras.fx).mean())
         self.generator = torch.Generator().manual_seed(0)
-        self.paces = [self.size * _LEVELS[0] / n for n in _LEVELS] + [1.0]
         self.num_steps = 0
         self.set(self.state())
         self._look(medium)
@@ -236,8 +265,30 @@ class _Descent:
         """Go on from a state, at rest."""
         for learned, values in zip(self._learned(), state, strict=True):
             learned.copy_(values)
-        groups = [{"params": [values], "lr": 0.0} for values in self._learned()]
-        self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12)
+        self.optimizer = torch.optim.Adam(self._learned(), betas=(0.9, 0.99), eps=1e-12)
+
+    def record(self) -> dict[str, Any]:
+        """All that changes on the way, in plain values and tensors."""
+        return {
+            "state": self.state(),
+            "optimizer": self.optimizer.state_dict(),
+            "generator": self.generator.get_state(),
+            "num_steps": self.num_steps,
+            "rows": self.rows,
+            "weight": self.weight,
+        }
+
+    def go_on(self, record: dict[str, Any]) -> None:
+        """Go on from where `record` was asked."""
+        self.set(record["state"])
+        self.optimizer.load_state_dict(record["optimizer"])
+        self.generator.set_state(record["generator"])
+        self.num_steps, self.rows, self.weight = (record[name] for name in ("num_steps", "rows", "weight"))
+
+    @property
+    def clear(self) -> Pixels:
+        """Pixels that see the surroundings, and nothing opaque."""
+        return self.looked_at[self.rows]
 
     def _learned(self) -> list[nn.Parameter]:
         return [*self.offsets.levels, self.iors]
@@ -250,8 +301,7 @@ class _Descent:
         if self.num_steps and self.num_steps % _LOOK_EVERY == 0:
             self._look(self.moved())
         self.num_steps += 1
-        for group, pace in zip(self.optimizer.param_groups, self.paces, strict=True):
-            group["lr"] = rate * pace
+        self.optimizer.param_groups[0]["lr"] = rate
         self.optimizer.zero_grad()
         with torch.enable_grad():
             self._loss(sky).backward()
@@ -259,8 +309,8 @@ class _Descent:
 
     def _loss(self, sky: Boundary) -> Tensor:
         medium = self._moved()
-        drawn = torch.randint(len(self.clear), (_PIXELS,), generator=self.generator)
-        pixels, weight = self.clear[drawn], self.weight[drawn]
+        drawn = torch.randint(len(self.rows), (_PIXELS,), generator=self.generator)
+        pixels, weight = self.looked_at[self.rows[drawn]], self.weight[drawn]
         path, usable = self._traced(pixels, medium)
         rays = pixels.rays[usable]
         path = self.sampler.refine(path[usable], rays, medium)
@@ -271,7 +321,7 @@ class _Descent:
         now, before = (quadratic_spline(each.coefficients[0], each.box, rims)[0] for each in (medium, self.medium))
         left = ((now - before) / self.outline).square()
         outlines = (left / (1 + left)).mean()
-        return photometric + _OUTLINES * outlines + _SMOOTH * self.offsets.roughness(self.size)
+        return photometric + _OUTLINES * outlines + _SMOOTH * self.offsets.roughness()
 
     @torch.no_grad()
     def judged(self, medium: SdfGrid) -> float:
@@ -315,8 +365,8 @@ class _Descent:
         share = torch.where(told, share / usual.clamp(min=1e-6), 1.0).float()
         least, enough = _CLEAR
         weight = ((share[voxels].amin(1) - least) / (enough - least)).clamp(0, 1)
-        self.clear, self.weight = pixels[weight > 0], weight[weight > 0]
-        if not len(self.clear):
+        self.rows, self.weight = usable.nonzero()[:, 0][weight > 0], weight[weight > 0]
+        if not len(self.rows):
             raise NerfroError("opaque things hide the surroundings in all pixels; refine=true cannot help here")
 
     def _voxels(self, path: Path) -> Tensor:

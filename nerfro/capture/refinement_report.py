@@ -12,6 +12,7 @@ from torch import Tensor
 from nerfro.capture.refinement import Refined, refine_surface
 from nerfro.capture.surroundings import HELD_BACK, Around, Surroundings
 from nerfro.capture.visual_hull import Silhouettes
+from nerfro.errors import Interrupted
 from nerfro.files.atomic import write_atomically
 from nerfro.files.drawing import sheet
 from nerfro.files.images import save_picture
@@ -23,6 +24,7 @@ from nerfro.rays import Rays
 from nerfro.samplers.snell import Snell
 
 FIGURES, PICTURES = "refinement.json", "refinement.png"
+RECORD = "refinement.state"  # while it goes on, and after it was interrupted
 _NUM_PICTURES = 4
 _WIDTH = 256  # pixels across each picture
 
@@ -38,8 +40,13 @@ def refine(
         folder: to write to.
     """
     through, surroundings = around.through, around.surroundings
-    with bar("surface") as done:
-        refined = refine_surface(mesh, medium, silhouettes, through, surroundings, learn_index, done)
+    try:
+        with bar("surface") as done:
+            refined = refine_surface(
+                mesh, medium, silhouettes, through, surroundings, learn_index, done, folder / RECORD
+            )
+    except KeyboardInterrupt:
+        raise Interrupted("to go on with the refinement, repeat the command with overwrite=true") from None
     before, after = refined.errors[0], min(refined.errors)
     told = f"held-back pixels are off by {after:.4f} instead of {before:.4f} (0 right, 1 unrelated)"
     if refined.mesh is mesh:

@@ -64,6 +64,7 @@ class _Rims(NamedTuple):
     share: Float[np.ndarray, "K"]
     misfit: Float[np.ndarray, "K"]
     weight: Float[np.ndarray, "K"]
+    width: Float[np.ndarray, "K"]  # of a pixel there, world units
 
 
 def fit_surface(
@@ -103,13 +104,20 @@ def fit_surface(
     return flat if flat_misfit < _CONVINCING * rounded_misfit else rounded
 
 
-def rim_points(mesh: TriangleMesh, silhouettes: Silhouettes) -> Float[Tensor, "K 3"]:
-    """Points of a surface, world units, that views see on the outlines of their masks."""
+def rim_points(
+    mesh: TriangleMesh, silhouettes: Silhouettes
+) -> tuple[Float[Tensor, "K 3"], Float[Tensor, "K"], Float[Tensor, "K"]]:
+    """Points of a surface that views see on the outlines of their masks.
+
+    With them how far each had to move outwards to lie on it, and how wide a pixel is there; all in world units.
+    """
     faces, vertices = mesh.faces, mesh.vertices
     outlines = [_nearest_outline_pixel(mask) for mask in (silhouettes.masks > 0.5).numpy()]
     rims = _find_rims(vertices, _vertex_normals(vertices, faces), _edges(faces), silhouettes, outlines)
     share = rims.share[:, None]
-    return torch.from_numpy((1 - share) * vertices[rims.first] + share * vertices[rims.second]).float()
+    points = (1 - share) * vertices[rims.first] + share * vertices[rims.second]
+    first, second, third = (torch.from_numpy(values).float() for values in (points, rims.misfit, rims.width))
+    return first, second, third
 
 
 def _edges(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "E 2"]:
@@ -195,7 +203,7 @@ def _find_rims(
     spread = max(1.0, float(np.median(np.abs(misfit))) / _TYPICAL)
     near = np.abs(misfit) < _GATE * spread
     weight = 1 / (1 + (misfit / (_HALVED * spread)) ** 2)
-    return _Rims(first[near], second[near], share[near], (misfit * width)[near], weight[near])
+    return _Rims(first[near], second[near], share[near], (misfit * width)[near], weight[near], width[near])
 
 
 def _look_up(

@@ -6,7 +6,7 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -91,15 +91,18 @@ class NerfModel(LightningModule, ABC):
 
     def refined(self, path: Path, rays: Rays) -> Path:
         """Paths with gradients, but for those whose derivatives are too large, or not yet to be learned from."""
-        refined = self.path_sampler.refine(path, rays, self.medium)
         steady = self.path_sampler.steady(path, self.medium)
         if self.training and self.global_step < self.camera.glass_start:
             steady = steady & ~path.refracted
-        every = ("positions", "directions", "s", "exit_directions")
-        old, new = ([getattr(each, name) for name in every] for each in (path, refined))
-        return refined.moved(
-            *(torch.where(steady.view(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(old, new, strict=True))
-        )
+        if steady.all():
+            return self.path_sampler.refine(path, rays, self.medium)
+        rows = steady.nonzero()[:, 0]
+        if not len(rows):
+            return path
+        # The others are not replayed at all: they have many events, and take most of the time.
+        refined = self.path_sampler.refine(path[rows], rays[path.ray[rows]], self.medium)
+        names = ["positions", "directions", "s", "exit_directions", *(["throughput"] if path.splits else [])]
+        return path.changed(**{n: getattr(path, n).index_copy(0, rows, getattr(refined, n)) for n in names})
 
     @property
     def paths_learn(self) -> bool:
@@ -115,10 +118,13 @@ class NerfModel(LightningModule, ABC):
         """All that learns: parameters and initial learning rate by name. A model that adds parameters adds a group."""
         config, bending = self.optimizer_config, self.medium.bending_parameters()
         tint = [own for own in self.medium.parameters() if all(own is not other for other in bending)]
+        surface = self.medium.surface_parameters()
+        bending = [own for own in bending if all(own is not other for other in surface)]
         groups = {
             "fields": (list(self.fields.parameters()), config.learning_rate),
             "boundary": (list(self.boundary.parameters()), config.rate("boundary")),
             "medium": ([*bending, *self.path_sampler.parameters()], config.rate("medium")),
+            "surface": (surface, config.rate("surface")),
             "tint": (tint, config.rate("tint")),
             "camera": (self.camera.bending_parameters(), config.rate("camera")),
             "exposure": (self.camera.brightness_parameters(), config.rate("exposure")),
@@ -158,6 +164,9 @@ class NerfModel(LightningModule, ABC):
         shown = self.encode(batch.of_pixels(renderings[-1].rgb.detach())).clamp(0, 1)
         error = (shown - batch.of_pixels(batch.rgb)).square().mean()
         self.log("train/psnr", -10 * torch.log10(error), prog_bar=True)
+        if (unlikely := self.medium.prior()) is not None:
+            self.log("loss/surface", unlikely)
+            total = total + unlikely
         self.log("loss/total", total)
         for name, value in self.medium.learned().items():
             self.log(f"medium/{name}", value)
@@ -175,11 +184,21 @@ class NerfModel(LightningModule, ABC):
         for group in self.trainer.optimizers[0].param_groups:
             waits = self.global_step < self.optimizer_config.start(group["name"])
             group["lr"] = 0.0 if waits else group["initial_lr"] * factor
+            if group["name"] == "surface":  # steps that do not move it need no gradients by it, and are faster
+                for parameter in group["params"]:
+                    parameter.requires_grad_(not waits)
         for part in (self.boundary, *self.fields):
             part.detail = self.camera.detail(self.global_step)  # type: ignore[assignment]
         # Not at the end of the step before, which comes after its checkpoint: a resumed run would miss the update.
         if self.global_step > 0:
             self.point_sampler.after_step(self.global_step, list(self.fields))  # type: ignore[arg-type]
+
+    def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
+        super().optimizer_step(*args, **kwargs)
+        self.medium.settle(self.global_step)
+
+    def on_train_end(self) -> None:
+        self.medium.settle()
 
     def on_after_backward(self) -> None:
         if self.global_step < self.camera.start:

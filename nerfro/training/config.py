@@ -20,6 +20,7 @@ from nerfro.models.base import NerfModel, Parts
 from nerfro.models.optimizer import OptimizerConfig
 from nerfro.registry import build, configure, find
 from nerfro.training.content import ContentConfig, settle_content
+from nerfro.training.outlines import hold_outlines
 
 
 @dataclass
@@ -189,6 +190,11 @@ def build_model(config: DictConfig, training: Views | None = None) -> NerfModel:
     build_losses(config.loss, known=False)  # mistakes are told before anything is read
     optimizer = OptimizerConfig(**config.optimizer)
     path_sampler = build(config.sampler.path)
+    if config.medium.get("learn_surface") and not path_sampler.replays_surface:
+        raise NerfroError(
+            "medium.learn_surface=true learns by rays that bend at signed distances; take sampler/path=snell with "
+            "sampler.path.interface=sdf, or leave it out"
+        )
     medium = build(config.medium) if path_sampler.needs_medium else Vacuum()
     settle_content(config, medium, None if training is None else training.cameras)
     losses = build_losses(config.loss)
@@ -196,6 +202,7 @@ def build_model(config: DictConfig, training: Views | None = None) -> NerfModel:
     if training is not None:
         exposures = None if camera.exposure is None else exif_exposures([f.image for f in training.frames])
         camera.begin(training.cameras, exposures)
+        hold_outlines(medium, training)
     parts = Parts(
         medium=medium,
         path_sampler=path_sampler,

@@ -54,7 +54,9 @@ def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.
     }
     if config.trainer.get("strategy") == "ddp":
         # The index grid is a buffer and would be sent around in every step, though all processes have the same one.
-        ours["strategy"] = DDPStrategy(broadcast_buffers=False)
+        # A surface that waits, or is not met by a process's rays, has no gradient.
+        waits = bool(config.medium.get("learn_surface", False))
+        ours["strategy"] = DDPStrategy(broadcast_buffers=False, find_unused_parameters=waits)
     limit = config.trainer.get("max_time")
     if isinstance(limit, (int, float)):
         raise NerfroError(f"trainer.max_time={limit} has no unit; write DD:HH:MM:SS, such as 00:00:05:00")

@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -18,6 +19,7 @@ from nerfro.capture.surroundings import Room, Surroundings, divide_pixels, learn
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import load_mesh
+from nerfro.media import displacement
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.snell import Snell
 from tests.ball_photographs import BOX, RADIUS, cameras, mesh, photographs_of, save, solid
@@ -39,16 +41,16 @@ def dented() -> SdfGrid:
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     stages = (refinement._Stage(150, 5e-4, (3.0, 1.0)), refinement._Stage(50, 1e-4, (0.0, 0.0)))
     monkeypatch.setattr(refinement, "_STAGES", stages)
-    monkeypatch.setattr(refinement, "_LEVELS", (8, 16))
+    monkeypatch.setattr(displacement, "LEVELS", (8, 16))
     monkeypatch.setattr(refinement, "_PIXELS", 2000)
     monkeypatch.setattr(refinement, "_VOXELS", 12)
 
 
-def refined(start: SdfGrid, learn_index: bool = False) -> Refined:
+def refined(start: SdfGrid, learn_index: bool = False, **how: Any) -> Refined:
     silhouettes = Silhouettes.of(cameras(), mesh_silhouettes(mesh(), cameras(), 1).float())
     beside, through = divide_pixels(photographs_of(dented()), mesh())
     around = learn_surroundings(beside, mesh(), False)
-    return refine_surface(mesh(), start, silhouettes, through, around, learn_index)
+    return refine_surface(mesh(), start, silhouettes, through, around, learn_index, **how)
 
 
 def degrees_off(medium: SdfGrid, num_views: int = 6) -> float:
@@ -80,6 +82,34 @@ def test_a_surface_that_is_right_stays(short: None) -> None:
     found = refined(before)
     assert found.medium is before
     assert len(found.errors) > 2  # others were tried
+
+
+def test_an_interrupted_refinement_goes_on(short: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stages = (refinement._Stage(50, 5e-4, (3.0, 1.0)), refinement._Stage(25, 1e-4, (0.0, 0.0)))
+    monkeypatch.setattr(refinement, "_STAGES", stages)
+    monkeypatch.setattr(refinement, "_PIXELS", 500)
+    monkeypatch.setattr(refinement, "_LOOK_EVERY", 40)
+    record, told = tmp_path / "state", []
+
+    def interrupted(done: float) -> None:
+        if done > 0.6:
+            raise KeyboardInterrupt
+
+    undisturbed = refined(solid([1.5]), learn_index=True)
+    with pytest.raises(KeyboardInterrupt):
+        refined(solid([1.5]), learn_index=True, record=record, progress=interrupted)
+    kept = record.read_bytes()
+    found = refined(solid([1.5]), learn_index=True, record=record, progress=told.append)
+    assert told[0] > 0.3  # not from the beginning
+    assert found.errors == undisturbed.errors
+    assert torch.equal(found.medium.distances, undisturbed.medium.distances)
+    assert not record.exists()
+    for other in (kept, b"damaged"):  # of an index that was known, and of nothing
+        record.write_bytes(other)
+        told.clear()
+        with pytest.raises(KeyboardInterrupt):
+            refined(solid([1.5]), record=record, progress=lambda done: (told.append(done), interrupted(done)))
+        assert told[0] < 0.1
 
 
 def test_near_surroundings_are_refused(short: None) -> None:
