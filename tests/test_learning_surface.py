@@ -193,3 +193,16 @@ def test_what_cannot_learn_a_surface_is_refused_at_once(
     assert told in done.err
     assert len(done.err.strip().splitlines()) == 1
     assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+@pytest.mark.parametrize("experiment", ["glass", "unknown", "refractive_room"])
+def test_a_surface_learns_whatever_else_does(
+    train_here: Callable[..., Any], learning_run: list[str], tmp_path: Path, experiment: str
+) -> None:
+    done = train_here(
+        f"+experiment={experiment}", *learning_run, "trainer.max_steps=4", f"hydra.run.dir={tmp_path / 'run'}"
+    )
+    assert done.code == 0, done.err
+    state = load_checkpoint(tmp_path / "run" / LAST_CHECKPOINT)[0]["state_dict"]
+    assert state["medium._settled"].abs().max() > 1e-4
+    assert all(torch.isfinite(values).all() for values in state.values())

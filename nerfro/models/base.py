@@ -26,6 +26,7 @@ from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.models.optimizer import OptimizerConfig, learning_rate_factor, training_progress
 from nerfro.samplers.base import PathSampler, PointSampler
+from nerfro.samplers.replay import even_gradient
 from nerfro.samplers.surface_normals import first_normals
 from nerfro.types import Batch, Exits, Path, Rays, Rendering
 
@@ -94,13 +95,19 @@ class NerfModel(LightningModule, ABC):
         steady = self.path_sampler.steady(path, self.medium)
         if self.training and self.global_step < self.camera.glass_start:
             steady = steady & ~path.refracted
-        if steady.all():
+        moves = bool(self.medium.surface_parameters())
+        if moves and not self.camera.bending_parameters():
+            steady = steady & path.refracted  # straight paths would learn nothing
+        if steady.all() and not moves:
             return self.path_sampler.refine(path, rays, self.medium)
         rows = steady.nonzero()[:, 0]
         if not len(rows):
             return path
         # The others are not replayed at all: they have many events, and take most of the time.
         refined = self.path_sampler.refine(path[rows], rays[path.ray[rows]], self.medium)
+        if moves:
+            for name in ("positions", "directions", "exit_directions"):
+                even_gradient(getattr(refined, name))
         names = ["positions", "directions", "s", "exit_directions", *(["throughput"] if path.splits else [])]
         return path.changed(**{n: getattr(path, n).index_copy(0, rows, getattr(refined, n)) for n in names})
 
