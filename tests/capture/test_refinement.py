@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import sys
 from collections.abc import Callable
@@ -15,7 +16,7 @@ import nerfro.preprocess
 from nerfro.capture import refinement, surroundings
 from nerfro.capture.refinement import Refined, refine_surface
 from nerfro.capture.silhouettes import mesh_silhouettes
-from nerfro.capture.surroundings import Room, Surroundings, divide_pixels, learn_surroundings
+from nerfro.capture.surroundings import Pixels, Room, Surroundings, divide_pixels, learn_surroundings
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import load_mesh
@@ -46,11 +47,16 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refinement, "_VOXELS", 12)
 
 
-def refined(start: SdfGrid, learn_index: bool = False, **how: Any) -> Refined:
+@functools.cache
+def shown() -> tuple[Silhouettes, Pixels, Surroundings]:
+    """Outlines, pixels that the dented ball fills, and what is around it."""
     silhouettes = Silhouettes.of(cameras(), mesh_silhouettes(mesh(), cameras(), 1).float())
     beside, through = divide_pixels(photographs_of(dented()), mesh())
-    around = learn_surroundings(beside, mesh(), False)
-    return refine_surface(mesh(), start, silhouettes, through, around, learn_index, **how)
+    return silhouettes, through, learn_surroundings(beside, mesh(), False)
+
+
+def refined(start: SdfGrid, learn_index: bool = False, **how: Any) -> Refined:
+    return refine_surface(mesh(), start, *shown(), learn_index, **how)
 
 
 def degrees_off(medium: SdfGrid, num_views: int = 6) -> float:
