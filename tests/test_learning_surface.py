@@ -157,7 +157,7 @@ def test_a_run_that_goes_on_has_the_same_surface(
     assert train_here(*learning_run, "trainer.max_steps=11", f"hydra.run.dir={whole}").code == 0
     step = NerfModel.training_step
 
-    def killed(model: NerfModel, *batch: Any) -> Tensor:
+    def killed(model: NerfModel, *batch: Any) -> Any:
         if model.global_step == 8:
             raise RuntimeError("killed")
         return step(model, *batch)

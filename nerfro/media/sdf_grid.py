@@ -82,8 +82,8 @@ class SdfGrid(Solid):
     vertices: Float[Tensor, "V 3"]
     _traced: tuple[Tensor, int, Triangles, MeshIntersector] | None = None
     # Where the surface learns: how far it has moved, and had when the grid was last made anew, the distances that it
-    # was given, the grid's vertices beside it;
-    # and where it is held: places, how far it shall move there, to which accuracy that is known.
+    # was given, the grid's vertices beside it; and where it is held: places, how far it shall move there, to which
+    # accuracy that is known.
     displacement: Displacement
     _settled: Float[Tensor, "Q"]
     _given: Float[Tensor, "K X Y Z"]
