@@ -21,6 +21,7 @@ from nerfro.fields.mlp import compile_networks
 from nerfro.registry import build
 from nerfro.training.boundary_first import BoundaryFirst
 from nerfro.training.callbacks import StopOnSignal, Throughput
+from nerfro.training.camera_steps import CameraSteps
 from nerfro.training.config import TrainConfig, build_model
 from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.memory import require_memory
@@ -54,7 +55,8 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     require_same_run(folder, checkpoint, config)
     throughput, interruption = Throughput(), StopOnSignal()
     boundary_first = BoundaryFirst(batches, config.optimizer.boundary_first)
-    trainer = make_trainer(config, folder, [throughput, interruption, boundary_first, Viewer(config, source, test)])
+    extra = [throughput, interruption, boundary_first, CameraSteps(batches), Viewer(config, source, test)]
+    trainer = make_trainer(config, folder, extra)
     batches = batches.share(trainer.global_rank, trainer.world_size)
     batches = traced(batches, model, config)
     few = batches.smaller(4096)

@@ -24,7 +24,6 @@ class OptimizerConfig:
     boundary_learning_rate: Optional[Positive] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     medium_learning_rate: Optional[Positive] = None  # noqa: UP045 - of what bends rays: indices
     tint_learning_rate: Optional[Positive] = None  # noqa: UP045 - of what absorbs light
-    camera_learning_rate: Optional[Positive] = None  # noqa: UP045
     exposure_learning_rate: Optional[Positive] = None  # noqa: UP045
     medium_start: Natural = 0  # steps before what bends rays learns, so that it is not misled by an unlearned scene
     # Steps before the first in which the boundary alone learns, from rays that miss the content's box; and steps after

@@ -6,7 +6,6 @@ import torch
 from torch.nn.functional import normalize
 
 from nerfro.boundaries.envmap import EnvironmentMap
-from nerfro.camera.refined import RefinedCamera
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.types import Exits
 
@@ -37,9 +36,3 @@ def test_a_coarse_hash_grid_has_zeros_for_its_fine_levels() -> None:
     assert coarse.shape == whole.shape
     torch.testing.assert_close(coarse[:, :6], whole[:, :6])
     assert bool((coarse[:, 6:] == 0).all())
-
-
-def test_detail_grows_from_half_to_all() -> None:
-    camera = RefinedCamera(coarse_steps=100)
-    assert [camera.detail(step) for step in (0, 50, 100, 200)] == [0.5, 0.75, 1.0, 1.0]
-    assert RefinedCamera(coarse_steps=0).detail(0) == 1.0
