@@ -25,15 +25,13 @@ _NUM_PIXELS, _SHARE = 16384, 0.01
 _FEWEST = 64
 # Of the boundary's learning rate, in the first and in the last of these steps.
 _RATES = 25.0, 1.0
-
-
-# Cameras that are refined take a step after each so many of these, from the second time on. Only coarse levels of the
-# boundary are there at first, the others come in up to a share of the steps: a ghost that every camera has painted for
-# itself would hold it. So they are not asked whether errors fall, either.
-_BETWEEN = 50
+# Cameras that are refined take a step before these, from a first one on. Only coarse levels of the boundary are there
+# then, the others come in up to a share of the steps: a ghost that every camera has painted for itself would hold it.
+# So they are not asked whether errors fall, either.
+_FROM, _BETWEEN = 50, 15
 _COARSE, _COARSE_SHARE = 0.7, 0.7
 _STEP = Step(reach=2.0, scale=1.0, longest=1.0, centres=False, checked=False)
-_NUM_LOOKED_AT, _DRAWN = 1000, 3
+_NUM_LOOKED_AT, _DRAWN = 700, 3
 
 
 class BoundaryFirst(Callback):
@@ -70,7 +68,7 @@ class BoundaryFirst(Callback):
         for step in told("boundary", range(self._num_steps)):
             if isinstance(camera, RefinedCamera):
                 model.boundary.detail = min(1.0, _COARSE + (1 - _COARSE) * step / (_COARSE_SHARE * self._num_steps))
-                if step > _BETWEEN and step % _BETWEEN == 0:
+                if step >= _FROM and (step - _FROM) % _BETWEEN == 0:
                     _turn(model, camera, batches, box, step, finer=model.boundary.detail == 1)
             rays, view, rgb = batches.missing(box, num_pixels, step, camera)
             if len(rays) < _FEWEST:
