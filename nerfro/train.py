@@ -54,16 +54,14 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     model = build_model(config, training)
     require_same_run(folder, checkpoint, config)
     throughput, interruption = Throughput(), StopOnSignal()
-    boundary_first = BoundaryFirst(batches, config.optimizer.boundary_first)
-    extra = [throughput, interruption, boundary_first, CameraSteps(batches), Viewer(config, source, test)]
-    trainer = make_trainer(config, folder, extra)
-    batches = batches.share(trainer.global_rank, trainer.world_size)
-    batches = traced(batches, model, config)
+    before, between = BoundaryFirst(batches, config.optimizer.boundary_first), CameraSteps(batches)
+    trainer = make_trainer(config, folder, [throughput, interruption, before, between, Viewer(config, source, test)])
+    batches = traced(batches.share(trainer.global_rank, trainer.world_size), model, config)
     few = batches.smaller(4096)
-    share = few.batch_size / batches.batch_size
     first = few.batch(0)
     require_reach(model, first)
-    memory = require_memory(model, first.rays, trainer.strategy.root_device, share)
+    share, device = few.batch_size / batches.batch_size, trainer.strategy.root_device
+    memory = require_memory(model, first.rays, device, share)
     if trainer.is_global_zero:
         begin(folder, config, model)
         print(memory, flush=True)
@@ -82,7 +80,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
         print(f"nerfro: interrupted after step {trainer.global_step} and saved; to go on, repeat it with {command}")
         sys.exit(EXIT_INTERRUPTED)
 
-    model.to(trainer.strategy.root_device)
+    model.to(device)
     write_cameras(folder / "cameras.json", model.camera, training)
     metrics = ImageMetrics(*lpips, prefix=config.evaluation.split)
     result, treated = score_split(model, test, metrics, folder, supersampling, config.evaluation.refine_steps)

@@ -43,11 +43,11 @@ class CameraSteps(Callback):
         reach = max(_LEAST_REACH, _FIRST_REACH * _SHRINKING ** ((step - camera.start) // camera.every))
         # Not asked whether errors fall: every camera has painted its own ghost, which holds it where it is.
         how = Step(reach, _SCALE * reach, _LONGEST, checked=False)
-        look(pl_module, camera, self._batches, step, how)
+        _move(pl_module, camera, self._batches, step, how)
 
 
 @torch.no_grad()
-def look(model: NerfModel, camera: RefinedCamera, batches: RayBatches, step: int, how: Step) -> None:
+def _move(model: NerfModel, camera: RefinedCamera, batches: RayBatches, step: int, how: Step) -> None:
     """A step of all cameras by pixels with contrast, drawn anew for each training step."""
     batches = batches.to(model.device)
     candidates = batches.of_each_view(_DRAWN * camera.num_pixels, step)
