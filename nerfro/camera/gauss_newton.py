@@ -41,7 +41,7 @@ class Step:
 
     reach: float  # pixels over which differences are taken
     scale: float  # of the robust error, sRGB: pixels that are off by more count less
-    longest: float  # pixels that a camera is moved at most
+    longest: float  # pixels that a camera is moved at most, and the lens is changed
     centres: bool = True  # whether cameras are shifted, too; not where all that is looked at is infinitely far
     checked: bool = True  # whether a camera stays where the error of the same pixels would not fall
 
@@ -76,19 +76,24 @@ def improve(
     weights = 1 / (1 + (error / how.scale).square().sum(-1)).square()
     weights = weights / (1 + (slopes[..., :6] / _STEEP).square().sum((1, 2)))
     motion, lens = _solved(slopes.double(), error.double(), weights.double(), view, len(cameras))
-    motion = motion * (how.longest / motion.norm(dim=-1, keepdim=True).clamp(min=_TINY)).clamp(max=1)
+    motion, lens = (
+        numbers * (how.longest / numbers.norm(dim=-1, keepdim=True).clamp(min=_TINY)).clamp(max=1)
+        for numbers in (motion, lens)
+    )
     before = camera.position()
     camera.move(motion.to(across), lens.to(across))
     if not how.checked:
         return
 
-    def errors() -> Float[Tensor, "V"]:
-        squares = ((shown(camera(given, view), view) - target) / how.scale).square().sum(-1)
-        return squares.new_zeros(len(cameras)).index_add(0, view, squares / (1 + squares))
-
-    squares = (error / how.scale).square().sum(-1)
-    old, new = squares.new_zeros(len(cameras)).index_add(0, view, squares / (1 + squares)), errors()
+    new = _robust(shown(camera(given, view), view) - target, how.scale, view, len(cameras))
+    old = _robust(error, how.scale, view, len(cameras))
     camera.move_back(before, worse=new >= old, lens=bool(new.sum() >= old.sum()))
+
+
+def _robust(error: Float[Tensor, "R 3"], scale: float, view: Int[Tensor, "R"], num_views: int) -> Float[Tensor, "V"]:
+    """Error of each view: large ones of single pixels count as one."""
+    squares = (error / scale).square().sum(-1)
+    return squares.new_zeros(num_views).index_add(0, view, squares / (1 + squares))
 
 
 def telling(
