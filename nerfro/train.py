@@ -20,6 +20,7 @@ from nerfro.evaluation.treatments import score_split
 from nerfro.fields.mlp import compile_networks
 from nerfro.training.boundary_first import BoundaryFirst
 from nerfro.training.callbacks import StopOnSignal, Throughput
+from nerfro.training.camera_steps import CameraSteps
 from nerfro.training.config import TrainConfig, build_data, build_model
 from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.memory import require_memory
@@ -52,15 +53,14 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     model = build_model(config, training)
     require_same_run(folder, checkpoint, config)
     throughput, interruption = Throughput(), StopOnSignal()
-    boundary_first = BoundaryFirst(batches, config.optimizer.boundary_first)
-    trainer = make_trainer(config, folder, [throughput, interruption, boundary_first, Viewer(config, source, test)])
-    batches = batches.share(trainer.global_rank, trainer.world_size)
-    batches = traced(batches, model, config)
+    before, between = BoundaryFirst(batches, config.optimizer.boundary_first), CameraSteps(batches)
+    trainer = make_trainer(config, folder, [throughput, interruption, before, between, Viewer(config, source, test)])
+    batches = traced(batches.share(trainer.global_rank, trainer.world_size), model, config)
     few = batches.smaller(4096)
-    share = few.batch_size / batches.batch_size
     first = few.batch(0)
     require_reach(model, first)
-    memory = require_memory(model, first.rays, trainer.strategy.root_device, share)
+    share, device = few.batch_size / batches.batch_size, trainer.strategy.root_device
+    memory = require_memory(model, first.rays, device, share)
     if trainer.is_global_zero:
         begin(folder, config, model)
         print(memory, flush=True)
@@ -79,7 +79,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
         print(f"nerfro: interrupted after step {trainer.global_step} and saved; to go on, repeat it with {command}")
         sys.exit(EXIT_INTERRUPTED)
 
-    model.to(trainer.strategy.root_device)
+    model.to(device)
     write_learned(folder, model, training)
     metrics = ImageMetrics(*lpips, prefix=config.evaluation.split)
     result, treated = score_split(model, test, metrics, folder, supersampling, config.evaluation.refine_steps)

@@ -21,9 +21,7 @@ class Camera(nn.Module, ABC):
         exposure: whether each training view has a gain of its own.
     """
 
-    start = 0  # steps before what bends rays learns, so that it is not misled by an unlearned scene
-    glass_start = 0  # steps before it learns from rays that the medium bends, too
-    coarse_steps = 0  # steps in which the scene's levels of detail come in, from half of them on
+    moves = False  # whether cameras are believed to be elsewhere than the data say
 
     def __init__(self, exposure: bool = False) -> None:
         super().__init__()
@@ -38,10 +36,6 @@ class Camera(nn.Module, ABC):
         """
         if self.exposure is not None:
             self.exposure.begin(len(cameras), exposures)
-
-    def detail(self, step: int) -> float:
-        """Share of the scene's levels of detail, the coarse ones, that are shown: a blurred scene misleads less."""
-        return min(1.0, 0.5 + 0.5 * step / self.coarse_steps) if self.coarse_steps else 1.0
 
     @abstractmethod
     def forward(self, rays: Rays, view: Int[Tensor, "R"]) -> Rays:

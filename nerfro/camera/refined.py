@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Int
-from torch import Tensor, nn
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerfro.allowed import Natural
+from nerfro.allowed import Count, Natural
 from nerfro.camera.base import Camera
 from nerfro.camera.per_view import PerView
 from nerfro.camera.pixel_units import even_weights, object_distances, pixel_motions, without_world, world_motions
@@ -30,12 +30,13 @@ class _Motions(PerView):
     weights: Float[Tensor, "V 6"]
     of_world: Float[Tensor, "K V 6"]
     focal_unit: Float[Tensor, "1"]
+    motion: Float[Tensor, "V 6"]
 
     def __init__(self, hold_world: bool = True) -> None:
         super().__init__()
         self.hold_world = hold_world
-        self.motion = nn.Parameter(torch.zeros(0, 6))
         shapes = {
+            "motion": (6,),
             "poses": (3, 4),
             "focal": (2,),
             "distortion": (9,),
@@ -52,6 +53,7 @@ class _Motions(PerView):
         weights = even_weights(pixels)
         distortion = torch.zeros(0, 9) if cameras.distortion is None else cameras.distortion
         found = {
+            "motion": torch.zeros(len(cameras), 6),
             "poses": poses,
             "focal": torch.stack([cameras.fx, cameras.fy], -1),
             "distortion": distortion,
@@ -63,7 +65,6 @@ class _Motions(PerView):
         for name, tensor in found.items():
             buffer = getattr(self, name)
             setattr(self, name, tensor.to(buffer))
-        self.motion.data = self.motion.new_zeros(len(cameras), 6)
 
     def forward(self) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 3"]]:
         """Rotation of each camera and shift of its centre, along its own axes as given."""
@@ -85,33 +86,35 @@ class _Motions(PerView):
 class RefinedCamera(Camera):
     """Rotation and position of each training camera, and the lens that all share, refined with the scene.
 
-    All are counted in pixels: a step of any of them moves points at the object's distance by as much
-    (`pixel_units`), so that `optimizer.camera_learning_rate` is in pixels. A motion that all cameras share is taken
-    out, to first order: the world stays where the data have put it, with its surface.
+    Between training steps each camera takes a step of Gauss-Newton towards its photograph (`gauss_newton`): first
+    while the boundary learns alone, by what is seen past the object, then by all that is seen. A motion that all
+    cameras share is taken out, to first order: the world stays where the data have put it, with its surface.
 
     Args:
-        start: steps before cameras learn, so that they are not misled by an unlearned scene.
-        glass_start: steps before they learn from rays that the object bends, too; from then on these tell most.
-        coarse_steps: steps in which the levels of hash grids and sky come in, coarse to fine, from half of them on:
-            where the scene is blurred, poses that are off by pixels find the way, and gradients are less noisy.
+        start: training steps before the first of these steps, so that the scene is there.
+        every: training steps between two of them.
+        num_pixels: of each photograph that are looked at in one.
         lens: whether the focal length and the principal point, shared by all views, are refined.
         exposure: whether each training view has a gain of its own, for each colour channel.
         hold_world: whether the motion that all share is taken out; not for cameras in a world that is known.
     """
 
+    moves = True
+    lens: Float[Tensor, "3"] | None
+
     def __init__(
         self,
-        start: Natural = 100,
-        glass_start: Natural = 200,
-        coarse_steps: Natural = 1000,
+        start: Natural = 50,
+        every: Count = 100,
+        num_pixels: Count = 300,
         lens: bool = False,
         exposure: bool = False,
         hold_world: bool = True,
     ) -> None:
         super().__init__(exposure)
-        self.start, self.glass_start, self.coarse_steps = start, glass_start, coarse_steps
+        self.start, self.every, self.num_pixels = start, every, num_pixels
         self.motions = _Motions(hold_world)
-        self.lens = nn.Parameter(torch.zeros(3)) if lens else None  # focal length and principal point, pixels
+        self.register_buffer("lens", torch.zeros(3) if lens else None)  # focal length and principal point, pixels
 
     def begin(self, cameras: Cameras, exposures: Float[Tensor, "V"] | None = None) -> None:
         super().begin(cameras, exposures)
@@ -126,6 +129,52 @@ class RefinedCamera(Camera):
         directions = (axes @ (turns[view] @ local[..., None]))[..., 0]
         origins = rays.origins + (axes @ shifts[view, :, None])[..., 0]
         return replace(rays, origins=origins, directions=normalize(directions, dim=-1))
+
+    def slopes(
+        self,
+        rays: Rays,
+        view: Int[Tensor, "R"],
+        by_origin: Float[Tensor, "R C 3"],
+        by_direction: Float[Tensor, "R C 3"],
+    ) -> Float[Tensor, "R C N"]:
+        """Derivatives by the motion of each ray's camera in pixels (6), and by the lens (3 more, if it is refined).
+
+        Args:
+            rays: of the data's cameras.
+            view: of each.
+            by_origin: derivatives of anything by the origins of the rays as they are believed to be.
+            by_direction: by their directions.
+        """
+        axes, moved = self.motions.poses[view, :, :3], self(rays, view)
+        across = torch.linalg.cross(moved.directions[:, None].expand_as(by_direction), by_direction)
+        found = torch.cat([across @ axes, by_origin @ axes], -1) * self.motions.units[view, None]
+        if self.lens is None:
+            return found
+        kept, of_lens = self.lens.clone(), []
+        for number in range(len(kept)):  # half a pixel to both sides
+            ends = []
+            for half in (0.5, -0.5):
+                self.lens[number] = kept[number] + half
+                ends.append(self(rays, view).directions)
+            self.lens.copy_(kept)
+            of_lens.append((by_direction * (ends[0] - ends[1])[:, None]).sum(-1))
+        return torch.cat([found, torch.stack(of_lens, -1)], -1)
+
+    def position(self) -> tuple[Tensor, Tensor | None]:
+        """Where cameras and lens are, for `move_back`."""
+        return self.motions.motion.clone(), None if self.lens is None else self.lens.clone()
+
+    def move(self, motion: Float[Tensor, "V 6"], lens: Float[Tensor, "L"]) -> None:
+        """Turn and shift cameras, and change the lens that all share, by pixels."""
+        self.motions.motion += motion
+        if self.lens is not None:
+            self.lens += lens
+
+    def move_back(self, position: tuple[Tensor, Tensor | None], worse: Bool[Tensor, "V"], lens: bool) -> None:
+        """Put some cameras, and the lens, where they were."""
+        self.motions.motion[worse] = position[0][worse]
+        if lens and position[1] is not None:
+            self.lens = position[1]
 
     def _through_lens(self, local: Float[Tensor, "R 3"], view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
         """Directions along the cameras' axes, of the same pixels behind the lens as it is believed to be."""

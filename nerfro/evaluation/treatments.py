@@ -41,7 +41,7 @@ def score_split(
     and cameras are fitted on the left halves of photographs, and then the right halves are scored.
     """
     given, treated = score_views(model, views, metrics, folder, supersampling), {}
-    if model.camera.bending_parameters():
+    if model.camera.moves:
         views = replace(views, cameras=model.camera.aligned(views.cameras))
         metrics.reset()
         treated["aligned"] = score_views(model, views, metrics, folder, supersampling, "images_aligned")

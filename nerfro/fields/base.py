@@ -14,9 +14,6 @@ from nerfro.types import Radiance, Samples
 class Field(nn.Module, ABC):
     """Density and colour of a volume."""
 
-    # Share of its levels of detail, the coarse ones, that are shown while it trains, where it has some.
-    detail = 1.0
-
     @property
     def bounds(self) -> Float[Tensor, "2 3"] | None:
         """Opposite corners of the box outside of which it holds nothing, world units; None where it has none."""

@@ -47,11 +47,6 @@ class GridLevels:
     def __len__(self) -> int:
         return len(self.resolutions)
 
-    def coarsest(self, share: float) -> GridLevels:
-        """A share of the levels, one at least, without the finer ones."""
-        kept = slice(max(1, math.ceil(share * len(self))))
-        return GridLevels(self.resolutions[kept], self.sizes[kept], self.offsets[kept])
-
 
 def grid_levels(num_levels: int, base_resolution: int, finest_resolution: int, log2_table_size: int) -> GridLevels:
     """Levels in geometric progression of resolution (Eqns. 2 and 3)."""

@@ -8,7 +8,6 @@ from typing import Annotated, Literal
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import pad
 
 from nerfro.allowed import Count, Positive, Range, corners_of_box
 from nerfro.fields import hash_encoding
@@ -122,17 +121,13 @@ class HashGridField(Field):
         return self.initial_density * torch.exp(geometry[:, 0].float().clamp(max=_MAX_EXPONENT))
 
     def encode(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P F"]:
-        """Hash encoding in single precision, compiled on the CPU; zero on levels that are not shown yet."""
+        """Hash encoding in single precision, compiled on the CPU."""
         unit = (positions - self.box_min) / self.side
         if unit.device.type == "cpu":
             from nerfro.fields.hash_encoding_cpu import hash_encode  # compiled code, so only where it is used
         else:
             hash_encode = hash_encoding.hash_encode
-        if not self.training or self.detail == 1:
-            return hash_encode(unit, self.table, self.levels)
-        levels = self.levels.coarsest(self.detail)
-        features = hash_encode(unit, self.table[: levels.num_entries], levels)
-        return pad(features, (0, hash_encoding.NUM_FEATURES * (len(self.levels) - len(levels))))
+        return hash_encode(unit, self.table, self.levels)
 
     def encode_directions(self, directions: Float[Tensor, "P 3"]) -> Float[Tensor, "P K"]:
         """Spherical harmonics, compiled on the CPU."""

@@ -93,10 +93,8 @@ class NerfModel(LightningModule, ABC):
     def refined(self, path: Path, rays: Rays) -> Path:
         """Paths with gradients, but for those whose derivatives are too large, or not yet to be learned from."""
         steady = self.path_sampler.steady(path, self.medium)
-        if self.training and self.global_step < self.camera.glass_start:
-            steady = steady & ~path.refracted
         moves = bool(self.medium.surface_parameters())
-        if moves and not self.camera.bending_parameters():
+        if moves:
             steady = steady & path.refracted  # straight paths would learn nothing
         if steady.all() and not moves:
             return self.path_sampler.refine(path, rays, self.medium)
@@ -194,8 +192,6 @@ class NerfModel(LightningModule, ABC):
             if group["name"] == "surface":  # steps that do not move it need no gradients by it, and are faster
                 for parameter in group["params"]:
                     parameter.requires_grad_(not waits)
-        for part in (self.boundary, *self.fields):
-            part.detail = self.camera.detail(self.global_step)  # type: ignore[assignment]
         # Not at the end of the step before, which comes after its checkpoint: a resumed run would miss the update.
         if self.global_step > 0:
             self.point_sampler.after_step(self.global_step, list(self.fields))  # type: ignore[arg-type]
@@ -206,12 +202,6 @@ class NerfModel(LightningModule, ABC):
 
     def on_train_end(self) -> None:
         self.medium.settle()
-
-    def on_after_backward(self) -> None:
-        if self.global_step < self.camera.start:
-            for parameter in self.camera.bending_parameters():
-                if parameter.grad is not None:  # not remembered either: an unlearned scene says nothing
-                    parameter.grad.zero_()
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         groups = [
@@ -255,13 +245,29 @@ class NerfModel(LightningModule, ABC):
             self.train(was_training)
         return RenderedRays(*(torch.cat(parts) for parts in zip(*chunks, strict=True)))
 
+    @torch.no_grad()
+    def shown(self, rays: Rays, gains: Float[Tensor, "R 3"] | None = None) -> Float[Tensor, "R 3"]:
+        """What photographs would show along rays: sRGB in [0, 1], of radiance times the gains."""
+        was_training = self.training
+        self.eval()
+        try:
+            chunks = (rays[i : i + self.chunk_size] for i in range(0, len(rays), self.chunk_size))
+            radiance = torch.cat([self._render_traced(chunk, self.trace(chunk))[0] for chunk in chunks])
+        finally:
+            self.train(was_training)
+        return self.encode(radiance if gains is None else radiance * gains).clamp(0, 1)
+
     def _render_chunk(self, rays: Rays) -> tuple[Tensor, ...]:
         path = self.trace(rays)
         exits, normals = path.first_of_ray(path.exit_directions), first_normals(path, self.medium)
+        return *self._render_traced(rays, path), exits, normals
+
+    def _render_traced(self, rays: Rays, path: Path) -> tuple[Tensor, Tensor, Tensor]:
+        """Radiance, depth and opacity of rays by their paths."""
         meets = self._may_meet(rays, path)
         if meets.all():
             rendering = self.render_path(path)[-1]
-            return rendering.rgb, rendering.depth, rendering.opacity, exits, normals
+            return rendering.rgb, rendering.depth, rendering.opacity
         # Most rays of a picture pass by the object, unbent.
         rgb, depth = torch.empty_like(rays.directions), path.first_of_ray(path.far).clone()
         opacity = torch.zeros_like(depth)
@@ -272,7 +278,7 @@ class NerfModel(LightningModule, ABC):
             rgb[rows], depth[rows], opacity[rows] = (
                 part.to(rgb) for part in (rendering.rgb, rendering.depth, rendering.opacity)
             )
-        return rgb, depth, opacity, exits, normals
+        return rgb, depth, opacity
 
     def _may_meet(self, rays: Rays, path: Path) -> Bool[Tensor, "R"]:
         """Which rays may meet what the fields hold; the others are straight, and show the boundary."""

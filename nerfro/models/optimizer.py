@@ -24,7 +24,6 @@ class OptimizerConfig:
     boundary_learning_rate: Optional[Positive] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     medium_learning_rate: Optional[Positive] = None  # noqa: UP045 - of what bends rays: indices
     tint_learning_rate: Optional[Positive] = None  # noqa: UP045 - of what absorbs light
-    camera_learning_rate: Optional[Positive] = None  # noqa: UP045
     exposure_learning_rate: Optional[Positive] = None  # noqa: UP045
     # Of a surface that learns: how far a step moves it, as a share of the object's size; and steps before it does.
     surface_learning_rate: Positive = 1e-4

@@ -69,6 +69,11 @@ class RayDataModule(LightningDataModule):
     def on_exception(self, exception: BaseException) -> None:
         self.end_thread()
 
+    def make_anew(self) -> None:
+        """What bends rays is about to move: forget the batch that was made ahead."""
+        if self._ahead is not None:
+            self._ahead.forget()
+
     def end_thread(self) -> None:
         if self._ahead is not None:
             self._ahead.close()
@@ -97,6 +102,12 @@ class OneAhead:
         batch = self._next[1].result()
         self._next = (step + 1, self._thread.submit(self._without_gradients, step + 1))
         return batch
+
+    def forget(self) -> None:
+        """Wait for what is being made, and have it made again when it is asked for."""
+        if self._next is not None:
+            self._next[1].exception()
+            self._next = None
 
     def close(self) -> None:
         """End the thread."""

@@ -140,7 +140,11 @@ class RayBatches:
         return len(self._cameras) * self._cameras.height * self._cameras.width
 
     def missing(
-        self, box: Float[Tensor, "2 3"], num_pixels: int, step: int
+        self,
+        box: Float[Tensor, "2 3"],
+        num_pixels: int,
+        step: int,
+        believed: Callable[[Rays, Tensor], Rays] = lambda rays, view: rays,
     ) -> tuple[Rays, Int[Tensor, "R"], Float[Tensor, "R 3"]]:
         """Rays through random pixels that miss a box, their views and their colours; alike in all processes.
 
@@ -148,6 +152,7 @@ class RayBatches:
             box: its corners, world units.
             num_pixels: that are drawn.
             step: another one draws others.
+            believed: rays of views as they are believed to be, given those of the data.
         """
         cameras = self._cameras
         generator = np.random.default_rng([self.seed, step, num_pixels])
@@ -159,10 +164,33 @@ class RayBatches:
             view, pixel = usable.find(generator.integers(usable.starts[-1], size=num_pixels))
             drawn = view * size + pixel
         index = self._to_device(drawn)
-        rays = pixel_rays(cameras, index)
-        enter, leave = intersect_box(box, rays.origins, rays.directions)
-        beside = (enter >= leave) | (leave <= 0)
+        rays = believed(pixel_rays(cameras, index), index // size)
+        beside = misses(box, rays)
         return rays[beside], index[beside] // size, self._pixels[index[beside]]
+
+    def of_each_view(self, num_pixels: int, step: int) -> Int[Tensor, "V P"]:
+        """Random usable pixels of every view; another step draws others. A view without any has its first pixel."""
+        cameras = self._cameras
+        generator = np.random.default_rng([self.seed, step, num_pixels, len(cameras)])
+        size, shape = cameras.height * cameras.width, (len(cameras), num_pixels)
+        if self._usable is None:
+            within = generator.integers(size, size=shape)
+        else:
+            usable = self._usable[central_window(cameras.height, cameras.width, 1.0)]
+            counts = np.diff(usable.starts)[:, None]
+            drawn = generator.integers(np.maximum(counts, 1), size=shape) + usable.starts[:-1, None]
+            _, within = usable.find(np.minimum(drawn, usable.starts[-1] - 1).ravel())
+            within = np.where(counts > 0, within.reshape(shape), 0)
+        return self._to_device(within + size * np.arange(len(cameras))[:, None])
+
+    @property
+    def cameras(self) -> Cameras:
+        """Of all views, as the data give them."""
+        return self._cameras
+
+    def photographed(self, pixels: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
+        """Colours of pixels, numbered view by view and row by row; sRGB in [0, 1]."""
+        return self._pixels[pixels]
 
     def _divided_batch(self, drawn: Int[np.ndarray, "P"], generator: np.random.Generator, cameras: Cameras) -> Batch:
         """The batch of the drawn pixels: first those that have one ray, then the divided ones with all of theirs."""
@@ -247,6 +275,12 @@ class RayBatches:
             )
         if counts.sum() == 0:
             raise NerfroError(f"the masks leave no pixel to train on{precropped}; black is ignored, white is used")
+
+
+def misses(box: Float[Tensor, "2 3"], rays: Rays) -> Bool[Tensor, "R"]:
+    """Which rays pass by a box of these corners."""
+    enter, leave = intersect_box(box, rays.origins, rays.directions)
+    return (enter >= leave) | (leave <= 0)
 
 
 def _main_exits(path: Path) -> Float[Tensor, "R 3"]:

@@ -75,7 +75,7 @@ def write_cameras(file: Path, camera: Camera, views: Views) -> None:
     It is a `transforms.json`. Each frame also tells how far its camera was moved (`turned_degrees`, `shifted` in world
     units), and its `gain`.
     """
-    if not list(camera.parameters()):
+    if not camera.moves and camera.exposure is None:
         return
     given, believed = views.cameras, camera.believed(views.cameras).to("cpu")
     turned, shifted = (values.tolist() for values in motion_between(given.camera_to_world, believed.camera_to_world))

@@ -6,8 +6,6 @@ import torch
 from torch.nn.functional import normalize
 
 from nerfro.boundaries.envmap import EnvironmentMap
-from nerfro.camera.refined import RefinedCamera
-from nerfro.fields.hash_grid import HashGridField
 from nerfro.types import Exits
 
 
@@ -26,20 +24,3 @@ def test_a_coarse_sky_is_the_sum_of_its_coarse_levels() -> None:
     with torch.no_grad():
         sky.texels[shown:] = 0
     torch.testing.assert_close(sky(exits), coarse)
-
-
-def test_a_coarse_hash_grid_has_zeros_for_its_fine_levels() -> None:
-    field, places = HashGridField(num_levels=6, log2_table_size=10), 2 * torch.rand(200, 3) - 1
-    torch.nn.init.normal_(field.table)
-    whole = field.eval().encode(places)
-    field.train().detail = 0.5
-    coarse = field.encode(places)
-    assert coarse.shape == whole.shape
-    torch.testing.assert_close(coarse[:, :6], whole[:, :6])
-    assert bool((coarse[:, 6:] == 0).all())
-
-
-def test_detail_grows_from_half_to_all() -> None:
-    camera = RefinedCamera(coarse_steps=100)
-    assert [camera.detail(step) for step in (0, 50, 100, 200)] == [0.5, 0.75, 1.0, 1.0]
-    assert RefinedCamera(coarse_steps=0).detail(0) == 1.0

@@ -37,9 +37,7 @@ def part(given: Cameras, lens: bool = True, seed: int = 0) -> RefinedCamera:
     made = RefinedCamera(lens=lens).double()
     made.begin(given)
     generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for parameter in made.parameters():
-            parameter.copy_(torch.randn(parameter.shape, generator=generator, dtype=torch.float64))
+    made.move(*(torch.randn(shape, generator=generator, dtype=torch.float64) for shape in ((len(given), 6), (3,))))
     return made
 
 
@@ -53,27 +51,29 @@ LENSES = [None, coefficients([0.05, -0.02], [0.002, -0.001])]
 
 
 @pytest.mark.parametrize("distortion", LENSES)
-def test_derivatives_of_rays_are_those_of_central_differences(distortion: tuple[float, ...] | None) -> None:
+def test_slopes_are_those_of_central_differences(distortion: tuple[float, ...] | None) -> None:
     given = cameras(distortion)
     made, (view, row, column) = part(given), pixels(given)
+    made.motions.hold_world = False
+    made.motions.motion *= 0.01  # turns are composed to first order
+    made.motions.of_world = made.motions.of_world[:0]
     rays = given.rays(view, row, column)
-    weights = torch.randn(2, len(view), 3, dtype=torch.float64)
-
-    def value() -> Tensor:
-        moved = made(rays, view)
-        return (weights[0] * moved.origins + weights[1] * moved.directions).sum()
-
-    value().backward()
-    for parameter in made.parameters():
-        flat, h = parameter.data.view(-1), 1e-4
-        for i in range(len(flat)):
-            kept = float(flat[i])
-            ends = []
-            for sign in (1, -1):
-                flat[i] = kept + sign * h
-                ends.append(value().item())
-            flat[i] = kept
-            assert float(parameter.grad.view(-1)[i]) == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=1e-5, abs=1e-9)
+    by_origin, by_direction = torch.randn(2, len(view), 2, 3, dtype=torch.float64)
+    found = made.slopes(rays, view, by_origin, by_direction)
+    assert found.shape == (len(view), 2, 9)
+    h = 1e-3
+    for number in range(9):
+        ends = []
+        for sign in (h, -h):
+            before = made.position()
+            step = sign * torch.eye(9, dtype=torch.float64)[number]
+            made.move(step[:6].expand(NUM_VIEWS, 6), step[6:])
+            moved = made(rays, view)
+            by_all = (by_origin * moved.origins[:, None]).sum(-1) + (by_direction * moved.directions[:, None]).sum(-1)
+            ends.append(by_all)
+            made.move_back(before, torch.ones(NUM_VIEWS, dtype=torch.bool), lens=True)
+        expected = (ends[0] - ends[1]) / (2 * h)
+        torch.testing.assert_close(found[..., number], expected, rtol=1e-2, atol=1e-3 * float(expected.abs().max()))
 
 
 @pytest.mark.parametrize("distortion", LENSES)

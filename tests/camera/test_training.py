@@ -18,6 +18,7 @@ from nerfro.data.nerfstudio import NerfstudioData
 from nerfro.evaluation.left_halves import refine_on_left
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.light import to_linear, to_srgb
+from nerfro.training import boundary_first
 from nerfro.training.load import load
 from nerfro.training.run_folder import load_checkpoint
 from tests.ball_photographs import photographs, save
@@ -32,6 +33,10 @@ SMALL = [
 ]  # fmt: skip
 
 
+# A scene of a few steps has slopes for cameras to go by.
+LEARNED_SKY = ["optimizer.boundary_start=0", "optimizer.boundary_learning_rate=0.1", "optimizer.warmup_steps=0"]
+
+
 def poses_in(file: Path) -> torch.Tensor:
     frames = json.loads(file.read_text("utf-8"))["frames"]
     return torch.tensor([frame["transform_matrix"][:3] for frame in frames], dtype=torch.float64)
@@ -43,20 +48,14 @@ def test_disturbed_poses_come_back(train_here: Callable[..., Any], tmp_path: Pat
     true = views.cameras
     moved = disturbed(true, math.radians(0.5), 0.01, 0)
     save(replace(views, cameras=replace(true, camera_to_world=moved.float())), tmp_path / "ball")
-    options = ["camera=refined", "camera.start=40", "camera.glass_start=80", "optimizer.camera_learning_rate=0.01"]
-    options += [
-        "camera.coarse_steps=0",
-        *SMALL,
-        "trainer.max_steps=500",
-        f"data.root={tmp_path / 'ball'}",
-    ]
+    options = ["camera=refined", "camera.every=50", *SMALL, "trainer.max_steps=300", f"data.root={tmp_path / 'ball'}"]
     done = train_here(*options, f"hydra.run.dir={tmp_path / 'run'}")
     assert done.code == 0, done.err
     found = poses_in(tmp_path / "run" / "cameras.json")
     before, after = motion_between(true.camera_to_world, moved), motion_between(true.camera_to_world, found)
-    # From 0.494 degrees, a quarter of a pixel, to 0.263; and from 0.934 % of the distance to 0.371.
-    assert float(after[0].median()) < 0.7 * float(before[0].median())
-    assert float(after[1].median()) < 0.6 * float(before[1].median())
+    # From 0.494 degrees, a quarter of a pixel, to 0.179; and from 0.934 % of the distance to 0.251.
+    assert float(after[0].median()) < 0.5 * float(before[0].median())
+    assert float(after[1].median()) < 0.4 * float(before[1].median())
 
 
 @pytest.mark.slow
@@ -70,11 +69,11 @@ def test_cameras_of_other_views_come_back_on_left_halves(train_here: Callable[..
     assert done.code == 0, done.err
     scene = load(tmp_path / "run", "cpu")
     moved = replace(true, camera_to_world=disturbed(true, math.radians(0.5), 0.01, 1).float())
-    found = refine_on_left(scene.model, replace(views, cameras=moved), torch.ones(len(views), 3), 150)
+    found = refine_on_left(scene.model, replace(views, cameras=moved), torch.ones(len(views), 3), 6)
     before, after = (motion_between(true.camera_to_world, each.camera_to_world) for each in (moved, found))
-    # From 0.480 to 0.202 degrees, and from 0.027 to 0.008 of 3 world units.
-    assert float(after[0].median()) < 0.6 * float(before[0].median())
-    assert float(after[1].median()) < 0.5 * float(before[1].median())
+    # From 0.480 to 0.036 degrees, and from 0.027 to 0.002 of 3 world units.
+    assert float(after[0].median()) < 0.15 * float(before[0].median())
+    assert float(after[1].median()) < 0.15 * float(before[1].median())
 
 
 @pytest.mark.slow
@@ -99,9 +98,8 @@ def test_the_gains_of_disturbed_exposures_come_back(train_here: Callable[..., An
 def test_each_treatment_of_test_views_is_told_by_its_name(
     train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
 ) -> None:
-    options = ["camera=refined", "camera.lens=true", "camera.exposure=true", "camera.start=0", "camera.glass_start=0"]
-    options += [*tiny_default_run, "trainer.max_steps=3", "optimizer.camera_learning_rate=0.5"]
-    options += ["evaluation.refine_steps=2"]
+    options = ["camera=refined", "camera.lens=true", "camera.exposure=true", "camera.start=0", *tiny_default_run]
+    options += [*LEARNED_SKY, "camera.every=1", "trainer.max_steps=3", "evaluation.refine_steps=2"]
     done = train_here(*options, f"hydra.run.dir={tmp_path / 'run'}")
     assert done.code == 0, done.err
     document = json.loads((tmp_path / "run" / "metrics.json").read_text("utf-8"))
@@ -132,9 +130,8 @@ def test_each_treatment_of_test_views_is_told_by_its_name(
 def test_a_run_whose_cameras_learn_goes_on_as_if_it_had_not_stopped(
     train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
 ) -> None:
-    options = ["camera=refined", "camera.lens=true", "camera.exposure=true", "camera.start=2", "camera.glass_start=3"]
-    options += ["camera.coarse_steps=4"]
-    options += [*tiny_default_run, "optimizer.camera_learning_rate=0.1", "optimizer.final_learning_rate=1e-2"]
+    options = ["camera=refined", "camera.lens=true", "camera.exposure=true", "camera.start=2", "camera.every=2"]
+    options += [*tiny_default_run, "optimizer.final_learning_rate=1e-2"]
     states = []
     for name, parts in (("whole", [[6]]), ("parted", [[2], [6]])):
         for i, (steps,) in enumerate(parts):
@@ -149,16 +146,30 @@ def test_a_run_whose_cameras_learn_goes_on_as_if_it_had_not_stopped(
     assert float(states[0]["camera.exposure.log_gain"].abs().max()) > 0
 
 
-def test_cameras_wait_for_the_scene_and_glass_for_the_cameras(
+def test_cameras_wait_for_the_scene(
     train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
 ) -> None:
-    options = ["camera=refined", "camera.start=2", *tiny_default_run, "optimizer.camera_learning_rate=0.1"]
     for steps, moves in ((2, False), (3, True)):
         folder = tmp_path / f"run{steps}"
-        done = train_here(*options, f"trainer.max_steps={steps}", f"hydra.run.dir={folder}")
+        done = train_here(
+            "camera=refined", "camera.start=2", *tiny_default_run, *LEARNED_SKY, f"trainer.max_steps={steps}",
+            f"hydra.run.dir={folder}",
+        )  # fmt: skip
         assert done.code == 0, done.err
         state = load_checkpoint(folder / "checkpoints" / "last.ckpt")[0]["state_dict"]
         assert bool((state["camera.motions.motion"] != 0).any()) is moves
+
+
+def test_cameras_turn_while_the_sky_is_learned_alone(
+    train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(boundary_first, "_SHARE", 1.0)
+    options = ["camera=refined", *tiny_default_run, "optimizer.boundary_first=101", "trainer.max_steps=1"]
+    done = train_here(*options, f"hydra.run.dir={tmp_path / 'run'}")
+    assert done.code == 0, done.err
+    camera = load(tmp_path / "run", "cpu").model.camera
+    assert bool((camera.motions.motion[:, :3] != 0).all())
+    assert not bool(camera.motions.motion[:, 3:].any())
 
 
 def test_a_gain_for_each_view_needs_linear_radiance(

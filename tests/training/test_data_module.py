@@ -53,6 +53,15 @@ def ahead():
     assert not running()
 
 
+def test_what_was_made_ahead_is_made_again_where_it_is_forgotten(ahead) -> None:
+    made: list[int] = []
+    one = ahead(lambda step: made.append(step) or len(made))
+    assert one(0) == 1
+    one.forget()
+    assert made == [0, 1]
+    assert one(1) == 3
+
+
 def test_paths_made_ahead_are_those_of_the_step_in_any_order(ahead, ball: SdfGrid) -> None:
     sampler = Snell()
     make: Any = lambda step: sampler(rays(300, step), ball)  # noqa: E731

@@ -137,6 +137,24 @@ def test_masked_batch_of_one_image_is_different_usable_pixels_of_it(masked):
         assert len((batch.index // (HEIGHT * WIDTH)).unique()) == 1
 
 
+def test_every_view_has_its_own_usable_pixels(views, masked):
+    size = HEIGHT * WIDTH
+    own = torch.arange(NUM_VIEWS)[:, None]
+    for some in (views, masked):
+        drawn = RayBatches(some, 4, "all_images").of_each_view(40, 3)
+        assert drawn.shape == (NUM_VIEWS, 40)
+        assert torch.equal(drawn // size, own.expand_as(drawn))
+    assert masked.usable.flatten()[drawn].all()
+    again, others = (RayBatches(masked, 4, "all_images").of_each_view(40, step) for step in (3, 4))
+    assert torch.equal(again, drawn)
+    assert not torch.equal(others, drawn)
+    usable = masked.usable.clone()
+    usable[2] = False
+    none = RayBatches(replace(masked, usable=usable), 4, "all_images").of_each_view(40, 3)
+    assert (none[2] == 2 * size).all()
+    assert usable.flatten()[none[[v for v in range(NUM_VIEWS) if v != 2]]].all()
+
+
 @pytest.mark.parametrize(("batching", "size"), [("single_image", 1), ("all_images", 30)])
 def test_masks_hold_while_precropped_and_in_every_share(masked, batching, size):
     whole = RayBatches(masked, size, batching, seed=3, precrop_steps=20, jitter=True)

@@ -1,0 +1,159 @@
+"""Cameras that are brought nearer to their photographs with the scene held: one step of Gauss-Newton for each.
+
+A photograph has hundreds of pixels for the six numbers of its camera. So each camera has normal equations of its own,
+and a step of them is worth hundreds of steps along gradients of a few pixels. Derivatives are differences of rendered
+colours over about a pixel: they see silhouettes that move, and are not misled by what is finer than a pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize, one_hot
+
+from nerfro.camera.pixel_units import object_distances
+from nerfro.camera.refined import RefinedCamera
+from nerfro.cameras import Cameras
+from nerfro.pixel_parts import contrast, pixel_rays
+from nerfro.rays import Rays
+
+# Colours, sRGB in [0, 1], that photographs of views would have along rays.
+Shown = Callable[[Rays, Int[Tensor, "R"]], Float[Tensor, "R 3"]]
+# Colours [R, 3] that photographs have in pixels.
+Photographed = Callable[[Int[Tensor, "R"]], Float[Tensor, "R 3"]]
+
+# Pixels that differ from their neighbours by less (sRGB) tell nothing of where a camera stands.
+_LEAST_CONTRAST = 0.03
+# Change of colour for a pixel of motion from which a pixel counts less: so steep a slope does not reach far.
+_STEEP = 0.1
+# Of the mean of the normal equations' diagonal, added to it: what is not told of a camera stays.
+_DAMPING = 1e-3
+_TINY = 1e-9
+
+
+@dataclass(frozen=True)
+class Step:
+    """How cameras take a step."""
+
+    reach: float  # pixels over which differences are taken
+    scale: float  # of the robust error, sRGB: pixels that are off by more count less
+    longest: float  # pixels that a camera is moved at most, and the lens is changed
+    centres: bool = True  # whether cameras are shifted, too; not where all that is looked at is infinitely far
+    checked: bool = True  # whether a camera stays where the error of the same pixels would not fall
+
+
+def improve(
+    camera: RefinedCamera,
+    cameras: Cameras,
+    pixels: Int[Tensor, "R"],
+    photographed: Photographed,
+    shown: Shown,
+    how: Step,
+) -> None:
+    """Move each camera, and the lens that all share, by a step towards its photograph.
+
+    Args:
+        camera: what is believed of the cameras; it is changed.
+        cameras: as the data give them.
+        pixels: that are looked at, of all views.
+        photographed: their colours in the photographs.
+        shown: colours of the scene as it is now.
+        how: the step.
+    """
+    view = pixels // (cameras.height * cameras.width)
+    given, target = pixel_rays(cameras, pixels), photographed(pixels)
+    rays = camera(given, view)
+    across = how.reach / cameras.fx[view]
+    distances = object_distances(cameras).to(across)[view] if how.centres else None
+    seen, by_origin, by_direction = _differences(shown, rays, view, across, distances)
+    slopes = camera.slopes(given, view, by_origin, by_direction)
+    error = seen - target
+    # Geman and McClure's weights; and a pixel's derivative holds no farther than its colour can change.
+    weights = 1 / (1 + (error / how.scale).square().sum(-1)).square()
+    weights = weights / (1 + (slopes[..., :6] / _STEEP).square().sum((1, 2)))
+    motion, lens = _solved(slopes.double(), error.double(), weights.double(), view, len(cameras))
+    motion, lens = (
+        numbers * (how.longest / numbers.norm(dim=-1, keepdim=True).clamp(min=_TINY)).clamp(max=1)
+        for numbers in (motion, lens)
+    )
+    before = camera.position()
+    camera.move(motion.to(across), lens.to(across))
+    if not how.checked:
+        return
+
+    new = _robust(shown(camera(given, view), view) - target, how.scale, view, len(cameras))
+    old = _robust(error, how.scale, view, len(cameras))
+    camera.move_back(before, worse=new >= old, lens=bool(new.sum() >= old.sum()))
+
+
+def _robust(error: Float[Tensor, "R 3"], scale: float, view: Int[Tensor, "R"], num_views: int) -> Float[Tensor, "V"]:
+    """Error of each view: large ones of single pixels count as one."""
+    squares = (error / scale).square().sum(-1)
+    return squares.new_zeros(num_views).index_add(0, view, squares / (1 + squares))
+
+
+def telling(
+    candidates: Int[Tensor, "V M"], num_pixels: int, photographed: Photographed, cameras: Cameras
+) -> Int[Tensor, "R"]:
+    """Pixels of each view, of those that are offered: the first that have contrast, else the first."""
+    flat = (contrast(photographed, cameras, candidates.flatten()) < _LEAST_CONTRAST).view(candidates.shape)
+    order = flat.int().argsort(dim=1, stable=True)[:, :num_pixels]
+    return candidates.gather(1, order).flatten()
+
+
+def _differences(
+    shown: Shown,
+    rays: Rays,
+    view: Int[Tensor, "R"],
+    across: Float[Tensor, "R"],
+    distances: Float[Tensor, "R"] | None,
+) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3 3"], Float[Tensor, "R 3 3"]]:
+    """Colours, and their derivatives by origins and directions of rays, last axis x, y, z.
+
+    One-sided differences, for every second ray to the other side, so that curvature cancels in sums over pixels. Along
+    a ray nothing changes, so each has four. Without distances, at which origins are shifted by as many pixels as
+    directions are turned, nothing changes with origins.
+    """
+    d = rays.directions
+    seen, side = shown(rays, view), 1.0 - 2.0 * (torch.arange(len(d), device=d.device) % 2).to(d)
+    first = normalize(torch.linalg.cross(d, one_hot(d.abs().argmin(-1), 3).to(d)), dim=-1)
+    by_origin, by_direction = (d.new_zeros(len(d), 3, 3) for _ in range(2))
+    for axis in (first, torch.linalg.cross(d, first)):
+        step = (side * across)[:, None]
+        turned = shown(replace(rays, directions=normalize(d + step * axis, dim=-1)), view)
+        by_direction += ((turned - seen) / step)[:, :, None] * axis[:, None]
+        if distances is not None:
+            step = step * distances[:, None]
+            shifted = shown(replace(rays, origins=rays.origins + step * axis), view)
+            by_origin += ((shifted - seen) / step)[:, :, None] * axis[:, None]
+    return seen, by_origin, by_direction
+
+
+def _solved(
+    slopes: Float[Tensor, "R 3 N"],
+    error: Float[Tensor, "R 3"],
+    weights: Float[Tensor, "R"],
+    view: Int[Tensor, "R"],
+    num_views: int,
+) -> tuple[Float[Tensor, "V 6"], Float[Tensor, "L"]]:
+    """Weighted least squares of all cameras' six numbers, and of those that all share (by Schur's complement)."""
+    num = slopes.shape[-1]
+    squares = torch.einsum("r,rci,rcj->rij", weights, slopes, slopes)
+    products = torch.einsum("r,rci,rc->ri", weights, slopes, error)
+    matrix = slopes.new_zeros(num_views, num, num).index_add(0, view, squares)
+    vector = slopes.new_zeros(num_views, num).index_add(0, view, products)
+    own = matrix[:, :6, :6]
+    damping = _DAMPING * own.diagonal(dim1=1, dim2=2).mean(-1) + _TINY
+    own = own + damping[:, None, None] * torch.eye(6).to(own)
+    together, shared = matrix[:, :6, 6:], matrix[:, 6:, 6:].sum(0)
+    inverse = torch.linalg.solve(own, torch.cat([together, vector[:, :6, None]], -1))
+    lens = slopes.new_zeros(num - 6)
+    if num > 6:
+        shared = shared + (_DAMPING * shared.diagonal().mean() + _TINY) * torch.eye(num - 6).to(shared)
+        left = shared - (together.mT @ inverse[..., :-1]).sum(0)
+        lens = -torch.linalg.solve(left, vector[:, 6:].sum(0) - (together.mT @ inverse[..., -1:]).sum(0)[:, 0])
+    return -inverse[..., -1] - inverse[..., :-1] @ lens, lens
