@@ -78,7 +78,7 @@ class FallingBehind(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, NerfModel)
-        self.comparable = not list(pl_module.camera.parameters())
+        self.comparable = not (pl_module.camera.moves or list(pl_module.camera.parameters()))
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Batch, batch_idx: int
