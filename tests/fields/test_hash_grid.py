@@ -92,7 +92,8 @@ def decoded_in_double(
     unit = (positions - field.box_min) / field.side
     geometry = field.density_mlp.double()(hash_encoding.hash_encode(unit, field.table.double(), field.levels))
     inputs = torch.cat([geometry, spherical_harmonics(directions, field.direction_bands)], -1)
-    return field.initial_density * geometry[:, 0].exp(), torch.sigmoid(field.colour_mlp.double()(inputs)).square()
+    raw = field.colour_mlp.double()(inputs) + geometry[:, 1:4]
+    return field.initial_density * geometry[:, 0].exp(), torch.sigmoid(raw).square()
 
 
 def test_positions_and_directions_get_the_gradients_that_autograd_finds() -> None:
