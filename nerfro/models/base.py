@@ -218,7 +218,7 @@ class NerfModel(LightningModule, ABC):
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         with torch.autocast(self.device.type, enabled=False):  # directions in half precision would miss their pixels
             rays = data.watched.rays(self.device)
-        held = psnr(self.encode(self.render(rays).radiance).clamp(0, 1), data.watched.rgb.to(self.device))
+        held = psnr(self.shown(rays), data.watched.rgb.to(self.device))
         self.log("val/psnr", held, prog_bar=True, batch_size=1, rank_zero_only=True)
         if view < 0:
             return None  # no picture is due
@@ -237,25 +237,23 @@ class NerfModel(LightningModule, ABC):
 
         Memory is bounded by `chunk_size` rays' samples and activations plus the result.
         """
-        was_training = self.training
-        self.eval()
-        try:
-            chunks = [self._render_chunk(rays[i : i + self.chunk_size]) for i in range(0, len(rays), self.chunk_size)]
-        finally:
-            self.train(was_training)
-        return RenderedRays(*(torch.cat(parts) for parts in zip(*chunks, strict=True)))
+        return RenderedRays(*self._in_chunks(self._render_chunk, rays))
 
     @torch.no_grad()
     def shown(self, rays: Rays, gains: Float[Tensor, "R 3"] | None = None) -> Float[Tensor, "R 3"]:
         """What photographs would show along rays: sRGB in [0, 1], of radiance times the gains."""
+        radiance, _, _ = self._in_chunks(lambda chunk: self._render_traced(chunk, self.trace(chunk)), rays)
+        return self.encode(radiance if gains is None else radiance * gains).clamp(0, 1)
+
+    def _in_chunks(self, render: Callable[[Rays], tuple[Tensor, ...]], rays: Rays) -> list[Tensor]:
+        """What is rendered of `chunk_size` rays at a time, as in evaluation, put together."""
         was_training = self.training
         self.eval()
         try:
-            chunks = (rays[i : i + self.chunk_size] for i in range(0, len(rays), self.chunk_size))
-            radiance = torch.cat([self._render_traced(chunk, self.trace(chunk))[0] for chunk in chunks])
+            chunks = [render(rays[i : i + self.chunk_size]) for i in range(0, len(rays), self.chunk_size)]
         finally:
             self.train(was_training)
-        return self.encode(radiance if gains is None else radiance * gains).clamp(0, 1)
+        return [torch.cat(parts) for parts in zip(*chunks, strict=True)]
 
     def _render_chunk(self, rays: Rays) -> tuple[Tensor, ...]:
         path = self.trace(rays)
