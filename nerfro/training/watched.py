@@ -66,7 +66,8 @@ class FallingBehind(Callback):
 
     Attributes:
         comparable: whether the difference of both tells anything. Where cameras or exposures of training views learn,
-            those of other views do not.
+            those of other views do not; and where rays bend, one ray a pixel is worse than the pixels that are divided
+            in training.
         told: whether it has said so.
     """
 
@@ -78,7 +79,8 @@ class FallingBehind(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, NerfModel)
-        self.comparable = not (pl_module.camera.moves or list(pl_module.camera.parameters()))
+        learns = pl_module.camera.moves or list(pl_module.camera.parameters())
+        self.comparable = not (learns or pl_module.path_sampler.needs_medium)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Batch, batch_idx: int
