@@ -339,13 +339,14 @@ class Rendering:
 
 @dataclass(frozen=True)
 class Batch:
-    """Training pixels: first those that have one ray, then those that are divided, all rays of each together."""
+    """Training pixels: first those that have one ray, then the divided ones, all rays of each together, widest last."""
 
     rays: Rays  # of the pixels, as the data's cameras give them
     view: Int[Tensor, "R"]  # number of the training view that each ray belongs to
     rgb: Float[Tensor, "R 3"]  # colour of the pixel that each ray belongs to (sRGB in [0, 1])
     cameras: Cameras  # all training cameras, for losses that ask for further directions
     num_whole: int | None = None  # number of pixels that have one ray; all by default
+    num_together: int | None = None  # number of rays of pixels whose rays leave close together; all by default
     rays_per_pixel: int = 1  # of the divided ones
     rows: Int[Tensor, "R"] | None = None  # which rows of the whole batch these are, where several processes share it
     num_rows: int | None = None  # of the whole batch

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -129,6 +130,27 @@ def test_divided_pixels_bring_all_their_rays(views: Views, batching: str) -> Non
     assert torch.equal(batch.rgb, views.images.view(-1, 3)[batch.index])
     torch.testing.assert_close(batch.rays.directions[n:], part_rays(views.cameras, divided, 2).directions)
     torch.testing.assert_close(batch.rays.directions[:n], pixel_rays(views.cameras, batch.index[:n]).directions)
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_pixels_of_the_object_are_divided_for_their_contrast(views: Views, rank: int) -> None:
+    images = torch.zeros(1, SIDE, SIDE, 3)
+    images[:, :, 20:] = 0.5  # an edge down the photograph, beside the cube and through it
+    fine = dataclasses.replace(views, images=images)
+    batches = RayBatches(fine, 1000, "all_images", seed=3).share(rank, 2)
+    batch = batches.traced(through_cube, 2, 8.0, 0.1).batch(0)
+    n, end = batch.num_whole, batch.num_together
+    divided, parted = batch.index[n:end:4], batch.index[end::4]
+    assert torch.equal(divided.repeat_interleave(4), batch.index[n:end])
+    angles = diverging(views.cameras, Snell(), CUBE)
+    refracted = Snell()(pixel_rays(views.cameras, torch.arange(SIDE**2)), CUBE).refracted
+    edge = torch.isin(torch.arange(SIDE**2) % SIDE, torch.tensor([19, 20]))
+    assert (refracted & (angles < 8))[divided].all()
+    assert edge[divided].sum() > 5
+    assert (edge & refracted)[batch.index[:n]].sum() == 0, "none is left whole"
+    assert (edge & ~refracted)[batch.index[:n]].any(), "the sky beside the object is"
+    assert (angles[parted] >= angles[divided].max()).all()
+    torch.testing.assert_close(batch.rays.directions[n:end], part_rays(views.cameras, divided, 2).directions)
 
 
 @pytest.mark.parametrize("jitter", [False, True])

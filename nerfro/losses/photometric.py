@@ -19,8 +19,8 @@ from nerfro.types import Batch, Rendering
 class Photometric(Loss):
     """Mean squared colour error of the last level, plus that of earlier ones (paper, Eqn. lossRGB).
 
-    The mean is over pixels and channels, as in the authors' code; the paper's norm is three times that. Divided pixels
-    teach the boundary nothing: their rays part so widely that it would learn speckle from them.
+    The mean is over pixels and channels, as in the authors' code; the paper's norm is three times that. Pixels whose
+    rays part widely teach the boundary nothing: it would learn speckle from them.
 
     Args:
         coarse: factor of the earlier levels' errors; 1 in the paper, 0.1 in mip-NeRF.
@@ -41,14 +41,15 @@ class Photometric(Loss):
 
 
 def _teaching(rendering: Rendering, batch: Batch, boundary: Boundary) -> Float[Tensor, "R 3"]:
-    """The rays' radiance, of which that of divided pixels has no gradient by the boundary.
+    """The rays' radiance, of which that of pixels whose rays part has no gradient by the boundary.
 
     What bends and tints the rays still learns from where they leave.
     """
-    if (whole := batch.num_whole) is None:
+    if (together := batch.num_together) is None:
         return rendering.rgb
-    first = int(torch.searchsorted(rendering.path.ray, whole))
-    path, light = rendering.path[first:].changed(ray=rendering.path.ray[first:] - whole), rendering.boundary_rgb[first:]
+    first = int(torch.searchsorted(rendering.path.ray, together))
+    path = rendering.path[first:].changed(ray=rendering.path.ray[first:] - together)
+    light = rendering.boundary_rgb[first:]
     learned = light - light.detach()
     if path.exit_directions.requires_grad or path.absorption.requires_grad:
         fixed = {name: parameter.detach() for name, parameter in boundary.named_parameters()}
@@ -58,4 +59,4 @@ def _teaching(rendering: Rendering, batch: Batch, boundary: Boundary) -> Float[T
         bent = bent if rendering.gain is None else bent * rendering.gain[first:]
         learned = learned - (bent - bent.detach())
     from_boundary = path.per_ray(rendering.transmittance[first:, None] * learned)
-    return torch.cat([rendering.rgb[:whole], rendering.rgb[whole:] - from_boundary])
+    return torch.cat([rendering.rgb[:together], rendering.rgb[together:] - from_boundary])

@@ -73,7 +73,7 @@ class DensityGridSampler(PointSampler):
         every: Count = 16,
         looks: Share = 1 / 16,
         decay: Share = 0.9,
-        trust: Annotated[float, Range(more_than=0, at_most=1)] = 1.0,
+        trust: Annotated[float, Range(more_than=0, at_most=1)] = 0.4,
         num_shown: Annotated[int, Range(at_least=1, at_most=8192)] | None = None,
     ) -> None:
         super().__init__()

@@ -47,6 +47,8 @@ class BatchesConfig:
     # 1 gives all pixels one ray.
     supersample: Side = 1
     divergence: NotNegative = 8.0
+    # And of a pixel of the object whose photograph differs from a neighbour's by this much (sRGB); none for no others.
+    contrast: Optional[Positive] = None  # noqa: UP045
 
 
 @dataclass

@@ -132,6 +132,7 @@ def traced(batches: RayBatches, model: NerfModel, config: DictConfig) -> RayBatc
         lambda rays, view: model.path_sampler(model.camera(rays, view), model.medium),
         side,
         config.batches.divergence,
+        config.batches.get("contrast"),  # runs of former releases do not name it
         lambda rays, view: model.exit_directions(model.camera(rays, view)),
     )
 

@@ -19,7 +19,7 @@ from nerfro.data.pixel_store import PixelStore
 from nerfro.distributed import share_of
 from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import intersect_box
-from nerfro.pixel_parts import divergence, part_rays, pixel_rays, rays_beside
+from nerfro.pixel_parts import contrast, divergence, part_rays, pixel_rays, rays_beside
 from nerfro.rays import Rays
 from nerfro.types import Batch, Path
 
@@ -59,6 +59,7 @@ class RayBatches:
         self._trace: Tracer | None = None
         self._leaving: Leaving | None = None
         self._side, self._divergence = 1, 0.0
+        self._contrast: float | None = None
         cameras = views.cameras
         self._cameras = cameras
         self._pixels = PixelStore(views.images)
@@ -81,16 +82,22 @@ class RayBatches:
         return moved
 
     def traced(
-        self, trace: Tracer, side: int = 1, divergence: float = 8.0, leaving: Leaving | None = None
+        self,
+        trace: Tracer,
+        side: int = 1,
+        divergence: float = 8.0,
+        contrast: float | None = None,
+        leaving: Leaving | None = None,
     ) -> RayBatches:
         """The sequence with the paths of its rays, more than one for pixels for which one does not stand.
 
         Pixels are divided whose ray leaves in another direction than the one beside it, by `divergence` pixel angles or
-        more (see `pixel_parts.divergence`), into `side` rays in each direction; 1 divides none.
+        more (see `pixel_parts.divergence`), into `side` rays in each direction; 1 divides none. So are pixels whose ray
+        is refracted where the photograph has a contrast with the next pixels: edges and texture of things inside.
         Where the rays beside them leave is asked of `leaving`, if that is cheaper than to trace them.
         """
         traced = copy.copy(self)
-        traced._trace, traced._side, traced._divergence = trace, side, divergence
+        traced._trace, traced._side, traced._divergence, traced._contrast = trace, side, divergence, contrast
         traced._leaving = leaving or (lambda rays, view: _main_exits(trace(rays, view)))
         return traced
 
@@ -205,17 +212,24 @@ class RayBatches:
         rays = pixel_rays(self._cameras, pixels, place)
         path = self._trace(rays, view)
         beside = self._leaving(rays_beside(self._cameras, pixels, place), view)
-        divided = self._widest(divergence(self._cameras, pixels, _main_exits(path), beside))
+        parted = self._largest(divergence(self._cameras, pixels, _main_exits(path), beside), self._divergence)
+        fine = torch.zeros_like(parted)
+        if self._contrast is not None:
+            visible = path.first_of_ray(path.refracted) & ~parted
+            contrasts = contrast(self.photographed, self._cameras, pixels)
+            fine = self._largest(torch.where(visible, contrasts, -1), self._contrast) & visible
+        divided = parted | fine
 
         # Each pixel's first row in the whole batch.
         num_rays = torch.where(divided, several, 1)
-        order = torch.argsort(divided.int(), stable=True)
+        order = torch.argsort(fine.int() + 2 * parted.int(), stable=True)
         first_row = torch.empty_like(num_rays)
         first_row[order] = num_rays[order].cumsum(0) - num_rays[order]
 
         own = torch.zeros_like(divided)
         own[self._share] = True
-        whole, divided = (own & ~divided).nonzero()[:, 0], (own & divided).nonzero()[:, 0]
+        whole, finer, parted = ((own & kind).nonzero()[:, 0] for kind in (~divided, fine, parted))
+        divided = torch.cat([finer, parted])
         parts = part_rays(
             self._cameras, pixels[divided], self._side, None if place_in_part is None else place_in_part[divided]
         )
@@ -228,6 +242,7 @@ class RayBatches:
             rgb=self._pixels[index],
             cameras=cameras,
             num_whole=len(whole),
+            num_together=len(whole) + several * len(finer),
             rays_per_pixel=several,
             rows=torch.cat([first_row[whole], rows.flatten()]),
             num_rows=int(num_rays.sum()),
@@ -235,12 +250,13 @@ class RayBatches:
             index=index,
         )
 
-    def _widest(self, divergence: Float[Tensor, "P"]) -> Bool[Tensor, "P"]:
-        """Which pixels are divided: all that diverge too much, and the next ones up to a round number."""
-        step = max(1, round(_STEP_OF_DIVIDED * len(divergence)))
-        wanted = -(-int((divergence >= self._divergence).sum()) // step) * step
-        chosen = torch.zeros_like(divergence, dtype=torch.bool)
-        chosen[divergence.argsort(descending=True, stable=True)[:wanted]] = True
+    @staticmethod
+    def _largest(values: Float[Tensor, "P"], least: float) -> Bool[Tensor, "P"]:
+        """Which pixels are divided: all that have at least so much, and the next ones up to a round number."""
+        step = max(1, round(_STEP_OF_DIVIDED * len(values)))
+        wanted = -(-int((values >= least).sum()) // step) * step
+        chosen = torch.zeros_like(values, dtype=torch.bool)
+        chosen[values.argsort(descending=True, stable=True)[:wanted]] = True
         return chosen
 
     def _random(self, generator: np.random.Generator, *shape: int) -> Float[np.ndarray, "P ..."]:

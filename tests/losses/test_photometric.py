@@ -32,7 +32,7 @@ def rendering(colour: torch.Tensor, boundary: torch.Tensor, passed: torch.Tensor
 def batch() -> Batch:
     pixels = torch.rand(NUM_WHOLE + NUM_DIVIDED, 3)
     rgb = torch.cat([pixels[:NUM_WHOLE], pixels[NUM_WHOLE:].repeat_interleave(PARTS, 0)])
-    return Batch(None, None, rgb, None, num_whole=NUM_WHOLE, rays_per_pixel=PARTS)  # type: ignore[arg-type]
+    return Batch(None, None, rgb, None, num_whole=NUM_WHOLE, num_together=NUM_WHOLE, rays_per_pixel=PARTS)  # type: ignore[arg-type]
 
 
 def test_a_divided_pixel_is_compared_as_a_whole_and_teaches_the_field_alone() -> None:
@@ -51,6 +51,15 @@ def test_a_divided_pixel_is_compared_as_a_whole_and_teaches_the_field_alone() ->
     torch.testing.assert_close(of_boundary[:NUM_WHOLE], whole_boundary[:NUM_WHOLE])
     assert whole_boundary[NUM_WHOLE:].abs().min() > 0
     torch.testing.assert_close(of_boundary[NUM_WHOLE:], torch.zeros(NUM_DIVIDED * PARTS, 3), rtol=0, atol=1e-7)
+
+
+def test_a_divided_pixel_whose_rays_stay_together_teaches_the_boundary() -> None:
+    colour, boundary = (torch.rand(NUM_RAYS, 3, requires_grad=True) for _ in range(2))
+    given = dataclasses.replace(batch(), num_together=NUM_WHOLE + PARTS)  # the first of two divided pixels
+    loss = Photometric()([rendering(colour, boundary, torch.rand(NUM_RAYS))], given, MODEL)
+    (of_boundary,) = torch.autograd.grad(loss, boundary)
+    assert of_boundary[: NUM_WHOLE + PARTS].abs().min() > 0
+    torch.testing.assert_close(of_boundary[NUM_WHOLE + PARTS :], torch.zeros(PARTS, 3), rtol=0, atol=1e-7)
 
 
 def test_what_bends_rays_learns_from_divided_pixels_and_the_sky_does_not() -> None:
