@@ -49,6 +49,7 @@ class BatchesConfig:
     divergence: NotNegative = 8.0
     # And of a pixel of the object whose photograph differs from a neighbour's by this much (sRGB); none for no others.
     contrast: Optional[Positive] = None  # noqa: UP045
+    contrast_start: Natural = 0  # steps before: details are learned last, and more rays make slower steps
 
 
 @dataclass

@@ -132,7 +132,8 @@ def traced(batches: RayBatches, model: NerfModel, config: DictConfig) -> RayBatc
         lambda rays, view: model.path_sampler(model.camera(rays, view), model.medium),
         side,
         config.batches.divergence,
-        config.batches.get("contrast"),  # runs of former releases do not name it
+        config.batches.get("contrast"),  # runs of former releases name neither
+        config.batches.get("contrast_start", 0),
         lambda rays, view: model.exit_directions(model.camera(rays, view)),
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable
 from typing import Literal
 
@@ -59,7 +60,7 @@ class RayBatches:
         self._trace: Tracer | None = None
         self._leaving: Leaving | None = None
         self._side, self._divergence = 1, 0.0
-        self._contrast: float | None = None
+        self._contrast, self._contrast_start = math.inf, 0
         cameras = views.cameras
         self._cameras = cameras
         self._pixels = PixelStore(views.images)
@@ -87,17 +88,20 @@ class RayBatches:
         side: int = 1,
         divergence: float = 8.0,
         contrast: float | None = None,
+        contrast_start: int = 0,
         leaving: Leaving | None = None,
     ) -> RayBatches:
         """The sequence with the paths of its rays, more than one for pixels for which one does not stand.
 
         Pixels are divided whose ray leaves in another direction than the one beside it, by `divergence` pixel angles or
         more (see `pixel_parts.divergence`), into `side` rays in each direction; 1 divides none. So are pixels whose ray
-        is refracted where the photograph has a contrast with the next pixels: edges and texture of things inside.
+        is refracted where the photograph has a contrast with the next pixels: edges and texture of things inside. They
+        are from step `contrast_start` on.
         Where the rays beside them leave is asked of `leaving`, if that is cheaper than to trace them.
         """
         traced = copy.copy(self)
-        traced._trace, traced._side, traced._divergence, traced._contrast = trace, side, divergence, contrast
+        traced._trace, traced._side, traced._divergence = trace, side, divergence
+        traced._contrast, traced._contrast_start = math.inf if contrast is None else contrast, contrast_start
         traced._leaving = leaving or (lambda rays, view: _main_exits(trace(rays, view)))
         return traced
 
@@ -133,7 +137,8 @@ class RayBatches:
         row, column = window.top + pixel // window.width, window.left + pixel % window.width
         drawn = (view * height + row) * width + column
         if self._side > 1:
-            return self._divided_batch(drawn, generator, cameras.crop(window))
+            least = self._contrast if step >= self._contrast_start else math.inf
+            return self._divided_batch(drawn, least, generator, cameras.crop(window))
         # One small copy to the device; the rest is computed there.
         index = self._to_device(drawn[self._share])
         place = self._to_device(self._random(generator, 2)[self._share]) if self.jitter else None
@@ -199,7 +204,9 @@ class RayBatches:
         """Colours of pixels, numbered view by view and row by row; sRGB in [0, 1]."""
         return self._pixels[pixels]
 
-    def _divided_batch(self, drawn: Int[np.ndarray, "P"], generator: np.random.Generator, cameras: Cameras) -> Batch:
+    def _divided_batch(
+        self, drawn: Int[np.ndarray, "P"], least_contrast: float, generator: np.random.Generator, cameras: Cameras
+    ) -> Batch:
         """The batch of the drawn pixels: first those that have one ray, then the divided ones with all of theirs."""
         assert self._trace is not None
         assert self._leaving is not None
@@ -214,10 +221,10 @@ class RayBatches:
         beside = self._leaving(rays_beside(self._cameras, pixels, place), view)
         parted = self._largest(divergence(self._cameras, pixels, _main_exits(path), beside), self._divergence)
         fine = torch.zeros_like(parted)
-        if self._contrast is not None:
+        if least_contrast < math.inf:
             visible = path.first_of_ray(path.refracted) & ~parted
             contrasts = contrast(self.photographed, self._cameras, pixels)
-            fine = self._largest(torch.where(visible, contrasts, -1), self._contrast) & visible
+            fine = self._largest(torch.where(visible, contrasts, -1), least_contrast) & visible
         divided = parted | fine
 
         # Each pixel's first row in the whole batch.
