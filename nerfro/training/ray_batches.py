@@ -191,6 +191,11 @@ class RayBatches:
         return self._to_device(within + size * np.arange(len(cameras))[:, None])
 
     @property
+    def dividing(self) -> tuple[int, float]:
+        """`side` and `divergence` of `traced`."""
+        return self._side, self._divergence
+
+    @property
     def cameras(self) -> Cameras:
         """Of all views, as the data give them."""
         return self._cameras

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,7 @@ from tqdm import tqdm
 from nerfro.cameras import Cameras
 from nerfro.data.base import Views
 from nerfro.models.base import NerfModel
-from nerfro.pixel_parts import pixel_rays
+from nerfro.pixel_parts import divergence, part_rays, pixel_rays, rays_beside
 from nerfro.rays import Rays
 from nerfro.types import Batch
 
@@ -52,9 +52,31 @@ class WatchedPixels:
             colours.append(views.images[view].reshape(-1, 3)[drawn])
         return cls(views.cameras, torch.cat(indices), torch.cat(colours))
 
-    def rays(self, device: torch.device) -> Rays:
-        """One ray through the middle of each pixel."""
-        return pixel_rays(self.cameras.to(device), self.index.to(device))
+    def batch(
+        self,
+        device: torch.device,
+        leaving: Callable[[Rays], Float[Tensor, "R 3"]] | None = None,
+        side: int = 1,
+        limit: float = 8.0,
+    ) -> Batch:
+        """The pixels with the rays that training gives such pixels (see `RayBatches.traced`).
+
+        Args:
+            device: of its tensors.
+            leaving: unit directions in which rays leave.
+            side: of the rays of a pixel that is divided; 1 divides none, and needs no `leaving`.
+            limit: pixels are divided whose ray leaves so many pixel angles beside the next one, or more.
+        """
+        cameras, pixels = self.cameras.to(device), self.index.to(device)
+        rays, rgb = pixel_rays(cameras, pixels), self.rgb.to(device)
+        view = pixels // (cameras.height * cameras.width)
+        if side == 1 or leaving is None:
+            return Batch(rays, view, rgb, cameras, index=pixels)
+        divided = divergence(cameras, pixels, leaving(rays), leaving(rays_beside(cameras, pixels))) >= limit
+        whole, divided = (~divided).nonzero()[:, 0], divided.nonzero()[:, 0]
+        rows = torch.cat([whole, divided.repeat_interleave(side**2)])
+        rays = rays[whole].followed_by(part_rays(cameras, pixels[divided], side))
+        return Batch(rays, view[rows], rgb[rows], cameras, len(whole), side**2, index=pixels[rows])
 
 
 class FallingBehind(Callback):
@@ -66,8 +88,7 @@ class FallingBehind(Callback):
 
     Attributes:
         comparable: whether the difference of both tells anything. Where cameras or exposures of training views learn,
-            those of other views do not; and where rays bend, one ray a pixel is worse than the pixels that are divided
-            in training.
+            those of other views do not; and where rays bend, nobody has measured yet by how much healthy runs differ.
         told: whether it has said so.
     """
 

@@ -16,8 +16,12 @@ from PIL import Image
 
 from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
+from nerfro.media.shapes import Ball
+from nerfro.samplers.snell import Snell
 from nerfro.training.data_module import NO_PICTURE, RayDataModule, RotatingView, looks_every
+from nerfro.training.ray_batches import RayBatches
 from nerfro.training.watched import FallingBehind, WatchedPixels
+from nerfro.types import Batch
 
 LINE = "views that are not trained on fall behind"
 
@@ -98,13 +102,16 @@ def test_where_cameras_learn_only_a_loss_is_told() -> None:
     assert judged([(22, 23), (20.9, 24), (20.8, 25)], comparable=False) == [2]
 
 
-@pytest.mark.parametrize(("camera", "comparable"), [("false", True), ("true", False)])
+@pytest.mark.parametrize(
+    ("option", "comparable"),
+    [("camera.exposure=false", True), ("camera.exposure=true", False)],
+)
 def test_exposures_that_learn_are_those_of_training_views_alone(
-    learn: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, camera: str, comparable: bool
+    learn: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, option: str, comparable: bool
 ) -> None:
     begun: list[FallingBehind] = []
     monkeypatch.setattr(FallingBehind, "on_train_end", lambda self, *given: begun.append(self))
-    finished = learn(f"camera.exposure={camera}", "trainer.max_steps=1")
+    finished = learn(option, "trainer.max_steps=1")
     assert finished.code == 0, finished.err
     assert [behind.comparable for behind in begun] == [comparable]
 
@@ -134,7 +141,35 @@ def test_the_same_usable_pixels_are_watched_each_time(tiny_scene: Path) -> None:
     images = torch.stack(list(views.images)).view(-1, 3)
     assert torch.equal(one.rgb, images[one.index])
     rays = views.cameras.image_rays(1)
-    assert torch.allclose(one.rays(torch.device("cpu")).directions[-64:], rays.directions[one.index[-64:] - 256])
+    batch = one.batch(torch.device("cpu"))
+    assert torch.allclose(batch.rays.directions[-64:], rays.directions[one.index[-64:] - 256])
+    assert torch.equal(batch.of_pixels(batch.rgb), one.rgb)
+
+
+def test_watched_pixels_have_the_rays_that_training_gives_them(tiny_scene: Path) -> None:
+    views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val")
+    ball, sampler = Ball(0.6, 1.5), Snell()
+    trained = RayBatches(views, 256, "single_image").traced(lambda rays, view: sampler(rays, ball), 2, 8.0).batch(0)
+    watched = WatchedPixels.of(views)
+    batch = watched.batch(torch.device("cpu"), lambda rays: sampler.main(rays, ball).exit_directions, 2, 8.0)
+    assert batch.index is not None
+    assert trained.index is not None
+    assert torch.allclose(batch.of_pixels(batch.rgb).sort(0).values, watched.rgb.sort(0).values), "each pixel once"
+    rays = [rays_of_pixels(each) for each in (trained, batch)]
+    common = rays[0].keys() & rays[1].keys()
+    same = [pixel for pixel in common if torch.equal(rays[0][pixel], rays[1][pixel])]
+    assert sum(len(rays[1][pixel]) == 4 for pixel in same) > 10
+    assert sum(len(rays[1][pixel]) == 1 for pixel in same) > 100
+    # Training divides up to 1/32 of its pixels more, to have few sizes.
+    others = common - set(same)
+    assert len(others) <= 8
+    assert all(len(rays[0][pixel]) == 4 and len(rays[1][pixel]) == 1 for pixel in others)
+
+
+def rays_of_pixels(batch: Batch) -> dict[int, torch.Tensor]:
+    """Directions of the rays of each pixel of a batch."""
+    assert batch.index is not None
+    return {pixel: batch.rays.directions[batch.index == pixel] for pixel in batch.index.tolist()}
 
 
 def test_many_views_cost_no_more_than_few(tiny_scene: Path) -> None:
