@@ -57,8 +57,7 @@ class RayDataModule(LightningDataModule):
         """Pixels of validation views, with the rays that training gives such pixels as the medium is now."""
         assert self.trainer is not None
         assert self.watched is not None
-        model = cast(NerfModel, self.trainer.lightning_module)
-        return self.watched.batch(model.device, model.exit_directions, *self.batches.dividing)
+        return self.watched.batch(cast(NerfModel, self.trainer.lightning_module), *self.batches.dividing)
 
     def transfer_batch_to_device(self, batch: int, device: torch.device, dataloader_idx: int) -> Batch | int:
         assert self.trainer is not None

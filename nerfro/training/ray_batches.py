@@ -191,9 +191,9 @@ class RayBatches:
         return self._to_device(within + size * np.arange(len(cameras))[:, None])
 
     @property
-    def dividing(self) -> tuple[int, float]:
-        """`side` and `divergence` of `traced`."""
-        return self._side, self._divergence
+    def dividing(self) -> tuple[int, float, float | None]:
+        """`side`, `divergence` and `contrast` of `traced`."""
+        return self._side, self._divergence, self._contrast
 
     @property
     def cameras(self) -> Cameras:

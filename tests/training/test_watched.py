@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -141,29 +142,39 @@ def test_the_same_usable_pixels_are_watched_each_time(tiny_scene: Path) -> None:
     images = torch.stack(list(views.images)).view(-1, 3)
     assert torch.equal(one.rgb, images[one.index])
     rays = views.cameras.image_rays(1)
-    batch = one.batch(torch.device("cpu"))
+    batch = one.batch(bending(), 1, 8.0, None)
     assert torch.allclose(batch.rays.directions[-64:], rays.directions[one.index[-64:] - 256])
     assert torch.equal(batch.of_pixels(batch.rgb), one.rgb)
 
 
-def test_watched_pixels_have_the_rays_that_training_gives_them(tiny_scene: Path) -> None:
-    views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val")
+def bending() -> Any:
+    """What is asked of a model that bends rays by a ball."""
     ball, sampler = Ball(0.6, 1.5), Snell()
-    trained = RayBatches(views, 256, "single_image").traced(lambda rays, view: sampler(rays, ball), 2, 8.0).batch(0)
-    watched = WatchedPixels.of(views)
-    batch = watched.batch(torch.device("cpu"), lambda rays: sampler.main(rays, ball).exit_directions, 2, 8.0)
-    assert batch.index is not None
-    assert trained.index is not None
+    return SimpleNamespace(
+        device=torch.device("cpu"),
+        medium=ball,
+        path_sampler=sampler,
+        exit_directions=lambda rays: sampler.main(rays, ball).exit_directions,
+    )
+
+
+@pytest.mark.parametrize("contrast", [None, 0.015])
+def test_watched_pixels_have_the_rays_that_training_gives_them(contrast: float | None, tiny_scene: Path) -> None:
+    views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val")
+    model = bending()
+    batches = RayBatches(views, 256, "single_image")
+    batches = batches.traced(lambda rays, view: model.path_sampler(rays, model.medium), 2, 8.0, contrast)
+    trained, watched = batches.batch(0), WatchedPixels.of(views)
+    batch = watched.batch(model, *batches.dividing)
     assert torch.allclose(batch.of_pixels(batch.rgb).sort(0).values, watched.rgb.sort(0).values), "each pixel once"
-    rays = [rays_of_pixels(each) for each in (trained, batch)]
-    common = rays[0].keys() & rays[1].keys()
-    same = [pixel for pixel in common if torch.equal(rays[0][pixel], rays[1][pixel])]
-    assert sum(len(rays[1][pixel]) == 4 for pixel in same) > 10
-    assert sum(len(rays[1][pixel]) == 1 for pixel in same) > 100
-    # Training divides up to 1/32 of its pixels more, to have few sizes.
-    others = common - set(same)
-    assert len(others) <= 8
-    assert all(len(rays[0][pixel]) == 4 and len(rays[1][pixel]) == 1 for pixel in others)
+    one, other = rays_of_pixels(trained), rays_of_pixels(batch)
+    same = [pixel for pixel in one if torch.equal(one[pixel], other[pixel])]
+    assert sum(len(other[pixel]) == 4 for pixel in same) > (8 if contrast is None else 16)
+    assert sum(len(other[pixel]) == 1 for pixel in same) > 100
+    # Training divides up to 1/32 of its pixels more for each reason, to have few sizes.
+    others = one.keys() - set(same)
+    assert len(others) <= 16
+    assert all(len(one[pixel]) == 4 and len(other[pixel]) == 1 for pixel in others)
 
 
 def rays_of_pixels(batch: Batch) -> dict[int, torch.Tensor]:
