@@ -8,7 +8,7 @@ import re
 import shlex
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -46,14 +46,18 @@ def outline_of(points: np.ndarray, height: int, width: int) -> np.ndarray:
     return outline.contains_points(centres.reshape(-1, 2)).reshape(height, width)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _baked_quickly() -> Iterator[None]:
+    """Light that falls on the room is noisier, for poses and outlines do not depend on it; it is computed once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dataset, "BAKING_SPP", 8)
+        yield
+
+
 @pytest.fixture(scope="module")
 def few(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two photographs, large enough to find tags in."""
-    pytest.importorskip("mitsuba")
-    pytest.importorskip("pyapriltags")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dataset, "BAKING_SPP", 8)
-        return photograph(tmp_path_factory.mktemp("few"), resolution=320, photographs=2, spp=4)
+    return photograph(tmp_path_factory.mktemp("few"), resolution=320, photographs=2, spp=4)
 
 
 def test_poses_are_only_in_the_truth(few: Path) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+import nerfro.plugins
 from nerfro.paths import PACKAGE_DIR
 
 COMMANDS = {file.stem for file in PACKAGE_DIR.glob("*.py") if "\n@entry_point" in file.read_text()} | {"plugins"}
@@ -46,8 +47,13 @@ def test_an_unknown_command_is_refused_in_one_line(script: Path) -> None:
     assert refused.stderr.count("\n") == 1
 
 
-def test_arguments_reach_the_command_and_its_status_comes_back(script: Path) -> None:
-    assert run(script, "plugins", "loss=smoothness").stdout == run("-m", "nerfro.plugins", "loss=smoothness").stdout
+def test_arguments_reach_the_command_and_its_status_comes_back(
+    script: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")  # of the process that is started too
+    monkeypatch.setattr(sys, "argv", ["nerfro.plugins", "loss=smoothness"])
+    nerfro.plugins.main()
+    assert run(script, "plugins", "loss=smoothness").stdout == capsys.readouterr().out
     refused = run("-m", "nerfro", "train", "sed=1")
     assert refused.returncode == 1
     assert "sed" in refused.stderr

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -175,19 +172,15 @@ def test_papers_recipe_is_the_authors() -> None:
 
 
 @pytest.mark.slow
-def test_multirun_sweeps_over_the_ablations(tmp_path: Path, tiny_run: list[str], tiny_scene: Path) -> None:
+def test_multirun_sweeps_over_the_ablations(
+    tmp_path: Path, tiny_run: list[str], tiny_scene: Path, train_here: Callable[..., Any]
+) -> None:
     small = [override for override in tiny_run if not override.startswith(("sampler.points", "sampler/points"))]
-    command = [sys.executable, "-m", "nerfro.train", "-m", "+experiment=glob(ablation_no*)", "trainer.max_steps=2"]
-    command += [*small, f"hydra.sweep.dir={tmp_path / 'sweep'}", "evaluation.every=0"]
-    # Nobody listens at that proxy: the search for LPIPS weights ends at once.
-    environment = {
-        **os.environ,
-        "https_proxy": "http://127.0.0.1:9",
-        "TORCH_HOME": str(tmp_path),
-        "OMP_NUM_THREADS": "1",
-    }
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
+    done = train_here(
+        *("-m", "+experiment=glob(ablation_no*)", "trainer.max_steps=2", *small),
+        *(f"hydra.sweep.dir={tmp_path / 'sweep'}", "evaluation.every=0"),
+    )
+    assert done.code == 0, done.err
     ablations = [name for name in EXPERIMENTS if name.startswith("ablation_no")]
     runs = sorted(path.parent.name for path in (tmp_path / "sweep").glob("*/metrics.json"))
     assert runs == sorted(f"{name}-{tiny_scene.name}-seed0" for name in ablations)

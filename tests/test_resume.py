@@ -8,7 +8,6 @@ import os
 import pickle
 import random
 import signal
-import subprocess
 import sys
 from collections import namedtuple
 from collections.abc import Callable, Iterator
@@ -30,6 +29,7 @@ from nerfro.training.run_folder import (
     load_checkpoint,
     require_same_configuration,
 )
+from tests.forked import Command
 
 SCHEDULE = ["checkpoint.every_steps=3", "checkpoint.every_seconds=null", "evaluation.every=5", "trainer.max_steps=12"]
 
@@ -53,37 +53,19 @@ class Waiting(Loss):
 
 
 @pytest.fixture
-def start(tmp_path: Path, tiny_run: list[str], tiny_default_run: list[str]) -> Callable[..., subprocess.Popen[str]]:
-    """Start a real training process with a loss that waits; its folder is tmp_path/<name>."""
+def start(tmp_path: Path, tiny_run: list[str], tiny_default_run: list[str]) -> Callable[..., Command]:
+    """Start a training process with a loss that waits; its folder is tmp_path/<name>."""
     plugins = tmp_path / "slow_plugins"
     plugins.mkdir()
     (plugins / "waiting.py").write_text(SLOW_LOSS)
-    environment = {
-        **os.environ,
-        "NERFRO_PLUGINS": str(plugins),
-        "OMP_NUM_THREADS": "1",
-        # Nobody listens there: the search for LPIPS weights ends at once.
-        "https_proxy": "http://127.0.0.1:9",
-        "TORCH_HOME": str(tmp_path / "torch"),
-    }
+    number = itertools.count()
 
-    def start(name: str, *overrides: str, preset: str = "paper") -> subprocess.Popen[str]:
+    def start(name: str, *overrides: str, preset: str = "paper") -> Command:
         small = tiny_run if preset == "paper" else tiny_default_run
-        command = [sys.executable, "-m", "nerfro.train", *small, *SCHEDULE, "+loss.waiting.weight=1"]
-        command += [f"hydra.run.dir={tmp_path / name}", *overrides]
-        return subprocess.Popen(
-            command, env=environment, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
+        options = [*small, *SCHEDULE, "+loss.waiting.weight=1", f"hydra.run.dir={tmp_path / name}", *overrides]
+        return Command("train", options, tmp_path / f"log_{next(number)}", NERFRO_PLUGINS=str(plugins))
 
     return start
-
-
-def wait_for_step(process: subprocess.Popen[str], step: int) -> None:
-    assert process.stdout is not None
-    for line in process.stdout:
-        if line.strip() == f"at step {step}":
-            return
-    pytest.fail(f"the run ended before step {step}: {process.stderr.read() if process.stderr else ''}")
 
 
 def tensors(node: Any, prefix: str = "") -> dict[str, torch.Tensor]:
@@ -97,21 +79,17 @@ def tensors(node: Any, prefix: str = "") -> dict[str, torch.Tensor]:
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["paper", "default"])
 def test_killed_and_resumed_run_ends_with_the_weights_of_an_undisturbed_one(
-    preset: str, start: Callable[..., subprocess.Popen[str]], tmp_path: Path
+    preset: str, start: Callable[..., Command], tmp_path: Path
 ) -> None:
     undisturbed = start("undisturbed", preset=preset)
     killed_at = random.Random(os.urandom(8)).randint(4, 11)  # any step will do; the message names it
     killed = start("killed", preset=preset)
-    wait_for_step(killed, killed_at)
-    killed.send_signal(signal.SIGKILL)
-    killed.communicate(timeout=60)
-    assert killed.returncode == -signal.SIGKILL
+    killed.until(f"^at step {killed_at}$")
+    killed.send(signal.SIGKILL)
+    assert killed.wait() == -signal.SIGKILL
     assert not (tmp_path / "killed" / "metrics.json").exists()
-    resumed = start("killed", "ckpt_path=last", preset=preset)
-    _, errors = resumed.communicate(timeout=300)
-    assert resumed.returncode == 0, errors
-    _, errors = undisturbed.communicate(timeout=300)
-    assert undisturbed.returncode == 0, errors
+    start("killed", "ckpt_path=last", preset=preset).finished()
+    undisturbed.finished()
 
     one, other = (load_checkpoint(tmp_path / name / LAST_CHECKPOINT)[0] for name in ("undisturbed", "killed"))
     assert one["global_step"] == other["global_step"] == 12
@@ -127,26 +105,22 @@ def test_killed_and_resumed_run_ends_with_the_weights_of_an_undisturbed_one(
 
 
 @pytest.mark.slow
-def test_interrupted_run_saves_and_says_how_to_go_on(
-    start: Callable[..., subprocess.Popen[str]], tmp_path: Path
-) -> None:
+def test_interrupted_run_saves_and_says_how_to_go_on(start: Callable[..., Command], tmp_path: Path) -> None:
     process = start("run", "trainer.max_steps=500", "checkpoint.every_steps=400")
-    wait_for_step(process, 4)
-    process.send_signal(signal.SIGINT)
-    out, errors = process.communicate(timeout=60)
-    assert process.returncode == 130, errors
-    assert "Traceback" not in errors
+    process.until("^at step 4$")
+    process.send(signal.SIGINT)
+    assert process.wait() == 130, process.errors
+    assert "Traceback" not in process.errors
     steps = load_checkpoint(tmp_path / "run" / LAST_CHECKPOINT)[0]["global_step"]
     assert 4 <= steps <= 8
     folder = tmp_path / "run"
     expected = (
         f"interrupted after step {steps} and saved; to go on, repeat it with hydra.run.dir={folder} ckpt_path=last"
     )
-    assert expected in out
+    assert expected in process.printed
     # What the message says works, and goes on from there.
     resumed = start("run", f"trainer.max_steps={steps + 2}", "checkpoint.every_steps=400", "ckpt_path=last")
-    out, errors = resumed.communicate(timeout=120)
-    assert resumed.returncode == 0, errors
+    out = resumed.finished()
     seen = [int(line.rsplit(" ", 1)[1]) for line in out.splitlines() if line.startswith("at step")]
     assert seen == [steps, steps + 1]
 

@@ -22,6 +22,7 @@ from nerfro.paths import CONF_DIR
 from nerfro.registry import discover
 from nerfro.training.config import TrainConfig
 from nerfro.training.sweeps import Identity, folder_name, scene_name
+from tests.forked import Command
 
 SWEEPS = sorted(path.stem for path in (CONF_DIR / "sweep").glob("*.yaml"))
 
@@ -50,28 +51,15 @@ def sweep(train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path) -
 
 
 @pytest.fixture
-def start(tmp_path: Path, tiny_run: list[str]) -> Callable[..., subprocess.Popen[str]]:
-    """Start a real sweep in tmp_path/sweep, whose output goes to tmp_path/log."""
+def start(tmp_path: Path, tiny_run: list[str]) -> Callable[[list[str], str], Command]:
+    """Start a sweep with a loss that waits in a process, in tmp_path/sweep; what it prints goes to tmp_path/<name>."""
     plugins = tmp_path / "waiting_plugins"
     plugins.mkdir()
     (plugins / "waiting.py").write_text(WAITING_LOSS)
-    environment = {
-        **os.environ,
-        "NERFRO_PLUGINS": str(plugins),
-        "OMP_NUM_THREADS": "1",
-        # Nobody listens there: the search for LPIPS weights ends at once.
-        "https_proxy": "http://127.0.0.1:9",
-        "TORCH_HOME": str(tmp_path),
-        "RAY_USAGE_STATS_ENABLED": "0",
-    }
-
-    def run(*overrides: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "nerfro.train", "-m", *tiny_run, "evaluation.every=0", *overrides]
-        command.append(f"hydra.sweep.dir={tmp_path / 'sweep'}")
-        log = (tmp_path / "log").open("w")
-        return subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=log, stderr=subprocess.STDOUT, text=True)
-
-    return run
+    options = [*tiny_run, "evaluation.every=0", "+loss.waiting.weight=1", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
+    return lambda overrides, name: Command(
+        "train", ["-m", *options, *overrides], tmp_path / name, NERFRO_PLUGINS=str(plugins)
+    )
 
 
 def composed(*overrides: str) -> DictConfig:
@@ -215,27 +203,25 @@ def test_folders_are_named_by_experiment_scene_seed_and_what_else_is_swept() -> 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_stopped_sweep_goes_on_where_it_was(
-    how: signal.Signals, start: Callable[..., subprocess.Popen[str]], tmp_path: Path
+    how: signal.Signals, start: Callable[[list[str], str], Command], tiny_scene: Path, tmp_path: Path
 ) -> None:
-    overrides = ["seed=0,1,2", "+loss.waiting.weight=1", "trainer.max_steps=20"]
-    overrides += ["checkpoint.every_steps=4", "checkpoint.every_seconds=null"]
-    first = start(*overrides)
-    cells = [tmp_path / "sweep" / f"refractive-{name}-seed{seed}" for seed in range(3) for name in [tiny_name(first)]]
+    overrides = ["seed=0,1,2", "trainer.max_steps=20", "checkpoint.every_steps=4", "checkpoint.every_seconds=null"]
+    first = start(overrides, "first")
+    cells = [tmp_path / "sweep" / f"refractive-{scene_name(str(tiny_scene))}-seed{seed}" for seed in range(3)]
     deadline = time.monotonic() + 300
     while not (state(cells[0]) == "finished" and (cells[1] / "checkpoints" / "last.ckpt").is_file()):
-        assert first.poll() is None, (tmp_path / "log").read_text()
+        assert first.runs, first.errors
         assert time.monotonic() < deadline
         time.sleep(0.05)
-    first.send_signal(how)
+    first.send(how)
     assert first.wait(60) == (-signal.SIGKILL if how is signal.SIGKILL else 130)
     if how is signal.SIGINT:
-        assert "the same command goes on with it" in (tmp_path / "log").read_text()
+        assert "the same command goes on with it" in first.printed + first.errors
     assert not (cells[1] / "metrics.json").exists()
     assert not cells[2].exists()
     before = written(tmp_path / "sweep")
 
-    assert start(*overrides).wait(300) == 0
-    log = (tmp_path / "log").read_text()
+    log = start(overrides, "second").finished()
     assert "3 cells, 2 to run" in log
     assert "3 of 3 cells finished" in log
     assert before.items() <= written(tmp_path / "sweep").items(), "the finished cell was left alone"
@@ -247,27 +233,34 @@ def test_stopped_sweep_goes_on_where_it_was(
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local", "ray"])
 def test_launchers_run_cells_in_other_processes(
-    launcher: str, start: Callable[..., subprocess.Popen[str]], tmp_path: Path
+    launcher: str, sweep: Callable[..., Any], tiny_run: list[str], tmp_path: Path
 ) -> None:
     pytest.importorskip(f"hydra_plugins.hydra_{launcher.split('_')[0]}_launcher")
     overrides = [f"medium.mesh={tmp_path / 'nowhere.ply'},{'${data.root}/mesh.ply'}", "trainer.max_steps=2"]
     overrides.append(f"hydra/launcher={launcher}")
-    assert start(*overrides).wait(600) == 1
-    log = (tmp_path / "log").read_text()
+    command = [sys.executable, "-m", "nerfro.train", "-m", *tiny_run, "evaluation.every=0", *overrides]
+    # Nobody listens at that proxy: the search for LPIPS weights ends at once.
+    unlike = {"OMP_NUM_THREADS": "1", "https_proxy": "http://127.0.0.1:9", "TORCH_HOME": str(tmp_path)}
+    done = subprocess.run(
+        [*command, f"hydra.sweep.dir={tmp_path / 'sweep'}"],
+        cwd=tmp_path,
+        env={**os.environ, **unlike, "RAY_USAGE_STATS_ENABLED": "0"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=600,
+    )
+    log = done.stdout
+    assert done.returncode == 1, log
     assert "2 cells, 2 to run" in log
     assert "1 of 2 cells finished" in log
     assert len([line for line in log.splitlines() if line.startswith("  ") and ": failed: " in line]) == 1
     (run,) = (tmp_path / "sweep").glob("*/run.json")
     assert json.loads(run.read_text())["command"].startswith("python -m nerfro.train data.root=")
 
-    assert start(*overrides).wait(600) == 1
-    assert "2 cells, 0 to run" in (tmp_path / "log").read_text()
-
-
-def tiny_name(process: subprocess.Popen[str]) -> str:
-    """Name of the scene that a sweep's command is about."""
-    (root,) = [str(a).partition("=")[2] for a in process.args if str(a).startswith("data.root=")]  # type: ignore[union-attr]
-    return scene_name(root)
+    again = sweep(*overrides)
+    assert again.code == 1
+    assert "2 cells, 0 to run" in again.out, again.err
 
 
 def state(cell: Path) -> str | None:

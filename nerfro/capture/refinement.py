@@ -14,7 +14,6 @@ Photographs of some views are held back and judge: the surface is the one that e
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -28,11 +27,11 @@ from torch import Tensor, nn
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.cube_map import texel_directions
 from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.capture.record import Record
 from nerfro.capture.silhouette_fit import rim_points
 from nerfro.capture.surroundings import HELD_BACK, Pixels, Room, Surroundings, robust
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import NerfroError
-from nerfro.files.atomic import write_atomically
 from nerfro.files.cache import content_hash
 from nerfro.geometry.interpolation import quadratic_spline
 from nerfro.geometry.mesh import TriangleMesh
@@ -143,9 +142,10 @@ def refine_surface(
         )
     descent = _Descent(mesh, medium, silhouettes, through, surroundings, learn_index)
     at = _Position(descent.state(), [descent.judged(medium)])
-    key = "" if record is None else _key(mesh, medium, through, learn_index)
-    if record is not None:
-        at = _read(record, key, descent) or at
+    kept = Record(record, _key(mesh, medium, through, learn_index))
+    if (found := kept.read()) is not None:
+        at = _Position(**found["at"])
+        descent.go_on(found["descent"])
     while at.stage < len(_STAGES):
         stage = _STAGES[at.stage]
         while at.step < stage.steps:
@@ -162,13 +162,11 @@ def refine_surface(
                     at.best = descent.state()
                 elif at.errors[-1] > (1 + _WORSE) * min(at.errors):
                     break
-                if record is not None:
-                    _write(record, key, descent, at)
+                kept.write({"at": asdict(at), "descent": descent.record()})
         descent.set(at.best)
         at.stage, at.step = at.stage + 1, 0
     progress(1.0)
-    if record is not None:
-        record.unlink(missing_ok=True)
+    kept.remove()
     used = len(descent.clear) / max(1, len(descent.looked_at))
     if min(at.errors) > (1 - _LEAST_GAIN) * at.errors[0]:
         return Refined(mesh, medium, at.steps, at.errors, used)
@@ -199,25 +197,6 @@ def _key(mesh: TriangleMesh, medium: SdfGrid, through: Pixels, learn_index: bool
     arrays = (tensor.detach().numpy() for tensor in tensors)
     settings = (_VERSION, repr(_STAGES), repr(displacement.LEVELS), _PIXELS, learn_index)
     return content_hash(*settings, mesh.vertices, mesh.faces, *arrays)
-
-
-def _write(record: FilePath, key: str, descent: _Descent, at: _Position) -> None:
-    content = io.BytesIO()
-    torch.save({"key": key, "at": asdict(at), "descent": descent.record()}, content)
-    write_atomically(record, content.getvalue())
-
-
-def _read(record: FilePath, key: str, descent: _Descent) -> _Position | None:
-    """Go on from a record; None if there is none, or it is of something else."""
-    try:
-        found = torch.load(record, weights_only=True)
-        known = found["key"]
-    except Exception:  # torch.load raises nearly anything on a damaged file
-        return None
-    if known != key:
-        return None
-    descent.go_on(found["descent"])
-    return _Position(**found["at"])
 
 
 class _Descent:

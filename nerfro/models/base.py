@@ -136,20 +136,34 @@ class NerfModel(LightningModule, ABC):
         }
         return {name: group for name, group in groups.items() if group[0]}
 
-    def encode(self, radiance: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """What rays add up to, as sRGB; not clipped, so that what is too bright keeps its gradient."""
+    def encode(
+        self, radiance: Float[Tensor, "*batch 3"], gains: Float[Tensor, "*batch 3"] | None = None
+    ) -> Float[Tensor, "*batch 3"]:
+        """What rays add up to, times the gains, as sRGB; not clipped, so that what is too bright keeps its gradient."""
+        radiance = radiance if gains is None else radiance * gains
         return radiance if self.colour == "srgb" else to_srgb(radiance)
+
+    def photographed(
+        self, radiance: Float[Tensor, "*batch 3"], gains: Float[Tensor, "*batch 3"] | None = None
+    ) -> Float[Tensor, "*batch 3"]:
+        """What photographs show of radiance times the gains: sRGB in [0, 1]."""
+        return self.encode(radiance, gains).clamp(0, 1)
 
     def linear(self, radiance: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """What fields, boundary and rays have, as linear radiance."""
         return to_linear(radiance.clamp(min=0)) if self.colour == "srgb" else radiance
 
-    def difference(self, radiance: Float[Tensor, "*batch 3"], rgb: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor]:
-        """Prediction and target, both sRGB, for a loss to compare.
+    def difference(
+        self,
+        radiance: Float[Tensor, "*batch 3"],
+        rgb: Float[Tensor, "*batch 3"],
+        gains: Float[Tensor, "*batch 3"] | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Prediction, of radiance times the gains, and target, both sRGB, for a loss to compare.
 
         They are equal where both are brighter than a photograph can tell.
         """
-        prediction = self.encode(radiance)
+        prediction = self.encode(radiance, gains)
         return prediction, rgb if self.colour == "srgb" else clipped_alike(rgb, prediction)
 
     def training_step(self, batch: Batch, batch_index: int) -> dict[str, Tensor]:
@@ -166,7 +180,7 @@ class NerfModel(LightningModule, ABC):
                 value = loss(renderings, batch, self)
                 self.log(f"loss/{name}", value)
                 total = total + weight * value
-        shown = self.encode(batch.of_pixels(renderings[-1].rgb.detach())).clamp(0, 1)
+        shown = self.photographed(batch.of_pixels(renderings[-1].rgb.detach()))
         error = (shown - batch.of_pixels(batch.rgb)).square().mean()
         self.log("train/psnr", -10 * torch.log10(error), prog_bar=True)
         if (unlikely := self.medium.prior()) is not None:
@@ -217,8 +231,8 @@ class NerfModel(LightningModule, ABC):
             return None  # one process looks, the others wait
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         with torch.autocast(self.device.type, enabled=False):  # directions in half precision would miss their pixels
-            rays = data.watched.rays(self.device)
-        held = psnr(self.shown(rays), data.watched.rgb.to(self.device))
+            watched = data.watched_batch()
+        held = psnr(self.photographed(watched.of_pixels(self.radiance(watched.rays))), watched.of_pixels(watched.rgb))
         self.log("val/psnr", held, prog_bar=True, batch_size=1, rank_zero_only=True)
         if view < 0:
             return None  # no picture is due
@@ -227,7 +241,7 @@ class NerfModel(LightningModule, ABC):
         with torch.autocast(self.device.type, enabled=False):
             rays = views.cameras.to(self.device).image_rays(view)
         rendered = self.render(rays)
-        prediction = self.encode(rendered.radiance).clamp(0, 1).reshape(target.shape)
+        prediction = self.photographed(rendered.radiance).reshape(target.shape)
         depth, opacity = (m.reshape(target.shape[:2]) for m in (rendered.depth / views.cameras.far, rendered.opacity))
         return {"prediction": prediction, "target": target, "depth": depth, "opacity": opacity}
 
@@ -240,10 +254,14 @@ class NerfModel(LightningModule, ABC):
         return RenderedRays(*self._in_chunks(self._render_chunk, rays))
 
     @torch.no_grad()
+    def radiance(self, rays: Rays) -> Float[Tensor, "R 3"]:
+        """What rays add up to, without what else `render` tells."""
+        return self._in_chunks(lambda chunk: self._render_traced(chunk, self.trace(chunk)), rays)[0]
+
+    @torch.no_grad()
     def shown(self, rays: Rays, gains: Float[Tensor, "R 3"] | None = None) -> Float[Tensor, "R 3"]:
         """What photographs would show along rays: sRGB in [0, 1], of radiance times the gains."""
-        radiance, _, _ = self._in_chunks(lambda chunk: self._render_traced(chunk, self.trace(chunk)), rays)
-        return self.encode(radiance if gains is None else radiance * gains).clamp(0, 1)
+        return self.photographed(self.radiance(rays), gains)
 
     def _in_chunks(self, render: Callable[[Rays], tuple[Tensor, ...]], rays: Rays) -> list[Tensor]:
         """What is rendered of `chunk_size` rays at a time, as in evaluation, put together."""

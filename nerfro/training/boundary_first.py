@@ -76,9 +76,7 @@ class BoundaryFirst(Callback):
             torch.manual_seed(step_seed(model.seed, -1 - step))
             group["lr"] = group["initial_lr"] * first * (last / first) ** (step / self._num_steps)
             radiance = model.boundary(Exits.unbent(rays))
-            gains = camera.gains(view)
-            radiance = radiance if gains is None else radiance * gains
-            loss = torch.nn.functional.mse_loss(*model.difference(radiance, rgb))
+            loss = torch.nn.functional.mse_loss(*model.difference(radiance, rgb, camera.gains(view)))
             # Not by backward(): gradients of several processes would be waited for.
             gradients = torch.autograd.grad(loss, learning, allow_unused=True)
             for parameter, gradient in zip(learning, gradients, strict=True):
@@ -99,8 +97,7 @@ def _turn(
     pixels = pixels[misses(box, camera(pixel_rays(batches.cameras, pixels), view))]
 
     def shown(rays: Rays, view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
-        radiance, gains = model.boundary(Exits.unbent(rays)), camera.gains(view)
-        return model.encode(radiance if gains is None else radiance * gains).clamp(0, 1)
+        return model.photographed(model.boundary(Exits.unbent(rays)), camera.gains(view))
 
     how = replace(_STEP, reach=0.5 * _STEP.reach) if finer else _STEP
     improve(camera, batches.cameras, pixels, batches.photographed, shown, how)

@@ -53,6 +53,12 @@ class RayDataModule(LightningDataModule):
     def val_dataloader(self) -> RotatingView | list[int]:
         return [] if self.validation is None else RotatingView(self)
 
+    def watched_batch(self) -> Batch:
+        """Pixels of validation views, with the rays that training gives such pixels as the medium is now."""
+        assert self.trainer is not None
+        assert self.watched is not None
+        return self.watched.batch(cast(NerfModel, self.trainer.lightning_module), *self.batches.dividing)
+
     def transfer_batch_to_device(self, batch: int, device: torch.device, dataloader_idx: int) -> Batch | int:
         assert self.trainer is not None
         if not self.trainer.training:

@@ -196,6 +196,11 @@ class RayBatches:
         return self._to_device(within + size * np.arange(len(cameras))[:, None])
 
     @property
+    def dividing(self) -> tuple[int, float, float]:
+        """`side`, `divergence` and `contrast` of `traced`; infinite contrast where it divides none."""
+        return self._side, self._divergence, self._contrast
+
+    @property
     def cameras(self) -> Cameras:
         """Of all views, as the data give them."""
         return self._cameras

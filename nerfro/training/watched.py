@@ -14,11 +14,11 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 from tqdm import tqdm
 
+from nerfro import pixel_parts
 from nerfro.cameras import Cameras
 from nerfro.data.base import Views
 from nerfro.models.base import NerfModel
-from nerfro.pixel_parts import pixel_rays
-from nerfro.rays import Rays
+from nerfro.pixel_parts import part_rays, pixel_rays, rays_beside
 from nerfro.types import Batch
 
 # Pixels that are looked at, of at most so many views: the same ones each time, or their scores could not be compared.
@@ -35,13 +35,14 @@ class WatchedPixels:
     cameras: Cameras
     index: Int[Tensor, "R"]
     rgb: Float[Tensor, "R 3"]  # sRGB in [0, 1]
+    contrast: Float[Tensor, "R"]  # with the pixels around; see `pixel_parts.contrast`
 
     @classmethod
     def of(cls, views: Views, seed: int = 0) -> WatchedPixels:
         """Random pixels, equally many of each view, of those that may be trained on where masks say so."""
         generator = np.random.default_rng([seed, 0])
         chosen = np.unique(np.linspace(0, len(views) - 1, _MOST_VIEWS).round().astype(int)).tolist()
-        size, indices, colours = views.cameras.height * views.cameras.width, [], []
+        size, indices, colours, contrasts = views.cameras.height * views.cameras.width, [], [], []
         for view in chosen:
             allowed = np.arange(size)
             if views.usable is not None:
@@ -49,12 +50,28 @@ class WatchedPixels:
                 allowed = np.flatnonzero(usable) if usable.any() else allowed
             drawn = torch.from_numpy(generator.choice(allowed, min(_NUM_PIXELS // len(chosen), len(allowed)), False))
             indices.append(view * size + drawn)
-            colours.append(views.images[view].reshape(-1, 3)[drawn])
-        return cls(views.cameras, torch.cat(indices), torch.cat(colours))
+            picture = views.images[view].reshape(-1, 3)
+            colours.append(picture[drawn])
+            contrasts.append(pixel_parts.contrast(picture.__getitem__, views.cameras, drawn))
+        return cls(views.cameras, *map(torch.cat, (indices, colours, contrasts)))
 
-    def rays(self, device: torch.device) -> Rays:
-        """One ray through the middle of each pixel."""
-        return pixel_rays(self.cameras.to(device), self.index.to(device))
+    def batch(self, model: NerfModel, side: int, divergence: float, contrast: float) -> Batch:
+        """The pixels with the rays that training gives such pixels; see `RayBatches.traced` for what divides them."""
+        cameras, pixels = self.cameras.to(model.device), self.index.to(model.device)
+        rays, rgb = pixel_rays(cameras, pixels), self.rgb.to(model.device)
+        view = pixels // (cameras.height * cameras.width)
+        if side == 1:
+            return Batch(rays, view, rgb, cameras, index=pixels)
+        path, beside = model.path_sampler(rays, model.medium), model.exit_directions(rays_beside(cameras, pixels))
+        apart = pixel_parts.divergence(cameras, pixels, path.first_of_ray(path.exit_directions), beside)
+        fine = path.first_of_ray(path.refracted) & (self.contrast.to(model.device) >= contrast)
+        divided = fine | (apart >= divergence)
+        whole, divided = (~divided).nonzero()[:, 0], divided.nonzero()[:, 0]
+        rows = torch.cat([whole, divided.repeat_interleave(side**2)])
+        rays = rays[whole].followed_by(part_rays(cameras, pixels[divided], side))
+        return Batch(
+            rays, view[rows], rgb[rows], cameras, num_whole=len(whole), rays_per_pixel=side**2, index=pixels[rows]
+        )
 
 
 class FallingBehind(Callback):
@@ -66,8 +83,7 @@ class FallingBehind(Callback):
 
     Attributes:
         comparable: whether the difference of both tells anything. Where cameras or exposures of training views learn,
-            those of other views do not; and where rays bend, one ray a pixel is worse than the pixels that are divided
-            in training.
+            those of other views do not; and where rays bend, nobody has measured yet by how much healthy runs differ.
         told: whether it has said so.
     """
 

@@ -90,7 +90,7 @@ class Scene:
 
     def _render_view(self, cameras: Cameras, view: int, supersampling: Supersampling) -> tuple[Tensor, ...]:
         found = render_view(self.model, cameras.to(self.model.device), view, supersampling)
-        rgb = self.model.encode(found.radiance).clamp(0, 1)
+        rgb = self.model.photographed(found.radiance)
         radiance = self.model.linear(found.radiance)
         values = rgb, found.depth, found.opacity, found.normals, found.exit_directions, radiance
         return tuple(value.float().cpu().view(cameras.height, cameras.width, *value.shape[1:]) for value in values)

@@ -18,7 +18,7 @@ from hypothesis import settings
 
 from nerfro.evaluation.request import REQUEST_FILE
 from nerfro.training.run_folder import CONFIG_FILE, LAST_CHECKPOINT, load_checkpoint
-from tests.fuzz import kills
+from tests import forked
 from tests.fuzz.world import World
 
 LONG = settings.get_current_profile_name() == "long"
@@ -27,9 +27,7 @@ NUM_KILLS = 50 if LONG else 2  # of each command
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory, tiny_scene: Path, tiny_default_run: list[str]) -> World:
-    world = World(tmp_path_factory.mktemp("world"), tiny_scene, tiny_default_run)
-    kills.preload()
-    return world
+    return World(tmp_path_factory.mktemp("world"), tiny_scene, tiny_default_run)
 
 
 def tensors(node: Any) -> list[torch.Tensor]:
@@ -75,8 +73,8 @@ def test_killed_training_that_goes_on_ends_with_the_same_weights(world: World, t
     options = [*world.train_options(world.root / "data"), "trainer.max_time=null", f"trainer.max_steps={num_steps}"]
     options += ["checkpoint={every_steps: 1, every_seconds: null}", "evaluation.supersample=8"]
     log, right = tmp_path / "log", tmp_path / "right" / "run"
-    kills.run("train", [*options, f"hydra.run.dir={tmp_path / 'compiles' / 'run'}"], log)
-    kills.run("train", [*options, f"hydra.run.dir={right}"], log)
+    forked.run("train", [*options, f"hydra.run.dir={tmp_path / 'compiles' / 'run'}"], log)
+    forked.run("train", [*options, f"hydra.run.dir={right}"], log)
     seconds = written(right, "metrics.json") - written(right, CONFIG_FILE)
     expected, _ = load_checkpoint(right / LAST_CHECKPOINT)
     moments: Counter[str] = Counter()
@@ -84,10 +82,10 @@ def test_killed_training_that_goes_on_ends_with_the_same_weights(world: World, t
         run = tmp_path / str(number) / "run"
         # One in ten is killed as it starts, the others once they have a checkpoint.
         aim, within = (CONFIG_FILE, 0.2) if number % 10 == 9 else (LAST_CHECKPOINT, 0.9 * seconds)
-        ran = kills.kill("train", [*options, f"hydra.run.dir={run}"], log, run / aim, draw.uniform(0, within))
+        ran = forked.kill("train", [*options, f"hydra.run.dir={run}"], log, run / aim, draw.uniform(0, within))
         moments[moment_of(run, num_steps) if ran else "over"] += 1
         going_on = ["ckpt_path=last"] if (run / CONFIG_FILE).is_file() else []
-        kills.run("train", [*options, *going_on, f"hydra.run.dir={run}"], log)
+        forked.run("train", [*options, *going_on, f"hydra.run.dir={run}"], log)
         checkpoint, _ = load_checkpoint(run / LAST_CHECKPOINT)
         for part in ("state_dict", "optimizer_states"):
             pairs = zip(tensors(expected[part]), tensors(checkpoint[part]), strict=True)
@@ -102,17 +100,17 @@ def test_killed_evaluation_that_is_repeated_has_the_same_scores(world: World, tm
     draw, log = random.Random(1), tmp_path / "log"
     options = [f"checkpoint={world.root / 'run' / LAST_CHECKPOINT}", "device=cpu", "supersample=16"]
     for out in ("compiles", "right"):
-        kills.run("evaluate", [*options, f"out={tmp_path / out}"], log)
+        forked.run("evaluate", [*options, f"out={tmp_path / out}"], log)
     right = tmp_path / "right"
     seconds = written(right, "metrics.json") - written(right, REQUEST_FILE)
     moments: Counter[str] = Counter()
     for number in range(NUM_KILLS):
         folder = tmp_path / str(number)
         arguments = [*options, f"out={folder}"]
-        ran = kills.kill("evaluate", arguments, log, folder / REQUEST_FILE, draw.uniform(0, 0.95 * seconds))
+        ran = forked.kill("evaluate", arguments, log, folder / REQUEST_FILE, draw.uniform(0, 0.95 * seconds))
         finished = (folder / "metrics.json").is_file()
         moments["over" if not ran else "ending" if finished else "evaluating"] += 1
-        kills.run("evaluate", [*arguments, *(["overwrite=true"] if finished else [])], log)
+        forked.run("evaluate", [*arguments, *(["overwrite=true"] if finished else [])], log)
         assert pictures(folder) == pictures(right)
         assert names(folder) == names(right)
         assert (folder / "metrics.json").read_text() == (right / "metrics.json").read_text()

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,8 +18,12 @@ from PIL import Image
 
 from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
+from nerfro.media.shapes import Ball
+from nerfro.samplers.snell import Snell
 from nerfro.training.data_module import NO_PICTURE, RayDataModule, RotatingView, looks_every
+from nerfro.training.ray_batches import RayBatches
 from nerfro.training.watched import FallingBehind, WatchedPixels
+from nerfro.types import Batch
 
 LINE = "views that are not trained on fall behind"
 
@@ -98,13 +104,16 @@ def test_where_cameras_learn_only_a_loss_is_told() -> None:
     assert judged([(22, 23), (20.9, 24), (20.8, 25)], comparable=False) == [2]
 
 
-@pytest.mark.parametrize(("camera", "comparable"), [("false", True), ("true", False)])
+@pytest.mark.parametrize(
+    ("option", "comparable"),
+    [("camera.exposure=false", True), ("camera.exposure=true", False)],
+)
 def test_exposures_that_learn_are_those_of_training_views_alone(
-    learn: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, camera: str, comparable: bool
+    learn: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, option: str, comparable: bool
 ) -> None:
     begun: list[FallingBehind] = []
     monkeypatch.setattr(FallingBehind, "on_train_end", lambda self, *given: begun.append(self))
-    finished = learn(f"camera.exposure={camera}", "trainer.max_steps=1")
+    finished = learn(option, "trainer.max_steps=1")
     assert finished.code == 0, finished.err
     assert [behind.comparable for behind in begun] == [comparable]
 
@@ -134,7 +143,45 @@ def test_the_same_usable_pixels_are_watched_each_time(tiny_scene: Path) -> None:
     images = torch.stack(list(views.images)).view(-1, 3)
     assert torch.equal(one.rgb, images[one.index])
     rays = views.cameras.image_rays(1)
-    assert torch.allclose(one.rays(torch.device("cpu")).directions[-64:], rays.directions[one.index[-64:] - 256])
+    batch = one.batch(bending(), 1, 8.0, math.inf)
+    assert torch.allclose(batch.rays.directions[-64:], rays.directions[one.index[-64:] - 256])
+    assert torch.equal(batch.of_pixels(batch.rgb), one.rgb)
+
+
+def bending() -> Any:
+    """What is asked of a model that bends rays by a ball."""
+    ball, sampler = Ball(0.6, 1.5), Snell()
+    return SimpleNamespace(
+        device=torch.device("cpu"),
+        medium=ball,
+        path_sampler=sampler,
+        exit_directions=lambda rays: sampler.main(rays, ball).exit_directions,
+    )
+
+
+@pytest.mark.parametrize("contrast", [None, 0.015])
+def test_watched_pixels_have_the_rays_that_training_gives_them(contrast: float | None, tiny_scene: Path) -> None:
+    views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val")
+    model = bending()
+    batches = RayBatches(views, 256, "single_image")
+    batches = batches.traced(lambda rays, view: model.path_sampler(rays, model.medium), 2, 8.0, contrast)
+    trained, watched = batches.batch(0), WatchedPixels.of(views)
+    batch = watched.batch(model, *batches.dividing)
+    assert torch.allclose(batch.of_pixels(batch.rgb).sort(0).values, watched.rgb.sort(0).values), "each pixel once"
+    one, other = rays_of_pixels(trained), rays_of_pixels(batch)
+    same = [pixel for pixel in one if torch.equal(one[pixel], other[pixel])]
+    assert sum(len(other[pixel]) == 4 for pixel in same) > (8 if contrast is None else 16)
+    assert sum(len(other[pixel]) == 1 for pixel in same) > 100
+    # Training divides up to 1/32 of its pixels more for each reason, to have few sizes.
+    others = one.keys() - set(same)
+    assert len(others) <= 16
+    assert all(len(one[pixel]) == 4 and len(other[pixel]) == 1 for pixel in others)
+
+
+def rays_of_pixels(batch: Batch) -> dict[int, torch.Tensor]:
+    """Directions of the rays of each pixel of a batch."""
+    assert batch.index is not None
+    return {pixel: batch.rays.directions[batch.index == pixel] for pixel in batch.index.tolist()}
 
 
 def test_many_views_cost_no_more_than_few(tiny_scene: Path) -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import re
 import signal
-import subprocess
-import sys
 import time
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
+
+from tests.forked import Command
 
 
 def test_a_run_is_served_with_its_curve(train_here: Callable, tiny_run: list[str], tmp_path: Path) -> None:
@@ -18,29 +17,26 @@ def test_a_run_is_served_with_its_curve(train_here: Callable, tiny_run: list[str
     options += ["logger=tensorboard", "trainer.log_every_n_steps=1", "trainer.max_steps=3"]
     done = train_here(*options, f"hydra.run.dir={tmp_path / 'run'}")
     assert done.code == 0, done.err
-    command = [sys.executable, "-m", "nerfro.view", f"checkpoint={tmp_path / 'run'}", "port=0", "open=false",
-               "resolution=8", "device=cpu"]  # fmt: skip
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as served:
-        try:
-            assert served.stdout is not None
-            found = re.search(r"on (http://localhost:\d+); Ctrl-C ends it", served.stdout.readline())
-            assert found
-            assert "<canvas" in text(found[1])
-            logged = losses(found[1])
-            assert [step for step, _ in logged] == [0, 1, 2]
-            assert all(loss > 0 for _, loss in logged)
-            # A training elsewhere goes on.
-            file = tmp_path / "run" / "csv" / "metrics.csv"
-            header, *rows = file.read_text().splitlines()
-            row = dict(zip(header.split(","), rows[-1].split(","), strict=True)) | {"step": "3", "loss/total": "0.125"}
-            file.write_text("\n".join([header, *rows, ",".join(row.values()), ""]))
-            deadline = time.monotonic() + 30
-            while losses(found[1])[-1] != [3, 0.125]:
-                assert time.monotonic() < deadline
-                time.sleep(0.5)
-        finally:
-            served.send_signal(signal.SIGINT)
-    assert served.returncode == 130
+    options = [f"checkpoint={tmp_path / 'run'}", "port=0", "open=false", "resolution=8", "device=cpu"]
+    served = Command("view", options, tmp_path / "log")
+    try:
+        address = served.until(r"on (http://localhost:\d+); Ctrl-C ends it")[1]
+        assert "<canvas" in text(address)
+        logged = losses(address)
+        assert [step for step, _ in logged] == [0, 1, 2]
+        assert all(loss > 0 for _, loss in logged)
+        # A training elsewhere goes on.
+        file = tmp_path / "run" / "csv" / "metrics.csv"
+        header, *rows = file.read_text().splitlines()
+        row = dict(zip(header.split(","), rows[-1].split(","), strict=True)) | {"step": "3", "loss/total": "0.125"}
+        file.write_text("\n".join([header, *rows, ",".join(row.values()), ""]))
+        deadline = time.monotonic() + 30
+        while losses(address)[-1] != [3, 0.125]:
+            assert time.monotonic() < deadline
+            time.sleep(0.5)
+    finally:
+        served.send(signal.SIGINT)
+    assert served.wait() == 130, served.errors
 
 
 def text(address: str) -> str:
