@@ -83,7 +83,7 @@ class FallingBehind(Callback):
 
     Attributes:
         comparable: whether the difference of both tells anything. Where cameras or exposures of training views learn,
-            those of other views do not; and where rays bend, nobody has measured yet by how much healthy runs differ.
+            those of other views do not.
         told: whether it has said so.
     """
 
@@ -95,8 +95,7 @@ class FallingBehind(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, NerfModel)
-        learns = pl_module.camera.moves or list(pl_module.camera.parameters())
-        self.comparable = not (learns or pl_module.path_sampler.needs_medium)
+        self.comparable = not (pl_module.camera.moves or list(pl_module.camera.parameters()))
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Batch, batch_idx: int

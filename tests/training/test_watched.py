@@ -106,7 +106,7 @@ def test_where_cameras_learn_only_a_loss_is_told() -> None:
 
 @pytest.mark.parametrize(
     ("option", "comparable"),
-    [("camera.exposure=false", True), ("camera.exposure=true", False)],
+    [("camera.exposure=false", True), ("camera.exposure=true", False), ("sampler/path=snell", True)],
 )
 def test_exposures_that_learn_are_those_of_training_views_alone(
     learn: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, option: str, comparable: bool
