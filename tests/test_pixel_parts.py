@@ -151,6 +151,8 @@ def test_pixels_of_the_object_are_divided_for_their_contrast(views: Views, rank:
     assert (edge & ~refracted)[batch.index[:n]].any(), "the sky beside the object is"
     assert (angles[parted] >= angles[divided].max()).all()
     torch.testing.assert_close(batch.rays.directions[n:end], part_rays(views.cameras, divided, 2).directions)
+    before = batches.traced(through_cube, 2, 8.0, 0.1, contrast_start=1).batch(0)
+    assert before.num_together == before.num_whole == n + len(divided)
 
 
 @pytest.mark.parametrize("jitter", [False, True])
