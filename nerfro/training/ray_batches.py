@@ -228,8 +228,10 @@ class RayBatches:
         fine = torch.zeros_like(parted)
         if least_contrast < math.inf:
             visible = path.first_of_ray(path.refracted) & ~parted
-            contrasts = contrast(self.photographed, self._cameras, pixels)
-            fine = self._largest(torch.where(visible, contrasts, -1), least_contrast) & visible
+            of_visible = contrast(self.photographed, self._cameras, pixels[visible])
+            contrasts = of_visible.new_full(pixels.shape, -1)
+            contrasts[visible] = of_visible
+            fine = self._largest(contrasts, least_contrast) & visible
         divided = parted | fine
 
         # Each pixel's first row in the whole batch.
