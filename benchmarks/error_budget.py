@@ -41,7 +41,7 @@ def main() -> None:
     errors, classes = [], []
     for view in range(min(len(views), arguments.views or len(views))):
         rendered = render_view(model, views.cameras, view, supersampling)
-        prediction = model.encode(rendered.radiance).clamp(0, 1)
+        prediction = model.photographed(rendered.radiance)
         errors.append((prediction - views.images[view].reshape(-1, 3)).square().mean(-1))
         classes.append(classify(model, views.cameras, view, rendered.opacity, arguments.edge))
     print(f"{arguments.run}, {len(errors)} test views, {supersampling.side}^2 rays in divided pixels\n")

@@ -196,7 +196,7 @@ def rendered(model: NerfModel, cameras: Cameras, view: int, supersampling: Super
     rays = cameras.image_rays(view)
     central = model.render(replace(rays, radii=torch.zeros_like(rays.radii)))
     beside = torch.cat([model.exit_directions(rays_beside(cameras, some)) for some in pixels.split(model.chunk_size)])
-    shown, radiance = model.encode(central.radiance).clamp(0, 1), central.radiance.clone()
+    shown, radiance = model.photographed(central.radiance), central.radiance.clone()
     divided = divergence(cameras, pixels, central.exit_directions, beside) >= supersampling.divergence
     divided |= contrast(lambda some: shown[some - pixels[0]], cameras, pixels) >= (supersampling.contrast or math.inf)
     side = supersampling.side
@@ -205,7 +205,7 @@ def rendered(model: NerfModel, cameras: Cameras, view: int, supersampling: Super
         exits = model.exit_directions(parts).view(-1, side, side, 3)
         widths = 0.5 * torch.maximum(*(spacing(exits, axis) for axis in (1, 2))).flatten()
         radiance[some] = model.render(replace(parts, radii=widths)).radiance.view(-1, side**2, 3).mean(1)
-    return model.encode(radiance).clamp(0, 1), 2 + side**2 * float(divided.float().mean())
+    return model.photographed(radiance), 2 + side**2 * float(divided.float().mean())
 
 
 def spacing(directions: Float[Tensor, "*batch 3"], axis: int) -> Float[Tensor, "*batch"]:

@@ -43,7 +43,7 @@ def render_view(model: NerfModel, cameras: Cameras, view: int, supersampling: Su
     angles = divergence(cameras, pixels, rendered.exit_directions, exits)
     divided = angles >= supersampling.divergence
     if supersampling.contrast is not None:
-        shown = model.encode(rendered.radiance).clamp(0, 1)
+        shown = model.photographed(rendered.radiance)
         divided |= contrast(lambda some: shown[some - pixels[0]], cameras, pixels) >= supersampling.contrast
     chosen = divided.nonzero()[:, 0]
     if len(chosen) == 0:

@@ -38,7 +38,7 @@ def score_views(
     with progress:
         for view in range(len(views)):
             rendered = render_view(model, cameras, view, supersampling)
-            rgb = model.encode(rendered.radiance).clamp(0, 1).reshape(height, width, 3).cpu()
+            rgb = model.photographed(rendered.radiance).reshape(height, width, 3).cpu()
             save_png(folder / pictures / f"{metrics.prefix}_{view:03d}.png", rgb)
             coverage = None if views.masks is None else views.masks[view]
             metrics.update(rgb, views.images[view], view, coverage)

@@ -69,7 +69,7 @@ def _score_right(
         target = views.images[view]
         if model.camera.exposure is not None:
             gains[view] = fit_gain(model, radiance[:, left].flatten(0, 1), target[:, left].flatten(0, 1))
-        rgb = model.encode(gains[view] * radiance).clamp(0, 1)
+        rgb = model.photographed(gains[view] * radiance)
         save_png(folder / f"images_{name}" / f"{metrics.prefix}_{view:03d}.png", rgb)
         coverage = None if views.masks is None else views.masks[view][:, right].contiguous()
         metrics.update(rgb[:, right].contiguous(), target[:, right].contiguous(), view, coverage)
