@@ -53,8 +53,9 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     model = build_model(config, training)
     require_same_run(folder, checkpoint, config)
     throughput, interruption = Throughput(), StopOnSignal()
-    before, between = BoundaryFirst(batches, config.optimizer.boundary_first), CameraSteps(batches)
-    trainer = make_trainer(config, folder, [throughput, interruption, before, between, Viewer(config, source, test)])
+    # Cameras turn by the sky before it is learned.
+    cameras, boundary = CameraSteps(batches), BoundaryFirst(batches, config.optimizer.boundary_first)
+    trainer = make_trainer(config, folder, [throughput, interruption, cameras, boundary, Viewer(config, source, test)])
     batches = traced(batches.share(trainer.global_rank, trainer.world_size), model, config)
     few = batches.smaller(4096)
     first = few.batch(0)

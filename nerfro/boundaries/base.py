@@ -13,9 +13,6 @@ from nerfro.types import Exits
 class Boundary(nn.Module, ABC):
     """Radiance that arrives from beyond the volume, C'(d) of the paper's Eqn. volrendBd."""
 
-    # Share of its levels of detail, the coarse ones, that are shown while it trains, where it has some.
-    detail = 1.0
-
     @abstractmethod
     def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
         """Linear radiance, not negative and unbounded above; a sky needs the exits' directions alone."""

@@ -42,10 +42,6 @@ class CubeLevels:
         """Of places of the faces grown by one texel on every side, see `padded_texels`."""
         return sum(6 * (n + 2) ** 2 for n in self.resolutions)
 
-    def coarsest(self, share: float) -> CubeLevels:
-        """A share of the levels, one at least, without the finer ones."""
-        return CubeLevels(self.resolutions[: max(1, math.ceil(share * len(self)))])
-
     def __len__(self) -> int:
         return len(self.resolutions)
 

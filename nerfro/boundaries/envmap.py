@@ -64,13 +64,7 @@ class EnvironmentMap(Boundary):
             from nerfro.boundaries.cube_map_cpu import lookup  # compiled code, so only where it is used
         else:
             lookup = cube_map.lookup
-        levels = self.levels
-        texels: Tensor = self.texels
-        padded: Tensor = self.padded
-        if self.training and self.detail < 1:
-            levels = levels.coarsest(self.detail)
-            texels, padded = texels[: levels.num_texels], padded[: levels.num_padded]
-        raw = lookup(face, coordinates, texels, padded, levels)
+        raw = lookup(face, coordinates, self.texels, self.padded, self.levels)
         return _radiance(raw).view(exits.directions.shape)
 
     @torch.no_grad()

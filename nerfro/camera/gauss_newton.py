@@ -11,10 +11,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize, one_hot
 
+from nerfro.camera.panorama import Panorama
 from nerfro.camera.pixel_units import object_distances
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
@@ -42,7 +43,7 @@ class Step:
     reach: float  # pixels over which differences are taken
     scale: float  # of the robust error, sRGB: pixels that are off by more count less
     longest: float  # pixels that a camera is moved at most, and the lens is changed
-    centres: bool = True  # whether cameras are shifted, too; not where all that is looked at is infinitely far
+    share: float = 1.0  # of the step that is taken
     checked: bool = True  # whether a camera stays where the error of the same pixels would not fall
 
 
@@ -53,6 +54,7 @@ def improve(
     photographed: Photographed,
     shown: Shown,
     how: Step,
+    panorama: Panorama | None = None,
 ) -> None:
     """Move each camera, and the lens that all share, by a step towards its photograph.
 
@@ -63,25 +65,34 @@ def improve(
         photographed: their colours in the photographs.
         shown: colours of the scene as it is now.
         how: the step.
+        panorama: what the sky tells of them, if it is known.
     """
     view = pixels // (cameras.height * cameras.width)
     given, target = pixel_rays(cameras, pixels), photographed(pixels)
     rays = camera(given, view)
     across = how.reach / cameras.fx[view]
-    distances = object_distances(cameras).to(across)[view] if how.centres else None
+    distances = object_distances(cameras).to(across)[view]
     seen, by_origin, by_direction = _differences(shown, rays, view, across, distances)
     slopes = camera.slopes(given, view, by_origin, by_direction)
     error = seen - target
     # Geman and McClure's weights; and a pixel's derivative holds no farther than its colour can change.
     weights = 1 / (1 + (error / how.scale).square().sum(-1)).square()
     weights = weights / (1 + (slopes[..., :6] / _STEEP).square().sum((1, 2)))
-    motion, lens = _solved(slopes.double(), error.double(), weights.double(), view, len(cameras))
+    matrix, vector = _equations(slopes.double(), error.double(), weights.double(), view, len(cameras))
+    if panorama is not None:
+        # Both in units of their own errors' variance.
+        variance = (weights[:, None] * error.square()).sum() / (3 * weights.sum()).clamp(min=_TINY)
+        information, place = (variance * panorama.information).to(matrix), _told_by_sky(len(cameras), vector)
+        matrix[place[:, None], place] += information
+        vector[place] += information @ (camera.numbers() - panorama.numbers).to(vector)
+    step = -torch.linalg.solve(matrix, vector)
+    motion, lens = step[: 6 * len(cameras)].view(-1, 6), step[6 * len(cameras) :]
     motion, lens = (
         numbers * (how.longest / numbers.norm(dim=-1, keepdim=True).clamp(min=_TINY)).clamp(max=1)
         for numbers in (motion, lens)
     )
     before = camera.position()
-    camera.move(motion.to(across), lens.to(across))
+    camera.move(how.share * motion.to(across), how.share * lens.to(across))
     if not how.checked:
         return
 
@@ -97,12 +108,17 @@ def _robust(error: Float[Tensor, "R 3"], scale: float, view: Int[Tensor, "R"], n
 
 
 def telling(
-    candidates: Int[Tensor, "V M"], num_pixels: int, photographed: Photographed, cameras: Cameras
+    candidates: Int[Tensor, "V M"],
+    num_pixels: int,
+    photographed: Photographed,
+    cameras: Cameras,
+    useless: Bool[Tensor, "V M"] | None = None,
 ) -> Int[Tensor, "R"]:
-    """Pixels of each view, of those that are offered: the first that have contrast, else the first."""
+    """Pixels of each view, of those that are offered and not useless: the first that have contrast, else the first."""
     flat = (contrast(photographed, cameras, candidates.flatten()) < _LEAST_CONTRAST).view(candidates.shape)
-    order = flat.int().argsort(dim=1, stable=True)[:, :num_pixels]
-    return candidates.gather(1, order).flatten()
+    useless = torch.zeros_like(flat) if useless is None else useless
+    order = (flat + 2 * useless).argsort(dim=1, stable=True)[:, :num_pixels]
+    return candidates.gather(1, order)[~useless.gather(1, order)]
 
 
 def _differences(
@@ -110,13 +126,12 @@ def _differences(
     rays: Rays,
     view: Int[Tensor, "R"],
     across: Float[Tensor, "R"],
-    distances: Float[Tensor, "R"] | None,
+    distances: Float[Tensor, "R"],
 ) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3 3"], Float[Tensor, "R 3 3"]]:
     """Colours, and their derivatives by origins and directions of rays, last axis x, y, z.
 
     One-sided differences, for every second ray to the other side, so that curvature cancels in sums over pixels. Along
-    a ray nothing changes, so each has four. Without distances, at which origins are shifted by as many pixels as
-    directions are turned, nothing changes with origins.
+    a ray nothing changes, so each has four. Origins are shifted as far as directions turn, at the distances.
     """
     d = rays.directions
     seen, side = shown(rays, view), 1.0 - 2.0 * (torch.arange(len(d), device=d.device) % 2).to(d)
@@ -126,34 +141,36 @@ def _differences(
         step = (side * across)[:, None]
         turned = shown(replace(rays, directions=normalize(d + step * axis, dim=-1)), view)
         by_direction += ((turned - seen) / step)[:, :, None] * axis[:, None]
-        if distances is not None:
-            step = step * distances[:, None]
-            shifted = shown(replace(rays, origins=rays.origins + step * axis), view)
-            by_origin += ((shifted - seen) / step)[:, :, None] * axis[:, None]
+        step = step * distances[:, None]
+        shifted = shown(replace(rays, origins=rays.origins + step * axis), view)
+        by_origin += ((shifted - seen) / step)[:, :, None] * axis[:, None]
     return seen, by_origin, by_direction
 
 
-def _solved(
+def _equations(
     slopes: Float[Tensor, "R 3 N"],
     error: Float[Tensor, "R 3"],
     weights: Float[Tensor, "R"],
     view: Int[Tensor, "R"],
     num_views: int,
-) -> tuple[Float[Tensor, "V 6"], Float[Tensor, "L"]]:
-    """Weighted least squares of all cameras' six numbers, and of those that all share (by Schur's complement)."""
+) -> tuple[Float[Tensor, "M M"], Float[Tensor, "M"]]:
+    """Normal equations of all cameras' six numbers, and of those that all share behind them; damped."""
     num = slopes.shape[-1]
     squares = torch.einsum("r,rci,rcj->rij", weights, slopes, slopes)
     products = torch.einsum("r,rci,rc->ri", weights, slopes, error)
-    matrix = slopes.new_zeros(num_views, num, num).index_add(0, view, squares)
-    vector = slopes.new_zeros(num_views, num).index_add(0, view, products)
-    own = matrix[:, :6, :6]
+    each = slopes.new_zeros(num_views, num, num).index_add(0, view, squares)
+    gradient = slopes.new_zeros(num_views, num).index_add(0, view, products)
+    own, shared = each[:, :6, :6], each[:, 6:, 6:].sum(0)
     damping = _DAMPING * own.diagonal(dim1=1, dim2=2).mean(-1) + _TINY
     own = own + damping[:, None, None] * torch.eye(6).to(own)
-    together, shared = matrix[:, :6, 6:], matrix[:, 6:, 6:].sum(0)
-    inverse = torch.linalg.solve(own, torch.cat([together, vector[:, :6, None]], -1))
-    lens = slopes.new_zeros(num - 6)
-    if num > 6:
-        shared = shared + (_DAMPING * shared.diagonal().mean() + _TINY) * torch.eye(num - 6).to(shared)
-        left = shared - (together.mT @ inverse[..., :-1]).sum(0)
-        lens = -torch.linalg.solve(left, vector[:, 6:].sum(0) - (together.mT @ inverse[..., -1:]).sum(0)[:, 0])
-    return -inverse[..., -1] - inverse[..., :-1] @ lens, lens
+    shared = shared + (_DAMPING * shared.trace() / max(len(shared), 1) + _TINY) * torch.eye(num - 6).to(shared)
+    together = each[:, :6, 6:].flatten(0, 1)
+    matrix = torch.cat([torch.block_diag(*own), together], 1)
+    matrix = torch.cat([matrix, torch.cat([together.mT, shared], 1)])
+    return matrix, torch.cat([gradient[:, :6].flatten(), gradient[:, 6:].sum(0)])
+
+
+def _told_by_sky(num_views: int, vector: Float[Tensor, "M"]) -> Int[Tensor, "N"]:
+    """Where a panorama's numbers stand among all: three turns of each camera, and the lens."""
+    numbers = torch.arange(len(vector), device=vector.device)
+    return torch.cat([numbers[: 6 * num_views].view(-1, 6)[:, :3].flatten(), numbers[6 * num_views :]])

@@ -105,7 +105,7 @@ class RefinedCamera(Camera):
     def __init__(
         self,
         start: Natural = 50,
-        every: Count = 100,
+        every: Count = 50,
         num_pixels: Count = 300,
         lens: bool = False,
         exposure: bool = False,
@@ -159,6 +159,11 @@ class RefinedCamera(Camera):
             self.lens.copy_(kept)
             of_lens.append((by_direction * (ends[0] - ends[1])[:, None]).sum(-1))
         return torch.cat([found, torch.stack(of_lens, -1)], -1)
+
+    def numbers(self) -> Float[Tensor, "N"]:
+        """Turns of all cameras about their own axes, then the lens where it is refined; pixels."""
+        turns = self.motions.motion[:, :3].flatten()
+        return turns if self.lens is None else torch.cat([turns, self.lens])
 
     def position(self) -> tuple[Tensor, Tensor | None]:
         """Where cameras and lens are, for `move_back`."""

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from nerfro.camera.gauss_newton import Step, improve, telling
-from nerfro.camera.refined import RefinedCamera
 from nerfro.fields.base import Field
 from nerfro.models.base import NerfModel, step_seed
-from nerfro.pixel_parts import pixel_rays
 from nerfro.progress import told
-from nerfro.rays import Rays
-from nerfro.training.ray_batches import RayBatches, misses
+from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Exits
 
 # Pixels that are drawn for a step, at most this share of all; those that see the object are left out.
@@ -25,13 +19,6 @@ _NUM_PIXELS, _SHARE = 16384, 0.01
 _FEWEST = 64
 # Of the boundary's learning rate, in the first and in the last of these steps.
 _RATES = 25.0, 1.0
-# Cameras that are refined take a step before these, from a first one on. Only coarse levels of the boundary are there
-# then, the others come in up to a share of the steps: a ghost that every camera has painted for itself would hold it.
-# So they are not asked whether errors fall, either.
-_FROM, _BETWEEN = 50, 15
-_COARSE, _COARSE_SHARE = 0.7, 0.7
-_STEP = Step(reach=2.0, scale=1.0, longest=1.0, centres=False, checked=False)
-_NUM_LOOKED_AT, _DRAWN = 700, 3
 
 
 class BoundaryFirst(Callback):
@@ -40,8 +27,6 @@ class BoundaryFirst(Callback):
     Their pixels cost one look-up each and no tracing, and a sky that is known lets the first gradients of the field be
     about the object. The run's own optimiser does it, so that the boundary's moments are warm as well. A run that goes
     on from a checkpoint has it behind it.
-
-    Cameras that are refined turn meanwhile, each towards its photograph: what is infinitely far tells no shift.
 
     Args:
         batches: of the run.
@@ -55,7 +40,7 @@ class BoundaryFirst(Callback):
         assert isinstance(pl_module, NerfModel)
         model, camera = pl_module, pl_module.camera
         learning = [parameter for parameter in model.boundary.parameters() if parameter.requires_grad]
-        box = _occupied(model)
+        box = occupied(model)
         if trainer.global_step > 0 or not learning or box is None:
             return
         # The views' gains as well: a sky that is the mean of photographs of unlike brightness would hold them back.
@@ -66,10 +51,6 @@ class BoundaryFirst(Callback):
         batches = self._batches.to(model.device, learning[0].dtype)
         num_pixels = min(_NUM_PIXELS, int(_SHARE * batches.num_pixels))
         for step in told("boundary", range(self._num_steps)):
-            if isinstance(camera, RefinedCamera):
-                model.boundary.detail = min(1.0, _COARSE + (1 - _COARSE) * step / (_COARSE_SHARE * self._num_steps))
-                if step >= _FROM and (step - _FROM) % _BETWEEN == 0:
-                    _turn(model, camera, batches, box, step, finer=model.boundary.detail == 1)
             rays, view, rgb = batches.missing(box, num_pixels, step, camera)
             if len(rays) < _FEWEST:
                 break
@@ -83,27 +64,9 @@ class BoundaryFirst(Callback):
                 parameter.grad = gradient
             optimizer.step()
         optimizer.zero_grad()
-        model.boundary.detail = 1.0
 
 
-@torch.no_grad()
-def _turn(
-    model: NerfModel, camera: RefinedCamera, batches: RayBatches, box: Float[Tensor, "2 3"], step: int, finer: bool
-) -> None:
-    """Turn all cameras by what is seen past the box."""
-    candidates = batches.of_each_view(_DRAWN * _NUM_LOOKED_AT, step)
-    pixels = telling(candidates, _NUM_LOOKED_AT, batches.photographed, batches.cameras)
-    view = pixels // (batches.cameras.height * batches.cameras.width)
-    pixels = pixels[misses(box, camera(pixel_rays(batches.cameras, pixels), view))]
-
-    def shown(rays: Rays, view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
-        return model.photographed(model.boundary(Exits.unbent(rays)), camera.gains(view))
-
-    how = replace(_STEP, reach=0.5 * _STEP.reach) if finer else _STEP
-    improve(camera, batches.cameras, pixels, batches.photographed, shown, how)
-
-
-def _occupied(model: NerfModel) -> Float[Tensor, "2 3"] | None:
+def occupied(model: NerfModel) -> Float[Tensor, "2 3"] | None:
     """Corners of the box outside of which there is nothing but the boundary; None where the field fills all space."""
     field = model.fields[0]
     assert isinstance(field, Field)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float, Int
@@ -10,22 +10,27 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from nerfro.camera.gauss_newton import Step, improve, telling
+from nerfro.camera.panorama import Panorama, align
 from nerfro.camera.refined import RefinedCamera
 from nerfro.models.base import NerfModel
+from nerfro.pixel_parts import pixel_rays
 from nerfro.rays import Rays
+from nerfro.training.boundary_first import occupied
 from nerfro.training.data_module import RayDataModule
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.ray_batches import RayBatches, misses
 
 # Pixels over which differences are taken, at first and at least, and their factor from one step to the next.
 _FIRST_REACH, _LEAST_REACH, _SHRINKING = 2.0, 0.5, 0.85
+# Steps that are taken whole. Of later ones always less is: errors of single steps average out.
+_WHOLE = 10
 # Scale of the robust error (sRGB) for each pixel of reach; and pixels that a camera is moved at most.
 _SCALE, _LONGEST = 0.5, 1.0
 # Pixels that are drawn for each that is looked at, so that there are enough with contrast.
-_DRAWN = 3
+_DRAWN = 6
 
 
 class CameraSteps(Callback):
-    """Moves the training cameras at some steps, each towards its photograph, with the scene held.
+    """Turns the training cameras by the sky before training, and moves them at some steps, with the scene held.
 
     Args:
         batches: of the run.
@@ -33,6 +38,21 @@ class CameraSteps(Callback):
 
     def __init__(self, batches: RayBatches) -> None:
         self._batches = batches
+        self._panorama: Panorama | None = None
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        assert isinstance(pl_module, NerfModel)
+        model, camera, box = pl_module, pl_module.camera, occupied(pl_module)
+        if trainer.global_step > 0 or box is None or not isinstance(camera, RefinedCamera):
+            return
+        batches = self._batches.to(model.device)
+        self._panorama = align(camera, batches.cameras, batches.photographed, lambda rays: misses(box, rays))
+
+    def state_dict(self) -> dict[str, Any]:
+        return {} if self._panorama is None else dict(vars(self._panorama))
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self._panorama = Panorama(**state_dict) if state_dict else None
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
         assert isinstance(pl_module, NerfModel)
@@ -40,20 +60,30 @@ class CameraSteps(Callback):
         if not isinstance(camera, RefinedCamera) or step < camera.start or (step - camera.start) % camera.every:
             return
         cast(RayDataModule, trainer.datamodule).make_anew()  # type: ignore[attr-defined]
-        reach = max(_LEAST_REACH, _FIRST_REACH * _SHRINKING ** ((step - camera.start) // camera.every))
+        before = (step - camera.start) // camera.every
+        reach = max(_LEAST_REACH, _FIRST_REACH * _SHRINKING**before)
         # Not asked whether errors fall: every camera has painted its own ghost, which holds it where it is.
-        how = Step(reach, _SCALE * reach, _LONGEST, checked=False)
-        _move(pl_module, camera, self._batches, step, how)
+        how = Step(reach, _SCALE * reach, _LONGEST, share=min(1.0, _WHOLE / (before + 1)), checked=False)
+        _move(pl_module, camera, self._batches, step, how, self._panorama)
 
 
 @torch.no_grad()
-def _move(model: NerfModel, camera: RefinedCamera, batches: RayBatches, step: int, how: Step) -> None:
-    """A step of all cameras by pixels with contrast, drawn anew for each training step."""
-    batches = batches.to(model.device)
+def _move(
+    model: NerfModel, camera: RefinedCamera, batches: RayBatches, step: int, how: Step, panorama: Panorama | None
+) -> None:
+    """A step of all cameras by pixels with contrast, drawn anew for each training step.
+
+    Where a panorama tells how they are turned, what is seen past the object does not: the sky has learned it from them.
+    """
+    batches, box = batches.to(model.device), occupied(model)
     candidates = batches.of_each_view(_DRAWN * camera.num_pixels, step)
-    pixels = telling(candidates, camera.num_pixels, batches.photographed, batches.cameras)
+    past = torch.zeros_like(candidates, dtype=torch.bool)
+    if panorama is not None and box is not None:
+        view = candidates.flatten() // (batches.cameras.height * batches.cameras.width)
+        past = misses(box, camera(pixel_rays(batches.cameras, candidates.flatten()), view)).view(past.shape)
+    pixels = telling(candidates, camera.num_pixels, batches.photographed, batches.cameras, past)
 
     def shown(rays: Rays, view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
         return model.shown(rays, camera.gains(view))
 
-    improve(camera, batches.cameras, pixels, batches.photographed, shown, how)
+    improve(camera, batches.cameras, pixels, batches.photographed, shown, how, panorama)

@@ -67,15 +67,6 @@ def test_the_lens_that_all_share_is_found_with_them() -> None:
     assert float(found.cy[0]) == pytest.approx(float(TRUE.cy[0]), abs=0.1)
 
 
-def test_where_only_what_is_far_is_seen_cameras_turn_alone() -> None:
-    given = replace(TRUE, camera_to_world=disturbed(TRUE, math.radians(0.5), 0.01, 0).float())
-    camera = RefinedCamera(hold_world=False)
-    camera.begin(given)
-    improve(camera, given, looked_at(0), photographed, shown, Step(0.5, 0.3, 3.0, centres=False))
-    assert bool((camera.motions.motion[:, :3] != 0).any())
-    assert not bool(camera.motions.motion[:, 3:].any())
-
-
 def test_a_camera_stays_where_its_error_would_not_fall() -> None:
     """At the truth no step is for the better; and where nothing is checked, none is longer than allowed."""
     camera = RefinedCamera(hold_world=False)

@@ -18,7 +18,6 @@ from nerfro.data.nerfstudio import NerfstudioData
 from nerfro.evaluation.left_halves import refine_on_left
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.light import to_linear, to_srgb
-from nerfro.training import boundary_first
 from nerfro.training.load import load
 from nerfro.training.run_folder import load_checkpoint
 from tests.ball_photographs import photographs, save
@@ -53,9 +52,9 @@ def test_disturbed_poses_come_back(train_here: Callable[..., Any], tmp_path: Pat
     assert done.code == 0, done.err
     found = poses_in(tmp_path / "run" / "cameras.json")
     before, after = motion_between(true.camera_to_world, moved), motion_between(true.camera_to_world, found)
-    # From 0.494 degrees, a quarter of a pixel, to 0.179; and from 0.934 % of the distance to 0.251.
-    assert float(after[0].median()) < 0.5 * float(before[0].median())
-    assert float(after[1].median()) < 0.4 * float(before[1].median())
+    # From 0.494 degrees, a quarter of a pixel, to 0.018; and from 0.934 % of the distance to 0.194.
+    assert float(after[0].median()) < 0.1 * float(before[0].median())
+    assert float(after[1].median()) < 0.35 * float(before[1].median())
 
 
 @pytest.mark.slow
@@ -157,19 +156,21 @@ def test_cameras_wait_for_the_scene(
         )  # fmt: skip
         assert done.code == 0, done.err
         state = load_checkpoint(folder / "checkpoints" / "last.ckpt")[0]["state_dict"]
-        assert bool((state["camera.motions.motion"] != 0).any()) is moves
+        assert bool((state["camera.motions.motion"][:, 3:] != 0).any()) is moves
 
 
-def test_cameras_turn_while_the_sky_is_learned_alone(
-    train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_cameras_turn_by_the_sky_before_training_and_what_it_told_is_kept(
+    train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(boundary_first, "_SHARE", 1.0)
-    options = ["camera=refined", *tiny_default_run, "optimizer.boundary_first=101", "trainer.max_steps=1"]
+    options = ["camera=refined", *tiny_default_run, "trainer.max_steps=1"]
     done = train_here(*options, f"hydra.run.dir={tmp_path / 'run'}")
     assert done.code == 0, done.err
     camera = load(tmp_path / "run", "cpu").model.camera
     assert bool((camera.motions.motion[:, :3] != 0).all())
     assert not bool(camera.motions.motion[:, 3:].any())
+    kept = load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")[0]["callbacks"]["CameraSteps"]
+    torch.testing.assert_close(kept["numbers"], camera.numbers())
+    assert kept["information"].shape == (camera.numbers().numel(),) * 2
 
 
 def test_a_gain_for_each_view_needs_linear_radiance(
