@@ -78,19 +78,20 @@ def align(
         if overlap is None:
             continue  # where little of the sky is seen, only what is hardly blurred is of it alone
         matrix, vector, variance = _equations(overlap, gains, learn_gains=camera.exposure is not None)
-        numbers = camera.numbers()
-        turns, lens, brighter = (
-            _solved(matrix, vector)
-            .to(pictures)
-            .split([3 * len(cameras), len(numbers) - 3 * len(cameras), len(vector) - len(numbers)])
-        )
+        num_turns, num_lens = 3 * len(cameras), overlap.lens.shape[-1]
+        step = _solved(matrix, vector).to(pictures)
+        turns, lens, brighter = step.split([num_turns, num_lens, len(step) - num_turns - num_lens])
         gains = gains * brighter.exp().view(-1, 3) if len(brighter) else gains
-        turns = turns.view(-1, 3)
-        longest = 2 * blur * cameras.width / pictures.shape[-1]
+        turns, longest = turns.view(-1, 3), 2 * blur * cameras.width / pictures.shape[-1]
         turns = turns * (longest / turns.norm(dim=-1, keepdim=True).clamp(min=_TINY)).clamp(max=1)
         camera.move(F.pad(turns, (0, 3)), lens)
-        numbers, information = camera.numbers(), _without(matrix, len(numbers)) / max(variance, _LEAST_VARIANCE)
-    return None if numbers is None or information is None else Panorama(numbers, information.to(numbers))
+        numbers, information = camera.numbers(), _without(matrix, num_turns + num_lens) / max(variance, _LEAST_VARIANCE)
+    if numbers is None or information is None:
+        return None
+    together = camera.motions.together().to(information)
+    others = torch.eye(len(information)).to(information)
+    others[: len(together), : len(together)] -= together @ together.mT
+    return Panorama(numbers, (others @ information @ others).to(numbers))
 
 
 def _solved(matrix: Float[Tensor, "N N"], right: Float[Tensor, "N *K"]) -> Float[Tensor, "N *K"]:
