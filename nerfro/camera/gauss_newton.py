@@ -1,7 +1,8 @@
 """Cameras that are brought nearer to their photographs with the scene held: one step of Gauss-Newton for each.
 
-A photograph has hundreds of pixels for the six numbers of its camera. So each camera has normal equations of its own,
-and a step of them is worth hundreds of steps along gradients of a few pixels. Derivatives are differences of rendered
+A photograph has hundreds of pixels for the six numbers of its camera, and a step of its normal equations is worth
+hundreds of steps along gradients of a few pixels. Cameras hang together by the lens that they share, and by what a
+panorama tells of them. Derivatives are differences of rendered
 colours over about a pixel: they see silhouettes that move, and are not misled by what is finer than a pixel.
 """
 
@@ -13,8 +14,9 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize, one_hot
+from torch.nn.functional import normalize
 
+from nerfro.camera.least_squares import axes_across, robust_weights
 from nerfro.camera.panorama import Panorama
 from nerfro.camera.pixel_units import object_distances
 from nerfro.camera.refined import RefinedCamera
@@ -75,16 +77,15 @@ def improve(
     seen, by_origin, by_direction = _differences(shown, rays, view, across, distances)
     slopes = camera.slopes(given, view, by_origin, by_direction)
     error = seen - target
-    # Geman and McClure's weights; and a pixel's derivative holds no farther than its colour can change.
-    weights = 1 / (1 + (error / how.scale).square().sum(-1)).square()
-    weights = weights / (1 + (slopes[..., :6] / _STEEP).square().sum((1, 2)))
+    # A pixel's derivative holds no farther than its colour can change.
+    weights = robust_weights(error, how.scale) / (1 + (slopes[..., :6] / _STEEP).square().sum((1, 2)))
     matrix, vector = _equations(slopes.double(), error.double(), weights.double(), view, len(cameras))
     if panorama is not None:
         # Both in units of their own errors' variance.
         variance = (weights[:, None] * error.square()).sum() / (3 * weights.sum()).clamp(min=_TINY)
         information, place = (variance * panorama.information).to(matrix), _told_by_sky(len(cameras), vector)
         matrix[place[:, None], place] += information
-        vector[place] += information @ (camera.numbers() - panorama.numbers).to(vector)
+        vector[place] += information @ (camera.numbers().to(vector) - panorama.numbers.to(vector))
     step = -torch.linalg.solve(matrix, vector)
     motion, lens = step[: 6 * len(cameras)].view(-1, 6), step[6 * len(cameras) :]
     motion, lens = (
@@ -135,9 +136,8 @@ def _differences(
     """
     d = rays.directions
     seen, side = shown(rays, view), 1.0 - 2.0 * (torch.arange(len(d), device=d.device) % 2).to(d)
-    first = normalize(torch.linalg.cross(d, one_hot(d.abs().argmin(-1), 3).to(d)), dim=-1)
     by_origin, by_direction = (d.new_zeros(len(d), 3, 3) for _ in range(2))
-    for axis in (first, torch.linalg.cross(d, first)):
+    for axis in axes_across(d):
         step = (side * across)[:, None]
         turned = shown(replace(rays, directions=normalize(d + step * axis, dim=-1)), view)
         by_direction += ((turned - seen) / step)[:, :, None] * axis[:, None]

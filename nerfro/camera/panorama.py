@@ -14,9 +14,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.nn import functional as F
 
+from nerfro.camera.least_squares import axes_across, robust_weights
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
 from nerfro.light import to_linear
@@ -120,11 +122,9 @@ def _reduced(cameras: Cameras, photographed: Callable[[Tensor], Tensor]) -> Floa
 
 def _blurred(pictures: Float[Tensor, "V C h w"], deviation: float) -> Float[Tensor, "V C h w"]:
     """Convolved with a Gaussian; what is beyond the frame is black."""
-    reach, channels = int(3 * deviation) + 1, pictures.shape[1]
-    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1).to(pictures) / deviation).square())
-    kernel = (kernel / kernel.sum()).expand(channels, 1, 1, -1)
-    pictures = F.conv2d(pictures, kernel, padding=(0, reach), groups=channels)
-    return F.conv2d(pictures, kernel.mT, padding=(reach, 0), groups=channels)
+    deviations = 0, 0, deviation, deviation
+    found = gaussian_filter(pictures.cpu().numpy(), deviations, mode="constant", radius=int(3 * deviation) + 1)
+    return torch.from_numpy(found).to(pictures)
 
 
 @dataclass(frozen=True)
@@ -177,8 +177,7 @@ def _overlap(
 
     across = 1 / small.fx.mean()
     by_direction = pictures.new_zeros(len(view), 3, 3)
-    first = F.normalize(torch.linalg.cross(directions, F.one_hot(directions.abs().argmin(-1), 3).to(directions)))
-    for axis in (first, torch.linalg.cross(directions, first)):
+    for axis in axes_across(directions):
         ends = [sampled(directions + side * across * axis) for side in (0.5, -0.5)]
         by_direction += ((ends[0] - ends[1]) / across)[..., None] * axis[direction, None]
     # The ray of the data's camera that is believed to go there; what is seen there moves the other way.
@@ -219,7 +218,7 @@ def _equations(
         total = weight.new_zeros(num_directions).index_add(0, direction, weight).clamp(min=_TINY)
         mean = colour.new_zeros(num_directions, 3).index_add(0, direction, weight[:, None] * colour) / total[:, None]
         error = colour - mean[direction]
-        weight = 1 / (1 + (error / _SCALE).square().sum(-1)).square()  # Geman and McClure
+        weight = robust_weights(error, _SCALE)
     total = weight.new_zeros(num_directions).index_add(0, direction, weight).clamp(min=_TINY)
 
     of_view, num_lens = torch.arange(3, device=view.device) + 3 * view[:, None], overlap.lens.shape[-1]

@@ -91,8 +91,8 @@ class _Motions(PerView):
 class RefinedCamera(Camera):
     """Rotation and position of each training camera, and the lens that all share, refined with the scene.
 
-    Between training steps each camera takes a step of Gauss-Newton towards its photograph (`gauss_newton`): first
-    while the boundary learns alone, by what is seen past the object, then by all that is seen. A motion that all
+    Before training, cameras turn until photographs of the sky agree (`panorama`), where there is one. Between training
+    steps each takes a step of Gauss-Newton towards its photograph (`gauss_newton`). A motion that all
     cameras share is taken out, to first order: the world stays where the data have put it, with its surface.
 
     Args:

@@ -77,10 +77,10 @@ def _move(
     """
     batches, box = batches.to(model.device), occupied(model)
     candidates = batches.of_each_view(_DRAWN * camera.num_pixels, step)
-    past = torch.zeros_like(candidates, dtype=torch.bool)
+    past = None
     if panorama is not None and box is not None:
         view = candidates.flatten() // (batches.cameras.height * batches.cameras.width)
-        past = misses(box, camera(pixel_rays(batches.cameras, candidates.flatten()), view)).view(past.shape)
+        past = misses(box, camera(pixel_rays(batches.cameras, candidates.flatten()), view)).view(candidates.shape)
     pixels = telling(candidates, camera.num_pixels, batches.photographed, batches.cameras, past)
 
     def shown(rays: Rays, view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
