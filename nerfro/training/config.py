@@ -19,6 +19,7 @@ from nerfro.media.analytic import Vacuum
 from nerfro.models.base import NerfModel, Parts
 from nerfro.models.optimizer import OptimizerConfig
 from nerfro.registry import build, configure, find
+from nerfro.training.backdrop import settle_backdrop
 from nerfro.training.content import ContentConfig, settle_content
 from nerfro.training.outlines import hold_outlines
 
@@ -184,7 +185,7 @@ def build_losses(nodes: DictConfig, known: bool = True) -> dict[str, Loss]:
 
 
 def build_model(config: DictConfig, training: Views | None = None) -> NerfModel:
-    """Compose the model of a configuration (see `TrainConfig`); fills in `config.content` where it is left open.
+    """Compose the model of a configuration (see `TrainConfig`); fills in what it leaves to the data.
 
     Args:
         config: of the run.
@@ -200,9 +201,9 @@ def build_model(config: DictConfig, training: Views | None = None) -> NerfModel:
         )
     medium = build(config.medium) if path_sampler.needs_medium else Vacuum()
     settle_content(config, medium, None if training is None else training.cameras)
-    losses = build_losses(config.loss)
     camera = build(config.camera)
     if training is not None:
+        settle_backdrop(config, training.images)
         exposures = None if camera.exposure is None else exif_exposures([f.image for f in training.frames])
         camera.begin(training.cameras, exposures)
         hold_outlines(medium, training)
@@ -213,7 +214,7 @@ def build_model(config: DictConfig, training: Views | None = None) -> NerfModel:
         make_field=lambda: build(config.field),
         boundary=build(config.boundary),
         camera=camera,
-        losses=losses,
+        losses=build_losses(config.loss),
         optimizer=optimizer,
         seed=config.seed,
         chunk_size=config.evaluation.chunk_size,

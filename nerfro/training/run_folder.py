@@ -27,8 +27,8 @@ from nerfro.files.foreign_config import foreign_config
 from nerfro.files.owned import held, remove_unfinished, require_own
 from nerfro.models.base import NerfModel
 from nerfro.paths import PACKAGE_DIR, user_path
+from nerfro.training import backdrop, content
 from nerfro.training.config import build_model
-from nerfro.training.content import describe
 from nerfro.training.settings import RESUMING, first_difference, settings
 
 LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
@@ -66,7 +66,8 @@ def begin(folder: Path, config: DictConfig, model: NerfModel) -> None:
     """Refuse a disk that is too full, write what repeats the run, and say in a line or two what it is."""
     require_room(folder, needed_bytes(model))
     record(folder, config)
-    print(f"nerfro: {config.name} on {config.data.root} -> {folder}\n{describe(config.content)}", end="", flush=True)
+    found = f"{content.describe(config.content)}{backdrop.describe(config)}"
+    print(f"nerfro: {config.name} on {config.data.root} -> {folder}\n{found}", end="", flush=True)
 
 
 def require_room(folder: Path, needed_bytes: int) -> None:

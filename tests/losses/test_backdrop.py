@@ -1,0 +1,48 @@
+"""The loss of light that stops before a plain backdrop, and that it empties what white before white leaves."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from nerfro.errors import NerfroError
+from nerfro.losses.backdrop import Backdrop
+from nerfro.rendering import composite
+from nerfro.testing import example_path
+from nerfro.types import Batch, Radiance, Samples
+
+WHITE = [1.0, 1.0, 1.0]
+
+
+def learned_opacity(seen: torch.Tensor, loss: Backdrop, num_steps: int = 200) -> float:
+    """Mean opacity of one even white density before white, that has learned from pixels of one colour."""
+    path = example_path(8)
+    edges = torch.linspace(2, 6, 9).expand(8, -1)
+    samples = Samples.along(path, 0.5 * (edges[:, 1:] + edges[:, :-1]), edges)
+    raw = torch.full((1,), 1.0, requires_grad=True)
+    optimizer = torch.optim.Adam([raw], lr=0.1)
+    batch = Batch(None, None, seen.expand(8, 3), None)  # type: ignore[arg-type]  # nor is the model asked
+    for _ in range(num_steps):
+        density = raw.exp().expand(8, 8)
+        rendering = composite(samples, Radiance(density, torch.ones(8, 8, 3)), torch.ones(8, 3), path)
+        error = (rendering.rgb - 1).square().mean()
+        total = error + loss.weight * loss([rendering], batch, None)  # type: ignore[arg-type]
+        optimizer.zero_grad()
+        total.backward()
+        optimizer.step()
+    return float(rendering.opacity.detach().mean())
+
+
+def test_white_before_white_becomes_empty() -> None:
+    assert learned_opacity(torch.ones(3), Backdrop(WHITE, weight=0.0)) > 0.95
+    assert learned_opacity(torch.ones(3), Backdrop(WHITE)) < 0.05
+
+
+def test_pixels_of_another_colour_and_photographs_without_a_backdrop_are_not_charged() -> None:
+    assert learned_opacity(torch.tensor([1.0, 1.0, 0.98]), Backdrop(WHITE)) > 0.95
+    assert learned_opacity(torch.ones(3), Backdrop()) > 0.95
+
+
+def test_a_colour_has_three_numbers() -> None:
+    with pytest.raises(NerfroError, match="three numbers"):
+        Backdrop([1.0])

@@ -1,0 +1,94 @@
+"""Photographs that are cut out on one colour are found, and that colour is beyond the volume then."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from PIL import Image
+
+from nerfro.training.backdrop import find_backdrop
+
+GREY = 102 / 255
+
+
+def photographs(num_views: int = 10, colour: float = GREY) -> torch.Tensor:
+    """Textured squares in the middle of pictures of one colour."""
+    pictures = torch.full((num_views, 16, 16, 3), colour)
+    pictures[:, 4:12, 4:12] = torch.rand(num_views, 8, 8, 3)
+    return pictures
+
+
+def test_what_is_cut_out_is_found_whatever_the_colour() -> None:
+    for colour in (0.0, GREY, 1.0):
+        assert find_backdrop(photographs(colour=colour)) == pytest.approx([colour] * 3)
+
+
+def test_a_view_that_cuts_the_object_off_and_rounding_are_forgiven() -> None:
+    pictures = photographs()
+    pictures[3, :, 8:] = torch.rand(16, 8, 3)
+    pictures[5, 0, 0] += 1 / 255
+    assert find_backdrop(pictures) == pytest.approx([GREY] * 3)
+
+
+def test_photographs_of_rooms_have_no_backdrop() -> None:
+    slope = torch.linspace(0.4, 0.6, 16)[None, :, None, None].expand(10, 16, 16, 3)
+    assert find_backdrop(slope) is None
+    noisy = photographs() + 0.02 * torch.randn(10, 16, 16, 3)
+    assert find_backdrop(noisy) is None
+    of_different_colours = photographs() * torch.linspace(0.5, 1, 10)[:, None, None, None]
+    assert find_backdrop(of_different_colours) is None
+
+
+def test_the_black_rim_of_a_lens_is_no_backdrop() -> None:
+    pictures = torch.rand(10, 32, 32, 3)
+    pictures[:, :2] = pictures[:, -2:] = 0
+    pictures[:, :, :2] = pictures[:, :, -2:] = 0
+    assert find_backdrop(pictures) is None
+
+
+@pytest.fixture
+def cut_out(tiny_scene: Path, tmp_path: Path) -> Path:
+    """The tiny scene with photographs of its ball on grey."""
+    row, column = np.mgrid[:16, :16] - 7.5
+    for split in ("train", "val", "test"):
+        manifest = json.loads((tiny_scene / f"transforms_{split}.json").read_text())
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(manifest))
+        (tmp_path / split).mkdir()
+        for frame in manifest["frames"]:
+            levels = np.asarray(Image.open(tiny_scene / f"{frame['file_path']}.png")).copy()
+            levels[np.hypot(row, column) > 3] = 102
+            Image.fromarray(levels).save(tmp_path / f"{frame['file_path']}.png")
+    return tmp_path
+
+
+@pytest.mark.parametrize(("options", "told"), [([], True), (["loss.backdrop.weight=0"], False)])
+def test_straight_rays_end_on_the_backdrop(
+    train_here: Callable[..., Any], cut_out: Path, tmp_path: Path, options: list[str], told: bool
+) -> None:
+    run = tmp_path / "run"
+    finished = train_here(
+        "+experiment=straight",
+        f"data.root={cut_out}",
+        "trainer.accelerator=cpu",
+        "trainer.max_time=null",
+        "trainer.max_steps=2",
+        "batches.size=64",
+        "logger=none",
+        f"hydra.run.dir={run}",
+        *options,
+    )
+    assert finished.code == 0, finished.err
+    assert ("cut out on (102, 102, 102)" in finished.out) == told
+    config = OmegaConf.load(run / "config.yaml")
+    if told:
+        assert config.boundary.rgb == pytest.approx([((GREY + 0.055) / 1.055) ** 2.4] * 3, rel=1e-4)
+        assert config.loss.backdrop.colour == pytest.approx([GREY] * 3)
+    else:
+        assert "rgb" not in config.boundary
