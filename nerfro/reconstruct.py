@@ -61,7 +61,7 @@ def _surface(config: DictConfig, options: list[str], root: Path, out: Path) -> P
     """Surface and index; returns the folder where they are."""
     folder = out / "surface"
     made_of = [*root.glob("transforms*.json"), *(file for place in _MASKS for file in root.glob(place))]
-    told = [option("out", folder), "refine=true", "wrong_masks=null", "overwrite=true"]
+    told = [option("out", folder), "refine=true", "wrong_masks=null", "symmetry=auto", "overwrite=true"]
     options = [*options, *told, *shlex.split(config.preprocess)]
     Stage("preprocess", options, folder / FOUND, folder / SHEET, made_of).run()
     return folder

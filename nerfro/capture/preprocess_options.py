@@ -50,7 +50,8 @@ class PreprocessConfig:
             hull looks most like the masks.
         keep: number of separate parts to keep, the largest; by default all but strays.
         smoothing: how smooth the surface is where the masks leave it open; 0 for the carved hull itself.
-        symmetry: axis for what came off a wheel or a lathe: a body of revolution, where that looks like the masks.
+        symmetry: axis for what came off a wheel or a lathe: a body of revolution, where that looks like the masks; auto
+            to try one, and take it where it looks as much like the masks as the surface that is free.
         overwrite: whether files that exist may be replaced.
     """
 
@@ -68,7 +69,7 @@ class PreprocessConfig:
     wrong_masks: Optional[Natural] = 0  # noqa: UP045
     keep: Optional[Count] = None  # noqa: UP045
     smoothing: NotNegative = 1.0
-    symmetry: Annotated[Optional[str], Literal["axis"]] = None  # noqa: UP045
+    symmetry: Annotated[Optional[str], Literal["axis", "auto"]] = None  # noqa: UP045
     overwrite: bool = False
 
 

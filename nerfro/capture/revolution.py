@@ -16,10 +16,9 @@ from torch.nn.functional import normalize
 
 from nerfro.capture.upright import body_axis
 from nerfro.capture.visual_hull import Silhouettes
-from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
 
-Symmetry = Literal["axis"]
+Symmetry = Literal["axis", "auto"]
 
 # Radii along the axis, of a polyline, and triangles around it.
 _KNOTS, _SECTIONS = 72, 160
@@ -94,18 +93,17 @@ class Profile:
 
 def fit_revolution(
     mesh: TriangleMesh, silhouettes: Silhouettes, progress: Callable[[float], None] = lambda share: None
-) -> TriangleMesh:
-    """The body of revolution near a mesh whose outlines are those of the masks.
+) -> TriangleMesh | None:
+    """The body of revolution near a mesh whose outlines are those of the masks; None where the mesh has no axis.
 
     A ray through a mask's outline touches the body: along it, the least distance to the body is zero. Beside the
     outline it meets the body or does not. Axis, ends and radii are found by the robust squares of these distances in
     pixels, so an outline that is not the body's, such as that of a thing before it, does not pull. `progress` is told
     the share done.
-
-    Raises:
-        NerfroError: the mesh is nowhere near a body of revolution.
     """
     start = _first_guess(mesh)
+    if start is None:
+        return None
     origins, directions, width, side = _rays(silhouettes)
     middle, size = start.foot + 0.5 * start.height * start.axis, start.height
     across = torch.linalg.svd(start.axis[None])[2][1:]
@@ -143,7 +141,7 @@ def fit_revolution(
     return body(numbers).mesh()
 
 
-def _first_guess(mesh: TriangleMesh) -> Profile:
+def _first_guess(mesh: TriangleMesh) -> Profile | None:
     """Of the axes near the mesh's principal ones, that around which it is roundest."""
     vertices = mesh.vertices
     found: list[tuple[float, Profile]] = []
@@ -169,9 +167,7 @@ def _first_guess(mesh: TriangleMesh) -> Profile:
         spread = np.abs(radius - outer[number])[(number > _END) & (number < _KNOTS - _END)].mean() / outer.mean()
         foot, along_axis, radii = (torch.from_numpy(part).float() for part in (middle + low * axis, axis, outer))
         found.append((float(spread), Profile(foot, along_axis, torch.tensor(float(high - low)), radii)))
-    if not found:
-        raise NerfroError("symmetry=axis: the hull has no axis; leave it out")
-    return min(found, key=lambda each: each[0])[1]
+    return min(found, key=lambda each: each[0])[1] if found else None
 
 
 def _rays(

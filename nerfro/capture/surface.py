@@ -81,7 +81,8 @@ def make_mesh(
 ) -> TriangleMesh:
     """Carve the hull and fit a smooth surface into it, see `PreprocessConfig`; the box is found where none is given.
 
-    With `symmetry` a body of revolution is fitted too, and taken where it looks as much like the masks.
+    With `symmetry` a body of revolution is fitted too, and taken where it looks as much like the masks. For `axis`,
+    which tells what the object is, it may look a little less like them.
     """
     with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()) as progress:
         box = _object_box(silhouettes, wrong_masks) if corners is None else corners
@@ -98,7 +99,7 @@ def make_mesh(
             turning = progress.add_task("finding the axis", total=1)
             turned = fit_revolution(mesh, silhouettes, lambda done: progress.update(turning, completed=done))
     if symmetry is not None:
-        mesh = _as_alike(turned, mesh, silhouettes)
+        mesh = _as_alike(turned, mesh, silhouettes, symmetry)
     if num_kept < num_parts:
         print(f"{num_kept} of {num_parts} separate parts kept, the largest")
     if reaches_border(distances):
@@ -107,18 +108,24 @@ def make_mesh(
     return mesh
 
 
-def _as_alike(turned: TriangleMesh, free: TriangleMesh, silhouettes: Silhouettes) -> TriangleMesh:
-    """The body of revolution, unless its silhouettes are clearly less like the masks' than the free surface's.
+def _as_alike(
+    turned: TriangleMesh | None, free: TriangleMesh, silhouettes: Silhouettes, symmetry: Symmetry
+) -> TriangleMesh:
+    """The body of revolution, unless its silhouettes are less like the masks' than the free surface's.
 
     Medians are compared: masks from which something before the object is cut out should not decide.
     """
+    if turned is None:
+        if symmetry == "axis":
+            raise NerfroError("symmetry=axis: the hull has no axis; leave it out")
+        return free
     of_turned, of_free = (float(np.median(overlap(mesh, silhouettes, _MAX_PIXELS))) for mesh in (turned, free))
     told = f"overlap with the masks, median: {of_turned:.4f} as a body of revolution, {of_free:.4f} without"
-    if of_turned < of_free - _LESS_ALIKE:
+    if symmetry == "axis" and of_turned < of_free - _LESS_ALIKE:
         warn(f"{told}; so it is none, and symmetry=axis is not used")
         return free
     print(told)
-    return turned
+    return free if symmetry == "auto" and of_turned < of_free else turned
 
 
 def surfaces_inside(medium: Medium) -> list[TriangleMesh]:
