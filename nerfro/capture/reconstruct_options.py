@@ -73,9 +73,10 @@ def training_options(config: DictConfig, overrides: list[str], surface: Path) ->
         warn(f"{' '.join(found['doubtful'])} fits best, but the photographs do not tell for sure; see {surface.parent}")
     options = [*found["options"], *found["doubtful"]]
     if not is_given("experiment", extra):
-        # A vessel's materials are known.
-        experiment = "glass" if "wall" in config.medium else "unknown"
-        options.insert(0, f"+experiment={f'[refractive_room,{experiment}]' if found['near'] else experiment}")
+        # A vessel's materials are known. In a room, following reflections and learning the index cost more than they
+        # win in the same time (docs/real.md).
+        far = "glass" if "wall" in config.medium else "unknown"
+        options.insert(0, f"+experiment={'refractive_room' if found['near'] else far}")
     if not is_given("data.downscale", overrides):
         options.append(f"data.downscale={max(1.0, max(found['pixels']) / config.pixels):.4g}")
     return [*options, *extra]
