@@ -208,7 +208,7 @@ def test_unknown_field_of_a_lightning_object_is_refused() -> None:
 @pytest.mark.parametrize(
     ("losses", "message"),
     [
-        ({"photometrc": {}}, "no loss is called 'photometrc'; known: boundary, .*photometric, smoothness"),
+        ({"photometrc": {}}, "no loss is called 'photometrc'; known: backdrop, .*photometric, smoothness"),
         (
             {"photometric": {"weigth": 1}},
             "loss=photometric: Key 'weigth' not in 'PhotometricConfig'; its fields: weight",
@@ -244,7 +244,7 @@ def test_wrong_losses_are_refused(losses: dict[str, object], message: str) -> No
         (["+hydra.run.foo=1"], ["hydra.run.foo is no setting; known: dir"]),
         (["field.width=abc"], ["Value 'abc' of type 'str' could not be converted to Integer", "field.width"]),
         (["field=null"], ["Got NoneType; give the name of an option"]),
-        (["+loss.boundry.weight=1"], ["no loss is called 'boundry'; known: boundary"]),
+        (["+loss.boundry.weight=1"], ["no loss is called 'boundry'; known: backdrop, boundary"]),
         (["sampler.path.integrator=foo"], ["integrator='foo' is not allowed; choose 'adaptive', 'euler', 'leapfrog'"]),
         (["field._target_=os.system"], ["'os.system' is not registered"]),
         (["trainer._target_=os.system"], ["'os.system' is not registered"]),
@@ -301,7 +301,7 @@ def train_with_conf(
         ("optimizer: {lerning_rate: 3}", ["optimizer.lerning_rate is no setting; did you mean learning_rate?"]),
         ("evaluation: {evry: 3}", ["evaluation.evry is no setting; did you mean every?"]),
         ("sampler: {points: {num_caorse: 3}}", ["sampler.points.num_caorse is no setting; did you mean num_coarse?"]),
-        ("loss: {boundry: {weight: 0}}", ["no loss is called 'boundry'; known: boundary"]),
+        ("loss: {boundry: {weight: 0}}", ["no loss is called 'boundry'; known: backdrop, boundary"]),
         ("loss: {boundary: {wieght: 0}}", ["loss.boundary.wieght is no setting; did you mean weight?"]),
         ("field: {width: wide}", ["Value 'wide' of type 'str' could not be converted to Integer"]),
         ("defaults: [{override /model: nrf}]", ["Could not find 'model/nrf'"]),

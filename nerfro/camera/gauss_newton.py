@@ -2,8 +2,8 @@
 
 A photograph has hundreds of pixels for the six numbers of its camera, and a step of its normal equations is worth
 hundreds of steps along gradients of a few pixels. Cameras hang together by the lens that they share, and by what a
-panorama tells of them. Derivatives are differences of rendered
-colours over about a pixel: they see silhouettes that move, and are not misled by what is finer than a pixel.
+panorama tells of them. Derivatives are differences of rendered colours over about a pixel: they see silhouettes that
+move, and are not misled by what is finer than a pixel.
 """
 
 from __future__ import annotations

@@ -40,8 +40,8 @@ class Backdrop(Loss):
         self, colour: list[float] | None = None, weight: NotNegative = 0.1, start: Natural = 0, ramp: Natural = 0
     ) -> None:
         super().__init__(weight, start, ramp)
-        if colour is not None and len(colour) != 3:
-            raise NerfroError(f"loss=backdrop: colour={list(colour)} needs three numbers")
+        if colour is not None and (len(colour) != 3 or not all(0 <= value <= 1 for value in colour)):
+            raise NerfroError(f"loss=backdrop: colour={list(colour)} is no sRGB colour; give three numbers in [0, 1]")
         self.register_buffer("colour", None if colour is None else torch.tensor(colour), persistent=False)
 
     def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:

@@ -43,6 +43,7 @@ def test_pixels_of_another_colour_and_photographs_without_a_backdrop_are_not_cha
     assert learned_opacity(torch.ones(3), Backdrop()) > 0.95
 
 
-def test_a_colour_has_three_numbers() -> None:
-    with pytest.raises(NerfroError, match="three numbers"):
-        Backdrop([1.0])
+@pytest.mark.parametrize("colour", [[1.0], [255.0, 255.0, 255.0]])
+def test_a_colour_has_three_numbers_up_to_one(colour: list[float]) -> None:
+    with pytest.raises(NerfroError, match="three numbers in"):
+        Backdrop(colour)
