@@ -9,6 +9,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Callable, Iterator
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,7 +27,7 @@ from nerfro.capture.boards import tag_detector, twelve_faces
 from nerfro.data.opencv import OpenCVData
 from nerfro.geometry.mesh import load_mesh
 from nerfro.paths import CONF_DIR
-from nerfro.scenes import dataset
+from nerfro.scenes import dataset, dolphin_capture
 from nerfro.scenes.dolphin_capture import AIM, board_to_world
 from nerfro.scenes.synthesis import SynthesizeConfig, synthesize
 
@@ -47,17 +48,18 @@ def outline_of(points: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _baked_quickly() -> Iterator[None]:
-    """Light that falls on the room is noisier, for poses and outlines do not depend on it; it is computed once."""
+def _built_quickly() -> Iterator[None]:
+    """The scene is built once; light that falls on its room is noisy, for poses and outlines do not depend on it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dataset, "BAKING_SPP", 8)
+        patch.setattr(dolphin_capture, "build", cache(dolphin_capture.build))
         yield
 
 
 @pytest.fixture(scope="module")
 def few(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two photographs, large enough to find tags in."""
-    return photograph(tmp_path_factory.mktemp("few"), resolution=320, photographs=2, spp=4)
+    return photograph(tmp_path_factory.mktemp("few"), resolution=400, photographs=2, spp=4)
 
 
 def test_poses_are_only_in_the_truth(few: Path) -> None:

@@ -316,7 +316,7 @@ def test_the_index_of_a_homogeneous_ball_is_recovered(train_here: Callable[..., 
         "optimizer={learning_rate: 1e-2, final_learning_rate: 1e-3, boundary_learning_rate: 1e-9}",
         "model={resolution: 64, blur: 1.5, num_levels: 3, scene_share: 0.003, index_share: 0.997}",
         "batches.size=200",
-        "trainer.max_steps=300",
+        "trainer.max_steps=150",
         f"hydra.run.dir={tmp_path / 'run'}",
     )
     assert finished.code == 0, finished.err
