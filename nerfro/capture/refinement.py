@@ -5,18 +5,18 @@ moves so that these are the directions in which the surroundings have the pixels
 exact paths (`samplers.replay`). Three things keep it on the way:
 
 - Blurred surroundings first. Their slope tells the way over as many degrees as they are blurred.
-- Opaque things inside. Space is empty where many of the rays through it show the surroundings, whatever else is on
-  their ways; pixels whose rays cross space where few do are left out.
+- A robust error. Pixels that show opaque things inside have large ones, wherever the surface is, and hardly pull.
 - Outlines. Where a surface is seen from its side, the masks have told where it is, and it stays there.
 
-Photographs of some views are held back and judge: the surface is the one that explains them best.
+Photographs of some views are held back and judge: the surface is the one that explains them best. They also say how
+much it is smoothed, before the descent and after it, for a hull is as rough as its voxels.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -33,7 +33,7 @@ from nerfro.capture.surroundings import HELD_BACK, Pixels, Room, Surroundings, r
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import NerfroError
 from nerfro.files.cache import content_hash
-from nerfro.geometry.interpolation import quadratic_spline
+from nerfro.geometry.interpolation import quadratic_spline, smooth
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media import displacement
 from nerfro.media.displacement import Displacement
@@ -44,17 +44,12 @@ from nerfro.variants import variant
 
 _PIXELS = 6000  # of a step
 _JUDGED = 20_000  # held-back pixels, at most
-# Pixels that are looked at to tell what is clear, and after how many steps that is told anew.
-_LOOKED_AT, _LOOK_EVERY = 150_000, 100
-# Voxels a side of the object's bounds in which it is told, samples of a ray in them, rays that a voxel needs.
-_VOXELS, _SAMPLES, _FEWEST_RAYS = 48, 64, 20
-# A ray counts fully if in every voxel that it crosses so large a share of rays shows the surroundings, in units of what
-# is usual in clear space; not at all below the first.
-_CLEAR = (0.4, 0.6)
+# Standard deviations of the smoothing that is tried, in shares of the object's size.
+_SMOOTHINGS = (0.005, 0.007, 0.01, 0.014)
 # Residuals of linear radiance count half at this.
 _HALF = 0.1
 # Part of the key of a record: raise it when the same inputs lead elsewhere than before.
-_VERSION = 1
+_VERSION = 2
 # An outline is known to about this, pixels; weights of outlines and of smoothness.
 _OUTLINE, _OUTLINES, _SMOOTH = 0.25, 0.1, 0.1
 _RIMS = 4000  # points of outlines of a step
@@ -78,9 +73,9 @@ class _Stage:
 # The first stages are too bold for a surface that is nearly right. They are left when it is worse by a share, and so
 # is whatever is not the best when a stage ends.
 _STAGES = (
-    _Stage(200, 2e-4, (3.0, 1.4)),
-    _Stage(300, 1.5e-4, (1.4, 0.5)),
-    _Stage(150, 4e-5, (0.7, 0.35)),
+    _Stage(200, 4e-4, (3.0, 1.4)),
+    _Stage(300, 3e-4, (1.4, 0.5)),
+    _Stage(150, 8e-5, (0.7, 0.35)),
     _Stage(100, 1e-5, (0.0, 0.0)),
 )
 _WORSE = 0.01
@@ -100,14 +95,12 @@ class Refined:
         medium: made of it.
         steps, errors: after which steps it was judged, and the robust error of held-back pixels then: 0 where
             all is explained, 1 where nothing is. The first is that of the surface as it was.
-        used: share of the object's pixels that have taught it.
     """
 
     mesh: TriangleMesh
     medium: SdfGrid
     steps: list[int]
     errors: list[float]
-    used: float
 
 
 def refine_surface(
@@ -141,7 +134,9 @@ def refine_surface(
             "refine=true needs surroundings that are far away, and these are near; say room=false if they are not"
         )
     descent = _Descent(mesh, medium, silhouettes, through, surroundings, learn_index)
-    at = _Position(descent.state(), [descent.judged(medium)])
+    error = descent.judged(medium)
+    descent.start, smoothed = descent.smoothed(medium, error)
+    at = _Position(descent.state(), [error, smoothed], [0, 0])
     kept = Record(record, _key(mesh, medium, through, learn_index))
     if (found := kept.read()) is not None:
         at = _Position(**found["at"])
@@ -167,11 +162,11 @@ def refine_surface(
         at.stage, at.step = at.stage + 1, 0
     progress(1.0)
     kept.remove()
-    used = len(descent.clear) / max(1, len(descent.looked_at))
-    if min(at.errors) > (1 - _LEAST_GAIN) * at.errors[0]:
-        return Refined(mesh, medium, at.steps, at.errors, used)
-    moved = descent.moved()
-    return Refined(_onto(mesh, moved), moved, at.steps, at.errors, used)
+    moved, smoothed = descent.smoothed(descent.moved(), min(at.errors))
+    steps, errors = [*at.steps, at.steps[-1]], [*at.errors, smoothed]
+    if smoothed > (1 - _LEAST_GAIN) * error:
+        return Refined(mesh, medium, steps, errors)
+    return Refined(_onto(mesh, moved), moved, steps, errors)
 
 
 @dataclass
@@ -180,7 +175,7 @@ class _Position:
 
     best: list[Tensor]
     errors: list[float]
-    steps: list[int] = field(default_factory=lambda: [0])
+    steps: list[int]
     stage: int = 0
     step: int = 0  # of the stage
 
@@ -200,7 +195,7 @@ def _key(mesh: TriangleMesh, medium: SdfGrid, through: Pixels, learn_index: bool
 
 
 class _Descent:
-    """The surface on its way, and the pixels that teach and judge it."""
+    """The surface on its way from a start, and the pixels that teach and judge it."""
 
     def __init__(
         self,
@@ -211,25 +206,23 @@ class _Descent:
         surroundings: Surroundings,
         learn_index: bool,
     ) -> None:
-        self.medium, self.surroundings = medium, surroundings
+        self.given, self.start, self.surroundings = medium, medium, surroundings
         self.iors = nn.Parameter(medium.iors.clone(), requires_grad=learn_index)
-        self.bounds = torch.from_numpy(mesh.bounds).float()
         # Rays that are reflected inside are no help: tiny errors of the surface turn them anywhere.
         self.sampler = Snell(max_events=2 * len(medium.iors))
-        size = float(np.ptp(mesh.bounds, axis=0).max())
-        self.offsets = Displacement(tuple(medium.distances.shape[1:]), medium.box, size)
+        self.size = float(np.ptp(mesh.bounds, axis=0).max())
+        self.offsets = Displacement(tuple(medium.distances.shape[1:]), medium.box, self.size)
         held_back = through.view % HELD_BACK == HELD_BACK - 1
-        self.looked_at = through[~held_back].some(_LOOKED_AT)
+        self.teachers = through[~held_back]
         self.judges = (through[held_back] if held_back.any() else through).some(_JUDGED)
         self.first_errors: Tensor | None = None
         self.rims, _, _ = rim_points(mesh, silhouettes)
         cameras = silhouettes.cameras
-        distance = (cameras.camera_to_world[:, :, 3] - self.bounds.mean(0)).norm(dim=-1)
+        middle = torch.from_numpy(mesh.bounds.mean(0)).float()
+        distance = (cameras.camera_to_world[:, :, 3] - middle).norm(dim=-1)
         self.outline = _OUTLINE * float((distance / cameras.fx).mean())
         self.generator = torch.Generator().manual_seed(0)
-        self.num_steps = 0
         self.set(self.state())
-        self._look(medium)
 
     def moved(self) -> SdfGrid:
         """The medium as it is now, without gradients."""
@@ -252,9 +245,6 @@ class _Descent:
             "state": self.state(),
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
-            "num_steps": self.num_steps,
-            "rows": self.rows,
-            "weight": self.weight,
         }
 
     def go_on(self, record: dict[str, Any]) -> None:
@@ -262,24 +252,15 @@ class _Descent:
         self.set(record["state"])
         self.optimizer.load_state_dict(record["optimizer"])
         self.generator.set_state(record["generator"])
-        self.num_steps, self.rows, self.weight = (record[name] for name in ("num_steps", "rows", "weight"))
-
-    @property
-    def clear(self) -> Pixels:
-        """Pixels that see the surroundings, and nothing opaque."""
-        return self.looked_at[self.rows]
 
     def _learned(self) -> list[nn.Parameter]:
         return [*self.offsets.levels, self.iors]
 
     def _moved(self) -> SdfGrid:
-        return variant(self.medium.grown(self.offsets()), iors=1.0 * self.iors)
+        return variant(self.start.grown(self.offsets()), iors=1.0 * self.iors)
 
     def step(self, sky: Boundary, rate: float) -> None:
         """Follow the slope of the error, with surroundings that are blurred."""
-        if self.num_steps and self.num_steps % _LOOK_EVERY == 0:
-            self._look(self.moved())
-        self.num_steps += 1
         self.optimizer.param_groups[0]["lr"] = rate
         self.optimizer.zero_grad()
         with torch.enable_grad():
@@ -288,19 +269,30 @@ class _Descent:
 
     def _loss(self, sky: Boundary) -> Tensor:
         medium = self._moved()
-        drawn = torch.randint(len(self.rows), (_PIXELS,), generator=self.generator)
-        pixels, weight = self.looked_at[self.rows[drawn]], self.weight[drawn]
+        pixels = self.teachers[torch.randint(len(self.teachers), (_PIXELS,), generator=self.generator)]
         path, usable = self._traced(pixels, medium)
         rays = pixels.rays[usable]
         path = self.sampler.refine(path[usable], rays, medium)
         residual = sky(path.exits()).clamp(max=1) - pixels.radiance[usable]
-        weight = weight[usable]
-        photometric = (weight * robust(residual, _HALF)).sum() / weight.sum().clamp(min=1e-6)
+        photometric = robust(residual, _HALF).sum() / max(1, len(rays))
         rims = self.rims[torch.randint(len(self.rims), (_RIMS,), generator=self.generator)]
-        now, before = (quadratic_spline(each.coefficients[0], each.box, rims)[0] for each in (medium, self.medium))
+        now, before = (quadratic_spline(each.coefficients[0], each.box, rims)[0] for each in (medium, self.given))
         left = ((now - before) / self.outline).square()
         outlines = (left / (1 + left)).mean()
         return photometric + _OUTLINES * outlines + _SMOOTH * self.offsets.roughness()
+
+    @torch.no_grad()
+    def smoothed(self, medium: SdfGrid, error: float) -> tuple[SdfGrid, float]:
+        """The medium with its outer surface as smooth as the judges like it best, and their error; it has `error`."""
+        distances = medium.distances[0]
+        spacing = float(((medium.box[1] - medium.box[0]) / (torch.tensor(distances.shape) - 1)).min())
+        best = medium
+        for share in _SMOOTHINGS:
+            sigma = share * self.size / spacing
+            tried = medium.grown(distances - smooth(distances, 2 * math.ceil(3 * sigma) + 1, sigma))
+            if (judged := self.judged(tried)) < error:
+                best, error = tried, judged
+        return best, error
 
     @torch.no_grad()
     def judged(self, medium: SdfGrid) -> float:
@@ -313,6 +305,8 @@ class _Descent:
         known &= ~trace.exceeded & trace.path.refracted
         errors = robust(radiance - self.judges.radiance, _HALF)
         if self.first_errors is None:
+            if not known.any():
+                raise NerfroError("no pixel shows known surroundings through the object; refine=true cannot help here")
             self.judges, errors = self.judges[known], errors[known]
             self.first_errors, known = errors, known[known]
         return float(torch.where(known, errors, self.first_errors).mean())
@@ -324,44 +318,6 @@ class _Descent:
             _, known = self.surroundings.radiance(trace.path.exits())
             usable = known & ~trace.exceeded & trace.path.refracted & self.sampler.steady(trace.path, medium)
         return trace.path, usable
-
-    @torch.no_grad()
-    def _look(self, medium: SdfGrid) -> None:
-        """Tell which pixels see the surroundings, and nothing opaque."""
-        path, usable = self._traced(self.looked_at, medium)
-        pixels, path = self.looked_at[usable], path[usable]
-        if not len(pixels):
-            raise NerfroError("no pixel shows known surroundings through the object; refine=true cannot help here")
-        residual = self.surroundings.radiance(path.exits())[0] - pixels.radiance
-        voxels = self._voxels(path)
-        beyond = _VOXELS**3
-        crossing = torch.bincount(voxels.flatten(), minlength=beyond + 1)
-        agreeing = (1 - robust(residual, _HALF))[:, None].expand_as(voxels)
-        share = torch.bincount(voxels.flatten(), agreeing.flatten().double(), beyond + 1) / crossing.clamp(min=1)
-        told = crossing >= _FEWEST_RAYS
-        told[beyond] = False
-        usual = share[told].quantile(0.9) if told.any() else share.new_ones(())
-        share = torch.where(told, share / usual.clamp(min=1e-6), 1.0).float()
-        least, enough = _CLEAR
-        weight = ((share[voxels].amin(1) - least) / (enough - least)).clamp(0, 1)
-        self.rows, self.weight = usable.nonzero()[:, 0][weight > 0], weight[weight > 0]
-        if not len(self.rows):
-            raise NerfroError("opaque things hide the surroundings in all pixels; refine=true cannot help here")
-
-    def _voxels(self, path: Path) -> Tensor:
-        """Numbers of the voxels that each path crosses in the object's bounds [P, S]; one more for none."""
-        low, high = self.bounds
-        numbers = []
-        for chosen in torch.arange(len(path.s)).split(1 << 14):
-            part = path[chosen]
-            enter, leave = part.span(self.bounds)
-            shares = (torch.arange(_SAMPLES) + 0.5) / _SAMPLES
-            positions, _ = part.at(enter[:, None] + (leave - enter)[:, None] * shares)
-            voxel = ((positions - low) / (high - low) * _VOXELS).long()
-            inside = ((voxel >= 0) & (voxel < _VOXELS)).all(-1)
-            x, y, z = voxel.unbind(-1)
-            numbers.append(torch.where(inside, (x * _VOXELS + y) * _VOXELS + z, _VOXELS**3))
-        return torch.cat(numbers)
 
 
 @torch.no_grad()

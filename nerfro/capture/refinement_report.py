@@ -53,12 +53,9 @@ def refine(
         print(f"the surface stays as it is: at best {told}, which is too little to trust")
     else:
         moved = float(torch.from_numpy(refined.mesh.vertices - mesh.vertices).norm(dim=-1).median())
-        print(
-            f"surface refined: {told}; half of it moved by {moved:.2g} or more; "
-            f"{refined.used:.0%} of the object's pixels told how"
-        )
+        print(f"surface refined: {told}; half of it moved by {moved:.2g} or more")
     figures = {"steps": refined.steps, "held_back_error": [round(error, 5) for error in refined.errors]}
-    write_atomically(folder / FIGURES, json.dumps(figures | {"pixels_used": round(refined.used, 3)}, indent=1) + "\n")
+    write_atomically(folder / FIGURES, json.dumps(figures, indent=1) + "\n")
     _draw(around, medium, refined.medium, folder / PICTURES)
     return refined
 

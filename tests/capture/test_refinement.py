@@ -44,7 +44,6 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refinement, "_STAGES", stages)
     monkeypatch.setattr(displacement, "LEVELS", (8, 16))
     monkeypatch.setattr(refinement, "_PIXELS", 2000)
-    monkeypatch.setattr(refinement, "_VOXELS", 12)
 
 
 @functools.cache
@@ -94,7 +93,6 @@ def test_an_interrupted_refinement_goes_on(short: None, tmp_path: Path, monkeypa
     stages = (refinement._Stage(50, 5e-4, (3.0, 1.0)), refinement._Stage(25, 1e-4, (0.0, 0.0)))
     monkeypatch.setattr(refinement, "_STAGES", stages)
     monkeypatch.setattr(refinement, "_PIXELS", 500)
-    monkeypatch.setattr(refinement, "_LOOK_EVERY", 40)
     record, told = tmp_path / "state", []
 
     def interrupted(done: float) -> None:
