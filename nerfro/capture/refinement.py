@@ -73,17 +73,17 @@ class _Stage:
 # The first stages are too bold for a surface that is nearly right. They are left when it is worse by a share, and so
 # is whatever is not the best when a stage ends.
 _STAGES = (
-    _Stage(200, 4e-4, (3.0, 1.4)),
-    _Stage(300, 3e-4, (1.4, 0.5)),
-    _Stage(150, 8e-5, (0.7, 0.35)),
+    _Stage(200, 2e-4, (3.0, 1.4)),
+    _Stage(300, 1.5e-4, (1.4, 0.5)),
+    _Stage(150, 4e-5, (0.7, 0.35)),
     _Stage(100, 1e-5, (0.0, 0.0)),
 )
-_WORSE = 0.01
+_WORSE = 0.03
 _JUDGE_EVERY = 25  # steps
 # A surface that makes held-back photographs better by a smaller share is not taken: reflections, tint and what is
-# inside can be explained a little by a wrong surface too. It was 0.03 to 0.09 where the surface became better, and up
-# to 0.007 where it did not.
-_LEAST_GAIN = 0.02
+# inside can be explained a little by a wrong surface too. It was 0.012 to 0.11 where the surface became better, and up
+# to 0.009 where it did not.
+_LEAST_GAIN = 0.01
 
 
 @dataclass(frozen=True)
