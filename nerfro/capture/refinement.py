@@ -127,7 +127,7 @@ def refine_surface(
             interrupted goes on; it is removed at the end.
 
     Raises:
-        NerfroError: the surroundings are near, or too few pixels show them through the object.
+        NerfroError: the surroundings are near, or no pixel shows them through the object.
     """
     if isinstance(surroundings.boundary, Room):
         raise NerfroError(

@@ -89,6 +89,18 @@ def test_a_surface_that_is_right_stays(short: None) -> None:
     assert len(found.errors) > 2  # others were tried
 
 
+def test_a_rough_surface_is_smoothed_as_much_as_its_judges_like(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(refinement, "_STAGES", ())
+    monkeypatch.setattr(refinement, "_SMOOTHINGS", (0.02, 0.04, 0.3))
+    right = dented()
+    rough = 0.004 * torch.randn(right.distances.shape, generator=torch.Generator().manual_seed(0))
+    start = right.grown(rough[0])
+    found = refined(start)
+    assert degrees_off(found.medium) < 0.6 * degrees_off(start)
+    assert found.steps == [0, 0, 0]
+    assert found.errors[1] < 0.9 * found.errors[0]
+
+
 def test_an_interrupted_refinement_goes_on(short: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stages = (refinement._Stage(50, 5e-4, (3.0, 1.0)), refinement._Stage(25, 1e-4, (0.0, 0.0)))
     monkeypatch.setattr(refinement, "_STAGES", stages)
