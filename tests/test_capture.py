@@ -49,9 +49,11 @@ def outline_of(points: np.ndarray, height: int, width: int) -> np.ndarray:
 
 @pytest.fixture(scope="module", autouse=True)
 def _built_quickly() -> Iterator[None]:
-    """The scene is built once; light that falls on its room is noisy, for poses and outlines do not depend on it."""
+    """The scene is built once, its room is blurred and its light noisy: poses and outlines do not depend on these."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dataset, "BAKING_SPP", 8)
+        panels = dolphin_capture.room_panels
+        patch.setattr(dolphin_capture, "room_panels", lambda spacing: panels(5 * spacing))
         patch.setattr(dolphin_capture, "build", cache(dolphin_capture.build))
         yield
 
