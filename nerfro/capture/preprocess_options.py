@@ -7,7 +7,7 @@ import typing
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, Optional
+from typing import Annotated, Any, Optional
 
 import numpy as np
 from omegaconf import MISSING, DictConfig, OmegaConf
@@ -17,6 +17,7 @@ from nerfro.cameras import Cameras
 from nerfro.capture.index_report import CURVE, INDEX, LENGTHS, LENGTHS_CURVE
 from nerfro.capture.overlaps import REPORT, SHEET
 from nerfro.capture.refinement_report import FIGURES, PICTURES
+from nerfro.capture.revolution import Symmetry
 from nerfro.capture.upright import find_up
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing, write_atomically
@@ -69,7 +70,7 @@ class PreprocessConfig:
     wrong_masks: Optional[Natural] = 0  # noqa: UP045
     keep: Optional[Count] = None  # noqa: UP045
     smoothing: NotNegative = 1.0
-    symmetry: Annotated[Optional[str], Literal["axis", "auto"]] = None  # noqa: UP045
+    symmetry: Annotated[Optional[str], Symmetry] = None  # noqa: UP045
     overwrite: bool = False
 
 

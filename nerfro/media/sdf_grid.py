@@ -165,6 +165,11 @@ class SdfGrid(Solid):
         """Bounds of the outer mesh; the grid's box where there is none."""
         return torch.from_numpy(self.meshes[0].bounds).float() if self.meshes else self.box
 
+    @property
+    def spacing(self) -> Float[Tensor, "3"]:
+        """Distance between neighbouring vertices, world units."""
+        return (self.box[1] - self.box[0]) / (constant(self.distances.shape[1:], self.box.device) - 1)
+
     def grown(self, outwards: Float[Tensor, "X Y Z"]) -> SdfGrid:
         """The same glass with its outer surface moved outwards by so much at the grid's vertices, world units.
 
@@ -189,8 +194,7 @@ class SdfGrid(Solid):
         low, high = self.content_box
         self.displacement = Displacement(tuple(self.distances.shape[1:]), self.box, float((high - low).max()))
         self.register_buffer("_given", self.distances, persistent=False)
-        spacing = float(((self.box[1] - self.box[0]) / (torch.tensor(self.distances.shape[1:]) - 1)).max())
-        beside = (self.distances[0].abs() < spacing).flatten().nonzero()[:, 0]
+        beside = (self.distances[0].abs() < float(self.spacing.max())).flatten().nonzero()[:, 0]
         self.register_buffer("_beside", beside, persistent=False)
         # In checkpoints, for a run that goes on traces what it would have traced.
         self.register_buffer("_settled", self.displacement.state())
@@ -267,7 +271,7 @@ class SdfGrid(Solid):
             # Neighbouring blocks share the vertices between them.
             last = torch.arange(count * BLOCK + 1).clamp(max=nearest.shape[axis] - 1)
             nearest = nearest.index_select(axis, last).unfold(axis, BLOCK + 1, BLOCK).amin(-1)
-        spacing = (self.box[1] - self.box[0]).cpu() / (torch.tensor(self.coefficients.shape[1:]) - 1)
+        spacing = self.spacing.cpu()
         # A point is within half a cell's diagonal of a vertex; the spline's surface is a little off the data's.
         margin = 0.5 * torch.linalg.vector_norm(spacing) + 0.25 * spacing.min()
         return (nearest - margin).clamp(min=0).to(self.distances.device)
@@ -279,7 +283,7 @@ class SdfGrid(Solid):
         A derivative is a mean of differences of neighbouring coefficients, so that these bound it. Nothing bounds it
         at the grid's border, where splines are continued.
         """
-        spacing = (self.box[1] - self.box[0]).cpu() / (torch.tensor(self.coefficients.shape[1:]) - 1)
+        spacing = self.spacing.cpu()
         values = self._coefficients_of_blocks()
         bounds = []
         for axis in range(3):
