@@ -160,9 +160,9 @@ def refine_surface(
                 kept.write({"at": asdict(at), "descent": descent.record()})
         descent.set(at.best)
         at.stage, at.step = at.stage + 1, 0
+    moved, smoothed = descent.smoothed(descent.moved(), min(at.errors))
     progress(1.0)
     kept.remove()
-    moved, smoothed = descent.smoothed(descent.moved(), min(at.errors))
     steps, errors = [*at.steps, at.steps[-1]], [*at.errors, smoothed]
     if smoothed > (1 - _LEAST_GAIN) * error:
         return Refined(mesh, medium, steps, errors)
@@ -285,10 +285,9 @@ class _Descent:
     def smoothed(self, medium: SdfGrid, error: float) -> tuple[SdfGrid, float]:
         """The medium with its outer surface as smooth as the judges like it best, and their error; it has `error`."""
         distances = medium.distances[0]
-        spacing = float(((medium.box[1] - medium.box[0]) / (torch.tensor(distances.shape) - 1)).min())
         best = medium
         for share in _SMOOTHINGS:
-            sigma = share * self.size / spacing
+            sigma = share * self.size / float(medium.spacing.min())
             tried = medium.grown(distances - smooth(distances, 2 * math.ceil(3 * sigma) + 1, sigma))
             if (judged := self.judged(tried)) < error:
                 best, error = tried, judged
@@ -337,7 +336,7 @@ def _blurred(surroundings: Surroundings, degrees: float) -> Boundary:
 def _onto(mesh: TriangleMesh, medium: SdfGrid) -> TriangleMesh:
     """The mesh with its vertices moved onto the zero level of a medium's first body, by Newton's steps."""
     vertices = torch.from_numpy(mesh.vertices).float()
-    spacing = float(((medium.box[1] - medium.box[0]) / (torch.tensor(medium.distances.shape[1:]) - 1)).min())
+    spacing = float(medium.spacing.min())
     for _ in range(5):
         phi, gradient = quadratic_spline(medium.coefficients[0], medium.box, vertices)
         square = gradient.square().sum(-1, keepdim=True).clamp(min=0.25)
