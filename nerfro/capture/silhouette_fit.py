@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -16,41 +16,48 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from nerfro.cameras import Cameras
+from nerfro.capture.surroundings import HELD_BACK
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.geometry.mesh import TriangleMesh
+
+# For each view the number of the outline's pixel that is nearest to each of its pixels.
+_Outlines: TypeAlias = "dict[int, Int[np.ndarray, 'H W']]"
 
 
 class _Prior(NamedTuple):
     """What is taken for likely where no outline tells.
 
-    The last weights of area and bending for each observation of the outline are in units of the object's size. They
-    fall from `first` times that: a surface that is too small is pulled out at the edges, where the object is, whereas
-    one that fills the hull touches all masks everywhere and would stay.
+    Weights of area and bending are for each observation of the outline, in units of the object's size, and are
+    multiplied by a strength that falls step by step: a surface that is too small is pulled out at the edges, where the
+    object is, whereas one that fills the hull touches all masks everywhere and would stay.
     """
 
     area: float
     bending: float
-    first: float
+    first: float  # strength of the first step
+    last: float
     usual: bool  # whether the curvature that is usual around a vertex is likely, or none
-    iterations: int
+    edge: float  # curvature, see `_mean_curvature`, beyond which area and bending cost less: an edge is no error
 
 
-_ROUND = _Prior(area=3e-5, bending=1e-7, first=1, usual=True, iterations=10)
-_FLAT = _Prior(area=3e-6, bending=1e-8, first=100, usual=False, iterations=20)
-# Flat sides and sharp edges are believed in if they bring the outlines so much nearer to the masks'. Over five scenes
-# it was 0.26 and 0.64 times as near where they are true, and 0.94 to 1.2 where the object is round or masks are coarse.
-_CONVINCING = 0.8
+# Chosen on `torus` and `ship`, with masks of shares.
+_ROUND = _Prior(area=3e-6, bending=1e-5, first=100, last=0.01, usual=True, edge=np.inf)
+_FLAT = _Prior(area=3e-6, bending=5e-9, first=100, last=0.1, usual=False, edge=0.02)
+# Steps of falling strength, and steps after them, with all views, of the strength that was best.
+_STEPS, _LAST_STEPS = 22, 3
+# How far vertices move to the middle of their neighbours, along the surface.
+_SPREADING = 0.5
 # A normal that is turned by a radian counts as far away as this share of the object's size. Curvature is usual around a
 # vertex if this share of the vertices there have at least as much: 0 on flat sides and low roofs, the ball's on a ball.
 _TURN, _LEAST_SHARE = 0.08, 0.7
 # Around a vertex are so many of these, spread over the whole surface.
 _NUM_AROUND, _NUM_SPREAD = 31, 1000
-# A binary mask's outline is known to about this, pixels. The misfits' median over it, where that is more than 1, is how
-# far the surface still is from the masks: the two limits below widen with it, so that it never loses them all.
+# A binary mask's outline is known to about this, pixels. The misfits' median over it is how far the surface still is
+# from the masks: the two limits below widen with it, so that it never loses them all.
 _TYPICAL = 0.35
 # Outlines farther than this from a mask's belong to folds of the surface in front of itself; where the weight of an
-# observation is halved, pixels.
-_GATE, _HALVED = 3.0, 0.7
+# observation is halved, pixels. Masks of shares are surer than binary ones, up to a share of it.
+_GATE, _HALVED, _SUREST = 3.0, 0.7, 0.3
 
 
 class _Rims(NamedTuple):
@@ -87,21 +94,26 @@ def fit_surface(
     is left alone, where least area alone would draw it in between its rims. All of it is relative to the object's size
     and to the number of observations.
 
-    That draws in sharp edges. So a second surface is fitted without C and p, with much area first and hardly any at
-    last; it is taken where its outlines are clearly nearer to the masks'.
+    That draws in sharp edges. So a second surface is fitted without C and p, whose area and bending cost less where it
+    is bent much. Views that are held back decide between the two, and how strong area and bending are: the surer the
+    masks, the weaker.
 
     The mesh is closed and has triangles of about one size, such as marching cubes give. `smoothing` multiplies the
-    weights of area and bending; more of it suits masks that were drawn by hand. `progress` is told the share done.
+    strength that was found; more of it suits masks that were drawn by hand. `progress` is told the share done.
     """
     count = itertools.count(1)
 
     def step() -> None:
-        progress(next(count) / (_ROUND.iterations + _FLAT.iterations))
+        progress(min(1.0, next(count) / (2 * _STEPS + _LAST_STEPS)))
 
-    outlines = [_nearest_outline_pixel(mask) for mask in (silhouettes.masks > 0.5).numpy()]
-    rounded, rounded_misfit = _fit(mesh, silhouettes, outlines, smoothing, _ROUND, step)
-    flat, flat_misfit = _fit(mesh, silhouettes, outlines, smoothing, _FLAT, step)
-    return flat if flat_misfit < _CONVINCING * rounded_misfit else rounded
+    fit, outlines = _Fit(mesh, silhouettes), _outlines(silhouettes)
+    found = [fit.search(prior, outlines, step) for prior in (_ROUND, _FLAT)]
+    best = min(found, key=lambda each: each.misfit)
+    vertices = best.vertices
+    for left in reversed(range(_LAST_STEPS)):
+        vertices = fit.moved(vertices, outlines, best.prior, smoothing * best.strength, spread=left > 0)
+        step()
+    return TriangleMesh(vertices, mesh.faces)
 
 
 def rim_points(
@@ -112,62 +124,110 @@ def rim_points(
     With them how far each had to move outwards to lie on it, and how wide a pixel is there; all in world units.
     """
     faces, vertices = mesh.faces, mesh.vertices
-    outlines = [_nearest_outline_pixel(mask) for mask in (silhouettes.masks > 0.5).numpy()]
-    rims = _find_rims(vertices, _vertex_normals(vertices, faces), _edges(faces), silhouettes, outlines)
+    normals = _vertex_normals(vertices, faces)
+    rims = _find_rims(vertices, normals, _edges(faces), silhouettes, _outlines(silhouettes))
     share = rims.share[:, None]
     points = (1 - share) * vertices[rims.first] + share * vertices[rims.second]
     first, second, third = (torch.from_numpy(values).float() for values in (points, rims.misfit, rims.width))
     return first, second, third
 
 
+def _outlines(silhouettes: Silhouettes) -> _Outlines:
+    return {view: _nearest_outline_pixel(mask) for view, mask in enumerate((silhouettes.masks > 0.5).numpy())}
+
+
 def _edges(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "E 2"]:
     return np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
 
 
-def _fit(
-    mesh: TriangleMesh,
-    silhouettes: Silhouettes,
-    outlines: list[Int[np.ndarray, "H W"]],
-    smoothing: float,
-    prior: _Prior,
-    step: Callable[[], None],
-) -> tuple[TriangleMesh, float]:
-    """The surface that is likeliest by a prior, and its outlines' mean distance from the masks', world units."""
-    faces, vertices = mesh.faces, mesh.vertices.copy()
-    edges = _edges(faces)
-    size = float(np.ptp(vertices, axis=0).max())
-    both, degree = np.concatenate([edges, edges[:, ::-1]]), np.bincount(edges.ravel())
-    # These take values at vertices to the means of their neighbours', and to their differences along edges.
-    mean = sparse.csr_matrix((1 / degree[both[:, 0]], (both[:, 0], both[:, 1])), (len(vertices),) * 2)
-    signs, number = np.repeat([1.0, -1.0], len(edges)), np.tile(np.arange(len(edges)), 2)
-    across = sparse.csr_matrix((signs, (number, edges.T.ravel())), (len(edges), len(vertices)))
-    for iteration in range(prior.iterations):
-        normals = _vertex_normals(vertices, faces)
-        rims = _find_rims(vertices, normals, edges, silhouettes, outlines)
+class _Found(NamedTuple):
+    """The surface of one prior with which views that were held back agree best, and its mean misfit there."""
+
+    prior: _Prior
+    strength: float
+    vertices: Float[np.ndarray, "V 3"]
+    misfit: float
+
+
+class _Fit:
+    """What all steps of a fit share: the triangles and the views."""
+
+    def __init__(self, mesh: TriangleMesh, silhouettes: Silhouettes) -> None:
+        self.start, self.faces, self.silhouettes = mesh.vertices, mesh.faces, silhouettes
+        self.edges = edges = _edges(mesh.faces)
+        self.size = float(np.ptp(mesh.vertices, axis=0).max())
+        self.degree = np.bincount(edges.ravel())
+        both, num_vertices = np.concatenate([edges, edges[:, ::-1]]), len(mesh.vertices)
+        # These take values at vertices to the means of their neighbours', and to their differences along edges.
+        shape = (num_vertices, num_vertices)
+        self.mean = sparse.csr_matrix((1 / self.degree[both[:, 0]], (both[:, 0], both[:, 1])), shape)
+        signs, number = np.repeat([1.0, -1.0], len(edges)), np.tile(np.arange(len(edges)), 2)
+        self.across = sparse.csr_matrix((signs, (number, edges.T.ravel())), (len(edges), num_vertices))
+
+    def search(self, prior: _Prior, outlines: _Outlines, step: Callable[[], None]) -> _Found:
+        """Fit with a prior that becomes weaker and weaker; views that are held back tell the best strength.
+
+        Where there are too few to hold one back it is 1.
+        """
+        judges = {view: outline for view, outline in outlines.items() if view % HELD_BACK == HELD_BACK - 1}
+        teachers = {view: outline for view, outline in outlines.items() if view not in judges}
+        strengths = np.geomspace(prior.first, prior.last if judges else 1.0, _STEPS)
+        vertices, found = self.start, []
+        for strength in strengths.tolist():
+            vertices = self.moved(vertices, teachers, prior, strength)
+            misfit = float(np.abs(self.rims(vertices, judges or teachers).misfit).mean())
+            found.append(_Found(prior, strength, vertices, misfit))
+            step()
+        return min(found, key=lambda each: each.misfit) if judges else found[-1]
+
+    def rims(self, vertices: Float[np.ndarray, "V 3"], outlines: _Outlines) -> _Rims:
+        """Where views see the outlines of a surface."""
+        return _find_rims(vertices, _vertex_normals(vertices, self.faces), self.edges, self.silhouettes, outlines)
+
+    def moved(
+        self,
+        vertices: Float[np.ndarray, "V 3"],
+        outlines: _Outlines,
+        prior: _Prior,
+        strength: float,
+        spread: bool = True,
+    ) -> Float[np.ndarray, "V 3"]:
+        """Vertices after a step. `spread`: also along the surface, so that triangles become alike.
+
+        Small and large ones side by side, as marching cubes leave them, have a mean of neighbours that says more about
+        the triangles than about the curvature.
+        """
+        normals, rims = _vertex_normals(vertices, self.faces), self.rims(vertices, outlines)
         num_rims = len(rims.share)
-        # The last three steps have the last weights.
-        more = prior.first ** max(0.0, 1 - iteration / (prior.iterations - 3))
-        area = smoothing * num_rims * prior.area * more
-        bending = smoothing * num_rims * prior.bending * more * size**2
+        area = strength * num_rims * prior.area
+        bending = strength * num_rims * prior.bending * self.size**2
         row, column = np.tile(np.arange(num_rims), 2), np.concatenate([rims.first, rims.second])
         shares = np.concatenate([1 - rims.share, rims.share])
         observed = sparse.csr_matrix((shares, (row, column)), (num_rims, len(vertices)))
-        curvature, curved, around = _mean_curvature(vertices, normals, edges, mean)
-        usual = _usual_curvature(curved, vertices, normals, _TURN * size) if prior.usual else np.zeros_like(curved)
-        stretch = sum(n @ across.T @ across @ n for n in map(sparse.diags, normals.T))
-        stretched = sum(normals[:, a] * (across.T @ (across @ vertices[:, a])) for a in range(3))
-        pressure = -degree * around / np.sqrt(around.mean()) * usual
-        weights = sparse.diags(rims.weight)
-        system = observed.T @ weights @ observed + area * stretch + bending * (curvature.T @ curvature)
+        curvature, curved, around = _mean_curvature(vertices, normals, self.edges, self.mean)
+        usual = _usual_curvature(curved, vertices, normals, _TURN * self.size) if prior.usual else 0 * curved
+        bent = np.abs(curved - usual)
+        # What is bent while the prior is still strong may be the roofs that it shall level.
+        edge = prior.edge * max(1.0, strength)
+        stiff = 1 / np.hypot(1, 0.5 * (bent + self.mean @ bent) / edge)
+        stiffness, tension = sparse.diags(stiff), self.across.T @ sparse.diags(stiff[self.edges].prod(1)) @ self.across
+        stretch = sum(n @ tension @ n for n in map(sparse.diags, normals.T))
+        stretched = sum(normals[:, a] * (tension @ vertices[:, a]) for a in range(3))
+        pressure = -self.degree * around / np.sqrt(around.mean()) * usual
+        system = observed.T @ sparse.diags(rims.weight) @ observed + area * stretch
+        system += bending * (curvature.T @ stiffness @ curvature)
         right = observed.T @ (rims.weight * rims.misfit) - area * (stretched - pressure)
-        right -= bending * (curvature.T @ (curved - usual))
+        right -= bending * (curvature.T @ (stiffness @ (curved - usual)))
         # Symmetric and positive definite: no pivoting needed, and an ordering that keeps the factors sparse.
         factors = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0, options={"SymmetricMode": True})
-        longest = 2 * np.sqrt(((vertices[edges[:, 0]] - vertices[edges[:, 1]]) ** 2).sum(1).mean())
-        vertices += factors.solve(right).clip(-longest, longest)[:, None] * normals
-        step()
-    rims = _find_rims(vertices, _vertex_normals(vertices, faces), edges, silhouettes, outlines)
-    return TriangleMesh(vertices, faces), float(np.abs(rims.misfit).mean())
+        ends = vertices[self.edges]
+        longest = 2 * np.sqrt(((ends[:, 0] - ends[:, 1]) ** 2).sum(1).mean())
+        vertices = vertices + factors.solve(right).clip(-longest, longest)[:, None] * normals
+        if spread:
+            normals = _vertex_normals(vertices, self.faces)
+            towards = self.mean @ vertices - vertices
+            vertices = vertices + _SPREADING * (towards - (towards * normals).sum(1, keepdims=True) * normals)
+        return vertices
 
 
 def _find_rims(
@@ -175,13 +235,13 @@ def _find_rims(
     normals: Float[np.ndarray, "V 3"],
     edges: Int[np.ndarray, "E 2"],
     silhouettes: Silhouettes,
-    outlines: list[Int[np.ndarray, "H W"]],
+    outlines: _Outlines,
 ) -> _Rims:
     """The outermost rims that every view sees near each pixel of its mask's outline."""
     cameras = silhouettes.cameras
     spacing = float(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1).mean())
     parts = []
-    for view, outline in enumerate(outlines):
+    for view, outline in outlines.items():
         facing = (normals * (vertices - cameras.camera_to_world[view, :, 3].double().numpy())).sum(1)
         ends = facing[edges]
         turning = np.flatnonzero((ends[:, 0] > 0) != (ends[:, 1] > 0))
@@ -200,9 +260,9 @@ def _find_rims(
         outermost = known[order[np.diff(cell[order], prepend=-1) != 0]]
         parts.append((first[outermost], second[outermost], share[outermost], inside[outermost], width[outermost]))
     first, second, share, misfit, width = (np.concatenate(values) for values in zip(*parts, strict=True))
-    spread = max(1.0, float(np.median(np.abs(misfit))) / _TYPICAL)
-    near = np.abs(misfit) < _GATE * spread
-    weight = 1 / (1 + (misfit / (_HALVED * spread)) ** 2)
+    spread = float(np.median(np.abs(misfit))) / _TYPICAL
+    near = np.abs(misfit) < _GATE * max(1.0, spread)
+    weight = 1 / (1 + (misfit / (_HALVED * max(_SUREST, spread))) ** 2)
     return _Rims(first[near], second[near], share[near], (misfit * width)[near], weight[near], width[near])
 
 
