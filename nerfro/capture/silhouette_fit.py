@@ -40,11 +40,14 @@ class _Prior(NamedTuple):
     edge: float  # curvature, see `_mean_curvature`, beyond which area and bending cost less: an edge is no error
 
 
-# Chosen on `torus` and `ship`, with masks of shares.
+# Chosen on the scenes `torus` and `ship`, with masks of shares.
 _ROUND = _Prior(area=3e-6, bending=1e-5, first=100, last=0.01, usual=True, edge=np.inf)
 _FLAT = _Prior(area=3e-6, bending=5e-9, first=100, last=0.1, usual=False, edge=0.02)
 # Steps of falling strength, and steps after them, with all views, of the strength that was best.
 _STEPS, _LAST_STEPS = 22, 3
+# The strongest is taken whose outlines are at most so many times as far from the masks' as the nearest: noise of masks
+# tilts a surface before it moves its outlines.
+_AS_GOOD = 1.1
 # How far vertices move to the middle of their neighbours, along the surface.
 _SPREADING = 0.5
 # A normal that is turned by a radian counts as far away as this share of the object's size. Curvature is usual around a
@@ -56,7 +59,7 @@ _NUM_AROUND, _NUM_SPREAD = 31, 1000
 # from the masks: the two limits below widen with it, so that it never loses them all.
 _TYPICAL = 0.35
 # Outlines farther than this from a mask's belong to folds of the surface in front of itself; where the weight of an
-# observation is halved, pixels. Masks of shares are surer than binary ones, up to a share of it.
+# observation is halved, pixels. That falls to this share of it for masks of shares, which are surer than binary ones.
 _GATE, _HALVED, _SUREST = 3.0, 0.7, 0.3
 
 
@@ -104,7 +107,7 @@ def fit_surface(
     count = itertools.count(1)
 
     def step() -> None:
-        progress(min(1.0, next(count) / (2 * _STEPS + _LAST_STEPS)))
+        progress(next(count) / (2 * _STEPS + _LAST_STEPS))
 
     fit, outlines = _Fit(mesh, silhouettes), _outlines(silhouettes)
     found = [fit.search(prior, outlines, step) for prior in (_ROUND, _FLAT)]
@@ -165,20 +168,18 @@ class _Fit:
         self.across = sparse.csr_matrix((signs, (number, edges.T.ravel())), (len(edges), num_vertices))
 
     def search(self, prior: _Prior, outlines: _Outlines, step: Callable[[], None]) -> _Found:
-        """Fit with a prior that becomes weaker and weaker; views that are held back tell the best strength.
-
-        Where there are too few to hold one back it is 1.
-        """
-        judges = {view: outline for view, outline in outlines.items() if view % HELD_BACK == HELD_BACK - 1}
+        """Fit with a prior that becomes weaker and weaker; views that are held back tell the best strength."""
+        judging = range(HELD_BACK - 1, len(outlines), HELD_BACK) or [len(outlines) - 1]
+        judges = {view: outlines[view] for view in judging}
         teachers = {view: outline for view, outline in outlines.items() if view not in judges}
-        strengths = np.geomspace(prior.first, prior.last if judges else 1.0, _STEPS)
         vertices, found = self.start, []
-        for strength in strengths.tolist():
+        for strength in np.geomspace(prior.first, prior.last, _STEPS).tolist():
             vertices = self.moved(vertices, teachers, prior, strength)
-            misfit = float(np.abs(self.rims(vertices, judges or teachers).misfit).mean())
+            misfit = float(np.abs(self.rims(vertices, judges).misfit).mean())
             found.append(_Found(prior, strength, vertices, misfit))
             step()
-        return min(found, key=lambda each: each.misfit) if judges else found[-1]
+        enough = _AS_GOOD * min(each.misfit for each in found)
+        return next(each for each in found if each.misfit <= enough)
 
     def rims(self, vertices: Float[np.ndarray, "V 3"], outlines: _Outlines) -> _Rims:
         """Where views see the outlines of a surface."""

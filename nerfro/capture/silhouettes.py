@@ -23,7 +23,7 @@ _SOFT = 0.2
 # Farther from the outline than this the blur knows nothing, and the distance is counted from pixel to pixel.
 _REACH = 1.5
 # Inside and outside stay what the mask says, by at least this many pixels.
-_LEAST = 0.0
+_LEAST = 1e-3
 
 
 def outline_distance(mask: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:

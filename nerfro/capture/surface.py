@@ -132,8 +132,7 @@ def surfaces_inside(medium: Medium) -> list[TriangleMesh]:
     """The surfaces of the bodies inside the outer one, as far as they are there; none of a medium without a grid."""
     if not isinstance(medium, SdfGrid):
         return []
-    low, high = medium.box.double().cpu().numpy()
-    spacing = (high - low) / (np.array(medium.distances.shape[1:]) - 1)
+    low, spacing = (values.double().cpu().numpy() for values in (medium.box[0], medium.spacing))
     of_bodies = medium.distances.cummax(0).values[1:].cpu().numpy()
     return [extract_surface(distances, low, spacing) for distances in of_bodies if (distances < 0).any()]
 
