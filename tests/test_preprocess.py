@@ -238,16 +238,17 @@ def test_disagreeing_masks_name_the_number_that_may_be_wrong(preprocess: Callabl
         return mask
 
     _change_masks(capture, cut, 1)
-    printed = preprocess()
+    # The hull alone: the fit finds most of the side again.
+    printed = preprocess("smoothing=0")
     assert "overlaps below 0.9" in printed
     told = re.search(r"wrong_masks=(\d)", printed)
     assert told is not None
     before = json.loads((capture / "overlaps.json").read_text())["views"]
-    again = preprocess(f"wrong_masks={told[1]}", "overwrite=true")
+    again = preprocess(f"wrong_masks={told[1]}", "smoothing=0", "overwrite=true")
     assert "wrong_masks=" not in again
     after = json.loads((capture / "overlaps.json").read_text())["views"]
     whole = [f"train/r_{view}" for view in range(1, NUM_VIEWS)]
     assert np.mean([after[name] for name in whole]) > np.mean([before[name] for name in whole]) + 0.01
-    found = preprocess("wrong_masks=null", "overwrite=true")
+    found = preprocess("wrong_masks=null", "smoothing=0", "overwrite=true")
     assert f"wrong_masks={told[1]}: a coarse hull" in found
     assert json.loads((capture / "overlaps.json").read_text())["views"] == after
