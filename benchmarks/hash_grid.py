@@ -23,7 +23,7 @@ from nerfro.fields import hash_encoding
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.fields.spherical_harmonics import spherical_harmonics
 from nerfro.kernels.allocator import keep_freed_memory
-from nerfro.types import Samples
+from nerfro.types import Exits, Samples
 
 Task = Callable[[], object]
 
@@ -129,7 +129,7 @@ def environment_map_tasks(num_rays: int) -> list[tuple[str, Task, Task]]:
         torch.autograd.grad(torch.sigmoid(raw).square().sum(), boundary.texels)
 
     def compiled() -> None:
-        torch.autograd.grad(boundary(directions).square().sum(), boundary.texels)
+        torch.autograd.grad(boundary(Exits(directions)).square().sum(), boundary.texels)
 
     return [("environment map, one direction a ray, forward and backward", twin, compiled)]
 

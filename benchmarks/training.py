@@ -44,6 +44,7 @@ from nerfro.registry import build, discover
 from nerfro.training.config import TrainConfig, build_model
 from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.ray_batches import RayBatches
+from nerfro.training.trainer import lightning_precision
 from nerfro.types import Batch
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -132,7 +133,7 @@ class Training:
         trainer = pl.Trainer(
             max_steps=num_steps,
             callbacks=[steps],
-            precision=self.config.trainer.precision,
+            precision=lightning_precision(self.config),
             logger=False,
             enable_checkpointing=False,
             enable_progress_bar=False,

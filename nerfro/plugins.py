@@ -25,7 +25,7 @@ def describe(plugin: Plugin) -> Group:
     """A plugin's name, summary and fields, for the console."""
     table = Table("field", "type", "default", box=None, pad_edge=False, show_header=False)
     for name, kind, default in plugin.fields():
-        table.add_row(f"    {name}", kind, str(default))
+        table.add_row(f"    {name}", Text(kind), str(default))  # its brackets are no markup
     heading = Text.assemble((f"{plugin.kind}={plugin.name}", "bold"), f"  {plugin.summary}")
     return Group(heading, table) if table.rows else Group(heading)
 

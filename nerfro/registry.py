@@ -18,7 +18,7 @@ import typing
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Optional, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Optional, TypeVar, Union, get_args, get_origin
 
 from hydra.core.config_store import ConfigStore
 from hydra.errors import InstantiationException
@@ -82,9 +82,7 @@ class Plugin:
             if field.name == "_target_":
                 continue
             default = field.default_factory() if callable(field.default_factory) else field.default
-            hint = self.hints[field.name]
-            kind = " | ".join(map(str, get_args(hint))) if get_origin(hint) is Literal else _type_name(field.type)
-            yield field.name, kind, "required" if default is MISSING else default
+            yield field.name, _type_name(self.hints[field.name]), "required" if default is MISSING else default
 
 
 _plugins: dict[tuple[str, str], Plugin] = {}
@@ -138,6 +136,10 @@ def build(node: DictConfig | Mapping[str, object], **parts: object) -> Any:
 
     A class is given those of `parts` that it asks for.
     """
+    if not isinstance(node, Mapping):
+        raise NerfroError(
+            f"'{node}' stands where settings belong; a slash chooses an option, as in sampler/path=eikonal"
+        )
     node = node if isinstance(node, DictConfig) else OmegaConf.create(dict(node))
     target = node.get("_target_")
     if target in _LIGHTNING_TARGETS:
@@ -260,8 +262,6 @@ def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             raise NerfroError(f"{kind}={name}: its constructor takes *{parameter.name}; name every parameter instead")
         hint = hints.get(parameter.name)
-        if get_origin(hint) is Literal:
-            hint = type(get_args(hint)[0])
         config_type = _config_type(hint)
         if config_type is None:
             parts.add(parameter.name)
@@ -279,6 +279,8 @@ def _config_type(hint: Any) -> Any:
     if hint in (int, float, bool, str):
         return hint
     origin, args = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return type(args[0])
     if origin in (Union, types.UnionType) and type(None) in args and len(args) == 2:
         inner = _config_type(next(a for a in args if a is not type(None)))
         return None if inner is None else Optional[inner]  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
@@ -300,9 +302,17 @@ def _default(parameter: inspect.Parameter) -> Any:
 
 
 def _type_name(hint: Any) -> str:
-    if get_origin(hint) is Union:
-        return " | ".join("none" if a is type(None) else _type_name(a) for a in get_args(hint))
-    return getattr(hint, "__name__", str(hint)) if get_origin(hint) is None else str(hint)
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return " | ".join(map(str, args))
+    if origin is Annotated:
+        return _type_name(args[0])
+    if origin in (Union, types.UnionType):
+        return " | ".join("none" if a is type(None) else _type_name(a) for a in args)
+    if origin in (list, tuple):
+        return f"list[{_type_name(args[0])}]"
+    name: str = getattr(origin or hint, "__name__", str(hint))
+    return name
 
 
 def _first_line(error: BaseException) -> str:

@@ -160,6 +160,7 @@ def test_open_mesh_is_accepted_when_asked(
         ("trainer.max_steps=1.5", ["trainer.max_steps", "could not be converted to Integer"]),
         ("trainer.max_steps=99999999999", ["trainer.max_steps=99999999999 is not allowed"]),
         ("trainer.precision=8", ["trainer.precision='8' is not allowed; choose '32-true'"]),
+        ("sampler.path=nothing", ["'nothing' stands where settings belong"]),
         ("trainer.accumulate_grad_batches=0", ["trainer.accumulate_grad_batches=0 is not allowed"]),
         ("+trainer.limit_train_batches=0", ["trainer.limit_train_batches is no setting"]),
         ("checkpoint.every_seconds=-1", ["checkpoint.every_seconds=-1.0 is not allowed"]),

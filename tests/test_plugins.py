@@ -161,8 +161,8 @@ def test_list_shows_every_plugin_with_its_fields_defaults_and_summary(
     for plugin in plugins():
         assert f"{plugin.kind}={plugin.name}" in words
         assert " ".join(plugin.summary.split()) in words
-        for name, _, _ in plugin.fields():
-            assert name in words
+        for name, kind, _ in plugin.fields():
+            assert f"{name} {kind} " in words
     assert {plugin.kind for plugin in plugins()} == set(KINDS)
 
 

@@ -16,6 +16,7 @@ from nerfro.fields.base import Field
 from nerfro.fields.mlp import radiance
 from nerfro.fields.selection import evaluate_selected, inside_box
 from nerfro.geometry.contraction import contract, contracted_box, shrinkage
+from nerfro.kernels.precision import fast_bfloat16
 from nerfro.registry import register
 from nerfro.types import Radiance, Samples
 
@@ -47,7 +48,7 @@ class HashGridField(Field):
         shortcut: add three features of the density network to the colour before its sigmoid. A picture that is mostly
             of one colour drives all units of the colour network below zero where another colour is needed; what is
             there would stay grey, for no gradient comes through them.
-        precision: of the MLPs' matrix products; `float32` for processors without bfloat16 units.
+        precision: of the MLPs' matrix products. None: bfloat16 where the machine has units for it, else float32.
     """
 
     box_min: Float[Tensor, "3"]
@@ -66,7 +67,7 @@ class HashGridField(Field):
         direction_bands: Annotated[int, Range(at_least=1, at_most=harmonics.MAX_BANDS)] = 4,
         initial_depth: Positive = 0.1,
         shortcut: bool = True,
-        precision: Literal["bfloat16", "float32"] = "bfloat16",
+        precision: Literal["bfloat16", "float32"] | None = None,
     ) -> None:
         super().__init__()
         box = torch.from_numpy(corners_of_box(box_min, box_max))
@@ -139,12 +140,14 @@ class HashGridField(Field):
 
     def apply_mlp(self, mlp: nn.Sequential, *inputs: Float[Tensor, "P _"]) -> Float[Tensor, "P O"]:
         """An MLP of inputs side by side in the field's precision, with a gradient of our own on the CPU."""
-        if inputs[0].device.type == "cpu":
+        device = inputs[0].device.type
+        rounds = fast_bfloat16(device) if self.precision is None else self.precision == "bfloat16"
+        if device == "cpu":
             from nerfro.fields.relu_mlp import relu_mlp
 
             weights = [layer.weight for layer in mlp if isinstance(layer, nn.Linear)]
-            return relu_mlp(list(inputs), weights, getattr(torch, self.precision))
-        with torch.autocast(inputs[0].device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
+            return relu_mlp(list(inputs), weights, torch.bfloat16 if rounds else torch.float32)
+        with torch.autocast(device, torch.bfloat16, enabled=rounds):
             return mlp(torch.cat([part.to(inputs[0].dtype) for part in inputs], dim=-1))
 
 

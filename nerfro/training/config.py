@@ -96,7 +96,8 @@ class TrainerConfig:
     strategy: Any = "auto"
     max_steps: Annotated[int, Range(at_least=-1, at_most=10**9)] = -1  # -1 for as many as max_time allows
     max_time: Any = None  # DD:HH:MM:SS
-    precision: Annotated[str, Literal["32-true", "16-mixed", "bf16-mixed", "64-true"]] = "32-true"
+    # `fastest` is bf16-mixed where the machine has units for it, else 32-true.
+    precision: Annotated[str, Literal["32-true", "fastest", "16-mixed", "bf16-mixed", "64-true"]] = "32-true"
     gradient_clip_val: Optional[Positive] = None  # noqa: UP045
     gradient_clip_algorithm: Annotated[Optional[str], Literal["norm", "value"]] = None  # noqa: UP045
     accumulate_grad_batches: Optional[Count] = None  # noqa: UP045

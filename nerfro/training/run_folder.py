@@ -25,6 +25,7 @@ from nerfro.errors import Interrupted, NerfroError, first_of
 from nerfro.files.atomic import write_atomically
 from nerfro.files.foreign_config import foreign_config
 from nerfro.files.owned import held, remove_unfinished, require_own
+from nerfro.kernels.precision import fast_bfloat16
 from nerfro.models.base import NerfModel
 from nerfro.paths import PACKAGE_DIR, user_path
 from nerfro.training import backdrop, content
@@ -99,6 +100,7 @@ def record(folder: Path, config: DictConfig) -> None:
         "machine": platform.machine(),
         "threads": torch.get_num_threads(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "fast_bfloat16": fast_bfloat16("cuda" if torch.cuda.is_available() else "cpu"),
         "versions": {name: _version(name) for name in _PACKAGES},
     }
     write_atomically(folder / "run.json", json.dumps(facts, indent=2) + "\n")

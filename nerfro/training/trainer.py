@@ -8,6 +8,7 @@ from datetime import timedelta
 from pathlib import Path
 
 import lightning.pytorch as pl
+import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
@@ -17,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerfro.errors import NerfroError
 from nerfro.kernels.allocator import keep_freed_memory
+from nerfro.kernels.precision import fast_bfloat16
 from nerfro.registry import build
 from nerfro.training.callbacks import ConfigInCheckpoint, TrainingProgress
 from nerfro.training.checkpoint_files import CheckpointFiles
@@ -51,6 +53,7 @@ def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.
         "limit_val_batches": 1 if every > 0 else 0,
         "num_sanity_val_steps": 0,
         "use_distributed_sampler": False,
+        "precision": lightning_precision(config),
     }
     if config.trainer.get("strategy") == "ddp":
         # The index grid is a buffer and would be sent around in every step, though all processes have the same one.
@@ -68,6 +71,15 @@ def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.
     if limit is None and trainer.max_steps < 0:
         raise NerfroError("the run would never end; set trainer.max_time (DD:HH:MM:SS), trainer.max_steps, or both")
     return trainer
+
+
+def lightning_precision(config: DictConfig) -> str:
+    """`trainer.precision` as Lightning names it."""
+    precision: str = config.trainer.precision
+    if precision != "fastest":
+        return precision
+    on_gpu = torch.cuda.is_available() and config.trainer.accelerator in ("auto", "gpu", "cuda")
+    return "bf16-mixed" if fast_bfloat16("cuda" if on_gpu else "cpu") else "32-true"
 
 
 def prepare_process(seed: int) -> None:

@@ -1,0 +1,53 @@
+"""Networks multiply in bfloat16 only where the machine has units for it, or where they are told to."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from nerfro.errors import NerfroError
+from nerfro.fields import relu_mlp
+from nerfro.fields.hash_grid import HashGridField
+from nerfro.kernels.precision import fast_bfloat16
+from nerfro.training.trainer import lightning_precision
+
+
+@pytest.fixture(params=[True, False])
+def has_units(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: request.param)
+    return bool(request.param)
+
+
+def test_a_field_multiplies_in_what_the_machine_does_fast(has_units: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    used: list[torch.dtype] = []
+
+    def spy(inputs: list[Tensor], weights: list[Tensor], dtype: torch.dtype) -> Tensor:
+        used.append(dtype)
+        return inputs[0].new_zeros(len(inputs[0]), len(weights[-1]))
+
+    monkeypatch.setattr(relu_mlp, "relu_mlp", spy)
+    positions = torch.zeros(4, 3)
+    for precision in (None, "bfloat16", "float32"):
+        HashGridField(num_levels=2, log2_table_size=6, precision=precision).density(positions)
+    assert used == [torch.bfloat16 if has_units else torch.float32, torch.bfloat16, torch.float32]
+
+
+def test_other_kinds_of_number_are_refused() -> None:
+    with pytest.raises(NerfroError, match="choose 'bfloat16', 'float32'"):
+        HashGridField(precision="int8")  # type: ignore[arg-type]
+
+
+def test_the_trainer_takes_the_fastest_where_it_is_told_to(has_units: bool) -> None:
+    def named(precision: str) -> str:
+        trainer: DictConfig = OmegaConf.create({"trainer": {"precision": precision, "accelerator": "cpu"}})
+        return lightning_precision(trainer)
+
+    assert named("fastest") == ("bf16-mixed" if has_units else "32-true")
+    assert named("bf16-mixed") == "bf16-mixed"
+    assert named("32-true") == "32-true"
+
+
+def test_devices_that_nobody_knows_multiply_in_float32() -> None:
+    assert not fast_bfloat16("mps")
