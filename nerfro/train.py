@@ -53,8 +53,8 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     model = build_model(config, training)
     require_same_run(folder, checkpoint, config)
     throughput, interruption = Throughput(), StopOnSignal()
-    # Cameras turn by the sky before it is learned.
-    cameras, boundary = CameraSteps(batches), BoundaryFirst(batches, config.optimizer.boundary_first)
+    # Cameras move by sky and outlines before the sky is learned.
+    cameras, boundary = CameraSteps(batches, training), BoundaryFirst(batches, config.optimizer.boundary_first)
     trainer = make_trainer(config, folder, [throughput, interruption, cameras, boundary, Viewer(config, source, test)])
     batches = traced(batches.share(trainer.global_rank, trainer.world_size), model, config)
     few = batches.smaller(4096)

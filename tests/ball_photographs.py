@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -18,6 +19,7 @@ from nerfro.geometry.mesh import TriangleMesh
 from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.snell import Snell
+from nerfro.types import Exits
 
 SIZE, NUM_VIEWS, RADIUS, INNER = 40, 30, 0.7, 0.35
 BOX = torch.tensor([[-0.9] * 3, [0.9] * 3])
@@ -57,13 +59,15 @@ def photographs(iors: list[float], opaque: bool = False) -> Views:
     return photographs_of(solid(iors), opaque)
 
 
-def photographs_of(medium: SdfGrid, opaque: bool = False) -> Views:
-    """What a medium shows of the sky."""
+def photographs_of(
+    medium: SdfGrid, opaque: bool = False, around: Callable[[Exits], Tensor] = lambda exits: sky(exits.directions)
+) -> Views:
+    """What a medium shows of what is around it, the sky."""
     taken, images = cameras(), []
     for view in range(NUM_VIEWS):
         rays = taken.image_rays(view)
         path = Snell()(rays, medium)
-        radiance = sky(path.exit_directions)
+        radiance = around(path.exits())
         if opaque:  # painted, in every colour of the sky
             radiance = torch.where(path.refracted[:, None], sky(normalize(path.positions[:, 1], dim=-1)), radiance)
         images.append(to_srgb(radiance).view(SIZE, SIZE, 3))

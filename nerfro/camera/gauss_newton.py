@@ -1,14 +1,14 @@
 """Cameras that are brought nearer to their photographs with the scene held: one step of Gauss-Newton for each.
 
 A photograph has hundreds of pixels for the six numbers of its camera, and a step of its normal equations is worth
-hundreds of steps along gradients of a few pixels. Cameras hang together by the lens that they share, and by what a
-panorama tells of them. Derivatives are differences of rendered colours over about a pixel: they see silhouettes that
-move, and are not misled by what is finer than a pixel.
+hundreds of steps along gradients of a few pixels. Cameras hang together by the lens that they share, and by what
+panorama and outlines have told of them. Derivatives are differences of rendered colours over about a pixel: they see
+silhouettes that move, and are not misled by what is finer than a pixel.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -16,8 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerfro.camera.least_squares import axes_across, robust_weights
-from nerfro.camera.panorama import Panorama
+from nerfro.camera.least_squares import Told, axes_across, normal_equations, robust_weights, with_told
 from nerfro.camera.pixel_units import object_distances
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
@@ -33,8 +32,6 @@ Photographed = Callable[[Int[Tensor, "R"]], Float[Tensor, "R 3"]]
 _LEAST_CONTRAST = 0.03
 # Change of colour for a pixel of motion from which a pixel counts less: so steep a slope does not reach far.
 _STEEP = 0.1
-# Of the mean of the normal equations' diagonal, added to it: what is not told of a camera stays.
-_DAMPING = 1e-3
 _TINY = 1e-9
 
 
@@ -56,7 +53,7 @@ def improve(
     photographed: Photographed,
     shown: Shown,
     how: Step,
-    panorama: Panorama | None = None,
+    told: Sequence[Told] = (),
 ) -> None:
     """Move each camera, and the lens that all share, by a step towards its photograph.
 
@@ -67,7 +64,7 @@ def improve(
         photographed: their colours in the photographs.
         shown: colours of the scene as it is now.
         how: the step.
-        panorama: what the sky tells of them, if it is known.
+        told: what is known of the cameras already.
     """
     view = pixels // (cameras.height * cameras.width)
     given, target = pixel_rays(cameras, pixels), photographed(pixels)
@@ -79,15 +76,10 @@ def improve(
     error = seen - target
     # A pixel's derivative holds no farther than its colour can change.
     weights = robust_weights(error, how.scale) / (1 + (slopes[..., :6] / _STEEP).square().sum((1, 2)))
-    matrix, vector = _equations(slopes.double(), error.double(), weights.double(), view, len(cameras))
-    if panorama is not None:
-        # Both in units of their own errors' variance.
-        variance = (weights[:, None] * error.square()).sum() / (3 * weights.sum()).clamp(min=_TINY)
-        information, place = (variance * panorama.information).to(matrix), _told_by_sky(len(cameras), vector)
-        matrix[place[:, None], place] += information
-        vector[place] += information @ (camera.numbers().to(vector) - panorama.numbers.to(vector))
-    step = -torch.linalg.solve(matrix, vector)
-    motion, lens = step[: 6 * len(cameras)].view(-1, 6), step[6 * len(cameras) :]
+    matrix, vector = normal_equations(slopes.double(), error.double(), weights.double(), view, len(cameras))
+    variance = (weights[:, None] * error.square()).sum() / (3 * weights.sum()).clamp(min=_TINY)
+    matrix, vector = with_told(matrix, vector, camera.numbers(), variance, told)
+    motion, lens = camera.split(-torch.linalg.solve(matrix, vector))
     motion, lens = (
         numbers * (how.longest / numbers.norm(dim=-1, keepdim=True).clamp(min=_TINY)).clamp(max=1)
         for numbers in (motion, lens)
@@ -145,32 +137,3 @@ def _differences(
         shifted = shown(replace(rays, origins=rays.origins + step * axis), view)
         by_origin += ((shifted - seen) / step)[:, :, None] * axis[:, None]
     return seen, by_origin, by_direction
-
-
-def _equations(
-    slopes: Float[Tensor, "R 3 N"],
-    error: Float[Tensor, "R 3"],
-    weights: Float[Tensor, "R"],
-    view: Int[Tensor, "R"],
-    num_views: int,
-) -> tuple[Float[Tensor, "M M"], Float[Tensor, "M"]]:
-    """Normal equations of all cameras' six numbers, and of those that all share behind them; damped."""
-    num = slopes.shape[-1]
-    squares = torch.einsum("r,rci,rcj->rij", weights, slopes, slopes)
-    products = torch.einsum("r,rci,rc->ri", weights, slopes, error)
-    each = slopes.new_zeros(num_views, num, num).index_add(0, view, squares)
-    gradient = slopes.new_zeros(num_views, num).index_add(0, view, products)
-    own, shared = each[:, :6, :6], each[:, 6:, 6:].sum(0)
-    damping = _DAMPING * own.diagonal(dim1=1, dim2=2).mean(-1) + _TINY
-    own = own + damping[:, None, None] * torch.eye(6).to(own)
-    shared = shared + (_DAMPING * shared.trace() / max(len(shared), 1) + _TINY) * torch.eye(num - 6).to(shared)
-    together = each[:, :6, 6:].flatten(0, 1)
-    matrix = torch.cat([torch.block_diag(*own), together], 1)
-    matrix = torch.cat([matrix, torch.cat([together.mT, shared], 1)])
-    return matrix, torch.cat([gradient[:, :6].flatten(), gradient[:, 6:].sum(0)])
-
-
-def _told_by_sky(num_views: int, vector: Float[Tensor, "M"]) -> Int[Tensor, "N"]:
-    """Where a panorama's numbers stand among all: three turns of each camera, and the lens."""
-    numbers = torch.arange(len(vector), device=vector.device)
-    return torch.cat([numbers[: 6 * num_views].view(-1, 6)[:, :3].flatten(), numbers[6 * num_views :]])

@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.nn import functional as F
 
-from nerfro.camera.least_squares import axes_across, robust_weights
+from nerfro.camera.least_squares import Told, axes_across, robust_weights
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
 from nerfro.light import to_linear
@@ -40,26 +40,13 @@ _LEAST_VARIANCE = (0.5 / 255) ** 2
 _TINY = 1e-9
 
 
-@dataclass(frozen=True)
-class Panorama:
-    """What the sky tells of the cameras: how they are turned, up to a turn of all, and how surely.
-
-    Attributes:
-        numbers: three turns of each camera, then the lens where it is refined, as `RefinedCamera` counts them: pixels.
-        information: the inverse of their covariance. A turn of all cameras together is not told.
-    """
-
-    numbers: Float[Tensor, "N"]
-    information: Float[Tensor, "N N"]
-
-
 @torch.no_grad()
 def align(
     camera: RefinedCamera,
     cameras: Cameras,
     photographed: Callable[[Int[Tensor, "R"]], Float[Tensor, "R 3"]],
     of_sky: Callable[[Rays], Bool[Tensor, "R"]],
-) -> Panorama | None:
+) -> Told | None:
     """Turn the cameras, and change the lens that they share if it is refined, until photographs of the sky agree.
 
     Args:
@@ -69,11 +56,12 @@ def align(
         of_sky: which rays meet nothing before the sky.
 
     Returns:
-        What is known then; none where no two photographs show the same piece of sky.
+        What is known then, but for a turn of all cameras together; none where no two photographs show the same piece
+        of sky.
     """
     pictures = _reduced(cameras, photographed)
     gains, generator = pictures.new_ones(len(cameras), 3), torch.Generator().manual_seed(0)
-    numbers = information = None
+    information = None
     for share, num in told("panorama", _STEPS):
         blur = max(share * pictures.shape[-1], _LEAST_BLUR)
         overlap = _overlap(camera, cameras, pictures, of_sky, blur, num, generator)
@@ -87,13 +75,18 @@ def align(
         turns, longest = turns.view(-1, 3), 2 * blur * cameras.width / pictures.shape[-1]
         turns = turns * (longest / turns.norm(dim=-1, keepdim=True).clamp(min=_TINY)).clamp(max=1)
         camera.move(F.pad(turns, (0, 3)), lens)
-        numbers, information = camera.numbers(), _without(matrix, num_turns + num_lens) / max(variance, _LEAST_VARIANCE)
-    if numbers is None or information is None:
+        information = _without(matrix, num_turns + num_lens) / max(variance, _LEAST_VARIANCE)
+    if information is None:
         return None
     together = camera.motions.together().to(information)
     others = torch.eye(len(information)).to(information)
     others[: len(together), : len(together)] -= together @ together.mT
-    return Panorama(numbers, (others @ information @ others).to(numbers))
+    numbers = camera.numbers()
+    place = torch.arange(len(numbers), device=information.device)
+    place = torch.cat([place[: 6 * len(cameras)].view(-1, 6)[:, :3].flatten(), place[6 * len(cameras) :]])
+    known = information.new_zeros(len(numbers), len(numbers))
+    known[place[:, None], place] = others @ information @ others
+    return Told(numbers, known.to(numbers))
 
 
 def _solved(matrix: Float[Tensor, "N N"], right: Float[Tensor, "N *K"]) -> Float[Tensor, "N *K"]:

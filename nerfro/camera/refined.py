@@ -91,9 +91,10 @@ class _Motions(PerView):
 class RefinedCamera(Camera):
     """Rotation and position of each training camera, and the lens that all share, refined with the scene.
 
-    Before training, cameras turn until photographs of the sky agree (`panorama`), where there is one. Between training
-    steps each takes a step of Gauss-Newton towards its photograph (`gauss_newton`). A motion that all cameras share is
-    taken out, to first order: the world stays where the data have put it, with its surface.
+    Before training, cameras turn until photographs of the sky agree (`panorama`), where there is one, and move until
+    the surface is seen in its masks (`outlines`), where there are any. Between training steps each takes a step of
+    Gauss-Newton towards its photograph (`gauss_newton`). A motion that all cameras share is taken out, to first order:
+    the world stays where the data have put it, with its surface.
 
     Args:
         start: training steps before the first of these steps, so that the scene is there.
@@ -166,9 +167,14 @@ class RefinedCamera(Camera):
         return torch.cat([found, torch.stack(of_lens, -1)], -1)
 
     def numbers(self) -> Float[Tensor, "N"]:
-        """Turns of all cameras about their own axes, then the lens where it is refined; pixels."""
-        turns = self.motions.motion[:, :3].flatten()
-        return turns if self.lens is None else torch.cat([turns, self.lens])
+        """Turns and shifts of all cameras along their own axes, then the lens where it is refined; pixels."""
+        motion = self.motions.motion.flatten()
+        return motion if self.lens is None else torch.cat([motion, self.lens])
+
+    def split(self, numbers: Float[Tensor, "N"]) -> tuple[Float[Tensor, "V 6"], Float[Tensor, "L"]]:
+        """The motions of the cameras and the lens, of such numbers."""
+        num = self.motions.motion.numel()
+        return numbers[:num].view(-1, 6), numbers[num:]
 
     def position(self) -> tuple[Tensor, Tensor | None]:
         """Where cameras and lens are, for `move_back`."""

@@ -27,6 +27,7 @@ from torch import Tensor, nn
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.cube_map import texel_directions
 from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.capture.backdrop import Backdrop, backdrop_of
 from nerfro.capture.record import Record
 from nerfro.capture.silhouette_fit import rim_points
 from nerfro.capture.surroundings import HELD_BACK, Pixels, Room, Surroundings, robust
@@ -120,21 +121,18 @@ def refine_surface(
         medium: the bodies, with the indices that they have; white light alone is followed.
         silhouettes: of the surface; its outlines stay where they are.
         through: pixels that the object fills.
-        surroundings: what is seen around it.
+        surroundings: what is seen around it, near or far.
         learn_index: whether the indices are not known for sure, and learned along with the surface.
         progress: is told the share done.
         record: file in which the state is kept now and then, and from which a descent on the same pixels that was
             interrupted goes on; it is removed at the end.
 
     Raises:
-        NerfroError: the surroundings are near, or no pixel shows them through the object.
+        NerfroError: no pixel shows the surroundings through the object.
     """
-    if isinstance(surroundings.boundary, Room):
-        raise NerfroError(
-            "refine=true needs surroundings that are far away, and these are near; say room=false if they are not"
-        )
     descent = _Descent(mesh, medium, silhouettes, through, surroundings, learn_index)
     error = descent.judged(medium)
+    picture = _picture(surroundings, mesh, medium)
     descent.start, smoothed = descent.smoothed(medium, error)
     at = _Position(descent.state(), [error, smoothed], [0, 0])
     kept = Record(record, _key(mesh, medium, through, learn_index))
@@ -146,7 +144,7 @@ def refine_surface(
         while at.step < stage.steps:
             if at.step % _JUDGE_EVERY == 0:
                 share = at.step / stage.steps
-                sky = _blurred(surroundings, stage.blur[0] + (stage.blur[1] - stage.blur[0]) * share)
+                sky = _blurred(picture, stage.blur[0] + (stage.blur[1] - stage.blur[0]) * share)
             descent.step(sky, stage.rate * 0.5 * (1 + math.cos(math.pi * at.step / stage.steps)))
             at.step += 1
             progress(at.share)
@@ -216,7 +214,7 @@ class _Descent:
         self.teachers = through[~held_back]
         self.judges = (through[held_back] if held_back.any() else through).some(_JUDGED)
         self.first_errors: Tensor | None = None
-        self.rims, _, _ = rim_points(mesh, silhouettes)
+        self.rims = rim_points(mesh, silhouettes).points
         cameras = silhouettes.cameras
         middle = torch.from_numpy(mesh.bounds.mean(0)).float()
         distance = (cameras.camera_to_world[:, :, 3] - middle).norm(dim=-1)
@@ -314,23 +312,33 @@ class _Descent:
         """Paths of pixels, and which are bent, end in known surroundings and have sound derivatives."""
         with torch.no_grad():
             trace = self.sampler.trace(pixels.rays, medium)
-            _, known = self.surroundings.radiance(trace.path.exits())
+            known = self.surroundings.known(trace.path.exits())
             usable = known & ~trace.exceeded & trace.path.refracted & self.sampler.steady(trace.path, medium)
         return trace.path, usable
 
 
+def _picture(surroundings: Surroundings, mesh: TriangleMesh, medium: SdfGrid) -> EnvironmentMap | Backdrop:
+    """Surroundings that have a slope, and can be blurred."""
+    boundary = surroundings.boundary
+    if isinstance(boundary, Room):
+        return backdrop_of(boundary, medium, torch.from_numpy(mesh.bounds.mean(0)).float())
+    return boundary
+
+
 @torch.no_grad()
-def _blurred(surroundings: Surroundings, degrees: float) -> Boundary:
-    """Surroundings far away, convolved with a Gaussian of that standard deviation; themselves for none."""
+def _blurred(picture: EnvironmentMap | Backdrop, degrees: float) -> Boundary:
+    """A picture of surroundings, convolved with a Gaussian of that standard deviation; itself for none."""
     if degrees == 0:
-        return surroundings.boundary
+        return picture
+    sky = picture.colours if isinstance(picture, Backdrop) else picture
     count, generator = 32, torch.Generator().manual_seed(0)
     directions = texel_directions(max(16, round(135 / degrees)))
     total = torch.zeros_like(directions)
     for _ in range(count):
         turned = directions + math.radians(degrees) * torch.randn(3, generator=generator)
-        total += surroundings.boundary(Exits(turned / turned.norm(dim=-1, keepdim=True))).clamp(max=1)
-    return EnvironmentMap.of_texels(total / count)
+        total += sky(Exits(turned / turned.norm(dim=-1, keepdim=True))).clamp(max=1)
+    blurred = EnvironmentMap.of_texels(total / count)
+    return Backdrop(picture.middle, blurred, picture.distances) if isinstance(picture, Backdrop) else blurred
 
 
 def _onto(mesh: TriangleMesh, medium: SdfGrid) -> TriangleMesh:

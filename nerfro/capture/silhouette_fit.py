@@ -75,6 +75,18 @@ class _Rims(NamedTuple):
     misfit: Float[np.ndarray, "K"]
     weight: Float[np.ndarray, "K"]
     width: Float[np.ndarray, "K"]  # of a pixel there, world units
+    view: Int[np.ndarray, "K"]  # that sees it
+
+
+class RimPoints(NamedTuple):
+    """Points of a surface that views see on the outlines of their masks; lengths in world units."""
+
+    points: Float[Tensor, "K 3"]
+    normals: Float[Tensor, "K 3"]  # unit, outwards
+    misfits: Float[Tensor, "K"]  # how far each has to move outwards to lie on the outline
+    weights: Float[Tensor, "K"]  # of these: less where most others are nearer
+    widths: Float[Tensor, "K"]  # of a pixel there
+    views: Int[Tensor, "K"]
 
 
 def fit_surface(
@@ -119,20 +131,17 @@ def fit_surface(
     return TriangleMesh(vertices, mesh.faces)
 
 
-def rim_points(
-    mesh: TriangleMesh, silhouettes: Silhouettes
-) -> tuple[Float[Tensor, "K 3"], Float[Tensor, "K"], Float[Tensor, "K"]]:
-    """Points of a surface that views see on the outlines of their masks.
-
-    With them how far each had to move outwards to lie on it, and how wide a pixel is there; all in world units.
-    """
+def rim_points(mesh: TriangleMesh, silhouettes: Silhouettes) -> RimPoints:
+    """Where views see the outlines of a surface that are near those of their masks."""
     faces, vertices = mesh.faces, mesh.vertices
     normals = _vertex_normals(vertices, faces)
     rims = _find_rims(vertices, normals, _edges(faces), silhouettes, _outlines(silhouettes))
     share = rims.share[:, None]
-    points = (1 - share) * vertices[rims.first] + share * vertices[rims.second]
-    first, second, third = (torch.from_numpy(values).float() for values in (points, rims.misfit, rims.width))
-    return first, second, third
+    points, normal = ((1 - share) * each[rims.first] + share * each[rims.second] for each in (vertices, normals))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    values = [torch.from_numpy(each).float() for each in (points, normal, rims.misfit, rims.weight, rims.width)]
+    first, second, third, fourth, fifth = values
+    return RimPoints(first, second, third, fourth, fifth, torch.from_numpy(rims.view))
 
 
 def _outlines(silhouettes: Silhouettes) -> _Outlines:
@@ -259,12 +268,14 @@ def _find_rims(
         cell = _look_up(outline, cameras.select([view]), places[known], pixels)
         order = np.lexsort((inside[known], cell))
         outermost = known[order[np.diff(cell[order], prepend=-1) != 0]]
-        parts.append((first[outermost], second[outermost], share[outermost], inside[outermost], width[outermost]))
-    first, second, share, misfit, width = (np.concatenate(values) for values in zip(*parts, strict=True))
+        of_view = np.full(len(outermost), view)
+        chosen = (values[outermost] for values in (first, second, share, inside, width))
+        parts.append((*chosen, of_view))
+    first, second, share, misfit, width, views = (np.concatenate(values) for values in zip(*parts, strict=True))
     spread = float(np.median(np.abs(misfit))) / _TYPICAL
     near = np.abs(misfit) < _GATE * max(1.0, spread)
     weight = 1 / (1 + (misfit / (_HALVED * max(_SUREST, spread))) ** 2)
-    return _Rims(first[near], second[near], share[near], (misfit * width)[near], weight[near], width[near])
+    return _Rims(*(each[near] for each in (first, second, share, misfit * width, weight, width, views)))
 
 
 def _look_up(

@@ -137,17 +137,20 @@ class Surroundings:
         colours: some of the radiances that were seen.
     """
 
-    boundary: Boundary
+    boundary: EnvironmentMap | Room
     seen: Bool[Tensor, "6 n n"] | None
     unexplained: float
     colours: Float[Tensor, "P 3"]
 
     def radiance(self, exits: Exits) -> tuple[Float[Tensor, "P 3"], Bool[Tensor, "P"]]:
         """What a photograph shows in these directions, and whether that is known."""
-        radiance = self.boundary(exits).clamp(max=1)
+        return self.boundary(exits).clamp(max=1), self.known(exits)
+
+    def known(self, exits: Exits) -> Bool[Tensor, "P"]:
+        """Whether it is known what a photograph shows in these directions."""
         if self.seen is None:
-            return radiance, torch.ones(len(radiance), dtype=torch.bool)
-        return radiance, self.seen[_texel(exits.directions, self.seen.shape[-1])]
+            return torch.ones(len(exits.directions), dtype=torch.bool)
+        return self.seen[_texel(exits.directions, self.seen.shape[-1])]
 
 
 def learn_surroundings(
@@ -241,14 +244,18 @@ class Room(Boundary):
         self.sampler = DensityGridSampler(box_min=low, box_max=high, radius=radius, looks=0.25, decay=0.6)
 
     def forward(self, exits: Exits) -> Float[Tensor, "P 3"]:
-        """Where light comes from infinity, it has the colour of what is farthest."""
+        return self.seen(exits)[0]
+
+    def seen(self, exits: Exits) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P"]]:
+        """Radiance and how far away it comes from. What comes from infinity has the colour of what is farthest."""
         assert exits.positions is not None
         ones = torch.ones_like(exits.positions[:, 0])
         rays = Rays(exits.positions, exits.directions, exits.radii * ones, 0 * ones, ones)
         path = straight_path(rays)
         samples = self.sampler(path, None)
         radiance = self.field(samples)
-        return composite(samples, radiance, radiance.rgb[:, -1], path).rgb
+        rendered = composite(samples, radiance, radiance.rgb[:, -1], path)
+        return rendered.rgb, rendered.depth
 
     def after_step(self, step: int) -> None:
         self.sampler.after_step(step, [self.field])

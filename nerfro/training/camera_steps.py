@@ -10,13 +10,16 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from nerfro.camera.gauss_newton import Step, improve, telling
-from nerfro.camera.panorama import Panorama, align
+from nerfro.camera.least_squares import Told
+from nerfro.camera.panorama import align
 from nerfro.camera.refined import RefinedCamera
+from nerfro.data.base import Views
 from nerfro.models.base import NerfModel
 from nerfro.pixel_parts import pixel_rays
 from nerfro.rays import Rays
 from nerfro.training.boundary_first import occupied
 from nerfro.training.data_module import RayDataModule
+from nerfro.training.outlines import meet_masks
 from nerfro.training.ray_batches import RayBatches, misses
 
 # Pixels over which differences are taken, at first and at least, and their factor from one step to the next.
@@ -30,15 +33,17 @@ _DRAWN = 6
 
 
 class CameraSteps(Callback):
-    """Turns the training cameras by the sky before training, and moves them at some steps, with the scene held.
+    """Moves the training cameras by sky and outlines before training, and at some steps, with the scene held.
 
     Args:
         batches: of the run.
+        views: of the run.
     """
 
-    def __init__(self, batches: RayBatches) -> None:
-        self._batches = batches
-        self._panorama: Panorama | None = None
+    def __init__(self, batches: RayBatches, views: Views) -> None:
+        self._batches, self._views = batches, views
+        self._panorama: Told | None = None
+        self._outlines: Told | None = None
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, NerfModel)
@@ -47,12 +52,15 @@ class CameraSteps(Callback):
             return
         batches = self._batches.to(model.device)
         self._panorama = align(camera, batches.cameras, batches.photographed, lambda rays: misses(box, rays))
+        self._outlines = meet_masks(camera, self._views, model.medium, self._panorama)
 
     def state_dict(self) -> dict[str, Any]:
-        return {} if self._panorama is None else dict(vars(self._panorama))
+        known = {"panorama": self._panorama, "outlines": self._outlines}
+        return {name: dict(vars(told)) for name, told in known.items() if told is not None}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._panorama = Panorama(**state_dict) if state_dict else None
+        known = {name: Told(**told) for name, told in state_dict.items()}
+        self._panorama, self._outlines = known.get("panorama"), known.get("outlines")
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
         assert isinstance(pl_module, NerfModel)
@@ -64,12 +72,18 @@ class CameraSteps(Callback):
         reach = max(_LEAST_REACH, _FIRST_REACH * _SHRINKING**before)
         # Not asked whether errors fall: every camera has painted its own ghost, which holds it where it is.
         how = Step(reach, _SCALE * reach, _LONGEST, share=min(1.0, _WHOLE / (before + 1)), checked=False)
-        _move(pl_module, camera, self._batches, step, how, self._panorama)
+        _move(pl_module, camera, self._batches, step, how, self._panorama, self._outlines)
 
 
 @torch.no_grad()
 def _move(
-    model: NerfModel, camera: RefinedCamera, batches: RayBatches, step: int, how: Step, panorama: Panorama | None
+    model: NerfModel,
+    camera: RefinedCamera,
+    batches: RayBatches,
+    step: int,
+    how: Step,
+    panorama: Told | None,
+    outlines: Told | None,
 ) -> None:
     """A step of all cameras by pixels with contrast, drawn anew for each training step.
 
@@ -83,7 +97,9 @@ def _move(
         past = misses(box, camera(pixel_rays(batches.cameras, candidates.flatten()), view)).view(candidates.shape)
     pixels = telling(candidates, camera.num_pixels, batches.photographed, batches.cameras, past)
 
+    told = [known for known in (panorama, outlines) if known is not None]
+
     def shown(rays: Rays, view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
         return model.shown(rays, camera.gains(view))
 
-    improve(camera, batches.cameras, pixels, batches.photographed, shown, how, panorama)
+    improve(camera, batches.cameras, pixels, batches.photographed, shown, how, told)

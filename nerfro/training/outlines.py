@@ -1,10 +1,13 @@
-"""What the photographs' outlines tell of a surface that learns."""
+"""What the photographs' outlines tell of a surface that learns, and of the cameras."""
 
 from __future__ import annotations
 
 import torch
 
-from nerfro.cameras import Window
+from nerfro.camera.least_squares import Told
+from nerfro.camera.outlines import meet_outlines
+from nerfro.camera.refined import RefinedCamera
+from nerfro.cameras import Cameras, Window
 from nerfro.capture.silhouette_fit import rim_points
 from nerfro.capture.silhouettes import mesh_silhouettes, pixel_stride
 from nerfro.capture.visual_hull import Silhouettes
@@ -27,17 +30,45 @@ def hold_outlines(medium: Medium, views: Views) -> None:
         return
     assert isinstance(medium, SdfGrid)
     views, mesh = masked_views(views), medium.meshes[0]
-    stride = pixel_stride(views.cameras, _MAX_PIXELS)
-    height, width = views.cameras.height // stride, views.cameras.width // stride
-    window = Window(0, 0, height * stride, width * stride)
-    cameras = views.cameras.crop(window).resized(width, height)
+    silhouettes = mask_silhouettes(views)
+    if silhouettes is None:
+        cameras = reduced(views.cameras)
+        silhouettes = Silhouettes.of(cameras, mesh_silhouettes(mesh, cameras, 1).float())
+    rims = rim_points(mesh, silhouettes)
+    if len(rims.points):
+        outwards = torch.zeros_like(rims.misfits) if views.masks is None else rims.misfits
+        medium.hold(rims.points, outwards, _KNOWN * float(rims.widths.mean()))
+
+
+def meet_masks(camera: RefinedCamera, views: Views, medium: Medium, panorama: Told | None) -> Told | None:
+    """Move cameras until the surface is seen in its masks; what these tell, or none where one of both is missing.
+
+    Args:
+        camera: what is believed of the cameras; it is changed.
+        views: of them.
+        medium: that has the surface.
+        panorama: what the sky tells.
+    """
+    silhouettes = mask_silhouettes(views)
+    if silhouettes is None or not isinstance(medium, SdfGrid) or not medium.meshes:
+        return None
+    told = [] if panorama is None else [panorama]
+    return meet_outlines(camera, views.cameras, reduced, silhouettes, medium.meshes[0], told)
+
+
+def mask_silhouettes(views: Views) -> Silhouettes | None:
+    """What the masks of all views say, in smaller pictures; None where there are none."""
     if views.masks is None:
-        masks = mesh_silhouettes(mesh, cameras, 1).float()
-    else:
-        cut = (window.cut(mask.float()[None]) for mask in views.masks)
-        masks = torch.stack([mask.view(height, stride, width, stride).mean((1, 3)) for mask in cut])
-    places, outwards, width_of_pixel = rim_points(mesh, Silhouettes.of(cameras, masks))
-    if views.masks is None:
-        outwards = torch.zeros_like(outwards)
-    if len(places):
-        medium.hold(places, outwards, _KNOWN * float(width_of_pixel.mean()))
+        return None
+    cameras, stride = reduced(views.cameras), pixel_stride(views.cameras, _MAX_PIXELS)
+    window = Window(0, 0, cameras.height * stride, cameras.width * stride)
+    cut = (window.cut(mask.float()[None]) for mask in views.masks)
+    masks = torch.stack([mask.view(cameras.height, stride, cameras.width, stride).mean((1, 3)) for mask in cut])
+    return Silhouettes.of(cameras, masks)
+
+
+def reduced(cameras: Cameras) -> Cameras:
+    """Cameras of smaller pictures: every few pixels are one; what is left over at the right and below is cut off."""
+    stride = pixel_stride(cameras, _MAX_PIXELS)
+    height, width = cameras.height // stride, cameras.width // stride
+    return cameras.crop(Window(0, 0, height * stride, width * stride)).resized(width, height)

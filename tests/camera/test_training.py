@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,9 +15,13 @@ import torch
 
 from benchmarks.cameras import disturbed
 from nerfro.camera.similarity import motion_between
+from nerfro.capture.silhouettes import mesh_silhouettes
+from nerfro.data.blender import BlenderData
 from nerfro.data.nerfstudio import NerfstudioData
 from nerfro.evaluation.left_halves import refine_on_left
 from nerfro.evaluation.results import read_metrics_json
+from nerfro.files.images import save_png
+from nerfro.geometry.mesh import load_mesh
 from nerfro.light import to_linear, to_srgb
 from nerfro.training.load import load
 from nerfro.training.run_folder import load_checkpoint
@@ -159,18 +164,33 @@ def test_cameras_wait_for_the_scene(
         assert bool((state["camera.motions.motion"][:, 3:] != 0).any()) is moves
 
 
-def test_cameras_turn_by_the_sky_before_training_and_what_it_told_is_kept(
-    train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
+def test_cameras_move_by_sky_and_masks_before_training_and_what_these_told_is_kept(
+    train_here: Callable[..., Any], tiny_default_run: list[str], tiny_scene: Path, tmp_path: Path
 ) -> None:
     options = ["camera=refined", *tiny_default_run, "trainer.max_steps=1"]
-    done = train_here(*options, f"hydra.run.dir={tmp_path / 'run'}")
-    assert done.code == 0, done.err
-    camera = load(tmp_path / "run", "cpu").model.camera
-    assert bool((camera.motions.motion[:, :3] != 0).all())
-    assert not bool(camera.motions.motion[:, 3:].any())
-    kept = load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")[0]["callbacks"]["CameraSteps"]
-    torch.testing.assert_close(kept["numbers"], camera.numbers())
-    assert kept["information"].shape == (camera.numbers().numel(),) * 2
+    kept, cameras = [], []
+    for masks in (False, True):
+        if masks:
+            shutil.copytree(tiny_scene, tmp_path / "scene")
+            views, mesh = BlenderData(str(tiny_scene)).load("train"), load_mesh(tiny_scene / "mesh.ply")
+            for number, mask in enumerate(mesh_silhouettes(mesh, views.cameras, 1)):
+                picture = mask[..., None].float().expand(-1, -1, 3)
+                save_png(tmp_path / "scene" / "masks" / "train" / f"r_{number}.png", picture)
+            options.append(f"data.root={tmp_path / 'scene'}")
+        folder = tmp_path / f"run_{masks}"
+        done = train_here(*options, f"hydra.run.dir={folder}")
+        assert done.code == 0, done.err
+        cameras.append(load(folder, "cpu").model.camera)
+        kept.append(load_checkpoint(folder / "checkpoints" / "last.ckpt")[0]["callbacks"]["CameraSteps"])
+    without, with_masks = cameras
+    assert bool((without.motions.motion[:, :3] != 0).all())
+    assert not bool(without.motions.motion[:, 3:].any())
+    assert bool((with_masks.motions.motion != 0).all())
+    assert list(kept[0]) == ["panorama"]
+    assert list(kept[1]) == ["panorama", "outlines"]
+    for told, camera in ((kept[0]["panorama"], without), (kept[1]["outlines"], with_masks)):
+        torch.testing.assert_close(told["numbers"], camera.numbers())
+        assert told["information"].shape == (camera.numbers().numel(),) * 2
 
 
 def test_a_gain_for_each_view_needs_linear_radiance(

@@ -11,19 +11,22 @@ from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 import nerfro.preprocess
+from nerfro.boundaries.base import Boundary
 from nerfro.capture import refinement, surroundings
+from nerfro.capture.backdrop import backdrop_of
 from nerfro.capture.refinement import Refined, refine_surface
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.surroundings import Pixels, Room, Surroundings, divide_pixels, learn_surroundings
 from nerfro.capture.visual_hull import Silhouettes
-from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media import displacement
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.snell import Snell
-from tests.ball_photographs import BOX, RADIUS, cameras, mesh, photographs_of, save, solid
+from nerfro.types import Exits
+from tests.ball_photographs import BOX, RADIUS, cameras, mesh, photographs_of, save, sky, solid
 
 DEPTH, WIDTH, AXIS = 0.05, 0.12, torch.tensor([0.6, 0.0, 0.8])
 
@@ -128,12 +131,45 @@ def test_an_interrupted_refinement_goes_on(short: None, tmp_path: Path, monkeypa
         assert told[0] < 0.1
 
 
-def test_near_surroundings_are_refused(short: None) -> None:
-    beside, through = divide_pixels(photographs_of(dented()), mesh())
-    near = Surroundings(Room(mesh().bounds, 2.0), None, 0.0, beside.radiance)
+class PaintedShell(Room):
+    """The sky's colours on a ball around the object, just beyond the cameras."""
+
+    RADIUS = 3.2
+
+    def __init__(self) -> None:
+        Boundary.__init__(self)
+
+    def seen(self, exits: Exits) -> tuple[Tensor, Tensor]:
+        assert exits.positions is not None
+        along = (exits.positions * exits.directions).sum(-1)
+        away = (along**2 - exits.positions.square().sum(-1) + self.RADIUS**2).sqrt() - along
+        return sky((exits.positions + away[:, None] * exits.directions) / self.RADIUS), away
+
+
+def test_a_dent_is_found_by_near_surroundings(short: None) -> None:
+    room = PaintedShell()
+    beside, through = divide_pixels(photographs_of(dented(), around=room), mesh())
     silhouettes = Silhouettes.of(cameras(), mesh_silhouettes(mesh(), cameras(), 1).float())
-    with pytest.raises(NerfroError, match="far away"):
-        refine_surface(mesh(), solid([1.5]), silhouettes, through, near)
+    around = Surroundings(room, None, 0.0, beside.radiance)
+    before = solid([1.5])
+    found = refine_surface(mesh(), before, silhouettes, through, around)
+    assert degrees_off(found.medium) < 0.4 * degrees_off(before)
+
+
+def test_a_backdrop_is_the_room_along_every_line() -> None:
+    room = PaintedShell()
+    middle = torch.tensor([0.1, -0.2, 0.05])
+    backdrop = backdrop_of(room, solid([1.5]), middle)
+    generator = torch.Generator().manual_seed(0)
+    positions = (torch.rand(500, 3, generator=generator) - 0.5).requires_grad_()
+    directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=generator), dim=-1).requires_grad_()
+    lines = Exits(directions, positions)
+    assert (backdrop(lines) - room(lines)).abs().max() < 5e-3
+    ours, right = (torch.autograd.grad(b(lines).sum(), [directions, positions]) for b in (backdrop, room))
+    for one, other in zip(ours, right, strict=True):
+        across = other - (other * directions).sum(-1, keepdim=True) * directions
+        error = (one - other - ((one - other) * directions).sum(-1, keepdim=True) * directions).norm(dim=-1)
+        assert error.median() < 0.1 * across.norm(dim=-1).median()
 
 
 @pytest.fixture

@@ -1,0 +1,78 @@
+"""Near surroundings as a picture: what is seen from the middle of an object, in colours and distances.
+
+A field of radiance in space has no useful slope: its details are finer than what a surface has to be moved by. A
+picture can be blurred, and where it is looked up follows the line on which light leaves.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.boundaries import cube_map
+from nerfro.boundaries.base import Boundary
+from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.capture.surroundings import Room
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.rays import Rays
+from nerfro.samplers.snell import Snell
+from nerfro.types import Exits
+
+_SIDE = 192  # texels along a face's side, of half a degree
+_CHUNK = 16384  # rays at a time
+_STEPS = 5  # until a line meets the picture; the object is small beside its surroundings
+
+
+class Backdrop(Boundary):
+    """A picture of what is around a point. Lines that begin elsewhere are followed until they meet it.
+
+    What something near hides from the point is not in the picture.
+
+    Args:
+        middle: the point.
+        colours: linear radiance by direction from there.
+        distances: to what is seen there, of each texel (see `cube_map.texel_directions`), world units.
+    """
+
+    def __init__(self, middle: Float[Tensor, "3"], colours: EnvironmentMap, distances: Float[Tensor, "6*n*n"]) -> None:
+        super().__init__()
+        self.middle, self.colours, self.distances = middle, colours, distances
+        side = round((len(distances) / 6) ** 0.5)
+        self._levels, self._padded = cube_map.CubeLevels((side,)), cube_map.padded_texels(side).flatten()
+
+    def forward(self, exits: Exits) -> Float[Tensor, "P 3"]:
+        """Colours, with the slope that they have in the lines' positions and directions."""
+        assert exits.positions is not None
+        starts = exits.positions - self.middle
+        with torch.no_grad():
+            lengths = self._lengths(starts, exits.directions)
+        return self.colours(Exits(starts + lengths * exits.directions))
+
+    def _lengths(self, starts: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]) -> Float[Tensor, "P 1"]:
+        """Of lines until what is seen: where they meet a sphere of its distance, which is looked up there again."""
+        along = (starts * directions).sum(-1, keepdim=True)
+        square = starts.square().sum(-1, keepdim=True)
+        seen, lengths = directions, torch.zeros_like(along)
+        texels = self.distances[:, None].expand(-1, 3)
+        for _ in range(_STEPS):
+            distance = cube_map.lookup(*cube_map.project(seen), texels, self._padded, self._levels)[:, :1]
+            lengths = ((along.square() - square + distance.square()).clamp(min=0).sqrt() - along).clamp(min=0)
+            seen = starts + lengths * directions
+        return lengths
+
+
+@torch.no_grad()
+def backdrop_of(room: Room, medium: SdfGrid, middle: Float[Tensor, "3"]) -> Backdrop:
+    """What a room shows around an object, from the object's surface outwards; within, nothing is known of it."""
+    radius = float((medium.box[1] - medium.box[0]).norm())
+    radiance, distances = [], []
+    for directions in cube_map.texel_directions(_SIDE).split(_CHUNK):
+        ones = torch.ones(len(directions))
+        inwards = Rays(middle + radius * directions, -directions, 0 * ones, 0 * ones, 2 * radius * ones)
+        path = Snell()(inwards, medium)
+        starts = torch.where(path.refracted[:, None], path.positions[:, 1], middle)
+        seen, distance = room.seen(Exits(directions, starts))
+        radiance.append(seen)
+        distances.append(distance + (starts - middle).norm(dim=-1))
+    return Backdrop(middle, EnvironmentMap.of_texels(torch.cat(radiance)), torch.cat(distances))
