@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from nerfro.capture.camera_refinement import ROUGH_VOXELS, refine_cameras
 from nerfro.capture.medium_search import find_medium, refinable
 from nerfro.capture.overlaps import REPORT, SHEET, draw_overlays, report_overlaps, settled_wrong_masks
 from nerfro.capture.pose_conventions import require_consistent_poses
 from nerfro.capture.preprocess_options import (
+    CAMERAS,
     FOUND,
     MESH,
     PreprocessConfig,
@@ -33,6 +37,7 @@ from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import load_mesh
 from nerfro.paths import resolve_path
 from nerfro.registry import build
+from nerfro.viewing.camera_files import write_cameras
 
 
 @entry_point("preprocess", PreprocessConfig)
@@ -46,16 +51,26 @@ def main(config: DictConfig) -> None:
     box = None if config.box_min is None else np.array([config.box_min, config.box_max], np.float64)
     location, written = config.mesh, []
     overlaps = silhouettes = None
-    if mesh is None or views.masks is not None:
+    if mesh is None or views.masks is not None or config.refine_cameras:
         silhouettes = read_silhouettes(views, box is not None)
         wrong_masks = settled_wrong_masks(silhouettes, config.wrong_masks)
         require_consistent_poses(silhouettes, views.names, wrong_masks)
         carved = mesh is None
+
+        def hull(silhouettes: Silhouettes, voxels: int = config.resolution) -> TriangleMesh:
+            return make_mesh(silhouettes, box, voxels, wrong_masks, config.keep, config.smoothing, config.symmetry)
+
+        if config.refine_cameras:
+            rough = partial(hull, voxels=min(ROUGH_VOXELS, config.resolution))
+            camera = refine_cameras(views, silhouettes, wrong_masks, rough if mesh is None else mesh)
+            write_cameras(folder / CAMERAS, camera, views)
+            written.append(CAMERAS)
+            views = replace(views, cameras=camera.believed(views.cameras))
+            silhouettes = replace(silhouettes, cameras=views.cameras)
         if mesh is None:
-            mesh = make_mesh(
-                silhouettes, box, config.resolution, wrong_masks, config.keep, config.smoothing, config.symmetry
-            )
-            location, written = str(folder / MESH), [MESH]
+            mesh = hull(silhouettes)
+            location = str(folder / MESH)
+            written.append(MESH)
             mesh.save(folder / MESH)
         # Pictures and figures first: they help to find out what is wrong with a mesh that the medium then refuses.
         overlaps = report_overlaps(config.split, views, mesh, silhouettes, wrong_masks if carved else None, folder)
@@ -82,7 +97,7 @@ def main(config: DictConfig) -> None:
     inside = surfaces_inside(found.medium)
     if overlaps is not None and inside:
         draw_overlays(views, mesh, overlaps, inside, folder)
-    settings |= found.settings
+    settings |= found.settings | ({"camera": "refined"} if config.refine_cameras else {})
     command = train_command(settings, overrides)
     write_found(folder, command, found.doubtful, around.near, views.cameras)
     written += [*found.written, FOUND]

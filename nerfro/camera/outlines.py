@@ -25,6 +25,10 @@ _STEPS = 8
 _LONGEST = 2.0  # pixels that a camera is moved in a step, at most
 # Outlines are known no better than this, pixels; and errors of so many neighbours are one.
 _LEAST, _ALIKE = 0.02, 3.0
+# Cameras are off by about so many pixels, so that what outlines hardly tell stays.
+_GIVEN = 1.0
+# If the surface is still seen farther off its masks, pixels, it is not theirs, or they were drawn by hand.
+_MOST = 0.2
 
 
 @torch.no_grad()
@@ -35,7 +39,7 @@ def meet_outlines(
     silhouettes: Silhouettes,
     mesh: TriangleMesh,
     told: Sequence[Told] = (),
-) -> Told:
+) -> Told | None:
     """Move the cameras until the outlines of a surface are those of its masks.
 
     Masks that are too wide everywhere, or too narrow, by the same part of a pixel, do not disturb.
@@ -49,18 +53,26 @@ def meet_outlines(
         told: what is known of the cameras already.
 
     Returns:
-        What the outlines tell of them.
+        What the outlines tell of them; none where the surface cannot be brought to its masks. Then cameras stay.
     """
+    before = camera.position()
+    begun = camera.numbers()
+    given = Told(begun, torch.eye(len(begun)).to(begun) / _GIVEN**2)
     for step in bar("outlines", range(_STEPS + 1)):
         slopes, error, weights, view = _seen(camera, cameras, reduced, silhouettes, mesh)
         variance = float((weights * error[:, 0].square()).sum() / weights.sum()) + _LEAST**2
         if step < _STEPS:
             matrix, vector = normal_equations(slopes, error, weights, view, len(cameras))
             matrix, vector = _any_width(matrix, vector)
-            matrix, vector = with_told(matrix, vector, camera.numbers(), _ALIKE * variance, told)
+            matrix, vector = with_told(matrix, vector, camera.numbers(), _ALIKE * variance, [*told, given])
             motion, lens = camera.split(-torch.linalg.solve(matrix, vector).to(camera.motions.motion))
             motion = motion * (_LONGEST / motion.norm(dim=-1, keepdim=True).clamp(min=_LONGEST))
             camera.move(motion, lens)
+    off = float((error - error.median()).abs().median())
+    if off > _MOST:
+        camera.move_back(before, worse=torch.ones(len(cameras), dtype=torch.bool), lens=True)
+        print(f"outlines: at best the surface is {off:.2f} pixels off its masks, so they do not tell where cameras are")
+        return None
     matrix, vector = normal_equations(slopes, error, weights, view, len(cameras), damping=0.0)
     numbers = camera.numbers()
     return Told(numbers, (_any_width(matrix, vector)[0] / (_ALIKE * variance)).to(numbers))

@@ -26,7 +26,7 @@ from nerfro.media.base import Medium
 from nerfro.paths import EMBEDDED_PREFIX, resolve_path, user_path
 from nerfro.registry import build
 
-MESH, FOUND = "mesh.ply", "preprocess.json"
+MESH, CAMERAS, FOUND = "mesh.ply", "cameras.json", "preprocess.json"
 # The medium's grid is this much wider than the object.
 _MARGIN_SHARE = 0.15
 
@@ -41,6 +41,8 @@ class PreprocessConfig:
         search: lengths of a vessel, one or two, that are found from the photographs: wall, foot, level.
         refine: whether the surface is moved, after the index was found, until the photographs fit what is seen through
             it.
+        refine_cameras: whether poses are refined with the hull, by the sky and the outlines of the masks. The
+            surroundings must be far away.
         split: whose masks are used.
         mesh: a surface that was made elsewhere; it is checked against the masks, and no hull is made.
         room: whether the surroundings are near, for the search of the index; by default found out.
@@ -60,6 +62,7 @@ class PreprocessConfig:
     medium: Any = MISSING
     search: list[str] = field(default_factory=list)
     refine: bool = False
+    refine_cameras: bool = False
     split: str = "train"
     mesh: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     room: Optional[bool] = None  # noqa: UP045
@@ -92,11 +95,16 @@ def claim(config: DictConfig, overrides: list[str]) -> Path:
         corners_of_box(config.box_min, config.box_max)
     if config.refine and "shell_voxels" not in config.medium:
         raise NerfroError("refine=true moves a surface that is a distance; take medium=object or medium=vessel for it")
+    if config.refine_cameras and config.room:
+        raise NerfroError(
+            "refine_cameras=true needs surroundings that are far away, and room=true says that they are not"
+        )
     if config.out is None and str(config.data.root).startswith(EMBEDDED_PREFIX):
         raise NerfroError(f"data.root={config.data.root} ships with nerfro and is not written to; add out=FOLDER")
     folder = resolve_path(config.data.root) if config.out is None else user_path(config.out)
     names = [SHEET, REPORT] if config.mesh is not None else [MESH, SHEET, REPORT]
     names += [MESH, FIGURES, PICTURES] if config.refine else []
+    names += [CAMERAS] if config.refine_cameras else []
     names += [LENGTHS, LENGTHS_CURVE] if config.search else []
     names += [INDEX, CURVE] if searches_index(config, overrides) else []
     refuse_existing([folder / name for name in [*names, FOUND]], config.overwrite)

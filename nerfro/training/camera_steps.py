@@ -16,11 +16,11 @@ from nerfro.camera.refined import RefinedCamera
 from nerfro.data.base import Views
 from nerfro.models.base import NerfModel
 from nerfro.pixel_parts import pixel_rays
-from nerfro.rays import Rays
+from nerfro.rays import Rays, misses
 from nerfro.training.boundary_first import occupied
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.outlines import meet_masks
-from nerfro.training.ray_batches import RayBatches, misses
+from nerfro.training.ray_batches import RayBatches
 
 # Pixels over which differences are taken, at first and at least, and their factor from one step to the next.
 _FIRST_REACH, _LEAST_REACH, _SHRINKING = 2.0, 0.5, 0.85

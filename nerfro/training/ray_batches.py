@@ -19,7 +19,6 @@ from nerfro.data.pictures import Pictures
 from nerfro.data.pixel_store import PixelStore
 from nerfro.distributed import share_of
 from nerfro.errors import NerfroError
-from nerfro.geometry.interpolation import intersect_box
 from nerfro.pixel_parts import contrast, divergence, part_rays, pixel_rays, rays_beside
 from nerfro.rays import Rays
 from nerfro.types import Batch, Path
@@ -305,12 +304,6 @@ class RayBatches:
             )
         if counts.sum() == 0:
             raise NerfroError(f"the masks leave no pixel to train on{precropped}; black is ignored, white is used")
-
-
-def misses(box: Float[Tensor, "2 3"], rays: Rays) -> Bool[Tensor, "R"]:
-    """Which rays pass by a box of these corners."""
-    enter, leave = intersect_box(box, rays.origins, rays.directions)
-    return (enter >= leave) | (leave <= 0)
 
 
 def _main_exits(path: Path) -> Float[Tensor, "R 3"]:

@@ -41,7 +41,9 @@ def met(camera: RefinedCamera, given: Cameras, seen: Silhouettes, sure: list[int
     surely[:, sure or []] = 1e6
     information = torch.nn.functional.pad(surely.flatten(), (0, len(camera.numbers()) - surely.numel())).diag()
     known = [Told(camera.numbers(), information)]
-    return meet_outlines(camera, given, lambda cameras: cameras, seen, ellipsoid(), known)
+    told = meet_outlines(camera, given, lambda cameras: cameras, seen, ellipsoid(), known)
+    assert told is not None
+    return told
 
 
 def pixels_off(given: Cameras) -> float:
@@ -66,6 +68,15 @@ def test_shifts_are_found_where_turns_are_known() -> None:
     before = motion_between(TRUE.camera_to_world, given.camera_to_world)[1]
     after = motion_between(TRUE.camera_to_world, camera.believed(given).camera_to_world)[1]
     assert float(after.median()) < 0.15 * float(before.median())
+
+
+def test_cameras_stay_where_the_surface_is_another(capsys: pytest.CaptureFixture[str]) -> None:
+    camera = RefinedCamera()
+    camera.begin(TRUE)
+    other = TriangleMesh(ellipsoid().vertices[:, [1, 0, 2]], ellipsoid().faces[:, ::-1])
+    assert meet_outlines(camera, TRUE, lambda cameras: cameras, silhouettes(), other) is None
+    assert not bool(camera.motions.motion.any())
+    assert "pixels off its masks" in capsys.readouterr().out
 
 
 def test_the_shared_lens_is_found_where_cameras_are_known() -> None:

@@ -15,7 +15,7 @@ from nerfro.camera.panorama import align
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
 from nerfro.light import to_linear, to_srgb
-from nerfro.training.ray_batches import misses
+from nerfro.rays import misses
 from tests.ball_photographs import BOX, NUM_VIEWS, cameras, photographs
 
 TRUE = cameras()
