@@ -28,7 +28,7 @@ _LEAST, _ALIKE = 0.02, 3.0
 # Cameras are off by about so many pixels, so that what outlines hardly tell stays.
 _GIVEN = 1.0
 # If the surface is still seen farther off its masks, pixels, it is not theirs, or they were drawn by hand.
-_MOST = 0.2
+FARTHEST = 0.2
 
 
 @torch.no_grad()
@@ -39,6 +39,7 @@ def meet_outlines(
     silhouettes: Silhouettes,
     mesh: TriangleMesh,
     told: Sequence[Told] = (),
+    farthest: float = FARTHEST,
 ) -> Told | None:
     """Move the cameras until the outlines of a surface are those of its masks.
 
@@ -51,9 +52,10 @@ def meet_outlines(
         silhouettes: of all views.
         mesh: the surface.
         told: what is known of the cameras already.
+        farthest: how far off its masks the surface may be seen in the end, median, pixels.
 
     Returns:
-        What the outlines tell of them; none where the surface cannot be brought to its masks. Then cameras stay.
+        What the outlines tell of them; none where the surface is seen farther off. Then cameras stay.
     """
     before = camera.position()
     begun = camera.numbers()
@@ -69,7 +71,7 @@ def meet_outlines(
             motion = motion * (_LONGEST / motion.norm(dim=-1, keepdim=True).clamp(min=_LONGEST))
             camera.move(motion, lens)
     off = float((error - error.median()).abs().median())
-    if off > _MOST:
+    if off > farthest:
         camera.move_back(before, worse=torch.ones(len(cameras), dtype=torch.bool), lens=True)
         print(f"outlines: at best the surface is {off:.2f} pixels off its masks, so they do not tell where cameras are")
         return None

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 
-from nerfro.camera.outlines import meet_outlines
+from nerfro.camera.outlines import FARTHEST, meet_outlines
 from nerfro.camera.panorama import align
 from nerfro.camera.pixel_units import object_distances
 from nerfro.camera.refined import RefinedCamera
@@ -51,11 +52,12 @@ def refine_cameras(
             "refine_cameras=true: no two photographs show the same surroundings beside the object, and these tell how "
             "cameras are turned; leave it out"
         )
-    for _ in range(_ROUNDS):
+    for left in reversed(range(_ROUNDS)):
         mesh = surface
         if not isinstance(mesh, TriangleMesh):
             mesh = mesh(replace(silhouettes, cameras=camera.believed(views.cameras)))
-        if meet_outlines(camera, views.cameras, lambda cameras: cameras, silhouettes, mesh, [panorama]) is None:
+        farthest = math.inf if left else FARTHEST  # the first hulls are no better than the poses
+        if not meet_outlines(camera, views.cameras, lambda cameras: cameras, silhouettes, mesh, [panorama], farthest):
             raise NerfroError(
                 "refine_cameras=true: the surface does not come near its masks; correct the masks, or leave it "
                 "out where the surroundings are near"
