@@ -28,7 +28,7 @@ _LEAST, _ALIKE = 0.02, 3.0
 # Cameras are off by about so many pixels, so that what outlines hardly tell stays.
 _GIVEN = 1.0
 # If the surface is still seen farther off its masks, pixels, it is not theirs, or they were drawn by hand.
-FARTHEST = 0.2
+_FARTHEST = 0.2
 
 
 @torch.no_grad()
@@ -39,7 +39,7 @@ def meet_outlines(
     silhouettes: Silhouettes,
     mesh: TriangleMesh,
     told: Sequence[Told] = (),
-    farthest: float = FARTHEST,
+    farthest: float = _FARTHEST,
 ) -> Told | None:
     """Move the cameras until the outlines of a surface are those of its masks.
 

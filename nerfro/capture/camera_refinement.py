@@ -8,12 +8,13 @@ from dataclasses import replace
 
 import torch
 
-from nerfro.camera.outlines import FARTHEST, meet_outlines
+from nerfro.camera.outlines import meet_outlines
 from nerfro.camera.panorama import align
 from nerfro.camera.pixel_units import object_distances
 from nerfro.camera.refined import RefinedCamera
 from nerfro.camera.similarity import motion_between
-from nerfro.capture.visual_hull import Silhouettes, find_box
+from nerfro.capture.surface import object_box
+from nerfro.capture.visual_hull import Silhouettes
 from nerfro.data.base import Views
 from nerfro.data.pixel_store import PixelStore
 from nerfro.errors import NerfroError
@@ -21,7 +22,7 @@ from nerfro.geometry.mesh import TriangleMesh
 from nerfro.rays import misses
 
 ROUGH_VOXELS = 64  # along the hull's longest side, while cameras move
-_ROUNDS = 4
+_ROUNDS, _SETTLED = 10, 0.1  # at most; it ends when cameras move by fewer pixels
 
 
 def refine_cameras(
@@ -37,31 +38,31 @@ def refine_cameras(
     Args:
         views: photographs with poses.
         silhouettes: of the same views.
-        wrong_masks: see `find_box`.
+        wrong_masks: see `object_box`.
         surface: that is known, or makes the hull of masks.
 
     Raises:
-        NerfroError: no two photographs show the same of what is far away, or the surface does not come near its masks.
+        NerfroError: no two photographs show the same of what is far away.
     """
     camera = RefinedCamera()
     camera.begin(views.cameras)
-    colours, box = PixelStore(views.images), torch.from_numpy(find_box(silhouettes, wrong_masks)).float()
+    colours, box = PixelStore(views.images), torch.from_numpy(object_box(silhouettes, wrong_masks)).float()
     panorama = align(camera, views.cameras, lambda pixels: colours[pixels], lambda rays: misses(box, rays))
     if panorama is None:
         raise NerfroError(
             "refine_cameras=true: no two photographs show the same surroundings beside the object, and these tell how "
             "cameras are turned; leave it out"
         )
-    for left in reversed(range(_ROUNDS)):
-        mesh = surface
+    motions = camera.motions
+    for _ in range(_ROUNDS):
+        mesh, before = surface, motions.held()
         if not isinstance(mesh, TriangleMesh):
             mesh = mesh(replace(silhouettes, cameras=camera.believed(views.cameras)))
-        farthest = math.inf if left else FARTHEST  # the first hulls are no better than the poses
-        if not meet_outlines(camera, views.cameras, lambda cameras: cameras, silhouettes, mesh, [panorama], farthest):
-            raise NerfroError(
-                "refine_cameras=true: the surface does not come near its masks; correct the masks, or leave it "
-                "out where the surroundings are near"
-            )
+        # The first hulls are no better than the poses, and far off their masks.
+        meet_outlines(camera, views.cameras, lambda cameras: cameras, silhouettes, mesh, [panorama], math.inf)
+        moved = ((motions.held() - before) / motions.units).square().sum(-1).mean().sqrt()
+        if isinstance(surface, TriangleMesh) or float(moved) < _SETTLED:
+            break
     turned, shifted = motion_between(views.cameras.camera_to_world, camera.believed(views.cameras).camera_to_world)
     share = float((shifted / object_distances(views.cameras)).median())
     print(

@@ -85,7 +85,7 @@ def make_mesh(
     which tells what the object is, it may look a little less like them.
     """
     with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()) as progress:
-        box = _object_box(silhouettes, wrong_masks) if corners is None else corners
+        box = object_box(silhouettes, wrong_masks) if corners is None else corners
         carving = progress.add_task("carving", total=3)
         distances, corner, spacing = carve_grid(
             silhouettes, box, resolution, wrong_masks, lambda done: progress.update(carving, completed=done)
@@ -137,7 +137,7 @@ def surfaces_inside(medium: Medium) -> list[TriangleMesh]:
     return [extract_surface(distances, low, spacing) for distances in of_bodies if (distances < 0).any()]
 
 
-def _object_box(silhouettes: Silhouettes, wrong_masks: int) -> Float[np.ndarray, "2 3"]:
+def object_box(silhouettes: Silhouettes, wrong_masks: int) -> Float[np.ndarray, "2 3"]:
     """Bounds of a coarse hull, with a margin; a box that cuts the hull off is made larger if that helps."""
     first = find_box(silhouettes, wrong_masks)
     for wider in (*_WIDER, 1.0):

@@ -20,7 +20,7 @@ from nerfro.data.pixel_store import PixelStore
 from nerfro.distributed import share_of
 from nerfro.errors import NerfroError
 from nerfro.pixel_parts import contrast, divergence, part_rays, pixel_rays, rays_beside
-from nerfro.rays import Rays
+from nerfro.rays import Rays, misses
 from nerfro.types import Batch, Path
 
 Batching = Literal["single_image", "all_images"]
