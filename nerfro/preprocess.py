@@ -34,7 +34,7 @@ from nerfro.capture.visual_hull import Silhouettes
 from nerfro.cli import entry_point, warn
 from nerfro.data.masks import masked_views
 from nerfro.errors import NerfroError
-from nerfro.geometry.mesh import load_mesh
+from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.paths import resolve_path
 from nerfro.registry import build
 from nerfro.viewing.camera_files import write_cameras
