@@ -22,7 +22,7 @@ from nerfro.geometry.mesh import TriangleMesh
 from nerfro.rays import misses
 
 ROUGH_VOXELS = 64  # along the hull's longest side, while cameras move
-_ROUNDS, _SETTLED = 10, 0.1  # at most; it ends when cameras move by fewer pixels
+_ROUNDS, _SETTLED = 10, 0.02  # at most; it ends when cameras move by fewer pixels
 
 
 def refine_cameras(

@@ -18,6 +18,7 @@ from torch import Tensor
 from nerfro.cameras import Cameras
 from nerfro.capture.surroundings import HELD_BACK
 from nerfro.capture.visual_hull import Silhouettes
+from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
 
 # For each view the number of the outline's pixel that is nearest to each of its pixels.
@@ -271,6 +272,8 @@ def _find_rims(
         of_view = np.full(len(outermost), view)
         chosen = (values[outermost] for values in (first, second, share, inside, width))
         parts.append((*chosen, of_view))
+    if not parts:
+        raise NerfroError("no view sees the surface where it looks; surface, poses and masks do not belong together")
     first, second, share, misfit, width, views = (np.concatenate(values) for values in zip(*parts, strict=True))
     spread = float(np.median(np.abs(misfit))) / _TYPICAL
     near = np.abs(misfit) < _GATE * max(1.0, spread)

@@ -17,6 +17,7 @@ from nerfro.camera.similarity import motion_between
 from nerfro.cameras import Cameras
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.visual_hull import Silhouettes
+from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
 from tests.ball_photographs import NUM_VIEWS, RADIUS, SIZE, cameras
 
@@ -77,6 +78,14 @@ def test_cameras_stay_where_the_surface_is_another(capsys: pytest.CaptureFixture
     assert meet_outlines(camera, TRUE, lambda cameras: cameras, silhouettes(), other) is None
     assert not bool(camera.motions.motion.any())
     assert "pixels off its masks" in capsys.readouterr().out
+
+
+def test_masks_of_nothing_are_refused() -> None:
+    camera = RefinedCamera()
+    camera.begin(TRUE)
+    nothing = Silhouettes.of(TRUE, torch.zeros(NUM_VIEWS, SIZE, SIZE))
+    with pytest.raises(NerfroError, match="belong together"):
+        meet_outlines(camera, TRUE, lambda cameras: cameras, nothing, ellipsoid())
 
 
 def test_the_shared_lens_is_found_where_cameras_are_known() -> None:
