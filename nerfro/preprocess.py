@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from nerfro.capture.camera_refinement import ROUGH_VOXELS, refine_cameras
+from nerfro.capture.camera_refinement import refine_cameras
 from nerfro.capture.medium_search import find_medium, refinable
 from nerfro.capture.overlaps import REPORT, SHEET, draw_overlays, report_overlaps, settled_wrong_masks
 from nerfro.capture.pose_conventions import require_consistent_poses
 from nerfro.capture.preprocess_options import (
     CAMERAS,
-    FOUND,
     MESH,
     PreprocessConfig,
     claim,
+    conclude,
     searches_index,
     surface_settings,
-    train_command,
-    write_found,
 )
 from nerfro.capture.refinement_report import FIGURES, PICTURES, refine
 from nerfro.capture.silhouettes import mesh_silhouettes
@@ -49,8 +45,7 @@ def main(config: DictConfig) -> None:
     folder = claim(config, overrides)
     views = masked_views(build(config.data).load(config.split))
     box = None if config.box_min is None else np.array([config.box_min, config.box_max], np.float64)
-    location, written = config.mesh, []
-    overlaps = silhouettes = None
+    location, written, overlaps, silhouettes = config.mesh, [], None, None
     if mesh is None or views.masks is not None or config.refine_cameras:
         silhouettes = read_silhouettes(views, box is not None)
         wrong_masks = settled_wrong_masks(silhouettes, config.wrong_masks)
@@ -61,15 +56,13 @@ def main(config: DictConfig) -> None:
             return make_mesh(silhouettes, box, voxels, wrong_masks, config.keep, config.smoothing, config.symmetry)
 
         if config.refine_cameras:
-            rough = partial(hull, voxels=min(ROUGH_VOXELS, config.resolution))
-            camera = refine_cameras(views, silhouettes, wrong_masks, rough if mesh is None else mesh)
+            camera = refine_cameras(views, silhouettes, wrong_masks, hull if mesh is None else mesh)
             write_cameras(folder / CAMERAS, camera, views)
             written.append(CAMERAS)
             views = replace(views, cameras=camera.believed(views.cameras))
             silhouettes = replace(silhouettes, cameras=views.cameras)
         if mesh is None:
-            mesh = hull(silhouettes)
-            location = str(folder / MESH)
+            mesh, location = hull(silhouettes), str(folder / MESH)
             written.append(MESH)
             mesh.save(folder / MESH)
         # Pictures and figures first: they help to find out what is wrong with a mesh that the medium then refuses.
@@ -98,14 +91,7 @@ def main(config: DictConfig) -> None:
     if overlaps is not None and inside:
         draw_overlays(views, mesh, overlaps, inside, folder)
     settings |= found.settings | ({"camera": "refined"} if config.refine_cameras else {})
-    command = train_command(settings, overrides)
-    write_found(folder, command, found.doubtful, around.near, views.cameras)
-    written += [*found.written, FOUND]
-    print(f"wrote {', '.join(str(folder / name) for name in written)}")
-    if found.doubtful:
-        print(f"give {' '.join(f'{option}=N' for option in found.doubtful)} yourself")
-    print("where the surroundings are near, add +experiment=refractive_room; the baseline is +experiment=mipnerf")
-    print(f"train on it: {shlex.join(command)}")
+    conclude(folder, [*written, *found.written], settings, overrides, found.doubtful, around.near, views.cameras)
 
 
 if __name__ == "__main__":

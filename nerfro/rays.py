@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
-
-from nerfro.geometry.interpolation import intersect_box
 
 
 @dataclass(frozen=True)
@@ -45,9 +43,3 @@ class Rays:
     def detach(self) -> Rays:
         """The same rays without gradients."""
         return Rays(*(tensor.detach() for tensor in vars(self).values()))
-
-
-def misses(box: Float[Tensor, "2 3"], rays: Rays) -> Bool[Tensor, "R"]:
-    """Which rays pass by a box of these corners."""
-    enter, leave = intersect_box(box, rays.origins, rays.directions)
-    return (enter >= leave) | (leave <= 0)

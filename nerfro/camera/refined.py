@@ -92,9 +92,9 @@ class RefinedCamera(Camera):
     """Rotation and position of each training camera, and the lens that all share, refined with the scene.
 
     Before training, cameras turn until photographs of the sky agree (`panorama`), where there is one, and move until
-    the surface is seen in its masks (`outlines`), where there are any. Between training steps each takes a step of
-    Gauss-Newton towards its photograph (`gauss_newton`). A motion that all cameras share is taken out, to first order:
-    the world stays where the data have put it, with its surface.
+    the surface is seen in its masks (`capture.outlines`), where there are any. Between training steps each takes a step
+    of Gauss-Newton towards its photograph (`gauss_newton`). A motion that all cameras share is taken out, to first
+    order: the world stays where the data have put it, with its surface.
 
     Args:
         start: training steps before the first of these steps, so that the scene is there.

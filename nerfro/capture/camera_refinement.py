@@ -8,20 +8,20 @@ from dataclasses import replace
 
 import torch
 
-from nerfro.camera.outlines import meet_outlines
 from nerfro.camera.panorama import align
 from nerfro.camera.pixel_units import object_distances
 from nerfro.camera.refined import RefinedCamera
 from nerfro.camera.similarity import motion_between
+from nerfro.capture.outlines import meet_outlines
 from nerfro.capture.surface import object_box
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.data.base import Views
 from nerfro.data.pixel_store import PixelStore
 from nerfro.errors import NerfroError
+from nerfro.geometry.interpolation import misses
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.rays import misses
 
-ROUGH_VOXELS = 64  # along the hull's longest side, while cameras move
+_VOXELS = 64  # along the hull's longest side, while cameras move
 _ROUNDS, _SETTLED = 10, 0.02  # at most; it ends when cameras move by fewer pixels
 
 
@@ -29,7 +29,7 @@ def refine_cameras(
     views: Views,
     silhouettes: Silhouettes,
     wrong_masks: int,
-    surface: TriangleMesh | Callable[[Silhouettes], TriangleMesh],
+    surface: TriangleMesh | Callable[[Silhouettes, int], TriangleMesh],
 ) -> RefinedCamera:
     """Turn cameras by the sky, then move them until the surface is seen in its masks; print how far.
 
@@ -39,7 +39,7 @@ def refine_cameras(
         views: photographs with poses.
         silhouettes: of the same views.
         wrong_masks: see `object_box`.
-        surface: that is known, or makes the hull of masks.
+        surface: that is known, or makes the hull of masks with so many voxels along its longest side.
 
     Raises:
         NerfroError: no two photographs show the same of what is far away.
@@ -57,7 +57,7 @@ def refine_cameras(
     for _ in range(_ROUNDS):
         mesh, before = surface, motions.held()
         if not isinstance(mesh, TriangleMesh):
-            mesh = mesh(replace(silhouettes, cameras=camera.believed(views.cameras)))
+            mesh = mesh(replace(silhouettes, cameras=camera.believed(views.cameras)), _VOXELS)
         # The first hulls are no better than the poses, and far off their masks.
         meet_outlines(camera, views.cameras, lambda cameras: cameras, silhouettes, mesh, [panorama], math.inf)
         moved = ((motions.held() - before) / motions.units).square().sum(-1).mean().sqrt()

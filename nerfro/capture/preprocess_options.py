@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import typing
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -168,18 +169,27 @@ def train_command(settings: dict[str, object], overrides: list[str]) -> list[str
     return ["python", "-m", "nerfro.train", *kept, *_written(settings)]
 
 
-def write_found(
-    folder: Path, command: list[str], doubtful: dict[str, object], near: bool | None, cameras: Cameras
+def conclude(
+    folder: Path,
+    written: Sequence[str],
+    settings: dict[str, object],
+    overrides: list[str],
+    doubtful: dict[str, object],
+    near: bool | None,
+    cameras: Cameras,
 ) -> None:
-    """Write preprocess.json: what training needs to know.
+    """Write preprocess.json, what training needs to know, and print what was written and what comes next.
 
     Args:
         folder: to write to.
-        command: that trains.
-        doubtful: settings that it leaves out, because the photographs do not tell them, with what fits best.
+        written: names of the files that are there already.
+        settings: that the next command has beside the overrides.
+        overrides: of this command line.
+        doubtful: settings that are left out, because the photographs do not tell them, with what fits best.
         near: whether the surroundings are near, if that was found out.
         cameras: of the photographs.
     """
+    command = train_command(settings, overrides)
     found = {
         "options": command[3:],
         "doubtful": _written(doubtful),
@@ -187,6 +197,11 @@ def write_found(
         "pixels": [cameras.width, cameras.height],
     }
     write_atomically(folder / FOUND, json.dumps(found, indent=1) + "\n")
+    print(f"wrote {', '.join(str(folder / name) for name in [*written, FOUND])}")
+    if doubtful:
+        print(f"give {' '.join(f'{option}=N' for option in doubtful)} yourself")
+    print("where the surroundings are near, add +experiment=refractive_room; the baseline is +experiment=mipnerf")
+    print(f"train on it: {shlex.join(command)}")
 
 
 def _written(settings: dict[str, object]) -> list[str]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.kernels.constants import constant
 from nerfro.progress import told
+from nerfro.rays import Rays
 
 
 def trilinear(
@@ -52,6 +53,12 @@ def intersect_box(
     enter = torch.where(parallel, torch.where(missed, torch.inf, -torch.inf), torch.minimum(to_low, to_high)).amax(-1)
     leave = torch.where(parallel, torch.where(missed, -torch.inf, torch.inf), torch.maximum(to_low, to_high)).amin(-1)
     return enter, leave
+
+
+def misses(box: Float[Tensor, "2 3"], rays: Rays) -> Bool[Tensor, "R"]:
+    """Which rays pass by a box of these corners."""
+    enter, leave = intersect_box(box, rays.origins, rays.directions)
+    return (enter >= leave) | (leave <= 0)
 
 
 def spline_coefficients(values: Float[Tensor, "X Y Z"]) -> Float[Tensor, "X Y Z"]:

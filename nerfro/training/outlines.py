@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 
 from nerfro.camera.least_squares import Told
-from nerfro.camera.outlines import meet_outlines
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras, Window
+from nerfro.capture.outlines import meet_outlines
 from nerfro.capture.silhouette_fit import rim_points
 from nerfro.capture.silhouettes import mesh_silhouettes, pixel_stride
 from nerfro.capture.visual_hull import Silhouettes

@@ -19,8 +19,9 @@ from nerfro.data.pictures import Pictures
 from nerfro.data.pixel_store import PixelStore
 from nerfro.distributed import share_of
 from nerfro.errors import NerfroError
+from nerfro.geometry.interpolation import misses
 from nerfro.pixel_parts import contrast, divergence, part_rays, pixel_rays, rays_beside
-from nerfro.rays import Rays, misses
+from nerfro.rays import Rays
 from nerfro.types import Batch, Path
 
 Batching = Literal["single_image", "all_images"]

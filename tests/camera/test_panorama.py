@@ -14,8 +14,8 @@ from nerfro.camera.least_squares import Told
 from nerfro.camera.panorama import align
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
+from nerfro.geometry.interpolation import misses
 from nerfro.light import to_linear, to_srgb
-from nerfro.rays import misses
 from tests.ball_photographs import BOX, NUM_VIEWS, cameras, photographs
 
 TRUE = cameras()

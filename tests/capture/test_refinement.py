@@ -15,12 +15,13 @@ from torch import Tensor
 
 import nerfro.preprocess
 from nerfro.boundaries.base import Boundary
-from nerfro.capture import refinement, surroundings
+from nerfro.capture import refinement, refinement_report
 from nerfro.capture.backdrop import backdrop_of
 from nerfro.capture.refinement import Refined, refine_surface
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.surroundings import Pixels, Room, Surroundings, divide_pixels, learn_surroundings
 from nerfro.capture.visual_hull import Silhouettes
+from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media import displacement
 from nerfro.media.sdf_grid import SdfGrid
@@ -199,9 +200,11 @@ def test_preprocess_writes_the_refined_surface(short: None, preprocess: Callable
 
 
 def test_a_surface_that_cannot_be_refined_stays_as_it_is(preprocess: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(surroundings, "_NEAR_STEPS", 2)
-    monkeypatch.setattr(surroundings, "_NEAR_PIXELS", 64)
-    out, printed = preprocess("room=true")
+    def nothing_known(*_: object) -> Refined:
+        raise NerfroError("no pixel shows known surroundings")
+
+    monkeypatch.setattr(refinement_report, "refine_surface", nothing_known)
+    out, printed = preprocess()
     assert "the surface stays as it is" in printed
     assert load_mesh(out / "mesh.ply").vertices.shape == mesh().vertices.shape
 

@@ -11,10 +11,10 @@ import trimesh
 
 from benchmarks.cameras import disturbed
 from nerfro.camera.least_squares import Told
-from nerfro.camera.outlines import meet_outlines
 from nerfro.camera.refined import RefinedCamera
 from nerfro.camera.similarity import motion_between
 from nerfro.cameras import Cameras
+from nerfro.capture.outlines import meet_outlines
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import NerfroError
