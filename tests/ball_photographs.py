@@ -10,9 +10,10 @@ from pathlib import Path
 import torch
 import trimesh
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import avg_pool2d, normalize
 
 from nerfro.cameras import Cameras
+from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.data.base import Views
 from nerfro.files.images import save_png
 from nerfro.geometry.mesh import TriangleMesh
@@ -22,6 +23,7 @@ from nerfro.samplers.snell import Snell
 from nerfro.types import Exits
 
 SIZE, NUM_VIEWS, RADIUS, INNER = 40, 30, 0.7, 0.35
+SHARES = 5  # pixels of masks are divided by so many, each way
 BOX = torch.tensor([[-0.9] * 3, [0.9] * 3])
 
 
@@ -35,6 +37,12 @@ def cameras() -> Cameras:
     poses = torch.stack([right, torch.linalg.cross(back, right), back, 3 * back], -1)
     focal, middle = torch.full((NUM_VIEWS,), 0.8 * SIZE), torch.full((NUM_VIEWS,), SIZE / 2)
     return Cameras(poses, focal, focal, middle, middle, SIZE, SIZE, 0.5, 6.0)
+
+
+def soft_masks(mesh: TriangleMesh) -> Tensor:
+    """Shares of pixels [V, H, W] that the cameras see filled by a mesh."""
+    fine = mesh_silhouettes(mesh, cameras().resized(SHARES * SIZE, SHARES * SIZE), 1).float()
+    return avg_pool2d(fine[:, None], SHARES)[:, 0]
 
 
 def sky(directions: Tensor) -> Tensor:

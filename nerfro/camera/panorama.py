@@ -82,8 +82,8 @@ def align(
     others = torch.eye(len(information)).to(information)
     others[: len(together), : len(together)] -= together @ together.mT
     numbers = camera.numbers()
-    place = torch.arange(len(numbers), device=information.device)
-    place = torch.cat([place[: 6 * len(cameras)].view(-1, 6)[:, :3].flatten(), place[6 * len(cameras) :]])
+    motions, lens = camera.split(torch.arange(len(numbers), device=information.device))
+    place = torch.cat([motions[:, :3].flatten(), lens])
     known = information.new_zeros(len(numbers), len(numbers))
     known[place[:, None], place] = others @ information @ others
     return Told(numbers, known.to(numbers))

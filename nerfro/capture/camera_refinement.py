@@ -54,14 +54,13 @@ def refine_cameras(
             "cameras are turned; leave it out"
         )
     motions = camera.motions
-    for _ in range(_ROUNDS):
+    for _ in range(1 if isinstance(surface, TriangleMesh) else _ROUNDS):
         mesh, before = surface, motions.held()
         if not isinstance(mesh, TriangleMesh):
             mesh = mesh(replace(silhouettes, cameras=camera.believed(views.cameras)), _VOXELS)
         # The first hulls are no better than the poses, and far off their masks.
         meet_outlines(camera, views.cameras, lambda cameras: cameras, silhouettes, mesh, [panorama], math.inf)
-        moved = ((motions.held() - before) / motions.units).square().sum(-1).mean().sqrt()
-        if isinstance(surface, TriangleMesh) or float(moved) < _SETTLED:
+        if float(((motions.held() - before) / motions.units).square().sum(-1).mean().sqrt()) < _SETTLED:
             break
     turned, shifted = motion_between(views.cameras.camera_to_world, camera.believed(views.cameras).camera_to_world)
     share = float((shifted / object_distances(views.cameras)).median())

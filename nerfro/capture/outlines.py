@@ -7,7 +7,6 @@ It hardly tells a turn from a shift across the line of sight; that the sky tells
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -16,7 +15,7 @@ from torch import Tensor
 from nerfro.camera.least_squares import Told, normal_equations, with_told
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
-from nerfro.capture.silhouette_fit import rim_points
+from nerfro.capture.silhouette_fit import RimFinder
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.progress import told as bar
@@ -60,8 +59,9 @@ def meet_outlines(
     before = camera.position()
     begun = camera.numbers()
     given = Told(begun, torch.eye(len(begun)).to(begun) / _GIVEN**2)
+    finder = RimFinder(mesh, silhouettes)
     for step in bar("outlines", range(_STEPS + 1)):
-        slopes, error, weights, view = _seen(camera, cameras, reduced, silhouettes, mesh)
+        slopes, error, weights, view = _seen(camera, cameras, reduced, finder)
         variance = float((weights * error[:, 0].square()).sum() / weights.sum()) + _LEAST**2
         if step < _STEPS:
             matrix, vector = normal_equations(slopes, error, weights, view, len(cameras))
@@ -84,15 +84,14 @@ def _seen(
     camera: RefinedCamera,
     cameras: Cameras,
     reduced: Callable[[Cameras], Cameras],
-    silhouettes: Silhouettes,
-    mesh: TriangleMesh,
+    finder: RimFinder,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Slopes [R, 1, N + 1] and errors [R, 1] of the outlines in pixels of the silhouettes, their weights and views.
 
     The last slope is that by a width of which all masks are too wide.
     """
     believed = reduced(camera.believed(cameras))
-    rims = rim_points(mesh, replace(silhouettes, cameras=believed))
+    rims = finder.points(believed)
     of_views = rims.points.split(torch.bincount(rims.views, minlength=len(cameras)).tolist())
     place = torch.cat([believed.select([view]).project(points)[0][0] for view, points in enumerate(of_views)])
     place = place * place.new_tensor([cameras.width / believed.width, cameras.height / believed.height])

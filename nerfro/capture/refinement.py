@@ -27,9 +27,9 @@ from torch import Tensor, nn
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.cube_map import texel_directions
 from nerfro.boundaries.envmap import EnvironmentMap
-from nerfro.capture.backdrop import Backdrop, backdrop_of
 from nerfro.capture.record import Record
-from nerfro.capture.silhouette_fit import rim_points
+from nerfro.capture.room_picture import RoomPicture, picture_of
+from nerfro.capture.silhouette_fit import RimFinder
 from nerfro.capture.surroundings import HELD_BACK, Pixels, Room, Surroundings, robust
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import NerfroError
@@ -214,7 +214,7 @@ class _Descent:
         self.teachers = through[~held_back]
         self.judges = (through[held_back] if held_back.any() else through).some(_JUDGED)
         self.first_errors: Tensor | None = None
-        self.rims = rim_points(mesh, silhouettes).points
+        self.rims = RimFinder(mesh, silhouettes).points().points
         cameras = silhouettes.cameras
         middle = torch.from_numpy(mesh.bounds.mean(0)).float()
         distance = (cameras.camera_to_world[:, :, 3] - middle).norm(dim=-1)
@@ -317,20 +317,20 @@ class _Descent:
         return trace.path, usable
 
 
-def _picture(surroundings: Surroundings, mesh: TriangleMesh, medium: SdfGrid) -> EnvironmentMap | Backdrop:
+def _picture(surroundings: Surroundings, mesh: TriangleMesh, medium: SdfGrid) -> EnvironmentMap | RoomPicture:
     """Surroundings that have a slope, and can be blurred."""
     boundary = surroundings.boundary
     if isinstance(boundary, Room):
-        return backdrop_of(boundary, medium, torch.from_numpy(mesh.bounds.mean(0)).float())
+        return picture_of(boundary, medium, torch.from_numpy(mesh.bounds.mean(0)).float())
     return boundary
 
 
 @torch.no_grad()
-def _blurred(picture: EnvironmentMap | Backdrop, degrees: float) -> Boundary:
+def _blurred(picture: EnvironmentMap | RoomPicture, degrees: float) -> Boundary:
     """A picture of surroundings, convolved with a Gaussian of that standard deviation; itself for none."""
     if degrees == 0:
         return picture
-    sky = picture.colours if isinstance(picture, Backdrop) else picture
+    sky = picture.colours if isinstance(picture, RoomPicture) else picture
     count, generator = 32, torch.Generator().manual_seed(0)
     directions = texel_directions(max(16, round(135 / degrees)))
     total = torch.zeros_like(directions)
@@ -338,7 +338,7 @@ def _blurred(picture: EnvironmentMap | Backdrop, degrees: float) -> Boundary:
         turned = directions + math.radians(degrees) * torch.randn(3, generator=generator)
         total += sky(Exits(turned / turned.norm(dim=-1, keepdim=True))).clamp(max=1)
     blurred = EnvironmentMap.of_texels(total / count)
-    return Backdrop(picture.middle, blurred, picture.distances) if isinstance(picture, Backdrop) else blurred
+    return RoomPicture(picture.middle, blurred, picture.distances) if isinstance(picture, RoomPicture) else blurred
 
 
 def _onto(mesh: TriangleMesh, medium: SdfGrid) -> TriangleMesh:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -132,17 +133,40 @@ def fit_surface(
     return TriangleMesh(vertices, mesh.faces)
 
 
-def rim_points(mesh: TriangleMesh, silhouettes: Silhouettes) -> RimPoints:
-    """Where views see the outlines of a surface that are near those of their masks."""
-    faces, vertices = mesh.faces, mesh.vertices
-    normals = _vertex_normals(vertices, faces)
-    rims = _find_rims(vertices, normals, _edges(faces), silhouettes, _outlines(silhouettes))
-    share = rims.share[:, None]
-    points, normal = ((1 - share) * each[rims.first] + share * each[rims.second] for each in (vertices, normals))
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    values = [torch.from_numpy(each).float() for each in (points, normal, rims.misfit, rims.weight, rims.width)]
-    first, second, third, fourth, fifth = values
-    return RimPoints(first, second, third, fourth, fifth, torch.from_numpy(rims.view))
+class RimFinder:
+    """Where views see the outlines of a surface that are near those of their masks.
+
+    What does not depend on the cameras is prepared once, for those that move.
+    """
+
+    def __init__(self, mesh: TriangleMesh, silhouettes: Silhouettes) -> None:
+        self._vertices, self._edges = mesh.vertices, _edges(mesh.faces)
+        self._normals = _vertex_normals(mesh.vertices, mesh.faces)
+        self._silhouettes, self._outlines = silhouettes, _outlines(silhouettes)
+
+    def points(self, cameras: Cameras | None = None) -> RimPoints:
+        """With other cameras than the silhouettes', if they are given."""
+        silhouettes = self._silhouettes if cameras is None else replace(self._silhouettes, cameras=cameras)
+        rims = _find_rims(self._vertices, self._normals, self._edges, silhouettes, self._outlines)
+        normals = self._along_edges(self._normals, rims)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        return RimPoints(
+            points=_tensor(self._along_edges(self._vertices, rims)),
+            normals=_tensor(normals),
+            misfits=_tensor(rims.misfit),
+            weights=_tensor(rims.weight),
+            widths=_tensor(rims.width),
+            views=torch.from_numpy(rims.view),
+        )
+
+    @staticmethod
+    def _along_edges(values: Float[np.ndarray, "V 3"], rims: _Rims) -> Float[np.ndarray, "K 3"]:
+        share = rims.share[:, None]
+        return (1 - share) * values[rims.first] + share * values[rims.second]
+
+
+def _tensor(values: np.ndarray) -> Tensor:
+    return torch.from_numpy(values).float()
 
 
 def _outlines(silhouettes: Silhouettes) -> _Outlines:

@@ -16,8 +16,9 @@ from torch.nn import functional
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.cube_map import project
 from nerfro.boundaries.envmap import EnvironmentMap
-from nerfro.cameras import Cameras, Window
-from nerfro.capture.silhouettes import mesh_silhouettes, pixel_stride
+from nerfro.cameras import Cameras
+from nerfro.capture.pixel_blocks import PixelBlocks
+from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
 from nerfro.fields.hash_grid import HashGridField
@@ -98,25 +99,18 @@ def divide_pixels(views: Views, mesh: TriangleMesh, max_pixels: int = _MAX_PIXEL
     Raises:
         NerfroError: there are none of the one or the other.
     """
-    stride = pixel_stride(views.cameras, max_pixels)
-    height, width = views.cameras.height // stride, views.cameras.width // stride
-    window = Window(0, 0, height * stride, width * stride)
-    cameras = views.cameras.crop(window).resized(width, height)
-
-    def averaged(picture: Tensor) -> Tensor:
-        blocks = window.cut(picture.float()[None]).view(height, stride, width, stride, -1)
-        return blocks.mean((1, 3))
-
+    blocks = PixelBlocks(views.cameras, max_pixels)
+    cameras = blocks.cameras(views.cameras)
     silhouettes = None if views.masks is not None else mesh_silhouettes(mesh, cameras, 1).float()
     parts: list[list[tuple[Tensor, Tensor]]] = [[], []]
     for view in range(len(views)):
-        radiance = averaged(to_linear(views.images[view])).view(-1, 3)
-        share = averaged(views.masks[view])[..., 0] if silhouettes is None else silhouettes[view]  # type: ignore[index]
+        radiance = blocks.mean(to_linear(views.images[view])).view(-1, 3)
+        share = blocks.mean(views.masks[view]) if silhouettes is None else silhouettes[view]  # type: ignore[index]
         most, least = (functional.max_pool2d(x[None, None], 3, 1, 1)[0, 0] for x in (share, 1 - share))
-        usable = torch.ones_like(share) if views.usable is None else averaged(views.usable[view])[..., 0]
+        usable = torch.ones_like(share) if views.usable is None else blocks.mean(views.usable[view])
         for part, wanted in zip(parts, (most < 1e-3, least < 1e-3), strict=True):
             where = (wanted & (usable == 1)).flatten().nonzero()[:, 0]
-            part.append((view * height * width + where, radiance[where]))
+            part.append((view * blocks.height * blocks.width + where, radiance[where]))
     beside, through = (Pixels(cameras, *(torch.cat(values) for values in zip(*part, strict=True))) for part in parts)
     if not len(beside) or not len(through):
         raise NerfroError(

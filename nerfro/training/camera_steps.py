@@ -43,8 +43,7 @@ class CameraSteps(Callback):
 
     def __init__(self, batches: RayBatches, views: Views) -> None:
         self._batches, self._views = batches, views
-        self._panorama: Told | None = None
-        self._outlines: Told | None = None
+        self._told: dict[str, Told] = {}  # by what
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, NerfModel)
@@ -52,16 +51,15 @@ class CameraSteps(Callback):
         if trainer.global_step > 0 or box is None or not isinstance(camera, RefinedCamera):
             return
         batches = self._batches.to(model.device)
-        self._panorama = align(camera, batches.cameras, batches.photographed, lambda rays: misses(box, rays))
-        self._outlines = meet_masks(camera, self._views, model.medium, self._panorama)
+        panorama = align(camera, batches.cameras, batches.photographed, lambda rays: misses(box, rays))
+        known = {"panorama": panorama, "outlines": meet_masks(camera, self._views, model.medium, panorama)}
+        self._told = {name: told for name, told in known.items() if told is not None}
 
     def state_dict(self) -> dict[str, Any]:
-        known = {"panorama": self._panorama, "outlines": self._outlines}
-        return {name: dict(vars(told)) for name, told in known.items() if told is not None}
+        return {name: dict(vars(told)) for name, told in self._told.items()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        known = {name: Told(**told) for name, told in state_dict.items()}
-        self._panorama, self._outlines = known.get("panorama"), known.get("outlines")
+        self._told = {name: Told(**told) for name, told in state_dict.items()}
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
         assert isinstance(pl_module, NerfModel)
@@ -73,18 +71,12 @@ class CameraSteps(Callback):
         reach = max(_LEAST_REACH, _FIRST_REACH * _SHRINKING**before)
         # Not asked whether errors fall: every camera has painted its own ghost, which holds it where it is.
         how = Step(reach, _SCALE * reach, _LONGEST, share=min(1.0, _WHOLE / (before + 1)), checked=False)
-        _move(pl_module, camera, self._batches, step, how, self._panorama, self._outlines)
+        _move(pl_module, camera, self._batches, step, how, self._told)
 
 
 @torch.no_grad()
 def _move(
-    model: NerfModel,
-    camera: RefinedCamera,
-    batches: RayBatches,
-    step: int,
-    how: Step,
-    panorama: Told | None,
-    outlines: Told | None,
+    model: NerfModel, camera: RefinedCamera, batches: RayBatches, step: int, how: Step, told: dict[str, Told]
 ) -> None:
     """A step of all cameras by pixels with contrast, drawn anew for each training step.
 
@@ -93,14 +85,12 @@ def _move(
     batches, box = batches.to(model.device), occupied(model)
     candidates = batches.of_each_view(_DRAWN * camera.num_pixels, step)
     past = None
-    if panorama is not None and box is not None:
+    if "panorama" in told and box is not None:
         view = candidates.flatten() // (batches.cameras.height * batches.cameras.width)
         past = misses(box, camera(pixel_rays(batches.cameras, candidates.flatten()), view)).view(candidates.shape)
     pixels = telling(candidates, camera.num_pixels, batches.photographed, batches.cameras, past)
 
-    told = [known for known in (panorama, outlines) if known is not None]
-
     def shown(rays: Rays, view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
         return model.shown(rays, camera.gains(view))
 
-    improve(camera, batches.cameras, pixels, batches.photographed, shown, how, told)
+    improve(camera, batches.cameras, pixels, batches.photographed, shown, how, list(told.values()))

@@ -6,10 +6,11 @@ import torch
 
 from nerfro.camera.least_squares import Told
 from nerfro.camera.refined import RefinedCamera
-from nerfro.cameras import Cameras, Window
+from nerfro.cameras import Cameras
 from nerfro.capture.outlines import meet_outlines
-from nerfro.capture.silhouette_fit import rim_points
-from nerfro.capture.silhouettes import mesh_silhouettes, pixel_stride
+from nerfro.capture.pixel_blocks import PixelBlocks
+from nerfro.capture.silhouette_fit import RimFinder
+from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.data.base import Views
 from nerfro.data.masks import masked_views
@@ -34,10 +35,9 @@ def hold_outlines(medium: Medium, views: Views) -> None:
     if silhouettes is None:
         cameras = reduced(views.cameras)
         silhouettes = Silhouettes.of(cameras, mesh_silhouettes(mesh, cameras, 1).float())
-    rims = rim_points(mesh, silhouettes)
-    if len(rims.points):
-        outwards = torch.zeros_like(rims.misfits) if views.masks is None else rims.misfits
-        medium.hold(rims.points, outwards, _KNOWN * float(rims.widths.mean()))
+    rims = RimFinder(mesh, silhouettes).points()
+    outwards = torch.zeros_like(rims.misfits) if views.masks is None else rims.misfits
+    medium.hold(rims.points, outwards, _KNOWN * float(rims.widths.mean()))
 
 
 def meet_masks(camera: RefinedCamera, views: Views, medium: Medium, panorama: Told | None) -> Told | None:
@@ -49,8 +49,7 @@ def meet_masks(camera: RefinedCamera, views: Views, medium: Medium, panorama: To
         medium: that has the surface.
         panorama: what the sky tells.
     """
-    silhouettes = mask_silhouettes(views)
-    if silhouettes is None or not isinstance(medium, SdfGrid) or not medium.meshes:
+    if not isinstance(medium, SdfGrid) or not medium.meshes or (silhouettes := mask_silhouettes(views)) is None:
         return None
     told = [] if panorama is None else [panorama]
     return meet_outlines(camera, views.cameras, reduced, silhouettes, medium.meshes[0], told)
@@ -60,15 +59,10 @@ def mask_silhouettes(views: Views) -> Silhouettes | None:
     """What the masks of all views say, in smaller pictures; None where there are none."""
     if views.masks is None:
         return None
-    cameras, stride = reduced(views.cameras), pixel_stride(views.cameras, _MAX_PIXELS)
-    window = Window(0, 0, cameras.height * stride, cameras.width * stride)
-    cut = (window.cut(mask.float()[None]) for mask in views.masks)
-    masks = torch.stack([mask.view(cameras.height, stride, cameras.width, stride).mean((1, 3)) for mask in cut])
-    return Silhouettes.of(cameras, masks)
+    blocks = PixelBlocks(views.cameras, _MAX_PIXELS)
+    return Silhouettes.of(blocks.cameras(views.cameras), torch.stack([blocks.mean(mask) for mask in views.masks]))
 
 
 def reduced(cameras: Cameras) -> Cameras:
-    """Cameras of smaller pictures: every few pixels are one; what is left over at the right and below is cut off."""
-    stride = pixel_stride(cameras, _MAX_PIXELS)
-    height, width = cameras.height // stride, cameras.width // stride
-    return cameras.crop(Window(0, 0, height * stride, width * stride)).resized(width, height)
+    """Cameras of those smaller pictures."""
+    return PixelBlocks(cameras, _MAX_PIXELS).cameras(cameras)

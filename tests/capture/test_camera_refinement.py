@@ -16,15 +16,13 @@ import nerfro.preprocess
 from benchmarks.cameras import disturbed
 from nerfro.camera.similarity import motion_between
 from nerfro.capture import camera_refinement
-from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.data.base import Views
 from nerfro.files.images import save_png
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.light import to_srgb
-from tests.ball_photographs import NUM_VIEWS, RADIUS, SIZE, cameras, save, sky
+from tests.ball_photographs import NUM_VIEWS, RADIUS, SIZE, cameras, save, sky, soft_masks
 
 TRUE = cameras()
-SHARES = 5  # pixels of masks are divided by so many, each way
 
 
 def box_of_wood() -> TriangleMesh:
@@ -37,9 +35,7 @@ def box_of_wood() -> TriangleMesh:
 
 def save_photographs(folder: Path, poses: torch.Tensor) -> None:
     """Photographs and masks as the true cameras take them, with these poses."""
-    fine = mesh_silhouettes(box_of_wood(), TRUE.resized(SHARES * SIZE, SHARES * SIZE), 1).float()
-    masks = torch.nn.functional.avg_pool2d(fine[:, None], SHARES)[:, 0]
-    images = []
+    masks, images = soft_masks(box_of_wood()), []
     for view in range(NUM_VIEWS):
         image = to_srgb(sky(TRUE.image_rays(view).directions)).view(SIZE, SIZE, 3)
         mask = masks[view][..., None].expand(-1, -1, 3)

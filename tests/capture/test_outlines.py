@@ -15,14 +15,12 @@ from nerfro.camera.refined import RefinedCamera
 from nerfro.camera.similarity import motion_between
 from nerfro.cameras import Cameras
 from nerfro.capture.outlines import meet_outlines
-from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
-from tests.ball_photographs import NUM_VIEWS, RADIUS, SIZE, cameras
+from tests.ball_photographs import NUM_VIEWS, RADIUS, SIZE, cameras, soft_masks
 
 TRUE = cameras()
-SHARES = 5  # pixels of masks are divided by so many, each way
 
 
 def ellipsoid() -> TriangleMesh:
@@ -31,8 +29,7 @@ def ellipsoid() -> TriangleMesh:
 
 
 def silhouettes() -> Silhouettes:
-    fine = mesh_silhouettes(ellipsoid(), TRUE.resized(SHARES * SIZE, SHARES * SIZE), 1).float()
-    return Silhouettes.of(TRUE, torch.nn.functional.avg_pool2d(fine[:, None], SHARES)[:, 0])
+    return Silhouettes.of(TRUE, soft_masks(ellipsoid()))
 
 
 def met(camera: RefinedCamera, given: Cameras, seen: Silhouettes, sure: list[int] | None = None) -> Told:

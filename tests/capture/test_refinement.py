@@ -16,8 +16,8 @@ from torch import Tensor
 import nerfro.preprocess
 from nerfro.boundaries.base import Boundary
 from nerfro.capture import refinement, refinement_report
-from nerfro.capture.backdrop import backdrop_of
 from nerfro.capture.refinement import Refined, refine_surface
+from nerfro.capture.room_picture import picture_of
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.surroundings import Pixels, Room, Surroundings, divide_pixels, learn_surroundings
 from nerfro.capture.visual_hull import Silhouettes
@@ -160,7 +160,7 @@ def test_a_dent_is_found_by_near_surroundings(short: None) -> None:
 def test_a_backdrop_is_the_room_along_every_line() -> None:
     room = PaintedShell()
     middle = torch.tensor([0.1, -0.2, 0.05])
-    backdrop = backdrop_of(room, solid([1.5]), middle)
+    backdrop = picture_of(room, solid([1.5]), middle)
     generator = torch.Generator().manual_seed(0)
     positions = (torch.rand(500, 3, generator=generator) - 0.5).requires_grad_()
     directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=generator), dim=-1).requires_grad_()

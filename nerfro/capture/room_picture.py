@@ -24,7 +24,7 @@ _CHUNK = 16384  # rays at a time
 _STEPS = 5  # until a line meets the picture; the object is small beside its surroundings
 
 
-class Backdrop(Boundary):
+class RoomPicture(Boundary):
     """A picture of what is around a point. Lines that begin elsewhere are followed until they meet it.
 
     What something near hides from the point is not in the picture.
@@ -63,7 +63,7 @@ class Backdrop(Boundary):
 
 
 @torch.no_grad()
-def backdrop_of(room: Room, medium: SdfGrid, middle: Float[Tensor, "3"]) -> Backdrop:
+def picture_of(room: Room, medium: SdfGrid, middle: Float[Tensor, "3"]) -> RoomPicture:
     """What a room shows around an object, from the object's surface outwards; within, nothing is known of it."""
     radius = float((medium.box[1] - medium.box[0]).norm())
     radiance, distances = [], []
@@ -75,4 +75,4 @@ def backdrop_of(room: Room, medium: SdfGrid, middle: Float[Tensor, "3"]) -> Back
         seen, distance = room.seen(Exits(directions, starts))
         radiance.append(seen)
         distances.append(distance + (starts - middle).norm(dim=-1))
-    return Backdrop(middle, EnvironmentMap.of_texels(torch.cat(radiance)), torch.cat(distances))
+    return RoomPicture(middle, EnvironmentMap.of_texels(torch.cat(radiance)), torch.cat(distances))
