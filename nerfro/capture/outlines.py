@@ -15,7 +15,7 @@ from torch import Tensor
 from nerfro.camera.least_squares import Told, normal_equations, with_told
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
-from nerfro.capture.silhouette_fit import RimFinder
+from nerfro.capture.rims import RimFinder
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.progress import told as bar

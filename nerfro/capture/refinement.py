@@ -28,8 +28,8 @@ from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.cube_map import texel_directions
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.capture.record import Record
+from nerfro.capture.rims import RimFinder
 from nerfro.capture.room_picture import RoomPicture, picture_of
-from nerfro.capture.silhouette_fit import RimFinder
 from nerfro.capture.surroundings import HELD_BACK, Pixels, Room, Surroundings, robust
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import NerfroError

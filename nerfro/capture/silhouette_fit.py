@@ -4,26 +4,20 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import replace
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int
 from scipy import sparse
-from scipy.ndimage import binary_erosion, distance_transform_edt
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
-from torch import Tensor
 
-from nerfro.cameras import Cameras
+from nerfro.capture.creases import CURVED, FACETS, Sides, has_creases, sharpened
+from nerfro.capture.moving_mesh import MovingMesh
+from nerfro.capture.rims import Outlines, Rims, find_rims, outlines_of
 from nerfro.capture.surroundings import HELD_BACK
 from nerfro.capture.visual_hull import Silhouettes
-from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
-
-# For each view the number of the outline's pixel that is nearest to each of its pixels.
-_Outlines: TypeAlias = "dict[int, Int[np.ndarray, 'H W']]"
 
 
 class _Prior(NamedTuple):
@@ -40,55 +34,28 @@ class _Prior(NamedTuple):
     last: float
     usual: bool  # whether the curvature that is usual around a vertex is likely, or none
     edge: float  # curvature, see `_mean_curvature`, beyond which area and bending cost less: an edge is no error
+    steady: float  # in the last steps: weight of changes of curvature, for each square of what views are off
 
 
 # Chosen on the scenes `torus` and `ship`, with masks of shares.
-_ROUND = _Prior(area=3e-6, bending=1e-5, first=100, last=0.01, usual=True, edge=np.inf)
-_FLAT = _Prior(area=3e-6, bending=5e-9, first=100, last=0.1, usual=False, edge=0.02)
+_ROUND = _Prior(area=3e-6, bending=1e-5, first=100, last=0.01, usual=True, edge=np.inf, steady=0)
+_FLAT = _Prior(area=3e-6, bending=5e-9, first=100, last=0.1, usual=False, edge=0.02, steady=4)
 # Steps of falling strength, and steps after them, with all views, of the strength that was best.
-_STEPS, _LAST_STEPS = 22, 3
+_STEPS, _LAST_STEPS = 22, 6
+# Where curvature shall be steady, bending is hardly needed any more, and would draw edges in.
+_BENDING_LEFT = 0.1
+# Around a vertex, so many times half of what is known of its neighbours' normals is taken, to see in which direction
+# they turn most. Turns by less than this from neighbour to neighbour have no direction, radians. The sharper, the less
+# is asked of curvature across an edge.
+_BLURS, _NO_TURN, _SHARPNESS = 4, np.radians(0.5), 4
 # The strongest is taken whose outlines are at most so many times as far from the masks' as the nearest: noise of masks
 # tilts a surface before it moves its outlines.
 _AS_GOOD = 1.1
-# How far vertices move to the middle of their neighbours, along the surface.
-_SPREADING = 0.5
 # A normal that is turned by a radian counts as far away as this share of the object's size. Curvature is usual around a
 # vertex if this share of the vertices there have at least as much: 0 on flat sides and low roofs, the ball's on a ball.
 _TURN, _LEAST_SHARE = 0.08, 0.7
 # Around a vertex are so many of these, spread over the whole surface.
 _NUM_AROUND, _NUM_SPREAD = 31, 1000
-# A binary mask's outline is known to about this, pixels. The misfits' median over it is how far the surface still is
-# from the masks: the two limits below widen with it, so that it never loses them all.
-_TYPICAL = 0.35
-# Outlines farther than this from a mask's belong to folds of the surface in front of itself; where the weight of an
-# observation is halved, pixels. That falls to this share of it for masks of shares, which are surer than binary ones.
-_GATE, _HALVED, _SUREST = 3.0, 0.7, 0.3
-
-
-class _Rims(NamedTuple):
-    """Where the surface's outlines are seen: on edge (first, second) of the mesh, `share` of the way to second.
-
-    To meet the mask's outline the surface has to move outwards by `misfit` there, world units.
-    """
-
-    first: Int[np.ndarray, "K"]
-    second: Int[np.ndarray, "K"]
-    share: Float[np.ndarray, "K"]
-    misfit: Float[np.ndarray, "K"]
-    weight: Float[np.ndarray, "K"]
-    width: Float[np.ndarray, "K"]  # of a pixel there, world units
-    view: Int[np.ndarray, "K"]  # that sees it
-
-
-class RimPoints(NamedTuple):
-    """Points of a surface that views see on the outlines of their masks; lengths in world units."""
-
-    points: Float[Tensor, "K 3"]
-    normals: Float[Tensor, "K 3"]  # unit, outwards
-    misfits: Float[Tensor, "K"]  # how far each has to move outwards to lie on the outline
-    weights: Float[Tensor, "K"]  # of these: less where most others are nearer
-    widths: Float[Tensor, "K"]  # of a pixel there
-    views: Int[Tensor, "K"]
 
 
 def fit_surface(
@@ -115,66 +82,39 @@ def fit_surface(
     is bent much. Views that are held back decide between the two, and how strong area and bending are: the surer the
     masks, the weaker.
 
+    Where the second is better, the last steps replace most of its bending, which rounds edges, by
+
+        g sum_edges w_ij (h (H_i - H_j))^2
+
+    with w from 1 along the direction in which the surface bends least to 0 across it: an edge has one profile along its
+    length, and flat sides stay flat. The weight g grows with the square of what views that were held back are off.
+
+    Where the second has creases, sharp ones are made of it in two ways, see `sharpened`, and the views that are held
+    back decide between all.
+
     The mesh is closed and has triangles of about one size, such as marching cubes give. `smoothing` multiplies the
     strength that was found; more of it suits masks that were drawn by hand. `progress` is told the share done.
     """
     count = itertools.count(1)
 
     def step() -> None:
-        progress(next(count) / (2 * _STEPS + _LAST_STEPS))
+        progress(min(1.0, next(count) / (2 * _STEPS + _LAST_STEPS)))
 
-    fit, outlines = _Fit(mesh, silhouettes), _outlines(silhouettes)
+    fit, outlines = _Fit(mesh, silhouettes), outlines_of(silhouettes)
     found = [fit.search(prior, outlines, step) for prior in (_ROUND, _FLAT)]
+    if has_creases(found[1].vertices, fit.mesh):
+        facets, curved = (fit.with_creases(found[1], sides, outlines) for sides in (FACETS, CURVED))
+        found.append(facets if facets.misfit <= _AS_GOOD * curved.misfit else curved)
     best = min(found, key=lambda each: each.misfit)
     vertices = best.vertices
+    if best.sides is not None:
+        sides = best.sides._replace(flat=smoothing * best.sides.flat)
+        return TriangleMesh(fit.sharpened(vertices, sides, outlines), mesh.faces)
+    steady = smoothing * best.prior.steady * (best.misfit / fit.size) ** 2
     for left in reversed(range(_LAST_STEPS)):
-        vertices = fit.moved(vertices, outlines, best.prior, smoothing * best.strength, spread=left > 0)
+        vertices = fit.moved(vertices, outlines, best.prior, smoothing * best.strength, steady, spread=left > 0)
         step()
     return TriangleMesh(vertices, mesh.faces)
-
-
-class RimFinder:
-    """Where views see the outlines of a surface that are near those of their masks.
-
-    What does not depend on the cameras is prepared once, for those that move.
-    """
-
-    def __init__(self, mesh: TriangleMesh, silhouettes: Silhouettes) -> None:
-        self._vertices, self._edges = mesh.vertices, _edges(mesh.faces)
-        self._normals = _vertex_normals(mesh.vertices, mesh.faces)
-        self._silhouettes, self._outlines = silhouettes, _outlines(silhouettes)
-
-    def points(self, cameras: Cameras | None = None) -> RimPoints:
-        """With other cameras than the silhouettes', if they are given."""
-        silhouettes = self._silhouettes if cameras is None else replace(self._silhouettes, cameras=cameras)
-        rims = _find_rims(self._vertices, self._normals, self._edges, silhouettes, self._outlines)
-        normals = self._along_edges(self._normals, rims)
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        return RimPoints(
-            points=_tensor(self._along_edges(self._vertices, rims)),
-            normals=_tensor(normals),
-            misfits=_tensor(rims.misfit),
-            weights=_tensor(rims.weight),
-            widths=_tensor(rims.width),
-            views=torch.from_numpy(rims.view),
-        )
-
-    @staticmethod
-    def _along_edges(values: Float[np.ndarray, "V 3"], rims: _Rims) -> Float[np.ndarray, "K 3"]:
-        share = rims.share[:, None]
-        return (1 - share) * values[rims.first] + share * values[rims.second]
-
-
-def _tensor(values: np.ndarray) -> Tensor:
-    return torch.from_numpy(values).float()
-
-
-def _outlines(silhouettes: Silhouettes) -> _Outlines:
-    return {view: _nearest_outline_pixel(mask) for view, mask in enumerate((silhouettes.masks > 0.5).numpy())}
-
-
-def _edges(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "E 2"]:
-    return np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
 
 
 class _Found(NamedTuple):
@@ -184,67 +124,86 @@ class _Found(NamedTuple):
     strength: float
     vertices: Float[np.ndarray, "V 3"]
     misfit: float
+    sides: Sides | None = None  # between sharp edges
 
 
 class _Fit:
     """What all steps of a fit share: the triangles and the views."""
 
     def __init__(self, mesh: TriangleMesh, silhouettes: Silhouettes) -> None:
-        self.start, self.faces, self.silhouettes = mesh.vertices, mesh.faces, silhouettes
-        self.edges = edges = _edges(mesh.faces)
+        self.start, self.mesh, self.silhouettes = mesh.vertices, MovingMesh(mesh.faces), silhouettes
         self.size = float(np.ptp(mesh.vertices, axis=0).max())
+        self.edges = edges = self.mesh.edges
         self.degree = np.bincount(edges.ravel())
-        both, num_vertices = np.concatenate([edges, edges[:, ::-1]]), len(mesh.vertices)
-        # These take values at vertices to the means of their neighbours', and to their differences along edges.
-        shape = (num_vertices, num_vertices)
-        self.mean = sparse.csr_matrix((1 / self.degree[both[:, 0]], (both[:, 0], both[:, 1])), shape)
+        # Takes values at vertices to their differences along edges.
         signs, number = np.repeat([1.0, -1.0], len(edges)), np.tile(np.arange(len(edges)), 2)
-        self.across = sparse.csr_matrix((signs, (number, edges.T.ravel())), (len(edges), num_vertices))
+        self.across = sparse.csr_matrix((signs, (number, edges.T.ravel())), (len(edges), len(mesh.vertices)))
 
-    def search(self, prior: _Prior, outlines: _Outlines, step: Callable[[], None]) -> _Found:
+    def search(self, prior: _Prior, outlines: Outlines, step: Callable[[], None]) -> _Found:
         """Fit with a prior that becomes weaker and weaker; views that are held back tell the best strength."""
-        judging = range(HELD_BACK - 1, len(outlines), HELD_BACK) or [len(outlines) - 1]
-        judges = {view: outlines[view] for view in judging}
-        teachers = {view: outline for view, outline in outlines.items() if view not in judges}
+        teachers, judges = _divided(outlines)
         vertices, found = self.start, []
         for strength in np.geomspace(prior.first, prior.last, _STEPS).tolist():
             vertices = self.moved(vertices, teachers, prior, strength)
-            misfit = float(np.abs(self.rims(vertices, judges).misfit).mean())
-            found.append(_Found(prior, strength, vertices, misfit))
+            found.append(_Found(prior, strength, vertices, self.misfit(vertices, judges)))
             step()
         enough = _AS_GOOD * min(each.misfit for each in found)
         return next(each for each in found if each.misfit <= enough)
 
-    def rims(self, vertices: Float[np.ndarray, "V 3"], outlines: _Outlines) -> _Rims:
+    def with_creases(self, blunt: _Found, sides: Sides, outlines: Outlines) -> _Found:
+        """A surface whose edges are sharp, of one whose edges are not."""
+        teachers, judges = _divided(outlines)
+        vertices = self.sharpened(blunt.vertices, sides, teachers)
+        return blunt._replace(vertices=vertices, misfit=self.misfit(vertices, judges), sides=sides)
+
+    def sharpened(
+        self, vertices: Float[np.ndarray, "V 3"], sides: Sides, outlines: Outlines
+    ) -> Float[np.ndarray, "V 3"]:
+        """Vertices moved until edges are sharp."""
+        return sharpened(vertices, self.mesh, lambda moved: self.rims(moved, outlines), sides)
+
+    def rims(self, vertices: Float[np.ndarray, "V 3"], outlines: Outlines) -> Rims:
         """Where views see the outlines of a surface."""
-        return _find_rims(vertices, _vertex_normals(vertices, self.faces), self.edges, self.silhouettes, outlines)
+        return find_rims(vertices, self.mesh, self.silhouettes, outlines)
+
+    def misfit(self, vertices: Float[np.ndarray, "V 3"], outlines: Outlines) -> float:
+        """How far its outlines are from those of masks, mean."""
+        return float(np.abs(self.rims(vertices, outlines).misfit).mean())
 
     def moved(
         self,
         vertices: Float[np.ndarray, "V 3"],
-        outlines: _Outlines,
+        outlines: Outlines,
         prior: _Prior,
         strength: float,
+        steady: float = 0.0,
         spread: bool = True,
     ) -> Float[np.ndarray, "V 3"]:
-        """Vertices after a step. `spread`: also along the surface, so that triangles become alike.
+        """Vertices after a step.
 
-        Small and large ones side by side, as marching cubes leave them, have a mean of neighbours that says more about
-        the triangles than about the curvature.
+        Args:
+            vertices: before.
+            outlines: of the views that are looked at.
+            prior: what is likely where these do not tell.
+            strength: of its area and bending.
+            steady: weight of changes of curvature, for each observation.
+            spread: also move along the surface, so that triangles become alike. Small and large ones side by side, as
+                marching cubes leave them, have a mean of neighbours that says more about them than about curvature.
         """
-        normals, rims = _vertex_normals(vertices, self.faces), self.rims(vertices, outlines)
+        normals, rims = self.mesh.normals(vertices), self.rims(vertices, outlines)
         num_rims = len(rims.share)
         area = strength * num_rims * prior.area
-        bending = strength * num_rims * prior.bending * self.size**2
+        bending = strength * num_rims * prior.bending * self.size**2 * (_BENDING_LEFT if steady else 1)
         row, column = np.tile(np.arange(num_rims), 2), np.concatenate([rims.first, rims.second])
-        shares = np.concatenate([1 - rims.share, rims.share])
+        along = (normals[column] * np.tile(rims.normal, (2, 1))).sum(1)
+        shares = along * np.concatenate([1 - rims.share, rims.share])
         observed = sparse.csr_matrix((shares, (row, column)), (num_rims, len(vertices)))
-        curvature, curved, around = _mean_curvature(vertices, normals, self.edges, self.mean)
+        curvature, curved, around = _mean_curvature(vertices, normals, self.edges, self.mesh.mean)
         usual = _usual_curvature(curved, vertices, normals, _TURN * self.size) if prior.usual else 0 * curved
         bent = np.abs(curved - usual)
         # What is bent while the prior is still strong may be the roofs that it shall level.
         edge = prior.edge * max(1.0, strength)
-        stiff = 1 / np.hypot(1, 0.5 * (bent + self.mean @ bent) / edge)
+        stiff = 1 / np.hypot(1, 0.5 * (bent + self.mesh.mean @ bent) / edge)
         stiffness, tension = sparse.diags(stiff), self.across.T @ sparse.diags(stiff[self.edges].prod(1)) @ self.across
         stretch = sum(n @ tension @ n for n in map(sparse.diags, normals.T))
         stretched = sum(normals[:, a] * (tension @ vertices[:, a]) for a in range(3))
@@ -253,83 +212,24 @@ class _Fit:
         system += bending * (curvature.T @ stiffness @ curvature)
         right = observed.T @ (rims.weight * rims.misfit) - area * (stretched - pressure)
         right -= bending * (curvature.T @ (stiffness @ (curved - usual)))
+        if steady:
+            alike = sparse.diags(_along_edges(vertices, normals, self.edges, self.mesh.mean))
+            changes = steady * num_rims * self.size**2 * (curvature.T @ self.across.T @ alike @ self.across)
+            system += changes @ curvature
+            right -= changes @ curved
         # Symmetric and positive definite: no pivoting needed, and an ordering that keeps the factors sparse.
         factors = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0, options={"SymmetricMode": True})
         ends = vertices[self.edges]
         longest = 2 * np.sqrt(((ends[:, 0] - ends[:, 1]) ** 2).sum(1).mean())
         vertices = vertices + factors.solve(right).clip(-longest, longest)[:, None] * normals
-        if spread:
-            normals = _vertex_normals(vertices, self.faces)
-            towards = self.mean @ vertices - vertices
-            vertices = vertices + _SPREADING * (towards - (towards * normals).sum(1, keepdims=True) * normals)
-        return vertices
+        return self.mesh.spread(vertices) if spread else vertices
 
 
-def _find_rims(
-    vertices: Float[np.ndarray, "V 3"],
-    normals: Float[np.ndarray, "V 3"],
-    edges: Int[np.ndarray, "E 2"],
-    silhouettes: Silhouettes,
-    outlines: _Outlines,
-) -> _Rims:
-    """The outermost rims that every view sees near each pixel of its mask's outline."""
-    cameras = silhouettes.cameras
-    spacing = float(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1).mean())
-    parts = []
-    for view, outline in outlines.items():
-        facing = (normals * (vertices - cameras.camera_to_world[view, :, 3].double().numpy())).sum(1)
-        ends = facing[edges]
-        turning = np.flatnonzero((ends[:, 0] > 0) != (ends[:, 1] > 0))
-        share = ends[turning, 0] / (ends[turning, 0] - ends[turning, 1])
-        first, second = edges[turning].T
-        points = vertices[first] + share[:, None] * (vertices[second] - vertices[first])
-        places = torch.from_numpy(points).float()
-        inside, width = (values.double().numpy() for values in silhouettes.depth_inside(view, places)[:2])
-        known = np.flatnonzero(np.isfinite(inside))
-        if not len(known):
-            continue
-        # Pixels narrower than an edge may be met by no rim but one of a fold, so they are taken together.
-        pixels = max(1, int(np.ceil(spacing / width[known].mean())))
-        cell = _look_up(outline, cameras.select([view]), places[known], pixels)
-        order = np.lexsort((inside[known], cell))
-        outermost = known[order[np.diff(cell[order], prepend=-1) != 0]]
-        of_view = np.full(len(outermost), view)
-        chosen = (values[outermost] for values in (first, second, share, inside, width))
-        parts.append((*chosen, of_view))
-    if not parts:
-        raise NerfroError("no view sees the surface where it looks; surface, poses and masks do not belong together")
-    first, second, share, misfit, width, views = (np.concatenate(values) for values in zip(*parts, strict=True))
-    spread = float(np.median(np.abs(misfit))) / _TYPICAL
-    near = np.abs(misfit) < _GATE * max(1.0, spread)
-    weight = 1 / (1 + (misfit / (_HALVED * max(_SUREST, spread))) ** 2)
-    return _Rims(*(each[near] for each in (first, second, share, misfit * width, weight, width, views)))
-
-
-def _look_up(
-    outline: Int[np.ndarray, "H W"], camera: Cameras, points: torch.Tensor, pixels: int
-) -> Int[np.ndarray, "P"]:
-    """Number of the square of pixels x pixels that holds the part of the outline nearest to each point."""
-    place = camera.project(points)[0][0].numpy()
-    row = place[:, 1].astype(np.int64).clip(0, camera.height - 1)
-    column = place[:, 0].astype(np.int64).clip(0, camera.width - 1)
-    nearest = outline[row, column]
-    return nearest // camera.width // pixels * camera.width + nearest % camera.width // pixels
-
-
-def _nearest_outline_pixel(inside: np.ndarray) -> Int[np.ndarray, "H W"]:
-    """Number of the pixel of a mask's outline that is nearest to each pixel."""
-    outline = inside & ~binary_erosion(inside, border_value=1)
-    rows, columns = distance_transform_edt(~outline, return_distances=False, return_indices=True)
-    return rows.astype(np.int64) * inside.shape[1] + columns
-
-
-def _vertex_normals(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "V 3"]:
-    """Mean normals of the triangles around each vertex, weighted with their areas."""
-    a, b, c = vertices[faces].swapaxes(0, 1)
-    normal = np.cross(b - a, c - a)
-    sums = [np.bincount(faces.ravel(), np.repeat(normal[:, axis], 3), len(vertices)) for axis in range(3)]
-    total = np.stack(sums, -1)
-    return total / np.linalg.norm(total, axis=1, keepdims=True).clip(1e-12)
+def _divided(outlines: Outlines) -> tuple[Outlines, Outlines]:
+    """Views to fit a surface to, and those that are held back."""
+    judging = range(HELD_BACK - 1, len(outlines), HELD_BACK) or [len(outlines) - 1]
+    judges = {view: outlines[view] for view in judging}
+    return {view: outline for view, outline in outlines.items() if view not in judges}, judges
 
 
 def _mean_curvature(
@@ -354,6 +254,28 @@ def _mean_curvature(
     umbrella = mean - sparse.identity(len(vertices))
     change = scale @ sum(n @ umbrella @ n for n in map(sparse.diags, normals.T))
     return change.tocsr(), scale @ (normals * (umbrella @ vertices)).sum(1), around
+
+
+def _along_edges(
+    vertices: Float[np.ndarray, "V 3"],
+    normals: Float[np.ndarray, "V 3"],
+    edges: Int[np.ndarray, "E 2"],
+    mean: sparse.csr_matrix,
+) -> Float[np.ndarray, "E"]:
+    """How much each edge goes where the surface bends least: 0 across, 1 along, and 1 where it is flat or round."""
+    along, turn = (values[edges[:, 1]] - values[edges[:, 0]] for values in (vertices, normals))
+    square = (along**2).sum(1)
+    turning = turn[:, :, None] * turn[:, None, :] * (square.mean() / square)[:, None, None]
+    sums = [np.bincount(edges.ravel(), np.repeat(each, 2), len(vertices)) for each in turning.reshape(-1, 9).T]
+    around = np.stack(sums, -1) / np.bincount(edges.ravel(), minlength=len(vertices))[:, None]
+    for _ in range(_BLURS):
+        around = 0.5 * (around + mean @ around)
+    size, direction = np.linalg.eigh(around.reshape(-1, 3, 3))
+    # 0 where a surface turns alike in two directions, 1 where in one alone.
+    single = (size[:, 2] - size[:, 1]) / (size[:, 2] + size[:, 1] + _NO_TURN**2)
+    along /= np.sqrt(square)[:, None]
+    ends = [single[end] * np.abs((along * direction[end, :, 2]).sum(1)) for end in edges.T]
+    return ((1 - ends[0]) * (1 - ends[1])) ** _SHARPNESS
 
 
 def _usual_curvature(

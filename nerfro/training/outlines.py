@@ -9,7 +9,7 @@ from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
 from nerfro.capture.outlines import meet_outlines
 from nerfro.capture.pixel_blocks import PixelBlocks
-from nerfro.capture.silhouette_fit import RimFinder
+from nerfro.capture.rims import RimFinder
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.data.base import Views

@@ -1,0 +1,47 @@
+"""Masks that cameras around a body take of it, and hulls of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import trimesh
+
+from nerfro.cameras import Cameras
+from nerfro.capture.silhouettes import mesh_silhouettes
+from nerfro.capture.visual_hull import Silhouettes, carve_grid, extract_surface, find_box, remove_strays
+from nerfro.geometry.mesh import TriangleMesh
+
+
+def cameras_around(count: int, size: int, distance: float = 4.0, focal: float = 1.4, spread: float = 1.0) -> Cameras:
+    """Cameras on a spiral over a sphere (the part of it around +z that `spread` says) that look at the origin."""
+    z = 1 - spread * (2 * np.arange(count) + 1) / count
+    turn = 2.4 * np.arange(count)
+    back = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], -1)
+    right = np.cross([0.3, 0.9, 0.1], back)
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    poses = np.stack([right, np.cross(back, right), back, distance * back], -1)
+    ones = torch.ones(count)
+    pixels = focal * size * ones
+    return Cameras(torch.from_numpy(poses).float(), pixels, pixels, size / 2 * ones, size / 2 * ones, size, size, 1, 9)
+
+
+def photographed(mesh: trimesh.Trimesh, cameras: Cameras) -> Silhouettes:
+    """Binary masks: pixels whose central ray meets the mesh."""
+    body = TriangleMesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
+    return Silhouettes.of(cameras, mesh_silhouettes(body, cameras, 1).float())
+
+
+def photographed_softly(mesh: trimesh.Trimesh, cameras: Cameras, rays: int = 6) -> Silhouettes:
+    """Masks of the share of each pixel that is covered, by so many rays a side."""
+    fine = photographed(mesh, cameras.resized(rays * cameras.width, rays * cameras.height)).masks
+    return Silhouettes.of(cameras, torch.nn.functional.avg_pool2d(fine[None], rays)[0])
+
+
+def hull(silhouettes: Silhouettes, resolution: int, wrong_masks: int = 0) -> TriangleMesh:
+    distances, corner, spacing = carve_grid(silhouettes, find_box(silhouettes, wrong_masks), resolution, wrong_masks)
+    remove_strays(distances)
+    return extract_surface(distances, corner, spacing)
+
+
+def volume(mesh: TriangleMesh) -> float:
+    return float(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).volume)
