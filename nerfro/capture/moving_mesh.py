@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import sparse
 
-# Triangles that meet at more than this make a crease.
+# Triangles that meet at more than this make a crease, if what is beyond them differs as much.
 _CREASE = np.cos(np.radians(30))
 # How far vertices move to the middle of their neighbours, along the surface.
 _SPREADING = 0.5
@@ -29,6 +29,7 @@ class MovingMesh:
         first = np.cumsum(count) - count
         # The same triangle twice where an edge has not two.
         self._beside = of_edge[np.stack([first, first + (count == 2)], -1)]
+        self._beyond = faces[self._beside].sum(-1) - self.edges.sum(-1, keepdims=True)
         both = np.concatenate([self.edges, self.edges[:, ::-1]])
         num_vertices = int(faces.max()) + 1
         degree = np.bincount(both[:, 0], minlength=num_vertices)
@@ -46,10 +47,14 @@ class MovingMesh:
         return unit(np.stack(sums, -1))
 
     def creases(self, vertices: Float[np.ndarray, "V 3"]) -> tuple[Int[np.ndarray, "C 2"], Float[np.ndarray, "C 2 3"]]:
-        """Edges at which the surface is sharp, and the normals at both sides."""
-        normals = unit(self.face_normals(vertices))[self._beside]
-        sharp = normals.prod(1).sum(1) < _CREASE
-        return self.edges[sharp], normals[sharp]
+        """Edges at which the surface is sharp, and the normals at both sides.
+
+        A single vertex that is off makes none: beyond it the surface goes on as before.
+        """
+        beside = unit(self.face_normals(vertices))[self._beside]
+        beyond = self.normals(vertices)[self._beyond]
+        sharp = (beside.prod(1).sum(1) < _CREASE) & (beyond.prod(1).sum(1) < _CREASE)
+        return self.edges[sharp], beside[sharp]
 
     def spread(self, vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
         """Vertices moved along the surface, towards the middle of their neighbours, so that triangles become alike."""

@@ -63,6 +63,13 @@ def test_only_sharp_bodies_have_creases() -> None:
         assert has_creases(np.asarray(made.vertices), MovingMesh(np.asarray(made.faces))) is expected
 
 
+def test_a_vertex_that_is_off_makes_no_crease() -> None:
+    made = trimesh.creation.icosphere(4)
+    vertices = np.asarray(made.vertices).copy()
+    vertices[1000] *= 1.05  # eleven edges around it are sharp by their triangles alone
+    assert len(MovingMesh(np.asarray(made.faces)).creases(vertices)[0]) == 0
+
+
 def test_an_open_mesh_has_no_crease_where_it_ends() -> None:
     """Its border is no sharp edge, and one triangle alone has no other side."""
     vertices, faces = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.9]]), np.array([[0, 1, 2], [0, 2, 3]])
