@@ -16,7 +16,7 @@ from nerfro.capture.rims import Rims
 # A triangle takes the direction of its neighbours so often; directions that differ by this, radians, belong together.
 _ROUNDS, _ALIKE = 3, 0.35
 # Steps until edges are sharp.
-_STEPS = 12
+STEPS = 12
 
 
 class Sides(NamedTuple):
@@ -41,6 +41,7 @@ def sharpened(
     mesh: MovingMesh,
     rims_of: Callable[[Float[np.ndarray, "V 3"]], Rims],
     sides: Sides,
+    step: Callable[[], None] = lambda: None,
 ) -> Float[np.ndarray, "V 3"]:
     """Vertices moved in any direction until sides are smooth, edges sharp, and outlines the masks'.
 
@@ -50,13 +51,21 @@ def sharpened(
         sum_faces A_f sum_sides (m_f . (x_i - x_j))^2
 
     is solved, m_f that direction and A_f the area: vertices between two sides come to lie where these meet.
+
+    Args:
+        vertices: of a surface that is fitted, but blunt.
+        mesh: its triangles.
+        rims_of: where views see the outlines of vertices.
+        sides: what is likely of them.
+        step: is called after each of `STEPS` steps.
     """
-    for _ in range(_STEPS):
-        vertices = _step(vertices, mesh, rims_of(vertices), sides)
+    for _ in range(STEPS):
+        vertices = _solved(vertices, mesh, rims_of(vertices), sides)
+        step()
     return vertices
 
 
-def _step(vertices: Float[np.ndarray, "V 3"], mesh: MovingMesh, rims: Rims, sides: Sides) -> Float[np.ndarray, "V 3"]:
+def _solved(vertices: Float[np.ndarray, "V 3"], mesh: MovingMesh, rims: Rims, sides: Sides) -> Float[np.ndarray, "V 3"]:
     direction, area = _directions(vertices, mesh)
     weight = np.sqrt(np.repeat(area / area.mean(), 3))
     flat = _projected_differences(

@@ -100,19 +100,13 @@ def find_rims(
     Raises:
         NerfroError: no view sees the surface.
     """
-    cameras, edges = silhouettes.cameras, mesh.edges
-    normals, (creases, beside) = mesh.normals(vertices), mesh.creases(vertices)
-    spacing = float(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1).mean())
+    cameras, ends = silhouettes.cameras, vertices[mesh.edges]
+    spacing = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
+    normals, creases = mesh.normals(vertices), mesh.creases(vertices)
     parts = []
     for view, outline in outlines.items():
         eye = cameras.camera_to_world[view, :, 3].double().numpy()
-        facing = (normals * (vertices - eye)).sum(1)[edges]
-        smooth = np.flatnonzero((facing[:, 0] > 0) != (facing[:, 1] > 0))
-        share = facing[smooth, 0] / (facing[smooth, 0] - facing[smooth, 1])
-        away = (beside * (vertices[creases[:, 0]] - eye)[:, None]).sum(-1) > 0
-        sharp = creases[away[:, 0] != away[:, 1]]
-
-        (first, second), share = np.r_[edges[smooth], sharp].T, np.r_[share, np.full(len(sharp), 0.5)]
+        first, second, share, normal = _turning(vertices, normals, mesh.edges, creases, eye)
         points = vertices[first] + share[:, None] * (vertices[second] - vertices[first])
         places = torch.from_numpy(points).float()
         inside, width = (values.double().numpy() for values in silhouettes.depth_inside(view, places)[:2])
@@ -124,13 +118,6 @@ def find_rims(
         cell = _look_up(outline, cameras.select([view]), places[known], pixels)
         order = np.lexsort((inside[known], cell))
         outermost = known[order[np.diff(cell[order], prepend=-1) != 0]]
-
-        look = unit(points - eye)
-        normal = (1 - share[:, None]) * normals[first] + share[:, None] * normals[second]
-        across = np.cross(look, vertices[second] - vertices[first])
-        across *= np.sign((across * normal).sum(1, keepdims=True))
-        is_sharp = (np.arange(len(share)) >= len(smooth))[:, None]
-        normal = unit(np.where(is_sharp, across, normal - (normal * look).sum(1, keepdims=True) * look))
         of_view = np.full(len(outermost), view)
         parts.append((*(values[outermost] for values in (first, second, share, normal, inside, width)), of_view))
     if not parts:
@@ -140,6 +127,32 @@ def find_rims(
     near = np.abs(misfit) < _GATE * max(1.0, spread)
     weight = 1 / (1 + (misfit / (_HALVED * max(_SUREST, spread))) ** 2)
     return Rims(*(each[near] for each in (first, second, share, normal, misfit * width, weight, width, views)))
+
+
+def _turning(
+    vertices: Float[np.ndarray, "V 3"],
+    normals: Float[np.ndarray, "V 3"],
+    edges: Int[np.ndarray, "E 2"],
+    creases: tuple[Int[np.ndarray, "C 2"], Float[np.ndarray, "C 2 3"]],
+    eye: Float[np.ndarray, "3"],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Where a surface turns away from an eye: ends of edges, shares of the way between, and normals, see `Rims`."""
+    facing = (normals * (vertices - eye)).sum(1)[edges]
+    smooth = np.flatnonzero((facing[:, 0] > 0) != (facing[:, 1] > 0))
+    shares = facing[smooth, 0] / (facing[smooth, 0] - facing[smooth, 1])
+    away = (creases[1] * (vertices[creases[0][:, 0]] - eye)[:, None]).sum(-1) > 0
+    sharp = creases[0][away[:, 0] != away[:, 1]]
+
+    (first, second), share = np.r_[edges[smooth], sharp].T, np.r_[shares, np.full(len(sharp), 0.5)]
+    along = vertices[second] - vertices[first]
+    look = unit(vertices[first] + share[:, None] * along - eye)
+    normal = (1 - share[:, None]) * normals[first] + share[:, None] * normals[second]
+    # A sharp edge is seen to move across itself alone, whichever way the sides beside it look.
+    across = np.cross(look, along)
+    across *= np.sign((across * normal).sum(1, keepdims=True))
+    normal -= (normal * look).sum(1, keepdims=True) * look
+    normal[len(smooth) :] = across[len(smooth) :]
+    return first, second, share, unit(normal)
 
 
 def _look_up(outline: Int[np.ndarray, "H W"], camera: Cameras, points: Tensor, pixels: int) -> Int[np.ndarray, "P"]:

@@ -12,7 +12,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from nerfro.capture.creases import CURVED, FACETS, Sides, has_creases, sharpened
+from nerfro.capture.creases import CURVED, FACETS, STEPS, Sides, has_creases, sharpened
 from nerfro.capture.moving_mesh import MovingMesh
 from nerfro.capture.rims import Outlines, Rims, find_rims, outlines_of
 from nerfro.capture.surroundings import HELD_BACK
@@ -95,21 +95,22 @@ def fit_surface(
     The mesh is closed and has triangles of about one size, such as marching cubes give. `smoothing` multiplies the
     strength that was found; more of it suits masks that were drawn by hand. `progress` is told the share done.
     """
-    count = itertools.count(1)
+    count, total = itertools.count(1), 2 * _STEPS + _LAST_STEPS
 
     def step() -> None:
-        progress(min(1.0, next(count) / (2 * _STEPS + _LAST_STEPS)))
+        progress(next(count) / total)
 
     fit, outlines = _Fit(mesh, silhouettes), outlines_of(silhouettes)
     found = [fit.search(prior, outlines, step) for prior in (_ROUND, _FLAT)]
     if has_creases(found[1].vertices, fit.mesh):
-        facets, curved = (fit.with_creases(found[1], sides, outlines) for sides in (FACETS, CURVED))
+        total = 2 * _STEPS + 3 * STEPS
+        facets, curved = (fit.with_creases(found[1], sides, outlines, step) for sides in (FACETS, CURVED))
         found.append(facets if facets.misfit <= _AS_GOOD * curved.misfit else curved)
     best = min(found, key=lambda each: each.misfit)
     vertices = best.vertices
     if best.sides is not None:
         sides = best.sides._replace(flat=smoothing * best.sides.flat)
-        return TriangleMesh(fit.sharpened(vertices, sides, outlines), mesh.faces)
+        return TriangleMesh(fit.sharpened(vertices, sides, outlines, step), mesh.faces)
     steady = smoothing * best.prior.steady * (best.misfit / fit.size) ** 2
     for left in reversed(range(_LAST_STEPS)):
         vertices = fit.moved(vertices, outlines, best.prior, smoothing * best.strength, steady, spread=left > 0)
@@ -150,17 +151,17 @@ class _Fit:
         enough = _AS_GOOD * min(each.misfit for each in found)
         return next(each for each in found if each.misfit <= enough)
 
-    def with_creases(self, blunt: _Found, sides: Sides, outlines: Outlines) -> _Found:
+    def with_creases(self, blunt: _Found, sides: Sides, outlines: Outlines, step: Callable[[], None]) -> _Found:
         """A surface whose edges are sharp, of one whose edges are not."""
         teachers, judges = _divided(outlines)
-        vertices = self.sharpened(blunt.vertices, sides, teachers)
+        vertices = self.sharpened(blunt.vertices, sides, teachers, step)
         return blunt._replace(vertices=vertices, misfit=self.misfit(vertices, judges), sides=sides)
 
     def sharpened(
-        self, vertices: Float[np.ndarray, "V 3"], sides: Sides, outlines: Outlines
+        self, vertices: Float[np.ndarray, "V 3"], sides: Sides, outlines: Outlines, step: Callable[[], None]
     ) -> Float[np.ndarray, "V 3"]:
         """Vertices moved until edges are sharp."""
-        return sharpened(vertices, self.mesh, lambda moved: self.rims(moved, outlines), sides)
+        return sharpened(vertices, self.mesh, lambda moved: self.rims(moved, outlines), sides, step)
 
     def rims(self, vertices: Float[np.ndarray, "V 3"], outlines: Outlines) -> Rims:
         """Where views see the outlines of a surface."""
