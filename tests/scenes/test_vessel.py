@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import ModuleType
 
 import numpy as np
@@ -57,13 +56,14 @@ def by_mitsuba(rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
     if mi.variant().startswith("scalar"):
         pytest.skip("traces many rays at once, which needs LLVM or CUDA")
     dry, wet = _interfaces(mi)
-    found, through_water = _trace(mi, rays, dry, wet)
-    steady = through_water
-    for step in torch.eye(3, dtype=torch.float64):
-        for sign in (-1, 1):
-            beside, _ = _trace(mi, replace(rays, origins=rays.origins + sign * VOXEL * step), dry, wet)
-            steady = steady & (angle(beside, found) < STEADY)
-    return found, through_water, steady
+    axes = torch.eye(3, dtype=torch.float64)
+    shifts = VOXEL * torch.cat([torch.zeros(1, 3, dtype=torch.float64), axes, -axes])
+    origins, directions = (rays.origins + shifts[:, None]).flatten(0, 1), rays.directions.repeat(len(shifts), 1)
+    traced, met = _trace(mi, make_rays(origins, directions, 0.5, 9.0), dry, wet)
+    found, *beside = traced.split(len(rays))
+    through_water = met[: len(rays)]
+    steady = torch.stack([angle(each, found) < STEADY for each in beside]).all(0)
+    return found, through_water, through_water & steady
 
 
 def _trace(mi: ModuleType, rays: Rays, dry: dict[str, object], wet: dict[str, object]) -> tuple[Tensor, Tensor]:
