@@ -8,9 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
-from nerfro.capture.moving_mesh import MovingMesh, unit
+from nerfro.capture.moving_mesh import MovingMesh, Surface, solve_symmetric, unit
 from nerfro.capture.rims import Rims
 
 # A triangle takes the direction of its neighbours so often; directions that differ by this, radians, belong together.
@@ -30,10 +29,10 @@ class Sides(NamedTuple):
 FACETS, CURVED = Sides(flat=1.0, staying=1e-5), Sides(flat=0.05, staying=1e-4)
 
 
-def has_creases(vertices: Float[np.ndarray, "V 3"], mesh: MovingMesh) -> bool:
+def has_creases(surface: Surface) -> bool:
     """Whether its sharp edges, put end to end, are twice as long as the body."""
-    ends = vertices[mesh.creases(vertices)[0]]
-    return bool(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum() > 2 * np.ptp(vertices, axis=0).max())
+    ends = surface.vertices[surface.creases]
+    return bool(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum() > 2 * np.ptp(surface.vertices, axis=0).max())
 
 
 def sharpened(
@@ -82,10 +81,8 @@ def _solved(vertices: Float[np.ndarray, "V 3"], mesh: MovingMesh, rims: Rims, si
     system += staying * sparse.identity(3 * len(vertices))
     right = observed.T @ (rims.weight * rims.misfit) - flatness * (flat.T @ (flat @ vertices.ravel()))
     right += staying * (mesh.spread(vertices) - vertices).ravel()
-    factors = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0, options={"SymmetricMode": True})
-    step = factors.solve(right).reshape(-1, 3)
-    ends = vertices[mesh.edges]
-    longest = np.sqrt(((ends[:, 0] - ends[:, 1]) ** 2).sum(1).mean())
+    step = solve_symmetric(system, right).reshape(-1, 3)
+    longest = mesh.edge_length(vertices)
     return vertices + step * np.minimum(1, longest / np.linalg.norm(step, axis=1, keepdims=True).clip(1e-12))
 
 
@@ -99,10 +96,7 @@ def _directions(
     nothing is drawn flat there.
     """
     normals = mesh.face_normals(vertices)
-    area, num_faces = np.linalg.norm(normals, axis=1), len(mesh.faces)
-    number = np.repeat(np.arange(num_faces), 3)
-    corners = sparse.csr_matrix((np.ones(3 * num_faces), (number, mesh.faces.ravel())))
-    touching = ((corners @ corners.T) > 0).astype(np.float64).tocoo()
+    area, touching = np.linalg.norm(normals, axis=1), mesh.touching
     row, column = touching.row, touching.col
     patch = touching @ normals
     uneven = 1 - np.linalg.norm(patch, axis=1) / (touching @ area)

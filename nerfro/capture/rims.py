@@ -12,7 +12,7 @@ from scipy.ndimage import binary_erosion, distance_transform_edt
 from torch import Tensor
 
 from nerfro.cameras import Cameras
-from nerfro.capture.moving_mesh import MovingMesh, unit
+from nerfro.capture.moving_mesh import MovingMesh, Surface, unit
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
@@ -62,16 +62,16 @@ class RimFinder:
     """
 
     def __init__(self, mesh: TriangleMesh, silhouettes: Silhouettes) -> None:
-        self._vertices, self._mesh = mesh.vertices, MovingMesh(mesh.faces)
+        self._surface = MovingMesh(mesh.faces).surface(mesh.vertices)
         self._silhouettes, self._outlines = silhouettes, outlines_of(silhouettes)
 
     def points(self, cameras: Cameras | None = None) -> RimPoints:
         """With other cameras than the silhouettes', if they are given."""
         silhouettes = self._silhouettes if cameras is None else replace(self._silhouettes, cameras=cameras)
-        rims = find_rims(self._vertices, self._mesh, silhouettes, self._outlines)
-        share = rims.share[:, None]
+        rims = find_rims(self._surface, silhouettes, self._outlines)
+        vertices, share = self._surface.vertices, rims.share[:, None]
         return RimPoints(
-            points=_tensor((1 - share) * self._vertices[rims.first] + share * self._vertices[rims.second]),
+            points=_tensor((1 - share) * vertices[rims.first] + share * vertices[rims.second]),
             normals=_tensor(rims.normal),
             misfits=_tensor(rims.misfit),
             weights=_tensor(rims.weight),
@@ -89,9 +89,7 @@ def outlines_of(silhouettes: Silhouettes) -> Outlines:
     return {view: _nearest_outline_pixel(mask) for view, mask in enumerate((silhouettes.masks > 0.5).numpy())}
 
 
-def find_rims(
-    vertices: Float[np.ndarray, "V 3"], mesh: MovingMesh, silhouettes: Silhouettes, outlines: Outlines
-) -> Rims:
+def find_rims(surface: Surface, silhouettes: Silhouettes, outlines: Outlines) -> Rims:
     """The outermost rims that every view sees near each pixel of its mask's outline.
 
     A smooth surface turns away from a view between vertices, where normals say so; a sharp one at an edge of which the
@@ -100,13 +98,13 @@ def find_rims(
     Raises:
         NerfroError: no view sees the surface.
     """
-    cameras, ends = silhouettes.cameras, vertices[mesh.edges]
+    cameras, vertices = silhouettes.cameras, surface.vertices
+    ends = vertices[surface.edges]
     spacing = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
-    normals, creases = mesh.normals(vertices), mesh.creases(vertices)
     parts = []
     for view, outline in outlines.items():
         eye = cameras.camera_to_world[view, :, 3].double().numpy()
-        first, second, share, normal = _turning(vertices, normals, mesh.edges, creases, eye)
+        first, second, share, normal = _turning(surface, eye)
         points = vertices[first] + share[:, None] * (vertices[second] - vertices[first])
         places = torch.from_numpy(points).float()
         inside, width = (values.double().numpy() for values in silhouettes.depth_inside(view, places)[:2])
@@ -129,19 +127,14 @@ def find_rims(
     return Rims(*(each[near] for each in (first, second, share, normal, misfit * width, weight, width, views)))
 
 
-def _turning(
-    vertices: Float[np.ndarray, "V 3"],
-    normals: Float[np.ndarray, "V 3"],
-    edges: Int[np.ndarray, "E 2"],
-    creases: tuple[Int[np.ndarray, "C 2"], Float[np.ndarray, "C 2 3"]],
-    eye: Float[np.ndarray, "3"],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _turning(surface: Surface, eye: Float[np.ndarray, "3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Where a surface turns away from an eye: ends of edges, shares of the way between, and normals, see `Rims`."""
+    vertices, edges, normals, creases, beside = surface
     facing = (normals * (vertices - eye)).sum(1)[edges]
     smooth = np.flatnonzero((facing[:, 0] > 0) != (facing[:, 1] > 0))
     shares = facing[smooth, 0] / (facing[smooth, 0] - facing[smooth, 1])
-    away = (creases[1] * (vertices[creases[0][:, 0]] - eye)[:, None]).sum(-1) > 0
-    sharp = creases[0][away[:, 0] != away[:, 1]]
+    away = (beside * (vertices[creases[:, 0]] - eye)[:, None]).sum(-1) > 0
+    sharp = creases[away[:, 0] != away[:, 1]]
 
     (first, second), share = np.r_[edges[smooth], sharp].T, np.r_[shares, np.full(len(sharp), 0.5)]
     along = vertices[second] - vertices[first]

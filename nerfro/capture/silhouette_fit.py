@@ -9,11 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import sparse
-from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from nerfro.capture.creases import CURVED, FACETS, STEPS, Sides, has_creases, sharpened
-from nerfro.capture.moving_mesh import MovingMesh
+from nerfro.capture.moving_mesh import MovingMesh, solve_symmetric
 from nerfro.capture.rims import Outlines, Rims, find_rims, outlines_of
 from nerfro.capture.surroundings import HELD_BACK
 from nerfro.capture.visual_hull import Silhouettes
@@ -102,7 +101,7 @@ def fit_surface(
 
     fit, outlines = _Fit(mesh, silhouettes), outlines_of(silhouettes)
     found = [fit.search(prior, outlines, step) for prior in (_ROUND, _FLAT)]
-    if has_creases(found[1].vertices, fit.mesh):
+    if has_creases(fit.mesh.surface(found[1].vertices)):
         total = 2 * _STEPS + 3 * STEPS
         facets, curved = (fit.with_creases(found[1], sides, outlines, step) for sides in (FACETS, CURVED))
         found.append(facets if facets.misfit <= _AS_GOOD * curved.misfit else curved)
@@ -165,7 +164,7 @@ class _Fit:
 
     def rims(self, vertices: Float[np.ndarray, "V 3"], outlines: Outlines) -> Rims:
         """Where views see the outlines of a surface."""
-        return find_rims(vertices, self.mesh, self.silhouettes, outlines)
+        return find_rims(self.mesh.surface(vertices), self.silhouettes, outlines)
 
     def misfit(self, vertices: Float[np.ndarray, "V 3"], outlines: Outlines) -> float:
         """How far its outlines are from those of masks, mean."""
@@ -191,7 +190,8 @@ class _Fit:
             spread: also move along the surface, so that triangles become alike. Small and large ones side by side, as
                 marching cubes leave them, have a mean of neighbours that says more about them than about curvature.
         """
-        normals, rims = self.mesh.normals(vertices), self.rims(vertices, outlines)
+        surface = self.mesh.surface(vertices)
+        normals, rims = surface.normals, find_rims(surface, self.silhouettes, outlines)
         num_rims = len(rims.share)
         area = strength * num_rims * prior.area
         bending = strength * num_rims * prior.bending * self.size**2 * (_BENDING_LEFT if steady else 1)
@@ -218,11 +218,8 @@ class _Fit:
             changes = steady * num_rims * self.size**2 * (curvature.T @ self.across.T @ alike @ self.across)
             system += changes @ curvature
             right -= changes @ curved
-        # Symmetric and positive definite: no pivoting needed, and an ordering that keeps the factors sparse.
-        factors = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0, options={"SymmetricMode": True})
-        ends = vertices[self.edges]
-        longest = 2 * np.sqrt(((ends[:, 0] - ends[:, 1]) ** 2).sum(1).mean())
-        vertices = vertices + factors.solve(right).clip(-longest, longest)[:, None] * normals
+        longest = 2 * self.mesh.edge_length(vertices)
+        vertices = vertices + solve_symmetric(system, right).clip(-longest, longest)[:, None] * normals
         return self.mesh.spread(vertices) if spread else vertices
 
 
