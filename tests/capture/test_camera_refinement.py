@@ -52,6 +52,7 @@ def test_poses_come_back_with_the_hull(
     moved = disturbed(TRUE, math.radians(0.5), 0.01, 0)
     save_photographs(tmp_path, moved)
     monkeypatch.setattr(camera_refinement, "_ROUNDS", 2)
+    monkeypatch.setattr(camera_refinement, "_VOXELS", 32)  # of masks that are 40 pixels wide
     out = tmp_path / "out"
     options = [f"data.root={tmp_path}", f"out={out}", "data.near=0.5", "resolution=32", "medium.ior=1.5"]
     options += ["refine_cameras=true", "medium.cache=false", "medium.resolution=32"]
