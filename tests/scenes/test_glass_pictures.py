@@ -24,7 +24,7 @@ from nerfro.scenes.viewpoints import look_at_origin
 from nerfro.types import Path, Rays
 
 # Sums over a pixel of a cube converge slowly: an edge sees lamps in many directions.
-SIDE, ANGLE, SPP, PARTS = 20, 0.5, 4096, 16
+SIDE, ANGLE, SPP, PARTS = 12, 0.5, 4096, 16
 POSE = look_at_origin(np.array([2.6, 2.2, 2.0]))
 COLOURED = (0.4, 0.8, 1.4)
 BRANCHES = Snell(branches="all", least_weight=0.002, max_events=32)
