@@ -43,6 +43,11 @@ class Rims(NamedTuple):
     width: Float[np.ndarray, "K"]  # of a pixel there, world units
     view: Int[np.ndarray, "K"]  # that sees it
 
+    def points(self, vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "K 3"]:
+        """Where they are."""
+        share = self.share[:, None]
+        return (1 - share) * vertices[self.first] + share * vertices[self.second]
+
 
 class RimPoints(NamedTuple):
     """Points of a surface that views see on the outlines of their masks; lengths in world units."""
@@ -69,9 +74,8 @@ class RimFinder:
         """With other cameras than the silhouettes', if they are given."""
         silhouettes = self._silhouettes if cameras is None else replace(self._silhouettes, cameras=cameras)
         rims = find_rims(self._surface, silhouettes, self._outlines)
-        vertices, share = self._surface.vertices, rims.share[:, None]
         return RimPoints(
-            points=_tensor((1 - share) * vertices[rims.first] + share * vertices[rims.second]),
+            points=_tensor(rims.points(self._surface.vertices)),
             normals=_tensor(rims.normal),
             misfits=_tensor(rims.misfit),
             weights=_tensor(rims.weight),

@@ -13,7 +13,9 @@ from scipy.spatial import cKDTree
 
 from nerfro.capture.creases import CURVED, FACETS, STEPS, Sides, has_creases, sharpened
 from nerfro.capture.moving_mesh import MovingMesh, solve_symmetric
+from nerfro.capture.pixel_sides import by_pixel_sides
 from nerfro.capture.rims import Outlines, Rims, find_rims, outlines_of
+from nerfro.capture.silhouettes import holds_shares
 from nerfro.capture.surroundings import HELD_BACK
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.geometry.mesh import TriangleMesh
@@ -41,6 +43,8 @@ _ROUND = _Prior(area=3e-6, bending=1e-5, first=100, last=0.01, usual=True, edge=
 _FLAT = _Prior(area=3e-6, bending=5e-9, first=100, last=0.1, usual=False, edge=0.02, steady=4)
 # Steps of falling strength, and steps after them, with all views, of the strength that was best.
 _STEPS, _LAST_STEPS = 22, 6
+# Binary masks: last steps, which look at the sides of pixels, and the share of the strength that is right for these.
+_STEPS_BY_SIDES, _LEFT_BY_SIDES = 14, 0.3
 # Where curvature shall be steady, bending is hardly needed any more, and would draw edges in.
 _BENDING_LEFT = 0.1
 # Around a vertex, so many times half of what is known of its neighbours' normals is taken, to see in which direction
@@ -88,13 +92,17 @@ def fit_surface(
     with w from 1 along the direction in which the surface bends least to 0 across it: an edge has one profile along its
     length, and flat sides stay flat. The weight g grows with the square of what views that were held back are off.
 
+    The last steps look at binary masks once more, for what they say for certain, see `by_pixel_sides`.
+
     Where the second has creases, sharp ones are made of it in two ways, see `sharpened`, and the views that are held
     back decide between all.
 
     The mesh is closed and has triangles of about one size, such as marching cubes give. `smoothing` multiplies the
     strength that was found; more of it suits masks that were drawn by hand. `progress` is told the share done.
     """
-    count, total = itertools.count(1), 2 * _STEPS + _LAST_STEPS
+    binary = not holds_shares(silhouettes.masks.numpy(), silhouettes.distances.numpy())
+    last_steps = _STEPS_BY_SIDES if binary else _LAST_STEPS
+    count, total = itertools.count(1), 2 * _STEPS + last_steps
 
     def step() -> None:
         progress(next(count) / total)
@@ -110,9 +118,13 @@ def fit_surface(
     if best.sides is not None:
         sides = best.sides._replace(flat=smoothing * best.sides.flat)
         return TriangleMesh(fit.sharpened(vertices, sides, outlines, step), mesh.faces)
-    steady = smoothing * best.prior.steady * (best.misfit / fit.size) ** 2
-    for left in reversed(range(_LAST_STEPS)):
-        vertices = fit.moved(vertices, outlines, best.prior, smoothing * best.strength, steady, spread=left > 0)
+    strength, off = smoothing * best.strength, None
+    if binary:
+        rims = fit.rims(vertices, outlines)
+        strength, off = _LEFT_BY_SIDES * strength, float(np.abs(rims.misfit / rims.width).mean())
+    steady = strength / best.strength * best.prior.steady * (best.misfit / fit.size) ** 2
+    for left in reversed(range(last_steps)):
+        vertices = fit.moved(vertices, outlines, best.prior, strength, steady, off, spread=left > 0)
         step()
     return TriangleMesh(vertices, mesh.faces)
 
@@ -177,6 +189,7 @@ class _Fit:
         prior: _Prior,
         strength: float,
         steady: float = 0.0,
+        off: float | None = None,
         spread: bool = True,
     ) -> Float[np.ndarray, "V 3"]:
         """Vertices after a step.
@@ -187,11 +200,14 @@ class _Fit:
             prior: what is likely where these do not tell.
             strength: of its area and bending.
             steady: weight of changes of curvature, for each observation.
+            off: for binary masks, what their outlines are off by, pixels: the sides of pixels are looked at instead.
             spread: also move along the surface, so that triangles become alike. Small and large ones side by side, as
                 marching cubes leave them, have a mean of neighbours that says more about them than about curvature.
         """
         surface = self.mesh.surface(vertices)
         normals, rims = surface.normals, find_rims(surface, self.silhouettes, outlines)
+        if off is not None:
+            rims = by_pixel_sides(rims, rims.points(vertices), self.silhouettes, off)
         num_rims = len(rims.share)
         area = strength * num_rims * prior.area
         bending = strength * num_rims * prior.bending * self.size**2 * (_BENDING_LEFT if steady else 1)

@@ -39,11 +39,21 @@ def outline_distance(mask: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]
     counted = np.where(inside, distance_transform_edt(inside) - 0.5, 0.5 - distance_transform_edt(~inside))
     blurred = gaussian_filter(np.asarray(mask, np.float64), _BLUR, mode="nearest")
     refined = _BLUR * ndtri(blurred.clip(1e-6, 1 - 1e-6))
-    edge = np.abs(counted) < 1
-    if ((mask > 0.02) & (mask < 0.98))[edge].mean() > _SOFT:
+    if holds_shares(mask, counted):
         refined -= _SHIFT * _level_curvature(refined).clip(-1, 1)
     distance = np.where((np.abs(refined) < _REACH * _BLUR) & (np.abs(counted) < 2 * _REACH), refined, counted)
     return np.where(inside, distance.clip(min=_LEAST), distance.clip(max=-_LEAST)).astype(np.float32)
+
+
+def holds_shares(masks: Float[np.ndarray, "*V H W"], distances: Float[np.ndarray, "*V H W"]) -> bool:
+    """Whether masks tell shares of the pixels on their outlines, and not only which are inside.
+
+    Args:
+        masks: shares of pixels.
+        distances: of the pixels' centres to the outlines, pixels.
+    """
+    shares = ((masks > 0.02) & (masks < 0.98))[np.abs(distances) < 1]
+    return bool(shares.any() and shares.mean() > _SOFT)
 
 
 def _level_curvature(values: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:

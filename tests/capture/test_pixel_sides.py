@@ -1,0 +1,76 @@
+"""What the sides of pixels tell of an outline that masks in black and white leave open."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from nerfro.capture.moving_mesh import MovingMesh
+from nerfro.capture.pixel_sides import by_pixel_sides
+from nerfro.capture.rims import Rims, find_rims, outlines_of
+from nerfro.capture.silhouettes import holds_shares
+from nerfro.capture.visual_hull import Silhouettes
+from tests.silhouettes import cameras_around, photographed, photographed_softly
+
+RADIUS = 0.7
+
+
+def ball(radius: float = RADIUS) -> trimesh.Trimesh:
+    """Beside the point that the cameras look at: each view sees another disc."""
+    return trimesh.creation.icosphere(5, radius).apply_translation([0.11, 0.07, -0.05])
+
+
+def seen(radius: float, silhouettes: Silhouettes) -> tuple[Rims, Rims]:
+    """Rims of a ball of another radius, as read off the outlines, and by the sides of pixels."""
+    made = ball(radius)
+    surface = MovingMesh(np.asarray(made.faces)).surface(np.asarray(made.vertices))
+    rims = find_rims(surface, silhouettes, outlines_of(silhouettes))
+    return rims, by_pixel_sides(rims, rims.points(surface.vertices), silhouettes, 0.16)
+
+
+def mean(rims: Rims) -> float:
+    """Misfit, pixels."""
+    return float(np.average(rims.misfit / rims.width, weights=rims.weight))
+
+
+@pytest.fixture(scope="module")
+def silhouettes() -> Silhouettes:
+    return photographed(ball(), cameras_around(20, 96))
+
+
+def test_a_surface_that_is_right_stays(silhouettes: Silhouettes) -> None:
+    """The outlines that are read off the masks want single rims to move by a tenth of a pixel."""
+    read, sides = seen(RADIUS, silhouettes)
+    moves = [np.sqrt(np.average((rims.misfit / rims.width) ** 2, weights=rims.weight)) for rims in (read, sides)]
+    assert abs(mean(sides)) < 0.02
+    assert moves[1] < 0.5 * moves[0]
+
+
+@pytest.mark.parametrize("off", [-0.3, 0.3])
+def test_a_surface_that_is_off_is_moved_there(silhouettes: Silhouettes, off: float) -> None:
+    """In a few steps."""
+    pixel = 0.0293
+    radius = RADIUS + off * pixel
+    for _ in range(6):
+        radius += pixel * mean(seen(radius, silhouettes)[1])
+    assert abs(radius - RADIUS) / pixel < 0.03
+
+
+def test_rims_at_the_frame_know_only_the_pixels_in_it() -> None:
+    cameras = cameras_around(4, 24, focal=3.0)  # the ball is cut by all four sides
+    silhouettes = photographed(ball(), cameras)
+    rims = seen(RADIUS, silhouettes)[1]
+    assert np.isfinite(rims.misfit).all()
+    assert np.isfinite(rims.weight).all()
+
+
+def test_masks_in_black_and_white_are_told_from_those_of_shares(silhouettes: Silhouettes) -> None:
+    soft = photographed_softly(ball(), silhouettes.cameras, 4)
+    nearly = Silhouettes.of(silhouettes.cameras, (silhouettes.masks + 0.01).clamp(max=1))  # as JPEG leaves them
+    empty = torch.zeros(1, 8, 8)
+    assert holds_shares(soft.masks.numpy(), soft.distances.numpy())
+    for masks in (silhouettes, nearly):
+        assert not holds_shares(masks.masks.numpy(), masks.distances.numpy())
+    assert not holds_shares(empty.numpy(), Silhouettes.of(silhouettes.cameras.select([0]), empty).distances.numpy())
