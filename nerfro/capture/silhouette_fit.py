@@ -44,7 +44,9 @@ _FLAT = _Prior(area=3e-6, bending=5e-9, first=100, last=0.1, usual=False, edge=0
 # Steps of falling strength, and steps after them, with all views, of the strength that was best.
 _STEPS, _LAST_STEPS = 22, 6
 # Binary masks: last steps, which look at the sides of pixels, and the share of the strength that is right for these.
-_STEPS_BY_SIDES, _LEFT_BY_SIDES = 14, 0.3
+# Outlines that are farther off than this, mean, pixels, are wrong themselves: exact ones are off by 0.10 to 0.16, and
+# those that were moved by half a pixel, in waves, by 0.28.
+_STEPS_BY_SIDES, _LEFT_BY_SIDES, _EXACT = 14, 0.3, 0.2
 # Where curvature shall be steady, bending is hardly needed any more, and would draw edges in.
 _BENDING_LEFT = 0.1
 # Around a vertex, so many times half of what is known of its neighbours' normals is taken, to see in which direction
@@ -92,7 +94,7 @@ def fit_surface(
     with w from 1 along the direction in which the surface bends least to 0 across it: an edge has one profile along its
     length, and flat sides stay flat. The weight g grows with the square of what views that were held back are off.
 
-    The last steps look at binary masks once more, for what they say for certain, see `by_pixel_sides`.
+    The last steps look at exact binary masks once more, for what they say for certain, see `by_pixel_sides`.
 
     Where the second has creases, sharp ones are made of it in two ways, see `sharpened`, and the views that are held
     back decide between all.
@@ -100,9 +102,7 @@ def fit_surface(
     The mesh is closed and has triangles of about one size, such as marching cubes give. `smoothing` multiplies the
     strength that was found; more of it suits masks that were drawn by hand. `progress` is told the share done.
     """
-    binary = not holds_shares(silhouettes.masks.numpy(), silhouettes.distances.numpy())
-    last_steps = _STEPS_BY_SIDES if binary else _LAST_STEPS
-    count, total = itertools.count(1), 2 * _STEPS + last_steps
+    count, total = itertools.count(1), 2 * _STEPS + _LAST_STEPS
 
     def step() -> None:
         progress(next(count) / total)
@@ -118,10 +118,11 @@ def fit_surface(
     if best.sides is not None:
         sides = best.sides._replace(flat=smoothing * best.sides.flat)
         return TriangleMesh(fit.sharpened(vertices, sides, outlines, step), mesh.faces)
-    strength, off = smoothing * best.strength, None
-    if binary:
-        rims = fit.rims(vertices, outlines)
-        strength, off = _LEFT_BY_SIDES * strength, float(np.abs(rims.misfit / rims.width).mean())
+    strength, last_steps = smoothing * best.strength, _LAST_STEPS
+    off = fit.off_by_pixels_alone(vertices, outlines)
+    if off is not None:
+        strength, last_steps = _LEFT_BY_SIDES * strength, _STEPS_BY_SIDES
+        total += _STEPS_BY_SIDES - _LAST_STEPS
     steady = strength / best.strength * best.prior.steady * (best.misfit / fit.size) ** 2
     for left in reversed(range(last_steps)):
         vertices = fit.moved(vertices, outlines, best.prior, strength, steady, off, spread=left > 0)
@@ -181,6 +182,14 @@ class _Fit:
     def misfit(self, vertices: Float[np.ndarray, "V 3"], outlines: Outlines) -> float:
         """How far its outlines are from those of masks, mean."""
         return float(np.abs(self.rims(vertices, outlines).misfit).mean())
+
+    def off_by_pixels_alone(self, vertices: Float[np.ndarray, "V 3"], outlines: Outlines) -> float | None:
+        """What outlines of binary masks are off by, mean, pixels; none where masks hold shares, or are not exact."""
+        if holds_shares(self.silhouettes.masks.numpy(), self.silhouettes.distances.numpy()):
+            return None
+        rims = self.rims(vertices, outlines)
+        off = float(np.abs(rims.misfit / rims.width).mean())
+        return off if off < _EXACT else None
 
     def moved(
         self,

@@ -7,19 +7,21 @@ import pytest
 import torch
 import trimesh
 
+from nerfro.capture import silhouette_fit
 from nerfro.capture.moving_mesh import MovingMesh
 from nerfro.capture.pixel_sides import by_pixel_sides
 from nerfro.capture.rims import Rims, find_rims, outlines_of
+from nerfro.capture.silhouette_fit import fit_surface
 from nerfro.capture.silhouettes import holds_shares
 from nerfro.capture.visual_hull import Silhouettes
-from tests.silhouettes import cameras_around, photographed, photographed_softly
+from tests.silhouettes import cameras_around, hull, photographed, photographed_softly
 
-RADIUS = 0.7
+RADIUS, MIDDLE = 0.7, np.array([0.11, 0.07, -0.05])
 
 
 def ball(radius: float = RADIUS) -> trimesh.Trimesh:
     """Beside the point that the cameras look at: each view sees another disc."""
-    return trimesh.creation.icosphere(5, radius).apply_translation([0.11, 0.07, -0.05])
+    return trimesh.creation.icosphere(5, radius).apply_translation(MIDDLE)
 
 
 def seen(radius: float, silhouettes: Silhouettes) -> tuple[Rims, Rims]:
@@ -56,6 +58,25 @@ def test_a_surface_that_is_off_is_moved_there(silhouettes: Silhouettes, off: flo
     for _ in range(6):
         radius += pixel * mean(seen(radius, silhouettes)[1])
     assert abs(radius - RADIUS) / pixel < 0.03
+
+
+def test_a_fit_is_as_large_as_the_body() -> None:
+    """It is 0.09 pixels too small if the sides of pixels are not looked at."""
+    size, axes = 48, np.array([0.8, 0.6, 0.45])
+    body = trimesh.creation.icosphere(5)
+    body.vertices = axes * body.vertices + MIDDLE
+    silhouettes = photographed(body, cameras_around(20, size))
+    fitted = fit_surface(hull(silhouettes, 24), silhouettes)
+    beyond = axes.mean() * (np.linalg.norm((fitted.vertices - MIDDLE) / axes, axis=1) - 1)
+    assert abs(beyond.mean()) < 0.05 * 3.94 / 1.4 / size
+
+
+def test_masks_that_are_wrong_are_not_looked_at_by_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    cameras = cameras_around(12, 32)
+    masks = photographed(ball(), cameras).masks
+    wrong = Silhouettes.of(cameras, torch.stack([mask.roll(view % 3, 0) for view, mask in enumerate(masks)]))
+    monkeypatch.setattr(silhouette_fit, "by_pixel_sides", None)
+    fit_surface(hull(wrong, 16), wrong)
 
 
 def test_rims_at_the_frame_know_only_the_pixels_in_it() -> None:
