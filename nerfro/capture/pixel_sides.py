@@ -38,22 +38,23 @@ def by_pixel_sides(rims: Rims, points: Float[np.ndarray, "K 3"], silhouettes: Si
     """
     sigma = _SOFTNESS * off
     slope, bend = np.zeros(len(points)), np.zeros(len(points))
-    inside = (silhouettes.masks > 0.5).numpy()
     around = np.stack(np.meshgrid(*2 * [np.arange(_SIDE) - _SIDE // 2 + 1]), -1).reshape(-1, 1, 2)
     for view in np.unique(rims.view):
-        seen, mask = np.flatnonzero(rims.view == view), inside[view]
+        seen, inside = np.flatnonzero(rims.view == view), (silhouettes.masks[int(view)] > 0.5).numpy()
         camera = silhouettes.cameras.select([int(view)])
+        # Cameras project in single precision: a place some pixels away tells the direction.
         outwards = points[seen] + _SIDE * rims.width[seen, None] * rims.normal[seen]
         place, beyond = (
             camera.project(torch.from_numpy(each).float())[0][0].double().numpy() for each in (points[seen], outwards)
         )
         normal = (beyond - place) / np.linalg.norm(beyond - place, axis=1, keepdims=True)
         pixel = np.floor(place - 0.5).astype(np.int64) + around
-        known = ((pixel >= 0) & (pixel < mask.shape[::-1])).all(-1)
-        column, row = np.moveaxis(pixel.clip(0, np.array(mask.shape[::-1]) - 1), -1, 0)
+        held = pixel.clip(0, np.array(inside.shape[::-1]) - 1)
+        known = (pixel == held).all(-1)
+        column, row = np.moveaxis(held, -1, 0)
         offset = place - (pixel + 0.5)
         depth, along = (offset * normal).sum(-1), offset[..., 0] * normal[:, 1] - offset[..., 1] * normal[:, 0]
-        side = np.where(mask[row, column], 1.0, -1.0)
+        side = np.where(inside[row, column], 1.0, -1.0)
         weight = known * np.exp(-0.5 * (along / _ALONG) ** 2)
         sure = side * depth / sigma
         hazard = np.exp(-0.5 * (sure**2 + np.log(2 * np.pi)) - log_ndtr(sure))

@@ -32,6 +32,11 @@ def seen(radius: float, silhouettes: Silhouettes) -> tuple[Rims, Rims]:
     return rims, by_pixel_sides(rims, rims.points(surface.vertices), silhouettes, 0.16)
 
 
+def pixel(size: int) -> float:
+    """Width of a pixel at the rims of a body in the middle, world units."""
+    return 3.94 / 1.4 / size
+
+
 def mean(rims: Rims) -> float:
     """Misfit, pixels."""
     return float(np.average(rims.misfit / rims.width, weights=rims.weight))
@@ -53,11 +58,11 @@ def test_a_surface_that_is_right_stays(silhouettes: Silhouettes) -> None:
 @pytest.mark.parametrize("off", [-0.3, 0.3])
 def test_a_surface_that_is_off_is_moved_there(silhouettes: Silhouettes, off: float) -> None:
     """In a few steps."""
-    pixel = 0.0293
-    radius = RADIUS + off * pixel
+    width = pixel(silhouettes.cameras.width)
+    radius = RADIUS + off * width
     for _ in range(6):
-        radius += pixel * mean(seen(radius, silhouettes)[1])
-    assert abs(radius - RADIUS) / pixel < 0.03
+        radius += width * mean(seen(radius, silhouettes)[1])
+    assert abs(radius - RADIUS) / width < 0.03
 
 
 def test_a_fit_is_as_large_as_the_body() -> None:
@@ -68,7 +73,7 @@ def test_a_fit_is_as_large_as_the_body() -> None:
     silhouettes = photographed(body, cameras_around(20, size))
     fitted = fit_surface(hull(silhouettes, 24), silhouettes)
     beyond = axes.mean() * (np.linalg.norm((fitted.vertices - MIDDLE) / axes, axis=1) - 1)
-    assert abs(beyond.mean()) < 0.05 * 3.94 / 1.4 / size
+    assert abs(beyond.mean()) < 0.05 * pixel(size)
 
 
 def test_masks_that_are_wrong_are_not_looked_at_by_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
