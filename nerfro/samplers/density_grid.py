@@ -209,10 +209,12 @@ class DensityGridSampler(PointSampler):
         """A field's density at places of the grid."""
         if self.radius is None:
             return field.density(places)
-        positions = expand(places, self.centre, self.radius)
-        outside = (places - self.centre).norm(dim=-1) >= 2 * self.radius  # corners in which no place of the world lies
-        density = field.density(positions) / shrinkage(positions, self.centre, self.radius)
-        return torch.where(outside, 0.0, density)
+        density = places.new_zeros(len(places))
+        # In the cube's corners, half of it, lies no place of the world.
+        rows = ((places - self.centre).norm(dim=-1) < 2 * self.radius).nonzero()[:, 0]
+        positions = expand(places[rows], self.centre, self.radius)
+        density[rows] = field.density(positions) / shrinkage(positions, self.centre, self.radius)
+        return density
 
 
 def _weight(path: Path) -> Float[Tensor, "P"]:

@@ -109,21 +109,84 @@ def _shrinkage(x, y, z, centre, radius):
 
 
 @compiled
-def _cell(x, y, z, smaller, centre, low, per_unit, cells):
-    """Number of the grid's cell that a place lies in, which is contracted where its shrinkage is below 1.
+def _cell(x, y, z, per_unit, cells):
+    """Number of the grid's cell at a place that is counted from the grid's corner.
 
     There are `per_unit` cells a unit along each axis, `cells` in all.
     """
+    i = min(max(int(x * per_unit[0]), 0), cells - 1)
+    j = min(max(int(y * per_unit[1]), 0), cells - 1)
+    k = min(max(int(z * per_unit[2]), 0), cells - 1)
+    # Unsigned, because Numba counts signed indices from the end where they are negative, a test for each access.
+    return np.uintp((i * cells + j) * cells + k)
+
+
+@compiled
+def _cell_of(x, y, z, smaller, centre, low, per_unit, cells):
+    """The same of a place of the world, which is contracted where its shrinkage is below 1."""
     if smaller < 1.0:
         share = (2.0 - np.sqrt(smaller)) * np.sqrt(smaller)
         x = centre[0] + share * (x - centre[0])
         y = centre[1] + share * (y - centre[1])
         z = centre[2] + share * (z - centre[2])
-    i = min(max(int((x - low[0]) * per_unit[0]), 0), cells - 1)
-    j = min(max(int((y - low[1]) * per_unit[1]), 0), cells - 1)
-    k = min(max(int((z - low[2]) * per_unit[2]), 0), cells - 1)
-    # Unsigned, because Numba counts signed indices from the end where they are negative, a test for each access.
-    return np.uintp((i * cells + j) * cells + k)
+    return _cell(x - low[0], y - low[1], z - low[2], per_unit, cells)
+
+
+@compiled
+def _depths_even(positions, directions, s, first, width, low, flat, per_unit, cells, depths):
+    """Optical depth of each bin of arc length from `first` on, by the density in its middle."""
+    run = 0
+    for index in range(len(depths)):
+        place = first + (index + 0.5) * width
+        run = _segment(s, run, place)
+        ahead = place - s[run]
+        x = positions[run, 0] + ahead * directions[run, 0]
+        y = positions[run, 1] + ahead * directions[run, 1]
+        z = positions[run, 2] + ahead * directions[run, 2]
+        depths[index] = flat[_cell(x - low[0], y - low[1], z - low[2], per_unit, cells)] * width
+
+
+@compiled
+def _depths_contracted(
+    positions, directions, s, centre, radius, marks, begin, passing, aside, width, flat, per_unit, cells, depths
+):
+    """The same in contracted length.
+
+    Beyond the ball a place is a sin(phi) / cos(phi) along its line, a aside of the centre, and phi grows evenly with
+    the contracted length. There it is contracted to (2 - R cos(phi) / a) R (e cos(phi) + d sin(phi)), with e the unit
+    vector across the line. So each bin turns the one before, without a root or a tangent.
+    """
+    run, turned_run, turned_side, cosine, sine, by_cosine, by_sine = 0, -1, 0, 0.0, 0.0, 0.0, 0.0
+    x0, y0, z0, within, a = 0.0, 0.0, 0.0, 0.0, 0.0
+    half = 2.0 * radius
+    known = -1
+    for index in range(len(depths)):
+        place = (index + 0.5) * width
+        run = _segment(marks, run, place)
+        if run != known:  # place of the line that is nearest to the centre
+            known, a = run, aside[run]
+            within = np.sqrt(max(radius * radius - a * a, 0.0))
+            x0 = positions[run, 0] + (passing[run] - s[run]) * directions[run, 0] - centre[0]
+            y0 = positions[run, 1] + (passing[run] - s[run]) * directions[run, 1] - centre[1]
+            z0 = positions[run, 2] + (passing[run] - s[run]) * directions[run, 2] - centre[2]
+        length = begin[run] + place - marks[run]
+        if abs(length) <= within:
+            across, along = 1.0, length
+        else:
+            side = 1 if length > 0.0 else -1
+            if run == turned_run and side == turned_side:
+                cosine, sine = cosine * by_cosine - sine * by_sine, sine * by_cosine + cosine * by_sine
+            else:
+                turned_run, turned_side, rate = run, side, a / (radius * radius)
+                angle = side * (np.arctan2(within, a) + (abs(length) - within) * rate)
+                cosine, sine = np.cos(angle), np.sin(angle)
+                by_cosine, by_sine = np.cos(width * rate), np.sin(width * rate)
+            reach = (2.0 - radius / a * cosine) * radius
+            across, along = reach * cosine / a, reach * sine
+        x = across * x0 + along * directions[run, 0] + half
+        y = across * y0 + along * directions[run, 1] + half
+        z = across * z0 + along * directions[run, 2] + half
+        depths[index] = flat[_cell(x, y, z, per_unit, cells)] * width
 
 
 @compiled
@@ -180,16 +243,16 @@ def draw(positions, directions, s, low, high, density, u, num_bins, floor, trust
                 edges[ray], measure[ray], middles[ray] = last, last, last
                 lengths[ray], occupied[ray] = 0.0, False
                 continue
-            total, passed, run = 0.0, 1.0, 0
+            if radius > 0.0:
+                _depths_contracted(
+                    positions[ray], directions[ray], s[ray], centre, radius, marks, begin, passing, aside, width,
+                    flat, per_unit, cells, weights,
+                )  # fmt: skip
+            else:
+                _depths_even(positions[ray], directions[ray], s[ray], first, width, low, flat, per_unit, cells, weights)
+            total, passed = 0.0, 1.0
             for index in range(num_bins):
-                place = first + (index + 0.5) * width
-                run = _segment(marks, run, place)
-                ahead = _arc_length(place, run, marks, begin, passing, aside, radius) - s[ray, run]
-                x = positions[ray, run, 0] + ahead * directions[ray, run, 0]
-                y = positions[ray, run, 1] + ahead * directions[ray, run, 1]
-                z = positions[ray, run, 2] + ahead * directions[ray, run, 2]
-                smaller = _shrinkage(x, y, z, centre, radius)
-                stopped = min(_stopped(flat[_cell(x, y, z, smaller, centre, low, per_unit, cells)] * width), trust)
+                stopped = min(_stopped(weights[index]), trust)
                 weights[index] = passed * stopped
                 passed *= 1.0 - stopped
                 total += weights[index]
@@ -227,7 +290,7 @@ def draw(positions, directions, s, low, high, density, u, num_bins, floor, trust
                     headings[ray, edge - 1, 0], headings[ray, edge - 1, 1], headings[ray, edge - 1, 2] = dx, dy, dz
                     smaller = _shrinkage(x, y, z, centre, radius)
                     lengths[ray, edge - 1] = (place - before) / smaller
-                    depth = flat[_cell(x, y, z, smaller, centre, low, per_unit, cells)] * (place - before)
+                    depth = flat[_cell_of(x, y, z, smaller, centre, low, per_unit, cells)] * (place - before)
                     occupied[ray, edge - 1] = depth >= empty
                 before = place
     return edges, middles, points, headings, occupied, lengths, measure
