@@ -10,6 +10,8 @@ from torch import Tensor
 
 # Newton's method doubles the digits at each step; from the distorted point this is enough for single precision.
 _NEWTON_STEPS = 8
+# A step this short, at unit depth, is the last: the next one would be shorter than single precision tells.
+_LAST_STEP = 1e-5
 
 
 def coefficients(
@@ -76,6 +78,9 @@ def undistort(
         error = points - distorted
         step_x = yy * error[:, 0] - xy * error[:, 1]
         step_y = xx * error[:, 1] - xy * error[:, 0]
-        ideal = ideal + torch.stack([step_x, step_y], -1) / (xx * yy - xy * xy)[:, None]
+        step = torch.stack([step_x, step_y], -1) / (xx * yy - xy * xy)[:, None]
+        ideal = ideal + step
+        if bool((step.abs() < _LAST_STEP).all()):
+            break
     xx, xy, yy = distort(ideal, lens)[1].unbind(-1)
     return ideal, 1 / (xx * yy - xy * xy)
