@@ -55,7 +55,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     throughput, interruption = Throughput(), StopOnSignal()
     # Cameras move by sky and outlines before the sky is learned.
     cameras, boundary = CameraSteps(batches, training), BoundaryFirst(batches, config.optimizer.boundary_first)
-    trainer = make_trainer(config, folder, [throughput, interruption, cameras, boundary, Viewer(config, source, test)])
+    trainer = make_trainer(config, folder, throughput, [interruption, cameras, boundary, Viewer(config, source, test)])
     batches = traced(batches.share(trainer.global_rank, trainer.world_size), model, config)
     few = batches.smaller(4096)
     first = few.batch(0)

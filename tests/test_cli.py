@@ -96,11 +96,11 @@ def test_what_is_not_embedded_is_refused(location: str) -> None:
 
 def test_progress_begins_with_the_step(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(callbacks, "training_progress", lambda trainer: trainer.done)
-    trainer = SimpleNamespace(done=0.0, global_step=250, callback_metrics={"train/psnr": 20.0, "val/psnr": 19.0})
-    progress = callbacks.TrainingProgress()
+    trainer = SimpleNamespace(done=0.0, global_step=250, callback_metrics={"val/psnr": 19.0})
+    progress = callbacks.TrainingProgress(callbacks.Throughput())
     progress.on_train_start(trainer, None)
     trainer.done = 0.25
-    progress.on_train_batch_end(trainer, None, None, None, 0)
+    progress.on_train_batch_end(trainer, None, {"squared_error": 0.01}, None, 0)
     progress.on_train_end(trainer, None)
     last = capsys.readouterr().err.split("\r")[-1].strip()
     assert last.startswith("train  25%|")

@@ -72,6 +72,7 @@ class NerfModel(LightningModule, ABC):
         if colour == "srgb" and self.camera.exposure is not None:
             raise NerfroError("camera.exposure=true needs linear radiance; take model.colour=linear")
         self.optimizer_config, self.chunk_size, self.seed = parts.optimizer, parts.chunk_size, parts.seed
+        self._written = True  # whether what this step logs is
 
     @abstractmethod
     def render_path(self, path: Path) -> list[Rendering]:
@@ -182,7 +183,7 @@ class NerfModel(LightningModule, ABC):
                 total = total + weight * value
         shown = self.photographed(batch.of_pixels(renderings[-1].rgb.detach()))
         error = (shown - batch.of_pixels(batch.rgb)).square().mean()
-        self.log("train/psnr", -10 * torch.log10(error), prog_bar=True)
+        self.log("train/psnr", -10 * torch.log10(error))
         if (unlikely := self.medium.prior()) is not None:
             self.log("loss/surface", unlikely)
             total = total + unlikely
@@ -193,7 +194,14 @@ class NerfModel(LightningModule, ABC):
             self.log(f"camera/{name}", value)
         return {"loss": total, "squared_error": error}
 
+    def log(self, *args: Any, **kwargs: Any) -> None:
+        """Lightning's, but nothing in training steps that are not written: noting numbers took a tenth of a step."""
+        if self._written or not self.trainer.training:
+            super().log(*args, **kwargs)
+
     def on_train_batch_start(self, batch: Batch, batch_index: int) -> None:
+        every: int = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
+        self._written = (self.global_step + 1) % every == 0
         # Every step draws from its own seed, so that a resumed run repeats the steps of an undisturbed one.
         # All processes have the same one: each takes its rays' share of what is drawn.
         torch.manual_seed(step_seed(self.seed, self.global_step))

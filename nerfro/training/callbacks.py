@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import time
 from types import FrameType
@@ -65,8 +66,9 @@ class TrainingProgress(ProgressBar):
 
     _UPDATE_SECONDS = 0.5
 
-    def __init__(self) -> None:
+    def __init__(self, throughput: Throughput) -> None:
         super().__init__()
+        self._throughput = throughput
         self._bar: tqdm | None = None
         self._begun = self._shown = 0.0
         self._begun_at = 0.0
@@ -80,7 +82,7 @@ class TrainingProgress(ProgressBar):
         self._bar = tqdm(total=1.0, desc="train", bar_format=_FORM, dynamic_ncols=True, disable=not self._enabled)
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Batch, batch_idx: int
     ) -> None:
         now = time.perf_counter()
         if self._bar is None or now - self._shown < self._UPDATE_SECONDS:
@@ -89,13 +91,13 @@ class TrainingProgress(ProgressBar):
         done = training_progress(trainer)
         rate = (done - self._begun_at) / (now - self._begun)
         eta = tqdm.format_interval((1 - done) / rate) if rate > 0 else "?"
-        shown = {name: float(value) for name, value in trainer.callback_metrics.items()}
+        shown = trainer.callback_metrics
         self._bar.n = done
         # Not tqdm's postfix, which is always led by a comma.
         self._bar.bar_format = _FORM + (
-            f"step {trainer.global_step} ETA {eta} {shown.get('train/rays_per_second', 0):,.0f} rays/s "
-            f"train PSNR {shown.get('train/psnr', float('nan')):.2f}"
-            + (f" val PSNR {shown['val/psnr']:.2f}" if "val/psnr" in shown else "")
+            f"step {trainer.global_step} ETA {eta} {self._throughput.rays_per_second or 0:,.0f} rays/s "
+            f"train PSNR {-10 * math.log10(max(float(outputs['squared_error']), 1e-10)):.2f}"
+            + (f" val PSNR {float(shown['val/psnr']):.2f}" if "val/psnr" in shown else "")
         )
         self._bar.refresh()
 

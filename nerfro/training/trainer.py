@@ -20,7 +20,7 @@ from nerfro.errors import NerfroError
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.kernels.precision import fast_bfloat16
 from nerfro.registry import build
-from nerfro.training.callbacks import ConfigInCheckpoint, TrainingProgress
+from nerfro.training.callbacks import ConfigInCheckpoint, Throughput, TrainingProgress
 from nerfro.training.checkpoint_files import CheckpointFiles
 from nerfro.training.data_module import looks_every
 from nerfro.training.log import TrainingLog
@@ -28,7 +28,7 @@ from nerfro.training.run_folder import CONFIG_FILE, LAST_CHECKPOINT
 from nerfro.training.watched import FallingBehind
 
 
-def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.Trainer:
+def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra: list[Callback]) -> pl.Trainer:
     """Lightning's Trainer with the callbacks that every run has."""
     if (config.checkpoint.every_seconds is None) == (config.checkpoint.every_steps is None):
         raise NerfroError("set one of checkpoint.every_seconds and checkpoint.every_steps, and the other to null")
@@ -44,7 +44,15 @@ def make_trainer(config: DictConfig, folder: Path, extra: list[Callback]) -> pl.
     in_checkpoint = ConfigInCheckpoint(OmegaConf.to_yaml(config, resolve=True))
     ours = {
         "default_root_dir": str(folder),
-        "callbacks": [checkpoints, TrainingProgress(), in_checkpoint, TrainingLog(), FallingBehind(), *extra],
+        "callbacks": [
+            checkpoints,
+            throughput,
+            TrainingProgress(throughput),
+            in_checkpoint,
+            TrainingLog(),
+            FallingBehind(),
+            *extra,
+        ],
         "plugins": [CheckpointFiles()],
         "logger": [build(node, save_dir=str(folder)) for node in (config.logger or {}).values()],
         "max_epochs": -1,

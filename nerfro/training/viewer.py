@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 from omegaconf import DictConfig
@@ -51,13 +52,13 @@ class Viewer(Callback):
         print(f"nerfro: the model as it learns: {self._server.url}", flush=True)
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Batch, batch_idx: int
     ) -> None:
         if self._server is None or self._live is None:
             return
-        if time.monotonic() - self._told > _LOSS_SECONDS and "loss/total" in trainer.callback_metrics:
+        if time.monotonic() - self._told > _LOSS_SECONDS:
             self._told = time.monotonic()
-            self._server.add_loss(trainer.global_step, float(trainer.callback_metrics["loss/total"]))
+            self._server.add_loss(trainer.global_step, float(outputs["loss"]))
         self._live.update()
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
