@@ -204,7 +204,7 @@ class NerfModel(LightningModule, ABC):
         self._written = (self.global_step + 1) % every == 0
         # Every step draws from its own seed, so that a resumed run repeats the steps of an undisturbed one.
         # All processes have the same one: each takes its rays' share of what is drawn.
-        torch.manual_seed(step_seed(self.seed, self.global_step))
+        self.seed_draws(self.global_step)
         # Under a time limit every process has its own idea of it, and parameters would drift apart at different rates.
         progress = self.trainer.strategy.broadcast(training_progress(self.trainer))
         factor = learning_rate_factor(self.global_step, progress, self.optimizer_config)
@@ -217,6 +217,15 @@ class NerfModel(LightningModule, ABC):
         # Not at the end of the step before, which comes after its checkpoint: a resumed run would miss the update.
         if self.global_step > 0:
             self.point_sampler.after_step(self.global_step, list(self.fields))  # type: ignore[arg-type]
+
+    def seed_draws(self, step: int) -> None:
+        """Have random draws begin anew, for one step of the run."""
+        seed = step_seed(self.seed, step)
+        if self.device.type == "cpu":
+            # The other way notes the call's whole stack each time, for devices that are not in use yet.
+            torch.default_generator.manual_seed(seed)
+        else:
+            torch.manual_seed(seed)
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
         super().optimizer_step(*args, **kwargs)

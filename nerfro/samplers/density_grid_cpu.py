@@ -69,6 +69,9 @@ def _contracted_runs(positions, directions, s, centre, radius, near, marks, begi
     """`samplers.measures.Contracted.of` for one polyline; returns the measure of all."""
     total, last = 0.0, len(s) - 1
     for run in range(last + 1):
+        marks[run] = total
+        if 0 < run < last and s[run + 1] == s[run]:
+            continue  # there are as many vertices in every path; no place lies between those that are left over
         along, square = 0.0, 0.0
         for axis in range(3):
             offset = centre[axis] - positions[run, axis]
@@ -79,7 +82,6 @@ def _contracted_runs(positions, directions, s, centre, radius, near, marks, begi
         start = s[run] if run > 0 else min(near, s[1])
         end = s[run + 1] if run < last else passing[run] + FAR * max(aside[run], radius)
         begin[run] = _contracted_length(start - passing[run], aside[run], radius)
-        marks[run] = total
         total += _contracted_length(end - passing[run], aside[run], radius) - begin[run]
     return total
 

@@ -8,7 +8,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from nerfro.fields.base import Field
-from nerfro.models.base import NerfModel, step_seed
+from nerfro.models.base import NerfModel
 from nerfro.progress import told
 from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Exits
@@ -54,7 +54,7 @@ class BoundaryFirst(Callback):
             rays, view, rgb = batches.missing(box, num_pixels, step, camera)
             if len(rays) < _FEWEST:
                 break
-            torch.manual_seed(step_seed(model.seed, -1 - step))
+            model.seed_draws(-1 - step)
             group["lr"] = group["initial_lr"] * first * (last / first) ** (step / self._num_steps)
             radiance = model.boundary(Exits.unbent(rays))
             loss = torch.nn.functional.mse_loss(*model.difference(radiance, rgb, camera.gains(view)))
