@@ -113,8 +113,8 @@ def test_photographs_pass_all_stages_once(reconstruct: Reconstruct, pretended: P
     data = ["data=opencv", f"data.root={pretended.out}", "data.near=0.1", "data.far=9"]
     assert preprocess[:5] == [*data, "medium.resolution=64"]
     assert preprocess[-1] == "keep=1"
-    assert train == ["+experiment=unknown", "data=opencv", "medium.ior=1.4", "data.downscale=2", "trainer.max_steps=3",
-                     "logger=none", f"hydra.run.dir={pretended.out / 'run'}"]  # fmt: skip
+    assert train == ["+experiment=unknown", "data=opencv", "medium.ior=1.4", "camera.exposure=true", "data.downscale=2",
+                     "trainer.max_steps=3", "logger=none", f"hydra.run.dir={pretended.out / 'run'}"]  # fmt: skip
     assert f"python -m nerfro.train {' '.join(train)}" in done.out
     again = reconstruct(*asked)
     assert again.code == 0, again.err
@@ -180,7 +180,7 @@ def test_what_was_found_chooses_the_experiment(
     assert pretended.ran[1][1][:4] == ["data=blender", f"data.root={tiny_scene}", "medium=vessel", "medium.wall=0.1"]
     train = pretended.ran[2][1]
     assert train[0] == "+experiment=refractive_room"
-    assert train[1:4] == ["data=opencv", "medium.ior=1.4", "medium.ior=1.37"]
+    assert train[1:5] == ["data=opencv", "medium.ior=1.4", "medium.ior=1.37", "camera.exposure=true"]
     assert "medium.ior=1.37 fits best, but the photographs do not tell for sure" in done.out
 
 

@@ -92,6 +92,19 @@ def test_every_loss_and_weight_follows_its_schedule_in_the_log(
     assert {"train/psnr", "train/rays_per_second", "loss/total"} <= set(events.Tags()["scalars"])
 
 
+def test_numbers_are_written_every_few_steps_and_those_of_one_step_together(
+    train_here: Callable[..., Any], overrides: list[str], tmp_path: Path
+) -> None:
+    options = [f"hydra.run.dir={tmp_path / 'run'}", "logger=tensorboard", "trainer.log_every_n_steps=2"]
+    finished = train_here(*overrides, *options)
+    assert finished.code == 0, finished.err
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(tmp_path / "run" / "tensorboard")).Reload()
+    for name in ("loss/total", "train/psnr", "train/rays_per_second", "learning_rate/fields"):
+        assert [event.step for event in events.Scalars(name)] == [1, 3, 5], name
+
+
 def test_two_runs_of_one_seed_are_equal_and_of_another_are_not(
     train_here: Callable[..., Any], overrides: list[str], tmp_path: Path
 ) -> None:

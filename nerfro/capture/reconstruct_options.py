@@ -77,6 +77,8 @@ def training_options(config: DictConfig, overrides: list[str], surface: Path) ->
         # win in the same time (docs/real.md).
         far = "glass" if "wall" in config.medium else "unknown"
         options.insert(0, f"+experiment={'refractive_room' if found['near'] else far}")
+    if not is_given("camera.exposure", extra):
+        options.append("camera.exposure=true")  # telephones choose one for each photograph
     if not is_given("data.downscale", overrides):
         options.append(f"data.downscale={max(1.0, max(found['pixels']) / config.pixels):.4g}")
     return [*options, *extra]

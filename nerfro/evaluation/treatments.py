@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.camera.exposure import fit_gain
 from nerfro.data.base import Views
 from nerfro.evaluation.left_halves import refine_on_left
 from nerfro.evaluation.metrics import ImageMetrics
@@ -21,9 +22,6 @@ from nerfro.evaluation.results import EvaluationResult
 from nerfro.evaluation.scoring import score_views
 from nerfro.files.images import save_png
 from nerfro.models.base import NerfModel
-
-# Newton's steps to a gain; each doubles the digits.
-_STEPS = 20
 
 
 def score_split(
@@ -68,26 +66,9 @@ def _score_right(
         radiance = render_view(model, cameras, view, supersampling).radiance.view(height, width, 3).cpu()
         target = views.images[view]
         if model.camera.exposure is not None:
-            gains[view] = fit_gain(model, radiance[:, left].flatten(0, 1), target[:, left].flatten(0, 1))
+            gains[view] = fit_gain(model.encode, radiance[:, left].flatten(0, 1), target[:, left].flatten(0, 1))
         rgb = model.photographed(gains[view] * radiance)
         save_png(folder / f"images_{name}" / f"{metrics.prefix}_{view:03d}.png", rgb)
         coverage = None if views.masks is None else views.masks[view][:, right].contiguous()
         metrics.update(rgb[:, right].contiguous(), target[:, right].contiguous(), view, coverage)
     return gains, metrics.result()
-
-
-def fit_gain(model: NerfModel, radiance: Float[Tensor, "P 3"], target: Float[Tensor, "P 3"]) -> Float[Tensor, "3"]:
-    """Gain of each channel of linear radiance that brings its sRGB nearest to a picture's (Gauss-Newton)."""
-    radiance, target = radiance.double(), target.double()
-    logarithm = torch.zeros(3, dtype=torch.float64)
-    for _ in range(_STEPS):
-        with torch.enable_grad():
-            each = logarithm.expand_as(radiance).clone().requires_grad_()
-            shown = model.encode(each.exp() * radiance)
-            (slope,) = torch.autograd.grad(shown.sum(), each)
-        # Saturated pixels tell nothing where the photograph is saturated, too.
-        error = torch.where((target >= 1) & (shown > 1), 0.0, shown.detach() - target)
-        slope = torch.where((target >= 1) & (shown > 1), 0.0, slope)
-        step = (slope * error).sum(0) / slope.square().sum(0).clamp(min=1e-12)
-        logarithm = logarithm - step.clamp(-1, 1)
-    return logarithm.exp().to(torch.float32)

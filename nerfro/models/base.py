@@ -248,8 +248,7 @@ class NerfModel(LightningModule, ABC):
             return None  # one process looks, the others wait
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         with torch.autocast(self.device.type, enabled=False):  # directions in half precision would miss their pixels
-            watched = data.watched_batch()
-        held = psnr(self.photographed(watched.of_pixels(self.radiance(watched.rays))), watched.of_pixels(watched.rgb))
+            held = data.watched_psnr()
         self.log("val/psnr", held, prog_bar=True, batch_size=1, rank_zero_only=True)
         if view < 0:
             return None  # no picture is due

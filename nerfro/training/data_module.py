@@ -9,8 +9,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import cast
 
 import torch
+from jaxtyping import Float
 from lightning.pytorch import LightningDataModule
 from omegaconf import DictConfig
+from torch import Tensor
 
 from nerfro.data.base import Views
 from nerfro.models.base import NerfModel
@@ -53,11 +55,11 @@ class RayDataModule(LightningDataModule):
     def val_dataloader(self) -> RotatingView | list[int]:
         return [] if self.validation is None else RotatingView(self)
 
-    def watched_batch(self) -> Batch:
-        """Pixels of validation views, with the rays that training gives such pixels as the medium is now."""
+    def watched_psnr(self) -> Float[Tensor, ""]:
+        """Of pixels of validation views, with the rays that training gives such pixels as the medium is now; dB."""
         assert self.trainer is not None
         assert self.watched is not None
-        return self.watched.batch(cast(NerfModel, self.trainer.lightning_module), *self.batches.dividing)
+        return self.watched.psnr(cast(NerfModel, self.trainer.lightning_module), *self.batches.dividing)
 
     def transfer_batch_to_device(self, batch: int, device: torch.device, dataloader_idx: int) -> Batch | int:
         assert self.trainer is not None

@@ -15,9 +15,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from nerfro import pixel_parts
+from nerfro.camera.exposure import fit_gain
 from nerfro.cameras import Cameras
 from nerfro.data.base import Views
-from nerfro.models.base import NerfModel
+from nerfro.models.base import NerfModel, psnr
 from nerfro.pixel_parts import part_rays, pixel_rays, rays_beside
 from nerfro.types import Batch
 
@@ -73,6 +74,19 @@ class WatchedPixels:
             rays, view[rows], rgb[rows], cameras, num_whole=len(whole), rays_per_pixel=side**2, index=pixels[rows]
         )
 
+    def psnr(self, model: NerfModel, side: int, divergence: float, contrast: float) -> Float[Tensor, ""]:
+        """What the model has of the pixels, dB; where exposures learn, with the gain that suits each view best."""
+        batch = self.batch(model, side, divergence, contrast)
+        radiance, rgb = batch.of_pixels(model.radiance(batch.rays)), batch.of_pixels(batch.rgb)
+        if model.camera.exposure is None:
+            return psnr(model.photographed(radiance), rgb)
+        whole = len(batch.view) if batch.num_whole is None else batch.num_whole
+        views = torch.cat([batch.view[:whole], batch.view[whole :: batch.rays_per_pixel]])
+        gains = torch.ones_like(radiance)
+        for view in views.unique():
+            gains[views == view] = fit_gain(model.encode, radiance[views == view], rgb[views == view])
+        return psnr(model.photographed(radiance, gains), rgb)
+
 
 class FallingBehind(Callback):
     """Says once when pixels of views that are not trained on fall behind those that are.
@@ -82,8 +96,8 @@ class FallingBehind(Callback):
     last look.
 
     Attributes:
-        comparable: whether the difference of both tells anything. Where cameras or exposures of training views learn,
-            those of other views do not.
+        comparable: whether the difference of both tells anything. Where cameras of training views learn, those of other
+            views do not.
         told: whether it has said so.
     """
 
@@ -95,7 +109,7 @@ class FallingBehind(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, NerfModel)
-        self.comparable = not (pl_module.camera.moves or list(pl_module.camera.parameters()))
+        self.comparable = not pl_module.camera.moves
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Batch, batch_idx: int

@@ -8,9 +8,8 @@ import pytest
 import torch
 from torch.nn.functional import mse_loss
 
-from nerfro.camera.exposure import Exposure
+from nerfro.camera.exposure import Exposure, fit_gain
 from nerfro.camera.given import GivenCamera
-from nerfro.evaluation.treatments import fit_gain
 from nerfro.light import to_srgb
 from nerfro.losses.photometric import Photometric
 from nerfro.models.refractive import RefractiveModel
@@ -55,5 +54,5 @@ def test_a_rendering_is_exposed_before_losses_see_it() -> None:
 @pytest.mark.parametrize("factors", [(1.0, 1.0, 1.0), (0.4, 0.9, 1.7), (3.0, 0.2, 1.0)])
 def test_the_gain_of_a_picture_is_found_again_though_parts_of_it_saturate(factors: tuple[float, ...]) -> None:
     radiance, gain = 1.5 * torch.rand(500, 3), torch.tensor(factors)
-    found = fit_gain(RefractiveModel(example_parts()), radiance, to_srgb(gain * radiance).clamp(max=1))
+    found = fit_gain(RefractiveModel(example_parts()).encode, radiance, to_srgb(gain * radiance).clamp(max=1))
     torch.testing.assert_close(found, gain, rtol=1e-4, atol=0)

@@ -16,8 +16,10 @@ import pytest
 import torch
 from PIL import Image
 
+from nerfro.camera.given import GivenCamera
 from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
+from nerfro.light import to_srgb
 from nerfro.media.shapes import Ball
 from nerfro.samplers.snell import Snell
 from nerfro.training.data_module import NO_PICTURE, RayDataModule, RotatingView, looks_every
@@ -106,9 +108,9 @@ def test_where_cameras_learn_only_a_loss_is_told() -> None:
 
 @pytest.mark.parametrize(
     ("option", "comparable"),
-    [("camera.exposure=false", True), ("camera.exposure=true", False), ("sampler/path=snell", True)],
+    [("camera.exposure=true", True), ("camera=refined", False), ("sampler/path=snell", True)],
 )
-def test_exposures_that_learn_are_those_of_training_views_alone(
+def test_cameras_that_learn_are_those_of_training_views_alone(
     learn: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, option: str, comparable: bool
 ) -> None:
     begun: list[FallingBehind] = []
@@ -176,6 +178,32 @@ def test_watched_pixels_have_the_rays_that_training_gives_them(contrast: float |
     others = one.keys() - set(same)
     assert len(others) <= 16
     assert all(len(one[pixel]) == 4 and len(other[pixel]) == 1 for pixel in others)
+
+
+@pytest.mark.parametrize("side", [1, 2])
+@pytest.mark.parametrize("learns", [False, True])
+def test_where_exposures_learn_each_watched_view_has_the_gain_that_suits_it(
+    learns: bool, side: int, tiny_scene: Path
+) -> None:
+    views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val")
+    watched, model = (
+        WatchedPixels.of(Views(views.cameras.select([0, 0]), torch.rand(2, 16, 16, 3), None, ["a"])),
+        bending(),
+    )
+    model.radiance = lambda rays: 0.3 + 0.2 * rays.directions
+    model.encode, model.photographed = to_srgb, lambda rgb, gains=1.0: to_srgb(gains * rgb).clamp(0, 1)
+    model.camera = GivenCamera(exposure=learns)
+    batch = watched.batch(model, side, 8.0, math.inf)
+    shown = batch.of_pixels(model.radiance(batch.rays))
+    # Pixels are in the order in which their rays are.
+    whole = len(batch.view) if batch.num_whole is None else batch.num_whole
+    pixel = torch.cat([batch.index[:whole], batch.index[whole :: batch.rays_per_pixel]])
+    gains = torch.tensor([[0.7, 0.8, 0.9], [1.4, 1.2, 1.1]])[pixel // 256]
+    place = {int(number): row for row, number in enumerate(pixel)}
+    order = torch.tensor([place[int(number)] for number in watched.index])
+    watched = replace(watched, rgb=to_srgb(gains * shown)[order])
+    found = float(watched.psnr(model, side, 8.0, math.inf))
+    assert found > 80 if learns else 15 < found < 30
 
 
 def rays_of_pixels(batch: Batch) -> dict[int, torch.Tensor]:
