@@ -1,4 +1,4 @@
-"""Hash-grid field and environment map: compiled CPU kernels against their plain-PyTorch twins.
+"""Hash-grid field, environment map and density grid: compiled CPU kernels against their plain-PyTorch twins.
 
     python benchmarks/hash_grid.py [--rays 1024] [--samples 64] [--threads 2] [--rounds 9] [--cpu-time]
 
@@ -13,6 +13,7 @@ import platform
 import time
 from collections.abc import Callable
 from datetime import date
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -23,7 +24,11 @@ from nerfro.fields import hash_encoding
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.fields.spherical_harmonics import spherical_harmonics
 from nerfro.kernels.allocator import keep_freed_memory
-from nerfro.types import Exits, Samples
+from nerfro.media.analytic import Vacuum
+from nerfro.samplers.density_grid import DensityGridSampler
+from nerfro.samplers.stepfun import spread_uniform
+from nerfro.samplers.straight import Straight
+from nerfro.types import Exits, Rays, Samples
 
 Task = Callable[[], object]
 
@@ -55,7 +60,7 @@ def main() -> None:
         name = f"{num_levels} levels, 2^{log2_table_size} entries"
         for label, twin, compiled in hash_grid_tasks(samples, num_levels, log2_table_size):
             report(f"{label}; {name}", twin, compiled, arguments.rounds, clock)
-    for label, twin, compiled in environment_map_tasks(arguments.rays):
+    for label, twin, compiled in [*environment_map_tasks(arguments.rays), *drawing_tasks(arguments.rays)]:
         report(label, twin, compiled, arguments.rounds, clock)
 
 
@@ -132,6 +137,24 @@ def environment_map_tasks(num_rays: int) -> list[tuple[str, Task, Task]]:
         torch.autograd.grad(boundary(Exits(directions)).square().sum(), boundary.texels)
 
     return [("environment map, one direction a ray, forward and backward", twin, compiled)]
+
+
+def drawing_tasks(num_rays: int) -> list[tuple[str, Task, Task]]:
+    """Samples of straight rays past a ball, drawn from a grid with a few dense cells."""
+    origin = torch.nn.functional.normalize(torch.randn(3), dim=-1) * 2.2
+    directions = torch.nn.functional.normalize(0.9 * torch.randn(num_rays, 3) - origin, dim=-1)
+    near, far = torch.full((num_rays,), 0.5), torch.full((num_rays,), 4.0)
+    path = Straight()(Rays(origin.expand_as(directions), directions, torch.zeros(num_rays), near, far), Vacuum())
+    tasks = []
+    for label, options in (
+        ("a box, 32 samples of 96 bins", {"resolution": 64}),
+        ("all of space, 16 samples of 128 bins", {"radius": 1.0, "resolution": 96, "num_bins": 128, "num_samples": 16}),
+    ):
+        sampler = DensityGridSampler(**options)
+        sampler.density = 20 * torch.rand(sampler.density.shape) ** 8
+        u = spread_uniform(path, sampler.num_samples + 1, True)
+        tasks.append((f"drawing in {label}", partial(sampler.draw, path, u), partial(sampler.draw_compiled, path, u)))
+    return tasks
 
 
 def report(label: str, twin: Task, compiled: Task, rounds: int, clock: Callable[[], float]) -> None:
