@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from nerfro.capture.surroundings import Pixels, Room, Surroundings, robust
 from nerfro.errors import NerfroError
@@ -27,10 +27,13 @@ LOWEST, HIGHEST = 1.0, 2.5  # indices
 _COARSE = {1: (31, 12_000), 2: (13, 4_000)}
 # Candidates along each axis of closer looks, and how far they reach from its middle, as shares of what is searched.
 _AROUND = {1: 9, 2: 5}
-_REACHES = {1: (1 / 30, 1 / 75), 2: (1 / 10, 1 / 30, 1 / 75)}
+_REACHES = {1: (1 / 30, 1 / 75), 2: (1 / 75, 1 / 75)}
+# Two numbers that trade lie in a narrow valley. Candidates reach farther along it than across, so many times at most;
+# where it leads is told by derivatives at so many pixels: differences over this share of what is searched.
+_ELONGATED, _SLOPE_PIXELS, _DIFFERENCE = 6.0, 6_000, 1 / 300
 # Of a closer look, by how many numbers are looked for, and of one at surroundings that are rendered for each ray.
 _FINE_PIXELS, _NEAR_PIXELS = {1: 60_000, 2: 20_000}, 12_000
-_MOST_LOOKS = 4  # of each reach, until the middle stays where it is
+_MOST_LOOKS = 10  # of each reach, until the middle stays where it is
 # Rays with more events, or more than two for each surface, are no help: tiny errors of the surface turn them anywhere.
 _MAX_EVENTS = 4
 # Residuals count half at this share of the surroundings' standard deviation: what is inside spoils many pixels.
@@ -141,11 +144,12 @@ def find_numbers(
     looks = len(_REACHES[count]) * _MOST_LOOKS
     look = 0
     for part in _REACHES[count]:
-        reach = part * (high - low)
         steps = np.linspace(-1, 1, _AROUND[count])
         for _ in range(_MOST_LOOKS):
-            middle = middle.clip(low + reach, high - reach)
-            stencil = middle + reach * np.array(list(itertools.product(steps, repeat=count)))
+            reach = part * (high - low)[:, None] * search.valley(middle)
+            aside = np.abs(reach).sum(1)
+            middle = middle.clip(low + aside, high - aside)
+            stencil = middle + np.array(list(itertools.product(steps, repeat=count))) @ reach.T
             begun, look = share + (1 - share) * look / looks, look + 1
             closest = part == _REACHES[count][-1]
             fine = search.costs(
@@ -156,7 +160,7 @@ def find_numbers(
             )
             errors = fine.mean_error()
             found, curvature = _lowest(stencil, errors[None], reach)
-            settled = (np.abs(found[0] - middle) < 0.5 * reach).all()
+            settled = (np.abs(np.linalg.solve(reach, found[0] - middle)) < 0.5).all()
             middle = found[0].clip(low, high)
             if settled:
                 break
@@ -171,14 +175,16 @@ def find_numbers(
 
 
 def _lowest(
-    stencil: Float[np.ndarray, "C K"], errors: Float[np.ndarray, "B C"], reach: Float[np.ndarray, "K"]
+    stencil: Float[np.ndarray, "C K"], errors: Float[np.ndarray, "B C"], reach: Float[np.ndarray, "K K"]
 ) -> tuple[Float[np.ndarray, "B K"], Float[np.ndarray, "B K"]]:
-    """Where the parabolas through errors around a middle are lowest, and their second derivatives.
+    """Where the parabolas through errors around a middle are lowest, and their second derivatives by each number.
 
-    A parabola that has no lowest place near the stencil has it at the stencil's best candidate.
+    `reach` has in its columns how far the stencil reaches, in directions of its own. A parabola that has no lowest
+    place near the stencil has it at the stencil's best candidate.
     """
     count, middle = stencil.shape[1], stencil.mean(0)
-    x = (stencil - middle) / reach
+    back = np.linalg.inv(reach)
+    x = (stencil - middle) @ back.T
     pairs = list(itertools.combinations_with_replacement(range(count), 2))
     terms = np.stack([np.ones(len(x)), *x.T, *(x[:, i] * x[:, j] for i, j in pairs)], 1)
     fitted = errors @ np.linalg.pinv(terms).T
@@ -191,7 +197,7 @@ def _lowest(
     place = -np.linalg.solve(hessian_or_one, fitted[:, 1 : 1 + count, None])[..., 0]
     near = regular & (np.abs(place).max(1) < 1.5)
     place = np.where(near[:, None], place, x[errors.argmin(1)])
-    return middle + reach * place, np.diagonal(hessian, axis1=1, axis2=2) / reach**2
+    return middle + place @ reach.T, np.diagonal(back.T @ hessian @ back, axis1=1, axis2=2)
 
 
 def _doubts(
@@ -232,6 +238,7 @@ class _Costs:
 class _Search:
     def __init__(self, sought: Sought, through: Pixels, surroundings: Surroundings) -> None:
         self._medium, self._surroundings = sought.medium, surroundings
+        self._lowest, self._highest = sought.lowest, sought.highest
         medium = sought.medium(0.5 * (sought.lowest + sought.highest))
         self._sampler = Snell(max_events=max(_MAX_EVENTS, 2 * len(medium.iors)))
         self._pixels = through[self._sampler(through.rays, medium).refracted]
@@ -243,8 +250,40 @@ class _Search:
         other = colours[torch.randint(len(colours), (len(self._pixels),), generator=torch.Generator().manual_seed(1))]
         self.unrelated = float(robust(other - self._pixels.radiance, self._half).mean())
 
+    def valley(self, place: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K K"]:
+        """In columns, in shares of what is searched: directions across a valley and along it, where it is long.
+
+        Of a single number it is 1. By products of the derivatives of robust residuals with each other.
+        """
+        if len(place) == 1:
+            return np.ones((1, 1))
+        pixels = self._pixels.some(_SLOPE_PIXELS)
+        residuals, known = self._residuals(pixels, place)
+        derivatives = []
+        for away in _DIFFERENCE * np.diag(self._highest - self._lowest):
+            (ahead, known_ahead), (behind, known_behind) = (self._residuals(pixels, place + d) for d in (away, -away))
+            derivatives.append(ahead - behind)
+            known &= known_ahead & known_behind
+        weights = (self._half**2 / (residuals.square().mean(-1) + self._half**2)).square()
+        slopes = torch.stack(derivatives, -1)[known].double()
+        products = torch.einsum("p,pci,pcj->ij", weights[known].double(), slopes, slopes).numpy()
+        values, directions = np.linalg.eigh(products)
+        return directions * np.sqrt(values.max() / values.clip(1e-9 * values.max())).clip(max=_ELONGATED)
+
+    def _residuals(
+        self, pixels: Pixels, values: Float[np.ndarray, "K"]
+    ) -> tuple[Float[torch.Tensor, "P 3"], Bool[torch.Tensor, "P"]]:
+        """How far off pixels are with a candidate, and for which it is known."""
+        trace = self._sampler.trace(pixels.rays, self._medium(values.clip(self._lowest, self._highest)))
+        radiance, known = self._surroundings.radiance(trace.path.exits())
+        return radiance - pixels.radiance, known & ~trace.exceeded
+
     def costs(
-        self, candidates: Float[np.ndarray, "C K"], num_pixels: int, alike: bool, progress: Callable[[float], None]
+        self,
+        candidates: Float[np.ndarray, "C K"],
+        num_pixels: int,
+        alike: bool,
+        progress: Callable[[float], None] = lambda done: None,
     ) -> _Costs:
         """Errors of candidates. Where a ray's light comes from is not always known, and that differs among candidates.
 
@@ -252,14 +291,11 @@ class _Search:
         ones by those pixels for which all know it, or they would be preferred for knowing more.
         """
         pixels = self._pixels.some(num_pixels)
-        rays = pixels.rays
         errors, everywhere = [], torch.ones(len(pixels), dtype=torch.bool)
         for number, values in enumerate(candidates):
-            trace = self._sampler.trace(rays, self._medium(values))
-            radiance, known = self._surroundings.radiance(trace.path.exits())
-            known &= ~trace.exceeded
+            residuals, known = self._residuals(pixels, values)
             everywhere &= known
-            errors.append(torch.where(known, robust(radiance - pixels.radiance, self._half), self.unrelated))
+            errors.append(torch.where(known, robust(residuals, self._half), self.unrelated))
             progress((number + 1) / len(candidates))
         used = everywhere if alike else torch.ones_like(everywhere)
         view, num_views = pixels.view[used], len(pixels.cameras)

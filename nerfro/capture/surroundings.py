@@ -73,7 +73,7 @@ class Pixels:
     def view(self) -> Int[Tensor, "P"]:
         return self.index // (self.cameras.height * self.cameras.width)
 
-    @property
+    @cached_property
     def rays(self) -> Rays:
         """Through the pixels' centres."""
         return pixel_rays(self.cameras, self.index)
