@@ -58,13 +58,13 @@ def ball(radius: float) -> Tensor:
     return (points.norm(dim=-1) - radius).float()
 
 
-def solid(iors: list[float]) -> SdfGrid:
-    return SdfGrid.from_distances(torch.stack([ball(RADIUS), ball(INNER)][: len(iors)]), BOX, iors, 0.01)
+def solid(iors: list[float], inner: float = INNER) -> SdfGrid:
+    return SdfGrid.from_distances(torch.stack([ball(RADIUS), ball(inner)][: len(iors)]), BOX, iors, 0.01)
 
 
-def photographs(iors: list[float], opaque: bool = False) -> Views:
+def photographs(iors: list[float], opaque: bool = False, inner: float = INNER) -> Views:
     """What the bodies show of the sky: their surfaces are those of balls, to a grid's accuracy."""
-    return photographs_of(solid(iors), opaque)
+    return photographs_of(solid(iors, inner), opaque)
 
 
 def photographs_of(
