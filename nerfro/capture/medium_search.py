@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
 
+import torch
 from omegaconf import DictConfig
 
 from nerfro.capture.index_report import (
@@ -80,7 +81,7 @@ def find_medium(
         if not isinstance(medium, Solid):
             raise NerfroError("the index of this medium is not searched for; give medium.ior=, or take medium=object")
         found = search_index(around, medium, folder)
-        result = FoundMedium(medium, written=[INDEX, CURVE])
+        result = FoundMedium(medium.with_indices(torch.from_numpy(found.values)), written=[INDEX, CURVE])
         named = index_settings(found.values.tolist())
     else:
         medium = build_medium(config, settings, location, {})

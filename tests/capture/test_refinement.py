@@ -209,6 +209,22 @@ def test_a_surface_that_cannot_be_refined_stays_as_it_is(preprocess: Callable, m
     assert load_mesh(out / "mesh.ply").vertices.shape == mesh().vertices.shape
 
 
+def test_a_refinement_begins_with_the_index_that_was_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[SdfGrid] = []
+
+    def kept(mesh: object, medium: SdfGrid, *_: object) -> Refined:
+        begun.append(medium)
+        raise NerfroError("enough is known")
+
+    monkeypatch.setattr(refinement_report, "refine_surface", kept)
+    save(photographs_of(solid([1.33])), tmp_path)
+    options = [f"data.root={tmp_path}", f"mesh={tmp_path / 'mesh.ply'}", f"out={tmp_path / 'out'}", "data.near=0.5"]
+    options += ["refine=true", "room=false", "medium.cache=false", "medium.resolution=41"]
+    monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", *options])
+    nerfro.preprocess.main()
+    assert begun[0].iors.tolist() == [pytest.approx(1.33, rel=0.005)]
+
+
 def test_what_cannot_be_refined_is_refused_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
