@@ -255,8 +255,9 @@ class _Search:
 
         Of a single number it is 1. By products of the derivatives of robust residuals with each other.
         """
-        if len(place) == 1:
-            return np.ones((1, 1))
+        count = len(place)
+        if count == 1:
+            return np.eye(count)
         pixels = self._pixels.some(_SLOPE_PIXELS)
         residuals, known = self._residuals(pixels, place)
         derivatives = []
@@ -268,6 +269,8 @@ class _Search:
         slopes = torch.stack(derivatives, -1)[known].double()
         products = torch.einsum("p,pci,pcj->ij", weights[known].double(), slopes, slopes).numpy()
         values, directions = np.linalg.eigh(products)
+        if not values.max() > 0:  # nothing is known of any pixel
+            return np.eye(count)
         return directions * np.sqrt(values.max() / values.clip(1e-9 * values.max())).clip(max=_ELONGATED)
 
     def _residuals(
