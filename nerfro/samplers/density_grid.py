@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Annotated, Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerfro.allowed import Count, NotNegative, Positive, Range, Share, corners_of_box
@@ -49,7 +49,7 @@ class DensityGridSampler(PointSampler):
         resolution: cells of the grid along each side.
         uniform: share of the samples that are spread evenly.
         every: steps between two looks at the field.
-        looks: share of the cells that are looked at then, drawn at random.
+        looks: share of the cells that are looked at then, drawn at random; of those in which places of the world lie.
         decay: factor of a cell's remembered density at each look.
         trust: most of the light that one bin is believed to stop. A cell remembers its densest place, but many rays
             cross it elsewhere, and what they meet behind it would get next to no samples if the cell were opaque.
@@ -59,6 +59,7 @@ class DensityGridSampler(PointSampler):
     num_levels = 1
     box: Float[Tensor, "2 3"]
     density: Float[Tensor, "C C C"]
+    inside: Int[Tensor, "P"] | None  # numbers of the cells that are looked at; none for all
 
     def __init__(
         self,
@@ -84,6 +85,8 @@ class DensityGridSampler(PointSampler):
         box = torch.from_numpy(corners_of_box(box_min, box_max)).float()
         self.register_buffer("box", box if radius is None else contracted_box(box, radius), persistent=False)
         self.register_buffer("density", torch.zeros(resolution, resolution, resolution))
+        inside = None if radius is None else _cells_of_the_world(resolution)
+        self.register_buffer("inside", inside, persistent=False)
 
     def forward(self, path: Path, previous: Rendering | None) -> Samples:
         with torch.no_grad():
@@ -191,9 +194,10 @@ class DensityGridSampler(PointSampler):
         """Look at some of the cells, at a random place in each."""
         if step % self.every:
             return
-        num_cells = self.resolution**3
-        device = self.density.device
+        device, inside = self.density.device, self.inside
+        num_cells = self.resolution**3 if inside is None else len(inside)
         cells = torch.randint(num_cells, (int(num_cells * self.looks),), device=device)
+        cells = cells if inside is None else inside[cells]
         corners = torch.stack(
             [cells // self.resolution**2, cells // self.resolution % self.resolution, cells % self.resolution], dim=-1
         )
@@ -209,14 +213,19 @@ class DensityGridSampler(PointSampler):
         """A field's density at places of the grid."""
         if self.radius is None:
             return field.density(places)
-        density = places.new_zeros(len(places))
-        # In the cube's corners, half of it, lies no place of the world.
-        rows = ((places - self.centre).norm(dim=-1) < 2 * self.radius).nonzero()[:, 0]
-        positions = expand(places[rows], self.centre, self.radius)
-        density[rows] = field.density(positions) / shrinkage(positions, self.centre, self.radius)
-        return density
+        positions = expand(places, self.centre, self.radius)
+        outside = (places - self.centre).norm(dim=-1) >= 2 * self.radius  # where no place of the world lies
+        density = field.density(positions) / shrinkage(positions, self.centre, self.radius)
+        return torch.where(outside, 0.0, density)
 
 
 def _weight(path: Path) -> Float[Tensor, "P"]:
     """Share of its ray's light that a polyline brings, of the colour of which it brings most."""
     return path.throughput.amax(-1).clamp(max=1)
+
+
+def _cells_of_the_world(resolution: int) -> Int[Tensor, "P"]:
+    """Cells of the cube around contracted space, but for those in its corners, in which no place of the world lies."""
+    edges = torch.linspace(-1, 1, resolution + 1).square()
+    nearest = torch.minimum(edges[:-1], edges[1:])
+    return ((nearest[:, None, None] + nearest[:, None] + nearest).flatten() < 1).nonzero()[:, 0]
