@@ -282,11 +282,7 @@ class _Search:
         return radiance - pixels.radiance, known & ~trace.exceeded
 
     def costs(
-        self,
-        candidates: Float[np.ndarray, "C K"],
-        num_pixels: int,
-        alike: bool,
-        progress: Callable[[float], None] = lambda done: None,
+        self, candidates: Float[np.ndarray, "C K"], num_pixels: int, alike: bool, progress: Callable[[float], None]
     ) -> _Costs:
         """Errors of candidates. Where a ray's light comes from is not always known, and that differs among candidates.
 
