@@ -1,8 +1,8 @@
-"""How far disturbed poses come back, and what it does to the pictures: `python benchmarks/cameras.py`.
+"""How far disturbed poses, and a disturbed lens, come back: `python benchmarks/cameras.py`.
 
 Every training camera of a scene is turned about a random axis and shifted in a random direction; what all share is
-taken out, because it is the world's. The test cameras stay as they are. Each run is `nerfro.train` with the given
-options; errors are of the cameras that it believes in, left as they are.
+taken out, because it is the world's. The poses of test cameras stay as they are; the lens is wrong for all. Each run is
+`nerfro.train` with the given options; errors are of the cameras that it believes in, left as they are.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import math
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -35,6 +36,8 @@ def main() -> None:
     parser.add_argument("--root", default="embedded:torus", help="folder in Blender format, with a mesh")
     parser.add_argument("--degrees", type=float, default=0.5, help="by which each camera is turned")
     parser.add_argument("--percent", type=float, default=1.0, help="of its distance, by which each camera is shifted")
+    parser.add_argument("--focal", type=float, default=0.0, help="percent by which the focal length is too large")
+    parser.add_argument("--principal", type=float, default=0.0, help="pixels by which the principal point is off")
     parser.add_argument("--seed", type=int, default=0, help="of the disturbance")
     parser.add_argument("--out", help="folder for the runs; removed in the end if none is given")
     parser.add_argument("--rows", nargs="+", default=["true", "disturbed", "refined"], help="which runs")
@@ -44,16 +47,35 @@ def main() -> None:
         out = Path(given.out or folder).resolve()
         true = BlenderData(given.root).load("train").cameras
         moved = disturbed(true, math.radians(given.degrees), given.percent / 100, given.seed)
-        data = write_disturbed(resolve_path(given.root), moved, out / "data")
-        print("poses          PSNR   on the object   aligned   rotation, degrees    position, % of the distance")
+        believed = replace(
+            true,
+            fx=true.fx * (1 + given.focal / 100),
+            fy=true.fy * (1 + given.focal / 100),
+            cx=true.cx + given.principal,
+            cy=true.cy - given.principal,
+        )
+        data = write_disturbed(resolve_path(given.root), replace(believed, camera_to_world=moved), out / "data")
+        print(
+            "poses          PSNR   on the object   aligned   rotation, degrees    position, % of the distance", end=""
+        )
+        print("   focal length, %   principal point, pixels")
         print("                                                 median   largest     median   largest", flush=True)
         for row in given.rows:
             run = out / row
-            root = given.root if row == "true" else str(data)
+            bounds = f"data.near={true.near:g}", f"data.far={true.far:g}"
+            root = [given.root] if row == "true" else [str(data), "data=nerfstudio", *bounds]
             camera = ["camera=refined"] if row.startswith("refined") else []
-            options = [f"data.root={root}", *camera, *given.options, f"hydra.run.dir={run}", "logger=none"]
+            camera += ["camera.lens=true"] if camera and (given.focal or given.principal) else []
+            options = [
+                f"data.root={root[0]}",
+                *root[1:],
+                *camera,
+                *given.options,
+                f"hydra.run.dir={run}",
+                "logger=none",
+            ]
             subprocess.run([sys.executable, "-m", "nerfro.train", *options], check=True, stdout=subprocess.DEVNULL)
-            print(line(row, run, true, moved), flush=True)
+            print(line(row, run, true, moved, believed), flush=True)
 
 
 def disturbed(cameras: Cameras, angle: float, share: float, seed: int) -> Float[Tensor, "V 3 4"]:
@@ -69,34 +91,47 @@ def disturbed(cameras: Cameras, angle: float, share: float, seed: int) -> Float[
     return torch.cat([axes @ rotations(motion[:, :3]), poses[..., 3:] + axes @ motion[:, 3:, None]], -1)
 
 
-def write_disturbed(root: Path, poses: Float[Tensor, "V 3 4"], folder: Path) -> Path:
-    """A folder with everything that the data set has, but other poses of the training cameras."""
+def write_disturbed(root: Path, cameras: Cameras, folder: Path) -> Path:
+    """A folder in nerfstudio's format with everything that the data set has, but these training cameras.
+
+    The lens of the first is that of all splits.
+    """
     folder.mkdir(parents=True, exist_ok=True)
+    lens = {"fl_x": cameras.fx, "fl_y": cameras.fy, "cx": cameras.cx, "cy": cameras.cy}
     for path in root.iterdir():
-        if path.name != "transforms_train.json" and not (folder / path.name).exists():
-            os.symlink(path, folder / path.name)
-    document = json.loads((root / "transforms_train.json").read_text("utf-8"))
-    for frame, pose in zip(document["frames"], poses.tolist(), strict=True):
-        frame["transform_matrix"] = [*pose, [0.0, 0.0, 0.0, 1.0]]
-    (folder / "transforms_train.json").write_text(json.dumps(document))
+        if not path.name.startswith("transforms_"):
+            if not (folder / path.name).exists():
+                os.symlink(path, folder / path.name)
+            continue
+        document = json.loads(path.read_text("utf-8")) | {name: float(values[0]) for name, values in lens.items()}
+        for frame in document["frames"]:
+            frame["object_mask_path"] = frame.pop("mask_path")  # a frame's `mask_path` says what to ignore there
+        if path.name == "transforms_train.json":
+            for frame, pose in zip(document["frames"], cameras.camera_to_world.tolist(), strict=True):
+                frame["transform_matrix"] = [*pose, [0.0, 0.0, 0.0, 1.0]]
+        (folder / path.name).write_text(json.dumps(document))
     return folder
 
 
-def line(row: str, run: Path, true: Cameras, moved: Float[Tensor, "V 3 4"]) -> str:
+def line(row: str, run: Path, true: Cameras, moved: Float[Tensor, "V 3 4"], believed: Cameras) -> str:
     """A row of the table."""
     poses = true.camera_to_world.double()
+    lens = [float(values[0]) for values in (true.fx, true.cx, true.cy)]
+    known = list(lens)
     if row != "true":
-        poses = moved
+        poses, known = moved, [float(values[0]) for values in (believed.fx, believed.cx, believed.cy)]
     if row.startswith("refined"):
         document = json.loads((run / "cameras.json").read_text("utf-8"))
         poses = torch.tensor([frame["transform_matrix"][:3] for frame in document["frames"]], dtype=torch.float64)
+        known = [{**document, **document["frames"][0]}[name] for name in ("fl_x", "cx", "cy")]
     result = read_metrics_json(run / "metrics.json")
     turn, shift = errors(poses, true)
     aligned = result.treatments.get("aligned")
     return (
         f"{row:<12} {result.result.mean('psnr'):6.2f} {result.result.mean('psnr', 'mask') or math.nan:15.2f} "
         f"{aligned.mean('psnr') if aligned else math.nan:9.2f} {turn.median():10.3f} {turn.max():9.3f} "
-        f"{shift.median():10.3f} {shift.max():9.3f}"
+        f"{shift.median():10.3f} {shift.max():9.3f} {100 * (known[0] / lens[0] - 1):17.3f} "
+        f"{math.dist(known[1:], lens[1:]):25.3f}"
     )
 
 
