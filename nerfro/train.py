@@ -47,7 +47,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     validation = source.load("val").checked() if config.evaluation.every > 0 and "val" in source.splits else None
     wanted, training = config.batches, source.load("train")
     precrop = wanted.precrop_steps, wanted.precrop_fraction
-    batches = RayBatches(training, wanted.size, wanted.batching, config.seed, *precrop, wanted.jitter)
+    batches = RayBatches(training, wanted.size, wanted.batching, config.seed, *precrop, wanted.jitter, wanted.object)
     supersampling = Supersampling.of(config.evaluation)
     lpips = find_lpips_networks(config.evaluation.lpips_backbone, config.evaluation.lpips_vgg_backbone)
     model = build_model(config, training)

@@ -40,6 +40,8 @@ class BatchesConfig:
     # Pixels of `single_image` at a time, or of `all_images`.
     batching: Annotated[str, Literal["single_image", "all_images"]] = "single_image"
     jitter: bool = False  # draw each ray anywhere inside its pixel instead of through its centre
+    # Share of the pixels of a step that is drawn of the object's alone, which masks tell; the others are of all pixels.
+    object: Annotated[float, Range(at_least=0, at_most=1)] = 0.0
     # Training views, spread over the cameras' places, that are not trained on: they are the `val` split then.
     hold_back: Natural = 0
     precrop_steps: Natural = 0  # number of first steps that see only the central window of the images

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
-from typing import Literal
+from collections.abc import Callable, Iterable
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from nerfro.allowed import Count, Natural, checked
+from nerfro.allowed import Count, Natural, Range, checked
 from nerfro.cameras import Cameras, Window, central_window
 from nerfro.data.base import Views
-from nerfro.data.pictures import Pictures
 from nerfro.data.pixel_store import PixelStore
 from nerfro.distributed import share_of
 from nerfro.errors import NerfroError
@@ -51,6 +50,7 @@ class RayBatches:
         precrop_steps: Natural = 0,
         precrop_fraction: float = 0.5,
         jitter: bool = False,
+        object_share: Annotated[float, Range(at_least=0, at_most=1)] = 0.0,
     ) -> None:
         if len(views) == 0:
             raise NerfroError("there are no training images; give at least one")
@@ -71,10 +71,14 @@ class RayBatches:
                 f"{' offers while precropped' if precrop_steps > 0 else ' has'}; take a smaller one, or all_images"
             )
         self._usable: dict[Window, _Usable] | None = None
+        windows = {self._crop, central_window(cameras.height, cameras.width, 1.0)}
         if views.usable is not None:
-            windows = {self._crop, central_window(cameras.height, cameras.width, 1.0)}
-            self._usable = {window: _Usable(views.usable, window) for window in windows}
+            usable = views.usable
+            self._usable = {window: _Usable((view == 1 for view in usable), len(views), window) for window in windows}
             self._check_usable(np.diff(self._usable[self._crop].starts), views.names)
+        self._num_of_object = round(object_share * batch_size)
+        if self._num_of_object:
+            self._of_object = {window: _of_object(views, batching, window) for window in windows}
 
     def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> RayBatches:
         """The same sequence with cameras and pixels on another device, its rays in another precision."""
@@ -123,6 +127,7 @@ class RayBatches:
         """A sequence of at most so many pixels a step."""
         few = copy.copy(self)
         few.batch_size = min(most, self.batch_size)
+        few._num_of_object = self._num_of_object * few.batch_size // self.batch_size
         ends = (end * few.batch_size // self.batch_size for end in (self._share.start or 0, self._share.stop))
         few._share = slice(*ends)
         return few
@@ -290,9 +295,16 @@ class RayBatches:
             drawn = generator.choice(end - first, self.batch_size, replace=False, shuffle=False)
             return (view, drawn) if usable is None else usable.find(first + drawn)
         if usable is not None:
-            return usable.find(generator.integers(usable.starts[-1], size=self.batch_size))
-        views = generator.integers(len(self._cameras), size=self.batch_size)
-        return views, generator.integers(num_pixels, size=self.batch_size)
+            views, pixels = usable.find(generator.integers(usable.starts[-1], size=self.batch_size))
+        else:
+            views = generator.integers(len(self._cameras), size=self.batch_size)
+            pixels = generator.integers(num_pixels, size=self.batch_size)
+        if self._num_of_object:
+            of_object = self._of_object[window]
+            # Spread over the batch, so that processes have the same number each.
+            rows = np.arange(self._num_of_object) * self.batch_size // self._num_of_object
+            views[rows], pixels[rows] = of_object.find(generator.integers(of_object.starts[-1], size=len(rows)))
+        return views, pixels
 
     def _check_usable(self, counts: Int[np.ndarray, "V"], names: list[str]) -> None:
         """Refuse masks that leave too few pixels to draw a batch from."""
@@ -311,11 +323,25 @@ def _main_exits(path: Path) -> Float[Tensor, "R 3"]:
     return path.first_of_ray(path.exit_directions)
 
 
+def _of_object(views: Views, batching: Batching, window: Window) -> _Usable:
+    """The pixels that the object fills, by half at least."""
+    if views.masks is None or batching == "single_image":
+        raise NerfroError("batches.object draws pixels of the object from all images; it needs masks, and all_images")
+    filled = (view > 0.5 for view in views.masks)
+    if views.usable is not None:
+        filled = (mask & (view == 1) for mask, view in zip(filled, views.usable, strict=True))
+    found = _Usable(filled, len(views), window)
+    if found.starts[-1] == 0:
+        raise NerfroError("batches.object draws pixels of the object, and the masks have none; correct them, or take 0")
+    return found
+
+
 class _Usable:
     """The pixels of a window that may be drawn, numbered one view's after another's, kept as bits.
 
     Args:
-        usable: 1 in the pixels [H, W] that may be drawn, of each view.
+        usable: whether each pixel [H, W] may be drawn, of each view.
+        num_views: their number.
         window: of pixels.
 
     Attributes:
@@ -324,13 +350,13 @@ class _Usable:
 
     _BLOCK = 64  # bits that are counted together
 
-    def __init__(self, usable: Pictures | Bool[Tensor, "V H W"], window: Window) -> None:
+    def __init__(self, usable: Iterable[Bool[Tensor, "H W"]], num_views: int, window: Window) -> None:
         num_blocks = -(-window.height * window.width // self._BLOCK)
-        self._bits: UInt8[np.ndarray, "V B 8"] = np.empty((len(usable), num_blocks, self._BLOCK // 8), np.uint8)
-        counts = np.empty((len(usable), num_blocks), np.int64)
+        self._bits: UInt8[np.ndarray, "V B 8"] = np.empty((num_views, num_blocks, self._BLOCK // 8), np.uint8)
+        counts = np.empty((num_views, num_blocks), np.int64)
         for index, view in enumerate(usable):
             blocks = np.zeros((num_blocks, self._BLOCK), bool)
-            blocks.flat[: window.height * window.width] = window.cut(view[None] == 1).flatten().cpu().numpy()
+            blocks.flat[: window.height * window.width] = window.cut(view[None]).flatten().cpu().numpy()
             self._bits[index], counts[index] = np.packbits(blocks, axis=-1), blocks.sum(-1)
         self._before = np.cumsum(counts) - counts.flatten()  # usable pixels before each block
         self.starts: Int[np.ndarray, "V+1"] = np.cumsum([0, *counts.sum(1)])

@@ -137,6 +137,37 @@ def test_masked_batch_of_one_image_is_different_usable_pixels_of_it(masked):
         assert len((batch.index // (HEIGHT * WIDTH)).unique()) == 1
 
 
+def test_a_share_of_the_pixels_is_of_the_object(views, masked):
+    masks = torch.zeros(NUM_VIEWS, HEIGHT, WIDTH)
+    masks[1, 2:5, 3:7] = 1.0
+    masks[4, 6, 6:9] = 0.7
+    masks[4, 7] = 0.4  # covered by less than a half
+    of_object = (masks > 0.5).flatten()
+    for given in (views, masked):
+        batches = RayBatches(replace(given, masks=masks), 64, "all_images", seed=0, object_share=0.25)
+        wanted = of_object if given.usable is None else of_object & given.usable.flatten()
+        counts = torch.zeros(len(wanted))
+        for step in range(300):
+            counts += torch.bincount(batches.batch(step).index, minlength=len(counts))
+        usable = torch.ones_like(wanted) if given.usable is None else given.usable.flatten()
+        others, own = 300 * 48 / int(usable.sum()), 300 * 16 / int(wanted.sum())
+        expected = torch.where(usable, others, 0.0) + torch.where(wanted, own, 0.0)
+        assert ((counts - expected).abs() <= 6 * expected.sqrt()).all()
+        processes = [batches.share(rank, 2).batch(3).index for rank in range(2)]
+        assert torch.equal(torch.cat(processes), batches.batch(3).index)
+        assert min(int(wanted[index].sum()) for index in processes) >= 8
+
+
+def test_pixels_of_an_object_need_masks_and_all_images(views):
+    masks = torch.zeros(NUM_VIEWS, HEIGHT, WIDTH)
+    with pytest.raises(NerfroError, match="needs masks"):
+        RayBatches(views, 64, "all_images", object_share=0.25)
+    with pytest.raises(NerfroError, match="all_images"):
+        RayBatches(replace(views, masks=masks + 1), 64, object_share=0.25)
+    with pytest.raises(NerfroError, match="the masks have none"):
+        RayBatches(replace(views, masks=masks), 64, "all_images", object_share=0.25)
+
+
 def test_every_view_has_its_own_usable_pixels(views, masked):
     size = HEIGHT * WIDTH
     own = torch.arange(NUM_VIEWS)[:, None]
