@@ -179,7 +179,7 @@ def test_what_was_found_chooses_the_experiment(
     assert pretended.names[1:] == ["preprocess", "train", "summary"]
     assert pretended.ran[1][1][:4] == ["data=blender", f"data.root={tiny_scene}", "medium=vessel", "medium.wall=0.1"]
     train = pretended.ran[2][1]
-    assert train[0] == "+experiment=refractive_room"
+    assert train[0] == "+experiment=glass_room"
     assert train[1:5] == ["data=opencv", "medium.ior=1.4", "medium.ior=1.37", "camera.exposure=true"]
     assert "medium.ior=1.37 fits best, but the photographs do not tell for sure" in done.out
 

@@ -73,10 +73,10 @@ def training_options(config: DictConfig, overrides: list[str], surface: Path) ->
         warn(f"{' '.join(found['doubtful'])} fits best, but the photographs do not tell for sure; see {surface.parent}")
     options = [*found["options"], *found["doubtful"]]
     if not is_given("experiment", extra):
-        # A vessel's materials are known. In a room, following reflections and learning the index cost more than they
-        # win in the same time (docs/real.md).
+        # A vessel's materials are known. In a room, following all reflections and learning the index cost more than
+        # they win in the same time (docs/real.md).
         far = "glass" if "wall" in config.medium else "unknown"
-        options.insert(0, f"+experiment={'refractive_room' if found['near'] else far}")
+        options.insert(0, f"+experiment={'glass_room' if found['near'] else far}")
     if not is_given("camera.exposure", extra):
         options.append("camera.exposure=true")  # telephones choose one for each photograph
     if not is_given("data.downscale", overrides):
