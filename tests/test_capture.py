@@ -154,7 +154,7 @@ def test_from_photographs_to_a_table(
     assert figures["hull, intersection over union with the object"] >= 0.93
     run_folder = tmp_path / "run"
     finished = train_here(
-        "+experiment=refractive_room",
+        "+experiment=glass_room",
         *printed_command("train on it", printed),
         *("trainer.max_steps=40", "trainer.max_time=null", "trainer.accelerator=cpu", "logger=none"),
         *("data.downscale=10", "batches.size=512", "evaluation.supersample=1"),
