@@ -14,6 +14,7 @@ from torch import Tensor
 
 from nerfro.allowed import Count, Natural, Range, checked
 from nerfro.cameras import Cameras, Window, central_window
+from nerfro.cli import warn
 from nerfro.data.base import Views
 from nerfro.data.pixel_store import PixelStore
 from nerfro.distributed import share_of
@@ -77,6 +78,9 @@ class RayBatches:
             self._usable = {window: _Usable((view == 1 for view in usable), len(views), window) for window in windows}
             self._check_usable(np.diff(self._usable[self._crop].starts), views.names)
         self._num_of_object = round(object_share * batch_size)
+        if self._num_of_object and views.masks is None:
+            warn("batches.object: not every training photograph has a mask, so pixels are drawn of all alike")
+            self._num_of_object = 0
         if self._num_of_object:
             self._of_object = {window: _of_object(views, batching, window) for window in windows}
 
@@ -325,8 +329,9 @@ def _main_exits(path: Path) -> Float[Tensor, "R 3"]:
 
 def _of_object(views: Views, batching: Batching, window: Window) -> _Usable:
     """The pixels that the object fills, by half at least."""
-    if views.masks is None or batching == "single_image":
-        raise NerfroError("batches.object draws pixels of the object from all images; it needs masks, and all_images")
+    assert views.masks is not None
+    if batching == "single_image":
+        raise NerfroError("batches.object draws pixels of the object from all images; take batches.batching=all_images")
     filled = (view > 0.5 for view in views.masks)
     if views.usable is not None:
         filled = (mask & (view == 1) for mask, view in zip(filled, views.usable, strict=True))

@@ -158,10 +158,14 @@ def test_a_share_of_the_pixels_is_of_the_object(views, masked):
         assert min(int(wanted[index].sum()) for index in processes) >= 8
 
 
-def test_pixels_of_an_object_need_masks_and_all_images(views):
+def test_without_masks_there_are_no_pixels_of_the_object(views, capsys):
+    batches = RayBatches(views, 64, "all_images", seed=3, object_share=0.25)
+    assert "not every training photograph has a mask" in capsys.readouterr().out
+    assert torch.equal(batches.batch(5).index, RayBatches(views, 64, "all_images", seed=3).batch(5).index)
+
+
+def test_pixels_of_an_object_need_all_images_and_an_object(views):
     masks = torch.zeros(NUM_VIEWS, HEIGHT, WIDTH)
-    with pytest.raises(NerfroError, match="needs masks"):
-        RayBatches(views, 64, "all_images", object_share=0.25)
     with pytest.raises(NerfroError, match="all_images"):
         RayBatches(replace(views, masks=masks + 1), 64, object_share=0.25)
     with pytest.raises(NerfroError, match="the masks have none"):
