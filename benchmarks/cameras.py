@@ -46,36 +46,30 @@ def main() -> None:
     with TemporaryDirectory() as folder:
         out = Path(given.out or folder).resolve()
         true = BlenderData(given.root).load("train").cameras
-        moved = disturbed(true, math.radians(given.degrees), given.percent / 100, given.seed)
         believed = replace(
             true,
+            camera_to_world=disturbed(true, math.radians(given.degrees), given.percent / 100, given.seed),
             fx=true.fx * (1 + given.focal / 100),
             fy=true.fy * (1 + given.focal / 100),
             cx=true.cx + given.principal,
             cy=true.cy - given.principal,
         )
-        data = write_disturbed(resolve_path(given.root), replace(believed, camera_to_world=moved), out / "data")
+        data = write_disturbed(resolve_path(given.root), believed, out / "data")
+        spoilt = [f"data.root={data}", "data=nerfstudio", f"data.near={true.near:g}", f"data.far={true.far:g}"]
+        lens = "true" if given.focal or given.principal else "false"
         print(
-            "poses          PSNR   on the object   aligned   rotation, degrees    position, % of the distance", end=""
+            "poses          PSNR   on the object   aligned   rotation, degrees    position, % of the distance   "
+            "focal length, %   principal point, pixels\n"
+            "                                                 median   largest     median   largest",
+            flush=True,
         )
-        print("   focal length, %   principal point, pixels")
-        print("                                                 median   largest     median   largest", flush=True)
         for row in given.rows:
             run = out / row
-            bounds = f"data.near={true.near:g}", f"data.far={true.far:g}"
-            root = [given.root] if row == "true" else [str(data), "data=nerfstudio", *bounds]
-            camera = ["camera=refined"] if row.startswith("refined") else []
-            camera += ["camera.lens=true"] if camera and (given.focal or given.principal) else []
-            options = [
-                f"data.root={root[0]}",
-                *root[1:],
-                *camera,
-                *given.options,
-                f"hydra.run.dir={run}",
-                "logger=none",
-            ]
+            source = [f"data.root={given.root}"] if row == "true" else spoilt
+            camera = ["camera=refined", f"camera.lens={lens}"] if row.startswith("refined") else []
+            options = [*source, *camera, *given.options, f"hydra.run.dir={run}", "logger=none"]
             subprocess.run([sys.executable, "-m", "nerfro.train", *options], check=True, stdout=subprocess.DEVNULL)
-            print(line(row, run, true, moved, believed), flush=True)
+            print(line(row, run, true, true if row == "true" else believed), flush=True)
 
 
 def disturbed(cameras: Cameras, angle: float, share: float, seed: int) -> Float[Tensor, "V 3 4"]:
@@ -113,25 +107,22 @@ def write_disturbed(root: Path, cameras: Cameras, folder: Path) -> Path:
     return folder
 
 
-def line(row: str, run: Path, true: Cameras, moved: Float[Tensor, "V 3 4"], believed: Cameras) -> str:
-    """A row of the table."""
-    poses = true.camera_to_world.double()
-    lens = [float(values[0]) for values in (true.fx, true.cx, true.cy)]
-    known = list(lens)
-    if row != "true":
-        poses, known = moved, [float(values[0]) for values in (believed.fx, believed.cx, believed.cy)]
+def line(row: str, run: Path, true: Cameras, believed: Cameras) -> str:
+    """A row of the table; where cameras were refined, they are those of the run instead of those believed at first."""
+    poses = believed.camera_to_world.double()
+    true_lens, lens = ([float(values[0]) for values in (each.fx, each.cx, each.cy)] for each in (true, believed))
     if row.startswith("refined"):
-        document = json.loads((run / "cameras.json").read_text("utf-8"))
-        poses = torch.tensor([frame["transform_matrix"][:3] for frame in document["frames"]], dtype=torch.float64)
-        known = [{**document, **document["frames"][0]}[name] for name in ("fl_x", "cx", "cy")]
+        frames = json.loads((run / "cameras.json").read_text("utf-8"))["frames"]
+        poses = torch.tensor([frame["transform_matrix"][:3] for frame in frames], dtype=torch.float64)
+        lens = [frames[0][name] for name in ("fl_x", "cx", "cy")]
     result = read_metrics_json(run / "metrics.json")
     turn, shift = errors(poses, true)
     aligned = result.treatments.get("aligned")
     return (
         f"{row:<12} {result.result.mean('psnr'):6.2f} {result.result.mean('psnr', 'mask') or math.nan:15.2f} "
         f"{aligned.mean('psnr') if aligned else math.nan:9.2f} {turn.median():10.3f} {turn.max():9.3f} "
-        f"{shift.median():10.3f} {shift.max():9.3f} {100 * (known[0] / lens[0] - 1):17.3f} "
-        f"{math.dist(known[1:], lens[1:]):25.3f}"
+        f"{shift.median():10.3f} {shift.max():9.3f} {100 * (lens[0] / true_lens[0] - 1):17.3f} "
+        f"{math.dist(lens[1:], true_lens[1:]):25.3f}"
     )
 
 

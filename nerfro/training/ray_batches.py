@@ -77,11 +77,11 @@ class RayBatches:
             usable = views.usable
             self._usable = {window: _Usable((view == 1 for view in usable), len(views), window) for window in windows}
             self._check_usable(np.diff(self._usable[self._crop].starts), views.names)
-        self._num_of_object = round(object_share * batch_size)
-        if self._num_of_object and views.masks is None:
+        self._object_share = object_share
+        self._of_object: dict[Window, _Usable] | None = None
+        if object_share > 0 and views.masks is None:
             warn("batches.object: not every training photograph has a mask, so pixels are drawn of all alike")
-            self._num_of_object = 0
-        if self._num_of_object:
+        elif object_share > 0:
             self._of_object = {window: _of_object(views, batching, window) for window in windows}
 
     def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> RayBatches:
@@ -131,7 +131,6 @@ class RayBatches:
         """A sequence of at most so many pixels a step."""
         few = copy.copy(self)
         few.batch_size = min(most, self.batch_size)
-        few._num_of_object = self._num_of_object * few.batch_size // self.batch_size
         ends = (end * few.batch_size // self.batch_size for end in (self._share.start or 0, self._share.stop))
         few._share = slice(*ends)
         return few
@@ -303,10 +302,10 @@ class RayBatches:
         else:
             views = generator.integers(len(self._cameras), size=self.batch_size)
             pixels = generator.integers(num_pixels, size=self.batch_size)
-        if self._num_of_object:
-            of_object = self._of_object[window]
+        if self._of_object is not None:
+            of_object, count = self._of_object[window], round(self._object_share * self.batch_size)
             # Spread over the batch, so that processes have the same number each.
-            rows = np.arange(self._num_of_object) * self.batch_size // self._num_of_object
+            rows = np.arange(count) * self.batch_size // max(1, count)
             views[rows], pixels[rows] = of_object.find(generator.integers(of_object.starts[-1], size=len(rows)))
         return views, pixels
 
@@ -328,7 +327,7 @@ def _main_exits(path: Path) -> Float[Tensor, "R 3"]:
 
 
 def _of_object(views: Views, batching: Batching, window: Window) -> _Usable:
-    """The pixels that the object fills, by half at least."""
+    """The pixels of which the object fills more than a half."""
     assert views.masks is not None
     if batching == "single_image":
         raise NerfroError("batches.object draws pixels of the object from all images; take batches.batching=all_images")
