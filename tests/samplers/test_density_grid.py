@@ -158,3 +158,16 @@ def test_a_ray_that_does_not_split_is_sampled_as_ever() -> None:
     whole = sampler(split_in_two((1.0, 1.0)), None)
     assert torch.equal(whole.edges[::2], alone.edges)
     assert alone.occupied is None
+
+
+@pytest.mark.parametrize("resolution", [8, 9])
+def test_every_place_of_the_world_is_in_a_cell_that_is_looked_at(resolution: int) -> None:
+    sampler = DensityGridSampler(box_min=[-1] * 3, box_max=[1] * 3, radius=1.0, resolution=resolution)
+    middle = (torch.arange(301) - 150) / 150.5  # of the cube around the ball; some lie in all cells that touch it
+    places = torch.cartesian_prod(middle, middle, middle[::7])
+    places = places[places.norm(dim=-1) < 1]
+    cells = ((places + 1) / 2 * resolution).long()
+    numbers = (cells[:, 0] * resolution + cells[:, 1]) * resolution + cells[:, 2]
+    assert sampler.inside is not None
+    assert torch.isin(numbers.unique(), sampler.inside).all()
+    assert len(sampler.inside) < resolution**3
