@@ -21,7 +21,7 @@ import nerfro
 from nerfro.cameras import Cameras
 from nerfro.evaluation.render_view import render_view
 from nerfro.models.base import NerfModel
-from nerfro.pixel_parts import divergence, pixel_rays, rays_beside
+from nerfro.subdivision import divergence, neighbour_rays, pixel_rays
 
 CLASSES = ("past the glass", "things inside", "edges", "sky through the glass")
 
@@ -37,14 +37,14 @@ def main() -> None:
     scene = nerfro.load(arguments.run, device="cpu")
     model, views = scene.model, scene.views().checked()
     wanted = {"side": arguments.supersample, "divergence": arguments.divergence, "contrast": arguments.contrast}
-    supersampling = replace(scene.supersampling, **{name: value for name, value in wanted.items() if value is not None})
+    subdivision = replace(scene.subdivision, **{name: value for name, value in wanted.items() if value is not None})
     errors, classes = [], []
     for view in range(min(len(views), arguments.views or len(views))):
-        rendered = render_view(model, views.cameras, view, supersampling)
+        rendered = render_view(model, views.cameras, view, subdivision)
         prediction = model.photographed(rendered.radiance)
         errors.append((prediction - views.images[view].reshape(-1, 3)).square().mean(-1))
         classes.append(classify(model, views.cameras, view, rendered.opacity, arguments.edge))
-    print(f"{arguments.run}, {len(errors)} test views, {supersampling.side}^2 rays in divided pixels\n")
+    print(f"{arguments.run}, {len(errors)} test views, {subdivision.side}^2 rays in divided pixels\n")
     print("| pixels | share of pixels | share of squared error | PSNR of these | PSNR of all if these were perfect |")
     print("|---|---|---|---|---|")
     for row in budget(torch.cat(errors), torch.cat(classes)):
@@ -57,7 +57,7 @@ def classify(model: NerfModel, cameras: Cameras, view: int, opacity: Tensor, edg
     size = cameras.height * cameras.width
     parted, refracted = [], []
     for pixels in torch.arange(view * size, (view + 1) * size).split(model.chunk_size):
-        own, beside = (model.trace(rays(cameras, pixels)) for rays in (pixel_rays, rays_beside))
+        own, beside = (model.trace(rays(cameras, pixels)) for rays in (pixel_rays, neighbour_rays))
         leaving = [path.first_of_ray(path.exit_directions) for path in (own, beside)]
         parted.append(divergence(cameras, pixels, *leaving) >= edge)
         refracted.append(own.first_of_ray(own.refracted))

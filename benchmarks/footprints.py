@@ -28,16 +28,15 @@ from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.boundaries.envmap import _radiance as radiance_of
 from nerfro.cameras import Cameras
 from nerfro.data.blender import BlenderData
-from nerfro.evaluation.render_view import Supersampling
 from nerfro.files import lat_long
 from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import RoundedBox
 from nerfro.models.base import NerfModel
-from nerfro.pixel_parts import contrast, divergence, part_rays, pixel_rays, rays_beside
 from nerfro.rays import Rays
 from nerfro.samplers.snell import Snell
 from nerfro.scenes.skies import lat_long_texture
+from nerfro.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
 from nerfro.types import Exits
 
 TRUTH = 16  # rays a side of a pixel
@@ -179,7 +178,7 @@ def trained_run(run: Path, num_views: int) -> None:
         row, rays = [], 0.0
         for boundary in (sky, ByFootprint(sky, averaged=True), ByFootprint(sky, averaged=False)):
             model.boundary = boundary
-            shown = [rendered(model, views.cameras, view, replace(scene.supersampling, side=side)) for view in chosen]
+            shown = [rendered(model, views.cameras, view, replace(scene.subdivision, side=side)) for view in chosen]
             errors = [
                 (rgb - views.images[view].reshape(-1, 3)).square().mean()
                 for view, (rgb, _) in zip(chosen, shown, strict=True)
@@ -189,17 +188,19 @@ def trained_run(run: Path, num_views: int) -> None:
         print(f"| {side}x{side} | {rays:.1f} | " + " | ".join(row) + " |", flush=True)
 
 
-def rendered(model: NerfModel, cameras: Cameras, view: int, supersampling: Supersampling) -> tuple[Tensor, float]:
+def rendered(model: NerfModel, cameras: Cameras, view: int, subdivision: Subdivision) -> tuple[Tensor, float]:
     """A view (sRGB) as `render_view` makes it, but for the footprints of parts, half their spacing; rays a pixel."""
     size = cameras.height * cameras.width
     pixels = torch.arange(view * size, (view + 1) * size)
     rays = cameras.image_rays(view)
     central = model.render(replace(rays, radii=torch.zeros_like(rays.radii)))
-    beside = torch.cat([model.exit_directions(rays_beside(cameras, some)) for some in pixels.split(model.chunk_size)])
+    beside = torch.cat(
+        [model.exit_directions(neighbour_rays(cameras, some)) for some in pixels.split(model.chunk_size)]
+    )
     shown, radiance = model.photographed(central.radiance), central.radiance.clone()
-    divided = divergence(cameras, pixels, central.exit_directions, beside) >= supersampling.divergence
-    divided |= contrast(lambda some: shown[some - pixels[0]], cameras, pixels) >= (supersampling.contrast or math.inf)
-    side = supersampling.side
+    divided = divergence(cameras, pixels, central.exit_directions, beside) >= subdivision.divergence
+    divided |= contrast(lambda some: shown[some - pixels[0]], cameras, pixels) >= (subdivision.contrast or math.inf)
+    side = subdivision.side
     for some in divided.nonzero()[:, 0].split(model.chunk_size // side**2):
         parts = part_rays(cameras, pixels[some], side)
         exits = model.exit_directions(parts).view(-1, side, side, 3)
@@ -277,7 +278,7 @@ class View:
         shown = to_srgb(self._pyramid(self._central)).clamp(0, 1)
         every = torch.arange(self._first, self._first + len(shown))
         result = contrast(lambda some: shown[some - self._first], cameras, every) >= 0.1
-        result |= divergence(cameras, every, self._central, self._trace(rays_beside(cameras, every))[0]) >= 1.5
+        result |= divergence(cameras, every, self._central, self._trace(neighbour_rays(cameras, every))[0]) >= 1.5
         return result[self.pixels - self._first], result
 
     def as_evaluated(self, side: int, scale: float | None, divided: Tensor) -> Tensor:

@@ -20,13 +20,13 @@ from torch import Tensor, nn
 
 from nerfro.boundaries import cube_map
 from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.draws import Draws
 from nerfro.fields import hash_encoding
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.fields.spherical_harmonics import spherical_harmonics
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.media.analytic import Vacuum
 from nerfro.samplers.density_grid import DensityGridSampler
-from nerfro.samplers.stepfun import spread_uniform
 from nerfro.samplers.straight import Straight
 from nerfro.types import Exits, Rays, Samples
 
@@ -152,8 +152,9 @@ def drawing_tasks(num_rays: int) -> list[tuple[str, Task, Task]]:
     ):
         sampler = DensityGridSampler(**options)
         sampler.density = 20 * torch.rand(sampler.density.shape) ** 8
-        u = spread_uniform(path, sampler.num_samples + 1, True)
-        tasks.append((f"drawing in {label}", partial(sampler.draw, path, u), partial(sampler.draw_compiled, path, u)))
+        draws = Draws(0, 0, torch.arange(num_rays))
+        twin, compiled = partial(sampler.draw, path, draws), partial(sampler.draw_compiled, path, draws)
+        tasks.append((f"drawing in {label}", twin, compiled))
     return tasks
 
 

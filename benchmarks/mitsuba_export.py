@@ -3,7 +3,7 @@
     python -m nerfro.export checkpoint=RUN what=mitsuba out=S/scene.xml
     python benchmarks/mitsuba_export.py RUN S/scene.xml
 
-PSNR of whole pictures, ours with the run's own supersampling. `transmitting_glass` shows no partial reflection, as a
+PSNR of whole pictures, ours with the run's own subdivision. `transmitting_glass` shows no partial reflection, as a
 model that was trained with `sampler.path.branches=none`; `dielectric` is real glass.
 """
 

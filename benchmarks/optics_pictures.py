@@ -22,9 +22,9 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball, RoundedBox
 from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.paths import ASSETS_DIR
-from nerfro.pixel_parts import part_rays
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.snell import Snell
+from nerfro.subdivision import part_rays
 from nerfro.types import Path as RayPath
 from nerfro.types import Rays
 

@@ -35,12 +35,13 @@ from torch.profiler import ProfilerActivity, profile, record_function
 from torch.utils.flop_counter import FlopCounterMode
 
 import nerfro
-from nerfro.evaluation.render_view import Supersampling, render_view
+from nerfro.evaluation.render_view import render_view
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.models.base import NerfModel
 from nerfro.paths import ASSETS_DIR, CONF_DIR
 from nerfro.registry import build, discover
+from nerfro.subdivision import Subdivision
 from nerfro.training.config import TrainConfig, build_model
 from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.ray_batches import RayBatches
@@ -385,7 +386,7 @@ def report_view(path: Path, side: int = 400, turns: int = 5) -> None:
     scene = nerfro.load(path)
     cameras, model = scene.cameras("test").resized(side, side), scene.model
     print(f"| {side}x{side} view of `{scene.name}` | s | processor, s |\n|---|---|---|")
-    for name, sampling in (("one ray a pixel", Supersampling()), ("supersampled", scene.supersampling)):
+    for name, sampling in (("one ray a pixel", Subdivision()), ("supersampled", scene.subdivision)):
         measured = [spent(lambda: render_view(model, cameras, 0, sampling)) for _ in range(turns)]  # noqa: B023
         print(f"| {name} | {min(wall for wall, _ in measured):.2f} | {min(busy for _, busy in measured):.2f} |")
     parts: dict[str, list[tuple[object, str]]] = {
@@ -402,7 +403,7 @@ def report_view(path: Path, side: int = 400, turns: int = 5) -> None:
             for name, methods in parts.items():
                 for owner, method in methods:
                     clock(stack, owner, method, name, seconds)
-            busy = spent(lambda: render_view(model, cameras, 0, Supersampling()))[1]
+            busy = spent(lambda: render_view(model, cameras, 0, Subdivision()))[1]
         if busy < fastest:
             fastest, of_parts = busy, seconds
     print("\n| one ray a pixel | processor, s |\n|---|---|")

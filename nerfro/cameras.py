@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
+from nerfro.draws import Draws
 from nerfro.errors import NerfroError
 from nerfro.lens import distort, undistort
 from nerfro.rays import Rays
@@ -167,19 +168,18 @@ class Cameras:
         """Rays through all pixel centres of one view, row by row."""
         return self._window_rays(view, Window(0, 0, self.height, self.width))
 
-    def tile(self, size: int, generator: torch.Generator | None = None) -> Float[Tensor, "T T 3"]:
+    def tile(self, size: int, draws: Draws) -> Float[Tensor, "T T 3"]:
         """Unit viewing directions, in world space, of a random window of a random view.
 
         Args:
             size: side of the window in pixels; the image's shorter side where that is smaller.
-            generator: source of randomness on the CPU.
+            draws: random numbers that choose view and window.
         """
         side = min(size, self.height, self.width)
-        # Drawn on the CPU whatever the cameras' device: no synchronisation, and the same tile on every device.
-        view, top, left = (
-            int(torch.randint(count, (), generator=generator))
-            for count in (len(self), self.height - side + 1, self.width - side + 1)
-        )
+        # Drawn on the CPU whatever the cameras' device, so that the host does not wait for it.
+        words = draws.words(torch.zeros(1, dtype=torch.long), 3, "tile")[0].tolist()
+        counts = len(self), self.height - side + 1, self.width - side + 1
+        view, top, left = (word * count >> 32 for word, count in zip(words, counts, strict=True))
         return self._window_rays(view, Window(top, left, side, side)).directions.reshape(side, side, 3)
 
     def _window_rays(self, view: int, window: Window) -> Rays:

@@ -27,7 +27,7 @@ def main(config: DictConfig) -> None:
     shots = find_shots(config, scenes[0])
     rendering = Rendering(scenes, labels(config), LAYERS[config.what], sweep)
     read = [*map(checkpoint_of, runs), *([config.sky] if config.sky else []), *(sweep.files if sweep else [])]
-    request = (config.what, config.sweep, rendering.labels, scenes[0].supersampling, *map(file_hash, read))
+    request = (config.what, config.sweep, rendering.labels, scenes[0].subdivision, *map(file_hash, read))
     folder = user_path(config.out)
     files = render_frames(rendering, shots, folder, f".{config.format}", request, config.overwrite)
     print(f"{len(files)} frames: {files[0]}")

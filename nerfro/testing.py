@@ -16,6 +16,7 @@ from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.camera.base import Camera
 from nerfro.cameras import Cameras
 from nerfro.data.base import DataSource
+from nerfro.draws import Draws
 from nerfro.fields.base import Field
 from nerfro.fields.nerf import NerfField
 from nerfro.losses.base import Loss
@@ -79,14 +80,28 @@ def example_rendering() -> Rendering:
     return composite(samples, Radiance(density, rgb), torch.full((NUM_RAYS, 3), 0.3), example_path())
 
 
-def example_batch() -> Batch:
-    """A batch of the example rays with two small training cameras."""
+def example_batch(num_rays: int = NUM_RAYS) -> Batch:
+    """A batch of the example rays, one through each grey pixel, with two small training cameras."""
     pose = torch.eye(4)[:3].repeat(2, 1, 1)
     pose[:, 2, 3] = 4
     two = torch.full((2,), 8.0)
     cameras = Cameras(pose, two, two, two, two, width=16, height=16, near=2.0, far=6.0)
-    view = torch.arange(NUM_RAYS) % 2
-    return Batch(example_rays(), view, torch.full((NUM_RAYS, 3), 0.5), cameras)
+    every = torch.arange(num_rays)
+    return Batch(
+        rays=example_rays(num_rays),
+        pixel=every,
+        index=every,
+        view=every % 2,
+        rgb=torch.full((num_rays, 3), 0.5),
+        teaches_background=torch.ones(num_rays, dtype=torch.bool),
+        cameras=cameras,
+        draws=example_draws(num_rays),
+    )
+
+
+def example_draws(num_rays: int = NUM_RAYS, step: int = 0) -> Draws:
+    """Random numbers of a training step."""
+    return Draws(seed=0, step=step, ray=torch.arange(num_rays))
 
 
 def _check_medium(medium: Medium) -> None:
@@ -129,20 +144,20 @@ def _check_path_sampler(sampler: PathSampler) -> None:
 
 def _check_point_sampler(sampler: PointSampler) -> None:
     path = example_path()
-    for training in (True, False):
-        sampler.train(training)
-        drawn = []
-        for _ in range(2):
-            rendering: Rendering | None = None
-            for _ in range(sampler.num_levels):
-                samples = sampler(path, rendering)
-                _check_samples(samples, path)
-                density = torch.ones_like(samples.s)
-                radiance = Radiance(density, samples.positions.sigmoid())
-                rendering = composite(samples, radiance, torch.zeros(NUM_RAYS, 3), path)
-            drawn.append(samples.s)
-        same = torch.equal(drawn[0], drawn[1])
-        _require(same != training, "samples are random in training and repeat in evaluation")
+
+    def drawn(draws: Draws | None) -> torch.Tensor:
+        rendering: Rendering | None = None
+        for _ in range(sampler.num_levels):
+            samples = sampler(path, rendering, draws)
+            _check_samples(samples, path)
+            radiance = Radiance(torch.ones_like(samples.s), samples.positions.sigmoid())
+            rendering = composite(samples, radiance, torch.zeros(NUM_RAYS, 3), path)
+        return samples.s
+
+    first = drawn(example_draws())
+    _require(torch.equal(first, drawn(example_draws())), "samples are a function of the random numbers of the step")
+    _require(not torch.equal(first, drawn(example_draws(step=1))), "samples are random in training")
+    _require(torch.equal(drawn(None), drawn(None)), "samples repeat in evaluation")
 
 
 def _check_samples(samples: Samples, path: Path) -> None:

@@ -13,11 +13,11 @@ from nerfro.cli import EXIT_INTERRUPTED, entry_point
 from nerfro.distributed import leave
 from nerfro.evaluation.lpips import find_lpips_networks
 from nerfro.evaluation.metrics import ImageMetrics
-from nerfro.evaluation.render_view import Supersampling
 from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.score_tables import report
 from nerfro.evaluation.treatments import score_split
 from nerfro.fields.mlp import compile_networks
+from nerfro.subdivision import Subdivision
 from nerfro.training.boundary_first import BoundaryFirst
 from nerfro.training.callbacks import StopOnSignal, Throughput
 from nerfro.training.camera_steps import CameraSteps
@@ -48,7 +48,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     wanted, training = config.batches, source.load("train")
     precrop = wanted.precrop_steps, wanted.precrop_fraction
     batches = RayBatches(training, wanted.size, wanted.batching, config.seed, *precrop, wanted.jitter, wanted.object)
-    supersampling = Supersampling.of(config.evaluation)
+    subdivision = Subdivision.of(config.evaluation)
     lpips = find_lpips_networks(config.evaluation.lpips_backbone, config.evaluation.lpips_vgg_backbone)
     model = build_model(config, training)
     require_same_run(folder, checkpoint, config)
@@ -83,7 +83,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     model.to(device)
     write_learned(folder, model, training)
     metrics = ImageMetrics(*lpips, prefix=config.evaluation.split)
-    result, treated = score_split(model, test, metrics, folder, supersampling, config.evaluation.refine_steps)
+    result, treated = score_split(model, test, metrics, folder, subdivision, config.evaluation.refine_steps)
     title = f"{config.name} on {config.data.root}, {config.evaluation.split} views"
     spent = trainer.global_step, throughput.seconds, throughput.rays_per_second
     report(RunMetrics(result, *spent, treated), title, folder)

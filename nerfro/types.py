@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from nerfro.cameras import Cameras
-from nerfro.distributed import rand_rays
+from nerfro.draws import Draws
 from nerfro.rays import Rays
 
 __all__ = ["Batch", "Exits", "Path", "Radiance", "Rays", "Rendering", "Samples"]
@@ -97,10 +97,6 @@ class Path:
         if not self.splits:
             return values
         return values[torch.searchsorted(self.ray, torch.arange(self.num_rays, device=self.ray.device))]
-
-    def rand(self, num: int) -> Float[Tensor, "P num"]:
-        """Uniform numbers in [0, 1): drawn for each ray (see `distributed.rand_rays`), the same for its polylines."""
-        return self.of_ray(rand_rays(self.num_rays, num, self.s))
 
     def moved(
         self,
@@ -339,23 +335,48 @@ class Rendering:
 
 @dataclass(frozen=True)
 class Batch:
-    """Training pixels: first those that have one ray, then the divided ones, all rays of each together, widest last."""
+    """Training pixels and the rays through them: R rays through Q pixels, at least one through each.
 
-    rays: Rays  # of the pixels, as the data's cameras give them
-    view: Int[Tensor, "R"]  # number of the training view that each ray belongs to
-    rgb: Float[Tensor, "R 3"]  # colour of the pixel that each ray belongs to (sRGB in [0, 1])
-    cameras: Cameras  # all training cameras, for losses that ask for further directions
-    num_whole: int | None = None  # number of pixels that have one ray; all by default
-    num_together: int | None = None  # number of rays of pixels whose rays leave close together; all by default
-    rays_per_pixel: int = 1  # of the divided ones
-    rows: Int[Tensor, "R"] | None = None  # which rows of the whole batch these are, where several processes share it
-    num_rows: int | None = None  # of the whole batch
-    path: Path | None = None  # of the rays, without gradients, where they are traced already
-    index: Int[Tensor, "R"] | None = None  # the pixel that each ray belongs to: `view * H * W + row * W + column`
+    Losses compare pixels, not rays: they average over the rays of each pixel with `per_pixel`, then over pixels with
+    `mean()`. That mean is right for several processes as well, because each has equally many pixels of a batch.
 
-    def of_pixels(self, rgb: Float[Tensor, "R 3"]) -> Float[Tensor, "P 3"]:
-        """Radiance (or colour) of pixels from that of their rays: its mean."""
-        if self.num_whole is None:
-            return rgb
-        divided = rgb[self.num_whole :].view(-1, self.rays_per_pixel, 3)
-        return torch.cat([rgb[: self.num_whole], divided.mean(1)])
+    Attributes:
+        rays: rays as the data set's cameras give them.
+        pixel: row of the pixel, from 0 to Q - 1, that each ray belongs to.
+        index: number of each pixel in the data set, view * H * W + row * W + column.
+        view: number of the training view of each pixel.
+        rgb: colour of each pixel in its photograph, sRGB in [0, 1].
+        teaches_background: pixels from which the background learns; the others would teach it speckle, because their
+            rays diverge.
+        cameras: all training cameras, for losses that need further directions.
+        draws: random numbers of the step, with an index for each ray.
+        path: paths of the rays without gradients; None where they are not traced yet.
+    """
+
+    rays: Rays
+    pixel: Int[Tensor, "R"]
+    index: Int[Tensor, "Q"]
+    view: Int[Tensor, "Q"]
+    rgb: Float[Tensor, "Q 3"]
+    teaches_background: Bool[Tensor, "Q"]
+    cameras: Cameras
+    draws: Draws
+    path: Path | None = None
+
+    @property
+    def ray_view(self) -> Int[Tensor, "R"]:
+        """Number of the training view of each ray."""
+        return self.view[self.pixel]
+
+    def per_pixel(self, values: Float[Tensor, "R *C"]) -> Float[Tensor, "Q *C"]:
+        """Average the values of each pixel's rays."""
+        return mean_per_pixel(values, self.pixel, len(self.rgb))
+
+
+def mean_per_pixel(values: Float[Tensor, "R *C"], pixel: Int[Tensor, "R"], num_pixels: int) -> Float[Tensor, "Q *C"]:
+    """Average the values of each pixel's rays, given the row of the pixel that each ray belongs to."""
+    if len(pixel) == num_pixels:  # one ray through each pixel, in their order
+        return values
+    total = values.new_zeros(num_pixels, *values.shape[1:]).index_add(0, pixel, values)
+    num_rays = values.new_zeros(num_pixels).index_add(0, pixel, torch.ones_like(pixel, dtype=values.dtype))
+    return total / num_rays.view(-1, *[1] * (values.ndim - 1))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import torch
 
+from nerfro.draws import Draws
 from nerfro.errors import NerfroError
 from nerfro.registry import register
 from nerfro.samplers.base import PointSampler
@@ -31,10 +32,10 @@ class LogarithmicSampler(PointSampler):
             raise NerfroError(f"logarithmic: num_samples={num_samples} growth={growth}; take 2 or more, and above 1")
         self.num_samples, self.growth = num_samples, growth
 
-    def forward(self, path: Path, previous: Rendering | None) -> Samples:
+    def forward(self, path: Path, previous: Rendering | None, draws: Draws | None = None) -> Samples:
         bins = torch.arange(self.num_samples, device=path.s.device, dtype=path.s.dtype).expand(len(path.s), -1)
         # Random in training, central in evaluation: the contract of every sampler.
-        offsets = path.rand(self.num_samples) if self.training else 0.5
+        offsets = 0.5 if draws is None else draws.for_rays(path.ray, self.num_samples)
         u = (bins + offsets) / self.num_samples
         fraction = (self.growth**u - 1) / (self.growth - 1)
         return point_samples(path, path.near[:, None] + fraction * (path.far - path.near)[:, None])

@@ -6,10 +6,11 @@ import warnings
 
 import pytest
 
-from nerfro.evaluation.render_view import Supersampling, render_view
+from nerfro.evaluation.render_view import render_view
 from nerfro.kernels.constants import constant
 from nerfro.models.base import NerfModel
 from nerfro.registry import build
+from nerfro.subdivision import Subdivision
 from nerfro.training.config import build_model
 from nerfro.training.ray_batches import RayBatches
 from tests.pretended_gpu import GPU, OnGpu, PretendedGpu
@@ -61,11 +62,12 @@ def test_training_and_rendering_stay_on_the_gpu(
         model.to(GPU)
         batches, cameras = RayBatches(views, 8, config.batches.batching).to(GPU), views.cameras.to(GPU)
         gpu.waits.clear()
-        loss = model.training_step(batches.batch(STEP), 0)["loss"]
+        batch = batches.batch(STEP)
+        loss = model.training_step(batch, 0)["loss"]
         loss.backward()
-        model.point_sampler.after_step(STEP, list(model.fields))
+        model.point_sampler.after_step(list(model.fields), batch.draws)
         assert {wait for wait in gpu.waits if not wait.startswith(TRACING)} == waits
-        rendered = render_view(model, cameras, 0, Supersampling())
+        rendered = render_view(model, cameras, 0, Subdivision())
     assert isinstance(loss, OnGpu)
     assert isinstance(rendered.radiance, OnGpu)
     assert all(isinstance(tensor, OnGpu) for tensor in (*model.parameters(), *model.buffers()))

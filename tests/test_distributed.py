@@ -15,9 +15,6 @@ from typing import Any
 import pytest
 import torch
 
-import nerfro.distributed
-from nerfro.distributed import drawing_for, rand_rays
-from nerfro.errors import NerfroError
 from nerfro.training.callbacks import StopOnSignal
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 
@@ -119,7 +116,7 @@ def require_alike(together: Path, alone: Path) -> None:
     assert expected.keys() == got.keys()
     for name in expected:
         torch.testing.assert_close(got[name], expected[name], rtol=0, atol=1e-5, msg=lambda m, n=name: f"{n}: {m}")
-    assert num_rays(alone) == num_rays(together)
+    assert num_rays(together) == pytest.approx(num_rays(alone), rel=0.2), "the other process has about as many"
     scores = [json.loads((folder / "metrics.json").read_text())["test"]["psnr"] for folder in (together, alone)]
     assert scores[0] == pytest.approx(scores[1], abs=0.05)
     command = json.loads((together / "run.json").read_text())["command"]
@@ -198,31 +195,6 @@ def test_what_two_processes_cannot_do_is_refused_in_one_line(
     assert finished.code == 1
     assert finished.err.splitlines()[-1].endswith(message)
     assert not list(tmp_path.rglob("config.yaml"))
-
-
-def test_processes_draw_the_rows_that_one_would_draw(monkeypatch: pytest.MonkeyPatch) -> None:
-    like = torch.zeros((), dtype=torch.float64)
-
-    def draw(num_rays: int, rank: int, size: int) -> tuple[torch.Tensor, torch.Tensor]:
-        monkeypatch.setattr(nerfro.distributed, "rank_and_size", lambda: (rank, size))
-        torch.manual_seed(5)
-        return rand_rays(num_rays, 3, like), torch.rand(4)
-
-    whole, following = draw(12, 0, 1)
-    torch.manual_seed(5)
-    assert torch.equal(whole, torch.rand(12, 3, dtype=torch.float64))
-    shares = [draw(3, rank, 4) for rank in range(4)]
-    assert torch.equal(torch.cat([rows for rows, _ in shares]), whole)
-    assert all(torch.equal(after, following) for _, after in shares)
-
-
-@pytest.mark.parametrize("asked", [2, 5])
-def test_numbers_for_other_rows_than_the_batchs_are_refused(asked: int) -> None:
-    with (
-        drawing_for(torch.tensor([4, 5, 0]), 6),
-        pytest.raises(NerfroError, match=f"for {asked} rays, but the batch has 3"),
-    ):
-        rand_rays(asked, 2, torch.zeros(()))
 
 
 def test_a_signal_is_not_lost_while_the_processes_agree() -> None:

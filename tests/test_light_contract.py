@@ -23,7 +23,7 @@ from nerfro.samplers.hierarchical import Hierarchical
 from nerfro.samplers.snell import Snell, trace_interfaces
 from nerfro.samplers.straight import straight_path
 from nerfro.samplers.stratified import Stratified
-from nerfro.testing import NUM_RAYS, example_batch, example_parts, example_path, example_rays
+from nerfro.testing import NUM_RAYS, example_batch, example_draws, example_parts, example_path, example_rays
 from nerfro.types import Exits, Path, Radiance
 
 
@@ -68,7 +68,7 @@ def test_one_polyline_a_ray_is_the_same_bit_for_bit_however_it_is_said() -> None
 
 def test_opacity_and_depth_are_those_of_rays() -> None:
     path = split_path(0.25)
-    samples = Stratified(8).eval()(path, None)
+    samples = Stratified(8)(path, None)
     density = torch.zeros_like(samples.s)
     density[1::2] = 50.0  # the straight polylines are blocked at once, the bent ones pass
     rendering = composite(samples, Radiance(density, samples.positions), torch.zeros(2 * NUM_RAYS, 3), path)
@@ -86,12 +86,9 @@ def test_random_numbers_are_drawn_for_each_ray(sampler: Stratified | Hierarchica
           ("positions", "directions", "s", "exit_directions", "refracted", "radii")),
         ray=torch.arange(NUM_RAYS).repeat_interleave(2),
     )  # fmt: skip
-    samples = sampler.train()(twice, None)
+    samples = sampler(twice, None, example_draws())
     assert torch.equal(samples.s[::2], samples.s[1::2]), "polylines of a ray share its numbers"
-    torch.manual_seed(3)
-    first = sampler(twice, None).s[::2]
-    torch.manual_seed(3)
-    assert torch.equal(first, sampler(same, None).s), "and splitting changes nobody's"
+    assert torch.equal(samples.s[::2], sampler(same, None, example_draws()).s), "and splitting changes nobody's"
 
 
 @pytest.mark.parametrize("loss", [Photometric(), BoundaryRegulariser(start=0), Distortion()])
@@ -107,7 +104,7 @@ def test_samples_follow_the_gradients_of_their_path() -> None:
     path = example_path()
     positions = path.positions.clone().requires_grad_()
     moving = path.moved(positions, path.directions, path.s, path.exit_directions)
-    for sampler in (Stratified(8).eval(), DensityGridSampler(8, 16).eval()):
+    for sampler in (Stratified(8), DensityGridSampler(8, 16)):
         samples = sampler(moving, None)
         assert not samples.s.requires_grad
         (gradient,) = torch.autograd.grad(samples.positions.sum(), positions)

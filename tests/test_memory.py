@@ -12,7 +12,8 @@ import resource, sys
 import torch
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.cameras import Cameras
-from nerfro.evaluation.render_view import Supersampling, render_view
+from nerfro.evaluation.render_view import render_view
+from nerfro.subdivision import Subdivision
 from nerfro.fields.nerf import NerfField
 from nerfro.media.analytic import Vacuum
 from nerfro.models.base import Parts
@@ -32,11 +33,11 @@ torch.set_num_threads(1)
 field = lambda: NerfField(width=64, depth=4, skip=2, view_width=32)
 parts = Parts(Vacuum(), Straight(), Stratified(64), field, ConstantBoundary(), {}, OptimizerConfig(), chunk_size=256)
 model = RefractiveModel(parts)
-render_view(model, cameras(16), 0, Supersampling())
+render_view(model, cameras(16), 0, Subdivision())
 one_chunk = peak()
-render_view(model, cameras(64), 0, Supersampling())
+render_view(model, cameras(64), 0, Subdivision())
 whole_view = peak()
-render_view(model, cameras(64), 0, Supersampling(2))
+render_view(model, cameras(64), 0, Subdivision(2))
 print(one_chunk, whole_view, peak())
 """
 

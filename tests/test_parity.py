@@ -6,7 +6,9 @@ Set NERFRO_REFERENCE to compare with another recording of the same keys.
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from nerfro.boundaries.skybox import Skybox
+from nerfro.draws import Draws
 from nerfro.fields.nerf import NerfField
 from nerfro.losses.base import Loss
 from nerfro.losses.boundary import BoundaryRegulariser
@@ -25,6 +28,7 @@ from nerfro.models.optimizer import OptimizerConfig
 from nerfro.models.refractive import RefractiveModel
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.hierarchical import Hierarchical
+from nerfro.testing import example_batch
 from nerfro.types import Batch, Rays, Rendering
 
 RECORDING = Path(os.environ.get("NERFRO_REFERENCE", Path(__file__).parent / "reference_sphere.npz"))
@@ -36,7 +40,7 @@ class RecordedTile:
     def __init__(self, directions: Tensor) -> None:
         self.directions = directions
 
-    def tile(self, size: int) -> Tensor:
+    def tile(self, size: int, draws: Draws) -> Tensor:
         assert self.directions.shape[:2] == (size, size)
         return self.directions
 
@@ -60,8 +64,8 @@ def batch(recorded: dict[str, Tensor]) -> Batch:
     num_rays = len(recorded["origins"])
     near, far = (recorded[key].expand(num_rays) for key in ("near", "far"))
     rays = Rays(recorded["origins"], recorded["directions"], torch.zeros(num_rays), near, far)
-    tile = RecordedTile(recorded["sky_patch_directions"])
-    return Batch(rays, torch.zeros(num_rays).long(), recorded["target_rgb"], tile)  # type: ignore[arg-type]
+    tile: Any = RecordedTile(recorded["sky_patch_directions"])
+    return replace(example_batch(num_rays), rays=rays, rgb=recorded["target_rgb"], cameras=tile)
 
 
 @pytest.fixture(scope="module")

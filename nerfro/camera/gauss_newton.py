@@ -20,8 +20,8 @@ from nerfro.camera.least_squares import Told, axes_across, normal_equations, rob
 from nerfro.camera.pixel_units import object_distances
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
-from nerfro.pixel_parts import contrast, pixel_rays
 from nerfro.rays import Rays
+from nerfro.subdivision import contrast, pixel_rays
 
 # Colours, sRGB in [0, 1], that photographs of views would have along rays.
 Shown = Callable[[Rays, Int[Tensor, "R"]], Float[Tensor, "R 3"]]

@@ -22,9 +22,9 @@ from nerfro.camera.least_squares import Told, axes_across, robust_weights
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
 from nerfro.light import to_linear
-from nerfro.pixel_parts import pixel_rays
 from nerfro.progress import told
 from nerfro.rays import Rays
+from nerfro.subdivision import pixel_rays
 
 # Photographs are reduced to this width: places are found to a few hundredths of a pixel.
 _WIDTH = 256

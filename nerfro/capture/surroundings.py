@@ -20,16 +20,17 @@ from nerfro.cameras import Cameras
 from nerfro.capture.pixel_blocks import PixelBlocks
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.data.base import Views
+from nerfro.draws import Draws
 from nerfro.errors import NerfroError
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.light import to_linear
-from nerfro.pixel_parts import pixel_rays
 from nerfro.progress import bar
 from nerfro.rays import Rays
 from nerfro.rendering import composite
 from nerfro.samplers.density_grid import DensityGridSampler
 from nerfro.samplers.straight import straight_path
+from nerfro.subdivision import pixel_rays
 from nerfro.types import Exits
 
 # Photographs are averaged down to at most so many pixels a side.
@@ -236,6 +237,7 @@ class Room(Boundary):
             low, high, radius, finest_resolution=512, log2_table_size=17, direction_bands=1, initial_depth=3.0
         )
         self.sampler = DensityGridSampler(box_min=low, box_max=high, radius=radius, looks=0.25, decay=0.6)
+        self.draws: Draws | None = None  # random numbers of the step while it learns
 
     def forward(self, exits: Exits) -> Float[Tensor, "P 3"]:
         return self.seen(exits)[0]
@@ -246,13 +248,10 @@ class Room(Boundary):
         ones = torch.ones_like(exits.positions[:, 0])
         rays = Rays(exits.positions, exits.directions, exits.radii * ones, 0 * ones, ones)
         path = straight_path(rays)
-        samples = self.sampler(path, None)
+        samples = self.sampler(path, None, self.draws)
         radiance = self.field(samples)
         rendered = composite(samples, radiance, radiance.rgb[:, -1], path)
         return rendered.rgb, rendered.depth
-
-    def after_step(self, step: int) -> None:
-        self.sampler.after_step(step, [self.field])
 
 
 def _learn(boundary: Boundary, pixels: Pixels, steps: int, batch: int, progress: Callable[[float], None]) -> None:
@@ -260,9 +259,10 @@ def _learn(boundary: Boundary, pixels: Pixels, steps: int, batch: int, progress:
     generator = torch.Generator().manual_seed(0)
     first, last = _RATES
     optimizer = torch.optim.Adam(boundary.parameters(), first, eps=1e-15)
-    with torch.enable_grad(), torch.random.fork_rng(devices=[]):
+    with torch.enable_grad():
         for step in range(steps):
-            torch.manual_seed(step)
+            if isinstance(boundary, Room):
+                boundary.draws = Draws(0, step, torch.arange(batch))
             optimizer.param_groups[0]["lr"] = first * (last / first) ** (step / steps)
             drawn = pixels[torch.randint(len(pixels), (batch,), generator=generator)]
             predicted = boundary(Exits.unbent(drawn.rays))
@@ -272,8 +272,10 @@ def _learn(boundary: Boundary, pixels: Pixels, steps: int, batch: int, progress:
             functional.mse_loss(seen, drawn.radiance).backward()
             optimizer.step()
             if isinstance(boundary, Room):
-                boundary.after_step(step + 1)
+                boundary.sampler.after_step([boundary.field], Draws(0, step + 1, torch.arange(batch)))
             progress((step + 1) / steps)
+    if isinstance(boundary, Room):
+        boundary.draws = None
     boundary.eval().requires_grad_(False)
 
 

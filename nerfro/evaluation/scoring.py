@@ -14,10 +14,11 @@ from nerfro.evaluation.error_maps import write_error_sheet
 from nerfro.evaluation.folders import PicturePair
 from nerfro.evaluation.lpips import LpipsNetwork
 from nerfro.evaluation.metrics import ImageMetrics
-from nerfro.evaluation.render_view import Supersampling, render_view
+from nerfro.evaluation.render_view import render_view
 from nerfro.evaluation.results import EvaluationResult
 from nerfro.files.images import save_png
 from nerfro.models.base import NerfModel
+from nerfro.subdivision import Subdivision
 
 
 def score_views(
@@ -25,7 +26,7 @@ def score_views(
     views: Views,
     metrics: ImageMetrics,
     folder: Path,
-    supersampling: Supersampling,
+    subdivision: Subdivision,
     pictures: str = "images",
 ) -> EvaluationResult:
     """Render every view as `folder/<pictures>/<prefix>_NNN.png` (8-bit sRGB, rounded) and score it.
@@ -37,7 +38,7 @@ def score_views(
     progress = tqdm(total=len(views) * height * width, unit="ray", unit_scale=True, desc="evaluate", dynamic_ncols=True)
     with progress:
         for view in range(len(views)):
-            rendered = render_view(model, cameras, view, supersampling)
+            rendered = render_view(model, cameras, view, subdivision)
             rgb = model.photographed(rendered.radiance).reshape(height, width, 3).cpu()
             save_png(folder / pictures / f"{metrics.prefix}_{view:03d}.png", rgb)
             coverage = None if views.masks is None else views.masks[view]

@@ -17,11 +17,12 @@ from nerfro.camera.exposure import fit_gain
 from nerfro.data.base import Views
 from nerfro.evaluation.left_halves import refine_on_left
 from nerfro.evaluation.metrics import ImageMetrics
-from nerfro.evaluation.render_view import Supersampling, render_view
+from nerfro.evaluation.render_view import render_view
 from nerfro.evaluation.results import EvaluationResult
 from nerfro.evaluation.scoring import score_views
 from nerfro.files.images import save_png
 from nerfro.models.base import NerfModel
+from nerfro.subdivision import Subdivision
 
 
 def score_split(
@@ -29,7 +30,7 @@ def score_split(
     views: Views,
     metrics: ImageMetrics,
     folder: Path,
-    supersampling: Supersampling,
+    subdivision: Subdivision,
     refine_steps: int = 0,
 ) -> tuple[EvaluationResult, dict[str, EvaluationResult]]:
     """Score views as given, and once more for each treatment that is asked for, by its name.
@@ -38,24 +39,24 @@ def score_split(
     in. `exposed`: these, with a gain for each view and channel. `refined`: these, each camera refined by itself. Gains
     and cameras are fitted on the left halves of photographs, and then the right halves are scored.
     """
-    given, treated = score_views(model, views, metrics, folder, supersampling), {}
+    given, treated = score_views(model, views, metrics, folder, subdivision), {}
     if model.camera.moves:
         views = replace(views, cameras=model.camera.aligned(views.cameras))
         metrics.reset()
-        treated["aligned"] = score_views(model, views, metrics, folder, supersampling, "images_aligned")
+        treated["aligned"] = score_views(model, views, metrics, folder, subdivision, "images_aligned")
     gains = torch.ones(len(views), 3)
     if model.camera.exposure is not None:
         metrics.reset()
-        gains, treated["exposed"] = _score_right(model, views, metrics, folder, supersampling, "exposed")
+        gains, treated["exposed"] = _score_right(model, views, metrics, folder, subdivision, "exposed")
     if refine_steps:
         views = replace(views, cameras=refine_on_left(model, views, gains, refine_steps))
         metrics.reset()
-        _, treated["refined"] = _score_right(model, views, metrics, folder, supersampling, "refined")
+        _, treated["refined"] = _score_right(model, views, metrics, folder, subdivision, "refined")
     return given, treated
 
 
 def _score_right(
-    model: NerfModel, views: Views, metrics: ImageMetrics, folder: Path, supersampling: Supersampling, name: str
+    model: NerfModel, views: Views, metrics: ImageMetrics, folder: Path, subdivision: Subdivision, name: str
 ) -> tuple[Float[Tensor, "V 3"], EvaluationResult]:
     """Gains that are fitted on left halves where exposures learn, else 1; and the scores of right halves."""
     cameras = views.cameras.to(model.device)
@@ -63,7 +64,7 @@ def _score_right(
     left, right = slice(width // 2), slice(width // 2, None)
     gains = torch.ones(len(views), 3)
     for view in range(len(views)):
-        radiance = render_view(model, cameras, view, supersampling).radiance.view(height, width, 3).cpu()
+        radiance = render_view(model, cameras, view, subdivision).radiance.view(height, width, 3).cpu()
         target = views.images[view]
         if model.camera.exposure is not None:
             gains[view] = fit_gain(model.encode, radiance[:, left].flatten(0, 1), target[:, left].flatten(0, 1))

@@ -15,7 +15,7 @@ from nerfro.kernels.threads import use_threads
 from nerfro.paths import PACKAGE_DIR
 
 # Files that hold kernels, or the constants that are compiled into them; a kernel lies beside its plain twin.
-_SOURCES = ("kernels/*.py", "geometry/*.py", "*/*_cpu.py")
+_SOURCES = ("philox.py", "kernels/*.py", "geometry/*.py", "*/*_cpu.py")
 
 Function = TypeVar("Function", bound=Callable)
 

@@ -7,7 +7,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfro.allowed import Natural, NotNegative
-from nerfro.distributed import mean_over_rays
 from nerfro.errors import NerfroError
 from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
@@ -49,4 +48,4 @@ class Backdrop(Loss):
             return batch.rgb.new_zeros(())
         rendering = renderings[-1]
         stopped = rendering.path.per_ray(1 - rendering.transmittance)
-        return mean_over_rays(stopped * shows(batch.rgb, self.colour), batch.num_rows)
+        return (batch.per_pixel(stopped) * shows(batch.rgb, self.colour)).mean()

@@ -38,12 +38,11 @@ class BoundaryRegulariser(Loss):
     def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
         fine = renderings[-1]
         path = fine.path
-        counts = path.per_ray(fine.transmittance.detach()) > self.threshold
+        counts = batch.per_pixel(path.per_ray(fine.transmittance.detach())) > self.threshold
         if self.refracted_only:
-            counts = counts & path.first_of_ray(path.refracted)
-        if batch.num_whole is not None:
-            counts[batch.num_whole :] = False  # a part of a pixel need not have the pixel's colour
-        shown = model.encode(path.per_ray(fine.transmittance[:, None] * fine.boundary_rgb.detach()))
+            counts = counts & (batch.per_pixel(path.first_of_ray(path.refracted).to(fine.rgb)) > 0.5)
+        background = path.per_ray(fine.transmittance[:, None] * fine.boundary_rgb.detach())
+        shown = model.encode(batch.per_pixel(background))
         error = (shown - batch.rgb).abs().sum(-1)
         # Processes average their gradients: each brings its sum as often as there are processes.
         return (error * counts).sum() * rank_and_size()[1] / (sum_over_processes(counts.sum()) + 1)

@@ -7,7 +7,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.allowed import Natural, NotNegative
-from nerfro.distributed import mean_over_rays
 from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
 from nerfro.types import Batch, Rendering
@@ -34,7 +33,7 @@ class Distortion(Loss):
             weights, edges = torch.cat([weights, rendering.transmittance[:, None]], -1), torch.cat([measure, far], -1)
         # A path of no length has no weights either; the clamp only keeps the quotient a number.
         edges = (edges - near) / (far - near).clamp(min=1e-6)
-        return mean_over_rays(rendering.path.per_ray(distortion(weights, edges)), batch.num_rows)
+        return batch.per_pixel(rendering.path.per_ray(distortion(weights, edges))).mean()
 
 
 def distortion(weights: Float[Tensor, "R N"], edges: Float[Tensor, "R N+1"]) -> Float[Tensor, "R"]:

@@ -7,7 +7,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.allowed import Natural, NotNegative, corners_of_box
-from nerfro.distributed import mean_over_rays
 from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
 from nerfro.types import Batch, Rendering
@@ -44,4 +43,4 @@ class Nearby(Loss):
         path = rendering.path
         distance = (path.positions[:, 0].detach() - self.middle).norm(dim=-1).clamp(min=1e-6)
         counts = (1 - rendering.samples.s / distance[:, None]).clamp(min=0)
-        return mean_over_rays(path.per_ray((rendering.weights * counts).sum(-1)), batch.num_rows)
+        return batch.per_pixel(path.per_ray((rendering.weights * counts).sum(-1))).mean()

@@ -6,7 +6,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.allowed import Natural, NotNegative
-from nerfro.distributed import mean_over_rays
 from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
 from nerfro.types import Batch, Rendering
@@ -25,4 +24,4 @@ class Opaque(Loss):
 
     def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
         passed = renderings[-1].transmittance.square()
-        return mean_over_rays(renderings[-1].path.per_ray(passed), batch.num_rows)
+        return batch.per_pixel(renderings[-1].path.per_ray(passed)).mean()

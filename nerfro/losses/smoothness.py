@@ -32,7 +32,7 @@ class Smoothness(Loss):
         self.tile_size = tile_size
 
     def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
-        return tile_roughness(model.encode(model.boundary(Exits(batch.cameras.tile(self.tile_size)))))
+        return tile_roughness(model.encode(model.boundary(Exits(batch.cameras.tile(self.tile_size, batch.draws)))))
 
 
 def tile_roughness(rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:

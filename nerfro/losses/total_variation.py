@@ -8,7 +8,6 @@ from typing import Annotated
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from nerfro.allowed import Count, Natural, NotNegative, Range
 from nerfro.losses.base import Loss, Model
@@ -40,15 +39,23 @@ class TotalVariation(Loss):
         self.num_directions, self.angle = num_directions, angle
 
     def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
-        first, second = direction_pairs(self.num_directions, math.radians(self.angle), batch.rgb.device)
+        index = torch.arange(self.num_directions, device=batch.rgb.device)
+        numbers = batch.draws.uniform(index, 3, "total variation")
+        first, second = direction_pairs(numbers, math.radians(self.angle))
         rgb = model.encode(model.boundary(Exits(torch.cat([first, second]))))
         return (rgb[self.num_directions :] - rgb[: self.num_directions]).abs().mean()
 
 
-def direction_pairs(
-    num: int, angle: float, device: torch.device | str
-) -> tuple[Float[Tensor, "num 3"], Float[Tensor, "num 3"]]:
-    """Uniformly random unit directions, and for each another one `angle` radians from it, anywhere around."""
-    first = normalize(torch.randn(num, 3, device=device), dim=-1)
-    tangent = normalize(torch.linalg.cross(first, torch.randn(num, 3, device=device)), dim=-1)
+def direction_pairs(numbers: Float[Tensor, "N 3"], angle: float) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
+    """Map uniform numbers in [0, 1) to pairs of unit directions that are `angle` radians apart.
+
+    The first direction is uniform on the sphere, and the second is uniform on the circle around the first.
+    """
+    z = 2 * numbers[:, 0] - 1
+    azimuth, turn = (2 * math.pi * numbers[:, 1:]).unbind(-1)
+    cosine, sine, radius = azimuth.cos(), azimuth.sin(), (1 - z.square()).clamp(min=0).sqrt()
+    first = torch.stack([radius * cosine, radius * sine, z], -1)
+    # Unit vectors along the meridian and along the parallel of the first direction.
+    south, east = torch.stack([z * cosine, z * sine, -radius], -1), torch.stack([-sine, cosine, 0 * z], -1)
+    tangent = turn.cos()[:, None] * south + turn.sin()[:, None] * east
     return first, math.cos(angle) * first + math.sin(angle) * tangent

@@ -14,10 +14,10 @@ from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 
 from nerfro.allowed import checked
-from nerfro.boundaries.base import Boundary
+from nerfro.boundaries.base import Boundary, background_radiance
 from nerfro.camera.base import Camera
 from nerfro.camera.given import GivenCamera
-from nerfro.distributed import drawing_for
+from nerfro.draws import Draws
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import intersect_box
@@ -75,12 +75,33 @@ class NerfModel(LightningModule, ABC):
         self._written = True  # whether what this step logs is
 
     @abstractmethod
-    def render_path(self, path: Path) -> list[Rendering]:
-        """Render paths, one rendering for each sampling level."""
+    def render_path(
+        self, path: Path, draws: Draws | None = None, teaches_background: Bool[Tensor, "R"] | None = None
+    ) -> list[Rendering]:
+        """Render paths.
 
-    def forward(self, rays: Rays) -> list[Rendering]:
+        Args:
+            path: P polylines of R rays.
+            draws: random numbers of a training step; None in evaluation, which is deterministic.
+            teaches_background: rays from which the background learns; None for all. See `background`.
+
+        Returns:
+            One rendering for each sampling level.
+        """
+
+    def forward(self, rays: Rays, draws: Draws | None = None) -> list[Rendering]:
         """Bend rays and render their paths."""
-        return self.render_path(self.trace(rays))
+        return self.render_path(self.trace(rays), draws)
+
+    def background(
+        self,
+        path: Path,
+        teaches_background: Bool[Tensor, "R"] | None = None,
+        directions: Float[Tensor, "P 3"] | None = None,
+    ) -> Float[Tensor, "P 3"]:
+        """Evaluate the background radiance where polylines leave, or in other `directions`; some rays teach it."""
+        teaches = None if teaches_background is None else path.of_ray(teaches_background)
+        return background_radiance(self.boundary, path.exits(directions), teaches)
 
     def trace(self, rays: Rays, path: Path | None = None) -> Path:
         """Paths of rays, or the given ones, tinted by the medium; with gradients by what bends and learns."""
@@ -169,9 +190,9 @@ class NerfModel(LightningModule, ABC):
 
     def training_step(self, batch: Batch, batch_index: int) -> dict[str, Tensor]:
         """The loss of a batch, and the mean squared error of its pixels (sRGB)."""
-        with drawing_for(batch.rows, batch.num_rows):
-            renderings = self.render_path(self.trace(self.camera(batch.rays, batch.view), batch.path))
-        if (gains := self.camera.gains(batch.view)) is not None:
+        path = self.trace(self.camera(batch.rays, batch.ray_view), batch.path)
+        renderings = self.render_path(path, batch.draws, batch.teaches_background[batch.pixel])
+        if (gains := self.camera.gains(batch.ray_view)) is not None:
             renderings = [rendering.exposed(gains) for rendering in renderings]
         total = torch.zeros((), device=self.device)
         for name, loss in self.losses.items():
@@ -181,8 +202,8 @@ class NerfModel(LightningModule, ABC):
                 value = loss(renderings, batch, self)
                 self.log(f"loss/{name}", value)
                 total = total + weight * value
-        shown = self.photographed(batch.of_pixels(renderings[-1].rgb.detach()))
-        error = (shown - batch.of_pixels(batch.rgb)).square().mean()
+        shown = self.photographed(batch.per_pixel(renderings[-1].rgb.detach()))
+        error = (shown - batch.rgb).square().mean()
         self.log("train/psnr", -10 * torch.log10(error))
         if (unlikely := self.medium.prior()) is not None:
             self.log("loss/surface", unlikely)
@@ -202,9 +223,6 @@ class NerfModel(LightningModule, ABC):
     def on_train_batch_start(self, batch: Batch, batch_index: int) -> None:
         every: int = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
         self._written = (self.global_step + 1) % every == 0
-        # Every step draws from its own seed, so that a resumed run repeats the steps of an undisturbed one.
-        # All processes have the same one: each takes its rays' share of what is drawn.
-        self.seed_draws(self.global_step)
         # Under a time limit every process has its own idea of it, and parameters would drift apart at different rates.
         progress = self.trainer.strategy.broadcast(training_progress(self.trainer))
         factor = learning_rate_factor(self.global_step, progress, self.optimizer_config)
@@ -216,16 +234,7 @@ class NerfModel(LightningModule, ABC):
                     parameter.requires_grad_(not waits)
         # Not at the end of the step before, which comes after its checkpoint: a resumed run would miss the update.
         if self.global_step > 0:
-            self.point_sampler.after_step(self.global_step, list(self.fields))  # type: ignore[arg-type]
-
-    def seed_draws(self, step: int) -> None:
-        """Have random draws begin anew, for one step of the run."""
-        seed = step_seed(self.seed, step)
-        if self.device.type == "cpu":
-            # The other way notes the call's whole stack each time, for devices that are not in use yet.
-            torch.default_generator.manual_seed(seed)
-        else:
-            torch.manual_seed(seed)
+            self.point_sampler.after_step(list(self.fields), batch.draws)  # type: ignore[arg-type]
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
         super().optimizer_step(*args, **kwargs)
@@ -342,8 +351,3 @@ class RenderedRays:
 def psnr(prediction: Tensor, target: Tensor) -> Float[Tensor, ""]:
     """Peak signal-to-noise ratio of values in [0, 1], dB."""
     return -10 * torch.log10((prediction - target).square().mean())
-
-
-def step_seed(seed: int, step: int) -> int:
-    """A seed for one step, from the run's (Weyl sequence; distinct for neighbouring arguments)."""
-    return (seed * 0x9E3779B97F4A7C15 + step * 0xBF58476D1CE4E5B9) % 2**63

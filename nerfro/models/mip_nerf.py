@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from typing import Literal
 
+from jaxtyping import Bool
+from torch import Tensor
+
+from nerfro.draws import Draws
 from nerfro.models.base import NerfModel, Parts
 from nerfro.registry import register
 from nerfro.rendering import composite
@@ -23,11 +27,13 @@ class MipNerfModel(NerfModel):
     def __init__(self, parts: Parts, colour: Literal["linear", "srgb"] = "linear") -> None:
         super().__init__(parts, [parts.make_field()], colour)
 
-    def render_path(self, path: Path) -> list[Rendering]:
-        boundary_rgb = self.boundary(path.exits())
+    def render_path(
+        self, path: Path, draws: Draws | None = None, teaches_background: Bool[Tensor, "R"] | None = None
+    ) -> list[Rendering]:
+        boundary_rgb = self.background(path, teaches_background)
         (field,) = self.fields
         renderings: list[Rendering] = []
         for _ in range(self.point_sampler.num_levels):
-            samples = self.point_sampler(path, renderings[-1] if renderings else None)
+            samples = self.point_sampler(path, renderings[-1] if renderings else None, draws)
             renderings.append(composite(samples, field(samples), boundary_rgb, path))
         return renderings

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from typing import Literal
 
+from jaxtyping import Bool
+from torch import Tensor
+
+from nerfro.draws import Draws
 from nerfro.models.base import NerfModel, Parts
 from nerfro.registry import register
 from nerfro.rendering import composite
@@ -31,12 +35,14 @@ class RefractiveModel(NerfModel):
         super().__init__(parts, [parts.make_field() for _ in range(parts.point_sampler.num_levels)], colour)
         self.boundary_direction = boundary_direction
 
-    def render_path(self, path: Path) -> list[Rendering]:
-        samples = self.point_sampler(path, None)
-        leaving = None if self.boundary_direction == "exit" else samples.directions[:, -1]
-        boundary_rgb = self.boundary(path.exits(leaving))
+    def render_path(
+        self, path: Path, draws: Draws | None = None, teaches_background: Bool[Tensor, "R"] | None = None
+    ) -> list[Rendering]:
+        samples = self.point_sampler(path, None, draws)
+        directions = None if self.boundary_direction == "exit" else samples.directions[:, -1]
+        boundary_rgb = self.background(path, teaches_background, directions)
         renderings = [composite(samples, self.fields[0](samples), boundary_rgb, path)]
         for field in self.fields[1:]:
-            samples = self.point_sampler(path, renderings[-1])
+            samples = self.point_sampler(path, renderings[-1], draws)
             renderings.append(composite(samples, field(samples), boundary_rgb, path))
         return renderings

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
+from nerfro.draws import Draws
 from nerfro.fields.base import Field
 from nerfro.media.base import Medium
 from nerfro.samplers.branching import ONE_PATH
@@ -47,16 +48,33 @@ class PathSampler(nn.Module, ABC):
 
 
 class PointSampler(nn.Module, ABC):
-    """Chooses arc lengths on a path; random in training (by `Path.rand`), the same every time in evaluation.
+    """Chooses arc lengths on a path.
 
-    `Samples.along` asks the path for positions and directions there.
+    Attributes:
+        num_levels: number of times that the path is sampled, each level guided by the rendering of the level before.
     """
 
-    num_levels: int  # how often the path is sampled, each level guided by the rendering of the one before
+    num_levels: int
 
     @abstractmethod
-    def forward(self, path: Path, previous: Rendering | None) -> Samples:
-        """Sample the path, first without and then with the previous level's rendering."""
+    def forward(self, path: Path, previous: Rendering | None, draws: Draws | None = None) -> Samples:
+        """Sample a path.
 
-    def after_step(self, step: int, fields: Sequence[Field]) -> None:
-        """Learn from the radiance fields after a training step, if the sampler remembers anything of them."""
+        Args:
+            path: P polylines in arc length.
+            previous: rendering of the level before; None at the first level.
+            draws: random numbers of the training step; None in evaluation, where samples are deterministic. All
+                randomness comes from `draws.for_rays(path.ray, num)`, so that all polylines of a ray share their
+                numbers, and so that a run that resumes repeats the steps of an undisturbed run.
+
+        Returns:
+            Samples in ascending arc length; `Samples.along` looks up positions and directions on the path.
+        """
+
+    def after_step(self, fields: Sequence[Field], draws: Draws) -> None:
+        """Update what the sampler remembers of the radiance fields.
+
+        Args:
+            fields: radiance field of each sampling level, as `draws.step` training steps have made them.
+            draws: random numbers of the step that follows.
+        """

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerfro.allowed import Count, NotNegative, Positive, Range, Share, corners_of_box
-from nerfro.errors import NerfroError
+from nerfro.draws import Draws
 from nerfro.fields.base import Field
 from nerfro.geometry.contraction import contract, contracted_box, expand, shrinkage
 from nerfro.kernels.arrays import arrays
@@ -88,11 +88,11 @@ class DensityGridSampler(PointSampler):
         inside = None if radius is None else _cells_of_the_world(resolution)
         self.register_buffer("inside", inside, persistent=False)
 
-    def forward(self, path: Path, previous: Rendering | None) -> Samples:
+    def forward(self, path: Path, previous: Rendering | None, draws: Draws | None = None) -> Samples:
         with torch.no_grad():
-            u = self._places(path)
-            samples = self.draw_compiled(path, u) if path.s.device.type == "cpu" else self.draw(path, u)
-            if self.training:
+            draw = self.draw_compiled if path.s.device.type == "cpu" else self.draw
+            samples = draw(path, draws)
+            if draws is not None:
                 samples = replace(samples, occupied=self._asked(path, samples))
         # The kernel has found positions too; they are asked of the path only where it has gradients to give.
         if not path.positions.requires_grad:
@@ -100,17 +100,23 @@ class DensityGridSampler(PointSampler):
         along = Samples.along(path, samples.s, samples.edges)
         return replace(along, occupied=samples.occupied, lengths=samples.lengths, measure=samples.measure)
 
-    def _places(self, path: Path) -> Float[Tensor, "P N+1"]:
-        """Where in the cumulative weights the edges of samples lie.
+    def _quantiles(self, path: Path, draws: Draws | None) -> Float[Tensor, "P N+1"]:
+        """Compute the values of the cumulative weights at which edges of samples lie.
 
-        In training a branch is given samples by its weight. The intervals that it lacks are at its end, of no length.
+        In training, polylines of rays that split get samples in proportion to their weight. The intervals that one
+        lacks are at its end and have no length.
         """
-        if not (self.training and path.splits):
-            num_samples = self.num_samples if self.training else self.num_shown or self.num_samples
-            return spread_uniform(path, num_samples + 1, self.training)
-        num = (self.num_samples * _weight(path)).ceil().clamp(min=min(self.num_samples, _FEWEST)).long()[:, None]
+        if draws is None:
+            return spread_uniform(path, (self.num_shown or self.num_samples) + 1, None)
+        num = self._num_intervals(path)[:, None]
         edge = torch.arange(self.num_samples + 1, device=num.device).minimum(num)
-        return (edge + path.rand(self.num_samples + 1).gather(1, edge)) / (num + 1)
+        return (edge + draws.for_rays(path.ray, self.num_samples + 1).gather(1, edge)) / (num + 1)
+
+    def _num_intervals(self, path: Path) -> Int[Tensor, "P"]:
+        """Number of intervals of each polyline in training."""
+        if not path.splits:
+            return torch.full_like(path.ray, self.num_samples)
+        return (self.num_samples * _weight(path)).ceil().clamp(min=min(self.num_samples, _FEWEST)).long()
 
     @staticmethod
     def _asked(path: Path, samples: Samples) -> Bool[Tensor, "P N"] | None:
@@ -123,8 +129,9 @@ class DensityGridSampler(PointSampler):
         assert samples.occupied is not None
         return ((_weight(path) >= _HEAVY)[:, None] | samples.occupied) & (samples.deltas > 0)
 
-    def draw(self, path: Path, u: Float[Tensor, "R N+1"]) -> Samples:
-        """Samples at places `u` of the cumulative weights: the plain reference of the compiled kernel."""
+    def draw(self, path: Path, draws: Draws | None) -> Samples:
+        """Draw samples with PyTorch; the reference implementation of the compiled kernel."""
+        u = self._quantiles(path, draws)
         if self.radius is None:
             measure: WithinBox | Contracted = WithinBox.of(path, self.box)
         else:
@@ -146,20 +153,20 @@ class DensityGridSampler(PointSampler):
         depth = self.lookup(self.contracted(samples.positions)) * places.diff(dim=1)
         return replace(samples, occupied=depth >= _EMPTY)
 
-    def draw_compiled(self, path: Path, u: Float[Tensor, "R N+1"]) -> Samples:
-        """The same as `draw`, on the CPU.
-
-        Raises:
-            NerfroError: not one row of places for each path, which the kernel would read beyond their end.
-        """
-        if len(u) != len(path.s):
-            raise NerfroError(f"{len(u)} rows of random numbers for {len(path.s)} paths; draw them with Path.rand")
+    def draw_compiled(self, path: Path, draws: Draws | None) -> Samples:
+        """Draw the samples of `draw` on the CPU."""
         from nerfro.kernels.threads import use_threads
         from nerfro.samplers.density_grid_cpu import draw  # compiled code, so only where it is used
 
         use_threads()
+        if draws is None:
+            num_samples, of_path, key = self.num_shown or self.num_samples, (path.ray[:0], path.ray[:0]), (0, 0, 0, 0)
+        else:
+            of_path = draws.ray[path.ray], self._num_intervals(path)
+            num_samples, key = self.num_samples, draws.counters("samples")
+        tensors = path.positions, path.directions, path.s, *self.box, self.density, *of_path
         settings = self.num_bins, self._floor, self.trust, _EMPTY, self.radius or 0.0, self.near
-        arguments: list[Any] = [*arrays(path.positions, path.directions, path.s, *self.box, self.density, u), *settings]
+        arguments: list[Any] = [*arrays(*tensors), key, num_samples, *settings]
         drawn = draw(*arguments)
         edges, s, positions, directions, occupied, *of_measure = (torch.from_numpy(array) for array in drawn)
         lengths, measure = (None, None) if self.radius is None else of_measure
@@ -190,18 +197,19 @@ class DensityGridSampler(PointSampler):
         return self.density.view(-1)[(x * self.resolution + y) * self.resolution + z]
 
     @torch.no_grad()
-    def after_step(self, step: int, fields: Sequence[Field]) -> None:
+    def after_step(self, fields: Sequence[Field], draws: Draws) -> None:
         """Look at some of the cells, at a random place in each."""
-        if step % self.every:
+        if draws.step % self.every:
             return
         device, inside = self.density.device, self.inside
         num_cells = self.resolution**3 if inside is None else len(inside)
-        cells = torch.randint(num_cells, (int(num_cells * self.looks),), device=device)
+        words = draws.words(torch.arange(int(num_cells * self.looks), device=device), 4, "density grid")
+        cells = words[:, 0] * num_cells >> 32
         cells = cells if inside is None else inside[cells]
         corners = torch.stack(
             [cells // self.resolution**2, cells // self.resolution % self.resolution, cells % self.resolution], dim=-1
         )
-        unit = (corners + torch.rand(len(cells), 3, device=device)) / self.resolution
+        unit = (corners + (words[:, 1:] >> 8) * 2.0**-24) / self.resolution
         places = self.box[0] + unit * (self.box[1] - self.box[0])
         found = self._look(fields[-1], places)
         flat = self.density.view(-1)

@@ -7,10 +7,12 @@ from numba import prange
 
 from nerfro.geometry.contraction import FAR, NEAREST
 from nerfro.kernels.compilation import compiled, compiled_parallel
+from nerfro.kernels.philox import fill_uniform
 
 _BLOCK = 64  # rays that share a thread's scratch memory
 _THIN = 0.05  # optical depth whose fifth power is nothing in single precision
 _DARK = 1e-9  # transmittance behind which nothing is seen
+_EPS = float(np.finfo(np.float32).eps)
 
 
 @compiled
@@ -199,17 +201,36 @@ def _stopped(depth):
     return 1.0 - np.exp(-depth)
 
 
+@compiled
+def _even_quantiles(u):
+    """Fill with values of the cumulative weights, evenly spaced and both ends included."""
+    for edge in range(len(u)):
+        u[edge] = edge * ((1.0 - _EPS) / (len(u) - 1))
+
+
+@compiled
+def _random_quantiles(u, num_intervals, index, key):
+    """Fill with a random value of the cumulative weights in each of `num_intervals` + 1 bins; the last one repeats."""
+    fill_uniform(u, index, *key)
+    for edge in range(len(u)):
+        u[edge] = np.float32(edge + u[edge]) / np.float32(num_intervals + 1) if edge <= num_intervals else u[edge - 1]
+
+
 @compiled_parallel
-def draw(positions, directions, s, low, high, density, u, num_bins, floor, trust, empty, radius, near):
+def draw(
+    positions, directions, s, low, high, density, ray_index, num_intervals, key, num_samples, num_bins, floor, trust,
+    empty, radius, near,
+):  # fmt: skip
     """Edges and middles of samples drawn in proportion to the weights that the density gives, plus a floor.
 
-    `u` are places in the cumulative distribution, ascending on each ray [R, N + 1]; `floor` is the weight that every
-    bin has beside its share, which sums to one, and no bin is believed to stop more than `trust`. With a `radius` above
-    0 what is beyond it is contracted, and `low` and `high` are the corners of the cube around contracted space. Returns
-    edges [R, N + 1], arc lengths [R, N], positions and directions [R, N, 3], whether the optical depth there is `empty`
-    or more [R, N], and the samples' `lengths` [R, N] and `measure` [R, N + 1].
+    Samples are random, with `num_intervals` [R] out of `num_samples` on each ray and the numbers that `key`
+    (`Draws.counters`) gives for its `ray_index` [R]; without indices they are evenly spread. `floor` is the weight that
+    every bin has beside its share, which sums to one, and no bin is believed to stop more than `trust`. With a `radius`
+    above 0 what is beyond it is contracted, and `low` and `high` are the corners of the cube around contracted space.
+    Returns edges [R, N + 1], arc lengths [R, N], positions and directions [R, N, 3], whether the optical depth there is
+    `empty` or more [R, N], and the samples' `lengths` [R, N] and `measure` [R, N + 1].
     """
-    num_rays, num_edges = u.shape
+    num_rays, num_edges = len(s), num_samples + 1
     cells, num_runs = density.shape[0], s.shape[1]
     edges = np.empty((num_rays, num_edges), np.float32)
     middles = np.empty((num_rays, num_edges - 1), np.float32)
@@ -221,6 +242,7 @@ def draw(positions, directions, s, low, high, density, u, num_bins, floor, trust
     flat = density.ravel()
     for block in prange((num_rays + _BLOCK - 1) // _BLOCK):
         runs, weights = np.empty((4, num_runs)), np.empty(num_bins, np.float32)
+        u = np.empty(num_edges, np.float32)
         marks, begin, passing, aside = runs[0], runs[1], runs[2], runs[3]
         centre, per_unit = np.empty(3), np.empty(3)
         for axis in range(3):
@@ -252,6 +274,10 @@ def draw(positions, directions, s, low, high, density, u, num_bins, floor, trust
                 )  # fmt: skip
             else:
                 _depths_even(positions[ray], directions[ray], s[ray], first, width, low, flat, per_unit, cells, weights)
+            if len(ray_index) == 0:
+                _even_quantiles(u)
+            else:
+                _random_quantiles(u, num_intervals[ray], ray_index[ray], key)
             total, passed = 0.0, 1.0
             for index in range(num_bins):
                 stopped = min(_stopped(weights[index]), trust)
@@ -269,11 +295,11 @@ def draw(positions, directions, s, low, high, density, u, num_bins, floor, trust
             share = weights[0] / norm
             before, run_of_edge, run = np.float32(0), 0, 0
             for edge in range(num_edges):
-                while index < num_bins - 1 and u[ray, edge] >= below + share:
+                while index < num_bins - 1 and u[edge] >= below + share:
                     below += share
                     index += 1
                     share = weights[index] / norm
-                inside = min(max((u[ray, edge] - below) / share, 0.0), 1.0)
+                inside = min(max((u[edge] - below) / share, 0.0), 1.0)
                 place = np.float32(first + (index + inside) * width)
                 measure[ray, edge] = place
                 run_of_edge = _segment(marks, run_of_edge, place)

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.allowed import NotNegative, Range
+from nerfro.draws import Draws
 from nerfro.errors import NerfroError
 from nerfro.registry import register
 from nerfro.samplers.base import PointSampler
@@ -53,21 +54,23 @@ class Hierarchical(PointSampler):
         self.coarse = Stratified(num_coarse, draw, cast, offset, box_min, box_max)
         self.num_fine, self.union, self.blur, self.padding, self.cast = num_fine, union, blur, padding, cast
 
-    def forward(self, path: Path, previous: Rendering | None) -> Samples:
+    def forward(self, path: Path, previous: Rendering | None, draws: Draws | None = None) -> Samples:
         if previous is None:
-            return self.coarse(path, None)
+            return self.coarse(path, None, draws)
         if self.cast == "cones":
-            return cone_samples(path, self._draw(path, previous.samples.edges, previous.weights, self.num_fine + 1))
+            u = spread_uniform(path, self.num_fine + 1, draws, "fine samples")
+            return cone_samples(path, self._draw(previous.samples.edges, previous.weights, u))
         # Weights belong to samples; the bins that they are drawn from lie between the samples' midpoints.
-        s = self._draw(path, midpoints(previous.samples.s), previous.weights[:, 1:-1], self.num_fine)
+        u = spread_uniform(path, self.num_fine, draws, "fine samples")
+        s = self._draw(midpoints(previous.samples.s), previous.weights[:, 1:-1], u)
         if self.union:
             s = torch.cat([previous.samples.s, s], dim=1)
         return point_samples(path, s.sort(dim=1).values)
 
     @torch.no_grad()
     def _draw(
-        self, path: Path, edges: Float[Tensor, "R B+1"], weights: Float[Tensor, "R B"], num_samples: int
+        self, edges: Float[Tensor, "R B+1"], weights: Float[Tensor, "R B"], u: Float[Tensor, "R N"]
     ) -> Float[Tensor, "R N"]:
         weights = weights.detach().to(edges.dtype)
         weights = blur_weights(weights, self.padding) if self.blur else weights + self.padding
-        return invert_cdf(edges, weights, spread_uniform(path, num_samples, self.training))
+        return invert_cdf(edges, weights, u)

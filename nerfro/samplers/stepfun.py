@@ -6,21 +6,22 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.draws import Draws
 from nerfro.types import Path
 
 # Below this total weight a ray is treated as empty and sampled uniformly (mip-NeRF's code).
 _MIN_TOTAL_WEIGHT = 1e-5
 
 
-def spread_uniform(path: Path, num_samples: int, random: bool) -> Float[Tensor, "R N"]:
-    """Numbers in [0, 1), ascending along each ray: one uniform draw per bin, or evenly spaced from 0 to 1 - eps.
+def spread_uniform(path: Path, num_samples: int, draws: Draws | None, stream: str = "samples") -> Float[Tensor, "P N"]:
+    """Spread numbers over [0, 1), ascending along each polyline.
 
-    The evenly spaced ones include both ends, which is what inverse transform sampling is given in evaluation
-    (authors' code); `random` is the stratified draw of the paper's Eqn. stratified.
+    With `draws`, there is one uniform number in each of `num_samples` equal bins (paper, Eqn. stratified). Without, the
+    numbers are evenly spaced and include both ends, 0 and 1 - eps, as the authors' code does in evaluation.
     """
     like = path.s
-    if random:
-        jitter = path.rand(num_samples)
+    if draws is not None:
+        jitter = draws.for_rays(path.ray, num_samples, stream).to(like)
         return (torch.arange(num_samples, device=like.device, dtype=like.dtype) + jitter) / num_samples
     eps = torch.finfo(like.dtype).eps
     return torch.linspace(0.0, 1.0 - eps, num_samples, device=like.device, dtype=like.dtype).expand(len(like), -1)

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.allowed import Range
+from nerfro.draws import Draws
 from nerfro.errors import NerfroError
 from nerfro.registry import register
 from nerfro.samplers.base import PointSampler
@@ -52,13 +53,15 @@ class Stratified(PointSampler):
         box = torch.tensor([list(box_min), list(box_max)]) if box_min else None
         self.register_buffer("box", box, persistent=False)
 
-    def forward(self, path: Path, previous: Rendering | None) -> Samples:
+    def forward(self, path: Path, previous: Rendering | None, draws: Draws | None = None) -> Samples:
         if self.draw == "vertices":
-            return self._draw_vertices(path)
+            return self._draw_vertices(path, draws)
         near, far = (path.near, path.far) if self.box is None else path.span(self.box)
         cones = self.cast == "cones"
         fractions = (
-            self._cone_fractions(path) if cones else (self._bins(path.s) + self._offsets(path)) / self.num_samples
+            self._cone_fractions(path, draws)
+            if cones
+            else (self._bins(path.s) + self._offsets(path, draws)) / self.num_samples
         )
         s = near[:, None] + fractions * (far - near)[:, None]
         return cone_samples(path, s) if cones else point_samples(path, s)
@@ -66,29 +69,29 @@ class Stratified(PointSampler):
     def _bins(self, like: Tensor) -> Float[Tensor, "N"]:
         return torch.arange(self.num_samples, device=like.device, dtype=like.dtype)
 
-    def _offsets(self, path: Path) -> Float[Tensor, "R N"]:
-        if self.training:
-            return path.rand(self.num_samples)
+    def _offsets(self, path: Path, draws: Draws | None) -> Float[Tensor, "P N"]:
+        if draws is not None:
+            return draws.for_rays(path.ray, self.num_samples).to(path.s)
         return path.s.new_full((len(path.s), self.num_samples), self.offset)
 
-    def _cone_fractions(self, path: Path) -> Float[Tensor, "R N+1"]:
+    def _cone_fractions(self, path: Path, draws: Draws | None) -> Float[Tensor, "P N+1"]:
         like = path.s
         fractions = torch.linspace(0.0, 1.0, self.num_samples + 1, device=like.device, dtype=like.dtype)
-        if self.training:  # each edge moves within half a bin of its place, as mip-NeRF's do
+        if draws is not None:  # each edge moves within half a bin of its place, as mip-NeRF's do
             middle = 0.5 * (fractions[1:] + fractions[:-1])
             low = torch.cat([fractions[:1], middle])
             high = torch.cat([middle, fractions[-1:]])
-            return low + (high - low) * path.rand(len(fractions))
+            return low + (high - low) * draws.for_rays(path.ray, len(fractions)).to(like)
         return fractions.expand(len(like), -1)
 
-    def _draw_vertices(self, path: Path) -> Samples:
+    def _draw_vertices(self, path: Path, draws: Draws | None) -> Samples:
         steps, remainder = divmod(path.s.shape[1], self.num_samples)
         if steps == 0 or remainder:
             raise NerfroError(
                 f"sampler/points: draw=vertices needs a multiple of {self.num_samples} path vertices, this path has "
                 f"{path.s.shape[1]}; set sampler.path.num_steps to a multiple, or draw=arc_length"
             )
-        offsets = (self._offsets(path) * steps).long()  # floor: 0 .. steps - 1
+        offsets = (self._offsets(path, draws) * steps).long()  # floor: 0 .. steps - 1
         vertex = torch.arange(self.num_samples, device=path.s.device) * steps + offsets
         s = path.s.gather(1, vertex)
         index = vertex[..., None].expand(-1, -1, 3)

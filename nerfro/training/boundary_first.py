@@ -54,7 +54,6 @@ class BoundaryFirst(Callback):
             rays, view, rgb = batches.missing(box, num_pixels, step, camera)
             if len(rays) < _FEWEST:
                 break
-            model.seed_draws(-1 - step)
             group["lr"] = group["initial_lr"] * first * (last / first) ** (step / self._num_steps)
             radiance = model.boundary(Exits.unbent(rays))
             loss = torch.nn.functional.mse_loss(*model.difference(radiance, rgb, camera.gains(view)))

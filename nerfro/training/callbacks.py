@@ -19,6 +19,8 @@ from nerfro.types import Batch
 class Throughput(Callback):
     """Counts rays and the seconds spent on training steps, over resumed runs too, and logs `train/rays_per_second`.
 
+    Where several processes share a batch, each is taken to have as many rays as this one.
+
     Attributes:
         num_rays: rays trained on so far.
         seconds: wall-clock time of the training loop, without validation.
@@ -42,7 +44,7 @@ class Throughput(Callback):
         if self._last is not None:
             self.seconds += now - self._last
         self._last = now
-        self.num_rays += batch.num_rows or len(batch.rays) * trainer.world_size
+        self.num_rays += len(batch.rays) * trainer.world_size
         pl_module.log("train/rays_per_second", self.num_rays / self.seconds)
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

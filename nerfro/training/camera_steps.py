@@ -16,8 +16,8 @@ from nerfro.camera.refined import RefinedCamera
 from nerfro.data.base import Views
 from nerfro.geometry.interpolation import misses
 from nerfro.models.base import NerfModel
-from nerfro.pixel_parts import pixel_rays
 from nerfro.rays import Rays
+from nerfro.subdivision import pixel_rays
 from nerfro.training.boundary_first import occupied
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.outlines import meet_masks

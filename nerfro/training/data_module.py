@@ -16,6 +16,7 @@ from torch import Tensor
 
 from nerfro.data.base import Views
 from nerfro.models.base import NerfModel
+from nerfro.subdivision import Subdivision
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.watched import WatchedPixels
 from nerfro.types import Batch
@@ -59,7 +60,7 @@ class RayDataModule(LightningDataModule):
         """Of pixels of validation views, with the rays that training gives such pixels as the medium is now; dB."""
         assert self.trainer is not None
         assert self.watched is not None
-        return self.watched.psnr(cast(NerfModel, self.trainer.lightning_module), *self.batches.dividing)
+        return self.watched.psnr(cast(NerfModel, self.trainer.lightning_module), self.batches.subdivision)
 
     def transfer_batch_to_device(self, batch: int, device: torch.device, dataloader_idx: int) -> Batch | int:
         assert self.trainer is not None
@@ -135,14 +136,11 @@ def can_trace_ahead(model: NerfModel) -> bool:
 
 def traced(batches: RayBatches, model: NerfModel, config: DictConfig) -> RayBatches:
     """The batches with their paths, and with several rays in pixels for which one does not stand."""
-    side = config.batches.supersample if model.path_sampler.needs_medium else 1  # straight rays do not part
+    subdivision = Subdivision.of(config.batches)
     return batches.traced(
         lambda rays, view: model.path_sampler(model.camera(rays, view), model.medium),
-        side,
-        config.batches.divergence,
-        config.batches.get("contrast"),  # runs of former releases name neither
-        config.batches.get("contrast_start", 0),
         lambda rays, view: model.exit_directions(model.camera(rays, view)),
+        subdivision if model.path_sampler.needs_medium else None,  # straight rays do not diverge
     )
 
 

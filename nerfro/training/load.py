@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from nerfro.evaluation.render_view import Supersampling
 from nerfro.evaluation.request import find_device
 from nerfro.paths import user_path
 from nerfro.registry import discover
+from nerfro.subdivision import Subdivision
 from nerfro.training.config import build_data
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint, restore
 from nerfro.viewing.scene import Scene
@@ -46,4 +46,4 @@ def scene_of(checkpoint: dict[str, Any], config: DictConfig, device: torch.devic
     model = restore(checkpoint, config).to(device)
     corners = [config.content.box_min, config.content.box_max]  # which the model has settled
     content = None if None in corners else torch.tensor([list(corner) for corner in corners])
-    return Scene(model, build_data(config), Supersampling.of(config.evaluation), config.name, content)
+    return Scene(model, build_data(config), Subdivision.of(config.evaluation), config.name, content)

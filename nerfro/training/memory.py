@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from nerfro.draws import Draws
 from nerfro.errors import NerfroError
 from nerfro.kernels.available import available_bytes, number_in
 from nerfro.models.base import NerfModel
@@ -64,7 +65,8 @@ def _kept_bytes(model: NerfModel, rays: Rays) -> float:
             kept[storage.data_ptr()] = storage.nbytes()
         return tensor
 
-    with torch.random.fork_rng(devices=[]), torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        renderings = model(rays)  # what is kept lives as long as this does, so that no address occurs twice
+    draws = Draws(model.seed, 0, torch.arange(len(rays), device=rays.near.device))
+    with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+        renderings = model(rays, draws)  # what is kept lives as long as this does, so that no address occurs twice
         del renderings
     return sum(kept.values()) / len(rays)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -18,18 +18,14 @@ from nerfro.cli import warn
 from nerfro.data.base import Views
 from nerfro.data.pixel_store import PixelStore
 from nerfro.distributed import share_of
+from nerfro.draws import Draws
 from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import misses
-from nerfro.pixel_parts import contrast, divergence, part_rays, pixel_rays, rays_beside
 from nerfro.rays import Rays
-from nerfro.types import Batch, Path
+from nerfro.subdivision import PixelRays, Subdivision, Trace, TraceExits, contrast, pixel_rays, subdivide
+from nerfro.types import Batch
 
 Batching = Literal["single_image", "all_images"]
-Tracer = Callable[[Rays, Tensor], Path]
-Leaving = Callable[[Rays, Tensor], Tensor]  # unit directions [R, 3] in which rays leave
-
-# Numbers of divided pixels are multiples of this share of a batch, so that tensors have few different sizes.
-_STEP_OF_DIVIDED = 1 / 32
 
 
 @checked("batches")
@@ -58,10 +54,9 @@ class RayBatches:
         self.batch_size, self.batching, self.seed = batch_size, batching, seed
         self.precrop_steps, self.jitter = precrop_steps, jitter
         self._share = slice(batch_size)
-        self._trace: Tracer | None = None
-        self._leaving: Leaving | None = None
-        self._side, self._divergence = 1, 0.0
-        self._contrast, self._contrast_start = math.inf, 0
+        self.subdivision = Subdivision()
+        self._trace: Trace | None = None
+        self._trace_exits: TraceExits | None = None
         cameras = views.cameras
         self._cameras = cameras
         self._pixels = PixelStore(views.images)
@@ -91,26 +86,18 @@ class RayBatches:
         return moved
 
     def traced(
-        self,
-        trace: Tracer,
-        side: int = 1,
-        divergence: float = 8.0,
-        contrast: float | None = None,
-        contrast_start: int = 0,
-        leaving: Leaving | None = None,
+        self, trace: Trace, trace_exits: TraceExits | None = None, subdivision: Subdivision | None = None
     ) -> RayBatches:
-        """The sequence with the paths of its rays, more than one for pixels for which one does not stand.
+        """The sequence with the paths of its rays, several for each pixel that `subdivision` divides.
 
-        Pixels are divided whose ray leaves in another direction than the one beside it, by `divergence` pixel angles or
-        more (see `pixel_parts.divergence`), into `side` rays in each direction; 1 divides none. So are pixels whose ray
-        is refracted where the photograph has a contrast with the next pixels: edges and texture of things inside. They
-        are from step `contrast_start` on.
-        Where the rays beside them leave is asked of `leaving`, if that is cheaper than to trace them.
+        Args:
+            trace: traces rays, given the view of each.
+            trace_exits: traces the exit direction of each ray's main polyline; None takes it from `trace`.
+            subdivision: which pixels are divided; None divides none.
         """
         traced = copy.copy(self)
-        traced._trace, traced._side, traced._divergence = trace, side, divergence
-        traced._contrast, traced._contrast_start = math.inf if contrast is None else contrast, contrast_start
-        traced._leaving = leaving or (lambda rays, view: _main_exits(trace(rays, view)))
+        traced._trace, traced._trace_exits = trace, trace_exits
+        traced.subdivision = subdivision or Subdivision()
         return traced
 
     def forget(self) -> None:
@@ -143,16 +130,30 @@ class RayBatches:
         generator = np.random.default_rng([self.seed, step])
         view, pixel = self._draw(generator, window)
         row, column = window.top + pixel // window.width, window.left + pixel % window.width
-        drawn = (view * height + row) * width + column
-        if self._side > 1:
-            least = self._contrast if step >= self._contrast_start else math.inf
-            return self._divided_batch(drawn, least, generator, cameras.crop(window))
         # One small copy to the device; the rest is computed there.
-        index = self._to_device(drawn[self._share])
-        place = self._to_device(self._random(generator, 2)[self._share]) if self.jitter else None
-        rays, views = pixel_rays(cameras, index, place), index // (height * width)
-        path = None if self._trace is None else self._trace(rays, views)
-        return Batch(rays, views, self._pixels[index], cameras.crop(window), path=path, index=index)
+        pixels = self._to_device(((view * height + row) * width + column)[self._share])
+        slot = torch.arange(self.batch_size, device=cameras.device)[self._share]
+        draws = Draws(self.seed, step, slot)
+        found = self._rays(pixels, draws, step)
+        return Batch(
+            rays=found.rays,
+            pixel=found.pixel,
+            index=pixels,
+            view=pixels // (height * width),
+            rgb=self._pixels[pixels],
+            teaches_background=~found.diverges,
+            cameras=cameras.crop(window),
+            draws=replace(draws, ray=slot[found.pixel] * self.subdivision.side**2 + found.part),
+            path=found.path,
+        )
+
+    def _rays(self, pixels: Int[Tensor, "Q"], draws: Draws, step: int) -> PixelRays:
+        """Rays through pixels, with their paths where there is something that traces them."""
+        contrasts = None
+        if step >= self.subdivision.contrast_start:
+            contrasts = lambda rows: contrast(self.photographed, self._cameras, pixels[rows])  # noqa: E731
+        jitter = draws if self.jitter else None
+        return subdivide(self._cameras, pixels, self.subdivision, self._trace, self._trace_exits, contrasts, jitter)
 
     @property
     def num_pixels(self) -> int:
@@ -204,11 +205,6 @@ class RayBatches:
         return self._to_device(within + size * np.arange(len(cameras))[:, None])
 
     @property
-    def dividing(self) -> tuple[int, float, float]:
-        """`side`, `divergence` and `contrast` of `traced`; infinite contrast where it divides none."""
-        return self._side, self._divergence, self._contrast
-
-    @property
     def cameras(self) -> Cameras:
         """Of all views, as the data give them."""
         return self._cameras
@@ -216,73 +212,6 @@ class RayBatches:
     def photographed(self, pixels: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
         """Colours of pixels, numbered view by view and row by row; sRGB in [0, 1]."""
         return self._pixels[pixels]
-
-    def _divided_batch(
-        self, drawn: Int[np.ndarray, "P"], least_contrast: float, generator: np.random.Generator, cameras: Cameras
-    ) -> Batch:
-        """The batch of the drawn pixels: first those that have one ray, then the divided ones with all of theirs."""
-        assert self._trace is not None
-        assert self._leaving is not None
-        several = self._side**2
-        pixels = self._to_device(drawn)
-        view = pixels // (self._cameras.height * self._cameras.width)
-        place = self._to_device(self._random(generator, 2)) if self.jitter else None
-        place_in_part = self._to_device(self._random(generator, several, 2)) if self.jitter else None
-        # Every process traces the rays of the whole batch once, to know how the others divide their pixels.
-        rays = pixel_rays(self._cameras, pixels, place)
-        path = self._trace(rays, view)
-        beside = self._leaving(rays_beside(self._cameras, pixels, place), view)
-        parted = self._largest(divergence(self._cameras, pixels, _main_exits(path), beside), self._divergence)
-        fine = torch.zeros_like(parted)
-        if least_contrast < math.inf:
-            visible = path.first_of_ray(path.refracted) & ~parted
-            of_visible = contrast(self.photographed, self._cameras, pixels[visible])
-            contrasts = of_visible.new_full(pixels.shape, -1)
-            contrasts[visible] = of_visible
-            fine = self._largest(contrasts, least_contrast) & visible
-        divided = parted | fine
-
-        # Each pixel's first row in the whole batch.
-        num_rays = torch.where(divided, several, 1)
-        order = torch.argsort(fine.int() + 2 * parted.int(), stable=True)
-        first_row = torch.empty_like(num_rays)
-        first_row[order] = num_rays[order].cumsum(0) - num_rays[order]
-
-        own = torch.zeros_like(divided)
-        own[self._share] = True
-        whole, finer, parted = ((own & kind).nonzero()[:, 0] for kind in (~divided, fine, parted))
-        divided = torch.cat([finer, parted])
-        parts = part_rays(
-            self._cameras, pixels[divided], self._side, None if place_in_part is None else place_in_part[divided]
-        )
-        view_of_part = view[divided].repeat_interleave(several)
-        index = torch.cat([pixels[whole], pixels[divided].repeat_interleave(several)])
-        rows = first_row[divided][:, None] + torch.arange(several, device=pixels.device)
-        return Batch(
-            rays=rays[whole].followed_by(parts),
-            view=torch.cat([view[whole], view_of_part]),
-            rgb=self._pixels[index],
-            cameras=cameras,
-            num_whole=len(whole),
-            num_together=len(whole) + several * len(finer),
-            rays_per_pixel=several,
-            rows=torch.cat([first_row[whole], rows.flatten()]),
-            num_rows=int(num_rays.sum()),
-            path=path.of_rays(whole).followed_by(self._trace(parts, view_of_part)),
-            index=index,
-        )
-
-    @staticmethod
-    def _largest(values: Float[Tensor, "P"], least: float) -> Bool[Tensor, "P"]:
-        """Which pixels are divided: all that have at least so much, and the next ones up to a round number."""
-        step = max(1, round(_STEP_OF_DIVIDED * len(values)))
-        wanted = -(-int((values >= least).sum()) // step) * step
-        chosen = torch.zeros_like(values, dtype=torch.bool)
-        chosen[values.argsort(descending=True, stable=True)[:wanted]] = True
-        return chosen
-
-    def _random(self, generator: np.random.Generator, *shape: int) -> Float[np.ndarray, "P ..."]:
-        return generator.random((self.batch_size, *shape), dtype=np.float32)
 
     def _to_device(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self._cameras.device, non_blocking=True)
@@ -320,10 +249,6 @@ class RayBatches:
             )
         if counts.sum() == 0:
             raise NerfroError(f"the masks leave no pixel to train on{precropped}; black is ignored, white is used")
-
-
-def _main_exits(path: Path) -> Float[Tensor, "R 3"]:
-    return path.first_of_ray(path.exit_directions)
 
 
 def _of_object(views: Views, batching: Batching, window: Window) -> _Usable:

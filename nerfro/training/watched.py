@@ -14,13 +14,12 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 from tqdm import tqdm
 
-from nerfro import pixel_parts
 from nerfro.camera.exposure import fit_gain
 from nerfro.cameras import Cameras
 from nerfro.data.base import Views
 from nerfro.models.base import NerfModel, psnr
-from nerfro.pixel_parts import part_rays, pixel_rays, rays_beside
-from nerfro.types import Batch
+from nerfro.subdivision import PixelRays, Subdivision, contrast, subdivide
+from nerfro.types import Batch, mean_per_pixel
 
 # Pixels that are looked at, of at most so many views: the same ones each time, or their scores could not be compared.
 _NUM_PIXELS, _MOST_VIEWS = 2048, 32
@@ -36,7 +35,7 @@ class WatchedPixels:
     cameras: Cameras
     index: Int[Tensor, "R"]
     rgb: Float[Tensor, "R 3"]  # sRGB in [0, 1]
-    contrast: Float[Tensor, "R"]  # with the pixels around; see `pixel_parts.contrast`
+    contrast: Float[Tensor, "R"]  # with the pixels around; see `subdivision.contrast`
 
     @classmethod
     def of(cls, views: Views, seed: int = 0) -> WatchedPixels:
@@ -53,35 +52,33 @@ class WatchedPixels:
             indices.append(view * size + drawn)
             picture = views.images[view].reshape(-1, 3)
             colours.append(picture[drawn])
-            contrasts.append(pixel_parts.contrast(picture.__getitem__, views.cameras, drawn))
+            contrasts.append(contrast(picture.__getitem__, views.cameras, drawn))
         return cls(views.cameras, *map(torch.cat, (indices, colours, contrasts)))
 
-    def batch(self, model: NerfModel, side: int, divergence: float, contrast: float) -> Batch:
-        """The pixels with the rays that training gives such pixels; see `RayBatches.traced` for what divides them."""
-        cameras, pixels = self.cameras.to(model.device), self.index.to(model.device)
-        rays, rgb = pixel_rays(cameras, pixels), self.rgb.to(model.device)
-        view = pixels // (cameras.height * cameras.width)
-        if side == 1:
-            return Batch(rays, view, rgb, cameras, index=pixels)
-        path, beside = model.path_sampler(rays, model.medium), model.exit_directions(rays_beside(cameras, pixels))
-        apart = pixel_parts.divergence(cameras, pixels, path.first_of_ray(path.exit_directions), beside)
-        fine = path.first_of_ray(path.refracted) & (self.contrast.to(model.device) >= contrast)
-        divided = fine | (apart >= divergence)
-        whole, divided = (~divided).nonzero()[:, 0], divided.nonzero()[:, 0]
-        rows = torch.cat([whole, divided.repeat_interleave(side**2)])
-        rays = rays[whole].followed_by(part_rays(cameras, pixels[divided], side))
-        return Batch(
-            rays, view[rows], rgb[rows], cameras, num_whole=len(whole), rays_per_pixel=side**2, index=pixels[rows]
+    def rays(self, model: NerfModel, subdivision: Subdivision) -> PixelRays:
+        """The rays that training gives such pixels."""
+        contrast = self.contrast.to(model.device)
+        return subdivide(
+            self.cameras.to(model.device),
+            self.index.to(model.device),
+            subdivision,
+            lambda rays, view: model.path_sampler(rays, model.medium),
+            lambda rays, view: model.exit_directions(rays),
+            lambda rows: contrast[rows],
         )
 
-    def psnr(self, model: NerfModel, side: int, divergence: float, contrast: float) -> Float[Tensor, ""]:
-        """What the model has of the pixels, dB; where exposures learn, with the gain that suits each view best."""
-        batch = self.batch(model, side, divergence, contrast)
-        radiance, rgb = batch.of_pixels(model.radiance(batch.rays)), batch.of_pixels(batch.rgb)
+    def psnr(self, model: NerfModel, subdivision: Subdivision) -> Float[Tensor, ""]:
+        """Peak signal-to-noise ratio of the model's pixels, dB; learned exposures are replaced by the best gains.
+
+        Args:
+            model: that renders the pixels.
+            subdivision: which pixels get several rays.
+        """
+        found, rgb = self.rays(model, subdivision), self.rgb.to(model.device)
+        radiance = mean_per_pixel(model.radiance(found.rays), found.pixel, len(rgb))
         if model.camera.exposure is None:
             return psnr(model.photographed(radiance), rgb)
-        whole = len(batch.view) if batch.num_whole is None else batch.num_whole
-        views = torch.cat([batch.view[:whole], batch.view[whole :: batch.rays_per_pixel]])
+        views = self.index.to(model.device) // (self.cameras.height * self.cameras.width)
         gains = torch.ones_like(radiance)
         for view in views.unique():
             gains[views == view] = fit_gain(model.encode, radiance[views == view], rgb[views == view])

@@ -13,7 +13,7 @@ from nerfro.errors import NerfroError
 from nerfro.files.images import to_8bit
 from nerfro.files.ply import write_ply
 from nerfro.light import to_srgb
-from nerfro.pixel_parts import pixel_rays
+from nerfro.subdivision import pixel_rays
 from nerfro.viewing.scene import Scene
 from nerfro.viewing.volume import ask
 

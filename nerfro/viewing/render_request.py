@@ -123,9 +123,9 @@ def labels(config: DictConfig) -> list[str]:
 def prepared(config: DictConfig, scene: Scene) -> Scene:
     """A loaded scene as it is to be rendered: rays a pixel and at once, and its sky."""
     wanted = {"side": config.supersample, "divergence": config.divergence, "contrast": config.contrast}
-    rays = replace(scene.supersampling, **{name: value for name, value in wanted.items() if value is not None})
+    rays = replace(scene.subdivision, **{name: value for name, value in wanted.items() if value is not None})
     model = variant(scene.model, chunk_size=config.chunk_size or scene.model.chunk_size)
-    scene = replace(scene, model=model, supersampling=rays)
+    scene = replace(scene, model=model, subdivision=rays)
     return scene if config.sky is None else scene.with_(sky=config.sky)
 
 

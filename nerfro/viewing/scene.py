@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,12 +15,13 @@ from tqdm import tqdm
 from nerfro.cameras import Cameras
 from nerfro.data.base import DataSource, Views
 from nerfro.errors import NerfroError
-from nerfro.evaluation.render_view import Supersampling, render_view
+from nerfro.evaluation.render_view import render_view
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.models.base import NerfModel
 from nerfro.paths import user_path
+from nerfro.subdivision import Subdivision
 from nerfro.types import Exits
 from nerfro.variants import variant
 from nerfro.viewing.changes import with_absorption, with_indices, with_sky, without_glass, without_inside
@@ -49,14 +50,14 @@ class Scene:
     Attributes:
         model: the radiance field, glass and sky, in evaluation.
         source: the data set.
-        supersampling: rays a pixel, as the run was evaluated.
+        subdivision: rays a pixel, as the run was evaluated.
         name: of the experiment.
         content: corners of the box outside of which the field holds nothing, world units, where it has one.
     """
 
     model: NerfModel
     source: DataSource
-    supersampling: Supersampling = Supersampling()  # noqa: RUF009 (frozen)
+    subdivision: Subdivision = field(default_factory=Subdivision)
     name: str = ""
     content: Float[Tensor, "2 3"] | None = None
 
@@ -71,7 +72,7 @@ class Scene:
     def render(
         self,
         cameras: Cameras,
-        supersampling: Supersampling | None = None,
+        subdivision: Subdivision | None = None,
         chunk_size: int | None = None,
         progress: bool = False,
     ) -> RenderedViews:
@@ -79,17 +80,17 @@ class Scene:
 
         Args:
             cameras: on any device; see `nerfro.cameras.Cameras` for their axes.
-            supersampling: rays a pixel, as the run was evaluated by default; `Supersampling()` gives each pixel one.
+            subdivision: rays a pixel, as the run was evaluated by default; `Subdivision()` gives each pixel one.
             chunk_size: rays rendered at once, as the run was evaluated by default.
             progress: whether to show a bar with the time that is left.
         """
         scene = self if chunk_size is None else replace(self, model=variant(self.model, chunk_size=chunk_size))
         views = tqdm(range(len(cameras)), unit="view", desc="render", disable=not progress, dynamic_ncols=True)
-        rendered = [scene._render_view(cameras, view, supersampling or self.supersampling) for view in views]
+        rendered = [scene._render_view(cameras, view, subdivision or self.subdivision) for view in views]
         return RenderedViews(*(torch.stack(parts) for parts in zip(*rendered, strict=True)))
 
-    def _render_view(self, cameras: Cameras, view: int, supersampling: Supersampling) -> tuple[Tensor, ...]:
-        found = render_view(self.model, cameras.to(self.model.device), view, supersampling)
+    def _render_view(self, cameras: Cameras, view: int, subdivision: Subdivision) -> tuple[Tensor, ...]:
+        found = render_view(self.model, cameras.to(self.model.device), view, subdivision)
         rgb = self.model.photographed(found.radiance)
         radiance = self.model.linear(found.radiance)
         values = rgb, found.depth, found.opacity, found.normals, found.exit_directions, radiance

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from nerfro.draws import Draws
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.fields.selection import inside_box
@@ -150,12 +151,14 @@ class EikonalFields(NerfModel):
         with torch.set_grad_enabled(stage == Stage.INDEX and torch.is_grad_enabled()):
             return self.path_sampler(rays, self.medium)
 
-    def render_path(self, path: Path) -> list[Rendering]:
+    def render_path(
+        self, path: Path, draws: Draws | None = None, teaches_background: Bool[Tensor, "R"] | None = None
+    ) -> list[Rendering]:
         stage = Stage(int(self.stage))
-        samples = self.point_sampler(path, None)
+        samples = self.point_sampler(path, None, draws)
         (field,) = self.fields
         if stage == Stage.SCENE:
-            return [composite(samples, field(samples), self.boundary(path.exits()), path)]
+            return [composite(samples, field(samples), self.background(path, teaches_background), path)]
         outside = ~inside_box(samples.positions.detach(), *self.medium.box)
         if stage == Stage.INDEX and self.training:
             assert self._blurred is not None  # made at the start of the step
@@ -163,7 +166,7 @@ class EikonalFields(NerfModel):
             return [composite(samples, radiance, self._blurred.sky_towards(path.exit_directions), path)]
         with torch.no_grad():
             radiance = radiance_where(field, samples, outside)
-            sky = self.boundary(path.exits())
+            sky = self.background(path)
         if stage == Stage.INTERIOR:
             inner = radiance_where(self.interior, samples, ~outside)
             radiance = Radiance(radiance.density + inner.density, radiance.rgb + inner.rgb)

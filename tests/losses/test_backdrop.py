@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from nerfro.errors import NerfroError
 from nerfro.losses.backdrop import Backdrop
 from nerfro.rendering import composite
-from nerfro.testing import example_path
-from nerfro.types import Batch, Radiance, Samples
+from nerfro.testing import example_batch, example_path
+from nerfro.types import Radiance, Samples
 
 WHITE = [1.0, 1.0, 1.0]
 
@@ -21,7 +23,7 @@ def learned_opacity(seen: torch.Tensor, loss: Backdrop, num_steps: int = 200) ->
     samples = Samples.along(path, 0.5 * (edges[:, 1:] + edges[:, :-1]), edges)
     raw = torch.full((1,), 1.0, requires_grad=True)
     optimizer = torch.optim.Adam([raw], lr=0.1)
-    batch = Batch(None, None, seen.expand(8, 3), None)  # type: ignore[arg-type]  # nor is the model asked
+    batch = replace(example_batch(8), rgb=seen.expand(8, 3))
     for _ in range(num_steps):
         density = raw.exp().expand(8, 8)
         rendering = composite(samples, Radiance(density, torch.ones(8, 8, 3)), torch.ones(8, 3), path)

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from nerfro.losses.distortion import Distortion, distortion
-from nerfro.types import Batch, Path, Rendering, Samples
+from nerfro.testing import example_batch
+from nerfro.types import Path, Rendering, Samples
 
 
 def random_intervals(num_rays: int, num_samples: int, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
@@ -62,8 +63,7 @@ def loss(weights: torch.Tensor, s: torch.Tensor, measure: torch.Tensor | None = 
     samples = Samples(positions, positions, s[:, :-1], s, torch.ones(5), measure=measure)
     colour = torch.zeros(5, 3)
     rendering = Rendering(colour, weights, 1 - weights.sum(-1), colour, samples, path)
-    batch = Batch(None, colour, None, None)  # type: ignore[arg-type]  # nor is the model asked
-    return Distortion()([rendering], batch, None)  # type: ignore[arg-type]
+    return Distortion()([rendering], example_batch(len(colour)), None)  # type: ignore[arg-type]
 
 
 def test_loss_does_not_depend_on_the_scenes_scale_or_place() -> None:

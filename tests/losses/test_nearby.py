@@ -7,10 +7,10 @@ import torch
 
 from nerfro.losses.nearby import Nearby
 from nerfro.rendering import composite
-from nerfro.testing import example_path
-from nerfro.types import Batch, Path, Radiance, Rendering, Samples
+from nerfro.testing import example_batch, example_path
+from nerfro.types import Path, Radiance, Rendering, Samples
 
-BATCH = Batch(None, None, torch.zeros(8, 3), None)  # type: ignore[arg-type]  # nor is the model asked
+BATCH = example_batch(8)
 
 
 def white_fog(path: Path, density: torch.Tensor) -> Rendering:

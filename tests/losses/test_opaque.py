@@ -6,8 +6,8 @@ import torch
 
 from nerfro.losses.opaque import Opaque
 from nerfro.rendering import composite
-from nerfro.testing import example_path
-from nerfro.types import Batch, Radiance, Samples
+from nerfro.testing import example_batch, example_path
+from nerfro.types import Radiance, Samples
 
 
 def learned_opacity(weight: float, num_steps: int = 200) -> float:
@@ -17,7 +17,7 @@ def learned_opacity(weight: float, num_steps: int = 200) -> float:
     samples = Samples.along(path, 0.5 * (edges[:, 1:] + edges[:, :-1]), edges)
     raw = torch.full((1,), -5.0, requires_grad=True)
     optimizer = torch.optim.Adam([raw], lr=0.1)
-    batch = Batch(None, None, torch.zeros(8, 3), None)  # type: ignore[arg-type]  # nor is the model asked
+    batch = example_batch(8)
     for _ in range(num_steps):
         density = raw.exp().expand(8, 8)
         rendering = composite(samples, Radiance(density, torch.zeros(8, 8, 3)), torch.zeros(8, 3), path)

@@ -13,7 +13,7 @@ from nerfro.boundaries.skybox import Skybox
 from nerfro.fields.nerf import NerfField
 from nerfro.losses.photometric import Photometric
 from nerfro.media.analytic import Luneburg
-from nerfro.models.base import Parts, step_seed
+from nerfro.models.base import Parts
 from nerfro.models.mip_nerf import MipNerfModel
 from nerfro.models.optimizer import OptimizerConfig
 from nerfro.models.refractive import RefractiveModel
@@ -123,12 +123,6 @@ def test_optimizer_gives_the_boundary_its_own_rate(parts: Parts) -> None:
 def test_model_whose_boundary_has_no_weights_can_be_optimised(parts: Parts) -> None:
     groups = RefractiveModel(replace(parts, boundary=Compass())).configure_optimizers().param_groups
     assert len(groups) == 1
-
-
-def test_seeds_of_steps_and_runs_differ() -> None:
-    seeds = {step_seed(seed, step) for seed in range(10) for step in range(200)}
-    assert len(seeds) == 10 * 200
-    assert all(0 <= seed < 2**63 for seed in seeds)
 
 
 def test_index_grid_does_not_burden_the_checkpoint(parts: Parts) -> None:

@@ -8,6 +8,7 @@ from torch.nn.functional import normalize
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.cameras import Cameras
+from nerfro.draws import Draws
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.media.shapes import Ball
 from nerfro.rendering import composite
@@ -60,8 +61,10 @@ class Nothing(Boundary):
         return torch.zeros_like(exits.directions)
 
 
-def rendered(path: Path, sampler: DensityGridSampler, field: HashGridField, boundary: Boundary) -> torch.Tensor:
-    samples = sampler(path, None)
+def rendered(
+    path: Path, sampler: DensityGridSampler, field: HashGridField, boundary: Boundary, draws: Draws | None = None
+) -> torch.Tensor:
+    samples = sampler(path, None, draws)
     return composite(samples, field(samples), boundary(path.exits()), path).rgb
 
 
@@ -76,14 +79,14 @@ def scores(space: dict, boundary: Boundary, num_steps: int = 150) -> list[float]
     parameters = [*field.parameters(), *boundary.parameters()]
     optimizer = torch.optim.Adam(parameters, eps=1e-15)
     for step in range(num_steps):
-        sampler.after_step(step, [field])
+        draws = Draws(0, step, torch.arange(512))
+        sampler.after_step([field], draws)
         optimizer.param_groups[0]["lr"] = 4e-2 * 0.1 ** (step / num_steps)
         chosen = torch.randint(len(target), (512,))
-        loss = (rendered(path[chosen], sampler, field, boundary) - target[chosen]).square().mean()
+        loss = (rendered(path[chosen], sampler, field, boundary, draws) - target[chosen]).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    sampler.eval()
     path, target, toy = photographs(3, 2)
     with torch.no_grad():
         error = (rendered(path, sampler, field, boundary) - target).square().mean(-1)

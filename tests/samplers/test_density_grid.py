@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch import nn
 
-from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.geometry.contraction import contracted_length, shrinkage
 from nerfro.samplers.density_grid import DensityGridSampler
-from nerfro.samplers.stepfun import spread_uniform
-from nerfro.testing import example_path
+from nerfro.testing import example_draws, example_path
 from nerfro.types import Path, Radiance, Samples
 
 RADIUS = 0.4
@@ -31,16 +28,15 @@ ALL_OF_SPACE = {"radius": 0.7, "near": 0.3, "trust": 0.4}
 def trained_sampler(**space: float) -> DensityGridSampler:
     sampler = DensityGridSampler(num_samples=16, num_bins=64, resolution=32, every=1, **space)
     for step in range(200):
-        sampler.after_step(step, nn.ModuleList([DenseBall()]))
+        sampler.after_step([DenseBall()], example_draws(step=step))
     return sampler
 
 
 @pytest.mark.parametrize("space", [{}, ALL_OF_SPACE])
 def test_compiled_kernel_draws_what_the_plain_twin_draws(space: dict) -> None:
     sampler, path = trained_sampler(**space), example_path(64)
-    for random in (False, True):
-        u = spread_uniform(path, sampler.num_samples + 1, random)
-        plain, compiled = sampler.draw(path, u), sampler.draw_compiled(path, u)
+    for draws in (None, example_draws(64)):
+        plain, compiled = sampler.draw(path, draws), sampler.draw_compiled(path, draws)
         # Nearly infinite places may differ by some of their distance.
         torch.testing.assert_close(compiled.edges, plain.edges, rtol=5e-3 * bool(space), atol=2e-4)
         torch.testing.assert_close(compiled.s, plain.s, rtol=5e-3 * bool(space), atol=2e-4)
@@ -51,15 +47,8 @@ def test_compiled_kernel_draws_what_the_plain_twin_draws(space: dict) -> None:
         assert close.float().mean() > 0.99  # a sample within rounding of a vertex may lie on either side
 
 
-@pytest.mark.parametrize("num_rows", [63, 65])
-def test_kernel_refuses_other_numbers_of_rows_than_of_paths(num_rows: int) -> None:
-    sampler, u = DensityGridSampler(num_samples=16), torch.zeros(num_rows, 17)
-    with pytest.raises(NerfroError, match=f"{num_rows} rows .* 64 paths"):
-        sampler.draw_compiled(example_path(64), u)
-
-
 def test_samples_gather_where_the_density_is() -> None:
-    sampler, path = trained_sampler().eval(), example_path(64)
+    sampler, path = trained_sampler(), example_path(64)
     samples = sampler(path, None)
     dense = (path.at(torch.linspace(2, 6, 400).expand(64, -1).contiguous())[0].norm(dim=-1) < RADIUS * 0.8).any(-1)
     assert 5 < dense.sum() < 60
@@ -71,7 +60,7 @@ def test_samples_gather_where_the_density_is() -> None:
 def test_what_stands_behind_a_cell_of_which_a_ray_meets_the_empty_part_gets_samples(
     trust: float, behind: float
 ) -> None:
-    sampler = DensityGridSampler(num_samples=64, num_bins=64, resolution=32, uniform=0.01, trust=trust).eval()
+    sampler = DensityGridSampler(num_samples=64, num_bins=64, resolution=32, uniform=0.01, trust=trust)
     sampler.density[15:17] = 1e3  # four bins look opaque: two of a cell that something fills in part, and two behind
     path = straight(torch.tensor([0.0, 8.0]), 0.1)
     drawn = sampler(path, None)
@@ -89,7 +78,7 @@ def straight(s: torch.Tensor, aside: float) -> Path:
 
 @pytest.mark.parametrize("aside", [0.0, 0.5, 2.0])
 def test_samples_of_all_space_hold_all_contracted_length(aside: float) -> None:
-    sampler = trained_sampler(**ALL_OF_SPACE).eval()
+    sampler = trained_sampler(**ALL_OF_SPACE)
     path = straight(torch.tensor([2.0, 3.0, 3.5, 6.0]), aside)
     samples = sampler(path, None)
     shorter = shrinkage(samples.positions, torch.zeros(3), 0.7)
@@ -100,7 +89,7 @@ def test_samples_of_all_space_hold_all_contracted_length(aside: float) -> None:
 
 
 def test_samples_of_all_space_do_not_depend_on_where_a_line_has_vertices() -> None:
-    sampler = trained_sampler(**ALL_OF_SPACE).eval()
+    sampler = trained_sampler(**ALL_OF_SPACE)
     few, many = (sampler(straight(s, 0.2), None) for s in (torch.tensor([1.0, 9.0]), torch.linspace(0.5, 7, 12)))
     torch.testing.assert_close(sampler.contracted(few.positions), sampler.contracted(many.positions), rtol=0, atol=1e-5)
     torch.testing.assert_close(few.deltas[:, :-1], many.deltas[:, :-1], rtol=1e-3, atol=1e-5)
@@ -108,8 +97,8 @@ def test_samples_of_all_space_do_not_depend_on_where_a_line_has_vertices() -> No
 
 def test_pictures_have_their_own_number_of_samples() -> None:
     sampler = DensityGridSampler(num_samples=16, num_shown=40)
-    assert sampler(example_path(4), None).s.shape == (4, 16)
-    assert sampler.eval()(example_path(4), None).s.shape == (4, 40)
+    assert sampler(example_path(4), None, example_draws(4)).s.shape == (4, 16)
+    assert sampler(example_path(4), None).s.shape == (4, 40)
 
 
 def test_grid_remembers_the_field_it_looked_at() -> None:
@@ -136,8 +125,7 @@ def split_in_two(shares: tuple[float, float]) -> Path:
 
 def test_branches_are_sampled_by_their_weight_in_training() -> None:
     sampler, path = trained_sampler(), split_in_two((0.9, 0.1))
-    torch.manual_seed(1)
-    samples = sampler(path, None)
+    samples = sampler(path, None, example_draws(64))
     num = (samples.deltas > 0).sum(-1).view(-1, 2)
     assert num.max(0).values.tolist() == [15, 8]
     dense = sampler.lookup(samples.positions) * samples.deltas >= 0.005
@@ -146,16 +134,14 @@ def test_branches_are_sampled_by_their_weight_in_training() -> None:
     assert torch.equal(faint, dense[1::2])
     assert 0 < faint.sum() < main.sum() / 3
     # In pictures all are sampled alike.
-    drawn = sampler.eval()(path, None)
+    drawn = sampler(path, None)
     assert torch.equal(drawn.edges[::2], drawn.edges[1::2])
 
 
 def test_a_ray_that_does_not_split_is_sampled_as_ever() -> None:
     sampler, path = trained_sampler(), example_path(64)
-    torch.manual_seed(1)
-    alone = sampler(path, None)
-    torch.manual_seed(1)
-    whole = sampler(split_in_two((1.0, 1.0)), None)
+    alone = sampler(path, None, example_draws(64))
+    whole = sampler(split_in_two((1.0, 1.0)), None, example_draws(64))
     assert torch.equal(whole.edges[::2], alone.edges)
     assert alone.occupied is None
 

@@ -8,12 +8,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from nerfro.draws import Draws
 from nerfro.errors import NerfroError
 from nerfro.rendering import composite
 from nerfro.samplers.hierarchical import Hierarchical
 from nerfro.samplers.stepfun import midpoints
 from nerfro.samplers.straight import straight_path
-from nerfro.testing import example_path, example_rays
+from nerfro.testing import example_draws, example_path, example_rays
 from nerfro.types import Path, Radiance, Rendering
 
 
@@ -31,12 +32,12 @@ def spike(num_samples: int, index: int) -> Tensor:
     return weights
 
 
-@pytest.mark.parametrize("training", [True, False])
-def test_all_fine_samples_fall_around_the_one_sample_with_weight(training: bool) -> None:
+@pytest.mark.parametrize("draws", [None, example_draws()])
+def test_all_fine_samples_fall_around_the_one_sample_with_weight(draws: Draws | None) -> None:
     path = example_path()
-    sampler = Hierarchical(16, 32, union=False).train(training)
+    sampler = Hierarchical(16, 32, union=False)
     coarse = render(path, sampler, spike(16, 9))
-    fine = sampler(path, coarse)
+    fine = sampler(path, coarse, draws)
     bins = midpoints(coarse.samples.s)
     assert fine.s.shape == (len(path.s), 32)
     assert (fine.s >= bins[:, 8:9] - 1e-5).all()
@@ -45,7 +46,7 @@ def test_all_fine_samples_fall_around_the_one_sample_with_weight(training: bool)
 
 def test_fine_samples_are_shared_out_in_proportion_to_the_weights() -> None:
     path = straight_path(example_rays())
-    sampler = Hierarchical(8, 1000, union=False).eval()
+    sampler = Hierarchical(8, 1000, union=False)
     weights = torch.tensor([9.0, 1, 0, 3, 0, 0, 4, 9])  # the first and the last have no bin of their own
     coarse = render(path, sampler, weights)
     bins = midpoints(coarse.samples.s)
@@ -57,9 +58,9 @@ def test_fine_samples_are_shared_out_in_proportion_to_the_weights() -> None:
 
 def test_union_holds_every_coarse_sample_and_is_sorted() -> None:
     path = example_path()
-    sampler = Hierarchical(16, 24).train()
+    sampler = Hierarchical(16, 24)
     coarse = render(path, sampler, torch.rand(16))
-    fine = sampler(path, coarse)
+    fine = sampler(path, coarse, example_draws())
     assert fine.s.shape == (len(path.s), 40)
     assert (fine.s.diff(dim=1) >= 0).all()
     assert ((fine.s[:, None] - coarse.samples.s[..., None]).abs().min(-1).values == 0).all()
@@ -67,8 +68,8 @@ def test_union_holds_every_coarse_sample_and_is_sorted() -> None:
 
 def test_fine_samples_lie_on_the_bent_path() -> None:
     path = example_path()
-    sampler = Hierarchical(16, 24).train()
-    fine = sampler(path, render(path, sampler, torch.rand(16)))
+    sampler = Hierarchical(16, 24)
+    fine = sampler(path, render(path, sampler, torch.rand(16)), example_draws())
     start, end = path.positions[:, None, :-1], path.positions[:, None, 1:]
     # Distance to the nearest segment of the polyline, by brute force.
     # Rows with fewer vertices repeat their last one; such a segment is a point.
@@ -81,7 +82,7 @@ def test_fine_samples_lie_on_the_bent_path() -> None:
 
 def test_padding_reaches_bins_without_weight() -> None:
     path = straight_path(example_rays())
-    sampler = Hierarchical(16, 64, union=False, padding=0.1).eval()
+    sampler = Hierarchical(16, 64, union=False, padding=0.1)
     coarse = render(path, sampler, spike(16, 9))
     bins = midpoints(coarse.samples.s)
     outside = (sampler(path, coarse).s < bins[:, 8:9]).sum(1)
@@ -91,7 +92,7 @@ def test_padding_reaches_bins_without_weight() -> None:
 
 def test_blur_reaches_the_neighbours_of_a_spike() -> None:
     path = straight_path(example_rays())
-    sampler = Hierarchical(16, 400, union=False, blur=True).eval()
+    sampler = Hierarchical(16, 400, union=False, blur=True)
     coarse = render(path, sampler, spike(16, 9))
     bins = midpoints(coarse.samples.s)
     fine = sampler(path, coarse).s
@@ -108,9 +109,9 @@ def test_no_gradient_flows_through_where_samples_lie() -> None:
 
 def test_cones_are_redrawn_between_edges() -> None:
     path = straight_path(example_rays())
-    sampler = Hierarchical(16, 24, union=False, cast="cones").train()
+    sampler = Hierarchical(16, 24, union=False, cast="cones")
     coarse = render(path, sampler, spike(16, 5))
-    fine = sampler(path, coarse)
+    fine = sampler(path, coarse, example_draws())
     assert fine.edges.shape == (len(path.s), 25)
     assert (fine.edges >= coarse.samples.edges[:, 5:6] - 1e-5).all()
     assert (fine.edges <= coarse.samples.edges[:, 6:7] + 1e-5).all()

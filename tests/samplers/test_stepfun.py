@@ -11,6 +11,7 @@ from torch import Tensor
 
 from nerfro.samplers.stepfun import blur_weights, invert_cdf, midpoints, spread_uniform
 from nerfro.samplers.straight import straight_path
+from nerfro.testing import example_draws
 from nerfro.types import Path
 from tests.closed_forms import make_rays
 
@@ -78,7 +79,7 @@ def test_samples_stay_inside_at_both_ends_of_u() -> None:
 
 def test_ascending_u_gives_ascending_samples() -> None:
     edges, weights = random_step_function(50, 40)
-    s = invert_cdf(edges.float(), weights.float(), spread_uniform(_paths(50), 128, True))
+    s = invert_cdf(edges.float(), weights.float(), spread_uniform(_paths(50), 128, example_draws(50)))
     assert (s.diff(dim=1) >= -1e-6).all()
 
 
@@ -106,13 +107,13 @@ def test_blur_equals_a_slow_loop() -> None:
 
 @pytest.mark.parametrize("num_samples", [1, 5, 64])
 def test_random_u_has_one_draw_in_each_bin(num_samples: int) -> None:
-    u = spread_uniform(_paths(100), num_samples, True)
+    u = spread_uniform(_paths(100), num_samples, example_draws(100))
     assert ((u * num_samples).floor() == torch.arange(num_samples)).all()
     assert len(u.unique()) > 0.9 * u.numel()
 
 
 def test_even_u_runs_from_zero_to_just_below_one() -> None:
-    u = spread_uniform(_paths(2), 9, False)
+    u = spread_uniform(_paths(2), 9, None)
     torch.testing.assert_close(u, torch.linspace(0, 1, 9, dtype=torch.float64).expand(2, -1))
     assert (u < 1).all()
 

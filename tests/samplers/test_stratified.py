@@ -12,7 +12,7 @@ from nerfro.media.analytic import Luneburg
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.straight import straight_path
 from nerfro.samplers.stratified import LAST_DELTA, Stratified, cone_samples
-from nerfro.testing import example_path, example_rays
+from nerfro.testing import example_draws, example_path, example_rays
 from nerfro.types import Path
 
 NUM_VERTICES = 48
@@ -28,7 +28,7 @@ def fractions(path: Path, s: torch.Tensor) -> torch.Tensor:
 
 
 def test_training_draws_one_sample_from_each_bin(bent: Path) -> None:
-    samples = Stratified(16).train()(bent, None)
+    samples = Stratified(16)(bent, None, example_draws(200))
     place = fractions(bent, samples.s) * 16 - torch.arange(16)
     assert (place > -1e-4).all()
     assert (place < 1 + 1e-4).all()
@@ -38,24 +38,24 @@ def test_training_draws_one_sample_from_each_bin(bent: Path) -> None:
 
 
 def test_evaluation_takes_the_middles_of_the_bins(bent: Path) -> None:
-    samples = Stratified(16).eval()(bent, None)
+    samples = Stratified(16)(bent, None)
     expected = ((torch.arange(16) + 0.5) / 16).expand(200, -1)
     torch.testing.assert_close(fractions(bent, samples.s), expected, atol=1e-5, rtol=0)
 
 
 def test_offset_moves_the_samples_of_evaluation(bent: Path) -> None:
-    samples = Stratified(16, offset=0.0).eval()(bent, None)
+    samples = Stratified(16, offset=0.0)(bent, None)
     torch.testing.assert_close(samples.s[:, 0], bent.near)
 
 
 def test_intervals_reach_from_sample_to_sample_and_the_last_is_thin(bent: Path) -> None:
-    samples = Stratified(16).train()(bent, None)
+    samples = Stratified(16)(bent, None, example_draws(200))
     torch.testing.assert_close(samples.deltas[:, :-1], samples.s.diff(dim=1))
     torch.testing.assert_close(samples.deltas[:, -1], torch.full((200,), LAST_DELTA), atol=1e-6, rtol=0)
 
 
 def test_vertices_are_drawn_one_from_each_group_with_offsets_that_differ_between_rays(bent: Path) -> None:
-    samples = Stratified(8, draw="vertices").train()(bent, None)
+    samples = Stratified(8, draw="vertices")(bent, None, example_draws(200))
     distance = (samples.positions[:, :, None] - bent.positions[:, None]).norm(dim=-1)
     nearest, vertex = distance.min(-1)
     assert (nearest == 0).all(), "every sample is a vertex"
@@ -68,7 +68,7 @@ def test_vertices_are_drawn_one_from_each_group_with_offsets_that_differ_between
 
 @pytest.mark.parametrize(("offset", "picked"), [(0.5, 3), (0.0, 0)])
 def test_evaluation_draws_the_same_vertex_of_each_group(bent: Path, offset: float, picked: int) -> None:
-    samples = Stratified(8, draw="vertices", offset=offset).eval()(bent, None)
+    samples = Stratified(8, draw="vertices", offset=offset)(bent, None)
     torch.testing.assert_close(samples.positions, bent.positions[:, picked :: NUM_VERTICES // 8], rtol=0, atol=0)
     torch.testing.assert_close(samples.s, bent.s[:, picked :: NUM_VERTICES // 8], rtol=0, atol=0)
 
@@ -82,11 +82,11 @@ def test_vertices_that_cannot_be_shared_out_evenly_are_refused(bent: Path) -> No
 
 def test_cones_fill_the_path_without_gaps() -> None:
     path = straight_path(example_rays())
-    for training in (True, False):
-        samples = Stratified(16, cast="cones").train(training)(path, None)
+    for draws in (example_draws(), None):
+        samples = Stratified(16, cast="cones")(path, None, draws)
         assert (samples.deltas > 0).all()
         torch.testing.assert_close(samples.s, 0.5 * (samples.edges[:, 1:] + samples.edges[:, :-1]))
-        within = 0.5 / 16 + 1e-5 if training else 1e-5
+        within = 0.5 / 16 + 1e-5 if draws else 1e-5
         even = torch.linspace(0, 1, 17)
         assert (fractions(path, samples.edges) - even).abs().max() <= within
 

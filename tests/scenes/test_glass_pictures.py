@@ -15,12 +15,12 @@ from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball, RoundedBox
 from nerfro.models.base import psnr
-from nerfro.pixel_parts import part_rays
 from nerfro.samplers.snell import Snell
 from nerfro.scenes import path_tracer, torus
 from nerfro.scenes.path_tracer import PathTracer, Pinhole
 from nerfro.scenes.surface import Surface, rounded_box, sphere, torus_angles
 from nerfro.scenes.viewpoints import look_at_origin
+from nerfro.subdivision import part_rays
 from nerfro.types import Path, Rays
 
 # Sums over a pixel of a cube converge slowly: an edge sees lamps in many directions.

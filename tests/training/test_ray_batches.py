@@ -81,26 +81,6 @@ def test_shares_of_several_processes_make_up_the_batch(views, batching):
     assert torch.equal(whole.share(0, 1).batch(4).index, expected.index)
 
 
-@pytest.mark.parametrize("jitter", [False, True])
-@pytest.mark.parametrize("precrop_steps", [0, 10])
-def test_without_masks_pixels_are_drawn_as_ever(views, precrop_steps, jitter):
-    """Measured results depend on which pixels a seed draws; here they are drawn as the method is written down."""
-    size = HEIGHT * WIDTH if precrop_steps == 0 else HEIGHT * WIDTH // 4
-    for batching in ("single_image", "all_images"):
-        generator = np.random.default_rng([3, 7])
-        if batching == "single_image":
-            view, pixel = generator.integers(NUM_VIEWS), generator.choice(size, 30, replace=False, shuffle=False)
-        else:
-            view, pixel = generator.integers(NUM_VIEWS, size=30), generator.integers(size, size=30)
-        row, column = (pixel // WIDTH, pixel % WIDTH) if precrop_steps == 0 else (3 + pixel // 8, 4 + pixel % 8)
-        expected = (view * HEIGHT + row) * WIDTH + column
-        batch = RayBatches(views, 30, batching, seed=3, precrop_steps=precrop_steps, jitter=jitter).batch(7)
-        assert batch.index.tolist() == expected.tolist()
-        offsets = torch.from_numpy(generator.random((30, 2), dtype=np.float32)) if jitter else None
-        rays = views.cameras.rays(*place(batch.index).unbind(-1), offsets)
-        assert torch.equal(batch.rays.directions, rays.directions)
-
-
 def test_masks_that_rule_nothing_out_change_no_batch_of_one_image(views):
     allowed = replace(views, usable=torch.ones(NUM_VIEWS, HEIGHT, WIDTH, dtype=torch.bool))
     for step in range(5):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -22,10 +21,11 @@ from nerfro.data.blender import BlenderData
 from nerfro.light import to_srgb
 from nerfro.media.shapes import Ball
 from nerfro.samplers.snell import Snell
+from nerfro.subdivision import Subdivision
 from nerfro.training.data_module import NO_PICTURE, RayDataModule, RotatingView, looks_every
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.watched import FallingBehind, WatchedPixels
-from nerfro.types import Batch
+from nerfro.types import Rays, mean_per_pixel
 
 LINE = "views that are not trained on fall behind"
 
@@ -145,9 +145,8 @@ def test_the_same_usable_pixels_are_watched_each_time(tiny_scene: Path) -> None:
     images = torch.stack(list(views.images)).view(-1, 3)
     assert torch.equal(one.rgb, images[one.index])
     rays = views.cameras.image_rays(1)
-    batch = one.batch(bending(), 1, 8.0, math.inf)
-    assert torch.allclose(batch.rays.directions[-64:], rays.directions[one.index[-64:] - 256])
-    assert torch.equal(batch.of_pixels(batch.rgb), one.rgb)
+    found = one.rays(bending(), Subdivision())
+    assert torch.allclose(found.rays.directions[-64:], rays.directions[one.index[-64:] - 256])
 
 
 def bending() -> Any:
@@ -166,18 +165,15 @@ def test_watched_pixels_have_the_rays_that_training_gives_them(contrast: float |
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val")
     model = bending()
     batches = RayBatches(views, 256, "single_image")
-    batches = batches.traced(lambda rays, view: model.path_sampler(rays, model.medium), 2, 8.0, contrast)
-    trained, watched = batches.batch(0), WatchedPixels.of(views)
-    batch = watched.batch(model, *batches.dividing)
-    assert torch.allclose(batch.of_pixels(batch.rgb).sort(0).values, watched.rgb.sort(0).values), "each pixel once"
-    one, other = rays_of_pixels(trained), rays_of_pixels(batch)
-    same = [pixel for pixel in one if torch.equal(one[pixel], other[pixel])]
-    assert sum(len(other[pixel]) == 4 for pixel in same) > (8 if contrast is None else 16)
-    assert sum(len(other[pixel]) == 1 for pixel in same) > 100
-    # Training divides up to 1/32 of its pixels more for each reason, to have few sizes.
-    others = one.keys() - set(same)
-    assert len(others) <= 16
-    assert all(len(one[pixel]) == 4 and len(other[pixel]) == 1 for pixel in others)
+    trace = lambda rays, view: model.path_sampler(rays, model.medium)  # noqa: E731
+    batch = batches.traced(trace, subdivision=Subdivision(2, 8.0, contrast)).batch(0)
+    watched = WatchedPixels.of(views)
+    found = watched.rays(model, Subdivision(2, 8.0, contrast))
+    trained = rays_of_pixels(batch.rays, batch.index[batch.pixel])
+    shown = rays_of_pixels(found.rays, watched.index[found.pixel])
+    assert all(torch.equal(trained[pixel], shown[pixel]) for pixel in trained)
+    assert sum(len(directions) == 4 for directions in trained.values()) > (8 if contrast is None else 16)
+    assert sum(len(directions) == 1 for directions in trained.values()) > 100
 
 
 @pytest.mark.parametrize("side", [1, 2])
@@ -193,23 +189,17 @@ def test_where_exposures_learn_each_watched_view_has_the_gain_that_suits_it(
     model.radiance = lambda rays: 0.3 + 0.2 * rays.directions
     model.encode, model.photographed = to_srgb, lambda rgb, gains=1.0: to_srgb(gains * rgb).clamp(0, 1)
     model.camera = GivenCamera(exposure=learns)
-    batch = watched.batch(model, side, 8.0, math.inf)
-    shown = batch.of_pixels(model.radiance(batch.rays))
-    # Pixels are in the order in which their rays are.
-    whole = len(batch.view) if batch.num_whole is None else batch.num_whole
-    pixel = torch.cat([batch.index[:whole], batch.index[whole :: batch.rays_per_pixel]])
-    gains = torch.tensor([[0.7, 0.8, 0.9], [1.4, 1.2, 1.1]])[pixel // 256]
-    place = {int(number): row for row, number in enumerate(pixel)}
-    order = torch.tensor([place[int(number)] for number in watched.index])
-    watched = replace(watched, rgb=to_srgb(gains * shown)[order])
-    found = float(watched.psnr(model, side, 8.0, math.inf))
+    rays = watched.rays(model, Subdivision(side, 8.0))
+    shown = mean_per_pixel(model.radiance(rays.rays), rays.pixel, len(watched.index))
+    gains = torch.tensor([[0.7, 0.8, 0.9], [1.4, 1.2, 1.1]])[watched.index // 256]
+    watched = replace(watched, rgb=to_srgb(gains * shown))
+    found = float(watched.psnr(model, Subdivision(side, 8.0)))
     assert found > 80 if learns else 15 < found < 30
 
 
-def rays_of_pixels(batch: Batch) -> dict[int, torch.Tensor]:
-    """Directions of the rays of each pixel of a batch."""
-    assert batch.index is not None
-    return {pixel: batch.rays.directions[batch.index == pixel] for pixel in batch.index.tolist()}
+def rays_of_pixels(rays: Rays, index: torch.Tensor) -> dict[int, torch.Tensor]:
+    """Directions of the rays of each pixel, by its number in the data set."""
+    return {pixel: rays.directions[index == pixel] for pixel in index.tolist()}
 
 
 def test_many_views_cost_no_more_than_few(tiny_scene: Path) -> None:

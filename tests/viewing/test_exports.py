@@ -19,9 +19,9 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.render_view import Supersampling
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.light import to_linear, to_srgb
+from nerfro.subdivision import Subdivision
 from nerfro.viewing.exports import ExportConfig, find_export
 from nerfro.viewing.scene import Scene
 from nerfro.viewing.surface import without_crumbs
@@ -206,7 +206,7 @@ def test_mitsuba_renders_the_same_picture(scene: Scene, glass: str, least: float
     for view in range(2):
         linear = np.array(mitsuba.render(loaded, sensor=view, spp=64))[..., :3]
         picture = to_srgb(torch.from_numpy(linear)).clamp(0, 1)
-        ours = scene.render(scene.cameras().select([view]), Supersampling(3)).rgb[0]
+        ours = scene.render(scene.cameras().select([view]), Subdivision(3)).rgb[0]
         assert -10 * torch.log10((picture - ours).square().mean()) > least
 
 

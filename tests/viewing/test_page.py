@@ -17,7 +17,6 @@ from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.cameras import Cameras
 from nerfro.data.blender import BlenderData
 from nerfro.errors import NerfroError
-from nerfro.evaluation.render_view import Supersampling
 from nerfro.fields.base import Field
 from nerfro.files import lat_long, radiance_hdr
 from nerfro.light import to_linear
@@ -27,6 +26,8 @@ from nerfro.models.base import psnr
 from nerfro.paths import resolve_path
 from nerfro.samplers.density_grid import DensityGridSampler
 from nerfro.samplers.snell import Snell
+from nerfro.subdivision import Subdivision
+from nerfro.testing import example_draws
 from nerfro.types import Radiance, Samples
 from nerfro.variants import variant
 from nerfro.viewing.page import page_of, upwards
@@ -60,7 +61,7 @@ def picture(text: str) -> Float[torch.Tensor, "H W 3"]:
 
 
 def one_ray(scene: Scene, cameras: Cameras | None = None) -> Float[torch.Tensor, "V H W 3"]:
-    return scene.render(cameras or scene.cameras("test"), Supersampling()).rgb
+    return scene.render(cameras or scene.cameras("test"), Subdivision()).rgb
 
 
 @pytest.fixture
@@ -128,11 +129,9 @@ class Surroundings(Field):
 def test_contracted_surroundings_are_shown(scene: Scene, tmp_path: Path) -> None:
     sampler = DensityGridSampler(512, 256, [-2.0] * 3, [2.0] * 3, radius=2.0, near=1.0, resolution=48, looks=0.9)
     field = Surroundings()
-    for _ in range(3):
-        sampler.after_step(0, [field])
-    everywhere = replace(
-        scene, model=variant(scene.model, point_sampler=sampler.eval(), fields=torch.nn.ModuleList([field]))
-    )
+    for step in range(3):
+        sampler.after_step([field], example_draws(step=step * sampler.every))
+    everywhere = replace(scene, model=variant(scene.model, point_sampler=sampler, fields=torch.nn.ModuleList([field])))
     found = ask(page_of(everywhere, 96), f"(() => {{ {SHOT} return [0, 1, 2].map((v) => shot(v, 32)); }})()", tmp_path)
     expected, without = one_ray(everywhere), one_ray(everywhere.with_(inside=False))
     for shot, rgb, empty in zip(found, expected, without, strict=True):
@@ -174,7 +173,7 @@ def test_controls_change_what_they_say(scene: Scene, tmp_path: Path) -> None:
     assert agrees("sky", scene.with_(sky=lamp))
     torch.testing.assert_close(shots["end"], shots["start"])
     _check_reflection(scene, to_linear(shots["start"]), to_linear(shots["reflection"]))
-    met = scene.render(scene.cameras("test"), Supersampling()).normals[0].any(-1)
+    met = scene.render(scene.cameras("test"), Subdivision()).normals[0].any(-1)
     left = (to_linear(shots["tint"]) / to_linear(shots["start"]))[met].mean(0)
     assert left[0] > left[1] > left[2]
     assert left[0] < 0.9

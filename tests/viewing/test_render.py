@@ -14,8 +14,8 @@ import torch
 from PIL import Image
 
 import nerfro.render
-from nerfro.evaluation.render_view import Supersampling
 from nerfro.files.lat_long import save_lat_long
+from nerfro.subdivision import Subdivision
 from nerfro.viewing.scene import Scene
 
 
@@ -96,7 +96,7 @@ def test_an_interrupted_rendering_goes_on_and_another_is_not_mixed_in(render: Ca
 
 def test_test_views_are_those_of_the_scene(render: Callable[..., tuple[int, str]], scene: Scene) -> None:
     assert render("views=test", "resolution=null")[0] == 0
-    ours = scene.render(scene.cameras(), Supersampling()).rgb
+    ours = scene.render(scene.cameras(), Subdivision()).rgb
     for view in range(3):
         np.testing.assert_allclose(read(f"O/test_{view:03d}.png"), 255 * ours[view], atol=0.51)
     assert not Path("O/film.mp4").exists()
@@ -118,7 +118,7 @@ def test_every_layer_is_drawn_and_written_as_it_is(what: str, render: Callable, 
     (values,) = (channel.pixels for channel in OpenEXR.File("O/test_001.exr").channels().values())
     camera = scene.cameras().select([1]).resized(16, 16)
     parts = {"glass": {"inside": False}, "inside": {"glass": False}, "sky": {"inside": False, "glass": False}}
-    rendered = scene.with_(**parts.get(what, {})).render(camera, Supersampling())
+    rendered = scene.with_(**parts.get(what, {})).render(camera, Subdivision())
     name = {"exits": "exit_directions"}.get(what, what if what not in parts else "radiance")
     np.testing.assert_allclose(values.reshape(16, 16, -1), getattr(rendered, name)[0].view(16, 16, -1), atol=1e-5)
     shown = read("O/test_001.png")
@@ -130,7 +130,7 @@ def test_a_sweep_of_the_index_goes_from_air_to_glass(render: Callable[..., tuple
     assert render("views=test:0", "frames=3", "sweep=medium.ior:1.0:1.6")[0] == 0
     camera = scene.cameras().select([0]).resized(16, 16)
     for frame, ior in enumerate((1.0, 1.3, 1.6)):
-        expected = scene.with_(ior=ior).render(camera, Supersampling()).rgb[0]
+        expected = scene.with_(ior=ior).render(camera, Subdivision()).rgb[0]
         np.testing.assert_allclose(read(f"O/frame_{frame:04d}.png"), 255 * expected, atol=0.51)
     assert len(frames_of_film("O/film.mp4")) == 3
 
@@ -151,7 +151,7 @@ def test_runs_stand_side_by_side_under_their_names(render: Callable[..., tuple[i
     code, err = render("checkpoint=[a.ckpt,b.ckpt]", "labels=[one,two]", "views=test:0", "resolution=64")
     assert code == 0, err
     both = read("O/test_000.png")
-    alone = scene.render(scene.cameras().select([0]).resized(64, 64), Supersampling()).rgb[0]
+    alone = scene.render(scene.cameras().select([0]).resized(64, 64), Subdivision()).rgb[0]
     for left in (0, both.shape[1] - 64):
         np.testing.assert_allclose(both[-64:, left : left + 64], 255 * alone, atol=0.51)
         assert both[:-64, left : left + 64].min() < 100, "a label in ink"

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.render_view import Supersampling
 from nerfro.files import lat_long
 from nerfro.samplers.snell import Snell
+from nerfro.subdivision import Subdivision
 from nerfro.variants import variant
 from nerfro.viewing.scene import Scene
 from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, SolidBall, colour, sky_of
@@ -107,14 +107,14 @@ def test_the_sky_is_read_and_replaced_as_linear_radiance(scene: Scene, tmp_path)
     assert rendered.rgb.max() == 1
 
 
-def test_pictures_do_not_depend_on_chunks_and_carry_their_supersampling(scene: Scene) -> None:
+def test_pictures_do_not_depend_on_chunks_and_carry_their_subdivision(scene: Scene) -> None:
     camera = scene.cameras().select([2])
     whole, pieces = scene.render(camera), scene.render(camera, chunk_size=100)
     for one, other in zip(whole, pieces, strict=True):
         torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
     fine = scene.render(camera.resized(96, 96)).radiance
     mean = fine.view(1, 32, 3, 32, 3, 3).mean((2, 4))
-    parts = scene.render(camera, Supersampling(3)).radiance
+    parts = scene.render(camera, Subdivision(3)).radiance
     torch.testing.assert_close(parts, mean, atol=1e-5, rtol=1e-5)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,16 +10,18 @@ import numpy as np
 import pytest
 import torch
 
-import nerfro.distributed
 from nerfro.cameras import Cameras
 from nerfro.data.base import Views
-from nerfro.distributed import drawing_for, rand_rays
 from nerfro.media.analytic import Vacuum
 from nerfro.media.shapes import Ball, RoundedBox
-from nerfro.pixel_parts import contrast, divergence, part_rays, pixel_rays, rays_beside
+from nerfro.models.refractive import RefractiveModel
+from nerfro.samplers.hierarchical import Hierarchical
 from nerfro.samplers.snell import Snell
 from nerfro.samplers.straight import Straight
+from nerfro.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
+from nerfro.testing import example_parts
 from nerfro.training.ray_batches import RayBatches
+from nerfro.types import Batch
 
 NUM_VIEWS, HEIGHT, WIDTH = 3, 8, 10
 SIDE, FOCAL = 33, 60.0
@@ -55,7 +56,7 @@ def through_cube(rays, view):
 
 def diverging(cameras: Cameras, sampler, medium) -> torch.Tensor:
     pixels = torch.arange(len(cameras) * cameras.height * cameras.width)
-    exits, beside = (sampler(rays(cameras, pixels), medium).exit_directions for rays in (pixel_rays, rays_beside))
+    exits, beside = (sampler(rays(cameras, pixels), medium).exit_directions for rays in (pixel_rays, neighbour_rays))
     return divergence(cameras, pixels, exits, beside)
 
 
@@ -112,52 +113,51 @@ def test_rim_of_a_cube_diverges_and_its_face_does_not(above: Cameras) -> None:
     assert divergent[beside_rim].float().mean() > 0.5
 
 
-@pytest.mark.parametrize("batching", ["single_image", "all_images"])
-def test_divided_pixels_bring_all_their_rays(views: Views, batching: str) -> None:
-    whole = RayBatches(views, 64, batching, seed=3)
-    drawn, batch = whole.batch(7), whole.traced(through_cube, 2, 8.0).batch(7)
-    angles = diverging(views.cameras, Snell(), CUBE)[drawn.index]
-    n = batch.num_whole
-    assert 0 < n < 64
-    assert len(batch.rays) == batch.num_rows == n + 4 * (64 - n)
-    divided = batch.index[n::4]
-    assert torch.equal(divided.repeat_interleave(4), batch.index[n:])
-    assert torch.equal(torch.cat([batch.index[:n], divided]).sort().values, drawn.index.sort().values)
-    # All that diverge are divided, and the widest of the others, up to the next multiple of a 32nd of the batch.
-    wide = drawn.index[angles >= 8.0]
-    assert set(wide.tolist()) <= set(divided.tolist())
-    assert len(divided) == -(-len(wide) // 2) * 2
+def batches_of(views: Views, subdivision: Subdivision, size: int = 64, jitter: bool = False) -> RayBatches:
+    batches = RayBatches(views, size, "all_images", seed=3, jitter=jitter)
+    return batches.traced(through_cube, subdivision=subdivision)
+
+
+def of_pixels(batch: Batch, divided: bool) -> torch.Tensor:
+    """Rows of a batch's pixels that have several rays, or one."""
+    return ((torch.bincount(batch.pixel) > 1) == divided).nonzero()[:, 0]
+
+
+def test_pixels_whose_rays_diverge_have_a_ray_through_each_part(views: Views) -> None:
+    batch = batches_of(views, Subdivision(2, 8.0)).batch(7)
+    divided, whole = of_pixels(batch, True), of_pixels(batch, False)
+    assert 0 < len(divided) < 64
+    assert torch.equal(divided, (diverging(views.cameras, Snell(), CUBE)[batch.index] >= 8.0).nonzero()[:, 0])
+    assert torch.equal(batch.teaches_background, (batch.pixel.bincount() == 1))
     assert torch.equal(batch.rgb, views.images.view(-1, 3)[batch.index])
-    torch.testing.assert_close(batch.rays.directions[n:], part_rays(views.cameras, divided, 2).directions)
-    torch.testing.assert_close(batch.rays.directions[:n], pixel_rays(views.cameras, batch.index[:n]).directions)
+    expected = part_rays(views.cameras, batch.index[divided], 2).directions.view(-1, 4, 3)
+    for parts, pixel in zip(expected, divided, strict=True):
+        torch.testing.assert_close(batch.rays.directions[batch.pixel == pixel], parts)
+    of_whole = torch.isin(batch.pixel, whole)
+    directions = pixel_rays(views.cameras, batch.index[batch.pixel[of_whole]]).directions
+    torch.testing.assert_close(batch.rays.directions[of_whole], directions)
 
 
-@pytest.mark.parametrize("rank", [0, 1])
-def test_pixels_of_the_object_are_divided_for_their_contrast(views: Views, rank: int) -> None:
+def test_pixels_of_the_object_are_divided_for_their_contrast(views: Views) -> None:
     images = torch.zeros(1, SIDE, SIDE, 3)
     images[:, :, 20:] = 0.5  # an edge down the photograph, beside the cube and through it
-    fine = dataclasses.replace(views, images=images)
-    batches = RayBatches(fine, 1000, "all_images", seed=3).share(rank, 2)
-    batch = batches.traced(through_cube, 2, 8.0, 0.1).batch(0)
-    n, end = batch.num_whole, batch.num_together
-    divided, parted = batch.index[n:end:4], batch.index[end::4]
-    assert torch.equal(divided.repeat_interleave(4), batch.index[n:end])
-    angles = diverging(views.cameras, Snell(), CUBE)
-    refracted = Snell()(pixel_rays(views.cameras, torch.arange(SIDE**2)), CUBE).refracted
-    edge = torch.isin(torch.arange(SIDE**2) % SIDE, torch.tensor([19, 20]))
-    assert (refracted & (angles < 8))[divided].all()
-    assert edge[divided].sum() > 5
-    assert (edge & refracted)[batch.index[:n]].sum() == 0, "none is left whole"
-    assert (edge & ~refracted)[batch.index[:n]].any(), "the sky beside the object is"
-    assert (angles[parted] >= angles[divided].max()).all()
-    torch.testing.assert_close(batch.rays.directions[n:end], part_rays(views.cameras, divided, 2).directions)
-    before = batches.traced(through_cube, 2, 8.0, 0.1, contrast_start=1).batch(0)
-    assert before.num_together == before.num_whole == n + len(divided)
+    fine = replace(views, images=images)
+    batch = batches_of(fine, Subdivision(2, 8.0, 0.1, contrast_start=1), 1000).batch(1)
+    angles = diverging(views.cameras, Snell(), CUBE)[batch.index]
+    refracted = Snell()(pixel_rays(views.cameras, batch.index), CUBE).refracted
+    edge = torch.isin(batch.index % SIDE, torch.tensor([19, 20]))
+    assert (edge & refracted & (angles < 8)).sum() > 5
+    assert (edge & ~refracted).any(), "the sky beside the object is not divided"
+    expected = (angles >= 8) | (edge & refracted)
+    assert torch.equal(of_pixels(batch, True), expected.nonzero()[:, 0])
+    assert torch.equal(batch.teaches_background, angles < 8)
+    before = batches_of(fine, Subdivision(2, 8.0, 0.1, contrast_start=1), 1000).batch(0)
+    assert torch.equal(of_pixels(before, True), (~before.teaches_background).nonzero()[:, 0])
 
 
 @pytest.mark.parametrize("jitter", [False, True])
 def test_paths_of_a_batch_are_those_of_its_rays(views: Views, jitter: bool) -> None:
-    batch = RayBatches(views, 200, jitter=jitter).traced(through_cube, 2, 4.0).batch(0)
+    batch = batches_of(views, Subdivision(2, 4.0), 200, jitter).batch(0)
     traced = Snell()(batch.rays, CUBE)
     s = torch.linspace(2.0, 6.0, 50).expand(len(batch.rays), -1)
     for a, b in zip(batch.path.at(s), traced.at(s), strict=True):
@@ -167,14 +167,14 @@ def test_paths_of_a_batch_are_those_of_its_rays(views: Views, jitter: bool) -> N
 
 
 def test_jittered_parts_stay_inside_their_parts_and_fill_them(views: Views) -> None:
-    batches = RayBatches(views, 200, seed=0, jitter=True).traced(through_cube, 2, 4.0)
-    offsets = []
+    batches, offsets = batches_of(views, Subdivision(2, 4.0), 200, jitter=True), []
     for step in range(4):
         batch = batches.batch(step)
-        n = batch.num_whole
-        x, y, z = batch.rays.directions[n:].unbind(-1)
+        rays = torch.isin(batch.pixel, of_pixels(batch, True))
+        x, y, z = batch.rays.directions[rays].unbind(-1)
         column, row = SIDE / 2 - FOCAL * x / z, SIDE / 2 + FOCAL * y / z
-        place = torch.stack([column - batch.index[n:] % SIDE, row - batch.index[n:] // SIDE], -1).view(-1, 2, 2, 2)
+        index = batch.index[batch.pixel[rays]]
+        place = torch.stack([column - index % SIDE, row - index // SIDE], -1).view(-1, 2, 2, 2)
         corners = 0.5 * torch.stack(torch.meshgrid(torch.arange(2), torch.arange(2), indexing="ij"), -1)
         offsets.append(((place - corners) * 2).view(-1, 2))
     offset = torch.cat(offsets)
@@ -199,41 +199,25 @@ def test_contrast_is_the_largest_step_to_a_neighbour(cameras: Cameras) -> None:
 
 
 def test_where_nothing_bends_no_pixel_is_divided(views: Views) -> None:
-    batch = RayBatches(views, 50).traced(lambda rays, view: Straight()(rays, Vacuum()), 2, 1.1).batch(0)
-    assert batch.num_whole == len(batch.rays) == 50
+    straight = lambda rays, view: Straight()(rays, Vacuum())  # noqa: E731
+    batches = RayBatches(views, 50).traced(straight, subdivision=Subdivision(2, 1.1))
+    assert torch.equal(batches.batch(0).pixel, torch.arange(50))
 
 
-def test_a_pixel_is_the_mean_of_linear_radiance(views: Views) -> None:
-    batch = RayBatches(views, 64, seed=1).traced(through_cube, 2, 8.0).batch(0)
-    rgb = torch.rand(len(batch.rays), 3)
-    pixels, n = batch.of_pixels(rgb), batch.num_whole
-    assert torch.equal(pixels[:n], rgb[:n])
-    torch.testing.assert_close(pixels[n], rgb[n : n + 4].mean(0))
-    assert torch.equal(replace(batch, num_whole=None).of_pixels(rgb), rgb)
-
-
-def test_processes_share_pixels_and_random_numbers(views: Views, monkeypatch: pytest.MonkeyPatch) -> None:
-    batches = RayBatches(views, 60, "all_images", seed=3, jitter=True).traced(through_cube, 2, 8.0)
-    expected = batches.batch(4)
-    like = torch.zeros((), dtype=torch.float64)
-
-    def draw(batch) -> torch.Tensor:
-        torch.manual_seed(5)
-        with drawing_for(batch.rows, batch.num_rows):
-            return rand_rays(len(batch.rays), 3, like)
-
-    numbers = draw(expected)
-    torch.manual_seed(5)
-    assert torch.equal(numbers, rand_rays(len(expected.rays), 3, like)), "one process draws as ever"
-    monkeypatch.setattr(nerfro.distributed, "rank_and_size", lambda: (0, 3))
-    seen = torch.zeros(len(expected.rays))
+def test_batches_and_renderings_do_not_depend_on_the_process_or_the_chunk(views: Views) -> None:
+    """Each pixel has the same rays, paths, numbers and samples, whoever traces it and beside whichever others."""
+    batches = batches_of(views, Subdivision(2, 8.0, 0.2), 60, jitter=True)
+    whole = batches.batch(4)
+    model = RefractiveModel(replace(example_parts(), point_sampler=Hierarchical(8, 8)))
+    sampled = model.render_path(whole.path, whole.draws)[-1].samples.s
+    assert len(whole.draws.ray.unique()) == len(whole.rays) > 60
     for rank in range(3):
-        batch = batches.share(rank, 3).batch(4)
-        assert len(batch.of_pixels(batch.rgb)) == 20
-        for name in ("index", "rgb", "view"):
-            assert torch.equal(getattr(batch, name), getattr(expected, name)[batch.rows])
-        assert torch.equal(batch.rays.directions, expected.rays.directions[batch.rows])
-        assert torch.equal(batch.path.exit_directions, expected.path.exit_directions[batch.rows])
-        assert torch.equal(draw(batch), numbers[batch.rows])
-        seen[batch.rows] += 1
-    assert (seen == 1).all()
+        share, own = batches.share(rank, 3).batch(4), torch.arange(20 * rank, 20 * (rank + 1))
+        for name in ("index", "rgb", "view", "teaches_background"):
+            assert torch.equal(getattr(share, name), getattr(whole, name)[own])
+        rows = torch.isin(whole.pixel, own).nonzero()[:, 0]
+        assert torch.equal(share.pixel + 20 * rank, whole.pixel[rows])
+        assert torch.equal(share.draws.ray, whole.draws.ray[rows])
+        assert torch.equal(share.rays.directions, whole.rays.directions[rows])
+        assert torch.equal(share.path.exit_directions, whole.path.exit_directions[rows])
+        torch.testing.assert_close(model.render_path(share.path, share.draws)[-1].samples.s, sampled[rows])

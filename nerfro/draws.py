@@ -1,0 +1,66 @@
+"""Random numbers of training as a function of (seed, step, ray, dimension)."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nerfro.philox import philox4x32
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Random numbers of one training step.
+
+    Each number is a function of the seed, the step, the name of a stream, an index and a dimension (Philox 4x32-10 with
+    the seed as key and the others as counter). There is no state: numbers do not depend on what was drawn before, on
+    the process, on the chunk in which rays are rendered, or on the device. Whoever draws for two purposes names two
+    streams, because the same arguments return the same numbers.
+
+    Attributes:
+        seed: seed of the run, from 0 to 2^64 - 1.
+        step: number of the training step.
+        ray: index of each ray of the batch in the random numbers, from 0 to 2^32 - 1 and unique within a step.
+    """
+
+    seed: int
+    step: int
+    ray: Int[Tensor, "R"]
+
+    def for_rays(self, ray: Int[Tensor, "P"], num: int, stream: str = "samples") -> Float[Tensor, "P num"]:
+        """Draw uniform numbers in [0, 1) for polylines; those of one ray share their numbers.
+
+        Args:
+            ray: number of the ray that each polyline belongs to, `Path.ray`.
+            num: numbers for each ray.
+            stream: name of the purpose.
+        """
+        return self.uniform(self.ray[ray], num, stream)
+
+    def uniform(self, index: Int[Tensor, "N"], num: int, stream: str) -> Float[Tensor, "N num"]:
+        """Draw uniform multiples of 2^-24 in [0, 1), in single precision.
+
+        Args:
+            index: identity of what the numbers are for, from 0 to 2^32 - 1.
+            num: numbers for each index.
+            stream: name of the purpose.
+        """
+        return (self.words(index, num, stream) >> 8).float() * 2.0**-24
+
+    def words(self, index: Int[Tensor, "N"], num: int, stream: str) -> Int[Tensor, "N num"]:
+        """Draw uniform integers from 0 to 2^32 - 1; the arguments are those of `uniform`."""
+        block = torch.arange(-(-num // 4), device=index.device)
+        index = index[:, None].expand(-1, len(block))
+        key_0, key_1, step, stream_number = self.counters(stream)
+        words = philox4x32(block.expand_as(index), index, torch.full_like(index, stream_number),
+                           torch.full_like(index, step), key_0, key_1)  # fmt: skip
+        return torch.stack(words, -1).flatten(1)[:, :num]
+
+    def counters(self, stream: str) -> tuple[int, int, int, int]:
+        """Words of the key, of the step and of the stream, for kernels that draw themselves."""
+        low, high = self.seed & 0xFFFFFFFF, self.seed >> 32 & 0xFFFFFFFF
+        return low, high, self.step & 0xFFFFFFFF, zlib.crc32(stream.encode())

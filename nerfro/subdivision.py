@@ -1,0 +1,181 @@
+"""Rays through pixels, and the division of pixels for which one ray does not stand.
+
+Axis Q: pixels. Pixels are numbered view * H * W + row * W + column.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Optional
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from nerfro.allowed import Natural, NotNegative, Positive, Side, checked
+from nerfro.cameras import Cameras
+from nerfro.draws import Draws
+from nerfro.rays import Rays
+from nerfro.types import Path
+
+Trace = Callable[[Rays, Int[Tensor, "R"]], Path]  # traces rays of views
+TraceExits = Callable[[Rays, Int[Tensor, "R"]], Float[Tensor, "R 3"]]  # traces their exit directions alone
+
+# From a ray to that of the neighbour, in pixels, along both axes: one pixel on the diagonal, where edges along rows and
+# columns are seen alike.
+_TO_NEIGHBOUR = math.sqrt(0.5)
+
+
+@checked("subdivision")
+@dataclass
+class Subdivision:
+    """Which pixels get several rays, and how many.
+
+    A pixel shows the mean radiance over its square. One ray through the pixel's centre does not stand for that mean
+    where neighbouring rays diverge, at rims and edges of the refractive object, or where the picture has fine detail.
+
+    Attributes:
+        side: rays along each side of a divided pixel, which gets side^2 rays; 1 divides none.
+        divergence: divide pixels whose ray leaves in a direction that differs from that of the neighbour's by this many
+            pixel angles 1 / fx or more; 0 divides all.
+        contrast: also divide pixels whose colour differs from that of one of the four pixels around by this much or
+            more (largest difference of a channel, sRGB); in training only where the ray is refracted. None divides no
+            others.
+        contrast_start: training step from which `contrast` applies.
+    """
+
+    side: Side = 1
+    divergence: NotNegative = 0.0
+    contrast: Optional[Positive] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    contrast_start: Natural = 0
+
+    @classmethod
+    def of(cls, options: Any) -> Subdivision:
+        """What a run's `batches` or `evaluation` asks for; runs of former releases do not name `contrast`."""
+        return cls(options.supersample, options.divergence, options.get("contrast"), options.get("contrast_start", 0))
+
+
+@dataclass(frozen=True)
+class PixelRays:
+    """Rays through pixels, one or several for each; those of pixels that are not divided come first.
+
+    Attributes:
+        rays: R rays.
+        path: path of each ray; None where nothing has traced it.
+        pixel: row of the pixel that each ray belongs to.
+        part: number of the ray among those of its pixel.
+        diverges: pixels that are divided because neighbouring rays diverge.
+    """
+
+    rays: Rays
+    path: Path | None
+    pixel: Int[Tensor, "R"]
+    part: Int[Tensor, "R"]
+    diverges: Bool[Tensor, "Q"]
+
+
+def subdivide(
+    cameras: Cameras,
+    pixels: Int[Tensor, "Q"],
+    subdivision: Subdivision,
+    trace: Trace | None,
+    trace_exits: TraceExits | None,
+    contrasts: Callable[[Int[Tensor, "N"]], Float[Tensor, "N"]] | None,
+    jitter: Draws | None = None,
+) -> PixelRays:
+    """Trace rays through pixels, several where one does not stand for the pixel.
+
+    Args:
+        cameras: of all views.
+        pixels: numbers of the pixels.
+        subdivision: which pixels are divided.
+        trace: traces rays, given the view of each; None traces none, so that no pixel is divided.
+        trace_exits: traces the exit direction of each ray's main polyline; None takes it from `trace`.
+        contrasts: contrast of the pixels in given rows of `pixels`; None divides no pixels for their contrast.
+        jitter: random numbers, with an index for each pixel, that place rays anywhere within their pixel, or their part
+            of it; None places them in its centre.
+    """
+    view, num_parts = pixels // (cameras.height * cameras.width), subdivision.side**2
+    place = None if jitter is None else jitter.uniform(jitter.ray, 2, "place in pixel")
+    rays = pixel_rays(cameras, pixels, place)
+    path = None if trace is None else trace(rays, view)
+    if trace is None or path is None or num_parts == 1:
+        every = torch.arange(len(pixels), device=pixels.device)
+        return PixelRays(rays, path, every, torch.zeros_like(every), torch.zeros_like(every, dtype=torch.bool))
+    trace_exits = trace_exits or (lambda rays, view: main_exits(trace(rays, view)))
+    exits, neighbours = main_exits(path), trace_exits(neighbour_rays(cameras, pixels, place), view)
+    diverges = divergence(cameras, pixels, exits, neighbours) >= subdivision.divergence
+    divided = diverges
+    if contrasts is not None and subdivision.contrast is not None:
+        rows = (path.first_of_ray(path.refracted) & ~diverges).nonzero()[:, 0]
+        divided = divided.index_put((rows,), contrasts(rows) >= subdivision.contrast)
+    whole, parted = (~divided).nonzero()[:, 0], divided.nonzero()[:, 0]
+    if jitter is not None:
+        place = jitter.uniform(jitter.ray[parted], 2 * num_parts, "place in part").view(-1, num_parts, 2)
+    parts, pixel = part_rays(cameras, pixels[parted], subdivision.side, place), parted.repeat_interleave(num_parts)
+    part = torch.arange(num_parts, device=pixels.device).repeat(len(parted))
+    return PixelRays(
+        rays=rays[whole].followed_by(parts),
+        path=path.of_rays(whole).followed_by(trace(parts, view[pixel])),
+        pixel=torch.cat([whole, pixel]),
+        part=torch.cat([torch.zeros_like(whole), part]),
+        diverges=diverges,
+    )
+
+
+def pixel_rays(
+    cameras: Cameras, pixels: Int[Tensor, "R"], place: Float[Tensor, "R 2"] | Float[Tensor, "2"] | None = None
+) -> Rays:
+    """Make rays through a place (x, y) in [0, 1) of pixels, by default their centres."""
+    width, height = cameras.width, cameras.height
+    return cameras.rays(pixels // (height * width), pixels // width % height, pixels % width, place)
+
+
+def part_rays(
+    cameras: Cameras, pixels: Int[Tensor, "Q"], side: int, place: Float[Tensor, "Q K 2"] | None = None
+) -> Rays:
+    """Make rays through the K = side x side equal parts of pixels, those of each pixel together, at a place of each."""
+    ticks = torch.arange(side, device=pixels.device)
+    corners = torch.cartesian_prod(ticks, ticks).view(-1, 2)
+    places = (corners + (0.5 if place is None else place)) / side
+    return pixel_rays(cameras, pixels.repeat_interleave(side**2), places.expand(len(pixels), -1, 2).reshape(-1, 2))
+
+
+def neighbour_rays(cameras: Cameras, pixels: Int[Tensor, "R"], place: Float[Tensor, "R 2"] | None = None) -> Rays:
+    """Make rays one pixel away from those of `pixel_rays`, on the diagonal."""
+    centre = torch.full((2,), 0.5, device=pixels.device)
+    return pixel_rays(cameras, pixels, (centre if place is None else place) + _TO_NEIGHBOUR)
+
+
+def main_exits(path: Path) -> Float[Tensor, "R 3"]:
+    """Exit direction of the main polyline of each ray."""
+    return path.first_of_ray(path.exit_directions)
+
+
+def contrast(
+    colours: Callable[[Int[Tensor, "R"]], Float[Tensor, "R 3"]], cameras: Cameras, pixels: Int[Tensor, "R"]
+) -> Float[Tensor, "R"]:
+    """Largest difference of a channel between pixels and the four around them; `colours` gives those of pixels."""
+    height, width = cameras.height, cameras.width
+    row, column = pixels // width % height, pixels % width
+    own = colours(pixels)
+    largest = torch.zeros_like(own[:, 0])
+    for step, exists in ((-1, column > 0), (1, column < width - 1), (-width, row > 0), (width, row < height - 1)):
+        other = colours(torch.where(exists, pixels + step, pixels))
+        largest = torch.maximum(largest, (other - own).abs().amax(-1))
+    return largest
+
+
+def divergence(
+    cameras: Cameras, pixels: Int[Tensor, "R"], exits: Float[Tensor, "R 3"], neighbours: Float[Tensor, "R 3"]
+) -> Float[Tensor, "R"]:
+    """Angle between the exit directions of rays and of their neighbours, in pixel angles 1 / fx.
+
+    Straight rays diverge by 1 or less. Where the angle is wide, a pixel shows a mean over directions far apart, which a
+    ray through its centre would teach to one of them, as speckle.
+    """
+    chord = torch.linalg.vector_norm(exits - neighbours, dim=-1)
+    view = pixels // (cameras.height * cameras.width)
+    return 2 * torch.asin((0.5 * chord).clamp(max=1)) * cameras.fx[view]
