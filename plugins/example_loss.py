@@ -16,5 +16,6 @@ class OpacityEntropy(Loss):
     """Entropy of the finest level's opacity: rays shall either pass or be stopped, not be dimmed by fog."""
 
     def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
-        passed = renderings[-1].transmittance.clamp(1e-5, 1 - 1e-5)
-        return -(passed * torch.log(passed) + (1 - passed) * torch.log(1 - passed)).mean()
+        # Of rays, and then of pixels: light that splits has several polylines for a ray, and a pixel may have several rays.
+        opacity = batch.per_pixel(renderings[-1].opacity).clamp(1e-5, 1 - 1e-5)
+        return -(opacity * torch.log(opacity) + (1 - opacity) * torch.log(1 - opacity)).mean()

@@ -141,10 +141,10 @@ def test_exits_begin_where_the_last_straight_run_does() -> None:
 
 
 def test_a_pixel_is_the_encoded_mean_of_radiance_not_the_mean_of_its_code() -> None:
-    batch = replace(example_batch(), num_whole=0, rays_per_pixel=NUM_RAYS)
+    batch = replace(example_batch(), pixel=torch.zeros(NUM_RAYS, dtype=torch.long), rgb=torch.zeros(1, 3))
     radiance = torch.zeros(NUM_RAYS, 3)
     radiance[::2] = 1
-    assert float(to_srgb(batch.of_pixels(radiance))[0, 0]) == pytest.approx(0.7354, abs=1e-3)
+    assert float(to_srgb(batch.per_pixel(radiance))[0, 0]) == pytest.approx(0.7354, abs=1e-3)
 
 
 @pytest.mark.parametrize("suffix", [".hdr", ".exr"])

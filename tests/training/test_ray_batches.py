@@ -13,6 +13,7 @@ from nerfro.data.base import Views
 from nerfro.errors import NerfroError
 from nerfro.media.shapes import Ball
 from nerfro.samplers.snell import Snell
+from nerfro.subdivision import Subdivision
 from nerfro.training.ray_batches import RayBatches
 
 NUM_VIEWS, HEIGHT, WIDTH = 5, 12, 16
@@ -202,15 +203,6 @@ def test_batch_without_equal_shares_is_refused(views):
         RayBatches(views, 30).share(0, 4)
 
 
-def test_batches_ignore_and_spare_the_global_generator(views):
-    torch.manual_seed(0)
-    before = torch.get_rng_state()
-    first = RayBatches(views, 30, seed=1).batch(0).index
-    assert torch.equal(torch.get_rng_state(), before)
-    torch.manual_seed(99)
-    assert torch.equal(RayBatches(views, 30, seed=1).batch(0).index, first)
-
-
 def test_single_image_draws_different_pixels_of_one_image(views):
     batches = RayBatches(views, HEIGHT * WIDTH, "single_image", seed=0)
     seen = set()
@@ -302,9 +294,9 @@ def test_batches_hold_all_polylines_of_their_rays(views):
     towards = replace(views.cameras, camera_to_world=views.cameras.camera_to_world.clone())
     towards.camera_to_world[..., 3] = 3 * towards.camera_to_world[..., 2]  # all look at the ball
     views = replace(views, cameras=towards)
-    batches = RayBatches(views, 60, "all_images", seed=1).traced(lambda rays, view: sampler(rays, medium), 2, 8.0)
-    batch = batches.batch(3)
-    assert 0 < batch.num_whole < 60
+    batches = RayBatches(views, 60, "all_images", seed=1)
+    batch = batches.traced(lambda rays, view: sampler(rays, medium), subdivision=Subdivision(2, 8.0)).batch(3)
+    assert 60 < len(batch.rays) < 4 * 60
     assert batch.path.num_rays == len(batch.rays)
     again = sampler(batch.rays, medium)
     assert len(again.ray) > 1.5 * len(batch.rays)
@@ -325,14 +317,14 @@ def test_batches_made_ahead_do_not_depend_on_the_default_type(views, jitter):
     """Lightning sets it for each step of `trainer.precision=64-true`, while a thread makes the next batch."""
     medium, sampler = Ball().double(), Snell()
     batches = RayBatches(views, 60, "all_images", 1, jitter=jitter).to("cpu", torch.float64)
-    batches = batches.traced(lambda rays, _: sampler(rays, medium), 2, 0.0)
+    batches = batches.traced(lambda rays, _: sampler(rays, medium), subdivision=Subdivision(2, 0.0))
     expected = batches.batch(0)
     torch.set_default_dtype(torch.float64)
     try:
         batch = batches.batch(0)
     finally:
         torch.set_default_dtype(torch.float32)
-    assert batch.num_whole == 0, "all pixels are divided"
+    assert len(batch.rays) == 4 * 60, "all pixels are divided"
     assert batch.rays.directions.dtype == batch.path.positions.dtype == torch.float64
     assert torch.equal(batch.rays.directions, expected.rays.directions)
     assert torch.equal(batch.path.positions, expected.path.positions)
