@@ -16,6 +16,6 @@ class OpacityEntropy(Loss):
     """Entropy of the finest level's opacity: rays shall either pass or be stopped, not be dimmed by fog."""
 
     def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
-        # Of rays, and then of pixels: light that splits has several polylines for a ray, and a pixel may have several rays.
+        # `opacity` sums the polylines of each ray, and `per_pixel` averages the rays of each pixel.
         opacity = batch.per_pixel(renderings[-1].opacity).clamp(1e-5, 1 - 1e-5)
         return -(opacity * torch.log(opacity) + (1 - opacity) * torch.log(1 - opacity)).mean()
