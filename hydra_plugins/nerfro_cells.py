@@ -102,11 +102,13 @@ class CellSweeper(BasicSweeper):
             sys.exit(1)
 
     def _cells(self, arguments: list[str]) -> "list[Cell]":
+        from nerfro.cli import renamed_override
         from nerfro.errors import NerfroError
 
         assert self.hydra_context is not None
         parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
-        (jobs,) = self.split_arguments(parser.parse_overrides([*self._parse_config(), *arguments]), None)
+        overrides = [*map(renamed_override, self._parse_config()), *arguments]
+        (jobs,) = self.split_arguments(parser.parse_overrides(overrides), None)
         if not jobs:
             raise NerfroError("the sweep has no cells: a glob or range in it names nothing")
         # What is swept over in a file tells cells apart even where the command line leaves one value of it.

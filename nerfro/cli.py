@@ -18,11 +18,14 @@ from typing import cast
 
 import hydra
 import yaml
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra._internal.sources_registry import SourcesRegistry
 from hydra._internal.utils import get_args_parser
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, OverrideParseException
-from omegaconf import DictConfig
+from hydra.plugins.config_source import ConfigResult
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from nerfro.allowed import check_names, check_settings
@@ -33,6 +36,14 @@ from nerfro.registry import discover
 _NO_MEMORY = re.compile("allocate memory|out of memory")  # as torch tells it, on a CPU and on a GPU
 EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141  # as a shell tells of a program that SIGPIPE ended
+
+# Old spellings of configuration keys and of options, which work for one release with a warning. Add one line for each
+# name that you change; command lines, YAML files of users, run folders and checkpoints then follow. Three forms:
+#   "batches.hold_back": "batches.num_validation_views"   a setting or a node with all settings below it
+#   "loss=nearby": "near_camera"                          an option of a group (`experiment=NAME` is one, too)
+#   "medium.learn_surface": None                          a setting that is gone: refused on the command line and in
+#                                                         YAML files, dropped from the configurations of old runs
+RENAMED: dict[str, str | None] = {}
 
 
 def entry_point(
@@ -66,8 +77,9 @@ def entry_point(
             with errors_in_one_line():
                 sys.argv[1:] = _flags_first(sys.argv[1:])
                 ConfigStore.instance().store(name=f"{config_name}_schema", node=schema, provider="nerfro")
+                SourcesRegistry.instance().types["file"] = _RenamingFiles
                 discover()
-                sys.argv[1:] = [_quoted(argument, verbatim) for argument in sys.argv[1:]]
+                sys.argv[1:] = [_quoted(renamed_override(argument), verbatim) for argument in sys.argv[1:]]
                 try:
                     hydra.main(version_base="1.3", config_path=str(config_dir), config_name=config_name)(job)()
                 except OSError as error:  # not of the job: Hydra makes its folder
@@ -178,6 +190,104 @@ def _messages(error: BaseException) -> list[str]:
         where = [f"{lines[0].partition(':')[0]}:"] if lines[0].startswith("In '") else []
         return [*where, f"{cause.full_key} is no setting; {nearest_of(str(cause.key), list(map(str, names)))}"]
     return lines + [line.strip() for line in str(cause).splitlines() if line.strip() and line.strip() not in lines]
+
+
+def renamed_override(override: str) -> str:
+    """Replace old names in a command-line override, with a warning for each.
+
+    Raises:
+        NerfroError: the setting is gone.
+    """
+    prefix, key, equals, value = cast(re.Match, re.fullmatch(r"(~|\+*)([^=]*)(=?)(.*)", override, re.DOTALL)).groups()
+    group, at, package = key.partition("@")
+    new_value = re.sub(r"\w+", lambda name: _renamed_option(group, name[0]), value)
+    new_package = _renamed_key(package if at else key)
+    if new_package is None:
+        raise NerfroError(_gone(key))
+    return f"{prefix}{group + at if at else ''}{new_package}{equals}{new_value}"
+
+
+def renamed_config(config: DictConfig, origin: Path) -> DictConfig:
+    """Replace old names in the configuration of an old run, with one warning, and drop settings that are gone."""
+    found = [f"{old} is called {new}" for old, new in RENAMED.items() if _move(config, old, new) and new]
+    if found:
+        warn(f"{origin} has old names of settings, which can be read for one more release: {', '.join(found)}")
+    return config
+
+
+class _RenamingFiles(FileConfigSource):
+    """Hydra's source of YAML files, with old names replaced."""
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        result = super().load_config(config_path)
+        group = config_path.rpartition("/")[0]
+        package = result.header.get("package") or group.replace("/", ".")
+        config = cast(DictConfig, result.config)
+        inside = "" if package == "_global_" else f"{package}."
+        for old, new in RENAMED.items():
+            is_here = old.startswith(inside) and (new is None or new.startswith(inside))
+            if is_here and _move(config, old.removeprefix(inside), new and new.removeprefix(inside)):
+                if new is None:
+                    raise NerfroError(f"{config_path}.yaml: {_gone(old)}")
+                warn(f"{config_path}.yaml: {_since(old, new)}")
+        if "defaults" in config:
+            config.defaults = [_renamed_default(group, entry) for entry in config.defaults]
+        return result
+
+
+_RenamingFiles.__name__ = FileConfigSource.__name__  # Hydra allows one class for each scheme, and compares their names
+
+
+def _renamed_default(group: str, entry: object) -> object:
+    """Replace old names in one entry of a defaults list."""
+    if isinstance(entry, str):
+        return _renamed_option(group, entry)
+    if not isinstance(entry, DictConfig):
+        return entry
+    ((key, option),) = entry.items()
+    *_, place = str(key).split()  # after `override` and `optional`
+    name, at, package = place.removeprefix("/").partition("@")
+    new_place = f"{place[: len(place) - len(package)]}{_renamed_key(package)}" if at else place
+    new_option = _renamed_option(name, option) if isinstance(option, str) else option
+    return {f"{str(key).removesuffix(place)}{new_place}": new_option}
+
+
+def _renamed_option(group: str, name: str) -> str:
+    new = RENAMED.get(f"{group}={name}")
+    if new is None:
+        return name
+    warn(_since(f"{group}={name}", f"{group}={new}"))
+    return new
+
+
+def _renamed_key(key: str) -> str | None:
+    for old, new in RENAMED.items():
+        if key == old or key.startswith(f"{old}."):
+            if new is not None:
+                warn(_since(old, new))
+            return new and new + key.removeprefix(old)
+    return key
+
+
+def _move(config: DictConfig, old: str, new: str | None) -> bool:
+    """Move a node of a configuration to its new place, or drop it; whether there is one."""
+    parent, _, name = old.rpartition(".")
+    node = OmegaConf.select(config, parent) if parent else config
+    if not isinstance(node, DictConfig) or name not in node:
+        return False
+    value = node._get_node(name)
+    del node[name]
+    if new is not None:
+        OmegaConf.update(config, new, value, force_add=True)
+    return True
+
+
+def _since(old: str, new: str) -> str:
+    return f"{old} is called {new} since this release; the old name works until the next one"
+
+
+def _gone(old: str) -> str:
+    return f"{old} was removed in this release; leave it out (CHANGELOG.md says what to use instead)"
 
 
 def warn(message: str) -> None:

@@ -14,15 +14,19 @@ from typing import Optional, get_type_hints
 
 import pytest
 import yaml
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 from omegaconf import OmegaConf
 
-from nerfro.cli import _flags_first, in_one_line
+from nerfro.cli import RENAMED, _flags_first, _RenamingFiles, in_one_line, renamed_override
 from nerfro.errors import NerfroError
+from nerfro.files.foreign_config import foreign_config
 from nerfro.paths import CONF_DIR, PACKAGE_DIR, resolve_path, user_path
-from nerfro.registry import KINDS
+from nerfro.registry import KINDS, discover, plugins
 from nerfro.training import callbacks
+from nerfro.training.config import TrainConfig
 
 
 @pytest.mark.parametrize("num_lines", [1, 10_000])  # less and more than a pipe's buffer
@@ -131,3 +135,71 @@ def test_an_integer_that_no_float_holds_is_named() -> None:
     with pytest.raises(OverflowError) as caught:
         config.weight = 10**400
     assert in_one_line(caught.value) == "weight is too large; take a number that a float can hold"
+
+
+OLD_NAMES = {
+    "batches.hidden": "batches.size",
+    "loss.near": "loss.distortion",
+    "loss=near": "distortion",
+    "experiment=mirror": "glass",
+    "medium.old_depth": None,
+}
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("batches.hidden=3", "batches.size=3"),
+        ("++batches.hidden=3,4", "++batches.size=3,4"),
+        ("~loss.near", "~loss.distortion"),
+        ("+loss@loss.near=near", "+loss@loss.distortion=distortion"),
+        ("+loss.near.weight=1", "+loss.distortion.weight=1"),
+        ("+experiment=mirror,nerf", "+experiment=glass,nerf"),
+        ("name=near", "name=near"),
+        ("batches.hidden_too=1", "batches.hidden_too=1"),
+    ],
+)
+def test_old_names_in_overrides_are_replaced_with_a_warning(
+    old: str, new: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("nerfro.cli.RENAMED", OLD_NAMES)
+    assert renamed_override(old) == new
+    printed = capsys.readouterr().out
+    assert ("since this release" in printed) == (old != new)
+    with pytest.raises(NerfroError, match=r"medium\.old_depth was removed .* leave it out"):
+        renamed_override("medium.old_depth=3")
+
+
+def test_old_names_in_files_of_users_and_in_old_runs_are_replaced_with_a_warning(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("nerfro.cli.RENAMED", OLD_NAMES)
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text(
+        "# @package _global_\ndefaults:\n  - mirror\n  - /loss@loss.near: near\n  - _self_\nbatches: {hidden: 7}\n"
+    )
+    files = _RenamingFiles("main", str(tmp_path))
+    config = files.load_config("experiment/mine").config
+    assert config == {"defaults": ["glass", {"/loss@loss.distortion": "distortion"}, "_self_"], "batches": {"size": 7}}
+    (tmp_path / "experiment" / "mine.yaml").write_text("# @package _global_\nmedium: {old_depth: 7}\n")
+    with pytest.raises(NerfroError, match=r"experiment/mine\.yaml: medium\.old_depth was removed"):
+        files.load_config("experiment/mine")
+    assert "experiment/mine.yaml: batches.hidden is called batches.size since this release" in capsys.readouterr().out
+
+    run = foreign_config("batches: {hidden: 7}\nmedium: {old_depth: 7, ior: 1.5}\n", tmp_path / "config.yaml")
+    assert run == {"batches": {"size": 7}, "medium": {"ior": 1.5}}
+    assert capsys.readouterr().out.count("batches.hidden is called batches.size") == 1
+
+
+def test_renamed_settings_exist_and_their_old_names_do_not() -> None:
+    discover()
+    ConfigStore.instance().store(name="train_schema", node=TrainConfig, provider="nerfro")
+    with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+        config = compose("train", ["+experiment=straight"])
+    for old, new in RENAMED.items():
+        group, is_option, option = old.partition("=")
+        if is_option:
+            assert not (CONF_DIR / group / f"{option}.yaml").exists(), old
+            assert (group, new) in {(p.kind, p.name) for p in plugins()} or (CONF_DIR / group / f"{new}.yaml").exists()
+        else:
+            assert OmegaConf.select(config, old) is None, old

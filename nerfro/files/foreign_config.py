@@ -9,6 +9,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from nerfro.cli import renamed_config
 from nerfro.errors import NerfroError
 
 
@@ -27,4 +28,4 @@ def foreign_config(text: str, origin: Path) -> DictConfig:
     asks = re.search(r".*\$\{.*", OmegaConf.to_yaml(config))
     if asks:
         raise NerfroError(f"{origin} asks for a value from elsewhere ({asks[0].strip()}); write the value itself there")
-    return config
+    return renamed_config(config, origin)
