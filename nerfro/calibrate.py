@@ -1,4 +1,4 @@
-"""`python -m nerfro.calibrate images=DIR target=apriltag out=DIR`: lens and poses of photographs."""
+"""`python -m nerfro.calibrate images=DIR target=apriltag out=DIR`: estimate lens and poses of photographs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nerfro.capture.calibrated_data import FILES, ray_range, relative, split_vie
 from nerfro.capture.calibration import Calibration, calibrate
 from nerfro.capture.model_import import import_model
 from nerfro.capture.photographs import list_photographs, luminance, outside
-from nerfro.capture.reconstruction import Making, find_model
+from nerfro.capture.reconstruction import SfmSettings, find_model
 from nerfro.capture.targets import Target, print_sheets
 from nerfro.cli import entry_point, warn
 from nerfro.data.masks import find_mask
@@ -22,14 +22,14 @@ from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing
 from nerfro.paths import user_path
 
-# Errors above this are told to be large, pixels; a focal length less certain than this is told to be uncertain.
-_GOOD_ERROR, _GOOD_FOCAL = 0.7, 0.02
+# Limits above which a warning is printed: reprojection error in pixels, and relative deviation of the focal length.
+_MAX_ERROR, _MAX_FOCAL_DEVIATION = 0.7, 0.02
 
 
 @entry_point("calibrate", CalibrateConfig)
 def main(config: DictConfig) -> None:
-    """Find the target, estimate, write the data set, and say what to do next."""
-    given = check_options(config)
+    """Detect the target, estimate lens and poses, write the data set, and print the next command."""
+    known = check_options(config)
     out = user_path(config.out)
     target = None if config.target == "colmap" else make_target(config)
     if config.write_board:
@@ -37,12 +37,12 @@ def main(config: DictConfig) -> None:
         if config.images is None:
             return
     images, size = list_photographs(user_path(config.images))
-    # Where the loader of the data set will look for them.
+    # Masks lie where the loader of the data set will look for them.
     masks = [find_mask(out, out / relative(image, out)) for image in images]
     refuse_existing([out / name for name in FILES], config.overwrite)
     if target is None:
-        making = Making(config.lens, given, config.pairs, config.threads)
-        model = find_model(config.reconstruction, images, masks, out / "sparse", making, config.overwrite)
+        settings = SfmSettings(config.lens, known, config.pairs, config.threads)
+        model = find_model(config.reconstruction, images, masks, out / "sparse", settings, config.overwrite)
         calibration, points = import_model(model, images, size)
         quads, seen = [], points
     else:
@@ -50,10 +50,10 @@ def main(config: DictConfig) -> None:
             image.name: outside(target.find(luminance(image)), mask)
             for image, mask in zip(track(images, f"looking for {target.feature}"), masks, strict=True)
         }
-        calibration = calibrate(sightings, size, config.lens, given, target.fewest, target.feature)
+        calibration = calibrate(sightings, size, config.lens, known, target.min_features, target.feature)
         quads, points = [sheet.corners for sheet in target.sheets()], np.empty((0, 3))
         seen = np.concatenate(quads)
-    _report(calibration, "points" if target is None else target.feature, config.lens == "pinhole" and given is None)
+    _report(calibration, "points" if target is None else target.feature, config.lens == "pinhole" and known is None)
     splits = split_views([image.name for image in images if image.name in calibration.poses], config.test_every)
     reach = ray_range(calibration, seen)
     written = write_calibrated(out, images, size, calibration, splits, config.target, quads, points, reach)
@@ -77,9 +77,9 @@ def _write_board(target: Target | None, out: Path, overwrite: bool) -> None:
 def _report(calibration: Calibration, feature: str, may_distort: bool) -> None:
     print("\n".join(calibration.lines(feature)))
     lens = calibration.intrinsics
-    if calibration.mean_error > _GOOD_ERROR and may_distort and not lens.distortion:
-        warn("the error is large; a lens that distorts wants lens=radial or lens=opencv")
-    if lens.focal_deviation is not None and lens.focal_deviation > _GOOD_FOCAL * lens.matrix[0, 0]:
+    if calibration.mean_error > _MAX_ERROR and may_distort and not lens.distortion:
+        warn("the reprojection error is large; for a lens with distortion set lens=radial or lens=opencv")
+    if lens.focal_deviation is not None and lens.focal_deviation > _MAX_FOCAL_DEVIATION * lens.matrix[0, 0]:
         warn("the focal length is uncertain; photograph the board also at a slant, and from near and far")
 
 

@@ -1,4 +1,4 @@
-"""`python -m nerfro.mask data=... data.root=DIR outlines={NAME:BOX}`: masks of the object where none exist."""
+"""`python -m nerfro.mask data=... data.root=DIR outlines={NAME:BOX}`: segment the object in all views."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from nerfro.capture.mask_files import (
     save_mask,
     stored_size,
 )
-from nerfro.capture.masking import Found, grab, outline_region, propagate
+from nerfro.capture.masking import Segmentation, grab, outline_region, propagate
 from nerfro.capture.outline_hull import AGREES
 from nerfro.capture.targets import opencv
 from nerfro.cli import entry_point, warn
@@ -37,16 +37,16 @@ _SHEET = "masks.png"
 @entry_point("mask", MaskConfig)
 @torch.no_grad()
 def main(config: DictConfig) -> None:
-    """Cut the object out where an outline is given, then in all other views, and write what was missing."""
+    """Segment the outlined views, then all other views, and write the missing masks."""
     if str(config.data.root).startswith(EMBEDDED_PREFIX):
-        raise NerfroError(f"data.root={config.data.root} ships with nerfro and has its masks; give a folder of yours")
+        raise NerfroError(f"data.root={config.data.root} is part of nerfro and has masks; set data.root to your folder")
     outlines = read_outlines(config.outlines)
     source = build(config.data)
     cameras, images, frames = load_all(source)
     outlined = {find_frame(name, frames): outline for name, outline in outlines.items()}
     kept = {} if config.overwrite else {i: frame.mask for i, frame in enumerate(frames) if frame.mask is not None}
     check_start(frames, outlined, kept, config.hull_only)
-    opencv()  # told now, if it is missing, and not after the hull
+    opencv()  # report a missing package before the long work starts
     size = cameras.width, cameras.height
     done = {view: read_resized(mask, size) for view, mask in kept.items()}
     for view, outline in outlined.items():
@@ -54,9 +54,9 @@ def main(config: DictConfig) -> None:
         done[view] = grab(images[view], *outline_region(scaled, size))
     for view, mask in done.items():
         if not mask.any():
-            raise NerfroError(f"{frames[view].name}: nothing is in the outline or the mask; draw it around the object")
+            raise NerfroError(f"{frames[view].name}: the outline or mask is empty; draw it around the object")
     missing = len(frames) - len(done)
-    print(f"{len(kept)} masks exist, {len(outlined)} outlines are given; {missing} views are cut out by the hull")
+    print(f"{len(kept)} existing masks, {len(outlined)} outlines; segmenting {missing} further views")
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns) as progress:
         task = progress.add_task("cutting out", total=missing)
@@ -66,25 +66,25 @@ def main(config: DictConfig) -> None:
         save_mask(frames[view], found.masks[view])
     save_picture(source.root / _SHEET, mask_sheet(images, frames, found))
     _report(frames, found)
-    print(f"wrote {len(made)} masks beside their images (mask_*.png), and {source.root / _SHEET}: look at it")
-    print("correct wrong masks in any paint program, or delete them, outline one of them, and run this again")
+    print(f"wrote {len(made)} masks beside their images (mask_*.png); check them in {source.root / _SHEET}")
+    print("correct wrong masks in a paint program; or delete them, outline one of these views, and repeat the command")
     given = [text for text in HydraConfig.get().overrides.task if text.startswith(("data=", "data."))]
     if not any(text.startswith("data=") for text in given):
         given = ["data=opencv", *given]
     print(f"next: {shlex.join(['python', '-m', 'nerfro.preprocess', *given, 'medium.ior=1.33'])}")
 
 
-def _report(frames: list[Frame], found: Found) -> None:
+def _report(frames: list[Frame], found: Segmentation) -> None:
     if found.overlaps:
-        print("overlap (intersection over union) of what GrabCut finds with the hull of the others:")
+        print("overlap (intersection over union) of GrabCut's mask with the visual hull of the other views:")
     for view in sorted(found.overlaps, key=lambda view: found.overlaps[view]):
-        taken = ", so the hull is taken" if view in found.by_hull else ""
+        taken = " (mask from the hull)" if view in found.by_hull else ""
         print(f"  {found.overlaps[view]:.4f}  {frames[view].name}{taken}")
     doubtful = [frames[view].name for view in found.by_hull if view in found.overlaps]
     if doubtful:
         warn(
-            f"{len(doubtful)} of {len(frames)} views: GrabCut and the hull overlap by less than {AGREES} "
-            f"({first_of(doubtful)}); their masks are the hull's, which is a little too large: look at them first"
+            f"{len(doubtful)} of {len(frames)} views: GrabCut and the visual hull overlap by less than {AGREES} "
+            f"({first_of(doubtful)}); their masks are projections of the hull and slightly too large: check them first"
         )
 
 

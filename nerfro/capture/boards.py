@@ -1,6 +1,6 @@
-"""AprilTag boards: where each tag's corners are, and what its faces look like in print.
+"""Geometry and print image of AprilTag boards.
 
-A board has its own right-handed frame and unit. A face is a sheet: tags side by side, seen from its front.
+A board has a right-handed coordinate frame and a unit of length. A face is a flat sheet of adjacent tags.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ Family = Literal["tag36h11", "tagStandard41h12"]
 
 
 class Layout(NamedTuple):
-    """What a tag of a family measures, in modules (the squares that it is made of)."""
+    """Dimensions of the tags of a family, in modules (the black and white squares of a tag)."""
 
-    side: int  # of a whole tag, with the white border of tag36h11
-    inset: int  # of the corners that are detected, from the whole tag's sides
+    side: int  # side of a whole tag, including the white border of tag36h11
+    inset: int  # distance of the detected corners from the sides of the whole tag
 
 
 LAYOUTS: dict[Family, Layout] = {"tag36h11": Layout(10, 1), "tagStandard41h12": Layout(9, 2)}
@@ -32,10 +32,9 @@ class Face:
     """A sheet of tags in space.
 
     Attributes:
-        origin: its upper left corner as printed, board units.
-        right, down: unit vectors along its upper and its left edge; it is seen from where `down` turns to `right`
-            anticlockwise.
-        ids: of its tags as printed, rows from above.
+        origin: upper left corner of the printed sheet, in board units.
+        right, down: unit vectors along the upper and the left edge. The printed side faces along `down` x `right`.
+        ids: tag numbers as printed, the top row first.
     """
 
     origin: tuple[float, float, float]
@@ -45,7 +44,7 @@ class Face:
 
     @property
     def front(self) -> str:
-        """The axis that its front looks along, as in +x."""
+        """Coordinate axis nearest to the normal of the printed side, for example "+x"."""
         normal = np.cross(self.down, self.right)
         axis = int(np.abs(normal).argmax())
         return f"{'+' if normal[axis] > 0 else '-'}{'xyz'[axis]}"
@@ -53,14 +52,14 @@ class Face:
 
 @dataclass(frozen=True)
 class TagBoard:
-    """AprilTags of modules of a side in board units, on one or several faces."""
+    """AprilTags on one or several faces."""
 
     family: Family
-    module: float
+    module: float  # side of a module, in board units
     faces: tuple[Face, ...]
 
     def tag_corners(self) -> dict[int, Float[np.ndarray, "4 3"]]:
-        """The corners that are detected of each tag by its id: upper left, upper right, lower right, lower left."""
+        """Return the detected corners of each tag by tag number: upper left, upper right, lower right, lower left."""
         side, inset = LAYOUTS[self.family]
         near, far = inset * self.module, (side - inset) * self.module
         first = np.array([[near, near], [far, near], [far, far], [near, far]])
@@ -71,25 +70,28 @@ class TagBoard:
         }
 
     def face_corners(self, face: Face) -> Float[np.ndarray, "4 3"]:
-        """The corners of a whole sheet: upper left, upper right, lower right, lower left."""
+        """Return the corners of a whole sheet: upper left, upper right, lower right, lower left."""
         rows, columns = face.ids.shape
         height, width = (LAYOUTS[self.family].side * self.module * count for count in (rows, columns))
         return _on_face(face, np.array([[0, 0], [width, 0], [width, height], [0, height]]))
 
     def draw(self, face: Face, module_pixels: int = 1) -> UInt8[np.ndarray, "H W"]:
-        """A sheet as printed, without a margin: 0 is black, 255 white."""
+        """Draw a sheet as printed, without a margin: 0 is black, 255 is white."""
         sheet = np.block([[draw_tag(self.family, int(number)) for number in row] for row in face.ids])
         return np.kron(sheet, np.ones((module_pixels, module_pixels), np.uint8))
 
 
 def twelve_faces(tag: float = 0.05) -> TagBoard:
-    """The board of the paper's authors: a block of 0.27 units on the middle of a square of 0.81, 108 tags.
+    """Return the board of the paper's authors: a cubic block of side 0.27 in the middle of a square of side 0.81.
 
-    The square lies in the plane z = 0 with a corner at the origin; its eight outer cells are faces 0 to 7, 0.27 wide.
-    The walls of the block over the cell in the middle are faces 8 to 11 (towards +x, +y, -x, -y), and the object
-    stands on top of it at z = 0.27. The positions are those of calib_camera_with_apriltag.py in
-    https://github.com/alexkeroro86/SampleNeRFRO; a module is 0.01 units, and a face has 3x3 tags of tagStandard41h12.
-    All lengths go with a tag's side between the corners that are detected; 0.05 is the authors'.
+    The square lies in the plane z = 0 with a corner at the origin. Its eight outer cells, 0.27 wide, are faces 0 to 7.
+    The walls of the block on the middle cell are faces 8 to 11 (towards +x, +y, -x, -y), and the object
+    stands on top of the block at z = 0.27. The positions are taken from calib_camera_with_apriltag.py in
+    https://github.com/alexkeroro86/SampleNeRFRO. A module measures 0.01 units, and a face has 3x3 tags of
+    tagStandard41h12, 108 tags in all.
+
+    Args:
+        tag: side of a tag between its detected corners, which scales the whole board; the authors use 0.05.
     """
     module = tag / 5
     side, columnwise = 27 * module, np.arange(9).reshape(3, 3).T
@@ -107,9 +109,14 @@ def twelve_faces(tag: float = 0.05) -> TagBoard:
 
 
 def tag_grid(family: Family, rows: int, columns: int, tag: float) -> TagBoard:
-    """Tags 0, 1, ... row by row on one sheet in the plane z = 0: x to its right, y to its top, z out of the paper.
+    """Return a board of tags 0, 1, ... row by row on one sheet in the plane z = 0.
 
-    The side of a tag between the corners that are detected is in the unit of the poses.
+    The x axis points to the right of the sheet, the y axis to the top, and the z axis out of the paper.
+
+    Args:
+        family: tag family.
+        rows, columns: number of tags.
+        tag: side of a tag between its detected corners, in the unit of the poses.
     """
     side, inset = LAYOUTS[family]
     module = tag / (side - 2 * inset)
@@ -118,7 +125,7 @@ def tag_grid(family: Family, rows: int, columns: int, tag: float) -> TagBoard:
 
 
 def draw_tag(family: Family, number: int) -> UInt8[np.ndarray, "S S"]:
-    """A tag, one pixel for each module."""
+    """Draw a tag with one pixel per module."""
     # The struct apriltag_family of https://github.com/AprilRobotics/apriltag, drawn as its apriltag_to_image does.
     codes = tag_detector(family).tag_families[family].contents
     if not 0 <= number < codes.ncodes:
@@ -137,16 +144,16 @@ def draw_tag(family: Family, number: int) -> UInt8[np.ndarray, "S S"]:
 
 @functools.cache
 def tag_detector(family: Family) -> Any:
-    """The pyapriltags.Detector of a family, which also holds its codes."""
+    """Return the pyapriltags.Detector of a family, which also holds the codes of the family."""
     try:
         from pyapriltags import Detector
     except ImportError as error:
         raise NerfroError(f"AprilTags need pyapriltags ({error}); pip install 'nerfro[capture]'") from error
-    # Not pupil-apriltags: its old library writes past its memory where a picture is full of detail.
-    # Full resolution: decimated edges cost accuracy, and calibration is in no hurry.
+    # pupil-apriltags is no alternative: its older library writes past its memory on images with much detail.
+    # Decimation would be faster, but less accurate.
     return Detector(families=family, nthreads=1, quad_decimate=1.0)
 
 
 def _on_face(face: Face, places: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
-    """Points of a face, given as lengths to the right and down from its upper left corner."""
+    """Convert coordinates on a face (lengths to the right and down from the upper left corner) to board coordinates."""
     return np.array(face.origin) + places @ np.array([face.right, face.down], np.float64)

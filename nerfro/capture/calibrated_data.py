@@ -1,4 +1,4 @@
-"""The data set that a calibration becomes, and a picture of its cameras in space."""
+"""Writing a calibration as a data set, with a plot of the cameras."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from nerfro.files.atomic import write_atomically
 SPLITS = ("train", "val", "test")
 REPORT, PLOT = "calibration.json", "cameras.png"
 FILES = (*(f"transforms_{split}.json" for split in SPLITS), REPORT, PLOT)
-# Side of a drawn camera's picture, as a share of the cameras' median distance from the middle.
+# Size of a drawn camera, as a fraction of the median distance of the cameras from the centre of the scene.
 _CAMERA_SIZE = 0.08
 _MAX_POINTS = 4000
 _CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 
 
 def split_views(names: list[str], every: int) -> dict[str, list[str]]:
-    """Names by split: each `every`-th from the first is for test, each `every`-th from half way on for validation."""
+    """Split names into training, validation and test: every `every`-th name is for test, as many for validation."""
     splits: dict[str, list[str]] = {split: [] for split in SPLITS}
     for number, name in enumerate(sorted(names)):
         place = number % every
@@ -43,10 +43,21 @@ def write_calibrated(
     points: Float[np.ndarray, "P 3"],
     options: list[str],
 ) -> list[str]:
-    """Write the data set (see docs/data.md) of images of a size (width, height), calibration.json and cameras.png.
+    """Write the data set (see docs/data.md), calibration.json and cameras.png.
 
-    The quads are the board's sheets and the points the scene's, for the plot; the options are those that the next
-    commands need to hold all that was seen. Returns what was written, in words.
+    Args:
+        out: folder of the data set.
+        images: the photographs.
+        size: width and height, in pixels.
+        calibration: estimated lens and poses.
+        splits: image names by split.
+        target: name of the calibration target.
+        quads: corners of the sheets of the board, for the plot.
+        points: scene points, for the plot.
+        options: command-line options for the following commands, such as data.near and data.far.
+
+    Returns:
+        Descriptions of the written files.
     """
     files = {image.name: image for image in images}
     lens = calibration.intrinsics
@@ -57,7 +68,7 @@ def write_calibrated(
     for split, names in splits.items():
         path = out / f"transforms_{split}.json"
         if not names:
-            path.unlink(missing_ok=True)  # of an earlier calibration
+            path.unlink(missing_ok=True)  # left by an earlier calibration
             continue
         frames = []
         for name in names:
@@ -87,7 +98,7 @@ def write_calibrated(
 
 
 def relative(file: Path, folder: Path) -> str:
-    """A file's path from a folder; through a link within the folder, whose place in it says where masks are."""
+    """Return the path of a file relative to a folder; links inside the folder are kept, since masks lie beside them."""
     file, folder = Path(os.path.abspath(file)), Path(os.path.abspath(folder))
     if not file.is_relative_to(folder):
         file, folder = file.resolve(), folder.resolve()
@@ -95,7 +106,7 @@ def relative(file: Path, folder: Path) -> str:
 
 
 def ray_range(calibration: Calibration, seen: Float[np.ndarray, "P 3"]) -> list[str]:
-    """Options `data.near` and `data.far` that hold all that the target or the points span; none without points."""
+    """Return options `data.near` and `data.far` that enclose all points for all cameras; none without points."""
     if len(seen) == 0:
         return []
     centres = np.stack([pose.camera_to_world[:, 3] for pose in calibration.poses.values()])
@@ -111,9 +122,17 @@ def _draw_cameras(
     quads: Sequence[Float[np.ndarray, "4 3"]],
     points: Float[np.ndarray, "P 3"],
 ) -> bytes:
-    """Pyramids from each camera's centre, coloured by its reprojection error, from the side and from above, as PNG.
+    """Plot the cameras as pyramids, coloured by reprojection error, from the side and from above.
 
-    The poses are in OpenCV's axes; the slopes are half the width and height of the image at unit depth.
+    Args:
+        poses: camera-to-world matrices in OpenCV's axes.
+        errors: reprojection errors, in pixels.
+        slopes: half the width and height of the image at unit depth.
+        quads: corners of the sheets of the board.
+        points: scene points.
+
+    Returns:
+        The plot as a PNG file.
     """
     from matplotlib import colormaps
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -130,7 +149,7 @@ def _draw_cameras(
     colours = colormaps["viridis"](norm(errors))
     half = np.array(slopes) / max(slopes) * 0.5 * size
     frame = np.array([[x * half[0], y * half[1], 0.5 * size / max(slopes)] for x, y in _CORNERS])
-    # Stray points of a reconstruction lie anywhere.
+    # Outliers among the points of a reconstruction would otherwise determine the limits of the axes.
     core = [np.quantile(points, (0.02, 0.98), axis=0)] if len(points) else []
     shown = np.concatenate([centres, *quads, *core])
     low, high = shown.min(0) - size, shown.max(0) + size

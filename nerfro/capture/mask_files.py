@@ -1,4 +1,4 @@
-"""Outlines that are given, masks that exist, and those that are written beside their images."""
+"""Input and output of the mask command: outlines, existing masks, and masks written beside their images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from omegaconf import MISSING, OmegaConf
 from PIL import Image
 
 from nerfro.cameras import Cameras
-from nerfro.capture.masking import Found
+from nerfro.capture.masking import Segmentation
 from nerfro.capture.outline_hull import FEWEST_VIEWS
 from nerfro.capture.targets import opencv
 from nerfro.data.base import DataSource, Frame
@@ -27,21 +27,21 @@ from nerfro.files.drawing import sheet
 from nerfro.files.images import save_picture
 from nerfro.paths import user_path
 
-_TILE, _COLUMNS, _NAME_LENGTH = 220, 6, 20  # pixels, pictures, characters
-_OUTSIDE = (0.0, 0.0, 90.0)  # levels that are added to what is outside
+_TILE, _COLUMNS, _NAME_LENGTH = 220, 6, 20  # width of a tile in pixels, tiles per row, characters of a name
+_OUTSIDE = (0.0, 0.0, 90.0)  # 8-bit colour that is added outside the mask
 
 
 @dataclass
 class MaskConfig:
-    """What `python -m nerfro.mask` is asked.
+    """Options of `python -m nerfro.mask`.
 
     Attributes:
-        data: the views (options of the group `data`); those of all splits get masks.
-        outlines: by the image's name, a box [left, top, right, bottom] around the object or a rough polygon
-            [[column, row], ...], pixels; or a JSON file that holds these.
-        hull_only: take the masks that exist, three at least, and project their hull into all other views; nothing is
-            cut out by colours.
-        overwrite: make masks that exist anew, from the outlines alone; else they are kept and show the way.
+        data: data set (options of the group `data`); the views of all splits get masks.
+        outlines: by image name, a box [left, top, right, bottom] around the object or an approximate polygon
+            [[column, row], ...], in pixels; or a JSON file with such a mapping.
+        hull_only: project the visual hull of at least three existing masks into all other views, without segmentation
+            by colour.
+        overwrite: replace existing masks, starting from the outlines alone. Otherwise existing masks are kept and used.
     """
 
     data: Any = MISSING
@@ -51,7 +51,7 @@ class MaskConfig:
 
 
 def read_outlines(given: object) -> dict[str, list]:
-    """Outlines by name, each a box or a polygon, from a mapping or a file."""
+    """Read outlines by image name, each a box or a polygon, from a mapping or a JSON file."""
     if OmegaConf.is_config(given):
         given = OmegaConf.to_container(given)  # type: ignore[arg-type]
     if isinstance(given, str):
@@ -59,7 +59,7 @@ def read_outlines(given: object) -> dict[str, list]:
     if given is None:
         return {}
     if not isinstance(given, Mapping):
-        raise NerfroError("outlines= must be {NAME:[LEFT,TOP,RIGHT,BOTTOM]}, or a JSON file with such a mapping")
+        raise NerfroError("outlines= must be {NAME:[LEFT,TOP,RIGHT,BOTTOM]} or a JSON file with such a mapping")
     outlines = {}
     for name, outline in given.items():
         try:
@@ -70,15 +70,19 @@ def read_outlines(given: object) -> dict[str, list]:
         polygon = numbers.ndim == 2 and numbers.shape[0] >= 3 and numbers.shape[1] == 2
         if not (box or polygon) or not np.isfinite(numbers).all():
             raise NerfroError(
-                f"the outline of {name} is {outline}; give a box [left,top,right,bottom] or a polygon of three or more "
-                "[column,row]"
+                f"the outline of {name} is {outline}; give a box [left,top,right,bottom] or a polygon of at least "
+                "three vertices [column,row]"
             )
         outlines[str(name)] = numbers.tolist()
     return outlines
 
 
 def load_all(source: DataSource) -> tuple[Cameras, list[UInt8[np.ndarray, "H W 3"]], list[Frame]]:
-    """All splits' views, each image once, without masks; all must be of one size."""
+    """Load the views of all splits without masks, each image once.
+
+    Raises:
+        NerfroError: the images differ in size, or the format does not provide image files.
+    """
     parts: list[Cameras] = []
     images: list[UInt8[np.ndarray, "H W 3"]] = []
     frames: list[Frame] = []
@@ -86,15 +90,15 @@ def load_all(source: DataSource) -> tuple[Cameras, list[UInt8[np.ndarray, "H W 3
         with masks_left_out():
             views = source.load(split)
         if len(views.frames) != len(views):
-            raise NerfroError("this data format does not tell where its images lie; convert it to data=opencv")
+            raise NerfroError("this data format does not provide image files; convert the data set to data=opencv")
         known = {frame.image for frame in frames}
         fresh = [i for i, frame in enumerate(views.frames) if frame.image not in known]
-        parts += [views.cameras.select(fresh)] if fresh else []  # a split without new images may be cropped
+        parts += [views.cameras.select(fresh)] if fresh else []  # a split without new images may have another size
         images += [np.uint8(np.rint(255 * views.images[i].numpy())) for i in fresh]
         frames += [views.frames[i] for i in fresh]
     sizes = {(part.width, part.height) for part in parts}
     if len(sizes) > 1:
-        raise NerfroError(f"splits have images of several sizes ({sorted(sizes)}); leave data.eval_crop at 1")
+        raise NerfroError(f"the splits have images of several sizes ({sorted(sizes)}); set data.eval_crop=1")
     names = ("camera_to_world", "fx", "fy", "cx", "cy")
     tensors: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
     lenses = [torch.zeros(len(part), 9) if part.distortion is None else part.distortion for part in parts]
@@ -102,65 +106,68 @@ def load_all(source: DataSource) -> tuple[Cameras, list[UInt8[np.ndarray, "H W 3
 
 
 def find_frame(name: str, frames: list[Frame]) -> int:
-    """The frame of a name: as the data set calls it, or its file's name with or without extension."""
+    """Find a frame by its name in the data set, or by its file name with or without extension."""
     found = [i for i, frame in enumerate(frames) if frame.name == name]
     found = found or [i for i, frame in enumerate(frames) if name in (frame.image.name, frame.image.stem)]
     if len(found) != 1:
-        what = "is no image of the data" if not found else f"are {len(found)} images of the data"
-        raise NerfroError(f"outlines: {name} {what}; its names are like {frames[0].name}")
+        problem = "is not an image of the data set" if not found else f"matches {len(found)} images of the data set"
+        raise NerfroError(f"outlines: {name} {problem}; names of the data set look like {frames[0].name}")
     return found[0]
 
 
 def check_start(
     frames: list[Frame], outlined: Mapping[int, object], kept: Mapping[int, object], hull_only: bool
 ) -> None:
-    """Refuse where there is nothing to start from, nothing to do, or no place for a mask."""
+    """Check that there is a mask or outline to start from, a mask to make, and a unique file for each mask."""
     if not outlined and not kept:
         raise NerfroError(
-            "there is no mask to start from; give the outline of the object in an image, as in "
+            "there is no mask to start from; give the outline of the object in one image, for example "
             f"outlines={{{frames[0].name}:[LEFT,TOP,RIGHT,BOTTOM]}}"
         )
     if hull_only and len(outlined) + len(kept) < FEWEST_VIEWS:
         raise NerfroError(
-            f"hull_only=true takes masks or outlines of {FEWEST_VIEWS} images or more, from all sides; there are "
-            f"{len(outlined) + len(kept)}"
+            f"hull_only=true needs masks or outlines of at least {FEWEST_VIEWS} images from all sides, and there are "
+            f"{len(outlined) + len(kept)}; outline the object in more images"
         )
     for view in outlined:
         if view in kept:
             raise NerfroError(
-                f"{frames[view].name} has a mask, {kept[view]}; delete it, or set overwrite=true to make all masks anew"
+                f"{frames[view].name} already has a mask, {kept[view]}; delete the mask, or set overwrite=true to "
+                "replace all masks"
             )
     if len(kept) == len(frames):
-        raise NerfroError("all images have masks; delete those that are wrong, or set overwrite=true")
+        raise NerfroError("all images have masks; delete the wrong ones, or set overwrite=true")
     repeated = [path for path, count in Counter(mask_file(frame) for frame in frames).items() if count > 1]
     if repeated:
-        raise NerfroError(f"{repeated[0]} would be the mask of two images that differ in extension only; rename one")
+        raise NerfroError(f"{repeated[0]} would be the mask of two images that differ only in extension; rename one")
 
 
 def mask_file(frame: Frame) -> Path:
-    """Where a frame's mask goes: to where it is, unless that is a JPEG."""
+    """Return the file for the mask of a frame: the existing one, unless it is a JPEG."""
     if frame.mask is not None and frame.mask.suffix == ".png":
         return frame.mask
     return frame.image.with_name(f"mask_{frame.image.stem}.png")
 
 
 def stored_size(frame: Frame) -> tuple[int, int]:
-    """Width and height of a frame's file."""
+    """Return width and height of the image file of a frame."""
     with Image.open(frame.image) as image:
         return image.size
 
 
 def read_resized(mask: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-    """A mask in the size (width, height) of the images as they are loaded."""
-    share = to_unit(read_mask(mask))
-    height, width = share.shape
+    """Read a mask and resize it to the width and height of the loaded images."""
+    coverage = to_unit(read_mask(mask))
+    height, width = coverage.shape
     if height * size[0] != width * size[1]:
-        raise NerfroError(f"mask {mask} has {width}x{height} pixels, of other proportions than its image")
-    return opencv().resize(share, size, interpolation=opencv().INTER_AREA) > 0.5
+        raise NerfroError(
+            f"mask {mask} has {width}x{height} pixels, which is not the aspect ratio of its image; replace the mask"
+        )
+    return opencv().resize(coverage, size, interpolation=opencv().INTER_AREA) > 0.5
 
 
 def save_mask(frame: Frame, mask: Bool[np.ndarray, "H W"]) -> None:
-    """Write a frame's mask in its image's size, black and white."""
+    """Write the mask of a frame as a black and white image in the size of its image file."""
     picture, size = Image.fromarray(np.uint8(255 * mask)), stored_size(frame)
     if picture.size != size:
         picture = picture.resize(size, Image.Resampling.BICUBIC).point(lambda level: 255 * (level > 127))
@@ -170,17 +177,17 @@ def save_mask(frame: Frame, mask: Bool[np.ndarray, "H W"]) -> None:
 def mask_sheet(
     images: list[UInt8[np.ndarray, "H W 3"]],
     frames: list[Frame],
-    found: Found,
+    found: Segmentation,
 ) -> Image.Image:
-    """All views with their masks, darkened outside; the doubtful first, those that were given last."""
-    told = {view: f"{overlap:.3f}" for view, overlap in found.overlaps.items()}
-    told |= {view: f"{told.get(view, '')} hull".strip() for view in found.by_hull}
-    order = sorted(range(len(images)), key=lambda view: (view not in told, found.overlaps.get(view, 0.0)))
+    """Draw a contact sheet of all views, darkened outside the masks, with doubtful masks first and given masks last."""
+    labels = {view: f"{overlap:.3f}" for view, overlap in found.overlaps.items()}
+    labels |= {view: f"{labels.get(view, '')} hull".strip() for view in found.by_hull}
+    order = sorted(range(len(images)), key=lambda view: (view not in labels, found.overlaps.get(view, 0.0)))
     stride = max(1, images[0].shape[1] // (2 * _TILE))
     pictures, captions = [], []
     for view in order:
         inside, image = (torch.from_numpy(array[::stride, ::stride]) for array in (found.masks[view], images[view]))
         pictures.append(torch.where(inside[..., None], image / 255, image / 1020 + torch.tensor(_OUTSIDE) / 255))
-        captions.append(f"{told.get(view, 'given')}  {frames[view].name[-_NAME_LENGTH:]}")
-    legend = "overlap of GrabCut with the hull, and whose mask is the hull's; outside the mask is dark"
+        captions.append(f"{labels.get(view, 'given')}  {frames[view].name[-_NAME_LENGTH:]}")
+    legend = "overlap of GrabCut and visual hull; hull: the mask is the projection of the hull; dark: outside the mask"
     return sheet(pictures, captions, _TILE, _COLUMNS, legend)

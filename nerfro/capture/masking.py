@@ -1,4 +1,4 @@
-"""Silhouettes by GrabCut and by the visual hull of those that agree."""
+"""Segmentation of the object by GrabCut, guided by the visual hull of consistent silhouettes."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from nerfro.capture.targets import opencv
 from nerfro.errors import NerfroError
 
 _ITERATIONS = 5
-# The surroundings that GrabCut learns the background from, as a share of the region's longer side.
-_SURROUNDINGS = 0.4
-# How far the object may reach beyond the projected hull, and what is surely object within it, shares of its diameter.
+# Margin around the region that provides the background colours of GrabCut, as a fraction of the longer side.
+_BACKGROUND_MARGIN = 0.4
+# Fractions of the diameter of a projected hull: how far the object may extend beyond, and depth of the certain core.
 _REACH, _CORE = 0.06, 0.2
-# Colours that OpenCV's GrabCut models each of the two regions with.
-_NUM_COLOURS = 5
+# Number of mixture components per region in OpenCV's GrabCut.
+_NUM_COMPONENTS = 5
 
 
 def grab(
@@ -30,17 +30,23 @@ def grab(
     possible: Bool[np.ndarray, "H W"],
     certain: Bool[np.ndarray, "H W"] | None = None,
 ) -> Bool[np.ndarray, "H W"]:
-    """Cut an object out of an sRGB image by the colours inside and outside (Rother et al., GrabCut, SIGGRAPH 2004).
+    """Segment an object in an sRGB image by the colours inside and outside (GrabCut, Rother et al., SIGGRAPH 2004).
+
+    Args:
+        image: 8-bit sRGB image.
+        likely: pixels that probably show the object.
+        possible: pixels that may show the object.
+        certain: pixels that certainly show the object.
 
     Returns:
-        The largest connected part of the object, without holes; empty where nothing is left.
+        Mask of the largest connected component, without holes; empty if no pixel remains.
     """
     cv2 = opencv()
     mask = np.zeros_like(likely)
     rows, columns = (np.flatnonzero(possible.any(axis)) for axis in (1, 0))
     if len(rows) == 0:
         return mask
-    margin = int(_SURROUNDINGS * max(np.ptp(rows), np.ptp(columns))) + 4
+    margin = int(_BACKGROUND_MARGIN * max(np.ptp(rows), np.ptp(columns))) + 4
     window = tuple(slice(max(0, one[0] - margin), one[-1] + 1 + margin) for one in (rows, columns))
     height, width = likely[window].shape
     scale = min(1.0, MAX_SIDE / max(height, width))
@@ -55,26 +61,28 @@ def grab(
     if certain is not None:
         labels[shrink(certain & possible)] = cv2.GC_FGD
     num_inside = int((labels & 1).sum())
-    if not (labels == cv2.GC_BGD).any() or min(num_inside, labels.size - num_inside) < _NUM_COLOURS:
-        return likely & possible  # nothing to learn one of the two from
+    if not (labels == cv2.GC_BGD).any() or min(num_inside, labels.size - num_inside) < _NUM_COMPONENTS:
+        return likely & possible  # too few samples for one of the two colour models
     cv2.setRNGSeed(0)
     pixels = cv2.resize(np.ascontiguousarray(image[window]), small, interpolation=cv2.INTER_AREA)
-    # OpenCV's own order of channels does not matter to GrabCut.
+    # GrabCut does not depend on the order of the channels.
     models = np.zeros((1, 65)), np.zeros((1, 65))
     cv2.grabCut(pixels, labels, None, *models, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
     found = np.where(labels & 1, 1.0, 0.0).astype(np.float32)
     enlarged = cv2.resize(cv2.GaussianBlur(found, (0, 0), 0.7), (width, height), interpolation=cv2.INTER_LINEAR)
     mask[window] = enlarged > 0.5
-    return _largest_part(mask & possible)
+    return _largest_component(mask & possible)
 
 
 def outline_region(
     outline: ArrayLike, size: tuple[int, int]
 ) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
-    """Where the object is likely, and where it is possible, in an image of a size (width, height).
+    """Convert an outline to regions where the object is likely and where the object is possible.
 
-    The outline is a box (left, top, right, bottom) around the object, or the corners (column, row) of a polygon that
-    follows it roughly, pixels.
+    Args:
+        outline: box (left, top, right, bottom) around the object, or vertices (column, row) of a polygon that
+            approximates the object, in pixels.
+        size: width and height of the image.
     """
     region = np.zeros(size[::-1], np.uint8)
     numbers = np.array(outline, np.float64)
@@ -83,16 +91,18 @@ def outline_region(
         region[max(0, top) : max(0, bottom), max(0, left) : max(0, right)] = 1
         return region > 0, region > 0
     opencv().fillPoly(region, [np.rint(numbers).astype(np.int32)], 1)
-    return region > 0, _grown(region > 0, _REACH)
+    return region > 0, _dilate(region > 0, _REACH)
 
 
 @dataclass(frozen=True)
-class Found:
-    """Silhouettes by view, and for each that was not given:
+class Segmentation:
+    """Masks of all views.
 
     Attributes:
-        overlaps: of GrabCut's mask with the hull of the others (intersection over union).
-        by_hull: views whose mask is the hull's, since the two do not agree, or since the hull alone is wanted.
+        masks: by view, the given masks included.
+        overlaps: by view, intersection over union of GrabCut's mask and the visual hull of the other views.
+        by_hull: views whose mask is the projection of the visual hull, because GrabCut disagrees with the hull or was
+            not used.
     """
 
     masks: dict[int, Bool[np.ndarray, "H W"]]
@@ -106,39 +116,43 @@ def propagate(
     given: Mapping[int, Bool[np.ndarray, "H W"]],
     hull_only: bool = False,
     progress: Callable[[], None] = lambda: None,
-) -> Found:
-    """Find the object in all views from its silhouettes in some, at least one.
+) -> Segmentation:
+    """Segment the object in all views, starting from given masks of one or more views.
 
-    Those that are given lead. Where they are fewer than three, GrabCut adds the nearest views that look from elsewhere:
-    each is cut out from the hull of those before, and leads if the hull with it still looks like all their masks. Then
-    every view is cut out from the hull of the leading others. Where the two do not agree, the mask is the hull's: of
-    all masks that agree.
+    The reference views are the given ones. If fewer than three masks are given, further reference views are added one
+    by one: GrabCut segments the nearest view from a new direction, guided by the hull of the reference views,
+    and the view is accepted if the extended hull still agrees with all reference masks. Then every other view is
+    segmented by GrabCut, guided by the hull of the reference views. If GrabCut and the hull disagree, the mask of the
+    view is the projection of the hull of all accepted masks.
 
     Args:
-        hull_only: have no mask cut out; the views that lead are those given.
-        progress: called once for each view that was not given.
+        images: 8-bit sRGB images of all views.
+        cameras: cameras of all views.
+        given: known masks by view.
+        hull_only: do not use GrabCut; all missing masks are projections of the hull.
+        progress: called once for each view without a given mask.
 
     Raises:
-        NerfroError: too few views show what the given silhouettes show.
+        NerfroError: too few views agree with the given masks.
     """
     wanted = [view for view in range(len(images)) if view not in given]
     outlines = OutlineHull(cameras, given)
     if len(given) < FEWEST_VIEWS:
-        _lead(images, outlines)
+        _add_reference_views(images, outlines)
     if wanted and len(outlines) < FEWEST_VIEWS:
         raise NerfroError(
-            f"{len(outlines)} of {len(images)} views agree on a shape, {FEWEST_VIEWS} are needed: what is "
-            "outlined is not found in other images by its colours; outline the whole object in more views, or bring "
-            "masks, from all sides"
+            f"{len(outlines)} of {len(images)} views agree on a shape, {FEWEST_VIEWS} are needed, because the outlined "
+            "object is not found in other images by its colours; outline the whole object in more views from all "
+            "sides, or provide masks"
         )
     common = outlines.hull()
     if wanted and common is None:
-        raise NerfroError("no point lies inside the masks that are given: correct them, or the poses")
+        raise NerfroError("the visual hull of the given masks is empty; correct the masks or the poses")
     found, overlaps = {}, {}
     for view in wanted if not hull_only else []:
         region = outlines.seen_from(view, outlines.hull(without=view) if view in outlines else common)
         core = _distance(region) > _CORE * _diameter(region)
-        cut = grab(images[view], region, _grown(region, _REACH), core)
+        cut = grab(images[view], region, _dilate(region, _REACH), core)
         either = (cut | region).sum()
         overlaps[view] = float((cut & region).sum() / either) if either else 1.0
         if overlaps[view] >= AGREES:
@@ -148,33 +162,35 @@ def propagate(
     hull = OutlineHull(cameras, {**given, **found}).hull() if found else common
     for view in by_hull:
         found[view] = outlines.seen_from(view, hull)
-    return Found({**given, **found}, overlaps, by_hull)
+    return Segmentation({**given, **found}, overlaps, by_hull)
 
 
-def _lead(images: Sequence[UInt8[np.ndarray, "H W 3"]], outlines: OutlineHull) -> None:
-    """Add views that look from elsewhere, as long as all agree."""
+def _add_reference_views(images: Sequence[UInt8[np.ndarray, "H W 3"]], outlines: OutlineHull) -> None:
+    """Add views from new directions as long as all masks agree with their visual hull."""
     refused: list[int] = []
     while (view := outlines.next_view(refused)) is not None:
         region = outlines.seen_from(view, outlines.hull())
-        if not outlines.add_if_agreed(view, grab(images[view], region, _grown(region, _REACH))):
+        if not outlines.add_if_agreed(view, grab(images[view], region, _dilate(region, _REACH))):
             refused.append(view)
 
 
 def _diameter(region: Bool[np.ndarray, "H W"]) -> float:
+    """Return the diameter of a disk of the same area, in pixels."""
     return 2 * float(np.sqrt(region.sum() / np.pi))
 
 
-def _grown(region: Bool[np.ndarray, "H W"], share: float) -> Bool[np.ndarray, "H W"]:
-    return _distance(~region) <= max(2.0, share * _diameter(region))
+def _dilate(region: Bool[np.ndarray, "H W"], fraction: float) -> Bool[np.ndarray, "H W"]:
+    """Dilate a region by a fraction of its diameter, and by at least two pixels."""
+    return _distance(~region) <= max(2.0, fraction * _diameter(region))
 
 
 def _distance(region: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
-    """To the nearest pixel outside, pixels."""
+    """Compute the distance of each pixel of a region to the nearest pixel outside, in pixels."""
     return opencv().distanceTransform(region.astype(np.uint8), opencv().DIST_L2, 5)
 
 
-def _largest_part(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    parts, num_parts = label(mask)
-    if num_parts == 0:
+def _largest_component(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    components, num_components = label(mask)
+    if num_components == 0:
         return mask
-    return binary_fill_holes(parts == 1 + np.bincount(parts.ravel())[1:].argmax())
+    return binary_fill_holes(components == 1 + np.bincount(components.ravel())[1:].argmax())

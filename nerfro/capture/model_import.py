@@ -1,4 +1,4 @@
-"""Lens and poses of a COLMAP model, and how well it hangs together."""
+"""Import of lens and poses from a COLMAP model, with a check for weakly connected groups of images."""
 
 from __future__ import annotations
 
@@ -17,28 +17,41 @@ from nerfro.data.colmap_model import read_colmap
 from nerfro.data.frames import Lens
 from nerfro.errors import NerfroError, first_of
 
-# A group of cameras that shares fewer points with all others, or less than this share of what one of them usually sees,
-# may lie anywhere.
-_FEWEST_SHARED, _LEAST_SHARE = 30, 0.1
-# So many of the weakest links are looked at.
-_LINKS = 8
+# The pose of a group of cameras relative to the others is doubtful if the group shares fewer points with the others, or
+# fewer than this fraction of the points that one of its cameras usually sees.
+_MIN_SHARED_POINTS, _MIN_SHARED_FRACTION = 30, 0.1
+# Number of weakest links of the spanning tree that are tested.
+_NUM_LINKS = 8
 
 
 def import_model(folder: Path, images: Sequence[Path], size: tuple[int, int]) -> tuple[Calibration, Any]:
-    """Lens and poses of a model, text or binary, for images of a size (width, height), and its 3-D points [P, 3]."""
+    """Import a COLMAP model in text or binary format.
+
+    Args:
+        folder: folder of the model.
+        images: the photographs.
+        size: width and height of the photographs, in pixels; the lens is scaled to this size.
+
+    Returns:
+        Lens and poses, and the 3-D points [P, 3].
+
+    Raises:
+        NerfroError: the model contains none of the images, or more than one camera.
+    """
     pycolmap = require_pycolmap()
-    parsed = read_colmap(folder)  # first, for pycolmap does not notice a file that is cut off
+    parsed = read_colmap(folder)  # this reader detects truncated files, pycolmap does not
     names = {image.name for image in images}
     registered = [image for image in parsed.images if image.name in names]
     if not registered:
         raise NerfroError(
-            f"{folder} knows none of the images (its first is {parsed.images[0].name}); set images= to its folder"
+            f"{folder} contains none of the images (its first image is {parsed.images[0].name}); set images= to the "
+            "folder that the model was made from"
         )
     numbers = {image.camera for image in registered}
     if len(numbers) > 1:
         raise NerfroError(
-            f"{folder} has {len(numbers)} cameras, and this format holds one; reconstruct with one (single camera), "
-            "or train on the model itself: data=colmap"
+            f"{folder} has {len(numbers)} cameras, and the data set that calibrate writes holds one; reconstruct with "
+            "a single camera, or train on the model itself with data=colmap"
         )
     camera, where = parsed.cameras[numbers.pop()], f"{folder}: the camera"
     lens = lens_of(camera, where).resized((camera.width, camera.height), size, where)
@@ -49,19 +62,25 @@ def import_model(folder: Path, images: Sequence[Path], size: tuple[int, int]) ->
     for image in registered:
         error, num_points = errors[image.name]
         poses[image.name] = Pose(image.camera_to_world, num_points, error)
-    skipped = {image.name: "not placed by COLMAP" for image in images if image.name not in poses}
+    skipped = {image.name: "no pose from COLMAP" for image in images if image.name not in poses}
     return Calibration(_intrinsics(lens), poses, skipped, 0), parsed.points
 
 
 def loosest_group(seen: Bool[np.ndarray, "V P"]) -> tuple[list[int], int]:
-    """The smaller group of cameras that shares fewest points with all others, and how many.
+    """Find the group of cameras that shares the fewest points with all others.
 
-    Cameras are cut apart where the tree of their strongest links is weak. `seen` says which camera sees which point.
+    Candidates are made by cutting the weakest links of the maximum spanning tree of shared points.
+
+    Args:
+        seen: whether each camera sees each point.
+
+    Returns:
+        The smaller of the two groups, as camera numbers, and the number of shared points.
     """
     shared = seen.astype(np.int32) @ seen.T.astype(np.int32)
     np.fill_diagonal(shared, 0)
     tree = minimum_spanning_tree(1 / np.maximum(shared, 1e-3)).tocoo()
-    links = np.argsort(-tree.data)[:_LINKS]
+    links = np.argsort(-tree.data)[:_NUM_LINKS]
     cuts = []
     for link in links:
         rest = tree.copy()
@@ -75,7 +94,7 @@ def loosest_group(seen: Bool[np.ndarray, "V P"]) -> tuple[list[int], int]:
 
 
 def _warn_of_loose_groups(reconstruction: Any) -> None:
-    """Repeating patterns make pairs of images agree that see different things; such groups hang on few points."""
+    """Warn of a group of images that few points connect: repeating patterns can match images of different places."""
     images = [image for image in reconstruction.images.values() if image.has_pose]
     if len(images) < 2 or not reconstruction.points3D:
         return
@@ -84,17 +103,17 @@ def _warn_of_loose_groups(reconstruction: Any) -> None:
     for row, image in enumerate(images):
         seen[row, [column[f.point3D_id] for f in image.points2D if f.has_point3D()]] = True
     group, shared = loosest_group(seen)
-    if shared < max(_FEWEST_SHARED, _LEAST_SHARE * float(np.median(seen[group].sum(1)))):
+    if shared < max(_MIN_SHARED_POINTS, _MIN_SHARED_FRACTION * float(np.median(seen[group].sum(1)))):
         names = first_of(sorted(images[place].name for place in group))
         warn(
-            f"{names}: placed by {shared} points that they share with the other {len(images) - len(group)} images, so "
-            "perhaps in the wrong place (patterns that repeat look alike); look at cameras.png, photograph views "
-            "between, or make the model anew with pairs=sequential"
+            f"{names}: only {shared} points connect these to the other {len(images) - len(group)} images, so their "
+            "poses may be wrong, for example because of a repeating pattern; look at cameras.png, photograph views "
+            "between the two groups, or repeat the reconstruction with pairs=sequential"
         )
 
 
 def _reprojection_errors(reconstruction: Any, scale: float) -> dict[str, tuple[float, int]]:
-    """Root mean square in pixels and number of points, by image."""
+    """Compute the root mean square reprojection error in pixels and the number of points, by image name."""
     errors = {}
     for image in reconstruction.images.values():
         residuals = []
@@ -112,12 +131,12 @@ def _intrinsics(lens: Lens) -> Intrinsics:
     matrix = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
     if lens.distortion is None:
         return Intrinsics(matrix)
-    k1, k2, k3, _, p1, p2, *below = lens.distortion  # COLMAP's models have no fourth
+    k1, k2, k3, _, p1, p2, *below = lens.distortion  # COLMAP's camera models have no k4
     return Intrinsics(matrix, (k1, k2, p1, p2, k3, *below) if k3 or any(below) else (k1, k2, p1, p2))
 
 
 def require_pycolmap() -> Any:
-    """pycolmap, or an error that says how to install it."""
+    """Import pycolmap, or raise an error with the command that installs pycolmap."""
     try:
         import pycolmap
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""How well a surface's silhouettes are the masks: printed, and written as figures and as a sheet of pictures."""
+"""Overlap of the silhouettes of a surface with the masks, as printed report, JSON file and contact sheet."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _MAX_PIXELS = 256
 
 
 def settled_wrong_masks(silhouettes: Silhouettes, wrong_masks: int | None) -> int:
-    """How many views may be wrong: as it is said, or that with which the hull looks most like the masks; printed."""
+    """Return the given number of views that may be wrong, or else the number for which the hull agrees best."""
     if wrong_masks is None:
         wrong_masks = better_wrong_masks(silhouettes, 0) or 0
-        print(f"wrong_masks={wrong_masks}: a coarse hull looks most like the masks if so many views may be wrong")
+        print(f"wrong_masks={wrong_masks}: a coarse hull agrees best with the masks if so many views may be wrong")
     return wrong_masks
 
 
@@ -39,19 +39,22 @@ def report_overlaps(
     folder: Path,
     list_all: bool = True,
 ) -> Float[np.ndarray, "V"]:
-    """Print, write and return how well a surface's silhouettes are the masks.
+    """Print and write the overlap of the silhouettes of a surface with the masks.
 
     Args:
-        split: of the views.
-        views: with their masks.
-        mesh: the surface.
-        silhouettes: of the masks.
-        wrong_masks: with which the surface was carved; None for one that was not.
-        folder: to write to.
-        list_all: whether the overlap of every view is printed.
+        split: split of the views.
+        views: views with masks.
+        mesh: surface.
+        silhouettes: silhouettes of the masks.
+        wrong_masks: number of views that may be wrong in the visual hull; None for a surface of another origin.
+        folder: output folder.
+        list_all: print the overlap of every view.
+
+    Returns:
+        Intersection over union by view.
     """
     overlaps = overlap(mesh, silhouettes, _MAX_PIXELS)
-    print("overlap (intersection over union) of the surface's silhouette with each mask:")
+    print("overlap (intersection over union) of the silhouette of the surface with each mask:")
     for name, value in zip(views.names, overlaps, strict=True) if list_all else ():
         print(f"  {value:.4f}  {name}")
     worst = int(overlaps.argmin())
@@ -67,7 +70,7 @@ def report_overlaps(
 def draw_overlays(
     views: Views, mesh: TriangleMesh, overlaps: Float[np.ndarray, "V"], inside: list[TriangleMesh], folder: Path
 ) -> None:
-    """Write the sheet of pictures, with the outlines of what is inside, see `contact_sheet`."""
+    """Write the contact sheet of the overlaps, with the outlines of inner bodies (see `contact_sheet`)."""
     save_picture(folder / SHEET, contact_sheet(views, mesh, overlaps, _MAX_PIXELS, inside))
 
 
@@ -78,7 +81,8 @@ def _warn_of_bad(
     if not bad:
         return
     better = None if wrong_masks is None else better_wrong_masks(silhouettes, wrong_masks)
-    advice = (
-        "" if better is None else f"; where few masks are wrong, the others make a better hull: wrong_masks={better}"
+    advice = "" if better is None else f"; or set wrong_masks={better}, which ignores as many masks and agrees better"
+    warn(
+        f"overlap below {GOOD_OVERLAP}: {first_of(bad)}; look at {SHEET}, and correct the masks or poses of these "
+        f"views{advice}"
     )
-    warn(f"overlaps below {GOOD_OVERLAP}: {first_of(bad)}; look at {SHEET}, and correct their masks or poses{advice}")

@@ -1,4 +1,4 @@
-"""A sheet of all views with the silhouette of a surface drawn over the mask."""
+"""Contact sheet of all views with the silhouette of a surface drawn over the mask."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from nerfro.files.drawing import sheet
 from nerfro.geometry.mesh import TriangleMesh
 
 _MAX_VIEWS, _COLUMNS = 48, 8
-_WIDTH = 192  # pixels across each picture
-_NAME_LENGTH = 16  # characters, the last ones, that fit below a picture
+_WIDTH = 192  # width of a tile, in pixels
+_NAME_LENGTH = 16  # number of last characters of a name that fit below a tile
 _BOTH, _MASK_ONLY, _SURFACE_ONLY = (60, 190, 90), (235, 60, 45), (40, 110, 240)
-_OUTLINES = {"yellow": (255, 215, 0), "white": (255, 255, 255)}  # of bodies inside, the first and the rest
+_OUTLINES = {"yellow": (255, 215, 0), "white": (255, 255, 255)}  # colours of the first and of further inner bodies
 
 
 def contact_sheet(
@@ -29,10 +29,16 @@ def contact_sheet(
     max_pixels: int,
     inside: Sequence[TriangleMesh] = (),
 ) -> Image.Image:
-    """The views that overlap least, the worst first: both green, the mask alone red, the surface alone blue.
+    """Draw the views with the smallest overlap, the worst first.
 
-    Bodies inside are drawn as outlines. Images of more than `max_pixels` a side are shown in every second, third, ...
-    pixel.
+    Green pixels belong to mask and silhouette, red ones to the mask alone, blue ones to the silhouette alone.
+
+    Args:
+        views: views with masks.
+        mesh: surface.
+        overlaps: intersection over union by view.
+        max_pixels: larger images are subsampled to at most so many pixels per side.
+        inside: inner bodies, drawn as outlines.
     """
     assert views.masks is not None
     stride = pixel_stride(views.cameras, max_pixels)
@@ -54,7 +60,7 @@ def contact_sheet(
 
 
 def _outlines(silhouettes: Bool[Tensor, "V h w"]) -> Bool[Tensor, "V h w"]:
-    """The pixels of silhouettes that are next to others."""
+    """Select the pixels of silhouettes that touch a pixel outside."""
     others = torch.nn.functional.max_pool2d((~silhouettes[:, None]).float(), 3, 1, 1)[:, 0]
     return silhouettes & (others > 0)
 

@@ -1,4 +1,4 @@
-"""Photographs as calibration wants them: of one size, by their luminance, without what is seen through the object."""
+"""Photographs as input of the calibration: size check, luminance, and removal of points seen through the object."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear sRGB (I
 
 
 def list_photographs(folder: Path) -> tuple[list[Path], tuple[int, int]]:
-    """The photographs by name, and their size, which is that of all."""
+    """List the photographs of a folder by name, with their common width and height in pixels."""
     images = list_images(folder)
     repeated = [stem for stem, count in Counter(image.stem for image in images).items() if count > 1]
     if repeated:
-        raise NerfroError(f"{folder} holds several images called {repeated[0]}; keep one of each name")
+        raise NerfroError(f"{folder} contains several images named {repeated[0]}; keep one of each name")
     shapes = {image: read_rgb(image, "drop").shape[1::-1] for image in track(images, "reading")}
     ((size, _),) = Counter(shapes.values()).most_common(1)
     odd = next((image for image in images if shapes[image] != size), None)
     if odd is not None:
         raise NerfroError(
-            f"image {odd} has {shapes[odd][0]}x{shapes[odd][1]} pixels but most have {size[0]}x{size[1]}; all must be "
-            "of one lens and size: turn or remove it"
+            f"image {odd} has {shapes[odd][0]}x{shapes[odd][1]} pixels, but most images have {size[0]}x{size[1]}; all "
+            "images must have one lens and size: rotate or remove this image"
         )
     return images, size
 
 
 def luminance(image: Path) -> UInt8[np.ndarray, "H W"]:
-    """Luminance of an image, linear in light, its brightest thousandth white.
+    """Compute the linear luminance of an image, scaled so that the brightest thousandth of the pixels is white.
 
-    A pixel on an edge averages light, and sRGB's curve shows half the light as more than half a level. The edges of
-    what is bright are then found too far outside, those of tags by 0.2 to 0.3 pixels.
+    Pixels on an edge average linear light. In sRGB values, edges of bright regions would be detected too far outside:
+    by 0.2 to 0.3 pixels for tags.
     """
     light = to_linear(to_unit(read_rgb(image, "drop"))) @ _LUMINANCE
     white = max(float(np.quantile(light, 0.999)), 1 / 255)
@@ -47,7 +47,7 @@ def luminance(image: Path) -> UInt8[np.ndarray, "H W"]:
 
 
 def outside(sighting: Sighting, mask: Path | None) -> Sighting:
-    """The features that are not seen through the object, or cut by it."""
+    """Remove features that are seen through the object or overlap the mask of the object."""
     if mask is None or len(sighting.points) == 0:
         return sighting
     inside = to_unit(read_mask(mask)) > 0.5

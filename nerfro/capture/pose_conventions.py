@@ -1,4 +1,4 @@
-"""Whether poses and masks agree, and which misread convention would explain it if they do not."""
+"""Consistency check of poses and masks, which also detects misread pose conventions."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from nerfro.capture.visual_hull import Silhouettes, carve_grid, extract_surface,
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
 
-# The first look is at so many voxels a side and at most so many pixels a side.
+# Resolution of the coarse hull: voxels per side, and maximum number of pixels per side of the masks.
 _COARSE_VOXELS, _COARSE_PIXELS = 48, 64
-# A hull meets the masks that it was carved from; below this overlap, or this agreement, something is wrong.
+# The silhouettes of a visual hull agree with its masks; a smaller overlap or agreement indicates an error in the input.
 GOOD_OVERLAP = 0.9
-# A coarse hull may miss a mask's outline by this many of the pixels that it is looked at in.
+# Tolerance of the coarse hull at outlines, in pixels of the downscaled masks.
 _SLACK = 1.5
-# One wrong view needs so many; an agreement is clearly better by this much.
-_VOTES, _CLEARLY = 6, 0.005
+# One wrong view is allowed per so many views; an agreement is better only if the gain exceeds the second number.
+_VIEWS_PER_WRONG, _MIN_GAIN = 6, 0.005
 
-# What a file's poses could have been, as what has to be done to them as they were read; most frequent mistakes first.
-# `turn` is applied to the camera's axes (x right, y up, z back), `inverse` to the whole matrix before.
+# Alternative conventions of the poses in a file, with the correction of each, the most frequent mistakes first.
+# `_Turn` is applied to the camera axes (x right, y up, z back), after the inversion of the matrix if the flag is set.
 _Turn = tuple[tuple[int, int, int], ...]
 _HALF_TURN = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
 _FLIP = "the camera's y and z axes flipped (OpenCV's axes, y down, z forward, in a file read as OpenGL's, or reversed)"
@@ -42,7 +42,7 @@ _ALTERNATIVES: tuple[tuple[str, bool, _Turn], ...] = (
 
 
 def overlap(mesh: TriangleMesh, silhouettes: Silhouettes, max_pixels: int) -> Float[np.ndarray, "V"]:
-    """Intersection over union of a mesh's silhouette with each mask, 1 where both are empty, see `pixel_stride`."""
+    """Compute the intersection over union of the silhouette of a mesh with each mask; 1 where both are empty."""
     stride = pixel_stride(silhouettes.cameras, max_pixels)
     ours, theirs = mesh_silhouettes(mesh, silhouettes.cameras, stride), silhouettes.masks[:, ::stride, ::stride] > 0.5
     both, either = (ours & theirs).sum((1, 2)).double(), (ours | theirs).sum((1, 2))
@@ -50,9 +50,10 @@ def overlap(mesh: TriangleMesh, silhouettes: Silhouettes, max_pixels: int) -> Fl
 
 
 def coarse_agreement(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np.ndarray, "V"]:
-    """How well a coarse hull explains each mask: 1, less the pixels that differ and are not near the mask's outline.
+    """Compute the agreement of a coarse visual hull with each mask.
 
-    Counted in pixels of the mask; not below 0, and 0 where the hull is empty.
+    The agreement is 1 minus the number of differing pixels that are not near the outline, relative to the area of the
+    mask, clamped at 0. The agreement with an empty hull is 0.
     """
     box = find_box(silhouettes, wrong_masks)
     distances, corner, spacing = carve_grid(silhouettes, box, _COARSE_VOXELS, wrong_masks)
@@ -67,50 +68,54 @@ def coarse_agreement(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np
 
 
 def require_consistent_poses(silhouettes: Silhouettes, names: list[str], wrong_masks: int) -> None:
-    """Refuse masks whose common hull does not look like them; name the misread convention or the odd views."""
+    """Check that the visual hull of the masks agrees with the masks.
+
+    Raises:
+        NerfroError: it does not; the message names the misread pose convention or the inconsistent views, if found.
+    """
     found = float(np.median(coarse_agreement(silhouettes, wrong_masks)))
     if found >= GOOD_OVERLAP:
         return
-    state = f"the visual hull covers the masks badly (to {found:.0%})"
+    state = f"the visual hull agrees with the masks only to {found:.0%}"
     state = "the visual hull is empty: no point lies inside all masks" if found == 0 else state
     scores = [float(np.median(coarse_agreement(_changed(silhouettes, i, t), wrong_masks))) for _, i, t in _ALTERNATIVES]
-    # Of equally good ones (a ball is a ball upside down) the most frequent mistake.
+    # Symmetric objects agree equally well with several conventions; the first of the list is the most frequent mistake.
     best = next(i for i, score in enumerate(scores) if score >= max(scores) - 0.002)
     if scores[best] > max(GOOD_OVERLAP, found):
         raise NerfroError(
-            f"{state}; the poses are in another convention: with {_ALTERNATIVES[best][0]} they agree to "
-            f"{scores[best]:.0%}; correct transform_matrix, or choose the data= format that fits"
+            f"{state}; the poses use another convention: with {_ALTERNATIVES[best][0]} the agreement is "
+            f"{scores[best]:.0%}; correct transform_matrix, or choose the matching data= format"
         )
     for allowed in _numbers_of_wrong_masks(len(names), wrong_masks):
         each = coarse_agreement(silhouettes, allowed)
         if np.median(each) >= GOOD_OVERLAP:
-            odd = [names[view] for view in np.argsort(each, kind="stable")[:allowed]]
+            worst = [names[view] for view in np.argsort(each, kind="stable")[:allowed]]
             raise NerfroError(
-                f"{state}, but not if {allowed} views may be wrong; look at the masks and poses of "
-                f"{', '.join(odd)}, and correct them or set wrong_masks={allowed}"
+                f"{state}, but agrees if {allowed} views may be wrong; check the masks and poses of "
+                f"{', '.join(worst)}, and correct these views or set wrong_masks={allowed}"
             )
     raise NerfroError(
-        f"{state}, and no usual misreading of the poses explains it; check that masks, images and poses belong "
-        "together and that the object did not move between the views"
+        f"{state}, and none of the known pose conventions explains the difference; check that masks, images and poses "
+        "belong together and that the object did not move between the views"
     )
 
 
 def better_wrong_masks(silhouettes: Silhouettes, wrong_masks: int) -> int | None:
-    """The number of views that may be wrong with which a coarse hull looks most like the masks; None if now it does."""
+    """Find the number of wrong views for which a coarse hull agrees best; None if no number is better."""
     tried = [wrong_masks, *_numbers_of_wrong_masks(len(silhouettes), wrong_masks)]
     agreements = [float(coarse_agreement(silhouettes, allowed).mean()) for allowed in tried]
-    best = next(i for i, agreement in enumerate(agreements) if agreement >= max(agreements) - _CLEARLY)
-    return tried[best] if agreements[best] > agreements[0] + _CLEARLY else None
+    best = next(i for i, agreement in enumerate(agreements) if agreement >= max(agreements) - _MIN_GAIN)
+    return tried[best] if agreements[best] > agreements[0] + _MIN_GAIN else None
 
 
 def _numbers_of_wrong_masks(num_views: int, more_than: int) -> list[int]:
-    """1, 2, 4, ... as far as most views can still outvote them."""
-    most = max(1, num_views // _VOTES)
+    """Return candidates 1, 2, 4, ... up to the largest number of wrong views that the other views outvote."""
+    most = max(1, num_views // _VIEWS_PER_WRONG)
     return [number for number in sorted({2**power for power in range(8)} | {most}) if more_than < number <= most]
 
 
 def _changed(silhouettes: Silhouettes, inverse: bool, turn: _Turn) -> Silhouettes:
-    """The same masks with the poses read differently."""
+    """Reinterpret the poses by another convention."""
     poses: Tensor = silhouettes.cameras.camera_to_world
     rotation, centre = poses[:, :, :3], poses[:, :, 3:]
     if inverse:

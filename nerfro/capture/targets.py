@@ -1,4 +1,4 @@
-"""Calibration targets: their known points found in a photograph, and their sheets on paper in true size."""
+"""Calibration targets: detection of their points in a photograph, and their sheets for printing in true size."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _MARGIN, _WIDEST = 0.008, 3.0  # metres
 
 @dataclass(frozen=True)
 class Sighting:
-    """Points of a target seen in one image.
+    """Points of a target that were detected in one image.
 
     Attributes:
-        features: number of the tag or corner that each point belongs to.
-        points: in the target's frame and unit.
-        pixels: (column, row), whole numbers at the pixels' corners.
+        features: number of the tag or corner of each point.
+        points: positions in the frame and unit of the target.
+        pixels: image positions (column, row); integers are corners of pixels.
     """
 
     features: Int[np.ndarray, "N"]
@@ -35,7 +35,7 @@ class Sighting:
     pixels: Float[np.ndarray, "N 2"]
 
     def only(self, chosen: Bool[np.ndarray, "N"]) -> Sighting:
-        """Some of the points."""
+        """Select points by a mask."""
         return Sighting(self.features[chosen], self.points[chosen], self.pixels[chosen])
 
     @property
@@ -45,9 +45,12 @@ class Sighting:
 
 @dataclass(frozen=True)
 class Sheet:
-    """One printed page of a target, 0 black to 255 white.
+    """One printed page of a target.
 
-    The corners are upper left, upper right, lower right, lower left in the target's frame and unit.
+    Attributes:
+        title: caption of the page.
+        levels: grey levels, from 0 (black) to 255 (white).
+        corners: upper left, upper right, lower right and lower left corner, in the frame and unit of the target.
     """
 
     title: str
@@ -56,39 +59,40 @@ class Sheet:
 
 
 class Target(ABC):
-    """Something flat or folded that is printed, laid into the scene, and found in the photographs.
+    """A printed calibration target in the scene.
 
     Attributes:
-        feature: what is counted, in the plural.
-        fewest: an image with fewer of them is skipped.
+        feature: noun in the plural for the detected features, used in messages.
+        min_features: images with fewer features are skipped.
     """
 
     feature: str
-    fewest: int
+    min_features: int
 
     @abstractmethod
     def find(self, image: UInt8[np.ndarray, "H W"]) -> Sighting:
-        """The target's points in a grey image."""
+        """Detect the points of the target in a grey image."""
 
     @abstractmethod
     def sheets(self) -> list[Sheet]:
-        """What is printed."""
+        """Return the pages to print."""
 
 
 class TagTarget(Target):
     """A board of AprilTags."""
 
-    # As the paper's authors: twelve corners.
-    feature, fewest = "tags", 3
+    # The paper's authors require twelve corners, four for each tag.
+    feature, min_features = "tags", 3
 
     def __init__(self, board: TagBoard) -> None:
         self.board, self.corners = board, board.tag_corners()
 
     def find(self, image: UInt8[np.ndarray, "H W"]) -> Sighting:
-        # The library counts pixels from the image's corner as nerfro does, and goes round the tag from its lower left.
+        # The library counts pixels from the corner of the image, as nerfro does, and orders the corners of a tag
+        # anticlockwise from the lower left one.
         tags = [tag for tag in tag_detector(self.board.family).detect(image) if tag.tag_id in self.corners]
         repeated = {tag.tag_id for tag in tags if sum(other.tag_id == tag.tag_id for other in tags) > 1}
-        tags = [tag for tag in tags if tag.tag_id not in repeated]  # one of them is a reflection, or misread
+        tags = [tag for tag in tags if tag.tag_id not in repeated]  # one of two equal tags is a reflection or misread
         return Sighting(
             np.repeat(np.array([tag.tag_id for tag in tags], int), 4),
             np.concatenate([np.empty((0, 3)), *(self.corners[tag.tag_id] for tag in tags)]),
@@ -107,23 +111,26 @@ class TagTarget(Target):
 
 
 class CharucoTarget(Target):
-    """A chessboard with ArUco markers on its white squares, on one sheet in the plane z = 0, y to its top.
+    """A ChArUco board: a chessboard with ArUco markers on the white squares, in the plane z = 0, y to the top.
 
-    The sides `square` and `marker` are in the unit of the poses; OpenCV calls the dictionary DICT_<dictionary>.
+    Args:
+        columns, rows: number of squares.
+        square, marker: side of a square and of a marker, in the unit of the poses.
+        dictionary: name of the marker dictionary without OpenCV's prefix "DICT_".
     """
 
-    feature, fewest = "chessboard corners", 6
+    feature, min_features = "chessboard corners", 6
 
     def __init__(self, columns: int, rows: int, square: float, marker: float, dictionary: str) -> None:
         cv2 = opencv()
         number = getattr(cv2.aruco, f"DICT_{dictionary}", None)
         if number is None:
             known = sorted(name[5:] for name in dir(cv2.aruco) if name.startswith("DICT_"))
-            raise NerfroError(f"there is no dictionary={dictionary}; OpenCV has {', '.join(known)}")
+            raise NerfroError(f"dictionary={dictionary} does not exist; choose one of {', '.join(known)}")
         if min(columns, rows) < 3 or not 0 < marker < square:
             raise NerfroError(
-                f"columns={columns}, rows={rows}, size={square}, marker={marker} are no ChArUco board; take 3 or more "
-                "squares a side, and markers that are smaller than the squares"
+                f"columns={columns}, rows={rows}, size={square}, marker={marker} do not describe a ChArUco board; "
+                "choose at least 3 squares per side, and a marker smaller than a square"
             )
         self.columns, self.rows, self.square = columns, rows, square
         try:
@@ -132,7 +139,7 @@ class CharucoTarget(Target):
             self.detector = cv2.aruco.CharucoDetector(self.board)
         except cv2.error as error:
             raise NerfroError(
-                f"dictionary={dictionary} has too few markers for {columns}x{rows} squares; take a larger one"
+                f"dictionary={dictionary} has too few markers for {columns}x{rows} squares; choose a larger dictionary"
             ) from error
 
     def find(self, image: UInt8[np.ndarray, "H W"]) -> Sighting:
@@ -140,7 +147,7 @@ class CharucoTarget(Target):
         if numbers is None:
             return Sighting(np.empty(0, int), np.empty((0, 3)), np.empty((0, 2)))
         numbers = np.asarray(numbers).reshape(-1)
-        # OpenCV's pixel centres are whole numbers, and its board has y downwards.
+        # OpenCV puts pixel centres at integers, and its board has the y axis downwards.
         points = np.asarray(self.board.getChessboardCorners(), np.float64)[numbers]
         points = np.column_stack([points[:, 0], self.rows * self.square - points[:, 1], np.zeros(len(points))])
         return Sighting(numbers, points, np.asarray(corners, np.float64).reshape(-1, 2) + 0.5)
@@ -154,16 +161,16 @@ class CharucoTarget(Target):
 
 
 def print_sheets(sheets: list[Sheet], folder: Path) -> list[Path]:
-    """Write board.pdf, a page for each sheet, and the same pages as board_<number>.png.
+    """Write board.pdf with one page per sheet, and the same pages as board_<number>.png.
 
-    The target's unit is taken for a metre. A page is a sheet with a margin, so it must be printed at 100 %.
+    The unit of the target is interpreted as one metre. A page is a sheet with a margin, to be printed at 100 %.
     """
     pages, resolution = [], 0.0
     for sheet in sheets:
-        # Whole pixels for each of the sheet's, so that its edges stay sharp and in place.
+        # An integer number of pixels for each pixel of the sheet keeps edges sharp and in place.
         width = float(np.linalg.norm(sheet.corners[1] - sheet.corners[0]))
         if width > _WIDEST:
-            message = f"a board {width:g} m wide is not printed; give size in metres, for at most {_WIDEST:g} in all"
+            message = f"the board is {width:g} m wide, the limit is {_WIDEST:g} m; give size= in metres"
             raise NerfroError(message)
         enlarged = max(1, round(width * _DOTS_PER_METRE / sheet.levels.shape[1]))
         levels = np.kron(sheet.levels, np.ones((enlarged, enlarged), np.uint8))
@@ -188,10 +195,10 @@ def print_sheets(sheets: list[Sheet], folder: Path) -> list[Path]:
 
 @functools.cache
 def opencv() -> ModuleType:
-    """OpenCV, or an error that says how to install it."""
+    """Import OpenCV, or raise an error with the command that installs OpenCV."""
     try:
         import cv2
     except ImportError as error:
-        message = f"this needs OpenCV ({error}); pip install 'nerfro[capture]', or opencv-python-headless"
+        message = f"OpenCV is needed ({error}); pip install 'nerfro[capture]', or opencv-python-headless"
         raise NerfroError(message) from error
     return cv2

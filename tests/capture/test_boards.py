@@ -74,6 +74,6 @@ def test_detected_corners_are_those_of_the_drawing() -> None:
 
 
 def test_a_board_in_millimetres_is_refused_before_it_is_drawn(tmp_path: Path) -> None:
-    with pytest.raises(NerfroError, match=r"m wide is not printed; give size in metres"):
+    with pytest.raises(NerfroError, match=r"the limit is 3 m; give size= in metres"):
         print_sheets(TagTarget(twelve_faces(30.0)).sheets(), tmp_path)
     assert not list(tmp_path.iterdir())

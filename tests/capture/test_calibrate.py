@@ -188,7 +188,7 @@ def test_boards_are_printed_in_their_size(tmp_path: Path, command: Callable[...,
     assert "board.pdf exists; give another out=" in command("calibrate", "write_board=true", f"out={tmp_path}")
 
 
-def test_mistakes_are_told_in_one_line(tmp_path: Path, command: Callable[..., str]) -> None:
+def test_mistakes_are_reported_in_one_line(tmp_path: Path, command: Callable[..., str]) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()
     for name in ("a.png", "b.png", "c.png"):
@@ -197,16 +197,16 @@ def test_mistakes_are_told_in_one_line(tmp_path: Path, command: Callable[..., st
     assert "target='chess' is not allowed; choose 'apriltag'" in command("calibrate", *common, "target=chess")
     assert "set out=" in command("calibrate", f"images={photos}")
     assert "set images=" in command("calibrate", f"out={tmp_path}")
-    assert "0 of 3 images show 3 or more tags" in command("calibrate", *common)
+    assert "0 of 3 images show at least 3 tags" in command("calibrate", *common)
     assert "set board=grid" in command("calibrate", *common, "family=tag36h11")
-    assert "no dictionary=9X9" in command("calibrate", *common, "target=charuco", "dictionary=9X9")
-    assert "no lens" in command("calibrate", *common, "intrinsics=[700,700,32]")
-    assert "give size in metres" in command("calibrate", f"out={tmp_path}", "write_board=true", "size=30")
+    assert "dictionary=9X9 does not exist" in command("calibrate", *common, "target=charuco", "dictionary=9X9")
+    assert "do not describe a lens" in command("calibrate", *common, "intrinsics=[700,700,32]")
+    assert "give size= in metres" in command("calibrate", f"out={tmp_path}", "write_board=true", "size=30")
     assert "no tag 587" in command("calibrate", *common, "write_board=true", "board=grid", "columns=30", "rows=30")
     (tmp_path / "cameras.png").write_bytes(b"mine")
     assert "cameras.png exists; give another out=... or overwrite=true" in command("calibrate", *common)
     Image.fromarray(np.full((64, 48), 90, np.uint8)).save(photos / "b.png")
-    assert "b.png has 48x64 pixels but most have 64x48" in command("calibrate", *common)
+    assert "b.png has 48x64 pixels, but most images have 64x48" in command("calibrate", *common)
     Image.fromarray(np.full((48, 64), 90, np.uint8)).save(photos / "a.jpg")
-    assert "several images called a" in command("calibrate", *common)
+    assert "several images named a" in command("calibrate", *common)
     assert (tmp_path / "cameras.png").read_bytes() == b"mine"

@@ -110,8 +110,10 @@ def test_masks_that_exist_are_kept_and_show_the_way(
     for view, mask in drawn.items():
         Image.fromarray(np.uint8(200 * mask)).save(capture / "photos" / f"mask_p_{view}.png")
     before = {view: (capture / "photos" / f"mask_p_{view}.png").read_bytes() for view in drawn}
-    assert "delete it, or set overwrite=true" in command("mask", f"data.root={capture}", "outlines={p_0:[1,1,9,9]}")
-    assert "5 masks exist" in command("mask", f"data.root={capture}")
+    assert "delete the mask, or set overwrite=true" in command(
+        "mask", f"data.root={capture}", "outlines={p_0:[1,1,9,9]}"
+    )
+    assert "5 existing masks" in command("mask", f"data.root={capture}")
     for view, (_, mask, _) in enumerate(photographs):
         if view in drawn:
             assert (capture / "photos" / f"mask_p_{view}.png").read_bytes() == before[view]
@@ -136,7 +138,7 @@ def test_a_rough_polygon_from_a_file(tmp_path: Path, photographs: list) -> None:
 
 @pytest.mark.parametrize("rows", [slice(0, 12), slice(60, 72)])
 @pytest.mark.parametrize("columns", [slice(0, 12), slice(84, 96)])
-def test_a_mask_in_the_corner_is_told_in_one_line(
+def test_a_mask_in_the_corner_is_reported_in_one_line(
     rows: slice, columns: slice, capture: Path, command: Callable[..., str]
 ) -> None:
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
@@ -144,20 +146,20 @@ def test_a_mask_in_the_corner_is_told_in_one_line(
     Image.fromarray(mask).save(capture / "photos" / "mask_p_1.png")
     printed = command("mask", f"data.root={capture}")
     assert (
-        "what is outlined is not found in other images by its colours; outline the whole object" in printed
-        or "look at it" in printed
+        "the outlined object is not found in other images by its colours; outline the whole object" in printed
+        or "check them in" in printed
     )
 
 
-def test_mistakes_are_told_in_one_line(capture: Path, command: Callable[..., str]) -> None:
+def test_mistakes_are_reported_in_one_line(capture: Path, command: Callable[..., str]) -> None:
     root = f"data.root={capture}"
     assert "no mask to start from" in command("mask", root)
-    assert "q_1 is no image of the data; its names are like photos/p_" in command(
+    assert "q_1 is not an image of the data set; names of the data set look like photos/p_" in command(
         "mask", root, "outlines={q_1:[1,1,9,9]}"
     )
     assert "give a box [left,top,right,bottom]" in command("mask", root, "outlines={p_1:[9,9,1,1]}")
     assert "cannot be read" in command("mask", root, "outlines=nothing.json")
-    assert "ships with nerfro" in command("mask", "data=blender", "data.root=embedded:torus")
+    assert "is part of nerfro" in command("mask", "data=blender", "data.root=embedded:torus")
     assert not list((capture / "photos").glob("mask_*"))
 
 
@@ -203,11 +205,13 @@ def test_the_hull_is_taken_where_colours_say_something_else(
     printed = command("mask", f"data.root={root}", f"hull_only={str(hull_only).lower()}")
     overlaps = [overlap(read(root, view), photographs[view][1]) for view in range(1, NUM_VIEWS, 2)]
     assert min(overlaps) > 0.85, overlaps
-    assert ("so the hull is taken" in printed) == (not hull_only)
-    assert ("GrabCut and the hull overlap by less than 0.85" in printed) == (not hull_only)
+    assert ("(mask from the hull)" in printed) == (not hull_only)
+    assert ("GrabCut and the visual hull overlap by less than 0.85" in printed) == (not hull_only)
 
 
 def test_a_hull_alone_takes_three_masks(capture: Path, photographs: list, command: Callable[..., str]) -> None:
     for view in (0, 5):
         Image.fromarray(np.uint8(255 * photographs[view][1])).save(capture / "photos" / f"mask_p_{view}.png")
-    assert "hull_only=true takes masks or outlines of 3" in command("mask", f"data.root={capture}", "hull_only=true")
+    assert "hull_only=true needs masks or outlines of at least 3" in command(
+        "mask", f"data.root={capture}", "hull_only=true"
+    )

@@ -19,7 +19,7 @@ import pycolmap
 
 from nerfro.capture import model_import, reconstruction
 from nerfro.capture.model_import import loosest_group
-from nerfro.capture.reconstruction import count_order, sequential_pairs
+from nerfro.capture.reconstruction import numeric_order, sequential_pairs
 from nerfro.capture.targets import Sheet
 from tests.capture.photographs import angle, look_at, photograph
 
@@ -49,7 +49,7 @@ def test_models_are_imported(form: str, tmp_path: Path, command: Callable[..., s
         expected[image.name] = pose, 0.5 * np.sqrt(np.mean(squares))
     Image.fromarray(np.zeros((384, 512, 3), np.uint8)).save(tmp_path / "images" / "blurred.png")
     printed = command("calibrate", f"images={tmp_path / 'images'}", f"out={tmp_path}", "target=colmap", "test_every=3")
-    assert "skipped: blurred.png: not placed by COLMAP" in printed
+    assert "skipped: blurred.png: no pose from COLMAP" in printed
     report = json.loads((tmp_path / "calibration.json").read_text())
     np.testing.assert_allclose(report["cam_mat"], [[640, 0, 256], [0, 640, 192], [0, 0, 1]])
     assert set(report["images"]) == set(expected)
@@ -100,7 +100,7 @@ def test_a_model_is_made_where_there_is_none(tmp_path: Path, command: Callable[.
         mask[90:150, 130:190] = 255
         Image.fromarray(mask).save(tmp_path / "images" / f"mask_p_{view}.png")
     printed = command("calibrate", f"images={tmp_path / 'images'}", f"out={tmp_path}", "target=colmap", "test_every=3")
-    assert "6 of them with masks" in printed
+    assert "6 of them with a mask" in printed
     model = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
     for image in model.images.values():
         places = np.array([feature.xy for feature in image.points2D])
@@ -154,16 +154,16 @@ def test_a_model_is_named_and_a_lens_that_distorts_is_not_advised_to(
 
 
 def test_names_that_count() -> None:
-    assert count_order([f"IMG_{number}.JPG" for number in range(7039, 7136, 3)]) == list(range(33))
-    assert count_order([f"p_{number}.png" for number in (1, 10, 11, 2, 3, 4, 5, 6, 7, 8, 9)]) == [
+    assert numeric_order([f"IMG_{number}.JPG" for number in range(7039, 7136, 3)]) == list(range(33))
+    assert numeric_order([f"p_{number}.png" for number in (1, 10, 11, 2, 3, 4, 5, 6, 7, 8, 9)]) == [
         0,
         *range(3, 11),
         1,
         2,
     ]
-    assert count_order(["left.png", "right.png"]) is None
-    assert count_order(["a_1.png", "b_2.png", "a_3.png"]) is None
-    assert count_order(["20240101.png", "20260730.png", "20260731.png", "20260801.png"]) is None
+    assert numeric_order(["left.png", "right.png"]) is None
+    assert numeric_order(["a_1.png", "b_2.png", "a_3.png"]) is None
+    assert numeric_order(["20240101.png", "20260730.png", "20260731.png", "20260801.png"]) is None
 
 
 def test_a_sequence_is_matched_with_its_neighbours_and_ever_fewer_beyond() -> None:
@@ -195,5 +195,5 @@ def test_groups_that_hang_together_by_few_points_are_named(
     model = SimpleNamespace(images=dict(enumerate(images)), points3D=dict.fromkeys(range(seen.shape[1])))
     model_import._warn_of_loose_groups(model)
     told = capsys.readouterr().out
-    assert ("p_6, p_7, p_8 and 1 more: placed by 12 points" in told) == warned
+    assert ("p_6, p_7, p_8 and 1 more: only 12 points connect these" in told) == warned
     assert warned == bool(told)
