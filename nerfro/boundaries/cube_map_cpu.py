@@ -17,7 +17,7 @@ from torch.autograd.function import once_differentiable
 from nerfro.boundaries.cube_map import CubeLevels
 from nerfro.kernels.arrays import arrays
 from nerfro.kernels.compilation import compiled, compiled_parallel
-from nerfro.kernels.threads import use_threads
+from nerfro.kernels.threads import num_threads
 
 _ONE = np.float32(1)
 
@@ -46,7 +46,6 @@ class _Lookup(torch.autograd.Function):
         ctx.save_for_backward(face, coordinates, texels, padded)
         ctx.levels = levels
         total = torch.zeros(len(face), 3)
-        use_threads()
         _forward(*_places(face, coordinates, padded, levels), *arrays(texels, total))
         return total
 
@@ -54,7 +53,7 @@ class _Lookup(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Float[Tensor, "P 3"]) -> tuple:
         face, coordinates, texels, padded = ctx.saved_tensors
-        places, threads = _places(face, coordinates, padded, ctx.levels), use_threads()
+        places, threads = _places(face, coordinates, padded, ctx.levels), num_threads()
         of_coordinates = of_texels = None
         if ctx.needs_input_grad[1]:
             of_coordinates = torch.empty_like(coordinates)

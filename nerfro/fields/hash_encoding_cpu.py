@@ -22,7 +22,7 @@ from torch.autograd.function import once_differentiable
 from nerfro.fields.hash_encoding import HASH_Y, HASH_Z, NUM_FEATURES, GridLevels
 from nerfro.kernels.arrays import arrays
 from nerfro.kernels.compilation import compiled, compiled_parallel
-from nerfro.kernels.threads import use_threads
+from nerfro.kernels.threads import num_threads
 
 _BLOCK = 512
 _ONE = np.float32(1)
@@ -45,7 +45,6 @@ class _HashEncode(torch.autograd.Function):
         ctx.save_for_backward(positions, table)
         ctx.levels = levels
         features = positions.new_empty(positions.shape[1], NUM_FEATURES * len(levels))
-        use_threads()
         places, entries = arrays(positions, table)
         _forward(places, entries, *_layout(levels), features.numpy())
         return features
@@ -55,7 +54,7 @@ class _HashEncode(torch.autograd.Function):
     def backward(ctx: Any, gradient: Float[Tensor, "P 2*L"]) -> tuple[Tensor | None, Tensor | None, None]:
         positions, table = ctx.saved_tensors
         places, entries, upstream = arrays(positions, table, gradient)
-        layout, threads = _layout(ctx.levels), use_threads()
+        layout, threads = _layout(ctx.levels), num_threads()
         of_positions = of_table = None
         if ctx.needs_input_grad[0]:
             of_positions = torch.empty_like(positions)

@@ -13,7 +13,6 @@ from torch.autograd.function import once_differentiable
 
 from nerfro.fields.spherical_harmonics import check_bands
 from nerfro.kernels.compilation import compiled_parallel
-from nerfro.kernels.threads import use_threads
 
 # The reference's factors, by degree.
 _C0, _C1 = np.float32(0.28209479177387814), np.float32(0.4886025119029199)
@@ -37,7 +36,6 @@ class _Harmonics(torch.autograd.Function):
         ctx.save_for_backward(directions)
         ctx.num_bands = num_bands
         values = torch.empty(len(directions), num_bands**2)
-        use_threads()
         _harmonics(directions.detach().numpy(), num_bands, values.numpy())
         return values
 
@@ -46,7 +44,6 @@ class _Harmonics(torch.autograd.Function):
     def backward(ctx: Any, gradient: Float[Tensor, "P K"]) -> tuple[Float[Tensor, "P 3"], None]:
         (directions,) = ctx.saved_tensors
         of_directions = torch.zeros_like(directions)
-        use_threads()
         _backward(directions.detach().numpy(), gradient.contiguous().numpy(), ctx.num_bands, of_directions.numpy())
         return of_directions, None
 

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
+import ast
 import functools
 import hashlib
-from collections.abc import Callable
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
 
 from nerfro.files.cache import cache_dir
-from nerfro.kernels.threads import use_threads
-from nerfro.paths import PACKAGE_DIR
-
-# Files that hold kernels, or the constants that are compiled into them; a kernel lies beside its plain twin.
-_SOURCES = ("philox.py", "kernels/*.py", "geometry/*.py", "*/*_cpu.py")
+from nerfro.kernels.threads import num_threads, parallel_threads
 
 Function = TypeVar("Function", bound=Callable)
-
-# OpenMP threads spin while they wait. Numba's and PyTorch's are two pools, so that each would keep the other from the
-# cores: a training step took five times as long. Numba's own work queue sleeps. NUMBA_THREADING_LAYER overrides this.
-if numba.config.THREADING_LAYER == "default":  # type: ignore[attr-defined]
-    numba.config.THREADING_LAYER = "workqueue"  # type: ignore[attr-defined]
 
 
 def compiled(function: Function) -> Function:
@@ -42,14 +36,17 @@ def inlined(function: Function) -> Function:
 def compiled_parallel(function: Function) -> Function:
     """Compile with `prange` loops spread over the cores that PyTorch uses, and keep the machine code on disk.
 
-    A thread to which PyTorch gives one core has the same loops run one after the other. Several threads may call
-    those at once; Numba's work queue may have one caller only.
+    If PyTorch uses one core in the calling thread, the loops run in that thread. Several threads may then run kernels
+    at the same time; parallel kernels wait for each other.
     """
     serial, parallel = _compile(function, parallel=False), _compile(function, parallel=True)
 
     @functools.wraps(function)
     def run(*arguments: Any) -> Any:
-        return (serial if use_threads() == 1 else parallel)(*arguments)
+        if num_threads() == 1:
+            return serial(*arguments)
+        with parallel_threads():
+            return parallel(*arguments)
 
     return cast(Function, run)
 
@@ -59,31 +56,75 @@ def _compile(function: Function, parallel: bool, allocates: bool = True) -> Func
     options: dict[str, Any] = {"parallel": parallel, "nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
     if not allocates:
         options["_nrt"] = False  # Numba's run time, which makes arrays and counts their users
-    before = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-    # Numba looks at this once, when it makes the function's cache. An install may be read-only, hence a folder of ours;
-    # and Numba takes the two forms of one function for the same.
-    folder = (
-        (Path(before) if before else cache_dir() / "kernels") / _fingerprint() / ("parallel" if parallel else "serial")
-    )
-    numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
+    chosen = numba.config.CACHE_DIR  # type: ignore[attr-defined]
+    # The installed package may be read-only, and Numba does not tell the two forms of a function apart.
+    base = Path(chosen) if chosen else cache_dir() / "kernels"
+    folder = base / _fingerprint(function.__module__) / ("parallel" if parallel else "serial")
     try:
+        # Numba would try __pycache__ next, where machine code of other versions of imported files may lie.
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+        numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]  # read while the function's cache is made
         return numba.njit(cache=True, **options)(function)
-    except (RuntimeError, OSError):
-        # Where no folder can be written, every process compiles anew.
+    except (RuntimeError, OSError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        _warn_of_compiling(base, "NUMBA_CACHE_DIR" if chosen else "NERFRO_CACHE", reason)
         return numba.njit(**options)(function)
     finally:
-        numba.config.CACHE_DIR = before  # type: ignore[attr-defined]
+        numba.config.CACHE_DIR = chosen  # type: ignore[attr-defined]
 
 
 @functools.cache
-def _fingerprint() -> str:
-    """Hash of all sources that kernels are made of.
+def _warn_of_compiling(folder: Path, variable: str, reason: str) -> None:
+    from nerfro.cli import warn  # imports Hydra, which a library call does not need
 
-    Numba itself compiles again when a function's own file has changed, but not when the file of a function that it
-    calls has: it would go on running old machine code.
+    warn(
+        f"machine code cannot be kept in {folder} ({reason}), so every process compiles its kernels, which takes up to "
+        f"a minute; set {variable} to a folder that can be written"
+    )
+
+
+@functools.cache
+def _fingerprint(module: str) -> str:
+    """Hash the sources that the kernels of a module are compiled from.
+
+    Numba compiles a function again if the function's own file has changed. It does not look at files that the
+    function's constants and the functions that it calls come from, and would run outdated machine code.
     """
     digest = hashlib.sha256()
-    for pattern in _SOURCES:
-        for file in sorted(PACKAGE_DIR.glob(pattern)):
-            digest.update(file.read_bytes())
+    for _, source in sorted(imported_sources(module).items()):
+        digest.update(source)
     return digest.hexdigest()[:16]
+
+
+def imported_sources(module: str) -> dict[str, bytes]:
+    """Read the sources of a module and of all modules of nerfro and of its own package that it imports.
+
+    Args:
+        module: dotted name of a module that has been imported, or is being imported.
+
+    Returns:
+        Sources by the dotted name of their module. Imports within functions and for type checkers do not count, because
+        they cannot reach compiled code.
+    """
+    packages = {"nerfro", module.partition(".")[0]}
+    sources: dict[str, bytes] = {}
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        file = getattr(sys.modules.get(name), "__file__", None)
+        if name in sources or file is None or name.partition(".")[0] not in packages:
+            continue
+        sources[name] = Path(file).read_bytes()
+        if name != __name__:  # This module decides how kernels are compiled; its imports do not.
+            waiting += _imports(sources[name])
+    return sources
+
+
+def _imports(source: bytes) -> Iterator[str]:
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)

@@ -155,10 +155,8 @@ class DensityGridSampler(PointSampler):
 
     def draw_compiled(self, path: Path, draws: Draws | None) -> Samples:
         """Draw the samples of `draw` on the CPU."""
-        from nerfro.kernels.threads import use_threads
         from nerfro.samplers.density_grid_cpu import draw  # compiled code, so only where it is used
 
-        use_threads()
         if draws is None:
             num_samples, of_path, key = self.num_shown or self.num_samples, (path.ray[:0], path.ray[:0]), (0, 0, 0, 0)
         else:

@@ -1,13 +1,18 @@
-"""Kernels compile wherever nerfro is installed."""
+"""Kernels compile wherever nerfro is installed, and again whenever a source of theirs changes."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numba
 import pytest
 
-from nerfro.kernels.compilation import compiled
+import nerfro.fields.hash_encoding_cpu  # noqa: F401  # whose sources are listed
+from nerfro.kernels import compilation
+from nerfro.kernels.compilation import compiled, compiled_parallel, imported_sources
 
 
 def _square(x: float) -> float:
@@ -23,7 +28,46 @@ def test_machine_code_is_kept_in_the_cache_folder(tmp_path: Path, monkeypatch: p
     assert before == numba.config.CACHE_DIR
 
 
-def test_kernels_work_where_nothing_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_work_where_nothing_can_be_written_and_one_line_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("NERFRO_CACHE", str(tmp_path / "file" / "below"))
+    compilation._warn_of_compiling.cache_clear()
+    in_tree = set(Path(__file__).parent.rglob("*.nbi"))
     assert compiled(_square)(3.0) == 9.0
+    assert compiled_parallel(_square)(3.0) == 9.0
+    (line,) = "".join(capsys.readouterr()).splitlines()
+    assert str(tmp_path / "file" / "below") in line
+    assert "set NERFRO_CACHE to a folder that can be written" in line
+    assert set(Path(__file__).parent.rglob("*.nbi")) == in_tree
+
+
+def test_a_kernel_is_compiled_again_where_a_constant_of_another_file_has_changed(tmp_path: Path) -> None:
+    package = tmp_path / "plugin"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "middle.py").write_text("from plugin.numbers import FACTOR\n")
+    (package / "kernel.py").write_text(
+        "from nerfro.kernels.compilation import compiled\n"
+        "from plugin.middle import FACTOR\n\n\n"
+        "@compiled\ndef scaled(x):\n    return FACTOR * x\n"
+    )
+    environment = {
+        **os.environ,
+        "NERFRO_CACHE": str(tmp_path),
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path]),
+    }
+    environment["PYTHONDONTWRITEBYTECODE"] = "1"  # two files of the same second look the same to Python
+    command = [sys.executable, "-c", "from plugin.kernel import scaled; print(scaled(3))"]
+    for factor in (2, 5):
+        (package / "numbers.py").write_text(f"FACTOR = {factor}\n")
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=100)
+        assert done.stdout == f"{3 * factor}\n", done.stderr
+
+
+def test_sources_of_kernels_hold_all_that_their_module_imports_and_no_more() -> None:
+    sources = imported_sources("nerfro.fields.hash_encoding_cpu")
+    assert {"nerfro.fields.hash_encoding_cpu", "nerfro.fields.hash_encoding", compilation.__name__} <= sources.keys()
+    assert b"HASH_Y, HASH_Z = " in sources["nerfro.fields.hash_encoding"]
+    assert "nerfro.samplers.snell_cpu" not in sources

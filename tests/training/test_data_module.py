@@ -133,7 +133,7 @@ def test_kernels_bend_rays_alike_on_one_core_and_on_several(monkeypatch: pytest.
     for sampler in (Snell(), Eikonal()):
         paths = []
         for threads in (1, 2):
-            monkeypatch.setattr(compilation, "use_threads", lambda threads=threads: threads)
+            monkeypatch.setattr(compilation, "num_threads", lambda threads=threads: threads)
             paths.append(sampler(rays(2000), ball))
         assert paths[0].refracted.any()
         torch.testing.assert_close(paths[0].positions, paths[1].positions, rtol=0, atol=1e-6)

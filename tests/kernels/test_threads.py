@@ -1,0 +1,64 @@
+"""Kernels share a process with other threads and with other users of Numba."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+IMPORTS_ONLY = """
+import numba
+before = {name: value for name, value in vars(numba.config).items() if name.isupper()}
+import nerfro.boundaries.cube_map_cpu, nerfro.geometry.occupancy, nerfro.samplers.snell_cpu
+after = {name: value for name, value in vars(numba.config).items() if name.isupper()}
+print({name: after[name] for name in after if before.get(name) != after[name]})
+try:
+    print(numba.threading_layer())
+except ValueError:
+    print("no threads")
+"""
+
+TWO_THREADS = """
+import threading, numba, torch
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.samplers.snell import Snell
+from nerfro.types import Rays
+
+torch.set_num_threads(2)
+axis = torch.linspace(-1.5, 1.5, 16)
+distances = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).norm(dim=-1) - 0.8
+ball = SdfGrid.from_distances(distances[None], torch.tensor([[-1.5] * 3, [1.5] * 3]), [1.5], 0.01)
+directions = torch.nn.functional.normalize(torch.rand(500, 3) - 0.5, dim=-1)
+one = torch.ones(500)
+rays = Rays(-4 * directions.roll(1, 1) * 0.1 - 4 * directions, directions, 0 * one, 2 * one, 6 * one)
+expected = Snell()(rays, ball).positions
+same = []
+
+def trace():
+    same.extend(torch.equal(Snell()(rays, ball).positions, expected) for _ in range(200))
+
+threads = [threading.Thread(target=trace) for _ in range(2)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+print(len(same), all(same), numba.threading_layer(), numba.config.THREADING_LAYER)
+"""
+
+
+def run(source: str, **environment: str) -> list[str]:
+    variables = {**os.environ, "NUMBA_NUM_THREADS": "2", **environment}
+    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, timeout=300, env=variables)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split("\n")[:-1]
+
+
+def test_importing_kernels_changes_nothing_for_other_users_of_numba() -> None:
+    assert run(IMPORTS_ONLY) == ["{}", "no threads"]
+
+
+@pytest.mark.parametrize(("chosen", "used"), [("default", "workqueue"), ("omp", "omp")])
+def test_two_threads_may_trace_at_once_on_the_threading_layer_that_is_chosen(chosen: str, used: str) -> None:
+    assert run(TWO_THREADS, NUMBA_THREADING_LAYER=chosen) == [f"400 True {used} {chosen}"]
