@@ -20,7 +20,7 @@ from nerfro.capture.outline_hull import FEWEST_VIEWS
 from nerfro.capture.targets import opencv
 from nerfro.data.base import DataSource, Frame
 from nerfro.data.image_files import read_mask, to_unit
-from nerfro.data.masks import masks_left_out
+from nerfro.data.masks import without_masks
 from nerfro.data.transforms import read_json
 from nerfro.errors import NerfroError
 from nerfro.files.drawing import sheet
@@ -87,7 +87,7 @@ def load_all(source: DataSource) -> tuple[Cameras, list[UInt8[np.ndarray, "H W 3
     images: list[UInt8[np.ndarray, "H W 3"]] = []
     frames: list[Frame] = []
     for split in source.splits:
-        with masks_left_out():
+        with without_masks():
             views = source.load(split)
         if len(views.frames) != len(views):
             raise NerfroError("this data format does not provide image files; convert the data set to data=opencv")

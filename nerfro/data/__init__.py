@@ -1,1 +1,1 @@
-"""Posed images: folder -> cameras, images, masks."""
+"""Data formats: posed images on disk, loaded as cameras, images and masks."""

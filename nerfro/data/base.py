@@ -1,4 +1,4 @@
-"""What a data set is."""
+"""Interface of a data format: `DataSource` loads the `Views` of one split."""
 
 from __future__ import annotations
 
@@ -13,13 +13,20 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfro.cameras import Cameras
-from nerfro.data.pictures import Pictures
+from nerfro.data.lazy_images import LazyImages
 from nerfro.progress import told
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One posed image and its silhouette; its name and its camera's axes are those of the data set."""
+    """One posed image of a data set.
+
+    Attributes:
+        name: the image's name in the data set.
+        image: file of the image.
+        mask: file of the silhouette of the refractive object, or None.
+        camera_to_world: rotation and centre in world units. The data format defines the camera axes.
+    """
 
     name: str
     image: Path
@@ -29,58 +36,76 @@ class Frame:
 
 @dataclass(frozen=True)
 class Views:
-    """Posed images of one split. `images[i]`, `masks[i]` and `usable[i]` are tensors, mostly read when asked for.
+    """Posed images of one split.
+
+    Images, masks and usable pixels are indexed by view. They are usually `LazyImages`, which decode a file on access.
 
     Attributes:
-        cameras: one camera for each image, all of one resolution.
-        images: colours [H, W, 3], sRGB in [0, 1].
-        masks: share [H, W] of each pixel that the refractive object covers, or None where the data has no masks.
-        names: of the images, as the data set calls them.
-        usable: 1 (or True) in the pixels [H, W] that may be trained on, or None for all of them.
-        frames: files of the images and their masks, where the loader knows them.
+        cameras: one camera per image; all images have the same resolution.
+        images: RGB colours [H, W, 3], sRGB in [0, 1].
+        masks: coverage of each pixel [H, W] by the refractive object in [0, 1], or None if the data set has no masks.
+        names: names of the images in the data set.
+        usable: pixels [H, W] that training may use (1 or True), or None if all pixels are usable.
+        frames: image and mask files, if the data format knows them; otherwise empty.
     """
 
     cameras: Cameras
-    images: Pictures | Float[Tensor, "V H W 3"]
-    masks: Pictures | Float[Tensor, "V H W"] | None
+    images: LazyImages | Float[Tensor, "V H W 3"]
+    masks: LazyImages | Float[Tensor, "V H W"] | None
     names: list[str]
-    usable: Pictures | Bool[Tensor, "V H W"] | None = None
+    usable: LazyImages | Bool[Tensor, "V H W"] | None = None
     frames: Sequence[Frame] = ()
 
     def __len__(self) -> int:
         return len(self.names)
 
     def select(self, views: Sequence[int]) -> Views:
-        """Some of the views, in the order that is asked for."""
+        """Return the views with the given indices, in this order."""
         chosen = list(views)
         given = {name: getattr(self, name) for name in ("images", "masks", "usable")}
-        pictures = {name: p.select(chosen) if isinstance(p, Pictures) else p for name, p in given.items()}
-        pictures = {name: p[chosen] if isinstance(p, Tensor) else p for name, p in pictures.items()}
+        images = {name: p.select(chosen) if isinstance(p, LazyImages) else p for name, p in given.items()}
+        images = {name: p[chosen] if isinstance(p, Tensor) else p for name, p in images.items()}
         names, frames = [self.names[view] for view in chosen], [self.frames[view] for view in chosen if self.frames]
-        return replace(self, cameras=self.cameras.select(chosen), names=names, frames=frames, **pictures)
+        return replace(self, cameras=self.cameras.select(chosen), names=names, frames=frames, **images)
 
     def checked(self) -> Views:
-        """These views, of which every picture has been decoded once, to refuse what is corrupt, and forgotten."""
-        for pictures in (self.images, self.masks):
-            if isinstance(pictures, Pictures):
-                deque(told("reading", pictures.all_levels(), len(pictures)), maxlen=0)
+        """Decode every image and mask once, without storing it, and return these views.
+
+        Raises:
+            NerfroError: a file is corrupt.
+        """
+        for images in (self.images, self.masks):
+            if isinstance(images, LazyImages):
+                deque(told("reading", images.all_levels(), len(images)), maxlen=0)
         return self
 
 
 class DataSource(ABC):
-    """A folder, `root`, of posed images in some format."""
+    """A data set on disk in one format. Derive from this class to add a format.
+
+    Attributes:
+        root: folder of the data set.
+    """
 
     root: Path
 
     @property
     @abstractmethod
     def splits(self) -> list[str]:
-        """Names of the splits that the folder holds."""
+        """Names of the splits in the data set."""
 
     @abstractmethod
     def load(self, split: str) -> Views:
-        """One split, checked but for the pixels of its pictures, which are read later: see `Views.checked`.
+        """Load one split.
+
+        Poses, intrinsics and file headers are checked here. Pixels may be decoded later; see `Views.checked`.
+
+        Args:
+            split: one of `splits`.
+
+        Returns:
+            The views, with OpenGL camera axes (x right, y up, viewing direction -z) and lengths in world units.
 
         Raises:
-            NerfroError: unknown split, or anything missing, of the wrong size or not finite.
+            NerfroError: the split is unknown, a file is missing or has the wrong size, or a number is not finite.
         """

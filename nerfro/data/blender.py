@@ -1,13 +1,12 @@
-"""Data in the format of the NeRF authors' Blender scenes."""
+"""Data format of the synthetic NeRF scenes (Blender)."""
 
 from __future__ import annotations
 
 import math
 
 from nerfro.allowed import Distance, Factor
-from nerfro.data.base import Views
-from nerfro.data.frames import Lens, PosedImages
-from nerfro.data.image_files import Alpha
+from nerfro.data.frames import FrameSet, Lens, PosedImages
+from nerfro.data.image_files import Alpha, read_size
 from nerfro.data.transforms import find_splits, is_number, read_manifest
 from nerfro.errors import NerfroError
 from nerfro.registry import register
@@ -15,9 +14,10 @@ from nerfro.registry import register
 
 @register("data", "blender")
 class BlenderData(PosedImages):
-    """Folder with transforms_{train,val,test}.json in Blender's (OpenGL) camera axes and one field of view.
+    """Read the Blender format of the synthetic NeRF scenes: `transforms_{train,val,test}.json`.
 
-    The options are those of `PosedImages`; the paper's authors drop transparency. `embedded:torus` ships with nerfro.
+    Poses have OpenGL camera axes; all images share one horizontal field of view. `embedded:torus` is the scene that is
+    distributed with nerfro. `PosedImages` describes the options.
     """
 
     def __init__(
@@ -34,12 +34,11 @@ class BlenderData(PosedImages):
     def splits(self) -> list[str]:
         return list(find_splits(self.root))
 
-    def load(self, split: str) -> Views:
+    def read(self, split: str) -> FrameSet:
         manifest = read_manifest(self.root, split)
         angle = manifest.require("camera_angle_x", "the horizontal field of view in radians")
         if not is_number(angle) or not 0 < angle < math.pi:
-            raise NerfroError(
-                f"{manifest.path}: camera_angle_x={angle!r} must be an angle between 0 and pi, in radians"
-            )
-        frames, size = manifest.frames, manifest.size
-        return self.views(frames, lambda w, h: [Lens.of_angle(angle, w, h)] * len(frames), "opengl", size=size)
+            raise NerfroError(f"{manifest.path}: camera_angle_x={angle!r} must be an angle in radians, 0 to pi")
+        width, height, _ = read_size(manifest.frames[0].image)
+        lenses = [Lens.of_angle(angle, width, height)] * len(manifest.frames)
+        return FrameSet(manifest.frames, lenses, "opengl", size=manifest.size)

@@ -1,4 +1,4 @@
-"""Where rays begin and end, found from cameras and sparse points."""
+"""Near and far bounds of rays, estimated from cameras and sparse points."""
 
 from __future__ import annotations
 
@@ -8,38 +8,46 @@ from jaxtyping import Float
 from nerfro.errors import NerfroError
 from nerfro.geometry.lines import nearest_point
 
-# Cameras look at one place where it lies within 30 degrees of nearly all optical axes, and in front.
-_TOWARDS, _NEARLY_ALL = 0.87, 0.9
-# Rays begin at this share of the nearest camera's distance from there: before anything that is photographed.
-_NEAR_SHARE = 0.1
-# Points farther than this from a camera's axis (cosine) are hardly in its view; a thousandth at each end are strays.
-_IN_VIEW, _STRAYS = 0.7, 0.001
+# The cameras share a target if it lies in front of at least 90 % of them, within 30 degrees of the optical axis.
+_MIN_COSINE_TO_TARGET, _MIN_SHARE_OF_CAMERAS = 0.87, 0.9
+# Rays begin at this fraction of the distance between the target and the nearest camera.
+_NEAR_FRACTION = 0.1
+# A point is in view if the cosine to the optical axis exceeds this value. The quantile at each end counts as outliers.
+_MIN_COSINE_IN_VIEW, _OUTLIER_QUANTILE = 0.7, 0.001
 
 
 def find_bounds(poses: Float[np.ndarray, "V 3 4"], points: Float[np.ndarray, "P 3"]) -> tuple[float, float]:
-    """Near and far of cameras (OpenGL axes), world units.
+    """Estimate the near and far bounds of all cameras.
 
-    With points, 0.9 and 1.1 of the distances of the nearest and the farthest one in any view. Without, from the place
-    where the optical axes meet: near is a tenth of the least distance from it, far the greatest distance twice, which
-    reaches the other side of the cameras.
+    With points, the bounds are 0.9 times the distance of the nearest point in any view and 1.1 times the distance of
+    the farthest one. Without points, they follow from the target, the point nearest to all optical axes: near is a
+    tenth of the distance of the nearest camera, far is twice the distance of the farthest camera.
+
+    Args:
+        poses: camera-to-world matrices with OpenGL axes, world units.
+        points: sparse points in world units; may be empty.
+
+    Returns:
+        Near and far, arc lengths in world units.
 
     Raises:
-        NerfroError: there are no points in view, and the cameras look at no common place.
+        NerfroError: no points are in view and the cameras have no common target.
     """
     centres, forward = poses[:, :, 3], -poses[:, :, 2]
-    seen = [_distances_in_view(points, *camera) for camera in zip(centres, forward, strict=True)]
-    ends = np.array([np.quantile(each, [_STRAYS, 1 - _STRAYS]) for each in seen if len(each)])
-    if len(ends):
-        return 0.9 * float(ends[:, 0].min()), 1.1 * float(ends[:, 1].max())
-    towards = nearest_point(centres, forward) - centres
-    distances = np.linalg.norm(towards, axis=1)
-    looks = (towards * forward).sum(1) > _TOWARDS * distances
-    if looks.mean() < _NEARLY_ALL or not distances.min() > 0:
+    distances_in_view = [_distances_in_view(points, *camera) for camera in zip(centres, forward, strict=True)]
+    quantiles = [_OUTLIER_QUANTILE, 1 - _OUTLIER_QUANTILE]
+    ranges = np.array([np.quantile(each, quantiles) for each in distances_in_view if len(each)])
+    if len(ranges):
+        return 0.9 * float(ranges[:, 0].min()), 1.1 * float(ranges[:, 1].max())
+    to_target = nearest_point(centres, forward) - centres
+    distances = np.linalg.norm(to_target, axis=1)
+    sees_target = (to_target * forward).sum(1) > _MIN_COSINE_TO_TARGET * distances
+    if sees_target.mean() < _MIN_SHARE_OF_CAMERAS or not distances.min() > 0:
         raise NerfroError(
-            "data.near and data.far cannot be found: the cameras look at no common place, and there are no sparse "
-            "points; give both, in units of the poses"
+            "data.near and data.far cannot be found: the cameras have no common target, and the data set has no sparse "
+            "points; set both, in world units"
         )
-    return _NEAR_SHARE * float(distances.min()), 2 * float(distances.max())
+    return _NEAR_FRACTION * float(distances.min()), 2 * float(distances.max())
 
 
 def _distances_in_view(
@@ -47,4 +55,4 @@ def _distances_in_view(
 ) -> Float[np.ndarray, "Q"]:
     offsets = points - centre
     distances = np.linalg.norm(offsets, axis=1)
-    return distances[offsets @ forward > _IN_VIEW * distances]
+    return distances[offsets @ forward > _MIN_COSINE_IN_VIEW * distances]

@@ -1,4 +1,4 @@
-"""A COLMAP reconstruction and its photographs."""
+"""Data format of COLMAP reconstructions."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from nerfro.allowed import Distance, Factor
-from nerfro.data.base import Frame, Views
+from nerfro.data.base import Frame
 from nerfro.data.colmap_model import ColmapCamera, ColmapModel, read_colmap
-from nerfro.data.frames import Every, Lens, PosedImages, held_out
-from nerfro.data.image_files import Alpha
+from nerfro.data.frames import Every, FrameSet, Lens, PosedImages
+from nerfro.data.image_files import Alpha, read_size
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
 from nerfro.lens import coefficients, opencv_coefficients
@@ -22,17 +22,18 @@ _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "")
 
 @register("data", "colmap")
 class ColmapData(PosedImages):
-    """Folder with images/ and a COLMAP model (sparse/0, text or binary), in the model's own world.
+    """Read a COLMAP reconstruction (text or binary) and its images, in the world of the reconstruction.
 
-    Perspective cameras with any distortion that COLMAP has for them are read, fisheye lenses are refused. Images may
-    have been resized after the reconstruction.
+    All perspective camera models are supported, with distortion. Fisheye models are refused. Images may have been
+    resized after the reconstruction.
 
     Args:
-        root, near, far, downscale, alpha: see `PosedImages`; bounds that are none take 0.9 and 1.1 of the distances of
-            the nearest and the farthest 3-D points.
+        root, near, far, downscale, alpha: see `PosedImages`. Without `near` and `far`, the bounds are 0.9 and 1.1 times
+            the distances of the nearest and the farthest 3-D point.
         images: folder of the images within the root.
-        model: folder of the model within the root; none looks for sparse/0, sparse, colmap/sparse/0 and the root.
-        test_every: every such image by name, from the first, is for val and test.
+        model: folder of the model within the root. By default, the first model in sparse/0, sparse, colmap/sparse/0 and
+            the root is used.
+        test_every: every n-th image by name, from the first, belongs to val and test.
     """
 
     def __init__(
@@ -49,25 +50,24 @@ class ColmapData(PosedImages):
         super().__init__(root, near, far, downscale, alpha)
         self.images, self.model, self.test_every = images, model, test_every
 
-    def load(self, split: str) -> Views:
-        self.require(split)
+    def read(self, split: str) -> FrameSet:
         folder = self._model_folder()
         model = read_colmap(folder)
         open_bounds = self.near is None or self.far is None
-        nearest, farthest = _distances(model, folder) if open_bounds else (0.0, 0.0)
-        images = [model.images[i] for i in held_out(len(model.images), self.test_every, split, self.root)]
+        nearest, farthest = _distance_range(model, folder) if open_bounds else (0.0, 0.0)
+        images = self.held_out(model.images, self.test_every, split)
         frames = []
         for image in images:
             path = self.root / self.images / image.name
             if not path.is_file():
                 raise NerfroError(f"image {path} of the model {folder} does not exist; set data.images, or restore it")
             frames.append(Frame(image.name, path, find_mask(self.root, path), image.camera_to_world))
-
-        def lenses(width: int, height: int) -> list[Lens]:
-            places = [(model.cameras[image.camera], f"{folder}: camera {image.camera}") for image in images]
-            return [lens_of(c, at).resized((c.width, c.height), (width, height), at) for c, at in places]
-
-        return self.views(frames, lenses, "opencv", 0.9 * nearest, 1.1 * farthest)
+        size = read_size(frames[0].image)[:2]
+        lenses = []
+        for image in images:
+            camera, where = model.cameras[image.camera], f"{folder}: camera {image.camera}"
+            lenses.append(lens_of(camera, where).resized((camera.width, camera.height), size, where))
+        return FrameSet(frames, lenses, "opencv", 0.9 * nearest, 1.1 * farthest)
 
     def _model_folder(self) -> Path:
         folders = [self.root / name for name in ((self.model,) if self.model is not None else _MODEL_FOLDERS)]
@@ -79,7 +79,7 @@ class ColmapData(PosedImages):
 
 
 def lens_of(camera: ColmapCamera, where: str) -> Lens:
-    """The lens of a COLMAP camera of a supported model; COLMAP's pixel coordinates are nerfro's."""
+    """Convert the intrinsics of a perspective COLMAP camera; both use the same pixel coordinates."""
     p = camera.params
     if camera.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
         lens = Lens(p[0], p[0], p[1], p[2], coefficients(p[3:]))
@@ -91,27 +91,27 @@ def lens_of(camera: ColmapCamera, where: str) -> Lens:
             "`colmap image_undistorter`, or reconstruct with PINHOLE, RADIAL, OPENCV or FULL_OPENCV"
         )
     if lens.fx <= 0 or lens.fy <= 0:
-        raise NerfroError(f"{where} has the focal lengths {lens.fx:g}, {lens.fy:g}; they must be positive")
+        raise NerfroError(f"{where} has the focal lengths {lens.fx:g}, {lens.fy:g}; these must be positive")
     return lens
 
 
-def _distances(model: ColmapModel, folder: Path) -> tuple[float, float]:
-    """Distances of the nearest and farthest 3-D points in any view, a thousandth at each end taken for outliers."""
-    found = []
+def _distance_range(model: ColmapModel, folder: Path) -> tuple[float, float]:
+    """Find the distances of the nearest and the farthest 3-D point in any view, without 0.1 % outliers at each end."""
+    ranges = []
     for image in model.images:
-        seen = _in_view(model.points, image.camera_to_world, model.cameras[image.camera])
-        if len(seen) > 0:
-            found.append(np.quantile(seen, [0.001, 0.999]))
-    if not found:
-        raise NerfroError(f"{folder} has no 3-D points in view to take bounds from; set data.near and data.far")
-    near, far = np.array(found).T
+        distances = _distances_in_view(model.points, image.camera_to_world, model.cameras[image.camera])
+        if len(distances) > 0:
+            ranges.append(np.quantile(distances, [0.001, 0.999]))
+    if not ranges:
+        raise NerfroError(f"{folder} has no 3-D points in view to find bounds from; set data.near and data.far")
+    near, far = np.array(ranges).T
     return float(near.min()), float(far.max())
 
 
-def _in_view(
+def _distances_in_view(
     points: Float[np.ndarray, "P 3"], pose: Float[np.ndarray, "3 4"], camera: ColmapCamera
 ) -> Float[np.ndarray, "Q"]:
-    """Distances of the points within a camera's cone, without its distortion."""
+    """Distances of the points inside the view frustum; distortion is neglected."""
     local = (points - pose[:, 3]) @ pose[:, :3]
     local = local[local[:, 2] > 0]
     slope = 0.5 * np.array([camera.width, camera.height]) / camera.params[0]

@@ -1,7 +1,7 @@
-"""Reading a COLMAP reconstruction, text or binary (https://colmap.github.io/format.html).
+"""Reader of COLMAP reconstructions, text or binary (https://colmap.github.io/format.html).
 
-nerfro's own reader, because pycolmap 4.2 takes a truncated cameras.bin without a word and dies, out of memory, of a
-truncated points3D.bin; an index of 3-D points with their tracks is not needed here either.
+pycolmap is not used because version 4.2 accepts a truncated cameras.bin silently and runs out of memory on a truncated
+points3D.bin. Tracks of 3-D points are skipped.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from nerfro.errors import NerfroError
 
-# Names and numbers of parameters, by the model's number in binary files.
+# Name and number of parameters of each camera model; the index is the model's identifier in binary files.
 CAMERA_MODELS = (
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
@@ -39,7 +39,7 @@ _NUM_PARAMS = dict(CAMERA_MODELS)
 
 @dataclass(frozen=True)
 class ColmapCamera:
-    """Intrinsics: COLMAP's model name, image size in pixels and the model's parameters."""
+    """Intrinsics: name of the camera model, image size in pixels and parameters of the model."""
 
     model: str
     width: int
@@ -49,7 +49,7 @@ class ColmapCamera:
 
 @dataclass(frozen=True)
 class ColmapImage:
-    """A registered image: its path in the folder of images, its camera's number and pose (OpenCV axes)."""
+    """A registered image: path within the image folder, camera identifier and pose with OpenCV axes."""
 
     name: str
     camera: int
@@ -58,7 +58,7 @@ class ColmapImage:
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """A reconstruction: cameras by number, images by name, positions of the 3-D points."""
+    """A reconstruction: cameras by identifier, images sorted by name, positions of the 3-D points in world units."""
 
     cameras: dict[int, ColmapCamera]
     images: list[ColmapImage]
@@ -66,7 +66,14 @@ class ColmapModel:
 
 
 def read_colmap(folder: Path) -> ColmapModel:
-    """Read and check a model; without a file of 3-D points, there are none."""
+    """Read and check a model.
+
+    Args:
+        folder: folder with cameras, images and optionally points3D, all as .bin or all as .txt files.
+
+    Raises:
+        NerfroError: a file is missing, truncated or inconsistent.
+    """
     suffix = next(
         (s for s in _READERS if all((folder / f"{part}{s}").is_file() for part in ("cameras", "images"))), None
     )
@@ -78,10 +85,10 @@ def read_colmap(folder: Path) -> ColmapModel:
     path = folder / f"points3D{suffix}"
     points = np.array(list(read_points(path)) if path.is_file() else [], dtype=np.float64).reshape(-1, 3)
     if not images:
-        raise NerfroError(f"{folder / f'images{suffix}'} holds no registered image; did the reconstruction fail?")
+        raise NerfroError(f"{folder / f'images{suffix}'} holds no registered image; repeat the reconstruction")
     for one, other in pairwise(images):
         if one.name == other.name:
-            raise NerfroError(f"{folder}: two images are called {one.name}; keep one of them")
+            raise NerfroError(f"{folder}: two images have the name {one.name}; keep one of them")
     for image in images:
         if image.camera not in cameras:
             raise NerfroError(f"{folder}: image {image.name} has camera {image.camera}, which the model does not hold")
@@ -89,13 +96,13 @@ def read_colmap(folder: Path) -> ColmapModel:
 
 
 class _Binary:
-    """A binary file, read from its start; what is missing at its end is an error."""
+    """Sequential reader of a little-endian binary file. Reading past the end raises an error."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.content, self.offset = path, path.read_bytes(), 0
 
     def take(self, layout: str) -> tuple:
-        """The next values, little-endian."""
+        """Read the next values; `layout` is a format of `struct`."""
         size = struct.calcsize("<" + layout)
         self.skip(size)
         return struct.unpack_from("<" + layout, self.content, self.offset - size)
@@ -103,7 +110,7 @@ class _Binary:
     def skip(self, size: int) -> None:
         self.offset += size
         if self.offset > len(self.content):
-            raise NerfroError(f"{self.path} ends too early: truncated? copy or export it again")
+            raise NerfroError(f"{self.path} is truncated; copy or export it again")
 
     def name(self) -> str:
         end = self.content.find(b"\0", self.offset)
@@ -112,14 +119,14 @@ class _Binary:
         try:
             return text.decode("utf-8")
         except UnicodeDecodeError as error:
-            raise NerfroError(f"{self.path} holds a name that is not UTF-8: corrupt? export it again") from error
+            raise NerfroError(f"{self.path} holds a name that is not UTF-8; export it again") from error
 
     def items(self) -> Iterator[int]:
-        """Counts the items, and sees that nothing follows the last one."""
+        """Iterate over the number of items, and check that the file ends after the last item."""
         (count,) = self.take("Q")
         yield from range(count)
         if self.offset != len(self.content):
-            raise NerfroError(f"{self.path} goes on after its last item: corrupt, or of an unknown version")
+            raise NerfroError(f"{self.path} continues after its last item: it is corrupt or of an unsupported version")
 
 
 def _binary_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
@@ -127,7 +134,7 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
     for _ in file.items():
         number, model, width, height = file.take("iiQQ")
         if not 0 <= model < len(CAMERA_MODELS):
-            raise NerfroError(f"{path}: camera model number {model} is unknown; undistort the images with COLMAP first")
+            raise NerfroError(f"{path}: camera model {model} is unknown; undistort the images with COLMAP first")
         name, num_params = CAMERA_MODELS[model]
         yield number, _camera(name, width, height, file.take(f"{num_params}d"), f"{path}: camera {number}")
 
@@ -138,7 +145,7 @@ def _binary_images(path: Path) -> Iterator[ColmapImage]:
         values = file.take("i4d3di")
         name = file.name()
         (num_features,) = file.take("Q")
-        file.skip(24 * num_features)  # x, y, number of the 3-D point
+        file.skip(24 * num_features)  # x, y and identifier of the 3-D point
         yield _image(name, values[1:5], values[5:8], values[8], path)
 
 
@@ -146,24 +153,32 @@ def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
     file = _Binary(path)
     for _ in file.items():
         values = file.take("Q3d3BdQ")
-        file.skip(8 * values[-1])  # track: image, feature
+        file.skip(8 * values[-1])  # track: pairs of image and feature
         yield values[1:4]
 
 
 def _text_rows(
-    path: Path, form: str, kinds: tuple[Callable[[str], Any], ...], skip: int = 0
+    path: Path, form: str, parsers: tuple[Callable[[str], Any], ...], skip: int = 0
 ) -> Iterator[tuple[str, list[Any]]]:
-    """Place and words, of their kinds, of lines that are no comments; so many lines after each of them are left out."""
+    """Yield location and parsed words of each line that is not a comment.
+
+    Args:
+        path: the text file.
+        form: format of a line, for the error message.
+        parsers: one per word; the last parser receives the rest of the line.
+        skip: number of lines to skip after each line.
+    """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError as error:
-        raise NerfroError(f"{path} is no text: corrupt? export it again") from error
+        raise NerfroError(f"{path} is not a text file; export it again") from error
     numbered = ((i, line.strip()) for i, line in enumerate(lines, 1) if not line.startswith("#"))
     for i, line in numbered:
         if not line:
             continue
         try:
-            words = [kind(word) for kind, word in zip(kinds, line.split(maxsplit=len(kinds) - 1), strict=True)]
+            values = line.split(maxsplit=len(parsers) - 1)
+            words = [parse(value) for parse, value in zip(parsers, values, strict=True)]
         except ValueError as error:
             raise NerfroError(f"{path}, line {i} is not {form}: {line[:60]!r}") from error
         yield f"{path}, line {i}", words
@@ -172,15 +187,16 @@ def _text_rows(
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
-    kinds = (int, str, int, int, lambda words: tuple(map(float, words.split())))
+    parsers = (int, str, int, int, lambda words: tuple(map(float, words.split())))
     form = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"
-    for where, (number, model, width, height, params) in _text_rows(path, form, kinds):
+    for where, (number, model, width, height, params) in _text_rows(path, form, parsers):
         yield number, _camera(model, width, height, params, where)
 
 
 def _text_images(path: Path) -> Iterator[ColmapImage]:
-    kinds, form = (str, *[float] * 7, int, str), "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-    for _, (_, *pose, camera, name) in _text_rows(path, form, kinds, skip=1):  # its features, perhaps an empty line
+    parsers, form = (str, *[float] * 7, int, str), "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+    # Each image is followed by one line of features, which may be empty.
+    for _, (_, *pose, camera, name) in _text_rows(path, form, parsers, skip=1):
         yield _image(name, tuple(pose[:4]), tuple(pose[4:]), camera, path)
 
 
@@ -196,7 +212,9 @@ def _camera(model: str, width: int, height: int, params: tuple[float, ...], wher
     if model in _NUM_PARAMS and len(params) != _NUM_PARAMS[model]:
         raise NerfroError(f"{where}: {model} has {_NUM_PARAMS[model]} parameters, not {len(params)}; export it again")
     if width < 1 or height < 1 or not np.isfinite(params).all():
-        raise NerfroError(f"{where}: size {width}x{height} and parameters {params} are no camera; export it again")
+        raise NerfroError(
+            f"{where}: size {width}x{height} and parameters {params} are not valid; export the model again"
+        )
     return ColmapCamera(model, width, height, params)
 
 
@@ -204,7 +222,7 @@ def _image(name: str, quaternion: tuple[float, ...], shift: tuple[float, ...], c
     norm = float(np.linalg.norm(quaternion))
     if not (np.isfinite(norm) and np.isfinite(shift).all()) or abs(norm - 1) > 1e-3:
         raise NerfroError(f"{path}: image {name} has no valid pose (quaternion {quaternion}); export the model again")
-    # COLMAP's poses lead from the world to the camera, scalar part first.
+    # COLMAP stores world-to-camera poses, with the scalar part of the quaternion first.
     inverse = Rotation.from_quat([*quaternion[1:], quaternion[0]]).inv()
     return ColmapImage(name, camera, np.column_stack([inverse.as_matrix(), -inverse.apply(shift)]))
 

@@ -1,4 +1,4 @@
-"""How bright photographs were taken, as their files tell it."""
+"""Relative exposures from the EXIF data of photographs."""
 
 from __future__ import annotations
 
@@ -13,9 +13,12 @@ from nerfro.data.image_files import read_exposure
 
 
 def exif_exposures(files: Sequence[Path]) -> Float[Tensor, "V"] | None:
-    """Exposure of each photograph, t ISO / N^2: linear radiance that its sensor saw, up to one factor for all.
+    """Compute the relative exposure t ISO / N^2 of each photograph.
 
-    None unless every file has an exposure time, and all or none have an f-number, and a sensitivity.
+    A factor that no file records (f-number N or sensitivity ISO) is assumed to be equal for all photographs.
+
+    Returns:
+        Exposures in arbitrary units, or None if a file lacks its exposure time t or only some files record a factor.
     """
     known = [read_exposure(path) for path in files]
     if not known or any(time is None for time, *_ in known):

@@ -1,12 +1,13 @@
-"""From frames (an image, a pose, a lens) to views: what all loaders share."""
+"""Common part of the built-in data formats: from posed frames to views."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -16,24 +17,33 @@ from nerfro.allowed import Coordinate, Range, check
 from nerfro.cameras import Cameras, central_window
 from nerfro.data.base import DataSource, Frame, Views
 from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb
-from nerfro.data.masks import find_masks
-from nerfro.data.pictures import Pictures
+from nerfro.data.lazy_images import LazyImages
+from nerfro.data.masks import find_masks, find_usable
 from nerfro.errors import NerfroError
 from nerfro.lens import distort, undistort
 from nerfro.paths import resolve_path
 
-Every = Annotated[int, Range(at_least=2)]  # each such view is not trained on
+Every = Annotated[int, Range(at_least=2)]  # every n-th view is a test view
 SPLITS = ["train", "val", "test"]
+Item = TypeVar("Item")
 
 _ROTATION_TOLERANCE = 1e-3
+_FOCAL = Annotated[float, Range(at_least=1e-3, at_most=1e9)]
+_INTRINSICS = {"fx": _FOCAL, "fy": _FOCAL, "cx": Coordinate, "cy": Coordinate}
 
-# Distorting what was undistorted must lead back to within this many pixels.
+# Maximum error in pixels after undistorting and distorting a point again.
 _LENS_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Focal lengths and principal point in pixels, and distortion (see `nerfro.lens.coefficients`)."""
+    """Intrinsics of a perspective camera with lens distortion.
+
+    Attributes:
+        fx, fy: focal lengths in pixels.
+        cx, cy: principal point in pixels; the corner of the image is at (0, 0).
+        distortion: nine coefficients (see `nerfro.lens.coefficients`), or None.
+    """
 
     fx: float
     fy: float
@@ -43,37 +53,70 @@ class Lens:
 
     @classmethod
     def of_angle(cls, angle: float, width: int, height: int) -> Lens:
-        """The ideal lens with a horizontal field of view in radians and its principal point in the image's centre."""
+        """Return the ideal lens with a horizontal field of view in radians and a centred principal point."""
         focal = 0.5 * width / math.tan(0.5 * angle)
         return cls(focal, focal, 0.5 * width, 0.5 * height)
 
-    def resized(self, made_for: tuple[float, float], size: tuple[int, int], where: str) -> Lens:
-        """The lens for images of a width and height, resized after calibration without a change of proportions."""
-        by_width, by_height = size[0] / made_for[0], size[1] / made_for[1]
-        if abs(by_width - by_height) > 1.5 * max(1 / made_for[0], 1 / made_for[1]):
+    def resized(self, calibrated: tuple[float, float], size: tuple[int, int], where: str) -> Lens:
+        """Scale the intrinsics to images that were resized after the calibration.
+
+        Args:
+            calibrated: width and height in pixels that the intrinsics belong to.
+            size: width and height in pixels of the images.
+            where: subject of the error message.
+
+        Raises:
+            NerfroError: the aspect ratios differ.
+        """
+        by_width, by_height = size[0] / calibrated[0], size[1] / calibrated[1]
+        if abs(by_width - by_height) > 1.5 * max(1 / calibrated[0], 1 / calibrated[1]):
             raise NerfroError(
-                f"{where} is calibrated for {made_for[0]:g}x{made_for[1]:g} pixels but the images have "
-                f"{size[0]}x{size[1]}, of other proportions; give the images that were calibrated"
+                f"{where} is calibrated for {calibrated[0]:g}x{calibrated[1]:g} pixels but the images have "
+                f"{size[0]}x{size[1]} and another aspect ratio; restore the images that were calibrated"
             )
         return Lens(self.fx * by_width, self.fy * by_height, self.cx * by_width, self.cy * by_height, self.distortion)
 
 
+@dataclass(frozen=True)
+class FrameSet:
+    """Frames of one split as a data format describes them; the result of `PosedImages.read`.
+
+    Attributes:
+        frames: at least one frame.
+        lenses: one lens per frame, for the images in their stored size.
+        axes: camera axes of the poses: `opengl` (x right, y up, viewing direction -z) or `opencv` (y down, +z).
+        near, far: bounds of the rays (arc lengths, world units) that apply where the options leave these open.
+        size: stored width and height of the images in pixels, if the data set states them.
+        crop: fraction of each side that is kept around the centre.
+        usable: masks of the pixels that training may use, one per frame; empty if all pixels are usable.
+    """
+
+    frames: Sequence[Frame]
+    lenses: Sequence[Lens]
+    axes: Literal["opengl", "opencv"]
+    near: float = 0.0
+    far: float = math.inf
+    size: tuple[int, int] | None = None
+    crop: float = 1.0
+    usable: Sequence[Path | None] = ()
+
+
 class PosedImages(DataSource):
-    """Image files with poses: what the built-in loaders share.
+    """Base class of the built-in data formats. A format implements `read` and, if it defines splits, `splits`.
 
     Args:
-        root: the folder.
-        near, far: arc lengths at which rays begin and end, world units; None where the data will tell.
-        downscale: how many times smaller pictures become, any number from 1 on; each pixel is the mean of what it
-            covers, and the lens follows.
-        alpha: `drop` ignores the images' transparency, `white` and `black` composite them over that colour.
+        root: folder of the data set.
+        near, far: bounds of the rays, arc lengths in world units; None to use the bounds of the data set.
+        downscale: downscaling factor, any number from 1. Each pixel becomes the mean of the area that it covers, and
+            the intrinsics are scaled accordingly.
+        alpha: `drop` ignores transparency; `white` and `black` composite the images over this colour.
 
     Raises:
         NerfroError: an option is out of range.
     """
 
     def __init__(self, root: str, near: float | None, far: float | None, downscale: float, alpha: Alpha) -> None:
-        _require_interval(near, far)
+        _check_bounds(near, far)
         self.root = resolve_path(root)
         self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
 
@@ -81,76 +124,70 @@ class PosedImages(DataSource):
     def splits(self) -> list[str]:
         return SPLITS
 
-    def require(self, split: str) -> None:
-        """Refuse a root that is no folder, and an unknown split."""
+    @abstractmethod
+    def read(self, split: str) -> FrameSet:
+        """Read the poses, intrinsics and file names of one split; `load` has checked that the split exists.
+
+        Raises:
+            NerfroError: a file is missing, or a pose or lens is invalid.
+        """
+
+    def load(self, split: str) -> Views:
         require_root(self.root)
         if split not in self.splits:
             raise NerfroError(f"data.root={self.root} has no split '{split}'; it has {', '.join(self.splits)}")
+        return self._views(self.read(split))
 
-    def views(
-        self,
-        frames: Sequence[Frame],
-        lenses: Callable[[int, int], Sequence[Lens]],
-        axes: Literal["opengl", "opencv"],
-        nearest: float = 0.0,
-        farthest: float = math.inf,
-        size: tuple[int, int] | None = None,
-        crop: float = 1.0,
-    ) -> Views:
-        """Look at the frames' images and silhouettes, which are read when they are asked for, and set up their cameras.
+    def held_out(self, views: Sequence[Item], every: int, split: str) -> list[Item]:
+        """Select the views of a split in a format without splits: every n-th view, from the first, is for val and test.
 
-        Args:
-            frames: at least one.
-            lenses: the frames' lenses for a width and height of the images as stored.
-            axes: the camera axes of the poses: `opengl` (x right, y up, looks along -z) or `opencv` (y down, along +z).
-            nearest, farthest: what the data tell, in place of bounds that are None.
-            size: width and height of the images as stored, where the data set states them.
-            crop: share of each side that is kept, around the centre.
-
-        Raises:
-            NerfroError: an image or mask is missing, no image or of the wrong size, or a lens has no inverse.
+        This is the convention of LLFF.
         """
-        near, far = nearest if self.near is None else self.near, farthest if self.far is None else self.far
-        _require_interval(near, far)
-        files, alpha = [frame.image for frame in frames], self.alpha
-        images = Pictures.of(files, lambda path: read_rgb(path, alpha), self.downscale, size, alpha != "drop", alpha)
+        if len(views) < 2:
+            raise NerfroError(f"data.root={self.root} holds one image; at least two are needed, for training and test")
+        return [view for i, view in enumerate(views) if (i % every == 0) == (split != "train")]
+
+    def _views(self, read: FrameSet) -> Views:
+        near, far = read.near if self.near is None else self.near, read.far if self.far is None else self.far
+        _check_bounds(near, far)
+        frames, files, alpha = read.frames, [frame.image for frame in read.frames], self.alpha
+        composited = alpha != "drop"
+        images = LazyImages.of(
+            files, lambda path: read_rgb(path, alpha), self.downscale, read.size, composited, recipe=alpha
+        )
         (height, width), stored = images.shape, images.size[::-1]
         masks = find_masks(files, [frame.mask for frame in frames], self.downscale, stored)
-        full = lenses(*stored)
-        for frame, lens in zip(frames, full, strict=True):
-            focal, centre = Annotated[float, Range(at_least=1e-3, at_most=1e9)], Coordinate
-            hints = {"fx": focal, "fy": focal, "cx": centre, "cy": centre}
-            check(f"{frame.name}: its lens has ", hints, vars(lens))
+        for frame, lens in zip(frames, read.lenses, strict=True):
+            check(f"{frame.name}: its lens has ", _INTRINSICS, vars(lens))
         poses = np.stack([frame.camera_to_world for frame in frames])
-        if axes == "opencv":
+        if read.axes == "opencv":
             poses = poses * np.array([1.0, -1.0, -1.0, 1.0])
-        intrinsics = torch.tensor([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in full], dtype=torch.float64)
-        smaller = torch.tensor([width / stored[0], height / stored[1]], dtype=torch.float64).repeat(2)
-        fx, fy, cx, cy = (intrinsics * smaller).float().unbind(-1)
-        distorted = any(lens.distortion is not None for lens in full)
-        distortion = torch.tensor([lens.distortion or (0.0,) * 9 for lens in full]) if distorted else None
+        intrinsics = torch.tensor([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in read.lenses], dtype=torch.float64)
+        scale = torch.tensor([width / stored[0], height / stored[1]], dtype=torch.float64).repeat(2)
+        fx, fy, cx, cy = (intrinsics * scale).float().unbind(-1)
+        distorted = any(lens.distortion is not None for lens in read.lenses)
+        distortion = torch.tensor([lens.distortion or (0.0,) * 9 for lens in read.lenses]) if distorted else None
         cameras = Cameras(torch.from_numpy(poses).float(), fx, fy, cx, cy, width, height, near, far, distortion)
         _check_distortion(cameras, frames)
-        if crop < 1:
-            window = central_window(height, width, crop)
-            cameras, images, masks = cameras.crop(window), images.cut(window), masks and masks.cut(window)
-        return Views(cameras, images, masks, [frame.name for frame in frames], frames=frames)
+        usable = find_usable(files, read.usable, self.downscale, stored) if any(read.usable) else None
+        if read.crop < 1:
+            window = central_window(height, width, read.crop)
+            cameras, images = cameras.crop(window), images.cut(window)
+            masks, usable = masks and masks.cut(window), usable and usable.cut(window)
+        return Views(cameras, images, masks, [frame.name for frame in frames], usable, frames)
 
 
-def _require_interval(near: float | None, far: float | None) -> None:
+def _check_bounds(near: float | None, far: float | None) -> None:
     if far is not None and (near or 0.0) >= far:
-        raise NerfroError(f"data.near={near} and data.far={far} are no interval; take 0 <= near < far")
-
-
-def held_out(num_views: int, every: int, split: str, root: Path) -> list[int]:
-    """The views of a split where the data has none: each `every`-th, from the first, is for val and test (LLFF)."""
-    if num_views < 2:
-        raise NerfroError(f"data.root={root} holds one image; two or more are needed to train on one and test another")
-    return [i for i in range(num_views) if (i % every == 0) == (split != "train")]
+        raise NerfroError(f"data.near={near} and data.far={far} are not an interval; take 0 <= near < far")
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The images of a folder by name, at least one; masks (`mask_*`) and hidden files are left out."""
+    """List the image files of a folder by name, without masks (`mask_*`) and hidden files.
+
+    Raises:
+        NerfroError: the folder does not exist or holds no image.
+    """
     if not folder.is_dir():
         raise NerfroError(f"{folder} is not a folder; it should hold the images, see docs/data.md")
     images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
@@ -161,21 +198,27 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def require_root(root: Path) -> None:
-    """Refuse a data set's folder that does not exist."""
+    """Raise an error if the folder of a data set does not exist."""
     if not root.is_dir():
-        raise NerfroError(f"data.root={root} is not a folder; give the one that holds the data set")
+        raise NerfroError(f"data.root={root} is not a folder; give the folder of the data set")
 
 
 def check_pose(
     matrix: Float[np.ndarray, "rows 4"], where: str, name: str = "transform_matrix"
 ) -> Float[np.ndarray, "3 4"]:
-    """The first three rows of a camera-to-world matrix, which must be a rotation and a shift."""
+    """Check that a camera-to-world matrix is a rotation and a translation, and return its first three rows.
+
+    Args:
+        matrix: three or four rows.
+        where: subject of the error message, such as the file and the frame.
+        name: name of the matrix in the file.
+    """
     rotation = matrix[:3, :3]
     error = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
-        cause = "mirrors" if error <= _ROTATION_TOLERANCE else f"is off by {error:.2g}"
+        cause = "it is a reflection" if error <= _ROTATION_TOLERANCE else f"R^T R differs from 1 by {error:.2g}"
         raise NerfroError(
-            f"{where}: the 3x3 part of {name} is no rotation (it {cause}); "
+            f"{where}: the 3x3 part of {name} is not a rotation ({cause}); "
             "give camera-to-world matrices without scale or reflection"
         )
     if len(matrix) == 4 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > _ROTATION_TOLERANCE:
@@ -185,12 +228,12 @@ def check_pose(
 
 
 def _check_distortion(cameras: Cameras, frames: Sequence[Frame]) -> None:
-    """Refuse lenses whose model folds back within the image, as polynomials fitted to its middle may do."""
+    """Refuse a distortion that is not invertible within the image, as for polynomials fitted to the image centre."""
     if cameras.distortion is None:
         return
-    share = torch.linspace(0, 1, 9, dtype=torch.float64)
+    fractions = torch.linspace(0, 1, 9, dtype=torch.float64)
     size = torch.tensor([cameras.width, cameras.height])
-    grid = torch.cartesian_prod(share, share) * size  # the inside as well: a fold may lie within
+    grid = torch.cartesian_prod(fractions, fractions) * size  # the interior as well, because the fold may lie there
     for view, frame in enumerate(frames):
         fx, fy, cx, cy = (getattr(cameras, name)[view].double() for name in ("fx", "fy", "cx", "cy"))
         points = (grid - torch.stack([cx, cy])) / torch.stack([fx, fy])
@@ -199,6 +242,6 @@ def _check_distortion(cameras: Cameras, frames: Sequence[Frame]) -> None:
         error = (distort(ideal, lens)[0] - points).norm(dim=-1) * fx
         if not bool(((error < _LENS_TOLERANCE) & (area > 0)).all()):
             raise NerfroError(
-                f"{frame.name}: its lens distortion cannot be undone everywhere in the image; "
+                f"{frame.name}: the lens distortion is not invertible everywhere in the image; "
                 "check the coefficients and their order, or undistort the images first"
             )

@@ -1,4 +1,4 @@
-"""Data in the format of IDR and NeuS: one matrix for each camera, world to pixel."""
+"""Data format of IDR and NeuS: one projection matrix per camera."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import scipy.linalg
 from jaxtyping import Float
 
 from nerfro.allowed import Distance, Factor
-from nerfro.data.base import Frame, Views
-from nerfro.data.frames import Every, Lens, PosedImages, held_out, list_images
+from nerfro.data.base import Frame
+from nerfro.data.frames import Every, FrameSet, Lens, PosedImages, list_images
 from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha
 from nerfro.data.transforms import parse_matrix
 from nerfro.errors import NerfroError
@@ -23,18 +23,19 @@ _MAX_SKEW = 1e-3
 
 @register("data", "idr")
 class IdrData(PosedImages):
-    """Folder with image/, mask/ and cameras_sphere.npz, as IDR, NeuS, NeTO and NEMTO have it.
+    """Read the format of IDR, NeuS, NeTO and NEMTO: image/, mask/ and cameras_sphere.npz.
 
-    `world_mat_i` maps the world to pixels, `scale_mat_i` the unit sphere to the world. Masks belong to images in the
-    order of names. Pixel centres are whole numbers there (NeuS, gen_rays_at), so half a pixel is added.
+    `world_mat_i` projects world points to pixels, and `scale_mat_i` maps the unit sphere to the world. Images and masks
+    are matched in the order of names. In this format, pixel centres are at whole numbers (NeuS, `gen_rays_at`), so the
+    principal point is shifted by half a pixel.
 
     Args:
-        root, near, far, downscale, alpha: see `PosedImages`; bounds that are none take where rays enter the unit sphere
-            at the earliest and leave it at the latest.
-        cameras: name of the file of matrices.
-        world: `sphere` is the frame in which the object lies in the unit sphere, `file` that of `world_mat` (of which
-            `near` and `far` cannot be known).
-        test_every: every such image by name, from the first, is for val and test.
+        root, near, far, downscale, alpha: see `PosedImages`. Without `near` and `far`, the bounds enclose the unit
+            sphere in all views.
+        cameras: name of the file with the matrices.
+        world: `sphere` for the frame in which the object lies inside the unit sphere, or `file` for the world of
+            `world_mat`, which requires `near` and `far`.
+        test_every: every n-th image by name, from the first, belongs to val and test.
     """
 
     def __init__(
@@ -50,31 +51,30 @@ class IdrData(PosedImages):
     ) -> None:
         super().__init__(root, near, far, downscale, alpha)
         if world == "file" and (near is None or far is None):
-            raise NerfroError("data.world=file needs data.near and data.far, in units of that world")
+            raise NerfroError("data.world=file needs data.near and data.far; set both, in units of this world")
         self.cameras, self.world, self.test_every = cameras, world, test_every
 
-    def load(self, split: str) -> Views:
-        self.require(split)
+    def read(self, split: str) -> FrameSet:
         images = list_images(_first_folder(self.root, ("image", "images", "rgb")))
-        masks = _masks(self.root, len(images))
+        masks = _list_masks(self.root, len(images))
         file = self.root / self.cameras
         if not file.is_file():
-            raise NerfroError(f"{file} does not exist; name the file of matrices with data.cameras")
+            raise NerfroError(f"{file} does not exist; set data.cameras to the file with the matrices")
         arrays = load_arrays(file)
         num_matrices = sum(name.startswith("world_mat_") and name[10:].isdigit() for name in arrays)
         if num_matrices != len(images):
             raise NerfroError(
-                f"{file} has {num_matrices} matrices world_mat_<i> for {len(images)} images; make them equal"
+                f"{file} has {num_matrices} matrices world_mat_<i> for {len(images)} images; the numbers must be equal"
             )
         projections = (self._projection(arrays, i, file) for i in range(len(images)))
         cameras = [decompose(projection, f"{file}: world_mat_{i}") for i, projection in enumerate(projections)]
         poses, lenses = zip(*cameras, strict=True)
-        chosen = held_out(len(images), self.test_every, split, self.root)
+        chosen = self.held_out(range(len(images)), self.test_every, split)
         frames = [Frame(images[i].name, images[i], masks[i], poses[i]) for i in chosen]
-        # Over all views, so that the splits agree.
+        # All views are considered, so that all splits have the same bounds.
         distance = np.linalg.norm(np.stack(poses)[:, :, 3], axis=-1)
-        nearest, farthest = max(float(distance.min()) - 1, 0.0), float(distance.max()) + 1
-        return self.views(frames, lambda width, height: [lenses[i] for i in chosen], "opencv", nearest, farthest)
+        near, far = max(float(distance.min()) - 1, 0.0), float(distance.max()) + 1
+        return FrameSet(frames, [lenses[i] for i in chosen], "opencv", near, far)
 
     def _projection(self, arrays: dict[str, np.ndarray], index: int, file: Path) -> Float[np.ndarray, "3 4"]:
         product = np.eye(4)
@@ -86,16 +86,21 @@ class IdrData(PosedImages):
 
 
 def decompose(projection: Float[np.ndarray, "3 4"], where: str) -> tuple[Float[np.ndarray, "3 4"], Lens]:
-    """Camera-to-world matrix (OpenCV axes) and lens of a projection matrix that takes whole numbers as pixel centres.
+    """Decompose a projection matrix into camera-to-world matrix and lens by RQ factorization.
 
-    By RQ factorisation; any factor of the matrix, and with it a uniform scale of the world, is immaterial. The matrix
-    must be regular and without skew.
+    The scale of the matrix has no effect. Pixel centres of the matrix are at whole numbers.
+
+    Returns:
+        Camera-to-world matrix with OpenCV axes, and the lens.
+
+    Raises:
+        NerfroError: the matrix is singular or has skew.
     """
     square = projection[:, :3]
     determinant = np.linalg.det(square)
     if abs(determinant) <= 1e-12 * max(np.abs(square).max(), 1e-30) ** 3:
-        raise NerfroError(f"{where} is singular, so it is no camera; export the matrices again")
-    # A matrix of either sign projects to the same pixels; this one has what is in front at positive depth.
+        raise NerfroError(f"{where} is singular and therefore not a camera; export the matrices again")
+    # The matrix and its negative project equally. A positive determinant gives points in front a positive depth.
     upper, rotation = scipy.linalg.rq(square * np.sign(determinant))
     signs = np.diag(np.sign(np.diag(upper)))
     intrinsics, rotation = upper @ signs, signs @ rotation
@@ -112,12 +117,12 @@ def _first_folder(root: Path, names: tuple[str, ...]) -> Path:
     return next((root / name for name in names if (root / name).is_dir()), root / names[0])
 
 
-def _masks(root: Path, num_images: int) -> list[Path] | list[None]:
-    """The masks in the order of names; they need not be called as the images are."""
+def _list_masks(root: Path, num_images: int) -> list[Path] | list[None]:
+    """List the masks by name; the names may differ from those of the images."""
     folder = _first_folder(root, ("mask", "masks"))
     if not folder.is_dir():
         return [None] * num_images
     masks = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
     if len(masks) != num_images:
-        raise NerfroError(f"{folder} holds {len(masks)} masks for {num_images} images; give all of them one, or none")
+        raise NerfroError(f"{folder} holds {len(masks)} masks for {num_images} images; give one per image, or none")
     return masks

@@ -1,4 +1,4 @@
-"""Reading images and masks: every bit depth, checked, in the levels that the files have."""
+"""Readers of image and mask files with 8 or 16 bits per channel."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ Levels = UInt8[np.ndarray, "H W *C"] | UInt16[np.ndarray, "H W *C"]
 
 
 def to_unit(levels: Levels) -> Float[np.ndarray, "H W *C"]:
-    """Levels of 8 or 16 bits as numbers in [0, 1]."""
+    """Convert integer levels of 8 or 16 bits to numbers in [0, 1]."""
     return levels.astype(np.float32) / np.iinfo(levels.dtype).max
 
 
 def to_levels(values: Float[np.ndarray, "H W *C"]) -> UInt16[np.ndarray, "H W *C"]:
-    """Numbers in [0, 1] as the nearest levels of 16 bits."""
+    """Round numbers in [0, 1] to 16-bit levels."""
     return np.rint(values * 65535).astype(np.uint16)
 
 
 def read_levels(path: Path) -> Levels:
-    """Levels [H, W, C] of 8 or 16 bits, whichever a file has; C is 1 (grey), 2 (grey, alpha), 3 (RGB) or 4 (RGBA)."""
+    """Read the 8- or 16-bit levels [H, W, C] of a file; C is 1 (grey), 2 (grey, alpha), 3 (RGB) or 4 (RGBA)."""
     with _naming(path):
         content = path.read_bytes()
         return decode_png16(content) if is_png16(content) else _read_8bit(content, path)
 
 
 def read_size(path: Path) -> tuple[int, int, int]:
-    """Width, height and bits per channel of an image file, from its header alone."""
+    """Read width, height and bits per channel from the header of an image file."""
     with _naming(path), path.open("rb") as file:
         start = file.read(29)
         if is_png16(start):
@@ -52,31 +52,31 @@ def read_size(path: Path) -> tuple[int, int, int]:
 
 @contextlib.contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """Errors within it that tell of a bad file name it."""
+    """Convert errors about an unreadable file to a message that names the file."""
     try:
         yield
     except FileNotFoundError as error:
-        raise NerfroError(f"image {path} does not exist; restore it or take it out of the frames") from error
+        raise NerfroError(f"image {path} does not exist; restore it or remove its frame") from error
     except UnidentifiedImageError as error:
-        raise NerfroError(f"image {path} cannot be read (it is no image); copy or export it again") from error
-    # Pillow reports a corrupt PNG as SyntaxError or ValueError, and PngError is one.
+        raise NerfroError(f"image {path} cannot be read (it is not an image); copy or export it again") from error
+    # Pillow reports a corrupt PNG as SyntaxError or ValueError; PngError is a ValueError.
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise NerfroError(f"image {path} cannot be read ({error}); copy or export it again") from error
 
 
 def _require_upright(image: Image.Image, path: Path) -> None:
-    """Refuse a photograph that shall be turned when it is shown: which pixels poses and masks mean, nobody knows."""
-    # Pillow itself turns TIFF.
+    """Refuse an EXIF orientation, because it is unknown whether poses and masks refer to the rotated pixels."""
+    # Pillow applies the orientation of TIFF files itself.
     orientation = image.getexif().get(ExifTags.Base.Orientation, 1) if "exif" in image.info else 1
     if orientation != 1:
         raise NerfroError(
-            f"image {path} asks to be turned or mirrored (EXIF orientation {orientation}); turn its pixels (magick "
-            "mogrify -auto-orient), or remove the entry (exiftool -Orientation=) where poses fit the pixels as stored"
+            f"image {path} has EXIF orientation {orientation}; rotate its pixels (magick mogrify -auto-orient), or "
+            "remove the entry (exiftool -Orientation=) if the poses belong to the pixels as stored"
         )
 
 
 def read_exposure(path: Path) -> tuple[float | None, float | None, float | None]:
-    """Exposure time in seconds, f-number and ISO sensitivity of a photograph, where its EXIF tells."""
+    """Read exposure time in seconds, f-number and ISO sensitivity from EXIF data; None for a missing value."""
     with _naming(path), Image.open(path) as image:
         tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
     named = ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings
@@ -85,7 +85,7 @@ def read_exposure(path: Path) -> tuple[float | None, float | None, float | None]
 
 
 def _positive(value: object) -> float | None:
-    """A tag's number; None where it is missing or means nothing."""
+    """Convert an EXIF value to a positive number, or None if it is missing or invalid."""
     try:
         number = float(value[0] if isinstance(value, tuple) else value)  # type: ignore[arg-type]
     except (TypeError, ValueError, ZeroDivisionError, IndexError):
@@ -95,7 +95,7 @@ def _positive(value: object) -> float | None:
 
 def _read_8bit(content: bytes, path: Path) -> UInt8[np.ndarray, "H W C"]:
     with Image.open(io.BytesIO(content)) as image:
-        # Pillow reduces colour TIFF of more bits without a word, as it does PNG; tag 258 is BitsPerSample.
+        # Pillow silently reduces colour TIFF and PNG to 8 bits. Tag 258 is BitsPerSample.
         deep_tiff = image.format == "TIFF" and max(image.tag_v2.get(258, (1,))) > 8
         if deep_tiff or image.mode in ("I", "F") or image.mode.startswith("I;"):
             raise NerfroError(f"image {path} has more than 8 bits per channel; save it as 8- or 16-bit PNG")
@@ -108,10 +108,10 @@ def _read_8bit(content: bytes, path: Path) -> UInt8[np.ndarray, "H W C"]:
 
 
 def read_rgb(path: Path, alpha: Alpha) -> Levels:
-    """Read an image's colours: `drop` takes them as they are, `white` and `black` composite them over that colour.
+    """Read the colours of an image. `drop` ignores transparency; `white` and `black` composite over this colour.
 
     Returns:
-        Levels [H, W, 3]; of 16 bits where colours were composited, else as the file has them.
+        Levels [H, W, 3]: 16 bits if the image was composited, otherwise the bits of the file.
     """
     levels = read_levels(path)
     num_colours = 1 if levels.shape[-1] < 3 else 3
@@ -123,7 +123,10 @@ def read_rgb(path: Path, alpha: Alpha) -> Levels:
 
 
 def read_mask(path: Path) -> Levels:
-    """Read the share [H, W] of each pixel that the object covers; a mask of levels 0 and 1 only is taken as labels."""
+    """Read the coverage [H, W] of each pixel by the object.
+
+    Of a coloured mask, the largest channel counts. A mask with the levels 0 and 1 only is read as labels.
+    """
     levels = read_levels(path)
     share = levels[..., : 1 if levels.shape[-1] < 3 else 3].max(-1)
     most = np.iinfo(levels.dtype).max
@@ -131,16 +134,13 @@ def read_mask(path: Path) -> Levels:
 
 
 def downscaled(size: tuple[int, int], factor: float) -> tuple[int, int]:
-    """The size (two sides) of a picture that is made smaller by a factor of 1 or more, in whole pixels."""
+    """Return the two sides of an image after downscaling by a factor of 1 or more, rounded to whole pixels."""
     first, second = (max(1, round(side / factor)) for side in size)
     return first, second
 
 
 def area_mean(values: Float[np.ndarray, "H W *C"], size: tuple[int, int]) -> Float[np.ndarray, "h w *C"]:
-    """The whole picture in a size (height, width) no larger than its own.
-
-    A pixel is the mean of what it covers; pixels that it covers in part count by that part.
-    """
+    """Downscale an image to a size (height, width); each pixel becomes the mean of the area that it covers."""
     height, width = values.shape[:2]
     if size == (height, width):
         return values
@@ -155,7 +155,7 @@ def area_mean(values: Float[np.ndarray, "H W *C"], size: tuple[int, int]) -> Flo
 
 
 def _coverage(count: int, fewer: int) -> csr_array:
-    """The share [fewer, count] of each of `fewer` equal pieces of a line that each of `count` equal ones covers."""
+    """Return weights [fewer, count] that average `count` samples of a line over `fewer` intervals of equal length."""
     edges = np.union1d(np.arange(count + 1) / count, np.arange(fewer + 1) / fewer)
     middle, length = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
     places = (middle * fewer).astype(int), (middle * count).astype(int)

@@ -1,4 +1,4 @@
-"""Masks, silhouettes of the refractive object and pixels to ignore: where their files lie, and how they are read."""
+"""Masks: search and read silhouettes of the refractive object, and masks of pixels to ignore."""
 
 from __future__ import annotations
 
@@ -14,44 +14,50 @@ from PIL import Image
 from nerfro.cli import warn
 from nerfro.data.base import Views
 from nerfro.data.image_files import Levels, read_levels, read_mask, read_size
-from nerfro.data.pictures import Pictures
+from nerfro.data.lazy_images import LazyImages
 from nerfro.errors import NerfroError, first_of
 
 _SPLIT_FOLDERS = ("train", "val", "test")
-# Of masks, the better kept ones first; cameras and networks write either case.
+# Lossless format first. Cameras and networks write suffixes in lower or upper case.
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
-_left_out: ContextVar[bool] = ContextVar("left_out", default=False)
+_ignore_masks: ContextVar[bool] = ContextVar("ignore_masks", default=False)
 
 
 @contextlib.contextmanager
-def masks_left_out() -> Iterator[None]:
-    """Data that are loaded within it have no masks, for the tool that makes the missing ones: loaders refuse a part."""
-    token = _left_out.set(True)
+def without_masks() -> Iterator[None]:
+    """Load data sets without masks inside this context. The masking command uses this while masks are incomplete."""
+    token = _ignore_masks.set(True)
     try:
         yield
     finally:
-        _left_out.reset(token)
+        _ignore_masks.reset(token)
 
 
 def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None:
-    """The file of an image's silhouette, or None where there is none.
+    """Find the silhouette of an image.
 
-    Looked for in this order, `<stem>` the image's name without extension and `<folder>` its folder within the root:
-    the stated path; `mask_<stem>.png` beside the image; `masks/<folder>/<stem>.png` or `<stem>.<extension>.png`
-    (COLMAP's form) in the root, also without the folder's first part unless that is a split's (`images/a.jpg` has
-    `masks/a.png`, but `train/a.png` has only `masks/train/a.png`, for `test/a.png` is another picture). JPEG will do
-    where there is no PNG.
+    The first existing file is used, where `<stem>` is the image's name without extension and `<folder>` is its folder
+    within the root. PNG is preferred to JPEG.
+
+    1. the stated path;
+    2. `mask_<stem>.png` beside the image;
+    3. `masks/<folder>/<stem>.png` or `masks/<folder>/<stem>.<extension>.png` (COLMAP's convention);
+    4. the same without the first component of `<folder>`, unless this is the name of a split. For example,
+       `images/a.jpg` may use `masks/a.png`, but `train/a.png` may not, because `test/a.png` is another image.
 
     Args:
-        root: the data set's folder.
-        image: the image's file.
-        stated: path within the root that the data set itself gives, if it does; the file must exist.
+        root: folder of the data set.
+        image: the image file.
+        stated: path of the silhouette within the root as stated by the data set, if any. The file must exist.
+
+    Returns:
+        The file, or None if there is no silhouette.
     """
     if stated is not None:
         mask = root / stated.replace("\\", "/")
         if not mask.is_file():
-            raise NerfroError(f"mask {mask} of {image} does not exist; restore it or take its path out of the data set")
+            raise NerfroError(f"mask {mask} of {image} does not exist; restore it or remove its path from the data set")
         return mask
     candidates = [image.with_name(f"mask_{image.stem}{suffix}") for suffix in _SUFFIXES]
     if image.is_relative_to(root):
@@ -67,60 +73,65 @@ def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None
 
 def find_masks(
     images: Sequence[Path], masks: Sequence[Path | None], downscale: float, size: tuple[int, int]
-) -> Pictures | None:
-    """The silhouettes of images; where they have no files, the images' transparency, if they have any.
+) -> LazyImages | None:
+    """Load the silhouettes of images; without silhouette files, the transparency of the images is used.
 
     Args:
-        images: the images' files.
-        masks: the silhouettes' files. Where only some images have one, the user is told, and none is taken.
-        downscale: how many times smaller they become.
-        size: width and height of the images in pixels before downscaling.
+        images: image files.
+        masks: silhouette files. If only some images have one, none is used, with a warning.
+        downscale: downscaling factor, 1 or more.
+        size: stored width and height of the images in pixels.
 
     Returns:
-        Share of each pixel that the object covers; None where there are no silhouettes.
+        Coverage of each pixel by the object in [0, 1], or None if there are no silhouettes.
     """
-    if _left_out.get():
+    if _ignore_masks.get():
         return None
-    bare = [image.name for image, mask in zip(images, masks, strict=True) if mask is None]
-    if 0 < len(bare) < len(images):
-        told = f"{len(bare)} of {len(images)} images have no mask ({first_of(bare)})"
-        warn(f"{told}: a hull is made of the others, and nothing is scored on the object alone")
+    unmasked = [image.name for image, mask in zip(images, masks, strict=True) if mask is None]
+    if 0 < len(unmasked) < len(images):
+        warn(
+            f"{len(unmasked)} of {len(images)} images have no mask ({first_of(unmasked)}): the visual hull uses the "
+            "others, and no scores of the object alone are computed"
+        )
         return None
-    if not bare:
+    if not unmasked:
         return _of_files(images, masks, read_mask, downscale, size)
-    return Pictures.of(images, _read_alpha, downscale) if _is_transparent(images[0]) else None
+    return LazyImages.of(images, _read_alpha, downscale) if _is_transparent(images[0]) else None
 
 
 def masked_views(views: Views) -> Views:
-    """The views that have masks, where some have none."""
+    """Select the views that have mask files, if only some views have one; otherwise, return all views."""
     chosen = [i for i, frame in enumerate(views.frames) if frame.mask is not None]
-    if views.masks is not None or not chosen or not isinstance(views.images, Pictures):
+    if views.masks is not None or not chosen or not isinstance(views.images, LazyImages):
         return views
-    frames, pictures = [views.frames[i] for i in chosen], views.images
+    frames = [views.frames[i] for i in chosen]
     files = [frame.image for frame in frames]
-    masks = find_masks(files, [frame.mask for frame in frames], pictures.downscale, pictures.size[::-1])
+    masks = find_masks(files, [frame.mask for frame in frames], views.images.downscale, views.images.size[::-1])
     assert masks is not None
-    images = replace(pictures, files=files)
-    if pictures.window is not None:
-        masks = masks.cut(pictures.window)
+    images = replace(views.images, files=files)
+    if images.window is not None:
+        masks = masks.cut(images.window)
     return Views(views.cameras.select(chosen), images, masks, [views.names[i] for i in chosen], frames=frames)
 
 
 def find_usable(
     images: Sequence[Path], masks: Sequence[Path | None], downscale: float, size: tuple[int, int]
-) -> Pictures:
-    """Masks that rule pixels out: black ones are ignored, white ones are used, grey ones by the nearer of the two.
+) -> LazyImages:
+    """Load masks of the pixels to ignore (black) and to use (white); grey counts as the nearer of both.
 
-    Arguments are those of `find_masks`; every image must have a mask that leaves a pixel. The result is 1 in the pixels
-    that are used, less in all others; a block of averaged pixels is used if all of it is.
+    The arguments are those of `find_masks`, but every image must have a mask that leaves at least one pixel.
+
+    Returns:
+        Images that are 1 in usable pixels and less than 1 in all others. After downscaling, a pixel is usable if its
+        whole area is.
     """
     usable = _of_files(images, masks, _read_usable, downscale, size)
     for image, mask, levels in zip(images, masks, usable.all_levels(), strict=True):
         if levels.max() < np.iinfo(levels.dtype).max:
-            smaller = f" at data.downscale={downscale:g}" if downscale > 1 else ""
+            scale = f" at data.downscale={downscale:g}" if downscale > 1 else ""
             raise NerfroError(
-                f"mask {mask} rules out all pixels of {image}{smaller}: black is ignored, white is used; "
-                "is it inverted? Correct it or take the frame out"
+                f"mask {mask} excludes all pixels of {image}{scale}: black pixels are ignored, white pixels are used; "
+                "invert the mask or remove the frame"
             )
     return usable
 
@@ -131,22 +142,22 @@ def _of_files(
     read: Callable[[Path], Levels],
     downscale: float,
     size: tuple[int, int],
-) -> Pictures:
+) -> LazyImages:
     files = [mask for mask in masks if mask is not None]
     if len(files) < len(images):
-        bare = [str(image) for image, mask in zip(images, masks, strict=True) if mask is None]
+        unmasked = [str(image) for image, mask in zip(images, masks, strict=True) if mask is None]
         raise NerfroError(
-            f"{len(bare)} of {len(images)} images have no mask ({bare[0]} is the first) but others have; "
-            "give all of them masks, or none"
+            f"{len(unmasked)} of {len(images)} images have no mask ({unmasked[0]} is the first); "
+            "give masks for all images or for none"
         )
     for mask in files:
         width, height, _ = read_size(mask)
         if (width, height) != size:
             raise NerfroError(
                 f"mask {mask} has {width}x{height} pixels but its image has {size[0]}x{size[1]}; "
-                "make it again for the image as it is"
+                "create it again in the size of the image"
             )
-    return Pictures.of(files, read, downscale)
+    return LazyImages.of(files, read, downscale)
 
 
 def _read_usable(mask: Path) -> Levels:
@@ -156,13 +167,13 @@ def _read_usable(mask: Path) -> Levels:
 
 
 def _is_transparent(image: Path) -> bool:
-    """Whether an image has pixels that are not opaque; alpha that is 1 everywhere says nothing."""
+    """Return whether an image has pixels that are not opaque."""
     try:
         with Image.open(image) as opened:
             if not opened.has_transparency_data:  # known without decoding
                 return False
     except OSError:
-        return False  # told where the colours are read
+        return False  # the error is reported when the colours are read
     levels = _read_alpha(image)
     return bool((levels < np.iinfo(levels.dtype).max).any())
 

@@ -1,4 +1,4 @@
-"""The RefRef benchmark, as its parquet files come from its host."""
+"""Data format of the RefRef benchmark: parquet files."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from jaxtyping import Float
 
 from nerfro.allowed import Distance, Factor
 from nerfro.data.base import Frame, Views
-from nerfro.data.frames import SPLITS, Lens, PosedImages, check_pose
-from nerfro.data.image_files import Alpha
+from nerfro.data.frames import SPLITS, FrameSet, Lens, PosedImages, check_pose
+from nerfro.data.image_files import Alpha, read_size
 from nerfro.data.transforms import parse_matrix
 from nerfro.errors import NerfroError
 from nerfro.registry import register
 
-# Constants of RefRef's refref_dataparser.py: horizontal field of view, half side of the scene's box, views of a split.
+# Constants of RefRef's refref_dataparser.py: horizontal field of view, half side of the scene box, views per split.
 _CAMERA_ANGLE_X = 1.1656107902526855
 _HALF_SIDE = 7.3
 _VIEWS_PER_SPLIT = 100
@@ -30,13 +30,15 @@ _COLUMNS = ["image", "mask", "transform_matrix"]
 
 @register("data", "refref")
 class RefRefData(PosedImages):
-    """A scene of RefRef: rows of image, mask and pose (OpenGL axes), a hundred each for train, val and test.
+    """Read a scene of RefRef: rows of image, mask and pose, a hundred rows each for train, val and test.
+
+    Poses have OpenGL camera axes.
 
     Args:
-        root: folder with the scene's .parquet files, at any depth.
-        scene: its name, such as cube_smcvx_ampoule; none where the folder holds one scene alone.
-        near, far, downscale, alpha: see `PosedImages`; `far` none takes, from the farthest camera of all splits, the
-            farthest corner of RefRef's box of side 14.6.
+        root: folder that contains the .parquet files of the scene at any depth.
+        scene: name of the scene, such as cube_smcvx_ampoule. It may be omitted if the folder holds one scene.
+        near, far, downscale, alpha: see `PosedImages`. The default of `far` is the greatest distance between any camera
+            and any corner of RefRef's scene box, whose side is 14.6.
     """
 
     def __init__(
@@ -52,19 +54,21 @@ class RefRefData(PosedImages):
         self.scene = scene
 
     def load(self, split: str) -> Views:
-        self.require(split)
+        return replace(super().load(split), frames=())  # the unpacked files exist only while this process runs
+
+    def read(self, split: str) -> FrameSet:
         files = self._files()
         first = SPLITS.index(split) * _VIEWS_PER_SPLIT
         rows = _read_rows(files, range(first, first + _VIEWS_PER_SPLIT), _COLUMNS)
         farthest = _find_far(files) if self.far is None else 0.0
         folder = Path(tempfile.mkdtemp(dir=_unpacked().name))
         frames = [_unpack(row, number, folder, files[0]) for number, row in rows]
-        lens = functools.partial(Lens.of_angle, _CAMERA_ANGLE_X)
-        views = self.views(frames, lambda w, h: [lens(w, h)] * len(frames), "opengl", farthest=farthest)
-        return replace(views, frames=())  # their files go with this process
+        width, height, _ = read_size(frames[0].image)
+        lenses = [Lens.of_angle(_CAMERA_ANGLE_X, width, height)] * len(frames)
+        return FrameSet(frames, lenses, "opengl", far=farthest)
 
     def _files(self) -> list[Path]:
-        """The scene's files in order."""
+        """List the files of the scene in order."""
         pattern = "*.parquet" if self.scene is None else f"{self.scene}-*.parquet"
         files = sorted(self.root.rglob(pattern)) or sorted(self.root.rglob(f"{self.scene}.parquet"))
         if not files:
@@ -78,19 +82,23 @@ class RefRefData(PosedImages):
 
 @functools.cache
 def _unpacked() -> tempfile.TemporaryDirectory[str]:
-    """Where pictures are unpacked, for as long as this process runs."""
+    """Return the folder for unpacked images, which is deleted when the process ends."""
     return tempfile.TemporaryDirectory(prefix="nerfro_refref_")
 
 
 def _find_far(files: list[Path]) -> float:
-    """The default far bound, one for all splits."""
+    """Compute the default far bound, which is the same for all splits."""
     rows = _read_rows(files, range(len(SPLITS) * _VIEWS_PER_SPLIT), ["transform_matrix"])
     distance = max(float(np.linalg.norm(_pose(row, f"{files[0].name}: row {number}")[:, 3])) for number, row in rows)
     return distance + math.sqrt(3) * _HALF_SIDE
 
 
 def _read_rows(files: list[Path], numbers: range, columns: list[str]) -> list[tuple[int, dict[str, Any]]]:
-    """Number and content of the rows of a range, as far as there are any."""
+    """Read the existing rows of a range.
+
+    Returns:
+        Number and content of each row.
+    """
     try:
         import pyarrow
         import pyarrow.parquet
@@ -108,7 +116,9 @@ def _read_rows(files: list[Path], numbers: range, columns: list[str]) -> list[tu
             if len(wanted):
                 missing = [name for name in columns if name not in table.schema_arrow.names]
                 if missing:
-                    raise NerfroError(f"{path} has no column '{missing[0]}'; is it a file of RefRef?")
+                    raise NerfroError(
+                        f"{path} has no column '{missing[0]}', so it is not a file of RefRef; correct data.root"
+                    )
                 part = table.read(columns).slice(wanted.start - offset, len(wanted))
                 rows += zip(wanted, part.to_pylist(), strict=True)
         except (pyarrow.ArrowException, OSError) as error:
@@ -117,19 +127,19 @@ def _read_rows(files: list[Path], numbers: range, columns: list[str]) -> list[tu
         offset += num_rows
     if not rows:
         raise NerfroError(
-            f"{files[0].parent} holds {offset} rows, none from {numbers.start} on; is a file of the scene missing?"
+            f"{files[0].parent} holds {offset} rows, none from {numbers.start} on; download the missing files"
         )
     return rows
 
 
 def _unpack(row: dict[str, Any], number: int, folder: Path, source: Path) -> Frame:
-    """Write a row's pictures where the common reader finds them."""
+    """Write the image and mask of a row to PNG files, and return the frame."""
     where = f"{source.name}: row {number}"
     paths = []
     for column in ("image", "mask"):
         content = (row[column] or {}).get("bytes")
         if content is None:
-            raise NerfroError(f"{where}: '{column}' holds no picture; download the file again")
+            raise NerfroError(f"{where}: '{column}' holds no image; download the file again")
         paths.append(folder / f"{column}_{number:04d}.png")
         paths[-1].write_bytes(content)
     return Frame(paths[0].name, paths[0], paths[1], _pose(row, where))

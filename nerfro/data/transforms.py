@@ -1,4 +1,4 @@
-"""Reading `transforms_<split>.json` files: frames with a pose, an image and perhaps a mask."""
+"""Reader of `transforms_<split>.json` files, which list images with poses and optional masks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from nerfro.cli import warn
 from nerfro.data.base import Frame
-from nerfro.data.frames import SPLITS, check_pose
+from nerfro.data.frames import SPLITS, check_pose, require_root
 from nerfro.data.image_files import IMAGE_SUFFIXES
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError, first_of
@@ -23,21 +23,27 @@ from nerfro.errors import NerfroError, first_of
 
 @dataclass(frozen=True)
 class Manifest:
-    """A parsed `transforms_<split>.json` and its checked frames, at least one."""
+    """A parsed `transforms_<split>.json`.
+
+    Attributes:
+        path: the file.
+        document: content of the file.
+        frames: checked frames, at least one.
+    """
 
     path: Path
     document: Mapping[str, object]
     frames: list[Frame]
 
     def require(self, key: str, meaning: str) -> object:
-        """A value that the document must have."""
+        """Return a required value; `meaning` explains the key in the error message."""
         if key not in self.document:
             raise NerfroError(f"{self.path} has no '{key}' ({meaning}); add it")
         return self.document[key]
 
     @property
     def size(self) -> tuple[int, int] | None:
-        """Width and height of the images in pixels, where the file states them (`w` and `h`)."""
+        """Width and height of the images in pixels (`w` and `h`), or None if the file does not state both."""
         width, height = self.document.get("w"), self.document.get("h")
         if width is None or height is None:
             return None
@@ -47,37 +53,37 @@ class Manifest:
 
 
 def find_splits(root: Path) -> dict[str, Path]:
-    """The transforms files of a folder by split: `transforms_train.json` or `train_transforms.json`, at least one."""
-    if not root.is_dir():
-        raise NerfroError(f"data.root={root} is not a folder; give the one that holds transforms_train.json")
+    """Find the transforms files of a folder by split: `transforms_train.json` or `train_transforms.json`.
+
+    Returns:
+        At least one file; train, val and test come first.
+    """
+    require_root(root)
     found = {path.stem.removesuffix("_transforms"): path for path in root.glob("*_transforms.json")}
     found |= {path.stem.removeprefix("transforms_"): path for path in root.glob("transforms_*.json")}
     if not found:
         raise NerfroError(
-            f"data.root={root} holds no transforms_<split>.json; give a folder that does, see docs/data.md"
+            f"data.root={root} holds no transforms_<split>.json; give the folder of a data set, see docs/data.md"
         )
     rank = {name: i for i, name in enumerate(SPLITS)}
     return {name: found[name] for name in sorted(found, key=lambda name: (rank.get(name, len(rank)), name))}
 
 
 def read_manifest(root: Path, split: str, mask_key: str = "mask_path", skip_missing: bool = False) -> Manifest:
-    """Read and check the transforms file of a split, see `parse_manifest`."""
-    splits = find_splits(root)
-    if split not in splits:
-        raise NerfroError(f"data.root={root} has no split '{split}'; it has {', '.join(splits)}")
-    return parse_manifest(splits[split], mask_key, skip_missing)
+    """Read and check the transforms file of an existing split; see `parse_manifest`."""
+    return parse_manifest(find_splits(root)[split], mask_key, skip_missing)
 
 
 def parse_manifest(path: Path, mask_key: str = "mask_path", skip_missing: bool = False) -> Manifest:
     """Read and check a transforms file.
 
     Args:
-        path: of the file.
-        mask_key: key of a frame's silhouette. Under another than the usual one, none is looked for beside the images.
-        skip_missing: leave frames out whose image does not exist, and say so in one line.
+        path: the file.
+        mask_key: key of a frame's silhouette. With the default key, silhouettes are also searched beside the images.
+        skip_missing: skip frames whose image does not exist, with one warning.
 
     Raises:
-        NerfroError: the file is truncated or lacks a key; a frame has no image, a bad pose or another frame's name.
+        NerfroError: the file is truncated or lacks a key, or a frame has no image, an invalid pose or a repeated name.
     """
     document = read_json(path, "check its permissions")
     frames = document.get("frames") if isinstance(document, dict) else None
@@ -92,28 +98,28 @@ def parse_manifest(path: Path, mask_key: str = "mask_path", skip_missing: bool =
     counts = Counter(frame.image for frame in read)  # by file: `r_0` and `r_0.png` are one image
     repeated = list(dict.fromkeys(f"'{frame.name}'" for frame in read if counts[frame.image] > 1))
     if repeated:
-        raise NerfroError(f"{path}: {first_of(repeated)} occurs in several frames; keep one of each")
+        raise NerfroError(f"{path}: {first_of(repeated)} occurs in several frames; keep one frame per image")
     return Manifest(path, document, read)
 
 
 def read_json(path: Path, unreadable: str) -> Any:
-    """The content of a JSON file; `unreadable` is what to tell the user of one that cannot be opened."""
+    """Read a JSON file; `unreadable` is the advice in the error message for a file that cannot be opened."""
     try:
-        # Whole numbers too long for any use become infinite ones, which are refused where they are read.
-        long = 300
-        return json.loads(path.read_text("utf-8"), parse_int=lambda text: int(text) if len(text) < long else math.inf)
+        # Python refuses very long integers. Infinity takes their place and is refused where the value is used.
+        parse_int = lambda text: int(text) if len(text) < 300 else math.inf  # noqa: E731
+        return json.loads(path.read_text("utf-8"), parse_int=parse_int)
     except OSError as error:
         raise NerfroError(f"{path} cannot be read ({error.strerror}); {unreadable}") from error
     except (ValueError, RecursionError) as error:
-        raise NerfroError(f"{path} is not valid JSON ({error}): truncated? copy or export it again") from error
+        raise NerfroError(f"{path} is not valid JSON ({error}); copy or export it again") from error
 
 
 def parse_matrix(value: object, shapes: tuple[tuple[int, int], ...], where: str) -> Float[np.ndarray, "rows columns"]:
-    """A matrix of finite numbers of one of the shapes."""
+    """Convert nested lists to a matrix of finite numbers that has one of the shapes."""
     allowed = " or ".join(f"{rows}x{columns}" for rows, columns in shapes)
     try:
         matrix = np.array(value)
-    except ValueError:  # rows of several lengths
+    except ValueError:  # rows of different lengths
         matrix = np.empty(0, object)
     if matrix.dtype.kind not in "fiu":
         raise NerfroError(f"{where} is not a matrix of numbers; give {allowed} numbers")
@@ -128,18 +134,18 @@ def parse_matrix(value: object, shapes: tuple[tuple[int, int], ...], where: str)
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    """Whether a JSON value is a finite number."""
+    """Return whether a JSON value is a finite number."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _with_images(path: Path, frames: list) -> list:
-    """The frames but for those whose image does not exist; what is wrong with others is told when they are read."""
+    """Drop the frames whose image does not exist, with a warning. Other errors are reported by `_read_frame`."""
     names = [frame.get("file_path") if isinstance(frame, dict) else None for frame in frames]
     missing = [isinstance(name, str) and _existing_image(path.parent, name) is None for name in names]
     if all(missing) or not any(missing):
         return frames
-    told = first_of([str(name) for name, gone in zip(names, missing, strict=True) if gone])
-    warn(f"{path}: {sum(missing)} of {len(frames)} frames have no image and are skipped: {told}")
+    skipped = first_of([str(name) for name, gone in zip(names, missing, strict=True) if gone])
+    warn(f"{path}: {sum(missing)} of {len(frames)} frames have no image and are skipped: {skipped}")
     return [frame for frame, gone in zip(frames, missing, strict=True) if not gone]
 
 
@@ -150,7 +156,7 @@ def _read_frame(path: Path, index: int, entry: object, mask_key: str) -> Frame:
     for key in ("file_path", "transform_matrix"):
         if key not in entry:
             raise NerfroError(f"{where} has no '{key}'; add it or take the frame out")
-    # RefRef's key for the silhouette.
+    # `mask_file_path` is RefRef's key for the silhouette.
     stated = entry.get(mask_key, entry.get("mask_file_path"))
     if not isinstance(entry["file_path"], str) or not isinstance(stated, str | None):
         raise NerfroError(f"{where}: 'file_path' and '{mask_key}' must be text")
@@ -161,12 +167,12 @@ def _read_frame(path: Path, index: int, entry: object, mask_key: str) -> Frame:
     if image is None:
         missing = _candidates(path.parent, name)[0]
         raise NerfroError(f"{where}: image {missing} does not exist; restore it or take the frame out")
-    looked_for = mask_key == "mask_path" or stated is not None
-    return Frame(name, image, find_mask(path.parent, image, stated) if looked_for else None, pose)
+    has_mask = mask_key == "mask_path" or stated is not None
+    return Frame(name, image, find_mask(path.parent, image, stated) if has_mask else None, pose)
 
 
 def _candidates(root: Path, name: str) -> list[Path]:
-    """Where the image of a `file_path` may be, with or without extension."""
+    """List the possible image files of a `file_path`, which may lack its extension."""
     name = name.replace("\\", "/")
     known = PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES
     return [root / name] if known else [root / f"{name}{suffix}" for suffix in IMAGE_SUFFIXES]

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from nerfro.data.pictures import Pictures
+from nerfro.data.lazy_images import LazyImages
 from nerfro.light import to_linear
 from nerfro.losses.backdrop import shows
 from nerfro.registry import find
@@ -19,7 +19,7 @@ _LOOKED_AT = 8
 _OF_BORDER, _OF_PICTURES, _OF_PIXELS = 0.9, 0.8, 0.3
 
 
-def settle_backdrop(config: DictConfig, images: Pictures | Float[Tensor, "V H W 3"]) -> None:
+def settle_backdrop(config: DictConfig, images: LazyImages | Float[Tensor, "V H W 3"]) -> None:
     """Where photographs are cut out on one colour, tell `loss=backdrop`, and put that colour beyond the volume.
 
     Args:
@@ -46,7 +46,7 @@ def describe(config: DictConfig) -> str:
     return f"Photographs are cut out on ({levels}), so that is beyond the volume; loss.backdrop.weight=0 for a sky.\n"
 
 
-def find_backdrop(images: Pictures | Float[Tensor, "V H W 3"]) -> list[float] | None:
+def find_backdrop(images: LazyImages | Float[Tensor, "V H W 3"]) -> list[float] | None:
     """The one colour (sRGB in [0, 1]) on which nearly all of the pictures are cut out, or None."""
     step = max(1, len(images) // _LOOKED_AT)
     looked_at = [images[view] for view in range(0, len(images), step)]

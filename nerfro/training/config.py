@@ -12,7 +12,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from nerfro.allowed import Count, Natural, NotNegative, NumRays, Positive, Range, Resolution, Side
 from nerfro.data.base import DataSource, Views
 from nerfro.data.exposure import exif_exposures
-from nerfro.data.held_back import HeldBack
+from nerfro.data.validation_views import WithValidationViews
 from nerfro.errors import NerfroError
 from nerfro.losses.base import Loss
 from nerfro.media.analytic import Vacuum
@@ -163,7 +163,7 @@ class TrainConfig:
 def build_data(config: DictConfig) -> DataSource:
     """The data of a run; views that it holds back are their `val` split."""
     source, number = build(config.data), OmegaConf.select(config, "batches.hold_back")  # which older checkpoints lack
-    return HeldBack(source, number) if number else source
+    return WithValidationViews(source, number) if number else source
 
 
 def build_losses(nodes: DictConfig, known: bool = True) -> dict[str, Loss]:

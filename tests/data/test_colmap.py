@@ -1,113 +1,73 @@
-"""COLMAP's text and binary models, written here from its documentation and read back; pycolmap as a second witness."""
+"""COLMAP's text and binary models, against COLMAP's documentation and pycolmap."""
 
 from __future__ import annotations
 
-import struct
+import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
+import trimesh
+from omegaconf import OmegaConf
 
-from nerfro.data.colmap import ColmapData
+from nerfro.data.base import Views
 from nerfro.data.colmap_model import CAMERA_MODELS, read_colmap
 from nerfro.errors import NerfroError
 
-from .photographs import (
-    CX,
-    CY,
-    FX,
-    FY,
-    HEIGHT,
-    POINTS,
-    WIDTH,
-    camera_to_world,
-    check_views,
-    save_mask,
-    save_picture,
-    world_to_camera,
-)
+from .formats import BROWN, FORMATS, OPENCV, TRAIN, write_colmap
+from .photographs import CX, CY, FX, FY, HEIGHT, POINTS, WIDTH, camera_to_world, check_views, save_picture
 
-OPENCV = ("OPENCV", (FX, FY, CX, CY, -0.1, 0.02, 0.003, -0.002))
 TORCH_POINTS = torch.from_numpy(POINTS).float()
-NUMBERS = {name: i for i, (name, _) in enumerate(CAMERA_MODELS)}
+TINY = [
+    "sampler.points.num_samples=8",
+    "sampler.points.num_bins=16",
+    "sampler.points.resolution=16",
+    "field.num_levels=4",
+    "field.log2_table_size=10",
+    "field.width=16",
+    "medium.resolution=32",
+    "medium.cache=false",
+    "batches.size=32",
+    "evaluation.supersample=1",
+    "trainer.accelerator=cpu",
+    "trainer.max_steps=2",
+    "trainer.max_time=null",
+    "logger=none",
+]
 
 
-def quaternion(matrix: np.ndarray) -> np.ndarray:
-    """Scalar first, as COLMAP writes it."""
-    return np.roll(Rotation.from_matrix(matrix[:, :3]).as_quat(), 1)
-
-
-def write_binary(folder: Path, cameras: dict, images: list, points: np.ndarray) -> None:
-    folder.mkdir(parents=True)
-    content = struct.pack("<Q", len(cameras))
-    for number, (model, params) in cameras.items():
-        content += struct.pack("<iiQQ", number, NUMBERS[model], WIDTH, HEIGHT) + struct.pack(
-            f"<{len(params)}d", *params
-        )
-    (folder / "cameras.bin").write_bytes(content)
-    content = struct.pack("<Q", len(images))
-    for i, (name, camera, matrix) in enumerate(images, 1):
-        content += struct.pack("<i4d3di", i, *quaternion(matrix), *matrix[:, 3], camera) + name.encode() + b"\0"
-        # The second image has seen all points, the others have features that are none.
-        seen = range(1, len(points) + 1) if i == 2 else (-1, -1)
-        content += struct.pack("<Q", len(seen)) + b"".join(struct.pack("<ddq", 1.5, 2.5, n) for n in seen)
-    (folder / "images.bin").write_bytes(content)
-    content = struct.pack("<Q", len(points))
-    for i, point in enumerate(points, 1):
-        content += struct.pack("<Q3d3BdQ", i, *point, 9, 8, 7, 0.4, 1) + struct.pack("<ii", 2, i - 1)
-    (folder / "points3D.bin").write_bytes(content)
-
-
-def write_text(folder: Path, cameras: dict, images: list, points: np.ndarray) -> None:
-    folder.mkdir(parents=True)
-    row = lambda *values: " ".join(map(str, values)) + "\n"  # noqa: E731
-    lines = [row(n, model, WIDTH, HEIGHT, *map(repr, map(float, p))) for n, (model, p) in cameras.items()]
-    (folder / "cameras.txt").write_text("# Camera list\n" + "".join(lines))
-    lines = []
-    for i, (name, camera, matrix) in enumerate(images, 1):
-        pose = map(repr, map(float, (*quaternion(matrix), *matrix[:, 3])))
-        # The second line may be empty: an image without features.
-        seen = " ".join(f"1.5 2.5 {n}" for n in range(1, len(points) + 1)) if i == 2 else ""
-        lines.append(row(i, *pose, camera, name) + seen + "\n")
-    (folder / "images.txt").write_text("# Image list\n" + "".join(lines))
-    lines = [row(i, *map(repr, map(float, point)), 9, 8, 7, 0.4, 2, i - 1) for i, point in enumerate(points, 1)]
-    (folder / "points3D.txt").write_text("".join(lines))
-
-
-WRITERS = {"binary": write_binary, "text": write_text}
+def load(root: Path, split: str = "train", **options: Any) -> Views:
+    return FORMATS["colmap"].load(root, split, **options)
 
 
 @pytest.fixture
-def write(tmp_path):
-    """Write images and a model of six views, cameras by number and the camera of each image to choose."""
-
-    def write(how="binary", cameras={1: OPENCV}, camera=lambda i: 1, masks=False, points=POINTS):  # noqa: B006
-        images = []
-        for i in (4, 0, 5, 2, 1, 3):  # in no order
-            save_picture(tmp_path / f"images/top/v{i}.png", i)
-            if masks:
-                save_mask(tmp_path / f"masks/top/v{i}.png.png", i)
-            images.append((f"top/v{i}.png", camera(i), world_to_camera(i)))
-        WRITERS[how](tmp_path / "sparse/0", cameras, images, points)
-        return tmp_path
-
-    return write
+def write(tmp_path: Path) -> Callable[..., Path]:
+    return lambda form="binary", **changes: write_colmap(tmp_path, form=form, **changes)
 
 
-def load(root, split="train", **options):
-    return ColmapData(str(root), **{"near": 0.5, "far": 9.0, "test_every": 3} | options).load(split)
+def test_text_models_are_read_and_views_are_sorted_by_name(write):
+    root = write("text", masks=True)
+    check_views(load(root), list(TRAIN), **BROWN)
+    assert load(root, "test").names == ["top/v0.png", "top/v3.png"]
 
 
-@pytest.mark.parametrize("how", WRITERS)
-def test_points_project_onto_their_pixels_in_both_forms(write, how):
-    root = write(how, masks=True)
-    distortion = {"k": OPENCV[1][4:6], "p": OPENCV[1][6:]}
-    check_views(load(root), [1, 2, 4, 5], **distortion)
-    test = load(root, "test")
-    check_views(test, [0, 3], **distortion)
-    assert test.names == ["top/v0.png", "top/v3.png"]
+def test_a_reconstruction_with_a_distorting_lens_trains_in_a_room(write, train_here, tmp_path):
+    root, run = write(), tmp_path / "run"
+    trimesh.creation.icosphere(2, 0.3).export(root / "mesh.ply")
+    finished = train_here(
+        "+experiment=refractive_room", "data=colmap", f"data.root={root}", "data.test_every=3", *TINY,
+        f"hydra.run.dir={run}",
+    )  # fmt: skip
+    assert finished.code == 0, finished.err
+    rows = json.loads((run / "metrics.json").read_text())["views"]
+    assert len(rows) == 2
+    config = OmegaConf.load(run / "config.yaml")
+    middle = [0.5 * (low + high) for low, high in zip(config.field.box_min, config.field.box_max, strict=True)]
+    assert middle == pytest.approx([0, 0, 0], abs=1e-4)  # of the mesh
+    assert config.field.radius == config.sampler.points.radius > 0.5
 
 
 @pytest.mark.parametrize(
@@ -125,7 +85,7 @@ def test_points_project_onto_their_pixels_in_both_forms(write, how):
     ],
 )
 def test_every_perspective_model_is_read(write, model, params, lens):
-    check_views(load(write(cameras={7: (model, params)}, camera=lambda i: 7)), [1, 2, 4, 5], **lens)
+    check_views(load(write(cameras={7: (model, params)}, camera=lambda i: 7)), list(TRAIN), **lens)
 
 
 def test_pycolmap_writes_what_is_read_and_reads_what_is_written(write, tmp_path):
@@ -165,7 +125,7 @@ def test_bounds_come_from_the_points_unless_they_are_given(write):
 
 def test_without_points_bounds_must_be_given(write):
     root = write(points=np.zeros((0, 3)))
-    with pytest.raises(NerfroError, match=r"no 3-D points in view to take bounds from; set data\.near and data\.far"):
+    with pytest.raises(NerfroError, match=r"no 3-D points in view to find bounds from; set data\.near and data\.far"):
         load(root, far=None)
     (root / "sparse/0/points3D.bin").unlink()
     assert len(load(root)) == 4
@@ -196,10 +156,10 @@ def test_truncated_and_overlong_binary_files_are_refused(write, file):
     whole = path.read_bytes()
     for cut in (3, 20, len(whole) - 1):
         path.write_bytes(whole[:cut])
-        with pytest.raises(NerfroError, match=rf"{file}\.bin ends too early: truncated\?"):
+        with pytest.raises(NerfroError, match=rf"{file}\.bin is truncated; copy or export it again"):
             load(root)
     path.write_bytes(whole + b"\0")
-    with pytest.raises(NerfroError, match=rf"{file}\.bin goes on after its last item"):
+    with pytest.raises(NerfroError, match=rf"{file}\.bin continues after its last item"):
         load(root)
 
 
@@ -207,10 +167,10 @@ def test_truncated_and_overlong_binary_files_are_refused(write, file):
     ("file", "old", "new", "message"),
     [
         ("cameras", f"OPENCV {WIDTH}", f"OPENCV {WIDTH}.5", r"cameras\.txt, line 2 is not CAMERA_ID MODEL"),
-        ("cameras", " -0.002", "", "line 2: OPENCV has 8 parameters, not 7"),
+        ("cameras", " -0.003", "", "line 2: OPENCV has 8 parameters, not 7"),
         ("cameras", "OPENCV", "STRANGE", "camera 1 has the model STRANGE, which is not supported"),
         ("cameras", "1 OPENCV", "2 OPENCV", "has camera 1, which the model does not hold"),
-        ("images", "top/v5.png", "top/v4.png", "two images are called top/v4.png"),
+        ("images", "top/v5.png", "top/v4.png", "two images have the name top/v4.png"),
         ("images", "top/v5.png", "top/v6.png", "image .*v6.png of the model .* does not exist; set data.images"),
         ("images", " top/v5.png", "", r"images\.txt, line 6 is not IMAGE_ID"),
         ("points3D", "1 ", "1 x", r"points3D\.txt, line 1 is not POINT3D_ID"),
@@ -243,7 +203,7 @@ def test_unknown_camera_number_in_a_binary_file(write):
     content = bytearray(path.read_bytes())
     content[12] = 99
     path.write_bytes(content)
-    with pytest.raises(NerfroError, match="camera model number 99 is unknown"):
+    with pytest.raises(NerfroError, match="camera model 99 is unknown"):
         load(root)
 
 

@@ -1,50 +1,34 @@
-"""IDR's and NeuS's matrices, written here and taken apart again."""
+"""Matrices of IDR and NeuS are decomposed into the cameras that they were made of."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
+from nerfro.data.base import Views
 from nerfro.data.idr import IdrData, decompose
 from nerfro.errors import NerfroError
 
-from .photographs import CX, CY, FX, FY, POINTS, check_views, save_mask, save_picture, world_to_camera
+from .formats import SCALE, SHIFT, write_idr
+from .photographs import CX, CY, FX, FY, POINTS
 
 # Pixel centres are whole numbers in these files.
 K = np.array([[FX, 0, CX - 0.5], [0, FY, CY - 0.5], [0, 0, 1]])
-SCALE, SHIFT = 2.5, np.array([0.3, -0.2, 0.7])
 
 
 @pytest.fixture
-def write(tmp_path):
-    """Write five views whose object frame is the one of `photographs`, in a world that is larger and elsewhere."""
-
-    def write(num_images=5, masks=True, **changes):
-        scale = np.diag([SCALE, SCALE, SCALE, 1.0])
-        scale[:3, 3] = SHIFT
-        arrays = {}
-        for i in range(num_images):
-            save_picture(tmp_path / f"image/{i:06d}.png", i)
-            if masks:
-                save_mask(tmp_path / f"mask/{i:03d}.png", i)  # DTU: shorter numbers than the images'
-            matrix = np.vstack([K @ world_to_camera(i), [0, 0, 0, 1]]) @ np.linalg.inv(scale)
-            arrays |= {f"world_mat_{i}": matrix.astype(np.float32), f"scale_mat_{i}": scale, f"camera_mat_{i}": K}
-        arrays |= changes
-        np.savez(tmp_path / "cameras_sphere.npz", **{k: v for k, v in arrays.items() if v is not None})
-        return tmp_path
-
-    return write
+def write(tmp_path: Path) -> Callable[..., Path]:
+    return lambda **changes: write_idr(tmp_path, masks=True, **changes)
 
 
-def load(root, split="train", **options):
+def load(root: Path, split: str = "train", **options: Any) -> Views:
     return IdrData(str(root), **{"test_every": 3} | options).load(split)
-
-
-def test_points_of_the_unit_sphere_project_onto_their_pixels(write):
-    root = write()
-    check_views(load(root), [1, 2, 4])
-    check_views(load(root, "test"), [0, 3])
 
 
 def test_near_and_far_enclose_the_unit_sphere(write):
@@ -54,8 +38,6 @@ def test_near_and_far_enclose_the_unit_sphere(write):
 
 def test_the_files_own_world(write):
     cameras = load(write(), world="file", near=1.0, far=20.0).cameras
-    import torch
-
     world = torch.from_numpy(POINTS * SCALE + SHIFT).float()
     inside = load(write()).cameras.project(torch.from_numpy(POINTS).float())
     torch.testing.assert_close(cameras.project(world)[0], inside[0], rtol=0, atol=1e-3)
@@ -75,15 +57,10 @@ def test_decomposition_does_not_depend_on_the_matrix_factor(factor):
     assert (lens.fx, lens.fy, lens.cx, lens.cy) == pytest.approx((FX, FY, CX, CY))
 
 
-def test_data_without_masks(write):
-    root = write(masks=False)
-    assert load(root).masks is None
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"world_mat_4": None}, "has 4 matrices world_mat_<i> for 5 images; make them equal"),
+        ({"world_mat_5": None}, "has 5 matrices world_mat_<i> for 6 images; the numbers must be equal"),
         ({"scale_mat_2": None}, "has no 'scale_mat_2'; every image needs one"),
         ({"world_mat_1": np.eye(3)}, "world_mat_1 has shape 3x3; give 4x4 numbers"),
         ({"world_mat_1": np.full((4, 4), np.nan)}, "world_mat_1 holds NaN"),
@@ -96,14 +73,14 @@ def test_wrong_matrices_are_refused(write, changes, message):
         load(write(**changes))
 
 
-def test_what_is_missing_is_named(write, tmp_path):
+def test_missing_files_are_named(write, tmp_path):
     with pytest.raises(NerfroError, match=r"image is not a folder; it should hold the images"):
         load(tmp_path)
     root = write()
-    with pytest.raises(NerfroError, match=r"cameras_large\.npz does not exist; name the file of matrices"):
+    with pytest.raises(NerfroError, match=r"cameras_large\.npz does not exist; set data.cameras"):
         load(root, cameras="cameras_large.npz")
     (root / "mask/002.png").unlink()
-    with pytest.raises(NerfroError, match="holds 4 masks for 5 images"):
+    with pytest.raises(NerfroError, match="holds 5 masks for 6 images"):
         load(root)
     (root / "cameras_sphere.npz").write_bytes(b"PK\3\4 cut off")
     (root / "mask/002.png").write_bytes(b"")

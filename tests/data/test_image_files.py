@@ -132,7 +132,7 @@ def test_truncated_or_corrupt_image_is_named(save, kept):
 
 def test_file_that_is_no_image_is_named(tmp_path: Path):
     (tmp_path / "image.png").write_text("no image")
-    with pytest.raises(NerfroError, match=r"image\.png cannot be read \(it is no image\)"):
+    with pytest.raises(NerfroError, match=r"image\.png cannot be read \(it is not an image\)"):
         read_rgb(tmp_path / "image.png", "drop")
 
 
@@ -180,5 +180,5 @@ def test_photograph_that_asks_to_be_turned_is_refused(orientation: int, suffix: 
         assert image_files.read_levels(path).shape == (4, 6, 3)
         return
     for read in (image_files.read_size, image_files.read_levels):
-        with pytest.raises(NerfroError, match=rf"EXIF orientation {orientation}\); turn its pixels"):
+        with pytest.raises(NerfroError, match=rf"EXIF orientation {orientation}; rotate its pixels"):
             read(path)

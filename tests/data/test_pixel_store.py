@@ -12,7 +12,7 @@ from PIL import Image
 
 from nerfro.data import pixel_store
 from nerfro.data.image_files import read_rgb
-from nerfro.data.pictures import Pictures
+from nerfro.data.lazy_images import LazyImages
 from nerfro.data.pixel_store import PixelStore
 
 NUM_VIEWS, HEIGHT, WIDTH = 3, 5, 4
@@ -41,7 +41,7 @@ def save(folder: Path, bits: int, seed: int = 0) -> list[Path]:
 
 @pytest.mark.parametrize("bits", [8, 16])
 def test_drawn_colours_are_those_of_the_pictures_to_the_last_bit(bits: int, tmp_path: Path) -> None:
-    pictures = Pictures.of(save(tmp_path, bits), partial(read_rgb, alpha="drop"))
+    pictures = LazyImages.of(save(tmp_path, bits), partial(read_rgb, alpha="drop"))
     store = PixelStore(pictures)
     expected = torch.stack(list(pictures)).view(-1, 3)
     order = EVERY.flip(0)
@@ -53,21 +53,21 @@ def test_drawn_colours_are_those_of_the_pictures_to_the_last_bit(bits: int, tmp_
 def test_mapped_pixels_are_made_once_for_a_content(bits: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NERFRO_CACHE", str(tmp_path / "cache"))
     paths = save(tmp_path, bits)
-    resident = PixelStore(Pictures.of(paths, Reader()))[EVERY]
+    resident = PixelStore(LazyImages.of(paths, Reader()))[EVERY]
     monkeypatch.setattr(pixel_store, "_MAPPED_FROM", 0)
     reader = Reader()
     for _ in range(2):
-        assert torch.equal(PixelStore(Pictures.of(paths, reader))[EVERY], resident)
+        assert torch.equal(PixelStore(LazyImages.of(paths, reader))[EVERY], resident)
     assert reader.count == NUM_VIEWS
-    mapped = PixelStore(Pictures.of(paths, reader))
+    mapped = PixelStore(LazyImages.of(paths, reader))
     mapped.forget()
     assert torch.equal(mapped[EVERY], resident)
-    half = PixelStore(Pictures.of(paths, reader, recipe="other"))
+    half = PixelStore(LazyImages.of(paths, reader, recipe="other"))
     assert reader.count == 2 * NUM_VIEWS  # another recipe may make other colours of the same files
     assert torch.equal(half[EVERY], resident)
     save(tmp_path, bits, seed=1)  # other pictures under the same names
-    assert not torch.equal(PixelStore(Pictures.of(paths, reader))[EVERY], resident)
+    assert not torch.equal(PixelStore(LazyImages.of(paths, reader))[EVERY], resident)
     for path in (tmp_path / "cache").glob("*.npy"):
         path.write_bytes(path.read_bytes()[:-10])
     save(tmp_path, bits)
-    assert torch.equal(PixelStore(Pictures.of(paths, reader))[EVERY], resident)
+    assert torch.equal(PixelStore(LazyImages.of(paths, reader))[EVERY], resident)

@@ -31,7 +31,7 @@ _LEFT_ALONE = ("trainer.devices", "trainer.num_nodes", "trainer.strategy", "trai
 GROUPS = ["field=nerf", "field=mip_nerf", "boundary=constant", "boundary=skybox", "boundary=near_field",
           "sampler/points=stratified", "sampler/points=hierarchical", "sampler/path=straight", "sampler/path=eikonal",
           "medium=voxel_grid", "medium=ball", "medium=vacuum", "camera=given", "data=opencv", "data=llff",
-          "data=colmap", "data=nerfstudio", "data=idr", "data=refref", "data=nerrf", "model=mip_nerf",
+          "data=colmap", "data=nerfstudio", "data=idr", "data=refref", "model=mip_nerf",
           "+experiment=mipnerf", "+experiment=nerf", "+experiment=ablation_noH", "+scene=glass",
           "+loss/distortion=distortion"]  # fmt: skip
 WEIRD_JSON: list[Any] = [None, True, False, 0, -1, 1, 0.5, 1e39, 1e308, 1e-300, float("nan"), float("inf"), 10**400, "",

@@ -13,7 +13,7 @@ import torch
 import nerfro
 from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
-from nerfro.data.held_back import HeldBack, spread
+from nerfro.data.validation_views import WithValidationViews, spread
 from nerfro.errors import NerfroError
 from nerfro.training.ray_batches import RayBatches
 
@@ -32,7 +32,7 @@ def test_places_are_spread_and_the_outermost_are_left() -> None:
 
 def test_held_back_views_are_val_and_the_others_train(tiny_scene: Path) -> None:
     source = BlenderData(str(tiny_scene), near=2.0, far=6.0)
-    held = HeldBack(source, 1)
+    held = WithValidationViews(source, 1)
     whole, train, val = source.load("train"), held.load("train"), held.load("val")
     assert held.splits == ["train", "val", "test"]
     assert sorted([*train.names, *val.names]) == sorted(whole.names)
@@ -44,7 +44,7 @@ def test_held_back_views_are_val_and_the_others_train(tiny_scene: Path) -> None:
             assert torch.equal(part.cameras.camera_to_world[index], whole.cameras.camera_to_world[before])
             assert part.frames[index].image == whole.frames[before].image
     assert held.load("test").names == source.load("test").names
-    many = HeldBack(source, 2)
+    many = WithValidationViews(source, 2)
     assert many.load("train").names == val.names, "of many that are held back, those that train are spread"
     assert many.load("val").names == train.names
 
@@ -83,7 +83,7 @@ def test_a_run_never_draws_what_it_holds_back(
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ("3", "batches.hold_back=3 leaves nothing to train on: there are 3 training views; hold back fewer"),
+        ("3", "batches.hold_back=3 leaves no view to train on: there are 3 training views; take at most 2"),
         ("-1", "batches.hold_back=-1 is not allowed; take at least 0"),
         ("0.2", "Value '0.2' of type 'float' could not be converted to Integer"),
     ],
@@ -99,5 +99,5 @@ def test_numbers_that_cannot_be_held_back_are_refused_in_one_line(
 
 def test_holding_back_all_is_refused(tiny_scene: Path) -> None:
     for split in ("train", "val"):
-        with pytest.raises(NerfroError, match="leaves nothing"):
-            HeldBack(BlenderData(str(tiny_scene)), 4).load(split)
+        with pytest.raises(NerfroError, match="leaves no view"):
+            WithValidationViews(BlenderData(str(tiny_scene)), 4).load(split)

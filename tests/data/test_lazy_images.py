@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from nerfro.data.image_files import read_rgb
-from nerfro.data.pictures import Pictures
+from nerfro.data.lazy_images import LazyImages
 from nerfro.errors import NerfroError
 
 read = partial(read_rgb, alpha="drop")
@@ -27,7 +27,7 @@ def save(folder: Path, count: int, height: int = 4, width: int = 6) -> tuple[lis
 
 def test_pictures_are_in_the_order_of_their_files_and_means_of_blocks(tmp_path: Path) -> None:
     paths, levels = save(tmp_path, 30)
-    whole, half = Pictures.of(paths, read), Pictures.of(paths, read, 2)
+    whole, half = LazyImages.of(paths, read), LazyImages.of(paths, read, 2)
     assert np.array_equal(np.stack(list(whole.all_levels())), levels)
     mean = torch.from_numpy(levels.reshape(30, 2, 2, 3, 2, 3).mean((2, 4)) / 255).float()
     torch.testing.assert_close(torch.stack(list(half)), mean, rtol=0, atol=0.51 / 65535)
@@ -37,7 +37,7 @@ def test_8_bits_among_16_keep_their_values(tmp_path: Path) -> None:
     paths, levels = save(tmp_path, 2)
     deep = np.random.default_rng(1).integers(0, 65536, (4, 6), dtype=np.uint16)
     Image.fromarray(deep).save(paths[1])
-    pictures = Pictures.of(paths, read)
+    pictures = LazyImages.of(paths, read)
     assert torch.equal(pictures[0], torch.from_numpy(levels[0].astype(np.float32) / 255))
     assert torch.equal(pictures[1], torch.from_numpy(deep.astype(np.float32) / 65535)[..., None].expand(-1, -1, 3))
     assert {picture.dtype for picture in pictures.all_levels()} == {np.dtype(np.uint16)}
@@ -51,7 +51,7 @@ def test_only_a_few_pictures_are_decoded_ahead(tmp_path: Path) -> None:
         decoded.append(path)
         return read(path)
 
-    pictures = Pictures.of(paths, counting)
+    pictures = LazyImages.of(paths, counting)
     assert decoded == []
     levels = pictures.all_levels()
     next(levels)
@@ -61,7 +61,7 @@ def test_only_a_few_pictures_are_decoded_ahead(tmp_path: Path) -> None:
 
 def test_picture_that_changes_its_size_is_told(tmp_path: Path) -> None:
     paths, _ = save(tmp_path, 2)
-    pictures = Pictures.of(paths, read)
+    pictures = LazyImages.of(paths, read)
     Image.new("RGB", (2, 2)).save(paths[1])
-    with pytest.raises(NerfroError, match=r"1\.png has changed since"):
+    with pytest.raises(NerfroError, match=r"1\.png has changed during"):
         pictures[1]

@@ -1,4 +1,4 @@
-"""Pictures of one size that stay in their files until one is asked for."""
+"""Images of one size that are decoded on access."""
 
 from __future__ import annotations
 
@@ -18,22 +18,24 @@ from nerfro.cameras import Window
 from nerfro.data.image_files import Levels, area_mean, downscaled, read_size, to_levels, to_unit
 from nerfro.errors import NerfroError
 
-# Files that are decoded at once, and with them the memory that decoding takes.
-_MOST_THREADS = 8
+# Maximum number of files decoded at the same time, which bounds the memory for decoding.
+_MAX_THREADS = 8
 
 
 @dataclass(frozen=True)
-class Pictures:
-    """Pictures of one size: `pictures[i]` reads a file and is [H, W, 3] or, of masks, [H, W], in [0, 1].
+class LazyImages:
+    """Image files of one size. `images[i]` decodes a file and returns values in [0, 1].
+
+    The result has shape [H, W, 3], or [H, W] for masks. Create an instance with `LazyImages.of`.
 
     Attributes:
-        files: a picture each.
-        read: reader of one file; threads call it side by side.
-        size: height and width in pixels as stored.
-        dtype: of the levels: 16 bits where a file has them, or where levels are means.
-        downscale: how many times smaller they become, 1 or more.
-        recipe: what `read` does with a file, in words that change when it does something else.
-        window: the part that is kept, or None for all of it.
+        files: one file per image.
+        read: function that reads one file; called from several threads.
+        size: stored height and width in pixels.
+        dtype: uint16 if a file has 16 bits or if reading averages or composites levels, otherwise uint8.
+        downscale: downscaling factor, 1 or more.
+        recipe: text that identifies the conversion by `read`. It is part of the cache key of decoded pixels.
+        window: region of the downscaled image that is kept, or None for the whole image.
     """
 
     files: Sequence[Path]
@@ -53,25 +55,32 @@ class Pictures:
         expected_size: tuple[int, int] | None = None,
         deep: bool = False,
         recipe: str = "",
-    ) -> Pictures:
-        """Pictures, at least one, whose headers agree on a size.
+    ) -> LazyImages:
+        """Read the headers of image files and check that the sizes agree.
 
         Args:
-            expected_size: width and height in pixels as stored, where the data states them.
-            deep: whether levels of 8 bits may become others of 16 when they are read.
+            files: at least one file.
+            read: function that reads the levels [H, W, *C] of one file.
+            downscale: downscaling factor, 1 or more.
+            expected_size: stored width and height in pixels, if the data set states them.
+            deep: whether `read` may convert 8-bit to 16-bit levels.
+            recipe: see `LazyImages`.
+
+        Raises:
+            NerfroError: a header cannot be read, or the sizes differ.
         """
         width, height, bits = read_size(files[0])
         if expected_size is not None and expected_size != (width, height):
             raise NerfroError(
-                f"image {files[0]} has {width}x{height} pixels where {expected_size[0]}x{expected_size[1]} are "
-                "expected; restore the right image or correct the transforms file"
+                f"image {files[0]} has {width}x{height} pixels but the transforms file states "
+                f"{expected_size[0]}x{expected_size[1]}; restore the original image or correct the transforms file"
             )
         for path in files[1:]:
             *size, depth = read_size(path)
             if size != [width, height]:
                 raise NerfroError(
                     f"image {path} has {size[0]}x{size[1]} pixels but {files[0]} has {width}x{height}; "
-                    "all images of a split must have one size"
+                    "all images of a split must have the same size"
                 )
             bits = max(bits, depth)
         dtype = np.dtype(np.uint16 if deep or bits > 8 or downscale > 1 else np.uint8)
@@ -79,7 +88,7 @@ class Pictures:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Height and width in pixels of what `pictures[i]` returns."""
+        """Height and width in pixels of `images[i]`."""
         if self.window is not None:
             return self.window.height, self.window.width
         return downscaled(self.size, self.downscale)
@@ -94,23 +103,23 @@ class Pictures:
         return (self[index] for index in range(len(self)))
 
     def levels(self, index: int) -> Levels:
-        """The levels of one picture, of type `dtype`; a file that has changed is refused."""
+        """Decode one image to integer levels of type `dtype`."""
         levels = self.read(self.files[index])
         if levels.shape[:2] != self.size:
-            raise NerfroError(f"image {self.files[index]} has changed since it was looked at; start again")
+            raise NerfroError(f"the size of image {self.files[index]} has changed during the run; start it again")
         if self.downscale > 1:
             levels = to_levels(area_mean(to_unit(levels), downscaled(self.size, self.downscale)))
         if levels.dtype != self.dtype:
-            levels = levels.astype(np.uint16) * 257  # 255 becomes 65535, and every level the same share of it
+            levels = levels.astype(np.uint16) * 257  # maps 255 to 65535, and therefore keeps every level's fraction
         if self.window is None:
             return levels
         top, left, height, width = self.window
         return levels[top : top + height, left : left + width]
 
     def all_levels(self) -> Iterator[Levels]:
-        """The levels of all pictures in order, decoded side by side, a few ahead of the one that is asked for."""
-        threads = min(os.cpu_count() or 1, _MOST_THREADS)
-        # Decoding releases the interpreter's lock, so threads suffice.
+        """Decode all images in order with several threads, only a few images ahead of the consumer."""
+        threads = min(os.cpu_count() or 1, _MAX_THREADS)
+        # Decoding releases the global interpreter lock, so threads suffice.
         with ThreadPoolExecutor(threads) as pool:
             ahead: deque[Future[Levels]] = deque()
             for index in range(len(self)):
@@ -120,10 +129,10 @@ class Pictures:
             while ahead:
                 yield ahead.popleft().result()
 
-    def select(self, views: Sequence[int]) -> Pictures:
-        """Some of the pictures, in the order that is asked for."""
+    def select(self, views: Sequence[int]) -> LazyImages:
+        """Return the images with the given indices, in this order."""
         return replace(self, files=[self.files[view] for view in views])
 
-    def cut(self, window: Window) -> Pictures:
-        """The window of each picture."""
+    def cut(self, window: Window) -> LazyImages:
+        """Restrict every image to a window."""
         return replace(self, window=window)

@@ -1,0 +1,380 @@
+"""Formats with transforms files (Blender, OpenCV, nerfstudio), and the messages about wrong files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from nerfro.data.base import Views
+from nerfro.data.blender import BlenderData
+from nerfro.data.nerfstudio import NerfstudioData
+from nerfro.data.opencv import OpenCVData
+from nerfro.errors import NerfroError
+from nerfro.training.ray_batches import RayBatches
+
+from .formats import (
+    ANGLE,
+    IDEAL,
+    SHARED,
+    THIRD,
+    K,
+    P,
+    change_json,
+    write_blender,
+    write_nerfstudio,
+    write_opencv,
+    write_transforms,
+)
+from .photographs import CY, FX, HEIGHT, WIDTH, camera_to_world, check_views, picture, save_mask, save_picture
+
+
+def load(root: Path, split: str = "train", **options: Any) -> Views:
+    return NerfstudioData(str(root), **{"near": 0.5, "far": 9.0} | options).load(split)
+
+
+def edit(root: Path, change: Callable[[dict], Any]) -> Path:
+    change_json(root / "transforms_train.json", change)
+    return root
+
+
+# Blender and OpenCV
+
+
+def test_frames_keep_the_order_and_the_names_of_the_file(tmp_path: Path) -> None:
+    root = edit(write_blender(tmp_path), lambda d: d["frames"][1].update(file_path="train\\r_2.png"))
+    (root / "train/r_4.png").rename(root / "train/r.004.png")  # the dot is no extension
+    edit(root, lambda d: d["frames"][2].update(file_path="train/r.004"))
+    assert BlenderData(str(root)).load("train").names == ["train/r_1", "train/r_2.png", "train/r.004", "train/r_5"]
+
+
+def test_rounded_poses_and_poses_of_three_rows_are_accepted(tmp_path: Path) -> None:
+    def change(document: dict) -> None:
+        for frame in document["frames"]:
+            frame["transform_matrix"] = np.round(frame["transform_matrix"], 4)[:3].tolist()
+
+    assert len(BlenderData(str(edit(write_blender(tmp_path), change))).load("train")) == 4
+
+
+def test_masks_are_found_by_the_paths_of_the_file(tmp_path: Path) -> None:
+    root = write_transforms(tmp_path, {"camera_angle_x": ANGLE}, masks=True)
+    (root / "train/mask_r_4.png").rename(root / "other.png")
+    assert BlenderData(str(root)).load("train").masks is None
+    for key in ("mask_path", "mask_file_path"):  # the second one is RefRef's
+        edit(root, lambda d, key=key: d["frames"][2].update({key: "./other.png"}))
+        np.testing.assert_array_equal(BlenderData(str(root)).load("train").masks[2], picture(4)[..., 0] > 127)
+        edit(root, lambda d, key=key: d["frames"][2].pop(key))
+
+
+def test_splits_are_listed_in_the_usual_order(tmp_path: Path) -> None:
+    root = write_blender(tmp_path)
+    for name in ("transforms_extra.json", "val_transforms.json"):
+        (root / name).write_text((root / "transforms_train.json").read_text())
+    source = BlenderData(str(root))
+    assert source.splits == ["train", "val", "test", "extra"]
+    assert all(len(source.load(split)) > 0 for split in source.splits)
+
+
+def matrix(change: Callable[[np.ndarray], Any]) -> Callable[[dict], None]:
+    """Change the pose of the second frame."""
+
+    def edited(document: dict) -> None:
+        pose = np.array(document["frames"][1]["transform_matrix"], dtype=object)
+        change(pose)
+        document["frames"][1]["transform_matrix"] = pose.tolist()
+
+    return edited
+
+
+FRAME = r"transforms_train\.json: frame 1 \('train/r_2'\)"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.pop("frames"), r"transforms_train\.json has no list 'frames'"),
+        (lambda d: d.update(frames=[]), r"transforms_train\.json has an empty list 'frames'; a split needs"),
+        (lambda d: d.update(frames=["train/r_1"]), r"transforms_train\.json: frame 0 is not an object"),
+        (lambda d: d.pop("camera_angle_x"), r"transforms_train\.json has no 'camera_angle_x' \(the horizontal field"),
+        (lambda d: d.update(camera_angle_x="wide"), "camera_angle_x='wide' must be an angle in radians, 0 to pi"),
+        (lambda d: d.update(camera_angle_x=math.nan), "camera_angle_x=nan must be an angle"),
+        (lambda d: d.update(camera_angle_x=39.6), "camera_angle_x=39.6 must be an angle"),
+        (lambda d: d["frames"][1].pop("file_path"), r"transforms_train\.json: frame 1 has no 'file_path'"),
+        (lambda d: d["frames"][1].pop("transform_matrix"), r"frame 1 has no 'transform_matrix'"),
+        (lambda d: d["frames"][1].update(file_path=3), "'file_path' and 'mask_path' must be text"),
+        (lambda d: d["frames"][1].update(file_path="train/r_1"), "'train/r_1' occurs in several frames"),
+        (lambda d: d["frames"][1].update(file_path="train/r_1.png"), "'train/r_1', 'train/r_1.png' occurs in several"),
+        (lambda d: d["frames"][1].update(file_path="train/no"), r"\('train/no'\): image .*no\.png does not exist"),
+        (lambda d: d["frames"][1].update(mask_path="no.png"), r"mask .*no\.png of .*r_2\.png does not exist"),
+        (lambda d: d.update(w=9, h=6), r"r_1\.png has 24x18 pixels but the transforms file states 9x6"),
+        (lambda d: d.update(w="wide", h=6), "w='wide' and h=6 must be numbers of pixels"),
+        (matrix(lambda m: np.put(m, 3, math.nan)), FRAME + ": transform_matrix holds NaN or infinite numbers"),
+        (matrix(lambda m: np.put(m, 3, math.inf)), FRAME + ": transform_matrix holds NaN or infinite numbers"),
+        (matrix(lambda m: np.put(m, 3, "x")), FRAME + ": transform_matrix is not a matrix of numbers; give 4x4 or 3x4"),
+        (matrix(lambda m: np.put(m, 12, 0.5)), FRAME + ": the last row of transform_matrix is .* must be 0, 0, 0, 1"),
+        (lambda d: d["frames"][1].update(transform_matrix=[1, 2]), FRAME + ": transform_matrix has shape 2; give 4x4"),
+        (lambda d: d["frames"][1].update(transform_matrix=None), FRAME + ": transform_matrix"),
+        (matrix(lambda m: np.multiply(m[:3, 0], -1, m[:3, 0])), FRAME + r".* is not a rotation \(it is a reflection\)"),
+        (matrix(lambda m: np.multiply(m[:3, :3], 1.1, m[:3, :3])), FRAME + r".* \(R\^T R differs from 1 by 0.21\)"),
+    ],
+)
+def test_wrong_transforms_files_give_one_clear_line(
+    tmp_path: Path, change: Callable[[dict], Any], message: str
+) -> None:
+    root = edit(write_blender(tmp_path), change)
+    with pytest.raises(NerfroError, match=message) as caught:
+        BlenderData(str(root)).load("train")
+    assert "\n" not in str(caught.value)
+
+
+def test_files_without_the_expected_content_are_named(tmp_path: Path) -> None:
+    for source in (BlenderData, NerfstudioData):
+        with pytest.raises(NerfroError, match=r"holds no transforms_<split>\.json"):
+            source(str(tmp_path)).load("train")
+    path = write_blender(tmp_path) / "transforms_train.json"
+    path.write_text(path.read_text()[:-40])
+    with pytest.raises(NerfroError, match=r"transforms_train\.json is not valid JSON \(.*\); copy"):
+        BlenderData(str(tmp_path)).load("train")
+    path.write_text("[1, 2]")
+    with pytest.raises(NerfroError, match="has no list 'frames'"):
+        BlenderData(str(tmp_path)).load("train")
+
+
+def test_evaluation_images_are_cropped_with_their_rays_and_training_images_are_not(tmp_path: Path) -> None:
+    root = write_opencv(tmp_path, masks=True)
+    (root / "transforms_train.json").write_text((root / "transforms_test.json").read_text())
+    source = OpenCVData(str(root), eval_crop=0.5)
+    full, test = source.load("train"), source.load("test")
+    # A half of 18 // 2 is 4 and a half of 24 // 2 is 6 pixels on each side of the centre.
+    rows, columns = slice(5, 13), slice(6, 18)
+    assert full.images[0].shape == (HEIGHT, WIDTH, 3)
+    assert torch.equal(test.images[0], full.images[0][rows, columns])
+    assert torch.equal(test.masks[0], full.masks[0][rows, columns])
+    directions = full.cameras.image_rays(0).directions.reshape(HEIGHT, WIDTH, 3)[rows, columns]
+    torch.testing.assert_close(test.cameras.image_rays(0).directions.reshape(8, 12, 3), directions)
+    for crop in (0.0, -1.0, 1.2):
+        with pytest.raises(NerfroError, match=f"eval_crop={crop} is not allowed"):
+            OpenCVData("anywhere", eval_crop=crop)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"cam_mat": None}, "cam_mat is not a matrix|cam_mat has shape"),
+        ({"cam_mat": [[1.0, 0], [0, 1]]}, "cam_mat has shape 2x2; give 3x3 numbers"),
+        ({"cam_mat": [[np.nan, 0, 4], [0, 9, 3], [0, 0, 1]]}, "cam_mat holds NaN"),
+        ({"cam_mat": [[-9.0, 0, 4], [0, 9, 3], [0, 0, 1]]}, "cam_mat must have positive focal lengths and no skew"),
+        ({"cam_mat": [[9.0, 1, 4], [0, 9, 3], [0, 0, 1]]}, "cam_mat must have positive focal lengths and no skew"),
+        ({"cam_mat": [[9.0, 0, 4], [0, 9, 3], [0, 0, 2]]}, r"cam_mat must have the last row 0, 0, 1"),
+        *(
+            ({"dist": dist}, "must be 4, 5 or 8 numbers in OpenCV's order")
+            for dist in ([0.1], "none", [1, 2, 3, None], [[0.1, 0.2]])
+        ),
+    ],
+)
+def test_wrong_camera_matrices_and_distortions_are_refused(tmp_path: Path, changes: dict, message: str) -> None:
+    with pytest.raises(NerfroError, match=message):
+        OpenCVData(str(write_opencv(tmp_path, **changes))).load("train")
+
+
+def test_camera_matrices_that_are_missing_or_of_another_size_are_named(tmp_path: Path) -> None:
+    root = str(write_opencv(tmp_path, cam_mat=[[40.0, 0, 32], [0, 40, 12], [0, 0, 1]], dist=[[0.0] * 5]))
+    with pytest.warns(UserWarning, match=r"principal point \(32, 12\) outside the 24x18 pixels"):
+        OpenCVData(root).load("train")
+    edit(tmp_path, lambda document: document.pop("cam_mat"))
+    with pytest.raises(NerfroError, match=r"has no 'cam_mat' \(the 3x3 camera matrix in pixels\); add it"):
+        OpenCVData(root).load("train")
+
+
+# nerfstudio
+
+
+def test_every_tenth_frame_by_name_is_a_test_view(tmp_path: Path) -> None:
+    root = write_nerfstudio(tmp_path, seeds=reversed(range(12)))
+    check_views(load(root), [1, 10, 11, 2, 3, 4, 5, 6, 7, 9], k=K, p=P)
+    assert [name[-7:] for name in load(root, "test").names] == ["f_0.png", "f_8.png"]
+    assert load(root, "val").names == load(root, "test").names
+
+
+def test_frames_may_have_intrinsics_of_their_own(tmp_path: Path) -> None:
+    own = lambda i: {"fl_x": FX + 1, "k1": 0.1} if i == 2 else {}  # noqa: E731
+    cameras = load(write_nerfstudio(tmp_path, top=SHARED, frame=own), **THIRD).cameras
+    assert cameras.fx.tolist() == [FX, FX + 1, FX, FX]
+    assert cameras.distortion[:, 0].tolist() == pytest.approx([0, 0.1, 0, 0])
+
+
+def test_listed_splits_are_taken_in_their_order(tmp_path: Path) -> None:
+    lists = {f"{s}_filenames": [f"images/f_{i}.png" for i in n] for s, n in (("train", (3, 1)), ("test", (0,)))}
+    root = write_nerfstudio(tmp_path, top=SHARED | lists)
+    check_views(load(root), [3, 1])
+    check_views(load(root, "test"), [0])
+    with pytest.raises(NerfroError, match="no 'val_filenames'"):
+        load(root, "val")
+
+
+def test_a_file_for_each_split_and_a_field_of_view_instead_of_a_focal_length(tmp_path: Path) -> None:
+    root = write_nerfstudio(tmp_path, seeds=(1, 0), top={"camera_angle_x": ANGLE}, name="transforms_train.json")
+    assert NerfstudioData(str(root), 0.5, 9.0).splits == ["train"]
+    check_views(load(root), [1, 0], lens=IDEAL)
+
+
+def test_images_of_another_size_scale_the_intrinsics(tmp_path: Path) -> None:
+    root = write_nerfstudio(tmp_path)
+    for i in range(6):
+        save_picture(root / f"images/f_{i}.png", i, WIDTH // 2, HEIGHT // 2)
+    cameras = load(root).cameras
+    assert (cameras.width, cameras.height) == (WIDTH // 2, HEIGHT // 2)
+    assert cameras.fx.unique().tolist() == [FX / 2]
+    assert cameras.cy.unique().tolist() == pytest.approx([CY / 2])
+
+
+def usable(views: Views) -> np.ndarray:
+    return np.stack([pixels.numpy() == 1 for pixels in views.usable])
+
+
+def test_black_pixels_of_mask_path_are_not_drawn(tmp_path: Path) -> None:
+    root = write_nerfstudio(tmp_path, seeds=range(3), frame=lambda i: {"mask_path": f"masks/f_{i}.png"})
+    for i in range(3):
+        save_mask(root / f"masks/f_{i}.png", i)  # where other formats look for a silhouette
+    views = load(root)
+    assert views.masks is None
+    white = np.stack([picture(i)[..., 0] > 127 for i in (1, 2)])
+    np.testing.assert_array_equal(usable(views), white)
+    whole = white.reshape(2, HEIGHT // 2, 2, WIDTH // 2, 2).all((2, 4))
+    np.testing.assert_array_equal(usable(load(root, downscale=2)), whole)
+    assert 0 < whole.sum() < whole.size
+    for batching in ("single_image", "all_images"):
+        batches = RayBatches(views, 20, batching)
+        drawn = torch.cat([batches.batch(step).index for step in range(300)])
+        # Each of about 430 pixels is drawn 14 times: all that are usable, and no other.
+        assert drawn.unique().tolist() == np.flatnonzero(white).tolist()
+
+
+def test_grey_of_mask_path_counts_as_the_nearer_level_and_labels_are_0_and_1(tmp_path: Path) -> None:
+    root = write_nerfstudio(tmp_path, seeds=range(2), frame=lambda i: {"mask_path": "mask.png"})
+    levels = np.full((HEIGHT, WIDTH), 127, np.uint8)
+    levels[3, 5] = 128
+    for mask in (levels, levels - 127):
+        Image.fromarray(mask).save(root / "mask.png")
+        assert np.argwhere(usable(load(root))).tolist() == [[0, 3, 5]]
+
+
+def test_all_pixels_are_usable_without_mask_path(tmp_path: Path) -> None:
+    assert load(write_nerfstudio(tmp_path)).usable is None
+    assert load(write_nerfstudio(tmp_path, frame=lambda i: {"mask_path": None})).usable is None
+
+
+@pytest.mark.parametrize(
+    ("draw", "message"),
+    [
+        (lambda path: None, r"mask .*ignore\.png of .*f_1\.png does not exist"),
+        (lambda path: path.write_bytes(b"no image"), r"ignore\.png cannot be read"),
+        (lambda path: save_mask(path, 1, WIDTH, HEIGHT - 1), "24x17 pixels but its image has 24x18"),
+        (
+            lambda path: Image.new("L", (WIDTH, HEIGHT)).save(path),
+            r"mask .*ignore\.png excludes all pixels of .*f_1\.png: black pixels are ignored, white pixels are used",
+        ),
+    ],
+)
+def test_mask_path_without_a_usable_mask_is_named(tmp_path: Path, draw: Callable[[Path], Any], message: str) -> None:
+    root = write_nerfstudio(tmp_path, seeds=range(2), frame=lambda i: {"mask_path": "ignore.png"})
+    draw(root / "ignore.png")
+    with pytest.raises(NerfroError, match=message):
+        load(root)
+
+
+def test_mask_path_of_some_frames_and_of_other_types_is_named(tmp_path: Path) -> None:
+    root = write_nerfstudio(tmp_path, seeds=range(3), frame=lambda i: {"mask_path": "ignore.png"} if i == 1 else {})
+    save_mask(root / "ignore.png", 1)
+    with pytest.raises(NerfroError, match=r"1 of 2 images have no mask .*f_2\.png is the first"):
+        load(root)
+    with pytest.raises(NerfroError, match="'mask_path' must be text"):
+        load(write_nerfstudio(tmp_path, frame=lambda i: {"mask_path": 3}))
+
+
+@pytest.mark.parametrize(
+    ("top", "frame", "message"),
+    [
+        ({"camera_model": "OPENCV_FISHEYE"}, {}, "camera_model='OPENCV_FISHEYE' is not supported; undistort"),
+        ({"fl_x": "long"}, {}, "fl_x='long' must be a number"),
+        ({"fl_x": -3}, {}, "fl_x=-3, fl_y=29, w and h must be positive"),
+        ({"fl_x": None}, {}, "fl_x=None must be a number"),
+        ({"w": 30}, {}, "calibrated for 30x18 pixels but the images have 24x18 and another aspect ratio"),
+        ({"k1": -9.0}, {}, "lens distortion is not invertible everywhere in the image"),
+        ({"test_filenames": ["images/x.png"]}, {}, "no 'train_filenames'"),
+        ({"train_filenames": ["images/x.png"]}, {}, "train_filenames lists 'images/x.png', but no frame has this name"),
+        ({}, {"object_mask_path": "gone.png"}, "gone.png of .* does not exist"),
+        ({}, {"transform_matrix": [[1, 0], [0, 1]]}, "transform_matrix has shape 2x2"),
+    ],
+)
+def test_wrong_values_are_named(tmp_path: Path, top: dict, frame: dict, message: str) -> None:
+    with pytest.raises(NerfroError, match=message):
+        load(write_nerfstudio(tmp_path, seeds=range(3), top=SHARED | top, frame=lambda i: frame))
+
+
+def test_missing_focal_lengths_and_truncated_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(NerfroError, match="has neither 'fl_x' nor a valid 'camera_angle_x'"):
+        load(write_nerfstudio(tmp_path, top={}))
+    (tmp_path / "transforms.json").write_text('{"frames": [')
+    with pytest.raises(NerfroError, match="is not valid JSON"):
+        load(tmp_path)
+
+
+def test_frames_without_an_image_are_skipped_in_one_line_or_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = write_nerfstudio(tmp_path)
+    for i in (1, 4):
+        (root / f"images/f_{i}.png").unlink()
+    source = NerfstudioData(str(root), near=0.5, far=9.0, test_every=4)
+    assert [name[-7:] for name in source.load("train").names] == ["f_2.png", "f_3.png", "f_5.png"]
+    assert [name[-7:] for name in source.load("test").names] == ["f_0.png"]
+    assert capsys.readouterr().out.count("2 of 6 frames have no image and are skipped: ./images/f_4.png, ") == 1
+    with pytest.raises(NerfroError, match=r"image .*images/f_4\.png does not exist"):
+        load(root, missing="refuse")
+    for i in range(6):
+        (root / f"images/f_{i}.png").unlink(missing_ok=True)
+    with pytest.raises(NerfroError, match=r"f_4\.png does not exist"):
+        load(root)
+
+
+def test_bounds_are_estimated_from_the_cameras(tmp_path: Path) -> None:
+    # The cameras look at about the origin from a distance of 3.
+    root = str(write_nerfstudio(tmp_path, seeds=range(12)))
+    cameras = NerfstudioData(root).load("train").cameras
+    assert 0 < cameras.near < 1
+    assert 5 < cameras.far < 7
+    given = NerfstudioData(root, far=4.0).load("test").cameras
+    assert (given.near, given.far) == (cameras.near, 4.0)
+
+
+def test_bounds_enclose_the_sparse_points(tmp_path: Path) -> None:
+    root = write_nerfstudio(tmp_path, seeds=range(12), top=SHARED | {"ply_file_path": "sparse_pc.ply"})
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    points *= 0.2 / np.linalg.norm(points, axis=1, keepdims=True)
+    trimesh.PointCloud(points).export(root / "sparse_pc.ply")
+    cameras = NerfstudioData(str(root)).load("train").cameras
+    assert cameras.near == pytest.approx(0.9 * 2.8, rel=0.03)
+    assert cameras.far == pytest.approx(1.1 * 3.2, rel=0.03)
+    (root / "sparse_pc.ply").write_bytes(b"ply?")
+    with pytest.raises(NerfroError, match=r"sparse_pc\.ply holds no points"):
+        NerfstudioData(str(root)).load("train")
+
+
+def test_cameras_without_a_common_target_need_near_and_far(tmp_path: Path) -> None:
+    def outwards(i: int) -> dict:
+        pose = camera_to_world(i, "opengl")
+        pose[:3, :3] = pose[:3, :3] @ np.diag([-1.0, 1.0, -1.0])  # turned round
+        return {"transform_matrix": pose.tolist()}
+
+    root = write_nerfstudio(tmp_path, seeds=range(12), frame=outwards)
+    with pytest.raises(NerfroError, match=r"data\.near and data\.far cannot be found"):
+        NerfstudioData(str(root)).load("train")
+    assert load(root).cameras.near == 0.5
