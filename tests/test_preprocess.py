@@ -160,22 +160,22 @@ def test_supplied_mesh_is_compared_and_kept(preprocess: Callable[..., str], capt
 
 
 def test_data_without_masks_is_refused(preprocess: Callable[..., str], tiny_scene: Path) -> None:
-    assert "the data has no masks" in preprocess(f"data.root={tiny_scene}", "overwrite=true")
+    assert "the data set has no masks" in preprocess(f"data.root={tiny_scene}", "overwrite=true")
 
 
 @pytest.mark.parametrize(
     ("change", "count", "message"),
     [
         (lambda mask: 0 * mask, 1, "train/r_0: the mask is empty"),
-        (lambda mask: 0 * mask + 255, 1, "train/r_0: the mask is all object"),
-        (lambda mask: 255 - mask, NUM_VIEWS, "24 of 24 masks cover the frame .* they are inverted"),
+        (lambda mask: 0 * mask + 255, 1, "train/r_0: the mask is full"),
+        (lambda mask: 255 - mask, NUM_VIEWS, "24 of 24 masks are inverted"),
         (lambda mask: mask[:12], 1, r"r_0\.png has 40x12 pixels but its image has 40x40"),
         (
             lambda mask: np.maximum(mask, 255 * (np.arange(SIZE) < 15)).astype(np.uint8),
             NUM_VIEWS,
-            "cut by the frame in all 24",
+            "frame cuts the object in all 24",
         ),
-        (lambda mask: np.roll(mask, 20, 1), 1, "look at the masks and poses of train/r_0, and .* wrong_masks=1"),
+        (lambda mask: np.roll(mask, 20, 1), 1, "check the masks and poses of train/r_0, and .* wrong_masks=1"),
     ],
     ids=["empty", "full", "inverted", "size", "cut", "wrong"],
 )
@@ -194,7 +194,7 @@ def test_flipped_axes_are_named(preprocess: Callable[..., str], capture: Path) -
     for frame in document["frames"]:
         frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([1.0, -1, -1, 1])).tolist()
     (capture / "transforms_train.json").write_text(json.dumps(document))
-    assert "the poses are in another convention: with the camera's y and z axes flipped" in preprocess()
+    assert "the poses use another convention: with the camera's y and z axes flipped" in preprocess()
 
 
 def test_views_from_one_side_are_bounded_by_the_box(preprocess: Callable[..., str], capture: Path) -> None:
@@ -202,8 +202,8 @@ def test_views_from_one_side_are_bounded_by_the_box(preprocess: Callable[..., st
     document["frames"] = document["frames"][:3]
     (capture / "transforms_train.json").write_text(json.dumps(document))
     printed = preprocess("box_min=[-0.6,-0.8,-0.6]", "box_max=[1.2,1,0.3]", "smoothing=0")
-    assert "3 views make a coarse hull" in printed
-    assert "the hull is cut off by the box" in printed
+    assert "3 views give a coarse visual hull" in printed
+    assert "cuts the visual hull" in printed
     assert "no silhouette shows where the object ends in depth" in printed
     assert load_mesh(capture / "mesh.ply").bounds[1, 2] < 0.4
 
@@ -212,7 +212,7 @@ def test_two_views_are_too_few(preprocess: Callable[..., str], capture: Path) ->
     document = json.loads((capture / "transforms_train.json").read_text())
     document["frames"] = document["frames"][:2]
     (capture / "transforms_train.json").write_text(json.dumps(document))
-    assert "2 views do not bound a shape" in preprocess()
+    assert "2 views do not determine a shape" in preprocess()
 
 
 def test_options_out_of_range(preprocess: Callable[..., str]) -> None:
@@ -240,7 +240,7 @@ def test_disagreeing_masks_name_the_number_that_may_be_wrong(preprocess: Callabl
     _change_masks(capture, cut, 1)
     # The hull alone: the fit finds most of the side again.
     printed = preprocess("smoothing=0")
-    assert "overlaps below 0.9" in printed
+    assert "overlap below 0.9" in printed
     told = re.search(r"wrong_masks=(\d)", printed)
     assert told is not None
     before = json.loads((capture / "overlaps.json").read_text())["views"]

@@ -1,4 +1,4 @@
-"""Cameras and hull in turns, each made of the other, until the hull is seen in its masks."""
+"""Alternating refinement of camera poses and visual hull."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import misses
 from nerfro.geometry.mesh import TriangleMesh
 
-_VOXELS = 64  # along the hull's longest side, while cameras move
-_ROUNDS, _SETTLED = 10, 0.02  # at most; it ends when cameras move by fewer pixels
+_VOXELS = 64  # voxels along the longest side of the intermediate hulls
+_ROUNDS, _CONVERGED = 10, 0.02  # maximum number of rounds, and root mean square motion in pixels that ends them
 
 
 def refine_cameras(
@@ -31,18 +31,22 @@ def refine_cameras(
     wrong_masks: int,
     surface: TriangleMesh | Callable[[Silhouettes, int], TriangleMesh],
 ) -> RefinedCamera:
-    """Turn cameras by the sky, then move them until the surface is seen in its masks; print how far.
+    """Refine rotations by the distant surroundings, then poses by the outlines of the surface.
 
-    A turn and a shift of a camera move a small object alike. What is far away tells them apart, so it must be seen.
+    Rotation and translation of a camera move a small object alike in the image, so distant surroundings must be
+    visible to separate them.
 
     Args:
         views: photographs with poses.
-        silhouettes: of the same views.
-        wrong_masks: see `object_box`.
-        surface: that is known, or makes the hull of masks with so many voxels along its longest side.
+        silhouettes: silhouettes of the same views.
+        wrong_masks: number of views that may be wrong about any point.
+        surface: known surface, or a function that makes the hull of silhouettes with a number of voxels per side.
+
+    Returns:
+        The refined cameras; prints the median motion.
 
     Raises:
-        NerfroError: no two photographs show the same of what is far away.
+        NerfroError: no two photographs show the same distant surroundings.
     """
     camera = RefinedCamera()
     camera.begin(views.cameras)
@@ -50,21 +54,19 @@ def refine_cameras(
     panorama = align(camera, views.cameras, lambda pixels: colours[pixels], lambda rays: misses(box, rays))
     if panorama is None:
         raise NerfroError(
-            "refine_cameras=true: no two photographs show the same surroundings beside the object, and these tell how "
-            "cameras are turned; leave it out"
+            "refine_cameras=true needs photographs that show the same distant surroundings, which determine the "
+            "rotations, and no two photographs do; remove the option"
         )
     motions = camera.motions
     for _ in range(1 if isinstance(surface, TriangleMesh) else _ROUNDS):
         mesh, before = surface, motions.held()
         if not isinstance(mesh, TriangleMesh):
             mesh = mesh(replace(silhouettes, cameras=camera.believed(views.cameras)), _VOXELS)
-        # The first hulls are no better than the poses, and far off their masks.
+        # The first hulls are as inaccurate as the poses, so any distance to the masks is accepted.
         meet_outlines(camera, views.cameras, lambda cameras: cameras, silhouettes, mesh, [panorama], math.inf)
-        if float(((motions.held() - before) / motions.units).square().sum(-1).mean().sqrt()) < _SETTLED:
+        if float(((motions.held() - before) / motions.units).square().sum(-1).mean().sqrt()) < _CONVERGED:
             break
     turned, shifted = motion_between(views.cameras.camera_to_world, camera.believed(views.cameras).camera_to_world)
-    share = float((shifted / object_distances(views.cameras)).median())
-    print(
-        f"cameras refined: turned by {turned.median():.2g} degrees, shifted by {share:.2%} of their distance (medians)"
-    )
+    relative = float((shifted / object_distances(views.cameras)).median())
+    print(f"cameras refined: median rotation {turned.median():.2g} degrees, translation {relative:.2%} of the distance")
     return camera

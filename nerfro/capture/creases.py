@@ -1,4 +1,4 @@
-"""Sharp edges of a surface, which a fit that moves vertices along their normals leaves blunt."""
+"""Reconstruction of sharp edges, which a fit with displacements along normals leaves rounded."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from scipy import sparse
 from nerfro.capture.moving_mesh import MovingMesh, Surface, solve_symmetric, unit
 from nerfro.capture.rims import Rims
 
-# A triangle takes the direction of its neighbours so often; directions that differ by this, radians, belong together.
-_ROUNDS, _ALIKE = 3, 0.35
-# Steps until edges are sharp.
+# Number of smoothing rounds of the triangle normals, and angular width of the filter, in radians.
+_ROUNDS, _ANGULAR_WIDTH = 3, 0.35
+# Number of least-squares steps.
 STEPS = 12
 
 
 class Sides(NamedTuple):
-    """What is likely of a surface between its sharp edges, as weights for each observation of the outline."""
+    """Weights of the prior on the sides between sharp edges, relative to one observation of the outline."""
 
-    flat: float  # triangles have their sides' directions
-    staying: float  # vertices stay where they are
+    flat: float  # alignment of triangles with the filtered normals
+    staying: float  # damping of the displacements
 
 
-# Chosen on a box and on a cylinder; a prism with six sides confirms.
+# Chosen on a box and a cylinder, confirmed on a hexagonal prism.
 FACETS, CURVED = Sides(flat=1.0, staying=1e-5), Sides(flat=0.05, staying=1e-4)
 
 
 def has_creases(surface: Surface) -> bool:
-    """Whether its sharp edges, put end to end, are twice as long as the body."""
+    """Test whether the total length of the sharp edges exceeds twice the size of the body."""
     ends = surface.vertices[surface.creases]
     return bool(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum() > 2 * np.ptp(surface.vertices, axis=0).max())
 
@@ -42,21 +42,24 @@ def sharpened(
     sides: Sides,
     step: Callable[[], None] = lambda: None,
 ) -> Float[np.ndarray, "V 3"]:
-    """Vertices moved in any direction until sides are smooth, edges sharp, and outlines the masks'.
+    """Move vertices in all directions until sides are smooth, edges are sharp, and contours meet the masks.
 
-    Marching cubes cut an edge off by a row of triangles of neither side's direction. Each triangle first takes the
-    direction of one side, see `_directions`. Then the linear least squares of the outlines and of
+    Marching cubes bevel an edge with a row of triangles. Each triangle first receives a filtered normal m_f, the normal
+    of one adjacent side (see `_filtered_normals`). Then linear least squares minimize the misfits of the contours and
 
         sum_faces A_f sum_sides (m_f . (x_i - x_j))^2
 
-    is solved, m_f that direction and A_f the area: vertices between two sides come to lie where these meet.
+    with the areas A_f, which moves the vertices between two sides to the intersection of the sides.
 
     Args:
-        vertices: of a surface that is fitted, but blunt.
-        mesh: its triangles.
-        rims_of: where views see the outlines of vertices.
-        sides: what is likely of them.
-        step: is called after each of `STEPS` steps.
+        vertices: vertices of a fitted surface with rounded edges.
+        mesh: triangles of the surface.
+        rims_of: function that returns the contour points of a surface with given vertices.
+        sides: weights of the prior.
+        step: called after each of `STEPS` steps.
+
+    Returns:
+        The new vertices.
     """
     for _ in range(STEPS):
         vertices = _solved(vertices, mesh, rims_of(vertices), sides)
@@ -65,7 +68,7 @@ def sharpened(
 
 
 def _solved(vertices: Float[np.ndarray, "V 3"], mesh: MovingMesh, rims: Rims, sides: Sides) -> Float[np.ndarray, "V 3"]:
-    direction, area = _directions(vertices, mesh)
+    direction, area = _filtered_normals(vertices, mesh)
     weight = np.sqrt(np.repeat(area / area.mean(), 3))
     flat = _projected_differences(
         (mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()),
@@ -86,14 +89,15 @@ def _solved(vertices: Float[np.ndarray, "V 3"], mesh: MovingMesh, rims: Rims, si
     return vertices + step * np.minimum(1, longest / np.linalg.norm(step, axis=1, keepdims=True).clip(1e-12))
 
 
-def _directions(
+def _filtered_normals(
     vertices: Float[np.ndarray, "V 3"], mesh: MovingMesh
 ) -> tuple[Float[np.ndarray, "F 3"], Float[np.ndarray, "F"]]:
-    """Directions of triangles, each smoothed along its own side of an edge; and their areas.
+    """Filter the triangle normals without smoothing across sharp edges (guided normal filtering, Zhang et al. 2015).
 
-    To which side a triangle belongs is told by the most even patch that it is in (guided normal filtering, Zhang et
-    al. 2015): of those that reach over an edge, the one that does so least. On a round surface all are alike, and
-    nothing is drawn flat there.
+    The guide normal of a triangle is the mean normal of the most uniform patch of triangles around it.
+
+    Returns:
+        Filtered unit normals, and the areas of the triangles.
     """
     normals = mesh.face_normals(vertices)
     area, touching = np.linalg.norm(normals, axis=1), mesh.touching
@@ -106,7 +110,7 @@ def _directions(
     middle = vertices[mesh.faces].mean(1)
     apart = ((middle[row] - middle[column]) ** 2).sum(1)
     differing = ((guide[row] - guide[column]) ** 2).sum(1)
-    near = area[column] * np.exp(-apart / (2 * apart[apart > 0].mean()) - differing / (2 * _ALIKE**2))
+    near = area[column] * np.exp(-apart / (2 * apart[apart > 0].mean()) - differing / (2 * _ANGULAR_WIDTH**2))
     averaging, direction = sparse.csr_matrix((near, (row, column)), touching.shape), unit(normals)
     for _ in range(_ROUNDS):
         direction = unit(averaging @ direction)
@@ -119,7 +123,7 @@ def _projected_differences(
     directions: Float[np.ndarray, "R 3"],
     num_vertices: int,
 ) -> sparse.csr_matrix:
-    """[R, 3V]: takes the coordinates of vertices to weighted sums of two of them along directions."""
+    """Build the matrix [R, 3V] that maps vertex coordinates to weighted sums of two vertices along directions."""
     row = np.tile(np.repeat(np.arange(len(directions)), 3), 2)
     column = np.concatenate([(3 * end[:, None] + np.arange(3)).ravel() for end in ends])
     values = np.concatenate([(weight[:, None] * directions).ravel() for weight in weights])

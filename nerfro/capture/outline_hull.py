@@ -1,4 +1,4 @@
-"""The hull of silhouettes that come one after the other, and which view is next."""
+"""Visual hull of a growing set of silhouettes, and choice of the next view."""
 
 from __future__ import annotations
 
@@ -16,23 +16,28 @@ from nerfro.capture.visual_hull import Silhouettes, carve_grid, centre_lines, ex
 from nerfro.geometry.lines import nearest_point
 from nerfro.geometry.mesh import TriangleMesh
 
-# The object and its surroundings are looked at in at most so many pixels along the longer side.
+# Images are downscaled to at most so many pixels along the longer side.
 MAX_SIDE = 480
-# A mask agrees with a hull where they overlap by this much.
+# Smallest intersection over union of a mask and a hull that agree.
 AGREES = 0.85
 FEWEST_VIEWS = 3
 _VOXELS = 80
-# Share of the views that may be wrong about any point of space.
-_WRONG_SHARE = 0.1
-# Views whose directions differ by this many degrees look from elsewhere; within the lesser angle they look from one
-# side, where the lines through their masks' centres may meet anywhere, behind the cameras too.
-_ELSEWHERE, _ONE_SIDE = 25.0, 15.0
-# From one side the depth is only known from where the cameras look; the box is so many times larger.
-_UNCERTAIN = 1.6
+# Fraction of the views that may be wrong about any point.
+_WRONG_FRACTION = 0.1
+# Smallest angle, in degrees, between the directions of different views; and the angle within which all views look from
+# one side, so that the rays through the centroids of the masks do not determine the depth of the object.
+_MIN_VIEW_ANGLE, _ONE_SIDE = 25.0, 15.0
+# Enlargement of the box if all views look from one side.
+_DEPTH_MARGIN = 1.6
 
 
 class OutlineHull:
-    """Silhouettes of some of the cameras' views, none empty, and their visual hull."""
+    """Visual hull of the masks of some views; empty masks are ignored.
+
+    Args:
+        cameras: cameras of all views.
+        masks: initial masks by view.
+    """
 
     def __init__(self, cameras: Cameras, masks: Mapping[int, Bool[np.ndarray, "H W"]]) -> None:
         scale = max(1.0, max(cameras.width, cameras.height) / MAX_SIDE)
@@ -49,27 +54,27 @@ class OutlineHull:
         return view in self._outlines
 
     def add(self, view: int, mask: Bool[np.ndarray, "H W"]) -> None:
-        """Take up a silhouette; a view without the object says nothing."""
+        """Add the silhouette of a view, unless the mask is empty."""
         size = self.cameras.width, self.cameras.height
-        share = opencv().resize(mask.astype(np.float32), size, interpolation=opencv().INTER_AREA)
-        if (share > 0.5).any():
-            self._outlines[view] = Silhouettes.of(self.cameras.select([view]), torch.from_numpy(share[None]))
+        coverage = opencv().resize(mask.astype(np.float32), size, interpolation=opencv().INTER_AREA)
+        if (coverage > 0.5).any():
+            self._outlines[view] = Silhouettes.of(self.cameras.select([view]), torch.from_numpy(coverage[None]))
 
     def add_if_agreed(self, view: int, mask: Bool[np.ndarray, "H W"]) -> bool:
-        """Take up a silhouette if the hull with it looks like all masks."""
+        """Add the silhouette of a view if the extended hull agrees with all masks; returns whether it was added."""
         self.add(view, mask)
         if view not in self:
             return False
         silhouettes = self._silhouettes()
-        agreement = coarse_agreement(silhouettes, int(_WRONG_SHARE * len(silhouettes)))
+        agreement = coarse_agreement(silhouettes, int(_WRONG_FRACTION * len(silhouettes)))
         if agreement.min() < GOOD_OVERLAP:
             del self._outlines[view]
         return view in self
 
     def hull(self, without: int | None = None) -> TriangleMesh | None:
-        """The hull of all views but one; None where no point lies inside their masks."""
+        """Compute the hull of all views, optionally without one; None if the hull is empty."""
         silhouettes = self._silhouettes(without)
-        wrong = int(_WRONG_SHARE * len(silhouettes))
+        wrong = int(_WRONG_FRACTION * len(silhouettes))
         centre = self._centre_from_one_side(silhouettes)
         box = find_box(silhouettes, wrong) if centre is None else _box_around(centre, silhouettes)
         distances, corner, spacing = carve_grid(silhouettes, box, _VOXELS, wrong)
@@ -77,33 +82,37 @@ class OutlineHull:
         return extract_surface(distances, corner, spacing) if (distances < 0).any() else None
 
     def seen_from(self, view: int, hull: TriangleMesh | None) -> Bool[np.ndarray, "H W"]:
-        """The silhouette of a hull in the size of the images."""
+        """Render the silhouette of a hull in the size of the images."""
         if hull is None:
             return np.zeros(self.size[::-1], bool)
         seen = mesh_silhouettes(hull, self.cameras.select([view]), 1)[0].numpy().astype(np.float32)
         return opencv().resize(seen, self.size, interpolation=opencv().INTER_LINEAR) > 0.5
 
     def next_view(self, refused: list[int]) -> int | None:
-        """The nearest view that looks from elsewhere than those that are here or refused; None where there is none."""
+        """Choose the nearest view whose direction differs from all added and refused views; None if there is none."""
         silhouettes = self._silhouettes()
         centre = self._centre_from_one_side(silhouettes)
         centre = nearest_point(*centre_lines(silhouettes)) if centre is None else centre
         towards = self.cameras.camera_to_world[:, :, 3].double().numpy() - centre
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        # Those on opposite sides see one outline, so that angles are those between lines.
+        # Opposite views see the same outline, so the sign of a direction does not matter.
         cosines = np.abs(towards @ towards[[*self._outlines, *refused]].T).max(1)
-        elsewhere = np.flatnonzero(cosines <= np.cos(np.radians(_ELSEWHERE)))
-        return int(elsewhere[cosines[elsewhere].argmax()]) if len(elsewhere) else None
+        candidates = np.flatnonzero(cosines <= np.cos(np.radians(_MIN_VIEW_ANGLE)))
+        return int(candidates[cosines[candidates].argmax()]) if len(candidates) else None
 
     def _silhouettes(self, without: int | None = None) -> Silhouettes:
         views = [view for view in self._outlines if view != without]
-        views = views * 2 if len(views) == 1 else views  # a hull takes two
+        views = views * 2 if len(views) == 1 else views  # a visual hull needs at least two views
         parts = [self._outlines[view] for view in views]
         masks, distances, cut = (torch.cat([getattr(p, name) for p in parts]) for name in ("masks", "distances", "cut"))
         return Silhouettes(self.cameras.select(views), masks, distances, cut)
 
     def _centre_from_one_side(self, silhouettes: Silhouettes) -> Float[np.ndarray, "3"] | None:
-        """Where the object is if all views look from one side: as far along the first line as all cameras look."""
+        """Estimate the centre of the object if all views look from one side, else return None.
+
+        The centre lies on the ray through the centroid of the first mask, at the depth of the point that all cameras
+        look at.
+        """
         origins, directions = centre_lines(silhouettes)
         if np.abs(directions @ directions.T).min() < np.cos(np.radians(_ONE_SIDE)):
             return None
@@ -113,9 +122,9 @@ class OutlineHull:
 
 
 def _box_around(centre: Float[np.ndarray, "3"], silhouettes: Silhouettes) -> Float[np.ndarray, "2 3"]:
-    """A cube as wide as the first mask, and wider, for its depth is uncertain."""
+    """Return a cube somewhat wider than the first mask, because the depth is uncertain."""
     cameras, inside = silhouettes.cameras, silhouettes.masks[0] > 0.5
     pixels = max(int(inside.any(axis).sum()) for axis in (0, 1))
     distance = float(np.linalg.norm(centre - cameras.camera_to_world[0, :, 3].double().numpy()))
-    half_side = _UNCERTAIN * 0.5 * pixels * distance / float(cameras.fx[0])
+    half_side = _DEPTH_MARGIN * 0.5 * pixels * distance / float(cameras.fx[0])
     return np.stack([centre - half_side, centre + half_side])

@@ -1,4 +1,4 @@
-"""Photographs made smaller by whole numbers: squares of pixels become one."""
+"""Downscaling of images by an integer factor."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from nerfro.capture.silhouettes import pixel_stride
 
 
 class PixelBlocks:
-    """Squares of so many pixels a side; what is left over at the right and below is cut off.
+    """Downscaling of images by averaging square blocks; incomplete blocks at the right and bottom are cropped.
 
     Args:
-        cameras: of the photographs.
-        max_pixels: that their longer side may have in the end.
+        cameras: cameras of the images.
+        max_pixels: maximum length of the longer side after downscaling.
     """
 
     def __init__(self, cameras: Cameras, max_pixels: int) -> None:
@@ -23,10 +23,10 @@ class PixelBlocks:
         self._window = Window(0, 0, self.height * self._stride, self.width * self._stride)
 
     def cameras(self, cameras: Cameras) -> Cameras:
-        """Those of the smaller photographs."""
+        """Return the cameras of the downscaled images."""
         return cameras.crop(self._window).resized(self.width, self.height)
 
-    def mean(self, picture: Shaped[Tensor, "H W *C"]) -> Float[Tensor, "h w *C"]:
-        """Of each block."""
-        blocks = self._window.cut(picture.float()[None])[0].unflatten(1, (self.width, self._stride))
+    def mean(self, image: Shaped[Tensor, "H W *C"]) -> Float[Tensor, "h w *C"]:
+        """Average an image over each block."""
+        blocks = self._window.cut(image.float()[None])[0].unflatten(1, (self.width, self._stride))
         return blocks.unflatten(0, (self.height, self._stride)).mean((1, 3))

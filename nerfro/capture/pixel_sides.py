@@ -1,4 +1,4 @@
-"""What binary masks tell of an outline: on which side of it the centre of each pixel is."""
+"""Observation model of binary masks: the side of the outline on which each pixel centre lies."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ from scipy.special import log_ndtr
 from nerfro.capture.rims import Rims
 from nerfro.capture.visual_hull import Silhouettes
 
-# Of the pixels around a rim, those of a square of so many a side; farther along the outline they count less, by a
-# normal distribution of this standard deviation, pixels: it bends away from the rim's tangent.
+# Side, in pixels, of the square of pixels around a contour point, and standard deviation, in pixels, of the Gaussian
+# weight along the outline, which curves away from the tangent.
 _SIDE, _ALONG = 4, 0.7
-# The probit's standard deviation, in what an outline that is read off the masks is off by.
+# Standard deviation of the probit model, relative to the mean error of the outline.
 _SOFTNESS = 0.3
-# Less is known of a rim that no pixel's centre is near to; the step to where its pixels want it goes so far at most.
-_LEAST, _LONGEST = 1e-3, 0.5
+# Smallest second derivative in the Newton step, and longest step in pixels.
+_MIN_SECOND_DERIVATIVE, _MAX_STEP = 1e-3, 0.5
 
 
 def by_pixel_sides(rims: Rims, points: Float[np.ndarray, "K 3"], silhouettes: Silhouettes, off: float) -> Rims:
-    """Rims whose misfits and weights come from the sides of the pixels around them alone.
+    """Replace misfits and weights of contour points by those of a probit model of the surrounding pixels.
 
-    An outline that is read off a binary mask is off by 0.15 pixels, alike along whole stretches. What the mask says for
-    certain is which centres are inside. A surface that stands for the whole object makes much of that: its outline
-    passes between the centres of all views. A centre that is s inside an outline is inside the object with the
-    probability Phi(s / sigma); one step of Newton's method on its logarithm gives misfit and weight.
+    The outline that is interpolated from a binary mask has an error of 0.15 pixels, which is correlated along the
+    outline. The mask states exactly, however, which pixel centres are inside. In the probit model, a pixel centre at
+    the depth s inside the contour belongs to the object with probability Phi(s / sigma). One Newton step on the log
+    likelihood gives misfit and weight.
 
-    The outline that was read still tells which rims are outlines at all: those that are farther from it than most
-    belong to waves of the surface behind others, and weigh less.
+    The distance to the interpolated outline still reduces the weight of contour points far from the outline, because
+    such points belong to folds of the surface behind other parts.
 
     Args:
-        rims: of the surface, see `find_rims`.
-        points: where they are.
-        silhouettes: of binary masks.
-        off: what outlines are off by, mean, pixels: sigma follows it.
+        rims: contour points of the surface (see `find_rims`).
+        points: positions of the contour points.
+        silhouettes: silhouettes of binary masks.
+        off: mean error of the contours, in pixels; sigma is proportional to it.
     """
     sigma = _SOFTNESS * off
     slope, bend = np.zeros(len(points)), np.zeros(len(points))
@@ -42,7 +42,7 @@ def by_pixel_sides(rims: Rims, points: Float[np.ndarray, "K 3"], silhouettes: Si
     for view in np.unique(rims.view):
         seen, inside = np.flatnonzero(rims.view == view), (silhouettes.masks[int(view)] > 0.5).numpy()
         camera = silhouettes.cameras.select([int(view)])
-        # Cameras project in single precision: a place some pixels away tells the direction.
+        # Projection has single precision, so the image normal is computed from a point some pixels away.
         outwards = points[seen] + _SIDE * rims.width[seen, None] * rims.normal[seen]
         place, beyond = (
             camera.project(torch.from_numpy(each).float())[0][0].double().numpy() for each in (points[seen], outwards)
@@ -60,6 +60,6 @@ def by_pixel_sides(rims: Rims, points: Float[np.ndarray, "K 3"], silhouettes: Si
         hazard = np.exp(-0.5 * (sure**2 + np.log(2 * np.pi)) - log_ndtr(sure))
         slope[seen] = sigma * (weight * side * hazard).sum(0)
         bend[seen] = (weight * hazard * (hazard + sure)).sum(0)
-    misfit = (slope / bend.clip(_LEAST)).clip(-_LONGEST, _LONGEST)
+    misfit = (slope / bend.clip(_MIN_SECOND_DERIVATIVE)).clip(-_MAX_STEP, _MAX_STEP)
     trusted = 1 / (1 + (rims.misfit / (off * rims.width)) ** 2)
     return rims._replace(misfit=misfit * rims.width, weight=trusted * bend / _SOFTNESS**2)

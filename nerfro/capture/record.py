@@ -1,4 +1,4 @@
-"""The state of work that takes minutes, in a file: whoever begins the same work again goes on from there."""
+"""Saved state of a long computation, from which an interrupted computation resumes."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from nerfro.files.atomic import write_atomically
 
 
 class Record:
-    """A state that is kept now and then, and removed when the work is done.
+    """State of a computation in a file, which is removed at the end.
 
     Args:
-        path: file; without one nothing is kept.
-        key: says which work it is. A record of another key is none.
+        path: file of the state; None saves nothing.
+        key: identifies the computation; a state with another key is ignored.
     """
 
     def __init__(self, path: Path | None, key: str) -> None:
         self._path, self._key = path, key
 
     def read(self) -> dict[str, Any] | None:
-        """The state, if there is one of this work."""
+        """Read the state of this computation; None if there is no valid one."""
         if self._path is None:
             return None
         try:
@@ -33,13 +33,13 @@ class Record:
             return None
 
     def write(self, state: dict[str, Any]) -> None:
-        """Keep a state of plain values and tensors."""
+        """Save a state of plain values and tensors."""
         if self._path is not None:
             content = io.BytesIO()
             torch.save({"key": self._key, "state": state}, content)
             write_atomically(self._path, content.getvalue())
 
     def remove(self) -> None:
-        """The work is done."""
+        """Remove the file at the end of the computation."""
         if self._path is not None:
             self._path.unlink(missing_ok=True)

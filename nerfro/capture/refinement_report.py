@@ -1,4 +1,4 @@
-"""A surface's refinement: its bar, its figures, and pictures of what is seen through the surface before and after."""
+"""Refinement of a surface with progress bar, report file and comparison images."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.capture.refinement import Refined, refine_surface
-from nerfro.capture.surroundings import HELD_BACK, Around, Surroundings
+from nerfro.capture.surroundings import VALIDATION_EVERY, Around, Surroundings
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import Interrupted
 from nerfro.files.atomic import write_atomically
@@ -24,36 +24,36 @@ from nerfro.rays import Rays
 from nerfro.samplers.snell import Snell
 
 FIGURES, PICTURES = "refinement.json", "refinement.png"
-RECORD = "refinement.state"  # while it goes on, and after it was interrupted
+RECORD = "refinement.state"  # state of an unfinished refinement
 _NUM_PICTURES = 4
-_WIDTH = 256  # pixels across each picture
+_WIDTH = 256  # width of an image, in pixels
 
 
 def refine(
     around: Around, mesh: TriangleMesh, medium: SdfGrid, silhouettes: Silhouettes, learn_index: bool, folder: Path
 ) -> Refined:
-    """Refine a surface with a progress bar; write refinement.json and refinement.png, and print what was gained.
+    """Refine a surface with a progress bar, write refinement.json and refinement.png, and print the improvement.
 
     Args:
-        around: what photographs show.
+        around: observations of the object and its surroundings.
         mesh, medium, silhouettes, learn_index: see `refine_surface`.
-        folder: to write to.
+        folder: output folder.
     """
     through, surroundings = around.through, around.surroundings
     try:
-        with bar("surface") as done:
+        with bar("surface") as progress:
             refined = refine_surface(
-                mesh, medium, silhouettes, through, surroundings, learn_index, done, folder / RECORD
+                mesh, medium, silhouettes, through, surroundings, learn_index, progress, folder / RECORD
             )
     except KeyboardInterrupt:
-        raise Interrupted("to go on with the refinement, repeat the command with overwrite=true") from None
+        raise Interrupted("to resume the refinement, repeat the command with overwrite=true") from None
     before, after = refined.errors[0], min(refined.errors)
-    told = f"held-back pixels are off by {after:.4f} instead of {before:.4f} (0 right, 1 unrelated)"
+    change = f"validation error {before:.4f} -> {after:.4f} (0 exact, 1 unrelated)"
     if refined.mesh is mesh:
-        print(f"the surface stays as it is: at best {told}, which is too little to trust")
+        print(f"surface unchanged: {change}, which is no significant improvement")
     else:
         moved = float(torch.from_numpy(refined.mesh.vertices - mesh.vertices).norm(dim=-1).median())
-        print(f"surface refined: {told}; half of it moved by {moved:.2g} or more")
+        print(f"surface refined: {change}; median displacement {moved:.2g} world units")
     figures = {"steps": refined.steps, "held_back_error": [round(error, 5) for error in refined.errors]}
     write_atomically(folder / FIGURES, json.dumps(figures, indent=1) + "\n")
     _draw(around, medium, refined.medium, folder / PICTURES)
@@ -61,19 +61,19 @@ def refine(
 
 
 def _draw(around: Around, before: SdfGrid, after: SdfGrid, file: Path) -> None:
-    """Photographs that were held back, and what the surroundings would show through both surfaces in their place."""
-    views, cameras = around.views, around.through.cameras
-    held_back = range(HELD_BACK - 1, len(views), HELD_BACK) if len(views) >= HELD_BACK else range(len(views))
+    """Draw validation photographs beside the surroundings as refracted by both surfaces."""
+    views, cameras, every = around.views, around.through.cameras, VALIDATION_EVERY
+    validation = range(every - 1, len(views), every) if len(views) >= every else range(len(views))
     pictures, captions = [], []
-    for view in list(held_back)[:: max(1, len(held_back) // _NUM_PICTURES)][:_NUM_PICTURES]:
+    for view in list(validation)[:: max(1, len(validation) // _NUM_PICTURES)][:_NUM_PICTURES]:
         pictures.append(views.images[view])
         captions.append(f"photograph {views.names[view][-16:]}")
-        for what, medium in (("before", before), ("after", after)):
+        for state, medium in (("before", before), ("after", after)):
             rays = cameras.image_rays(view)
             radiance = _seen_through(around.surroundings, medium, rays)
             pictures.append(to_srgb(radiance.view(cameras.height, cameras.width, 3)).clamp(0, 1))
-            captions.append(f"{what}, nothing inside")
-    save_picture(file, sheet(pictures, captions, _WIDTH, 3, "the surroundings as they are seen through the surface"))
+            captions.append(f"{state}, nothing inside")
+    save_picture(file, sheet(pictures, captions, _WIDTH, 3, "surroundings as refracted by the surface"))
 
 
 @torch.no_grad()

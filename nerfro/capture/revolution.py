@@ -1,4 +1,4 @@
-"""A body of revolution whose outlines are the masks': for what came off a wheel or a lathe."""
+"""Fit of a body of revolution to the outlines of the masks."""
 
 from __future__ import annotations
 
@@ -20,29 +20,33 @@ from nerfro.geometry.mesh import TriangleMesh
 
 Symmetry = Literal["axis", "auto"]
 
-# Radii along the axis, of a polyline, and triangles around it.
+# Number of radii along the axis, and of vertices around the axis.
 _KNOTS, _SECTIONS = 72, 160
-_END = 4  # knots that the hull's ends are not believed in
-# Points on the outline of each mask, at most, and pixels inside and outside of it, which are so far from it (pixels).
-_POINTS, _BESIDE, _NEAR, _FAR = 100, 40, 3.0, 40.0
-# Iterations, and how far an outline may be from the body's in pixels to count half, at first and at last.
-_ITERATIONS, _HALVED = 24, (8.0, 1.0)
-# How much bends between knots weigh against pixels; a step's longest and shares' smallest parts, in heights.
-_BENDING, _LONGEST, _THINNEST = 0.03, 0.03, 1e-3
-_EDGE = 0.5  # pixels
-# No camera sees a low roof on the top, or a cone below the foot: a pixel less of height is worth so many outlines.
+_END = 4  # knots at each end whose initial radii are extrapolated, because the visual hull is inaccurate there
+# Samples per mask: points on the outline, and pixels inside and outside at distances in this range, in pixels.
+_OUTLINE_POINTS, _SIDE_POINTS, _NEAR, _FAR = 100, 40, 3.0, 40.0
+# Iterations, and the distance in pixels at which the weight of an observation is one half, first and last.
+_ITERATIONS, _HALF_WEIGHT = 24, (8.0, 1.0)
+# Weight of bending relative to pixels; longest step and smallest radius, as fractions of the height.
+_BENDING, _MAX_STEP, _MIN_RADIUS = 0.03, 0.03, 1e-3
+_EDGE = 0.5  # radius of the rounded edges, in pixels
+# Weight of the height relative to the observations: no camera sees a low roof on the top or a cone below the foot.
 _FLAT = 0.003
-_STIFF = 10.0  # how much more bends weigh at the ends, where only a thin slice would be seen of them
-# Places along a ray that are looked at, and closer ones around the nearest of these; rows and columns of pixels next to
-# the frame are no outline.
+_END_BENDING = 10.0  # factor of bending at the ends, where the masks show only thin slices
+# Number of samples along a ray, of samples in each refinement, and width in pixels of the ignored frame.
 _PLACES, _CLOSER, _FRAME = 48, 12, 2
 
 
 @dataclass(frozen=True)
 class Profile:
-    """A body of revolution: `radii` at evenly spaced heights along a unit `axis` from `foot`; flat ends.
+    """A body of revolution with flat ends.
 
-    Its edges there are rounded by about `edge`.
+    Attributes:
+        foot: intersection of the axis with the lower end, world units.
+        axis: unit direction of the axis.
+        height: distance between the ends.
+        radii: radii at evenly spaced heights.
+        edge: radius by which the edges of the ends are rounded.
     """
 
     foot: Float[Tensor, "3"]
@@ -52,13 +56,13 @@ class Profile:
     edge: float = 0.0
 
     def in_plane(self, points: Float[Tensor, "*P 3"]) -> tuple[Float[Tensor, "*P"], Float[Tensor, "*P"]]:
-        """Distance from the axis, and height over the foot."""
+        """Return the distance of points from the axis, and their height above the foot."""
         offset = points - self.foot
         along = offset @ self.axis
         return (offset - along[..., None] * self.axis).square().sum(-1).clamp(min=1e-20).sqrt(), along
 
     def distance(self, points: Float[Tensor, "*P 3"]) -> Float[Tensor, "*P"]:
-        """About the signed distance, negative inside; exact where it is zero."""
+        """Compute an approximate signed distance, negative inside, with an exact zero level."""
         radius, along = self.in_plane(points)
         step = self.height / (len(self.radii) - 1)
         place = (along / step).clamp(0, len(self.radii) - 1.001)
@@ -66,11 +70,11 @@ class Profile:
         first, second = self.radii[low], self.radii[low + 1]
         slope = ((second - first) / step).detach()
         side = (radius - torch.lerp(first, second, place - low)) / (1 + slope.square()).sqrt()
-        # Rounded at the edges, so that the least distance along a ray depends on both surfaces that meet there.
+        # At rounded edges, the minimum along a ray depends on both adjacent surfaces, which gives useful gradients.
         return self.edge * torch.logsumexp(torch.stack([side, -along, along - self.height]) / self.edge, 0)
 
     def mesh(self) -> TriangleMesh:
-        """Closed, outward faces counter-clockwise."""
+        """Convert the body to a closed mesh with counter-clockwise faces seen from outside."""
         axis = self.axis.double().numpy()
         across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
         across /= np.linalg.norm(across)
@@ -94,14 +98,21 @@ class Profile:
 def fit_revolution(
     mesh: TriangleMesh, silhouettes: Silhouettes, progress: Callable[[float], None] = lambda share: None
 ) -> TriangleMesh | None:
-    """The body of revolution near a mesh whose outlines are those of the masks; None where the mesh has no axis.
+    """Fit a body of revolution to the outlines of the masks.
 
-    A ray through a mask's outline touches the body: along it, the least distance to the body is zero. Beside the
-    outline it meets the body or does not. Axis, ends and radii are found by the robust squares of these distances in
-    pixels, so an outline that is not the body's, such as that of a thing before it, does not pull. `progress` is told
-    the share done.
+    The minimum distance to the body along a ray through the outline of a mask is zero. Rays on either side of the
+    outline intersect the body or miss it. Axis, ends and radii minimize a robust sum of the squared distances in
+    pixels, so that outlines of foreground objects have little influence.
+
+    Args:
+        mesh: initial surface.
+        silhouettes: silhouettes of the object.
+        progress: called with the completed fraction.
+
+    Returns:
+        The fitted body; None if the initial surface has no axis.
     """
-    start = _first_guess(mesh)
+    start = _initial_profile(mesh)
     if start is None:
         return None
     origins, directions, width, side = _rays(silhouettes)
@@ -109,11 +120,11 @@ def fit_revolution(
     across = torch.linalg.svd(start.axis[None])[2][1:]
     pixels = float(size / (width * (origins - middle).norm(dim=-1)).median())  # in the height
 
-    # Lengths in heights: two shifts and two turns across the axis, the ends, and the radii.
+    # Parameters in units of the height: two translations and two rotations of the axis, both ends, and the radii.
     def body(numbers: Tensor) -> Profile:
         axis = normalize(start.axis + numbers[2:4] @ across, dim=0)
         foot = middle + size * (numbers[:2] @ across + numbers[4] * axis)
-        height, radii = size * (numbers[5] - numbers[4]), size * numbers[6:].clamp(min=_THINNEST)
+        height, radii = size * (numbers[5] - numbers[4]), size * numbers[6:].clamp(min=_MIN_RADIUS)
         return Profile(foot, axis, height, radii, _EDGE * float(size) / pixels)
 
     def misfits(numbers: Tensor) -> Tensor:
@@ -122,27 +133,27 @@ def fit_revolution(
 
     numbers = torch.cat([torch.zeros(4), torch.tensor([-0.5, 0.5]), start.radii / size])
     bends = functional.pad(torch.eye(_KNOTS).diff(n=2, dim=0), (6, 0))
-    bends[:_END] *= _STIFF
-    bends[-_END:] *= _STIFF
+    bends[:_END] *= _END_BENDING
+    bends[-_END:] *= _END_BENDING
     for iteration in range(_ITERATIONS):
         done = min(1.0, iteration / (_ITERATIONS - 6))
-        halved = _HALVED[0] * (_HALVED[1] / _HALVED[0]) ** done
+        half_weight = _HALF_WEIGHT[0] * (_HALF_WEIGHT[1] / _HALF_WEIGHT[0]) ** done
         place = _nearest_place(body(numbers), origins, directions)
         misfit, slopes = misfits(numbers).double(), jacfwd(misfits)(numbers).double()
-        weight = 1 / (1 + (misfit / halved).square()).square()
+        weight = 1 / (1 + (misfit / half_weight).square()).square()
         stiff = (_BENDING * pixels) ** 2 * len(misfit) / _KNOTS * (bends.T @ bends).double()
         system = slopes.T @ (weight[:, None] * slopes) + stiff
         right = slopes.T @ (weight * misfit) + stiff @ numbers.double()
         right[4:6] += _FLAT * len(misfit) * pixels * torch.tensor([-1.0, 1.0])
         damping = 1e-3 * system.diagonal().mean() * torch.eye(len(numbers)).double()
         step = torch.linalg.solve(system + damping, right)
-        numbers = numbers - (step * (_LONGEST / step.abs().max()).clamp(max=1)).float()
+        numbers = numbers - (step * (_MAX_STEP / step.abs().max()).clamp(max=1)).float()
         progress((iteration + 1) / _ITERATIONS)
     return body(numbers).mesh()
 
 
-def _first_guess(mesh: TriangleMesh) -> Profile | None:
-    """Of the axes near the mesh's principal ones, that around which it is roundest."""
+def _initial_profile(mesh: TriangleMesh) -> Profile | None:
+    """Choose the axis near a principal axis around which the mesh is most circular; None without an axis."""
     vertices = mesh.vertices
     found: list[tuple[float, Profile]] = []
     for near in np.linalg.eigh(np.cov(vertices.T))[1].T:
@@ -150,14 +161,14 @@ def _first_guess(mesh: TriangleMesh) -> Profile | None:
         if axis is None:
             continue
         middle = mesh.bounds.mean(0)
-        for _ in range(2):  # the middle of the outline across the axis
+        for _ in range(2):  # centre the mesh perpendicular to the axis
             across = vertices - middle - ((vertices - middle) @ axis)[:, None] * axis
             middle = middle + across.mean(0)
         across = vertices - middle - ((vertices - middle) @ axis)[:, None] * axis
         along, radius = (vertices - middle) @ axis, np.linalg.norm(across, axis=1)
         low, high = along.min(), along.max()
         number = ((along - low) / (high - low) * (_KNOTS - 1)).round().astype(np.int64)
-        # Where the ends are, vertices lie nearer to the axis than the outline.
+        # Vertices on the end faces lie nearer to the axis than the outline, hence the quantile.
         outer = np.array(
             [np.quantile(radius[number == k], 0.8) if (number == k).any() else np.nan for k in range(_KNOTS)]
         )
@@ -173,9 +184,11 @@ def _first_guess(mesh: TriangleMesh) -> Profile | None:
 def _rays(
     silhouettes: Silhouettes,
 ) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"], Float[Tensor, "P"], Float[Tensor, "P"]]:
-    """Rays on the masks' outlines and beside them, the width of a pixel at unit distance, and on which side they are.
+    """Sample rays on the outlines of the masks and on both sides.
 
-    0 on the outline, 1 outside of it, -1 inside.
+    Returns:
+        Origins, unit directions, the width of a pixel at unit distance, and the side: 0 on the outline, 1 outside, -1
+        inside.
     """
     cameras, random = silhouettes.cameras, np.random.default_rng(0)
     views, places, sides = [], [], []
@@ -183,23 +196,23 @@ def _rays(
         outside = np.argwhere((distance < -_NEAR) & (distance > -_FAR)).astype(np.float32)
         inside = np.argwhere(distance > _NEAR).astype(np.float32)
         for side, points, count in (
-            (0.0, _outline_points(distance), _POINTS),
-            (1.0, outside, _BESIDE),
-            (-1.0, inside, _BESIDE),
+            (0.0, _outline_points(distance), _OUTLINE_POINTS),
+            (1.0, outside, _SIDE_POINTS),
+            (-1.0, inside, _SIDE_POINTS),
         ):
             chosen = points[random.permutation(len(points))[:count]]
             views.append(torch.full((len(chosen),), view))
             places.append(torch.from_numpy(chosen))
             sides.append(torch.full((len(chosen),), side))
     of_view, place = torch.cat(views), torch.cat(places)
-    # Whole numbers are pixels' centres.
+    # Integers are pixel centres here.
     rays = cameras.rays(of_view, place[:, 0], place[:, 1])
     width = 1 / (0.5 * (cameras.fx + cameras.fy))[of_view]
     return rays.origins.float(), rays.directions.float(), width, torch.cat(sides)
 
 
 def _outline_points(values: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "P 2"]:
-    """Where the outline crosses the lines between neighbouring pixels' centres: (row, column), not near the frame."""
+    """Find crossings (row, column) of the outline with lines between adjacent pixel centres, away from the frame."""
     found = []
     for axis in (0, 1):
         first, second = (values[:-1], values[1:]) if axis == 0 else (values[:, :-1], values[:, 1:])
@@ -215,7 +228,7 @@ def _outline_points(values: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "P 2"
 
 @torch.no_grad()
 def _nearest_place(body: Profile, origins: Tensor, directions: Tensor) -> Float[Tensor, "P"]:
-    """Where along each ray the body is nearest, or deepest."""
+    """Find the arc length along each ray at which the distance to the body is smallest."""
     middle = body.foot + 0.5 * body.height * body.axis
     reach = torch.sqrt((0.5 * body.height) ** 2 + body.radii.max() ** 2)
     place = ((middle - origins) * directions).sum(-1)

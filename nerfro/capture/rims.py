@@ -1,4 +1,4 @@
-"""Where views see the outlines of a surface, and how far these are from the outlines of their masks."""
+"""Contour points of a surface as seen from the cameras, and their distances to the outlines of the masks."""
 
 from __future__ import annotations
 
@@ -17,53 +17,55 @@ from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
 
-# For each view the number of the outline's pixel that is nearest to each of its pixels.
+# By view: the index of the outline pixel nearest to each pixel.
 Outlines: TypeAlias = "dict[int, Int[np.ndarray, 'H W']]"
 
-# A binary mask's outline is known to about this, pixels. The misfits' median over it is how far the surface still is
-# from the masks: the two limits below widen with it, so that it never loses them all.
-_TYPICAL = 0.35
-# Outlines farther than this from a mask's belong to folds of the surface in front of itself; where the weight of an
-# observation is halved, pixels. That falls to this share of it for masks of shares, which are surer than binary ones.
-_GATE, _HALVED, _SUREST = 3.0, 0.7, 0.3
+# Accuracy of the outline of a binary mask, in pixels. The median misfit relative to this accuracy scales the two limits
+# below, so that a surface far from the masks keeps its observations.
+_MASK_ACCURACY = 0.35
+# Largest misfit in pixels, beyond which a contour belongs to a fold of the surface in front of itself; misfit in pixels
+# at which the weight of an observation is one half; and smallest scale of that misfit, reached with antialiased masks.
+_MAX_MISFIT, _HALF_WEIGHT, _MIN_SCALE = 3.0, 0.7, 0.3
 
 
 class Rims(NamedTuple):
-    """Where the surface's outlines are seen: on edge (first, second) of the mesh, `share` of the way to second.
+    """Contour points on edges (first, second) of a mesh, at the fraction `share` of the way from first to second.
 
-    To meet the mask's outline the surface has to move by `misfit` along `normal` there, world units.
+    The surface meets the outline of the mask if it moves by `misfit` along `normal`.
     """
 
     first: Int[np.ndarray, "K"]
     second: Int[np.ndarray, "K"]
     share: Float[np.ndarray, "K"]
-    normal: Float[np.ndarray, "K 3"]  # unit, outwards, across the line of sight
-    misfit: Float[np.ndarray, "K"]
+    normal: Float[np.ndarray, "K 3"]  # unit, outwards, perpendicular to the line of sight
+    misfit: Float[np.ndarray, "K"]  # world units
     weight: Float[np.ndarray, "K"]
-    width: Float[np.ndarray, "K"]  # of a pixel there, world units
-    view: Int[np.ndarray, "K"]  # that sees it
+    width: Float[np.ndarray, "K"]  # width of a pixel at the point, world units
+    view: Int[np.ndarray, "K"]
 
     def points(self, vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "K 3"]:
-        """Where they are."""
+        """Compute the positions of the contour points."""
         share = self.share[:, None]
         return (1 - share) * vertices[self.first] + share * vertices[self.second]
 
 
 class RimPoints(NamedTuple):
-    """Points of a surface that views see on the outlines of their masks; lengths in world units."""
+    """Contour points of a surface as tensors; lengths in world units."""
 
     points: Float[Tensor, "K 3"]
-    normals: Float[Tensor, "K 3"]  # unit, outwards, across the line of sight
-    misfits: Float[Tensor, "K"]  # how far each has to move outwards to lie on the outline
-    weights: Float[Tensor, "K"]  # of these: less where most others are nearer
-    widths: Float[Tensor, "K"]  # of a pixel there
+    normals: Float[Tensor, "K 3"]  # unit, outwards, perpendicular to the line of sight
+    misfits: Float[Tensor, "K"]  # outward distance to the outline of the mask
+    weights: Float[Tensor, "K"]  # robust weights of the misfits
+    widths: Float[Tensor, "K"]  # width of a pixel at the point
     views: Int[Tensor, "K"]
 
 
 class RimFinder:
-    """Where views see the outlines of a surface that are near those of their masks.
+    """Finder of the contour points of a fixed surface for changing cameras.
 
-    What does not depend on the cameras is prepared once, for those that move.
+    Args:
+        mesh: surface.
+        silhouettes: silhouettes of the masks.
     """
 
     def __init__(self, mesh: TriangleMesh, silhouettes: Silhouettes) -> None:
@@ -71,7 +73,7 @@ class RimFinder:
         self._silhouettes, self._outlines = silhouettes, outlines_of(silhouettes)
 
     def points(self, cameras: Cameras | None = None) -> RimPoints:
-        """With other cameras than the silhouettes', if they are given."""
+        """Find the contour points, by default for the cameras of the silhouettes."""
         silhouettes = self._silhouettes if cameras is None else replace(self._silhouettes, cameras=cameras)
         rims = find_rims(self._surface, silhouettes, self._outlines)
         return RimPoints(
@@ -89,15 +91,15 @@ def _tensor(values: np.ndarray) -> Tensor:
 
 
 def outlines_of(silhouettes: Silhouettes) -> Outlines:
-    """Of all views."""
+    """Compute the nearest outline pixels of all views."""
     return {view: _nearest_outline_pixel(mask) for view, mask in enumerate((silhouettes.masks > 0.5).numpy())}
 
 
 def find_rims(surface: Surface, silhouettes: Silhouettes, outlines: Outlines) -> Rims:
-    """The outermost rims that every view sees near each pixel of its mask's outline.
+    """Find the outermost contour point near each pixel of the outlines of the masks.
 
-    A smooth surface turns away from a view between vertices, where normals say so; a sharp one at an edge of which the
-    view sees one side.
+    On a smooth surface, the contour crosses edges of the mesh along which the vertex normals turn away from the camera.
+    On a sharp edge, the contour follows the edge if the camera sees only one of its sides.
 
     Raises:
         NerfroError: no view sees the surface.
@@ -115,7 +117,7 @@ def find_rims(surface: Surface, silhouettes: Silhouettes, outlines: Outlines) ->
         known = np.flatnonzero(np.isfinite(inside))
         if not len(known):
             continue
-        # Pixels narrower than an edge may be met by no rim but one of a fold, so they are taken together.
+        # Pixels narrower than the edges of the mesh are grouped, or some would only contain contours of folds.
         pixels = max(1, int(np.ceil(spacing / width[known].mean())))
         cell = _look_up(outline, cameras.select([view]), places[known], pixels)
         order = np.lexsort((inside[known], cell))
@@ -123,16 +125,16 @@ def find_rims(surface: Surface, silhouettes: Silhouettes, outlines: Outlines) ->
         of_view = np.full(len(outermost), view)
         parts.append((*(values[outermost] for values in (first, second, share, normal, inside, width)), of_view))
     if not parts:
-        raise NerfroError("no view sees the surface where it looks; surface, poses and masks do not belong together")
+        raise NerfroError("no view sees the surface; check that surface, poses and masks belong together")
     first, second, share, normal, misfit, width, views = (np.concatenate(values) for values in zip(*parts, strict=True))
-    spread = float(np.median(np.abs(misfit))) / _TYPICAL
-    near = np.abs(misfit) < _GATE * max(1.0, spread)
-    weight = 1 / (1 + (misfit / (_HALVED * max(_SUREST, spread))) ** 2)
+    spread = float(np.median(np.abs(misfit))) / _MASK_ACCURACY
+    near = np.abs(misfit) < _MAX_MISFIT * max(1.0, spread)
+    weight = 1 / (1 + (misfit / (_HALF_WEIGHT * max(_MIN_SCALE, spread))) ** 2)
     return Rims(*(each[near] for each in (first, second, share, normal, misfit * width, weight, width, views)))
 
 
 def _turning(surface: Surface, eye: Float[np.ndarray, "3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Where a surface turns away from an eye: ends of edges, shares of the way between, and normals, see `Rims`."""
+    """Find the contour of a surface seen from a point: ends of edges, fractions along the edges, and normals."""
     vertices, edges, normals, creases, beside = surface
     facing = (normals * (vertices - eye)).sum(1)[edges]
     smooth = np.flatnonzero((facing[:, 0] > 0) != (facing[:, 1] > 0))
@@ -144,7 +146,7 @@ def _turning(surface: Surface, eye: Float[np.ndarray, "3"]) -> tuple[np.ndarray,
     along = vertices[second] - vertices[first]
     look = unit(vertices[first] + share[:, None] * along - eye)
     normal = (1 - share[:, None]) * normals[first] + share[:, None] * normals[second]
-    # A sharp edge is seen to move across itself alone, whichever way the sides beside it look.
+    # Only the motion of a sharp edge perpendicular to itself is visible, whatever the normals of the adjacent sides.
     across = np.cross(look, along)
     across *= np.sign((across * normal).sum(1, keepdims=True))
     normal -= (normal * look).sum(1, keepdims=True) * look
@@ -153,7 +155,7 @@ def _turning(surface: Surface, eye: Float[np.ndarray, "3"]) -> tuple[np.ndarray,
 
 
 def _look_up(outline: Int[np.ndarray, "H W"], camera: Cameras, points: Tensor, pixels: int) -> Int[np.ndarray, "P"]:
-    """Number of the square of pixels x pixels that holds the part of the outline nearest to each point."""
+    """Return the index of the block of pixels x pixels that contains the outline pixel nearest to each point."""
     place = camera.project(points)[0][0].numpy()
     row = place[:, 1].astype(np.int64).clip(0, camera.height - 1)
     column = place[:, 0].astype(np.int64).clip(0, camera.width - 1)
@@ -162,7 +164,7 @@ def _look_up(outline: Int[np.ndarray, "H W"], camera: Cameras, points: Tensor, p
 
 
 def _nearest_outline_pixel(inside: np.ndarray) -> Int[np.ndarray, "H W"]:
-    """Number of the pixel of a mask's outline that is nearest to each pixel."""
+    """Return the index of the outline pixel of a mask nearest to each pixel."""
     outline = inside & ~binary_erosion(inside, border_value=1)
     rows, columns = distance_transform_edt(~outline, return_distances=False, return_indices=True)
     return rows.astype(np.int64) * inside.shape[1] + columns

@@ -1,7 +1,7 @@
-"""Near surroundings as a picture: what is seen from the middle of an object, in colours and distances.
+"""Near surroundings as a panorama with depth, rendered from the centre of the object.
 
-A field of radiance in space has no useful slope: its details are finer than what a surface has to be moved by. A
-picture can be blurred, and where it is looked up follows the line on which light leaves.
+A radiance field has no useful gradient for the refinement of a surface, because its details are finer than the
+displacements. A panorama can be blurred, and depth makes the lookup follow the exit ray.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from nerfro.rays import Rays
 from nerfro.samplers.snell import Snell
 from nerfro.types import Exits
 
-_SIDE = 192  # texels along a face's side, of half a degree
-_CHUNK = 16384  # rays at a time
-_STEPS = 5  # until a line meets the picture; the object is small beside its surroundings
+_SIDE = 192  # texels per side of a cube face, half a degree each
+_CHUNK = 16384  # rays rendered at once
+_STEPS = 5  # fixed-point iterations of the lookup; few suffice, because the object is small beside its surroundings
 
 
 class RoomPicture(Boundary):
-    """A picture of what is around a point. Lines that begin elsewhere are followed until they meet it.
+    """A panorama with depth around a point; the lookup intersects exit rays from other positions with the depth.
 
-    What something near hides from the point is not in the picture.
+    The panorama lacks surfaces that are hidden from the point.
 
     Args:
-        middle: the point.
-        colours: linear radiance by direction from there.
-        distances: to what is seen there, of each texel (see `cube_map.texel_directions`), world units.
+        middle: centre of the panorama.
+        colours: linear radiance by direction.
+        distances: distance of each texel (see `cube_map.texel_directions`), world units.
     """
 
     def __init__(self, middle: Float[Tensor, "3"], colours: EnvironmentMap, distances: Float[Tensor, "6*n*n"]) -> None:
@@ -42,7 +42,7 @@ class RoomPicture(Boundary):
         self._levels, self._padded = cube_map.CubeLevels((side,)), cube_map.padded_texels(side).flatten()
 
     def forward(self, exits: Exits) -> Float[Tensor, "P 3"]:
-        """Colours, with the slope that they have in the lines' positions and directions."""
+        """Look up the radiance along exit rays, differentiable by their positions and directions."""
         assert exits.positions is not None
         starts = exits.positions - self.middle
         with torch.no_grad():
@@ -50,7 +50,7 @@ class RoomPicture(Boundary):
         return self.colours(Exits(starts + lengths * exits.directions))
 
     def _lengths(self, starts: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]) -> Float[Tensor, "P 1"]:
-        """Of lines until what is seen: where they meet a sphere of its distance, which is looked up there again."""
+        """Intersect exit rays with the depth of the panorama by fixed-point iteration; returns arc lengths."""
         along = (starts * directions).sum(-1, keepdim=True)
         square = starts.square().sum(-1, keepdim=True)
         seen, lengths = directions, torch.zeros_like(along)
@@ -64,7 +64,7 @@ class RoomPicture(Boundary):
 
 @torch.no_grad()
 def picture_of(room: Room, medium: SdfGrid, middle: Float[Tensor, "3"]) -> RoomPicture:
-    """What a room shows around an object, from the object's surface outwards; within, nothing is known of it."""
+    """Render a panorama of near surroundings from the surface of an object outwards."""
     radius = float((medium.box[1] - medium.box[0]).norm())
     radiance, distances = [], []
     for directions in cube_map.texel_directions(_SIDE).split(_CHUNK):

@@ -1,4 +1,4 @@
-"""From silhouettes to a surface: the hull is carved, and a smooth surface fitted into it."""
+"""From silhouettes to a surface: carving of the visual hull, and fit of a smooth surface."""
 
 from __future__ import annotations
 
@@ -21,52 +21,61 @@ from nerfro.media.sdf_grid import SdfGrid
 
 _FEWEST_VIEWS, _FEW_VIEWS = 3, 12
 _COARSE_VOXELS = 64
-# Masks that are wrong shift the place where all seem to meet, so boxes so much wider are tried.
-_WIDER = (1.0, 1.3, 1.7)
-# The object's box is found to this many coarse voxels.
+# Factors by which the initial box is enlarged if it cuts the hull: wrong masks shift the estimated centre.
+_BOX_FACTORS = (1.0, 1.3, 1.7)
+# Margin of the object's box, in coarse voxels.
 _MARGIN_VOXELS = 2
-# Of a body of revolution, which is truer where nothing tells, so much less overlap is taken; pixels a side to see it.
-_LESS_ALIKE, _MAX_PIXELS = 0.01, 256
-# Cameras whose directions to the object lie within this angle see it from one side, degrees.
+# With symmetry=axis a body of revolution is preferred although its overlap may be smaller by this amount; the overlap
+# is computed at the given number of pixels per side.
+_MAX_OVERLAP_LOSS, _MAX_PIXELS = 0.01, 256
+# Cameras within this angle, in degrees, see the object from one side.
 _ONE_SIDE = 75.0
 
 
 def read_silhouettes(views: Views, has_box: bool) -> Silhouettes:
-    """The outlines of views, checked; a box that the user has given bounds what the masks do not."""
+    """Check the masks of views and compute their outlines.
+
+    Args:
+        views: views with masks.
+        has_box: whether the user gives a box, which bounds the hull where masks are cut by the frame.
+
+    Raises:
+        NerfroError: masks are missing, empty, full, inverted, too few, or all cut by the frame.
+    """
     if views.masks is None:
         raise NerfroError(
-            "the data has no masks, and the hull is made of them; docs/capture.md tells where they are looked for "
+            "the data set has no masks, and the visual hull needs masks; docs/capture.md explains where to put masks "
             "and how to make them"
         )
     masks = torch.stack(list(views.masks))
-    share = (masks > 0.5).flatten(1).float().mean(1)
-    for wrong, what in ((share == 0, "empty"), (share == 1, "all object")):
+    coverage = (masks > 0.5).flatten(1).float().mean(1)
+    for wrong, state in ((coverage == 0, "empty"), (coverage == 1, "full")):
         if wrong.any():
             raise NerfroError(
-                f"{_names(views, wrong)}: the mask is {what}; draw it (object white, everything else black), "
-                "or take the view out"
+                f"{_names(views, wrong)}: the mask is {state}; draw the object white and everything else black, or "
+                "remove the view"
             )
-    # The frame is object and the rest is not: true of no photograph of an object, let alone of most.
-    inverted = (frame_pixels(masks).float().mean(1) > 0.9) & (share < 1)
+    inverted = (frame_pixels(masks).float().mean(1) > 0.9) & (coverage < 1)
     if inverted.float().mean() > 0.5:
         raise NerfroError(
-            f"{int(inverted.sum())} of {len(views)} masks cover the frame of their image and leave the inside: "
-            "they are inverted; save them with the object white and everything else black"
+            f"{int(inverted.sum())} of {len(views)} masks are inverted: white along the frame of the image, and black "
+            "inside; save masks with the object white and everything else black"
         )
     if len(views) < _FEWEST_VIEWS:
         raise NerfroError(
-            f"{len(views)} views do not bound a shape; give masks of {_FEWEST_VIEWS} or more, better 30 from all sides"
+            f"{len(views)} views do not determine a shape; give masks of at least {_FEWEST_VIEWS} views, better of 30 "
+            "from all sides"
         )
     if len(views) < _FEW_VIEWS:
-        warn(f"{len(views)} views make a coarse hull; 30 from all sides make a good one")
+        warn(f"{len(views)} views give a coarse visual hull; 30 views from all sides are better")
     silhouettes = Silhouettes.of(views.cameras, masks)
     if silhouettes.cut.all() and not has_box:
         raise NerfroError(
-            f"the object is cut by the frame in all {len(views)} views, so that it has no whole outline; "
-            "photograph it from farther away, or give box_min= and box_max= to cut the hull there"
+            f"the frame cuts the object in all {len(views)} views, so no outline is complete; photograph the object "
+            "from farther away, or give box_min= and box_max= to bound the hull"
         )
     if silhouettes.cut.any():
-        warn(f"{_names(views, silhouettes.cut)}: the frame cuts the object; nothing is known beyond it")
+        warn(f"{_names(views, silhouettes.cut)}: the frame cuts the object; nothing is known outside the frame")
     return silhouettes
 
 
@@ -79,10 +88,17 @@ def make_mesh(
     smoothing: float,
     symmetry: Symmetry | None = None,
 ) -> TriangleMesh:
-    """Carve the hull and fit a smooth surface into it, see `PreprocessConfig`; the box is found where none is given.
+    """Carve the visual hull and fit a smooth surface.
 
-    With `symmetry` a body of revolution is fitted too, and taken where it looks as much like the masks. For `axis`,
-    which tells what the object is, it may look a little less like them.
+    Args:
+        silhouettes: silhouettes of the object.
+        corners: box of the hull; None estimates the box.
+        resolution: number of voxels along the longest side.
+        wrong_masks: number of views that may be wrong about any point.
+        keep: number of components to keep; None keeps all but small ones.
+        smoothing: factor of the estimated smoothing strength; 0 returns the hull itself.
+        symmetry: also fit a body of revolution. `auto` uses this body if its overlap with the masks is at least as
+            large, `axis` also if the overlap is slightly smaller.
     """
     with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()) as progress:
         box = object_box(silhouettes, wrong_masks) if corners is None else corners
@@ -97,39 +113,41 @@ def make_mesh(
             mesh = fit_surface(mesh, silhouettes, smoothing, lambda done: progress.update(fitting, completed=done))
         if symmetry is not None:
             turning = progress.add_task("finding the axis", total=1)
-            turned = fit_revolution(mesh, silhouettes, lambda done: progress.update(turning, completed=done))
+            revolution = fit_revolution(mesh, silhouettes, lambda done: progress.update(turning, completed=done))
     if symmetry is not None:
-        mesh = _as_alike(turned, mesh, silhouettes, symmetry)
+        mesh = _choose_symmetry(revolution, mesh, silhouettes, symmetry)
     if num_kept < num_parts:
-        print(f"{num_kept} of {num_parts} separate parts kept, the largest")
+        print(f"kept the largest {num_kept} of {num_parts} separate components")
     if reaches_border(distances):
         _warn_of_open_hull(silhouettes, box)
     print(f"{len(mesh.faces)} triangles, voxels of {spacing:.4g}")
     return mesh
 
 
-def _as_alike(
-    turned: TriangleMesh | None, free: TriangleMesh, silhouettes: Silhouettes, symmetry: Symmetry
+def _choose_symmetry(
+    revolution: TriangleMesh | None, free: TriangleMesh, silhouettes: Silhouettes, symmetry: Symmetry
 ) -> TriangleMesh:
-    """The body of revolution, unless its silhouettes are less like the masks' than the free surface's.
+    """Choose the body of revolution or the free surface by the overlap of their silhouettes with the masks.
 
-    Medians are compared: masks from which something before the object is cut out should not decide.
+    The medians are compared, because a foreground object may be cut out of some masks.
     """
-    if turned is None:
+    if revolution is None:
         if symmetry == "axis":
-            raise NerfroError("symmetry=axis: the hull has no axis; leave it out")
+            raise NerfroError("symmetry=axis is not possible, because the visual hull has no axis; remove the option")
         return free
-    of_turned, of_free = (float(np.median(overlap(mesh, silhouettes, _MAX_PIXELS))) for mesh in (turned, free))
-    told = f"overlap with the masks, median: {of_turned:.4f} as a body of revolution, {of_free:.4f} without"
-    if symmetry == "axis" and of_turned < of_free - _LESS_ALIKE:
-        warn(f"{told}; so it is none, and symmetry=axis is not used")
+    symmetric, unconstrained = (
+        float(np.median(overlap(mesh, silhouettes, _MAX_PIXELS))) for mesh in (revolution, free)
+    )
+    result = f"median overlap with the masks: {symmetric:.4f} as a body of revolution, {unconstrained:.4f} otherwise"
+    if symmetry == "axis" and symmetric < unconstrained - _MAX_OVERLAP_LOSS:
+        warn(f"{result}; the object is no body of revolution, and symmetry=axis is ignored")
         return free
-    print(told)
-    return free if symmetry == "auto" and of_turned < of_free else turned
+    print(result)
+    return free if symmetry == "auto" and symmetric < unconstrained else revolution
 
 
 def surfaces_inside(medium: Medium) -> list[TriangleMesh]:
-    """The surfaces of the bodies inside the outer one, as far as they are there; none of a medium without a grid."""
+    """Extract the surfaces of the inner bodies of a medium on a grid; empty for other media."""
     if not isinstance(medium, SdfGrid):
         return []
     low, spacing = (values.double().cpu().numpy() for values in (medium.box[0], medium.spacing))
@@ -138,10 +156,13 @@ def surfaces_inside(medium: Medium) -> list[TriangleMesh]:
 
 
 def object_box(silhouettes: Silhouettes, wrong_masks: int) -> Float[np.ndarray, "2 3"]:
-    """Bounds of a coarse hull, with a margin; a box that cuts the hull off is made larger if that helps."""
-    first = find_box(silhouettes, wrong_masks)
-    for wider in (*_WIDER, 1.0):
-        box = first.mean(0) + wider * (first - first.mean(0))
+    """Estimate the bounding box of the object, with a margin, from a coarse visual hull.
+
+    A box that cuts the hull is enlarged; if no enlargement contains the hull, the initial box is used.
+    """
+    initial = find_box(silhouettes, wrong_masks)
+    for factor in (*_BOX_FACTORS, 1.0):
+        box = initial.mean(0) + factor * (initial - initial.mean(0))
         distances, corner, spacing = carve_grid(silhouettes, box, _COARSE_VOXELS, wrong_masks)
         remove_strays(distances)
         if not reaches_border(distances):
@@ -156,12 +177,11 @@ def _warn_of_open_hull(silhouettes: Silhouettes, box: Float[np.ndarray, "2 3"]) 
     towards = torch.nn.functional.normalize(towards, dim=-1)
     spread = float(torch.rad2deg(torch.arccos((towards @ towards.T).clamp(-1, 1))).max())
     if spread < _ONE_SIDE:
-        reason = (
-            f"all cameras look from within {spread:.0f} degrees, and no silhouette shows where the object ends in depth"
-        )
+        reason = f"all cameras look from within {spread:.0f} degrees, so silhouettes do not bound the object in depth"
     else:
-        reason = "the masks that would bound it are cut by their frames, or the box is too small"
-    warn(f"the hull is cut off by the box {np.round(box, 3).tolist()}: {reason}; give box_min= and box_max= to set it")
+        reason = "the masks that would bound the hull are cut by their frames, or the box is too small"
+    corners = np.round(box, 3).tolist()
+    warn(f"the box {corners} cuts the visual hull: {reason}; set the box with box_min= and box_max=")
 
 
 def _names(views: Views, chosen: torch.Tensor) -> str:

@@ -1,4 +1,4 @@
-"""What is seen around an object, learned from the pixels whose rays miss it."""
+"""Reconstruction of the surroundings of an object from the pixels whose rays miss the object."""
 
 from __future__ import annotations
 
@@ -33,31 +33,31 @@ from nerfro.samplers.straight import straight_path
 from nerfro.subdivision import pixel_rays
 from nerfro.types import Exits
 
-# Photographs are averaged down to at most so many pixels a side.
+# Photographs are downscaled to at most so many pixels per side.
 _MAX_PIXELS = 200
-# Steps, pixels of a step and learning rate at the beginning and the end: of a sky, and of what is near.
+# Number of steps and pixels per step for distant and near surroundings, and first and last learning rate.
 _SKY_STEPS, _SKY_PIXELS = 300, 16384
 _NEAR_STEPS, _NEAR_PIXELS = 400, 2048
 _RATES = (0.03, 0.0015)
-# Every so many-th view is held back, to see how well the surroundings are known where they were not learned.
-HELD_BACK = 8
-# A sky that leaves more than this share of the held-back views' variance unexplained is no sky: then things are near.
-_NO_SKY = 0.25
-# Less variance than this, of linear radiance, is none.
-_LEVEL = 1e-4
-# Texels a face's side of the map of directions that some ray has seen, at most, and pixels for each of them: few enough
-# that where photographs have looked there are no holes.
+# Every so many-th view is a validation view.
+VALIDATION_EVERY = 8
+# Surroundings are near if distant ones leave more than this fraction of the variance of validation views unexplained.
+_MAX_SKY_RESIDUAL = 0.25
+# Lower bound of the variance of linear radiance.
+_MIN_VARIANCE = 1e-4
+# Resolution of the map of observed directions: maximum texels per side of a face, and training pixels per texel, chosen
+# so that the map has no holes where photographs cover the surroundings.
 _SEEN_TEXELS, _SEEN_PIXELS = 64, 8
 
 
 @dataclass(frozen=True)
 class Pixels:
-    """Some pixels of photographs.
+    """A selection of pixels of photographs.
 
     Attributes:
-        cameras: of all photographs.
-        index: view * H * W + row * W + column of each.
-        radiance: linear; at most 1, however bright the light was.
+        cameras: cameras of all photographs.
+        index: view * H * W + row * W + column of each pixel.
+        radiance: linear radiance, clipped at 1 by the photograph.
     """
 
     cameras: Cameras
@@ -76,29 +76,37 @@ class Pixels:
 
     @cached_property
     def rays(self) -> Rays:
-        """Through the pixels' centres."""
+        """Rays through the centres of the pixels."""
         return pixel_rays(self.cameras, self.index)
 
     def some(self, count: int) -> Pixels:
-        """At most so many of them, at random but always the same."""
+        """Select at most `count` random pixels with a fixed seed."""
         chosen = torch.randperm(len(self), generator=torch.Generator().manual_seed(0))[:count]
         return self[chosen.sort().values]
 
 
 def robust(residual: Float[Tensor, "P 3"], half: float) -> Float[Tensor, "P"]:
-    """r^2 / (r^2 + half^2), r^2 the mean over channels: 0 right, 1/2 at `half`, 1 unrelated (Geman and McClure)."""
+    """Compute the Geman-McClure error r^2 / (r^2 + half^2), r^2 the mean square over channels: 0 exact, 1 outlier."""
     square = residual.square().mean(-1)
     return square / (square + half**2)
 
 
 def divide_pixels(views: Views, mesh: TriangleMesh, max_pixels: int = _MAX_PIXELS) -> tuple[Pixels, Pixels]:
-    """Pixels beside the object and pixels that it fills, by its masks, or by its mesh where there are none.
+    """Select the pixels beside the object and the pixels inside its silhouette.
 
-    Pixels on the outline and next to it are neither. Photographs of more than `max_pixels` a side are averaged down, in
-    linear light.
+    Silhouettes are the masks, or projections of the mesh if there are no masks. Pixels on and next to the outline
+    belong to neither selection.
+
+    Args:
+        views: photographs with poses.
+        mesh: surface of the object.
+        max_pixels: photographs are downscaled to at most so many pixels per side, in linear radiance.
+
+    Returns:
+        Pixels beside the object, and pixels inside.
 
     Raises:
-        NerfroError: there are none of the one or the other.
+        NerfroError: one of the selections is empty.
     """
     blocks = PixelBlocks(views.cameras, max_pixels)
     cameras = blocks.cameras(views.cameras)
@@ -115,21 +123,21 @@ def divide_pixels(views: Views, mesh: TriangleMesh, max_pixels: int = _MAX_PIXEL
     beside, through = (Pixels(cameras, *(torch.cat(values) for values in zip(*part, strict=True))) for part in parts)
     if not len(beside) or not len(through):
         raise NerfroError(
-            f"{len(beside)} pixels are seen beside the object and {len(through)} through it, and both are needed; "
-            "take photographs that show the surroundings too, or give medium.ior="
+            f"{len(beside)} pixels lie beside the object and {len(through)} inside its silhouette, and both are "
+            "needed; take photographs that also show the surroundings, or give medium.ior="
         )
     return beside, through
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Learned surroundings.
+    """Reconstructed surroundings.
 
     Attributes:
-        boundary: returns them.
-        seen: texels of directions that some ray has looked into, by face, row and column; None where all count.
-        unexplained: share of the variance of held-back views' pixels that is not explained.
-        colours: some of the radiances that were seen.
+        boundary: boundary model that returns the background radiance.
+        seen: observed directions, by face, row and column of a cube map; None if all directions are known.
+        unexplained: fraction of the variance of the validation pixels that is not explained.
+        colours: a sample of observed radiances.
     """
 
     boundary: EnvironmentMap | Room
@@ -138,11 +146,11 @@ class Surroundings:
     colours: Float[Tensor, "P 3"]
 
     def radiance(self, exits: Exits) -> tuple[Float[Tensor, "P 3"], Bool[Tensor, "P"]]:
-        """What a photograph shows in these directions, and whether that is known."""
+        """Return the radiance that a photograph records along exit rays, and whether the radiance is known."""
         return self.boundary(exits).clamp(max=1), self.known(exits)
 
     def known(self, exits: Exits) -> Bool[Tensor, "P"]:
-        """Whether it is known what a photograph shows in these directions."""
+        """Test whether the radiance in the exit directions is known."""
         if self.seen is None:
             return torch.ones(len(exits.directions), dtype=torch.bool)
         return self.seen[_texel(exits.directions, self.seen.shape[-1])]
@@ -151,47 +159,48 @@ class Surroundings:
 def learn_surroundings(
     beside: Pixels, mesh: TriangleMesh, near: bool | None, progress: Callable[[float], None] = lambda done: None
 ) -> Surroundings:
-    """Learn what is around an object from the pixels beside it.
+    """Reconstruct the surroundings of an object from the pixels beside the object.
 
     Args:
-        beside: the pixels.
-        mesh: the object.
-        near: whether things are so near that rays of equal direction see different ones; None finds out.
-        progress: is told the share done.
+        beside: pixels beside the object.
+        mesh: surface of the object.
+        near: whether the surroundings are so near that parallel rays see different points; None decides by validation
+            views.
+        progress: called with the completed fraction.
     """
-    held_back = beside.view % HELD_BACK == HELD_BACK - 1
-    learned, judges = beside[~held_back], beside[held_back] if held_back.any() else beside
-    judges = judges.some(_SKY_PIXELS)
+    validates = beside.view % VALIDATION_EVERY == VALIDATION_EVERY - 1
+    training, validation = beside[~validates], beside[validates] if validates.any() else beside
+    validation = validation.some(_SKY_PIXELS)
     found = None
     if not near:
-        # Texels as wide as pixels, and no more of them than half the pixels: what none teaches would be speckle.
-        side = min(1.5 * float(beside.cameras.fx.mean()) * math.pi / 2, math.sqrt(len(learned) / 12))
+        # Texels are as wide as pixels, and at most half as many, because unobserved texels would be noise.
+        side = min(1.5 * float(beside.cameras.fx.mean()) * math.pi / 2, math.sqrt(len(training) / 12))
         levels = [4 * 2**level for level in range(16) if 4 * 2**level <= max(16, side)]
         boundary = EnvironmentMap(levels)
-        _learn(boundary, learned, _SKY_STEPS, _SKY_PIXELS, progress)
-        n = max(1, min(_SEEN_TEXELS, int(math.sqrt(len(learned) / (6 * _SEEN_PIXELS)))))
+        _learn(boundary, training, _SKY_STEPS, _SKY_PIXELS, progress)
+        n = max(1, min(_SEEN_TEXELS, int(math.sqrt(len(training) / (6 * _SEEN_PIXELS)))))
         seen = torch.zeros(6, n, n, dtype=torch.bool)
-        seen[_texel(learned.rays.directions, n)] = True
-        found = Surroundings(boundary, seen, _unexplained(boundary, judges), judges.radiance)
-    if near or (near is None and found is not None and found.unexplained > _NO_SKY):
+        seen[_texel(training.rays.directions, n)] = True
+        found = Surroundings(boundary, seen, _unexplained(boundary, validation), validation.radiance)
+    if near or (near is None and found is not None and found.unexplained > _MAX_SKY_RESIDUAL):
         middle = torch.from_numpy(mesh.bounds.mean(0)).float()
         distance = (beside.cameras.camera_to_world[:, :, 3] - middle).norm(dim=-1)
         field = Room(mesh.bounds, float(distance.mean()))
-        _learn(field, learned, _NEAR_STEPS, _NEAR_PIXELS, progress)
-        unexplained = _unexplained(field, judges)
+        _learn(field, training, _NEAR_STEPS, _NEAR_PIXELS, progress)
+        unexplained = _unexplained(field, validation)
         if found is None or unexplained < found.unexplained:
-            found = Surroundings(field, None, unexplained, judges.radiance)
+            found = Surroundings(field, None, unexplained, validation.radiance)
     assert found is not None
     return found
 
 
 class Around:
-    """What photographs show through an object and around it, found out when it is first asked for.
+    """Observations of an object and its surroundings, computed on first use.
 
     Args:
         views: photographs with poses.
-        mesh: the object.
-        room: whether its surroundings are near; None finds out.
+        mesh: surface of the object.
+        room: whether the surroundings are near; None decides by validation views.
     """
 
     def __init__(self, views: Views, mesh: TriangleMesh, room: bool | None) -> None:
@@ -199,22 +208,22 @@ class Around:
 
     @property
     def near(self) -> bool | None:
-        """Whether the surroundings are near; None where nothing has asked for them."""
+        """Whether the surroundings are near; None if they have not been reconstructed."""
         known = self.__dict__.get("surroundings")
         return None if known is None else isinstance(known.boundary, Room)
 
     @cached_property
     def through(self) -> Pixels:
-        """Pixels that the object fills."""
+        """Pixels inside the silhouette of the object."""
         return self._divided[1]
 
     @cached_property
     def surroundings(self) -> Surroundings:
-        """Learned, with a bar; how well they are known is printed."""
-        with bar("surroundings") as told:
-            found = learn_surroundings(self._divided[0], self._mesh, self._room, told)
-        what = "near" if isinstance(found.boundary, Room) else "far away"
-        print(f"surroundings: {what}; {found.unexplained:.1%} of other views' variance unexplained")
+        """Reconstructed surroundings; prints their type and accuracy."""
+        with bar("surroundings") as progress:
+            found = learn_surroundings(self._divided[0], self._mesh, self._room, progress)
+        distance = "near" if isinstance(found.boundary, Room) else "far away"
+        print(f"surroundings: {distance}; {found.unexplained:.1%} of the variance of validation views is unexplained")
         return found
 
     @cached_property
@@ -223,11 +232,11 @@ class Around:
 
 
 class Room(Boundary):
-    """Surroundings at finite distance: radiance in all of space, seen along the lines on which light leaves.
+    """Near surroundings: a radiance field in all of space, rendered along the exit rays.
 
     Args:
-        bounds: of the object, world units.
-        radius: of the ball around its middle in which details are finest; best the cameras' distance.
+        bounds: corners of the bounding box of the object, world units.
+        radius: radius of the ball around the object outside which space is contracted; best the camera distance.
     """
 
     def __init__(self, bounds: Float[np.ndarray, "2 3"], radius: float) -> None:
@@ -237,13 +246,13 @@ class Room(Boundary):
             low, high, radius, finest_resolution=512, log2_table_size=17, direction_bands=1, initial_depth=3.0
         )
         self.sampler = DensityGridSampler(box_min=low, box_max=high, radius=radius, looks=0.25, decay=0.6)
-        self.draws: Draws | None = None  # random numbers of the step while it learns
+        self.draws: Draws | None = None  # random numbers of the current training step
 
     def forward(self, exits: Exits) -> Float[Tensor, "P 3"]:
         return self.seen(exits)[0]
 
     def seen(self, exits: Exits) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P"]]:
-        """Radiance and how far away it comes from. What comes from infinity has the colour of what is farthest."""
+        """Render radiance and its distance along exit rays. Transmitted light has the colour of the farthest sample."""
         assert exits.positions is not None
         ones = torch.ones_like(exits.positions[:, 0])
         rays = Rays(exits.positions, exits.directions, exits.radii * ones, 0 * ones, ones)
@@ -266,7 +275,7 @@ def _learn(boundary: Boundary, pixels: Pixels, steps: int, batch: int, progress:
             optimizer.param_groups[0]["lr"] = first * (last / first) ** (step / steps)
             drawn = pixels[torch.randint(len(pixels), (batch,), generator=generator)]
             predicted = boundary(Exits.unbent(drawn.rays))
-            # Brighter than a photograph can tell is not wrong.
+            # A photograph clips radiance at 1, so brighter predictions of clipped pixels are no error.
             seen = torch.where(drawn.radiance >= 1, predicted.clamp(max=1), predicted)
             optimizer.zero_grad()
             functional.mse_loss(seen, drawn.radiance).backward()
@@ -282,7 +291,7 @@ def _learn(boundary: Boundary, pixels: Pixels, steps: int, batch: int, progress:
 @torch.no_grad()
 def _unexplained(boundary: Boundary, pixels: Pixels) -> float:
     error = boundary(Exits.unbent(pixels.rays)).clamp(max=1) - pixels.radiance
-    return float(error.square().mean() / pixels.radiance.var(0).mean().clamp(min=_LEVEL))
+    return float(error.square().mean() / pixels.radiance.var(0).mean().clamp(min=_MIN_VARIANCE))
 
 
 def _texel(directions: Float[Tensor, "P 3"], n: int) -> tuple[Tensor, Tensor, Tensor]:

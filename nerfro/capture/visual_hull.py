@@ -1,4 +1,4 @@
-"""Shape from silhouettes: the largest body that no view of the object contradicts."""
+"""Shape from silhouettes: the visual hull, the largest body that is consistent with all masks."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from nerfro.errors import NerfroError
 from nerfro.geometry.lines import nearest_point
 from nerfro.geometry.mesh import TriangleMesh, merge_vertices
 
-# Each level halves the voxels and looks only at those near the surface of the level before.
+# Number of refinements. Each halves the voxels and evaluates only voxels near the surface of the coarser level.
 _LEVELS = 2
-# Width of that neighbourhood, voxels of the level before: more than their diagonal.
+# Width of the neighbourhood in voxels of the coarser level, more than a voxel's diagonal.
 _BAND = 2.0
-# Parts of less than this share of the largest part's volume are strays.
-_STRAY = 0.02
+# Components below this fraction of the volume of the largest component are removed.
+_MIN_VOLUME = 0.02
 _MIN_VIEWS = 2
 _CHUNK = 1 << 18
 
 
 @dataclass(frozen=True)
 class Silhouettes:
-    """What the views say about the object's outline.
+    """Silhouettes of the object in several views.
 
     Attributes:
-        cameras: of the views.
-        masks: share of each pixel that the object covers.
-        distances: of the pixels' centres to the outlines, pixels, positive inside.
-        cut: which masks touch the frame, so that nothing is known outside of it.
+        cameras: cameras of the views.
+        masks: fraction of each pixel that the object covers.
+        distances: signed distances of the pixel centres to the outlines, in pixels, positive inside.
+        cut: views in which the frame cuts the object, so that nothing is known outside the frame.
     """
 
     cameras: Cameras
@@ -47,7 +47,7 @@ class Silhouettes:
 
     @classmethod
     def of(cls, cameras: Cameras, masks: Float[Tensor, "V H W"]) -> Silhouettes:
-        """Find the outlines of masks."""
+        """Compute the outlines of masks."""
         distances = np.stack([outline_distance(mask.numpy()) for mask in masks])
         return cls(cameras, masks, torch.from_numpy(distances.astype(np.float32)), frame_pixels(masks).any(1))
 
@@ -57,12 +57,12 @@ class Silhouettes:
     def depth_inside(
         self, view: int, points: Float[Tensor, "P 3"]
     ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"], Float[Tensor, "P"]]:
-        """How far points are inside one view's silhouette.
+        """Compute the distances of points to the outline of one view.
 
         Returns:
-            Distance to the outline in pixels, positive inside, infinite where the view knows nothing: behind the
-            camera, or outside the frame where that cuts the object. The width of a pixel at the point, world units.
-            How far outside the frame the point is seen, pixels.
+            Signed distance in pixels, positive inside; infinite where the view gives no information, that is behind
+            the camera, and outside a frame that cuts the object. Width of a pixel at the point, in world units.
+            Distance of the projected point from the frame, in pixels.
         """
         cameras = self.cameras.select([view])
         pixels, depth = (values[0] for values in cameras.project(points))
@@ -79,10 +79,14 @@ class Silhouettes:
         return torch.where(unknown, torch.inf, distance), width, outside
 
     def carve(self, points: Float[Tensor, "P 3"], wrong_masks: int = 0) -> Float[Tensor, "P"]:
-        """About the signed distance to the visual hull, world units, negative inside; exact where it is zero.
+        """Compute an approximate signed distance to the visual hull with an exact zero level.
 
-        It is the largest over the views of the distance to the silhouette's cone, the (wrong_masks + 1)-th largest if
-        that many views may be wrong about any point. A point that fewer than two views see is outside.
+        The value is the maximum over the views of the distance to the cone of the silhouette, or the
+        (wrong_masks + 1)-th largest value if so many views may be wrong about any point. Points that fewer than two
+        views see are outside.
+
+        Returns:
+            Distances in world units, negative inside.
         """
         largest = torch.full((wrong_masks + 1, len(points)), -torch.inf)
         num_seen = torch.zeros(len(points), dtype=torch.int32)
@@ -98,7 +102,7 @@ class Silhouettes:
 
 
 def centre_lines(silhouettes: Silhouettes) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"]]:
-    """Origins and unit directions of the lines through the centres of masks, none of them empty."""
+    """Return origins and unit directions of the rays through the centroids of the masks, none of which may be empty."""
     cameras, inside = silhouettes.cameras, silhouettes.masks > 0.5
     rows, columns = torch.arange(cameras.height) + 0.5, torch.arange(cameras.width) + 0.5
     count = inside.sum((1, 2))
@@ -108,9 +112,10 @@ def centre_lines(silhouettes: Silhouettes) -> tuple[Float[np.ndarray, "V 3"], Fl
 
 
 def find_box(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np.ndarray, "2 3"]:
-    """A cube around the object: where the lines through the masks' centres meet, and as wide as the widest mask there.
+    """Estimate a cube that contains the object.
 
-    No mask is empty. The `wrong_masks` widest ones are passed over.
+    The centre is the point nearest to the rays through the centroids of the masks. The side follows from the widest
+    mask, after the `wrong_masks` widest ones are ignored. No mask may be empty.
     """
     cameras, inside = silhouettes.cameras, silhouettes.masks > 0.5
     centre = nearest_point(*centre_lines(silhouettes))
@@ -132,12 +137,17 @@ def carve_grid(
     wrong_masks: int = 0,
     progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[Float[np.ndarray, "X Y Z"], Float[np.ndarray, "3"], float]:
-    """Carve a grid of `resolution` voxels along the longest side, finer and finer near the surface.
+    """Evaluate the visual hull on a grid, coarse to fine near the surface.
 
-    The box's far sides move out to a whole number of voxels. `progress` is told how many levels are done, in shares.
+    Args:
+        silhouettes: silhouettes of the object.
+        box: corners of the grid; the upper corner moves outwards to an integer number of voxels.
+        resolution: number of voxels along the longest side.
+        wrong_masks: number of views that may be wrong about any point.
+        progress: called with the number of completed levels, a fraction included.
 
     Returns:
-        Signed distances at the voxels' corners (see `Silhouettes.carve`), the lower corner, and a voxel's side.
+        Signed distances at the corners of the voxels (see `Silhouettes.carve`), the lower corner, and the voxel size.
     """
     extent = np.asarray(box[1] - box[0], np.float64)
     factor = 2**_LEVELS
@@ -163,13 +173,16 @@ def carve_grid(
 
 
 def remove_strays(distances: Float[np.ndarray, "X Y Z"], keep: int | None = None) -> tuple[int, int]:
-    """Turn stray parts into air and enclosed voids into object, in place.
+    """Remove small components and fill enclosed voids, in place.
 
-    Silhouettes cannot show a void, and the cones of few views also meet where nothing is. The `keep` largest parts
-    stay; by default all that have 2 % of the largest one's volume.
+    Silhouettes cannot show voids, and the cones of few views also intersect in empty places.
+
+    Args:
+        distances: signed distances, negative inside.
+        keep: number of largest components to keep; by default all with 2 % of the volume of the largest one.
 
     Returns:
-        Number of parts that there were, and that were kept.
+        Number of components before and after the removal.
     """
     inside = distances < 0
     voids = binary_fill_holes(inside) & ~inside
@@ -179,7 +192,7 @@ def remove_strays(distances: Float[np.ndarray, "X Y Z"], keep: int | None = None
         return 0, 0
     sizes = np.bincount(parts.ravel())[1:]
     order = np.argsort(-sizes, kind="stable")
-    num_kept = int((sizes >= _STRAY * sizes.max()).sum()) if keep is None else min(keep, num_parts)
+    num_kept = int((sizes >= _MIN_VOLUME * sizes.max()).sum()) if keep is None else min(keep, num_parts)
     strays = ~np.isin(parts, [0, *(order[:num_kept] + 1)])
     distances[strays] = np.abs(distances[strays])
     return num_parts, num_kept
@@ -188,9 +201,13 @@ def remove_strays(distances: Float[np.ndarray, "X Y Z"], keep: int | None = None
 def extract_surface(
     distances: Float[np.ndarray, "X Y Z"], corner: Float[np.ndarray, "3"], spacing: float | Float[np.ndarray, "3"]
 ) -> TriangleMesh:
-    """The zero level as a closed mesh in world units; where it meets the grid's border it is closed there."""
+    """Extract the zero level as a mesh in world units, which is closed at the border of the grid.
+
+    Raises:
+        NerfroError: no voxel is inside.
+    """
     if not (distances < 0).any():
-        raise NerfroError("the visual hull is empty: no point is inside all masks")
+        raise NerfroError("the visual hull is empty: no point is inside all masks; check masks and poses")
     padded = np.pad(distances, 1, constant_values=0.5 * np.max(spacing))
     sides = tuple(np.broadcast_to(spacing, 3))
     vertices, faces, _, _ = marching_cubes(padded, 0.0, spacing=sides, gradient_direction="descent")
@@ -198,6 +215,6 @@ def extract_surface(
 
 
 def reaches_border(distances: Float[np.ndarray, "X Y Z"]) -> bool:
-    """Whether the body touches a side of the grid."""
+    """Test whether the body touches a side of the grid."""
     inside = distances < 0
     return bool(inside.sum() > inside[1:-1, 1:-1, 1:-1].sum())

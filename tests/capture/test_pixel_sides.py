@@ -12,7 +12,7 @@ from nerfro.capture.moving_mesh import MovingMesh
 from nerfro.capture.pixel_sides import by_pixel_sides
 from nerfro.capture.rims import Rims, find_rims, outlines_of
 from nerfro.capture.silhouette_fit import fit_surface
-from nerfro.capture.silhouettes import holds_shares
+from nerfro.capture.silhouettes import is_antialiased
 from nerfro.capture.visual_hull import Silhouettes
 from tests.silhouettes import cameras_around, hull, photographed, photographed_softly
 
@@ -96,7 +96,7 @@ def test_masks_in_black_and_white_are_told_from_those_of_shares(silhouettes: Sil
     soft = photographed_softly(ball(), silhouettes.cameras, 4)
     nearly = Silhouettes.of(silhouettes.cameras, (silhouettes.masks + 0.01).clamp(max=1))  # as JPEG leaves them
     empty = torch.zeros(1, 8, 8)
-    assert holds_shares(soft.masks.numpy(), soft.distances.numpy())
+    assert is_antialiased(soft.masks.numpy(), soft.distances.numpy())
     for masks in (silhouettes, nearly):
-        assert not holds_shares(masks.masks.numpy(), masks.distances.numpy())
-    assert not holds_shares(empty.numpy(), Silhouettes.of(silhouettes.cameras.select([0]), empty).distances.numpy())
+        assert not is_antialiased(masks.masks.numpy(), masks.distances.numpy())
+    assert not is_antialiased(empty.numpy(), Silhouettes.of(silhouettes.cameras.select([0]), empty).distances.numpy())

@@ -85,7 +85,7 @@ def test_a_box_is_no_body_of_revolution(capsys: pytest.CaptureFixture[str]) -> N
     box = trimesh.creation.box([0.9, 0.3, 1.2])
     mesh = TriangleMesh(np.asarray(box.vertices) @ TURN.T, np.asarray(box.faces))
     silhouettes = Silhouettes.of(cameras, _masks(mesh, cameras))
-    for symmetry, told in (("axis", "symmetry=axis is not used"), ("auto", "as a body of revolution")):
+    for symmetry, told in (("axis", "symmetry=axis is ignored"), ("auto", "as a body of revolution")):
         found = make_mesh(silhouettes, None, 32, 0, None, 0.0, symmetry)  # type: ignore[arg-type]
         assert told in capsys.readouterr().out
         sides = np.sort(np.ptp(found.vertices @ TURN, axis=0))

@@ -205,7 +205,7 @@ def test_misread_poses_are_named(odd_shape: trimesh.Trimesh, convention: str) ->
     silhouettes = photographed(odd_shape, cameras_around(16, 32))
     poses = MISREAD[convention](silhouettes.cameras.camera_to_world)
     misread = replace(silhouettes, cameras=replace(silhouettes.cameras, camera_to_world=poses))
-    with pytest.raises(NerfroError, match=rf"poses are in another convention: .*{convention}"):
+    with pytest.raises(NerfroError, match=rf"poses use another convention: .*{convention}"):
         require_consistent_poses(misread, [str(view) for view in range(16)], wrong_masks=0)
 
 
@@ -213,7 +213,7 @@ def test_view_that_contradicts_the_others_is_named(odd_shape: trimesh.Trimesh) -
     silhouettes = photographed(odd_shape, cameras_around(16, 32))
     masks = silhouettes.masks.clone()
     masks[5] = masks[5].roll(16, 0)
-    with pytest.raises(NerfroError, match=r"look at the masks and poses of view_5, and .* wrong_masks=1"):
+    with pytest.raises(NerfroError, match=r"check the masks and poses of view_5, and .* wrong_masks=1"):
         require_consistent_poses(
             Silhouettes.of(silhouettes.cameras, masks), [f"view_{view}" for view in range(16)], wrong_masks=0
         )
@@ -222,5 +222,5 @@ def test_view_that_contradicts_the_others_is_named(odd_shape: trimesh.Trimesh) -
 def test_shuffled_masks_are_refused(odd_shape: trimesh.Trimesh) -> None:
     silhouettes = photographed(odd_shape, cameras_around(16, 32))
     shuffled = Silhouettes.of(silhouettes.cameras, silhouettes.masks.roll(5, 0))
-    with pytest.raises(NerfroError, match="no usual misreading of the poses explains it"):
+    with pytest.raises(NerfroError, match="none of the known pose conventions explains the difference"):
         require_consistent_poses(shuffled, [str(view) for view in range(16)], wrong_masks=0)
