@@ -80,7 +80,7 @@ def main(config: DictConfig) -> None:
             mesh = refine(around, mesh, refinable(found), silhouettes, searches_index(config, overrides), folder).mesh
             written += [FIGURES, PICTURES]
         except NerfroError as reason:  # all that is known by now is worth keeping
-            warn(f"the surface stays as it is: {reason}")
+            warn(f"surface unchanged: {reason}")
         mesh.save(folder / MESH)
         settings = surface_settings(config, views.cameras, mesh, location, overrides)
         if mesh is not before:

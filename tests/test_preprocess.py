@@ -204,7 +204,7 @@ def test_views_from_one_side_are_bounded_by_the_box(preprocess: Callable[..., st
     printed = preprocess("box_min=[-0.6,-0.8,-0.6]", "box_max=[1.2,1,0.3]", "smoothing=0")
     assert "3 views give a coarse visual hull" in printed
     assert "cuts the visual hull" in printed
-    assert "no silhouette shows where the object ends in depth" in printed
+    assert "silhouettes do not bound the object in depth" in printed
     assert load_mesh(capture / "mesh.ply").bounds[1, 2] < 0.4
 
 
