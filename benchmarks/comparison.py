@@ -11,7 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from nerfro.evaluation.pictures import PictureRow, most_telling_crop, picture_grid
+from nerfro.evaluation.image_grid import ImageRow, image_grid, most_different_crop
 from nerfro.evaluation.results import METRICS, RunMetrics, read_metrics_json
 from nerfro.evaluation.tables import Column, Row, Table, to_markdown
 from nerfro.files.images import load_png, save_png
@@ -57,7 +57,7 @@ def table(metrics: dict[str, RunMetrics]) -> Table:
     ]
     reasons = [(metric, run.result.notes.get(metric.name)) for metric in shown for run in metrics.values()]
     notes = dict.fromkeys(f"{metric.title} n/a: {reason}" for metric, reason in reasons if reason is not None)
-    return Table("Embedded torus, 20 test views", "method", columns, tuple(rows), mark_best=True, notes=tuple(notes))
+    return Table("Embedded torus, 20 test views", "method", columns, tuple(rows), mark="best", notes=tuple(notes))
 
 
 def grid(metrics: dict[str, RunMetrics]):
@@ -67,9 +67,9 @@ def grid(metrics: dict[str, RunMetrics]):
         reference = load_png(ASSETS_DIR / "torus" / "test" / f"r_{view:03d}.png")
         predictions = [load_png(RUNS / name / "images" / f"test_{view:03d}.png") for name in SHOWN]
         scores = [f"{metrics[name].result.views[view].scores['psnr']:.2f} dB" for name in SHOWN]
-        crop = most_telling_crop(reference, predictions, 32)
-        rows.append(PictureRow(reference, predictions, captions=scores, crops=[crop]))
-    return picture_grid(rows, ["reference", *(METHODS[name] for name in SHOWN)])
+        crop = most_different_crop(reference, predictions, 32)
+        rows.append(ImageRow(reference, predictions, captions=scores, crops=[crop]))
+    return image_grid(rows, ["reference", *(METHODS[name] for name in SHOWN)])
 
 
 if __name__ == "__main__":

@@ -11,8 +11,8 @@ from nerfro.evaluation.lpips import find_lpips_networks
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.request import EvaluateConfig, find_device, own_folder, record, require_one_task
 from nerfro.evaluation.results import RunMetrics
-from nerfro.evaluation.score_tables import report
 from nerfro.evaluation.scoring import score_folders
+from nerfro.evaluation.tables import report
 from nerfro.evaluation.treatments import score_split
 from nerfro.files.images import load_png
 from nerfro.paths import user_path

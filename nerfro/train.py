@@ -14,7 +14,7 @@ from nerfro.distributed import leave
 from nerfro.evaluation.lpips import find_lpips_networks
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import RunMetrics
-from nerfro.evaluation.score_tables import report
+from nerfro.evaluation.tables import report
 from nerfro.evaluation.treatments import score_split
 from nerfro.fields.mlp import compile_networks
 from nerfro.subdivision import Subdivision

@@ -175,7 +175,7 @@ def test_interrupted_evaluation_says_how_to_go_on(
 
     scored = [f"checkpoint={run / LAST_CHECKPOINT}", f"out={tmp_path / 'scores'}"]
     with interrupted_at_second_picture():
-        assert evaluate_here(*scored) == (130, "nerfro: interrupted; the same command begins it again")
+        assert evaluate_here(*scored) == (130, "nerfro: interrupted; run the same command to start again")
     assert not (tmp_path / "scores" / "metrics.json").exists()
     assert evaluate_here(*scored)[0] == 0
     assert (tmp_path / "scores" / "metrics.json").exists()

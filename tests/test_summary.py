@@ -243,12 +243,12 @@ MEDALS = Table(
         Row("c", (22.04, 0.3, 3.0, None)),
         Row("d", (21.83, 0.4, 4.0, 0.5)),
     ),
-    medals=True,
+    mark="medals",
 )
 
 
 def test_medals_follow_the_papers_rule() -> None:
-    assert [[MEDALS.medal(i, j) for i in range(4)] for j in range(4)] == [
+    assert [[MEDALS.mark_of(i, j) or None for i in range(4)] for j in range(4)] == [
         ["gold", "gold", "silver", "bronze"],
         ["gold", "silver", "bronze", None],
         [None, "bronze", "silver", "gold"],

@@ -201,7 +201,7 @@ def test_evaluation_refuses_in_one_line(
 def test_evaluation_without_a_checkpoint_asks_for_one(evaluate_here: Callable[..., Any]) -> None:
     code, _, errors = evaluate_here()
     assert code == 1
-    assert "what is to be scored? give checkpoint=RUN/checkpoints/last.ckpt, or predictions=DIR" in errors
+    assert "give either checkpoint=RUN/checkpoints/last.ckpt, or predictions=DIR" in errors
 
 
 @pytest.mark.parametrize("chunk_size", [1, 37, 256])

@@ -1,1 +1,1 @@
-"""Image quality: metrics, tables, comparison pictures, and the files that hold them."""
+"""Image quality: metrics, score tables, comparison images, and their files."""

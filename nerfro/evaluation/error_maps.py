@@ -1,4 +1,4 @@
-"""Where two pictures differ: error at each pixel, in a perceptual colour map of a fixed scale, and sheets of them."""
+"""Error maps of two images in a perceptual colour map with a fixed scale, and sheets of error maps."""
 
 from __future__ import annotations
 
@@ -19,23 +19,30 @@ from nerfro.evaluation.ssim import WINDOW, ssim_map
 from nerfro.files.drawing import GAP, LINE_HEIGHT, colour_scale, fit, magma, paper, write
 from nerfro.files.images import save_png
 
-# Squared errors from 0 to this value are told apart; 0.05 is a difference of 0.22 in every channel.
+# Squared error at the end of the colour scale; 0.05 is a difference of 0.22 in every channel.
 SQUARED_ERROR_LIMIT = 0.05
-MIN_WIDTH = 256  # pixels; smaller pictures are enlarged to it in sheets, so that titles have room
+MIN_WIDTH = 256  # pixels; smaller images are enlarged in sheets, because titles need this width
 _SCALE_HEIGHT = 64  # pixels
 
 
 @dataclass(frozen=True)
 class ErrorMap:
-    """Error at each pixel of a picture."""
+    """Error at each pixel of an image.
 
-    name: str  # of the metric, as in file names
-    title: str  # what the values are, written at the colour scale
-    values: Float[Tensor, "H W"]  # 0 where there is no error; NaN where there is no value
-    limit: float  # value of the last colour of the scale, the same for all pictures
+    Attributes:
+        name: name of the metric, as in file names.
+        title: title of the colour scale.
+        values: error [H, W]; 0 for equal pixels, NaN for pixels without a value.
+        limit: value of the last colour of the scale, equal for all images.
+    """
+
+    name: str
+    title: str
+    values: Float[Tensor, "H W"]
+    limit: float
 
     def colours(self) -> Float[Tensor, "H W 3"]:
-        """The map in magma, sRGB in [0, 1]."""
+        """Apply the magma colour map; the result is sRGB in [0, 1]."""
         return magma(self.values, self.limit)
 
 
@@ -44,10 +51,15 @@ def error_maps(
     target: Float[Tensor, "H W 3"],
     lpips_networks: Mapping[str, LpipsNetwork] | None = None,
 ) -> list[ErrorMap]:
-    """All error maps that two pictures allow: squared error, 1 - SSIM, LPIPS with each network given, and FLIP.
+    """Compute the error maps of two images: squared error, 1 - SSIM, LPIPS with each given network, and FLIP.
 
-    1 - SSIM and LPIPS are left out where the picture is too small for them. 1 - SSIM has no values on the border of
-    five pixels, whose windows stick out of the picture.
+    1 - SSIM and LPIPS are omitted for images that are too small. 1 - SSIM has no values in a border of five pixels,
+    because windows there would exceed the image.
+
+    Args:
+        prediction: rendered image, sRGB in [0, 1].
+        target: reference image, sRGB in [0, 1].
+        lpips_networks: networks by name, see `find_lpips_networks`.
     """
     size = min(prediction.shape[:2])
     maps = [ErrorMap("squared_error", "squared error", squared_error_map(prediction, target), SQUARED_ERROR_LIMIT)]
@@ -64,11 +76,11 @@ def error_maps(
 
 
 def squared_error_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
-    """Squared error of each pixel, mean over channels; its mean over the picture is what PSNR measures."""
+    """Compute the squared error of each pixel, averaged over channels. Its mean over the image determines the PSNR."""
     if prediction.shape != target.shape:
         raise NerfroError(
             f"cannot compare a prediction {list(prediction.shape)} with a reference {list(target.shape)}; "
-            "both must be of one size"
+            "both must have the same size"
         )
     return (prediction - target).square().mean(-1)
 
@@ -78,18 +90,18 @@ def error_sheet(
 ) -> Float[Tensor, "h w 3"]:
     """Draw a prediction, its reference and its error maps in one row, with the colour scale below each map.
 
-    Pictures are enlarged by a whole number, without smoothing, so that pixels are seen as they are.
+    Images are enlarged by a whole factor without smoothing, so that single pixels remain visible.
     """
     zoom = -(-MIN_WIDTH // target.shape[1])
     height, width = zoom * target.shape[0], zoom * target.shape[1]
     titles = ["prediction", "reference", *(error.title for error in maps)]
-    pictures = [prediction, target, *(error.colours() for error in maps)]
+    images = [prediction, target, *(error.colours() for error in maps)]
     scales = [None, None, *(colour_scale(width, _SCALE_HEIGHT, error.title, error.limit) for error in maps)]
     sheet = paper(len(titles) * (width + GAP) - GAP, LINE_HEIGHT + height + _SCALE_HEIGHT)
-    for column, (title, picture, scale) in enumerate(zip(titles, pictures, scales, strict=True)):
+    for column, (title, image, scale) in enumerate(zip(titles, images, scales, strict=True)):
         left = column * (width + GAP)
         write(sheet, title, left + width // 2, LINE_HEIGHT // 2)
-        sheet.paste(fit(picture, width, height), (left, LINE_HEIGHT))
+        sheet.paste(fit(image, width, height), (left, LINE_HEIGHT))
         if scale is not None:
             sheet.paste(scale, (left, LINE_HEIGHT + height))
     return torch.from_numpy(np.array(sheet)).float() / 255
@@ -102,6 +114,6 @@ def write_error_sheet(
     reference: Float[Tensor, "H W 3"],
     networks: Mapping[str, LpipsNetwork],
 ) -> None:
-    """Write a view's error maps to `folder/errors/<name>.png`."""
+    """Write the error maps of a view to `folder/errors/<name>.png`."""
     maps = error_maps(prediction, reference, networks)
     save_png(folder / "errors" / f"{name}.png", error_sheet(prediction, reference, maps))

@@ -1,8 +1,10 @@
-"""FLIP: how much a viewer who flips between two pictures sees of their difference.
+"""FLIP: visibility of the difference between two images that alternate on a screen.
 
-The values are those of the authors' package flip-evaluator, for displays of low dynamic range (LDR), seen as it takes
-by default: 67 pixels in a degree of the field of view, a display 0.7 m wide with 3840 pixels from 0.7 m away. Source:
-Andersson et al., "FLIP: a difference evaluator for alternating images", HPG 2020.
+The values are computed by the authors' package flip-evaluator for low dynamic range (LDR) and its default viewing
+conditions: 67 pixels per degree, that is, a display of 0.7 m width and 3840 pixels at a distance of 0.7 m.
+
+Source:
+    Andersson et al., "FLIP: a difference evaluator for alternating images", HPG 2020.
 """
 
 from __future__ import annotations
@@ -16,14 +18,31 @@ from nerfro.evaluation.regions import mean_over
 
 
 def flip_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
-    """Visible difference at each pixel of sRGB in [0, 1]: values in [0, 1], float32; 0 where nothing is seen."""
-    pictures = [image.detach().cpu().float().contiguous().numpy() for image in (target, prediction)]
-    errors, _, _ = flip_evaluator.evaluate(*pictures, "LDR", applyMagma=False, computeMeanError=False)
+    """Compute the visible difference of two images at each pixel.
+
+    Args:
+        prediction: rendered image, sRGB in [0, 1].
+        target: reference image, sRGB in [0, 1].
+
+    Returns:
+        Values in [0, 1], float32; 0 for an invisible difference.
+    """
+    images = [image.detach().cpu().float().contiguous().numpy() for image in (target, prediction)]
+    errors, _, _ = flip_evaluator.evaluate(*images, "LDR", applyMagma=False, computeMeanError=False)
     return torch.from_numpy(errors[..., 0]).to(prediction.device)
 
 
 def flip(
     prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], inside: Bool[Tensor, "H W"] | None = None
 ) -> Float[Tensor, ""]:
-    """The mean of `flip_map` over all pixels, or those of a mask; NaN for an empty mask."""
+    """Compute the mean of `flip_map`; lower is better.
+
+    Args:
+        prediction: rendered image, sRGB in [0, 1].
+        target: reference image, sRGB in [0, 1].
+        inside: mask of the pixels that count; by default, all pixels count.
+
+    Returns:
+        Mean in [0, 1], without unit; NaN for an empty mask.
+    """
     return mean_over(flip_map(prediction, target), inside)

@@ -1,4 +1,4 @@
-"""Folders of predictions and references, of any program, matched by the names of their files."""
+"""Pairs of predictions and references in two folders, matched by file name."""
 
 from __future__ import annotations
 
@@ -17,16 +17,29 @@ from nerfro.evaluation.regions import object_pixels
 
 
 @dataclass(frozen=True)
-class PicturePair:
-    """A prediction and what it is compared with."""
+class ImagePair:
+    """A prediction with its reference.
 
-    name: str  # what both files are called, without extension
+    Attributes:
+        name: common name of both files, without extension.
+        prediction: file of the predicted image.
+        reference: file of the reference image.
+        mask: file of the object's silhouette, or None to use the transparency of the reference, if any.
+    """
+
+    name: str
     prediction: Path
     reference: Path
-    mask: Path | None  # says where the object is; None to take the reference's transparency, if it has any
+    mask: Path | None
 
     def load(self, alpha: Alpha) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"], Float[Tensor, "H W"] | None]:
-        """Read the prediction, the reference, and the share of each pixel that the object covers, if it is known.
+        """Read the images.
+
+        Args:
+            alpha: treatment of transparency, see `read_rgb`.
+
+        Returns:
+            Prediction and reference, sRGB in [0, 1], and the coverage of each pixel by the object in [0, 1], or None.
 
         Raises:
             NerfroError: a file cannot be read, sizes differ, or the mask is empty.
@@ -37,28 +50,33 @@ class PicturePair:
         if prediction.shape != reference.shape:
             raise NerfroError(
                 f"{self.prediction} has {_size(prediction)} pixels but its reference {self.reference} has "
-                f"{_size(reference)}; render it in the reference's size, or give references of the predictions' size"
+                f"{_size(reference)}; render both in the same size"
             )
         masks = find_masks([self.reference], [self.mask], 1, (reference.shape[1], reference.shape[0]))
         coverage = None if masks is None else masks[0]
         if coverage is not None and not object_pixels(coverage).any():
             raise NerfroError(
-                f"the mask {self.mask or f'(transparency) of {self.reference}'} is empty: no pixel is covered by half; "
-                "correct it, or leave the view out"
+                f"the mask {self.mask or f'(transparency) of {self.reference}'} is empty: it covers half of no pixel; "
+                "correct it, or remove the view"
             )
         return prediction, reference, coverage
 
 
-def match_folders(predictions: Path, references: Path, masks: Path | None) -> list[PicturePair]:
-    """Pair the pictures of two folders by their names without extension, in the order of their names.
+def match_folders(predictions: Path, references: Path, masks: Path | None) -> list[ImagePair]:
+    """Match the images of two folders by name without extension.
 
-    Masks among the references (`mask_<name>.png`) are not references. Without a folder of masks, they are looked for as
-    `find_mask` does, beside the references and in masks/ there.
+    Args:
+        predictions: folder of predicted images.
+        references: folder of reference images. Files `mask_<name>.png` are masks.
+        masks: folder of masks. By default, `find_mask` searches the folder of references.
+
+    Returns:
+        The pairs, sorted by name.
 
     Raises:
-        NerfroError: a folder does not exist or has no pictures, a picture has no partner, or a name occurs twice.
+        NerfroError: a folder does not exist or holds no images, an image has no counterpart, or a name occurs twice.
     """
-    predicted, truth = _pictures(predictions, "predictions"), _pictures(references, "references")
+    predicted, truth = _list_images(predictions, "predictions"), _list_images(references, "references")
     truth = {name: path for name, path in truth.items() if not name.startswith("mask_") or name[5:] not in truth}
     _require(predicted, truth, f"reference in references={references}")
     _require(truth, predicted, f"prediction in predictions={predictions}")
@@ -67,37 +85,37 @@ def match_folders(predictions: Path, references: Path, masks: Path | None) -> li
         files = {name: path for name, path in found.items() if path is not None}
         where = f"references={references}, where others have one"
     else:
-        files = {name.removeprefix("mask_"): path for name, path in _pictures(masks, "masks").items()}
+        files = {name.removeprefix("mask_"): path for name, path in _list_images(masks, "masks").items()}
         where = f"masks={masks}"
     if files:
         _require(truth, files, f"mask in {where}")
-    return [PicturePair(name, predicted[name], truth[name], files.get(name)) for name in sorted(predicted)]
+    return [ImagePair(name, predicted[name], truth[name], files.get(name)) for name in sorted(predicted)]
 
 
-def _pictures(folder: Path, option: str) -> dict[str, Path]:
-    """The pictures of a folder by their names without extension."""
+def _list_images(folder: Path, option: str) -> dict[str, Path]:
+    """List the images of a folder by name without extension."""
     if not folder.is_dir():
-        raise NerfroError(f"{option}={folder} is not a folder; give one that holds pictures")
-    pictures: dict[str, Path] = {}
+        raise NerfroError(f"{option}={folder} is not a folder; give a folder of images")
+    images: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() not in IMAGE_SUFFIXES or path.name.startswith("."):
             continue
-        if path.stem in pictures:
-            raise NerfroError(f"{pictures[path.stem]} and {path} have one name; keep one of them in {option}={folder}")
-        pictures[path.stem] = path
-    if not pictures:
-        raise NerfroError(f"{option}={folder} holds no pictures; allowed are {', '.join(IMAGE_SUFFIXES)}")
-    return pictures
+        if path.stem in images:
+            raise NerfroError(f"{images[path.stem]} and {path} have the same name; keep one in {option}={folder}")
+        images[path.stem] = path
+    if not images:
+        raise NerfroError(f"{option}={folder} holds no images; allowed are {', '.join(IMAGE_SUFFIXES)}")
+    return images
 
 
-def _require(pictures: Mapping[str, Path], partners: Collection[str], partner: str) -> None:
-    bare = [path for name, path in pictures.items() if name not in partners]
-    if bare:
+def _require(images: Mapping[str, Path], counterparts: Collection[str], description: str) -> None:
+    unmatched = [path for name, path in images.items() if name not in counterparts]
+    if unmatched:
         raise NerfroError(
-            f"{len(bare)} of {len(pictures)} pictures have no {partner} ({bare[0]} is the first); "
-            "files are matched by their names without extension: add or rename what is missing, or take it out"
+            f"{len(unmatched)} of {len(images)} images have no {description} ({unmatched[0]} is the first); "
+            "files are matched by name without extension: add or rename the missing files, or remove these"
         )
 
 
-def _size(picture: Tensor) -> str:
-    return f"{picture.shape[1]}x{picture.shape[0]}"
+def _size(image: Tensor) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"

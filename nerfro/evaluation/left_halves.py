@@ -1,4 +1,4 @@
-"""Cameras of views that were not trained on, refined on the left halves of their photographs."""
+"""Refinement of test cameras on the left halves of the photographs."""
 
 from __future__ import annotations
 
@@ -14,16 +14,23 @@ from nerfro.data.pixel_store import PixelStore
 from nerfro.models.base import NerfModel
 from nerfro.rays import Rays
 
-# Pixels of each view that are looked at in a step, and drawn for each of them, so that enough have contrast.
+# Pixels per view and step, and candidates drawn per pixel; the candidates with the most contrast are used.
 _NUM_PIXELS, _DRAWN = 600, 3
-# Pixels over which differences are taken, in the first and in the last step.
+# Distance of finite differences in pixels, in the first and in the last step.
 _REACH = 2.0, 0.5
 _SCALE, _LONGEST = 0.3, 3.0
 
 
 @torch.no_grad()
 def refine_on_left(model: NerfModel, views: Views, gains: Float[Tensor, "V 3"], steps: int) -> Cameras:
-    """The cameras, each moved until the fixed scene looks like the left half of its photograph."""
+    """Refine each camera so that the rendering of the fixed scene matches the left half of the photograph.
+
+    Args:
+        model: trained model, which stays unchanged.
+        views: test views.
+        gains: gain of each view and channel.
+        steps: number of Gauss-Newton steps.
+    """
     cameras, device = views.cameras.to(model.device), model.device
     part = RefinedCamera(hold_world=False).to(device)
     part.begin(cameras)

@@ -1,8 +1,8 @@
-"""Learned perceptual image patch similarity (LPIPS v0.1) over the features of AlexNet or VGG-16.
+"""Learned perceptual image patch similarity (LPIPS v0.1) with features of AlexNet or VGG-16.
 
-Written out here because torchmetrics and lpips both take the networks from torchvision, whose published builds do not
-load beside a CPU build of torch. The linear heads are the published ones, under lpips' licence beside them; the values
-are those of both packages.
+The packages torchmetrics and lpips load the networks from torchvision, whose published builds do not work beside a CPU
+build of torch. Therefore this module implements the networks. The linear heads are those of the package lpips (see the
+licence beside the file), and the values agree with both packages.
 
 Source:
     Zhang et al., "The unreasonable effectiveness of deep features as a perceptual metric", CVPR 2018.
@@ -25,11 +25,11 @@ from nerfro.evaluation.pretrained import ALEXNET, VGG16, Published, load_weights
 from nerfro.evaluation.regions import mean_over
 from nerfro.paths import ASSETS_DIR
 
-_HEADS = ASSETS_DIR / "_lpips/heads.npz"  # alex<l> and vgg<l>, lpips v0.1
+_HEADS = ASSETS_DIR / "_lpips/heads.npz"  # arrays alex<l> and vgg<l> of lpips v0.1
 
 
 class Convolution(NamedTuple):
-    """One layer of a backbone, followed by a ReLU."""
+    """One convolution of a backbone, followed by a ReLU."""
 
     key: str
     channels_in: int
@@ -37,17 +37,17 @@ class Convolution(NamedTuple):
     kernel: int = 3
     stride: int = 1
     padding: int = 1
-    pooling: int = 0  # side of the windows, with stride 2, over which its input is max-pooled; 0 for none
-    compared: bool = True  # whether its output is a feature of LPIPS
+    pooling: int = 0  # window of the max pooling of the input, with stride 2; 0 for no pooling
+    compared: bool = True  # whether LPIPS compares the output
 
 
 class Backbone(NamedTuple):
-    """A network whose features are compared."""
+    """A network that computes the features."""
 
-    published: Published  # where its weights are
-    heads: str  # name of its linear heads in the file of published ones
-    min_size: int  # pixels; in smaller pictures the last pooling has nothing left to pool
-    layers: tuple[Convolution, ...]  # its convolutions, in order
+    published: Published  # weights
+    heads: str  # name of the linear heads in the file of lpips
+    min_size: int  # pixels; in smaller images, the last pooling has an empty input
+    layers: tuple[Convolution, ...]  # convolutions in order
 
 
 ALEX = Backbone(
@@ -85,27 +85,36 @@ VGG = Backbone(
 
 
 class LpipsNetwork(nn.Module):
-    """Five feature layers of a backbone, and how much a difference in each channel matters.
+    """LPIPS network: a backbone with five feature layers, and a weight for each channel of these.
 
-    d(x, y) = sum_l mean_hw w_l . (f_l(x) - f_l(y))^2, with f_l of unit length over channels (Eqn. 1 of the paper).
+    d(x, y) = sum_l mean_hw w_l . (f_l(x) - f_l(y))^2, where f_l has unit length over channels (Eqn. 1 of the paper).
 
-    All weights are buffers that are not saved: a model that holds this network neither trains nor stores it.
+    All weights are non-persistent buffers, so a model that contains this network neither trains nor saves it.
     """
 
     shift: Tensor
     scale: Tensor
 
     def __init__(self, backbone: Backbone, weights: dict[str, Tensor], heads: Sequence[Float[Tensor, "C"]]) -> None:
-        """Take the weights of the backbone, as in its state dict, and of a linear head for each layer compared."""
+        """Create the network.
+
+        Args:
+            backbone: architecture.
+            weights: state dict of the backbone.
+            heads: channel weights of each compared layer.
+
+        Raises:
+            NerfroError: a weight is missing or has the wrong shape.
+        """
         super().__init__()
         self.backbone = backbone
         for i, layer in enumerate(backbone.layers):
             shape = (layer.channels, layer.channels_in, layer.kernel, layer.kernel)
-            self._take(f"kernel{i}", weights, f"{layer.key}.weight", shape)
-            self._take(f"bias{i}", weights, f"{layer.key}.bias", (layer.channels,))
+            self._register(f"kernel{i}", weights, f"{layer.key}.weight", shape)
+            self._register(f"bias{i}", weights, f"{layer.key}.bias", (layer.channels,))
         for i, head in enumerate(heads):
             self.register_buffer(f"head{i}", head.view(1, -1, 1, 1), persistent=False)
-        # The colours of ImageNet, for inputs in [-1, 1].
+        # Mean and standard deviation of ImageNet colours, for inputs in [-1, 1].
         self.register_buffer("shift", torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("scale", torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1), persistent=False)
 
@@ -115,38 +124,46 @@ class LpipsNetwork(nn.Module):
         target: Float[Tensor, "H W 3"],
         inside: Bool[Tensor, "H W"] | None = None,
     ) -> Float[Tensor, ""]:
-        """Perceptual distance of two pictures, sRGB in [0, 1]: the sum of the layers' means, as published.
+        """Compute the perceptual distance of two images; lower is better.
 
-        With a mask it is the mean of `distance_map` over its pixels, and NaN if there are none.
+        Args:
+            prediction: rendered image, sRGB in [0, 1].
+            target: reference image, sRGB in [0, 1].
+            inside: mask of the pixels that count. With a mask, the result is the mean of `distance_map`.
+
+        Returns:
+            Distance, without unit; NaN for an empty mask.
         """
         if inside is not None:
             return mean_over(self.distance_map(prediction, target), inside)
         return torch.stack([layer.mean() for layer in self._layer_distances(prediction, target)]).sum()
 
     def distance_map(self, prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
-        """Perceptual distance around each pixel, for error maps: the layers enlarged bilinearly and added.
+        """Compute the perceptual distance around each pixel as the sum of the bilinearly enlarged layers.
 
-        The mean is close to, but not the same as, the distance of `forward`.
+        The mean of the map differs slightly from the distance of `forward`.
         """
         size = prediction.shape[:2]
         layers = self._layer_distances(prediction, target)
         enlarged = [F.interpolate(layer, size=size, mode="bilinear", align_corners=False) for layer in layers]
         return torch.stack(enlarged).sum(0)[0, 0]
 
-    def _take(self, name: str, weights: dict[str, Tensor], key: str, shape: tuple[int, ...]) -> None:
+    def _register(self, name: str, weights: dict[str, Tensor], key: str, shape: tuple[int, ...]) -> None:
         if key not in weights or tuple(weights[key].shape) != shape:
-            found = list(weights[key].shape) if key in weights else "nothing"
+            found = list(weights[key].shape) if key in weights else "none"
             raise NerfroError(
                 f"LPIPS weights: expected {key} of shape {list(shape)}, found {found}; "
-                f"use the file of {self.backbone.published.title} itself"
+                f"use the published file of {self.backbone.published.title}"
             )
         self.register_buffer(name, weights[key].detach().float().clone(), persistent=False)
 
     def _layer_distances(self, prediction: Tensor, target: Tensor) -> list[Float[Tensor, "1 1 h w"]]:
         size = self.backbone.min_size
         if min(prediction.shape[:2]) < size:
-            raise NerfroError(f"LPIPS needs at least {size} x {size} pixels, got {list(prediction.shape[:2])}")
-        # Under mixed precision the features would be half ones, and the distances 1e-3 off.
+            raise NerfroError(
+                f"LPIPS needs at least {size} x {size} pixels, got {list(prediction.shape[:2])}; use SSIM"
+            )
+        # Mixed precision would compute features in half precision, with errors of 1e-3 in the distance.
         with torch.autocast(prediction.device.type, enabled=False):
             pairs = zip(self._features(prediction), self._features(target), strict=True)
             return [
@@ -168,12 +185,12 @@ class LpipsNetwork(nn.Module):
 
 
 def unit_length(features: Float[Tensor, "1 C h w"]) -> Float[Tensor, "1 C h w"]:
-    """Scale the feature vector of each position to length one; zero stays zero."""
+    """Normalize the feature vector of each position to unit length; zero stays zero."""
     return features / (features.square().sum(dim=1, keepdim=True).sqrt() + 1e-10)
 
 
 def load_lpips_network(backbone: Backbone, path: Path | str | None = None, download: bool = True) -> LpipsNetwork:
-    """A network on the CPU, with the published weights: see `load_weights` for `path` and `download`."""
+    """Load a network with published weights on the CPU; see `load_weights` for `path` and `download`."""
     with np.load(_HEADS, allow_pickle=False) as file:
         layers = range(sum(layer.compared for layer in backbone.layers))
         heads = [torch.from_numpy(file[f"{backbone.heads}{i}"]) for i in layers]
@@ -183,18 +200,18 @@ def load_lpips_network(backbone: Backbone, path: Path | str | None = None, downl
 def find_lpips_networks(
     alex: Path | str | None = None, vgg: Path | str | None = None, download: bool = True
 ) -> tuple[dict[str, LpipsNetwork], dict[str, str]]:
-    """Build the networks whose weights can be had, and say why not the others.
+    """Load the networks whose weights are available.
 
     Args:
-        alex: file with AlexNet's weights; by default torch hub's cache, or the network.
-        vgg: file with VGG-16's weights; by default torch hub's cache. They are never fetched unasked: 528 MB.
-        download: whether AlexNet's weights may be fetched when they are not cached.
+        alex: file of AlexNet weights; by default the cache of torch hub, or a download.
+        vgg: file of VGG-16 weights; by default the cache of torch hub. The 528 MB are never downloaded automatically.
+        download: whether missing AlexNet weights may be downloaded.
 
     Returns:
-        By the name of their metric, `lpips` and `lpips_vgg`: the networks, and the reasons for those that are missing.
+        Networks by the name of the metric, `lpips` and `lpips_vgg`, and the reasons for missing networks.
 
     Raises:
-        NerfroError: if a file is given and is not that network's: whoever names a file wants it used.
+        NerfroError: a file is given and does not contain the weights of this network.
     """
     networks, reasons = {}, {}
     for metric, backbone, path, fetched in (("lpips", ALEX, alex, download), ("lpips_vgg", VGG, vgg, False)):

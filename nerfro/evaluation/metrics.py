@@ -1,4 +1,4 @@
-"""PSNR, the mean of any metric over pictures, and the metric that collects all of them over views and regions."""
+"""PSNR, the mean of a metric over images, and a metric that collects all scores of all views and regions."""
 
 from __future__ import annotations
 
@@ -20,33 +20,45 @@ from nerfro.evaluation.results import FULL, METRICS, OBJECT_REGIONS, EvaluationR
 from nerfro.evaluation.ssim import MS_SSIM_MIN_SIZE, WINDOW, ms_ssim, ssim
 from nerfro.files.images import round_to_8bit
 
-MAX_PSNR = 100.0  # dB; equal pictures would have infinity, which no mean, table or JSON file can hold
+MAX_PSNR = 100.0  # dB; the infinite PSNR of equal images has no mean and no representation in JSON
 _REGIONS = (FULL, *OBJECT_REGIONS)
 
-# A metric of two pictures [H, W, 3], sRGB in [0, 1], over all pixels or over those of a mask [H, W].
-PictureMetric = Callable[[Tensor, Tensor, Tensor | None], Tensor]
+# Metric of two images [H, W, 3], sRGB in [0, 1], over all pixels or over those of a mask [H, W].
+ImageMetric = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 
 
 def psnr(
     prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], inside: Bool[Tensor, "H W"] | None = None
 ) -> Float[Tensor, ""]:
-    """Peak signal-to-noise ratio of sRGB in [0, 1], -10 log10(mean squared error), in dB.
+    """Compute the peak signal-to-noise ratio, -10 log10(mean squared error); higher is better.
 
-    At most 100: equal pictures, and those with a mean squared error below 1e-10, score `MAX_PSNR`.
+    Args:
+        prediction: rendered image, sRGB in [0, 1].
+        target: reference image, sRGB in [0, 1].
+        inside: mask of the pixels that count; by default, all pixels count.
+
+    Returns:
+        PSNR in dB, at most `MAX_PSNR`, which a mean squared error below 1e-10 reaches; NaN for an empty mask.
+
+    Raises:
+        NerfroError: the sizes of the images differ.
     """
     errors = squared_error_map(prediction.double(), target.double())
     return (-10 * torch.log10(mean_over(errors, inside))).clamp(max=MAX_PSNR)
 
 
-class MeanOverPictures(torchmetrics.Metric):
-    """Mean of a metric over pictures: of `psnr`, `ssim`, `ms_ssim`, `flip` or an `LpipsNetwork`."""
+class MeanOverImages(torchmetrics.Metric):
+    """Mean of a metric over images.
+
+    Args:
+        metric: `psnr`, `ssim`, `ms_ssim`, `flip` or an `LpipsNetwork`.
+    """
 
     full_state_update = False
     total: Tensor
     count: Tensor
 
-    def __init__(self, metric: PictureMetric) -> None:
-        """Start with no pictures."""
+    def __init__(self, metric: ImageMetric) -> None:
         super().__init__()
         self.metric = metric
         self.add_state("total", default=torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
@@ -59,20 +71,24 @@ class MeanOverPictures(torchmetrics.Metric):
         target: Float[Tensor, "H W 3"],
         inside: Bool[Tensor, "H W"] | None = None,
     ) -> None:
-        """Add one picture, sRGB in [0, 1], or its pixels inside a mask."""
+        """Add one image, sRGB in [0, 1], or its pixels inside a mask."""
         self.total += self.metric(prediction, target, inside).double()
         self.count += 1
 
     def compute(self) -> Float[Tensor, ""]:
-        """Mean of the pictures so far."""
+        """Return the mean over the images so far."""
         return self.total / self.count
 
 
 class ImageMetrics(torchmetrics.Metric):
-    """Every metric of each view: on the full image, and on the object's mask and the crop around it where it is known.
+    """All scores of each view: on the full image, on the object's mask and on the crop around the object.
 
-    With `round_predictions` predictions are clipped and rounded to 8 bits first, so that the numbers can be computed
-    again from the pictures that were written; without, they are clipped only. Targets are taken as they are.
+    Args:
+        lpips_networks: networks by metric, see `find_lpips_networks`. Metrics without a network are not available.
+        reasons: reason for each missing network, by metric.
+        round_predictions: whether to round predictions to 8 bits, so that the scores can be reproduced from the written
+            images. Predictions are always clipped to [0, 1].
+        prefix: views have the names `<prefix>_<three-digit number>`.
     """
 
     full_state_update = False
@@ -85,14 +101,6 @@ class ImageMetrics(torchmetrics.Metric):
         round_predictions: bool = True,
         prefix: str = "test",
     ) -> None:
-        """Start with no views.
-
-        Args:
-            lpips_networks: by the name of their metric, see `find_lpips_networks`; what is not there is left out.
-            reasons: why a network is missing, by the same names.
-            round_predictions: see above.
-            prefix: views are named `<prefix>_<number, three digits>`.
-        """
         super().__init__()
         self.lpips_networks = nn.ModuleDict(lpips_networks or {})
         self.reasons = dict(reasons or {})
@@ -113,20 +121,23 @@ class ImageMetrics(torchmetrics.Metric):
         """Score one view.
 
         Args:
-            prediction: rendered picture, sRGB.
-            target: reference picture, sRGB in [0, 1].
-            view: number of the view; by default they are counted. Processes that share the work must give it.
-            coverage: share of each pixel that the object covers; without it only the full image is scored, and so it
-                is where the object is not seen.
+            prediction: rendered image, sRGB.
+            target: reference image, sRGB in [0, 1].
+            view: number of the view; by default, views are counted. It is required if several processes share the work.
+            coverage: coverage of each pixel by the object in [0, 1]. Without it, or if the object is not visible, only
+                the full image is scored.
+
+        Raises:
+            NerfroError: the sizes differ, or a value is not finite.
         """
         if prediction.shape != target.shape or prediction.ndim != 3 or prediction.shape[-1] != 3:
             raise NerfroError(
                 f"cannot compare a prediction {list(prediction.shape)} with a reference {list(target.shape)}; "
-                "both must be [H, W, 3] and of one size"
+                "both must have the same size [H, W, 3]"
             )
         if coverage is not None and coverage.shape != target.shape[:2]:
-            raise NerfroError(f"a mask {list(coverage.shape)} does not fit a picture {list(target.shape)}; give [H, W]")
-        rounded = round_to_8bit(prediction)  # also refuses what is not finite
+            raise NerfroError(f"a mask {list(coverage.shape)} does not fit an image {list(target.shape)}; give [H, W]")
+        rounded = round_to_8bit(prediction)  # raises an error for values that are not finite
         prediction = rounded if self.round_predictions else prediction.clamp(0, 1)
         scores = torch.full((len(_REGIONS), len(METRICS)), torch.nan, dtype=torch.float64, device=prediction.device)
         scores[0] = self._score(prediction, target, None)
@@ -139,20 +150,21 @@ class ImageMetrics(torchmetrics.Metric):
         self.rows.append(torch.cat([number, scores.flatten()])[None])
 
     def compute(self) -> Float[Tensor, "V 1+K"]:
-        """Scores of all views, gathered from all processes.
+        """Gather the scores of all views from all processes.
 
-        A row for each view: its number, in rising order, then the scores on the full image in the order of `METRICS`,
-        those on the mask and those on the crop; NaN where one is not available.
+        Returns:
+            One row per view, sorted by number: the number, followed by the scores of the full image, the mask and the
+            crop, each in the order of `METRICS`. Missing scores are NaN.
         """
         if len(self.rows) == 0:
-            raise NerfroError("no view was scored; call update with at least one, or choose a split that has views")
+            raise NerfroError("no view was scored; choose a split that has views")
         rows = dim_zero_cat(self.rows)
-        # A distributed sampler hands some views out twice to give every process as many; they count once.
+        # A distributed sampler may repeat views to balance the processes; each view counts once.
         by_view = {int(row[0]): row for row in rows}
         return torch.stack([by_view[number] for number in sorted(by_view)])
 
     def result(self, names: Sequence[str] | None = None) -> EvaluationResult:
-        """The scores as named rows, with the reasons for what is missing; names are made from the prefix by default."""
+        """Return the scores by view name, with the reasons for missing scores; by default, names use the prefix."""
         rows = self.compute()
         if names is None:
             names = [f"{self.prefix}_{int(number):03d}" for number in rows[:, 0]]
@@ -165,8 +177,8 @@ class ImageMetrics(torchmetrics.Metric):
         return EvaluationResult(tuple(views), self._notes(views), "8bit" if self.round_predictions else "float")
 
     def _score(self, prediction: Tensor, target: Tensor, inside: Tensor | None) -> Float[Tensor, "K"]:
-        """All metrics in the order of `METRICS`; NaN for those that are absent, or need a larger picture."""
-        metrics: dict[str, PictureMetric] = {"psnr": psnr, "ssim": ssim, "ms_ssim": ms_ssim, "flip": flip}
+        """Compute the scores in the order of `METRICS`; NaN if a network is missing or the image is too small."""
+        metrics: dict[str, ImageMetric] = {"psnr": psnr, "ssim": ssim, "ms_ssim": ms_ssim, "flip": flip}
         metrics.update(self.lpips_networks.items())  # type: ignore[arg-type]
         scores = torch.full((len(METRICS),), torch.nan, dtype=torch.float64, device=prediction.device)
         for index, metric in enumerate(METRICS):
@@ -176,13 +188,13 @@ class ImageMetrics(torchmetrics.Metric):
 
     def _notes(self, views: Sequence[ViewScores]) -> dict[str, str]:
         notes = {}
-        unseen = [view.name for view in views if view.regions and view.score("psnr", "mask") is None]
-        if unseen:
-            notes["mask"] = f"the mask is missing or empty in {', '.join(unseen)}"
+        unmasked = [view.name for view in views if view.regions and view.score("psnr", "mask") is None]
+        if unmasked:
+            notes["mask"] = f"the mask is missing or empty in {', '.join(unmasked)}"
         for region in _REGIONS:
-            seen = [view for view in views if view.score("psnr", region) is not None]
+            scored = [view for view in views if view.score("psnr", region) is not None]
             for metric in METRICS:
-                if any(view.score(metric.name, region) is None for view in seen):
+                if any(view.score(metric.name, region) is None for view in scored):
                     notes[metric.name if region == FULL else f"{region}.{metric.name}"] = self._reason(
                         metric.name, region
                     )
@@ -191,7 +203,7 @@ class ImageMetrics(torchmetrics.Metric):
     def _reason(self, metric: str, region: Region) -> str:
         if metric.startswith("lpips") and metric not in self.lpips_networks:
             return self.reasons.get(metric, "no network was given")
-        where = {FULL: "pictures", "mask": "pictures or masks", "crop": "crops"}[region]
+        where = {FULL: "images", "mask": "images or masks", "crop": "crops"}[region]
         return f"{where} below {self.min_sizes[metric]} pixels"
 
 

@@ -1,4 +1,4 @@
-"""Pictures of paths through a medium."""
+"""Plots of paths through a medium."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 _RESOLUTION = 600
-# Share of the box's diagonal that is shown around it.
+# Margin around the box, as a fraction of its longest side.
 _MARGIN = 0.15
 
 
 def draw_paths(path: Path, medium: Medium, file: FilePath) -> None:
-    """Write a picture of a few paths and the medium that they cross (see `plot_paths`)."""
+    """Write a plot of a few paths and the medium to a PNG file; see `plot_paths`."""
     file.parent.mkdir(parents=True, exist_ok=True)
     _draw(path, medium).print_png(str(file))
 
 
-def picture_of_paths(path: Path, medium: Medium) -> UInt8[np.ndarray, "H W 3"]:
-    """What `draw_paths` writes, as a small picture in memory."""
+def image_of_paths(path: Path, medium: Medium) -> UInt8[np.ndarray, "H W 3"]:
+    """Render the plot of `draw_paths` as a small image in memory."""
     return np.asarray(_draw(path, medium, dpi=70).buffer_rgba())[..., :3].copy()
 
 
@@ -45,10 +45,10 @@ def _draw(path: Path, medium: Medium, dpi: int = 150) -> FigureCanvasAgg:
 
 
 def plot_paths(axes: Axes, path: Path, medium: Medium, colour: str = "tab:red") -> None:
-    """Draw paths, projected on the plane in which they spread most, over the refractive index in that plane.
+    """Plot paths over the refractive index in the plane that contains most of the paths.
 
-    The plane goes through the centre of the medium's box. Rays outside it are drawn by their projection. Light that
-    splits is the fainter the less of it there is.
+    The plane passes through the centre of the medium's box, and all paths are projected onto it. Branches of split
+    light are drawn with an opacity that increases with throughput.
     """
     vertices = path.positions.detach().cpu()
     centre = medium.box.mean(0).to(vertices)
@@ -61,7 +61,7 @@ def plot_paths(axes: Axes, path: Path, medium: Medium, colour: str = "tab:red") 
     axes.imshow(n, cmap="Blues", vmin=1, vmax=2 * float(n.max()) - 1, extent=extent, origin="lower")
     for positions, share in zip(vertices, path.throughput.cpu(), strict=True):
         flat = positions - centre
-        # Weak light is faint, but seen; where colours part, each is drawn in its own.
+        # Weak branches remain visible. Branches of separated colours (dispersion) are drawn in these colours.
         strength = float(share.max())
         drawn = colour if float(share.min()) == strength else tuple((share / strength).tolist())
         axes.plot(flat @ across, flat @ up, color=drawn, linewidth=0.8, alpha=0.15 + 0.85 * strength**0.5)
@@ -74,7 +74,7 @@ def plot_paths(axes: Axes, path: Path, medium: Medium, colour: str = "tab:red") 
 def _plane(
     positions: Float[Tensor, "R S 3"], centre: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Two orthogonal unit vectors: the rays' main direction, and the one across in which they spread most."""
+    """Return two orthogonal unit vectors: mean direction of the rays, and orthogonal direction of largest spread."""
     along = torch.nn.functional.normalize((positions[:, -1] - positions[:, 0]).mean(0), dim=0)
     offsets = (positions - centre).reshape(-1, 3)
     offsets = offsets - (offsets @ along)[:, None] * along

@@ -1,4 +1,4 @@
-"""ImageNet weights of AlexNet and VGG-16: from a file, from torch hub's cache, or from the network if there is one."""
+"""ImageNet weights of AlexNet and VGG-16, from a file, the cache of torch hub, or a download."""
 
 from __future__ import annotations
 
@@ -22,10 +22,15 @@ STALL_SECONDS = 30.0
 
 @dataclass(frozen=True)
 class Published:
-    """A file of weights."""
+    """Published weights of a network.
 
-    title: str  # the network's name
-    url: str  # where torchvision publishes it; the name ends in the first digits of its SHA-256, which is checked
+    Attributes:
+        title: name of the network.
+        url: address at torchvision. The file name ends in the first digits of the SHA-256 hash, which is verified.
+    """
+
+    title: str
+    url: str
 
 
 ALEXNET = Published("AlexNet", "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth")  # 233 MB
@@ -36,15 +41,14 @@ def load_weights(published: Published, path: Path | str | None = None, download:
     """Load a state dict on the CPU, without executing pickled code.
 
     Args:
-        published: which.
-        path: a file as torchvision publishes it; by default the cache of torch hub is asked,
-            `torch.hub.get_dir()/checkpoints`, which honours TORCH_HOME.
-        download: whether to fetch the file into that cache when it is not there. A network that does not answer within
-            five seconds is given up, once for the whole process.
+        published: the weights.
+        path: a file as published by torchvision. By default, the cache of torch hub is used,
+            `torch.hub.get_dir()/checkpoints`, which respects TORCH_HOME.
+        download: whether to download a missing file into the cache. If the server does not answer within five seconds,
+            no further attempt is made in this process.
 
     Raises:
-        NerfroError: if the file cannot be read, or the weights are neither cached nor can be fetched; the message is
-            the reason, in one line.
+        NerfroError: the file cannot be read, or the weights are not cached and cannot be downloaded.
     """
     title, url = published.title, published.url
     if path is not None:
@@ -53,14 +57,16 @@ def load_weights(published: Published, path: Path | str | None = None, download:
         return _read(Path(path), title, f"give the path of a downloaded {url}")
     cached = Path(torch.hub.get_dir()) / "checkpoints" / url.rsplit("/", 1)[-1]
     if not cached.is_file():
-        by_hand = f"put {url} at {cached} by hand"
+        by_hand = f"download {url} to {cached}"
         if not download:
-            raise NerfroError(f"no weights; {title}'s are not in torch's cache: {by_hand}")
+            raise NerfroError(f"no weights; {title} is not in the cache of torch: {by_hand}")
         reason = unreachable(url)
         if reason:
-            raise NerfroError(f"no weights; {title}'s are not in torch's cache, and no network ({reason}): {by_hand}")
+            raise NerfroError(
+                f"no weights; {title} is not in the cache of torch, and there is no network ({reason}): {by_hand}"
+            )
         before = socket.getdefaulttimeout()
-        # Bound each wait for data: torch hub opens its address without a timeout and would wait for ever.
+        # torch hub opens the address without a timeout and could wait for ever.
         socket.setdefaulttimeout(STALL_SECONDS)
         try:
             return torch.hub.load_state_dict_from_url(url, map_location="cpu", check_hash=True, weights_only=True)
@@ -73,14 +79,14 @@ def load_weights(published: Published, path: Path | str | None = None, download:
 
 @functools.lru_cache
 def unreachable(url: str, seconds: float = CONNECT_SECONDS) -> str:
-    """Say in a few words why an address does not answer; the empty string if it does.
+    """Return the reason why an address does not answer, or an empty string if it answers.
 
-    The timeout of a socket bounds neither the resolution of names nor the number of addresses that are tried in turn,
-    so the attempt runs in a thread that is left behind when the time is up.
+    The timeout of a socket limits neither name resolution nor the number of addresses that are tried. Therefore the
+    attempt runs in a thread, which is abandoned after the time limit.
     """
     reasons = [f"no answer within {seconds:g} s"]
 
-    def ask() -> None:
+    def connect() -> None:
         try:
             urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=seconds).close()
             reasons.append("")
@@ -88,7 +94,7 @@ def unreachable(url: str, seconds: float = CONNECT_SECONDS) -> str:
             cause = getattr(error, "reason", error)
             reasons.append(getattr(cause, "strerror", None) or str(cause))
 
-    thread = threading.Thread(target=ask, daemon=True)
+    thread = threading.Thread(target=connect, daemon=True)
     thread.start()
     thread.join(seconds)
     return reasons[-1]
@@ -97,9 +103,9 @@ def unreachable(url: str, seconds: float = CONNECT_SECONDS) -> str:
 def _read(path: Path, title: str, advice: str) -> dict[str, Tensor]:
     try:
         weights = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch.load raises nearly anything on a file that is none of its own
+    except Exception as error:  # torch.load raises almost any exception on a foreign file
         reason = type(error).__name__ if isinstance(error, pickle.UnpicklingError) else str(error).partition("\n")[0]
         raise NerfroError(f"{title} weights {path} cannot be read ({reason}); {advice}") from error
     if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
-        raise NerfroError(f"{title} weights {path} are no state dict; {advice}")
+        raise NerfroError(f"{title} weights {path} are not a state dict; {advice}")
     return weights

@@ -1,4 +1,4 @@
-"""What `python -m nerfro.evaluate` can be asked."""
+"""Configuration and output folder of `python -m nerfro.evaluate`."""
 
 # ruff: noqa: UP045 - OmegaConf on Python 3.10 wants Optional
 
@@ -24,42 +24,42 @@ REQUEST_FILE = "evaluate.yaml"
 
 @dataclass
 class EvaluateConfig:
-    """What `python -m nerfro.evaluate` is asked: to score a trained model, or pictures that any program rendered."""
+    """Options of `python -m nerfro.evaluate`, which scores a trained model or images of any program."""
 
-    checkpoint: Optional[str] = None  # file written by nerfro.train, to render and score
-    split: str = "test"  # of the data to render
-    root: Optional[str] = None  # folder of the data, if it has moved since training
-    chunk_size: Optional[NumRays] = None  # rays rendered at once, which bounds the memory; the trained one by default
-    # Rays per pixel (see docs/experiments.md); as trained by default.
+    checkpoint: Optional[str] = None  # checkpoint of nerfro.train to render and score
+    split: str = "test"  # split to render
+    root: Optional[str] = None  # folder of the data set, if it has moved since training
+    chunk_size: Optional[NumRays] = None  # rays rendered at once, which limits memory; by default as in training
+    # Rays per pixel (see docs/experiments.md); by default as in training.
     supersample: Optional[Side] = None
     divergence: Optional[NotNegative] = None
     contrast: Optional[Positive] = None
-    # Steps in which the views' cameras are refined on left halves, to be scored on right ones; as trained by default.
+    # Steps that refine test cameras on left image halves, to score right halves; by default as in training.
     refine_steps: Optional[Natural] = None
-    predictions: Optional[str] = None  # folder of pictures to score, instead of a checkpoint
-    references: Optional[str] = None  # folder of pictures of the same names, compared with `predictions`
-    # Folder of masks of the same names; by default those that lie with the references, or their transparency.
+    predictions: Optional[str] = None  # folder of images to score, instead of a checkpoint
+    references: Optional[str] = None  # folder of reference images with the same names as `predictions`
+    # Folder of masks with the same names; by default the masks beside the references, or their transparency.
     masks: Optional[str] = None
-    # What becomes of transparency in both: `drop`, or composite over `white` or `black`.
+    # Treatment of transparency in both folders: `drop` ignores it, `white` and `black` composite over this colour.
     alpha: Annotated[str, Literal["drop", "white", "black"]] = "drop"
-    # Folder for pictures and tables; by default beside the checkpoint's folder, or `scores` in `predictions`.
+    # Folder for images and tables; by default beside the folder of checkpoints, or `scores` in `predictions`.
     out: Optional[str] = None
-    # `8bit` rounds predictions to what a PNG holds before they are scored, `float` does not.
+    # `8bit` rounds predictions to 8 bits, as in PNG files, before scoring; `float` does not.
     protocol: Annotated[str, Literal["8bit", "float"]] = "8bit"
-    lpips_backbone: Optional[str] = None  # file of AlexNet weights, if torch's hub cache has none
-    lpips_vgg_backbone: Optional[str] = None  # file of VGG-16 weights, if torch's hub cache has none
-    device: str = "auto"  # `cpu`, `cuda`, or `auto` for a GPU if there is one
-    overwrite: bool = False  # whether an earlier evaluation in `out` may be replaced
+    lpips_backbone: Optional[str] = None  # file of AlexNet weights; by default the cache of torch hub
+    lpips_vgg_backbone: Optional[str] = None  # file of VGG-16 weights; by default the cache of torch hub
+    device: str = "auto"  # `cpu`, `cuda`, or `auto` for a GPU if available
+    overwrite: bool = False  # whether to replace an earlier evaluation in `out`
 
 
 def require_one_task(config: DictConfig) -> None:
-    """Refuse options that contradict each other, or that would be passed over."""
+    """Raise an error for options that contradict each other or have no effect."""
     if (config.checkpoint is None) == (config.predictions is None):
         raise NerfroError(
-            "what is to be scored? give checkpoint=RUN/checkpoints/last.ckpt, or predictions=DIR and references=DIR"
+            "give either checkpoint=RUN/checkpoints/last.ckpt, or predictions=DIR and references=DIR, to score"
         )
     if config.predictions is not None and config.references is None:
-        raise NerfroError(f"predictions={config.predictions} are compared with what? give references=DIR")
+        raise NerfroError(f"predictions={config.predictions} need references; give references=DIR")
     others: tuple[str, ...]
     if config.checkpoint is None:
         task, others = "predictions", ("split", "root", "chunk_size", "supersample", "divergence", "contrast")
@@ -67,31 +67,35 @@ def require_one_task(config: DictConfig) -> None:
         task, others = "checkpoint", ("references", "masks", "alpha")
     for name in others:
         if config[name] != getattr(EvaluateConfig, name):
-            raise NerfroError(f"{name}={config[name]} means nothing with {task}=...; leave it out")
+            raise NerfroError(f"{name}={config[name]} has no effect with {task}=...; remove it")
 
 
 @contextmanager
 def own_folder(config: DictConfig, default: Path) -> Iterator[Path]:
-    """Hold the folder that the scores go to; refused if it holds anything else than an evaluation to be replaced."""
+    """Lock the output folder; raises an error if it holds anything but an evaluation that may be replaced."""
     folder = default if config.out is None else user_path(config.out)
     if not (folder / REQUEST_FILE).is_file():
-        require_own(folder, (), "it is no evaluation's folder; give another out=...")
+        require_own(folder, (), "it is not the folder of an evaluation; give another out=...")
     refuse_existing([folder / "metrics.json"], config.overwrite)
     with held(folder, "out"):
         remove_unfinished(folder)
         try:
             yield folder
         except KeyboardInterrupt:
-            raise Interrupted("the same command begins it again") from None
+            raise Interrupted("run the same command to start again") from None
 
 
 def record(folder: Path, config: DictConfig) -> None:
-    """Write what is evaluated, before anything else of it: from then on the folder is an evaluation's."""
+    """Write the configuration first, which marks the folder as that of an evaluation."""
     write_atomically(folder / REQUEST_FILE, OmegaConf.to_yaml(config, resolve=True))
 
 
 def find_device(name: str) -> torch.device:
-    """The device of a name, or with `auto` the GPU if there is one; refused if it cannot be used."""
+    """Return the device of a name; `auto` selects a GPU if available.
+
+    Raises:
+        NerfroError: the device cannot be used.
+    """
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     try:

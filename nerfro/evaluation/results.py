@@ -1,4 +1,4 @@
-"""What an evaluation found: scores of each view, their means, and the file `metrics.json` that holds them."""
+"""Scores of an evaluation, per view and averaged, and the file `metrics.json`."""
 
 from __future__ import annotations
 
@@ -13,17 +13,24 @@ from nerfro.data.transforms import is_number, read_json
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 
-Score = float | None  # None: not available, the reason stands in the notes
+Score = float | None  # None if not available; the notes contain the reason
 
 
 @dataclass(frozen=True)
 class Metric:
-    """How a metric is called and read."""
+    """Description of a metric.
 
-    name: str  # key in files and in code
-    title: str  # heading in tables
-    better: Literal["higher", "lower"]  # whether higher or lower values are better
-    decimals: int  # digits after the point in tables
+    Attributes:
+        name: key in files and in code.
+        title: heading in tables.
+        better: whether higher or lower values are better.
+        decimals: number of decimals in tables.
+    """
+
+    name: str
+    title: str
+    better: Literal["higher", "lower"]
+    decimals: int
 
 
 METRICS = (
@@ -35,70 +42,87 @@ METRICS = (
     Metric("flip", "FLIP", "lower", 3),
 )
 
-Region = Literal["full", "mask", "crop"]  # of a picture, see nerfro/evaluation/regions.py
+Region = Literal["full", "mask", "crop"]  # see nerfro/evaluation/regions.py
 FULL: Region = "full"
-AS_GIVEN = "as given"  # how test views are treated under `test`: cameras and exposure are the data's
-OBJECT_REGIONS: tuple[Region, ...] = ("mask", "crop")  # those that need to know where the object is
+AS_GIVEN = "as given"  # name of the scores under `test`: cameras and exposures of the data set
+OBJECT_REGIONS: tuple[Region, ...] = ("mask", "crop")  # regions that require a mask of the object
 
 
 @dataclass(frozen=True)
 class ViewScores:
-    """The scores of one picture."""
+    """Scores of one view.
 
-    name: str  # which view it is; `images/<name>.png` is the picture
-    scores: Mapping[str, Score]  # value of each metric on the full image, by name; None where it is not available
-    # The same on the object's mask and on the crop around it; empty where there is no mask.
+    Attributes:
+        name: name of the view; `images/<name>.png` is its image.
+        scores: scores of the full image by metric.
+        regions: scores of the object's mask and of the crop around it, by metric; empty without a mask.
+    """
+
+    name: str
+    scores: Mapping[str, Score]
     regions: Mapping[Region, Mapping[str, Score]] = field(default_factory=dict)
 
     def score(self, metric: str, region: Region = FULL) -> Score:
-        """The value of one metric in one region; None where it is not available."""
+        """Return the score of a metric in a region, or None if it is not available."""
         scores = self.scores if region == FULL else self.regions.get(region, {})
         return scores.get(metric)
 
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """The scores of all views."""
+    """Scores of all views.
 
-    views: tuple[ViewScores, ...]  # one row for each view, in order
-    # Why a metric is not available: by its name for the full image, by `<region>.<metric>` in a region, and by `mask`
-    # for views in which both regions are missing.
+    Attributes:
+        views: scores of each view, in order.
+        notes: reason for each missing score. Keys are `<metric>` for the full image, `<region>.<metric>` for a region,
+            and `mask` for views without both object regions.
+        protocol: `8bit` if predictions were rounded to 8 bits before scoring, otherwise `float`.
+    """
+
+    views: tuple[ViewScores, ...]
     notes: Mapping[str, str] = field(default_factory=dict)
-    protocol: Literal["8bit", "float"] = "8bit"  # whether predictions were rounded to what a PNG holds before scoring
+    protocol: Literal["8bit", "float"] = "8bit"
 
     @property
     def regions(self) -> tuple[Region, ...]:
-        """The regions that were scored, the full image first."""
+        """Scored regions, the full image first."""
         return (FULL, *(region for region in OBJECT_REGIONS if any(region in view.regions for view in self.views)))
 
     def mean(self, metric: str, region: Region = FULL) -> Score:
-        """Mean of the per-view values; None if any view lacks one, for a mean over fewer views is another quantity."""
+        """Average a score over all views; None if any view lacks it, because means over different views differ."""
         values = [view.score(metric, region) for view in self.views]
         present = [value for value in values if value is not None]
         return math.fsum(present) / len(present) if present and len(present) == len(values) else None
 
     def means(self, region: Region = FULL) -> dict[str, Score]:
-        """The mean of every metric in a region, by name."""
+        """Return the mean of every metric in a region, by name."""
         return {metric.name: self.mean(metric.name, region) for metric in METRICS}
 
 
 @dataclass(frozen=True)
 class RunMetrics:
-    """The content of a run's `metrics.json`."""
+    """Content of the file `metrics.json` of a run.
 
-    result: EvaluationResult  # scores of the test views
-    steps: int | None = None  # optimisation steps that the weights have seen; None for pictures of another program
-    train_seconds: float | None = None  # wall-clock, without evaluation; None if nothing was trained
-    rays_per_second: float | None = None  # training throughput; None if nothing was trained
-    # The same views under other cameras or exposures than the data's, by the name of the treatment; see `treatments`.
+    Attributes:
+        result: scores of the test views.
+        steps: number of optimisation steps; None for images of another program.
+        train_seconds: wall-clock time of training in seconds, without evaluation; None without training.
+        rays_per_second: training throughput; None without training.
+        treatments: scores of the same views with corrected cameras or exposures; see `nerfro.evaluation.treatments`.
+    """
+
+    result: EvaluationResult
+    steps: int | None = None
+    train_seconds: float | None = None
+    rays_per_second: float | None = None
     treatments: Mapping[str, EvaluationResult] = field(default_factory=dict)
 
 
 def write_metrics_json(path: Path | str, metrics: RunMetrics) -> None:
-    """Write the file by which other tools read a run, whole or not at all; docs/metrics.md says what it holds.
+    """Write `metrics.json` atomically; docs/metrics.md describes the format.
 
     Raises:
-        NerfroError: if a number is NaN or infinite (JSON has neither), or the file cannot be written.
+        NerfroError: a number is NaN or infinite, which JSON cannot represent, or the file cannot be written.
     """
     result = metrics.result
     content = {
@@ -116,14 +140,14 @@ def write_metrics_json(path: Path | str, metrics: RunMetrics) -> None:
 
 
 def read_metrics_json(path: Path | str) -> RunMetrics:
-    """Read what `write_metrics_json` wrote, now or when it knew fewer metrics and no regions; means are computed again.
+    """Read a file of `write_metrics_json`. Means are computed again; metrics and regions may be missing.
 
     Raises:
-        NerfroError: if the file is missing, truncated, or lacks a key.
+        NerfroError: the file is missing, truncated, or lacks a key.
     """
     path = Path(path)
     if not path.is_file():
-        raise NerfroError(f"{path} does not exist; has this run been evaluated? run nerfro.evaluate on it")
+        raise NerfroError(f"{path} does not exist; run nerfro.evaluate to create it")
     try:
         content = read_json(path, "run nerfro.evaluate on the run again")
         notes, protocol = content.get("notes", {}), content.get("protocol", "8bit")
@@ -167,12 +191,12 @@ def _scores(row: Mapping[str, Score]) -> dict[str, Score]:
 def _number(value: object) -> float | None:
     if value is None or is_number(value):
         return value
-    raise TypeError(f"{value!r} is no number")
+    raise TypeError(f"{value!r} is not a number")
 
 
 def _refuse_non_finite(value: object, name: str) -> None:
     if isinstance(value, float) and not math.isfinite(value):
-        raise NerfroError(f"{name} is {value}, which JSON cannot hold; give a finite number, or None if there is none")
+        raise NerfroError(f"{name} is {value}, which JSON cannot represent; give a finite number or None")
     if isinstance(value, dict):
         for key, item in value.items():
             _refuse_non_finite(item, f"{name}.{key}")

@@ -1,4 +1,4 @@
-"""Scoring the views of a split, which are rendered first, or the pictures of a folder."""
+"""Scores of the rendered views of a split, or of a folder of images."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tqdm import tqdm
 from nerfro.data.base import Views
 from nerfro.data.image_files import Alpha
 from nerfro.evaluation.error_maps import write_error_sheet
-from nerfro.evaluation.folders import PicturePair
+from nerfro.evaluation.folders import ImagePair
 from nerfro.evaluation.lpips import LpipsNetwork
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.render_view import render_view
@@ -27,11 +27,11 @@ def score_views(
     metrics: ImageMetrics,
     folder: Path,
     subdivision: Subdivision,
-    pictures: str = "images",
+    subfolder: str = "images",
 ) -> EvaluationResult:
-    """Render every view as `folder/<pictures>/<prefix>_NNN.png` (8-bit sRGB, rounded) and score it.
+    """Render all views, write these as 8-bit sRGB to `folder/<subfolder>/<prefix>_NNN.png`, and compute the scores.
 
-    Memory: one view's rays and pictures, plus `model.chunk_size` rays' samples and activations.
+    The memory holds the rays and images of one view and the samples of `model.chunk_size` rays.
     """
     height, width = views.cameras.height, views.cameras.width
     cameras = views.cameras.to(model.device)
@@ -40,7 +40,7 @@ def score_views(
         for view in range(len(views)):
             rendered = render_view(model, cameras, view, subdivision)
             rgb = model.photographed(rendered.radiance).reshape(height, width, 3).cpu()
-            save_png(folder / pictures / f"{metrics.prefix}_{view:03d}.png", rgb)
+            save_png(folder / subfolder / f"{metrics.prefix}_{view:03d}.png", rgb)
             coverage = None if views.masks is None else views.masks[view]
             metrics.update(rgb, views.images[view], view, coverage)
             progress.update(height * width)
@@ -48,14 +48,14 @@ def score_views(
 
 
 def score_folders(
-    pairs: list[PicturePair],
+    pairs: list[ImagePair],
     alpha: Alpha,
     metrics: ImageMetrics,
     networks: Mapping[str, LpipsNetwork],
     folder: Path,
     device: torch.device,
 ) -> EvaluationResult:
-    """Score each prediction on a device, and draw its error maps into `folder/errors`."""
+    """Score each prediction on a device, and write error maps to `folder/errors`."""
     metrics = metrics.to(device)
     for pair in tqdm(pairs, unit="view", desc="evaluate", dynamic_ncols=True):
         prediction, reference, coverage = pair.load(alpha)

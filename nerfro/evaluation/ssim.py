@@ -1,4 +1,4 @@
-"""Structural similarity (SSIM) and its form over several scales (MS-SSIM)."""
+"""Structural similarity (SSIM) and multiscale structural similarity (MS-SSIM)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from nerfro.errors import NerfroError
 from nerfro.evaluation.regions import mean_over
 
-WINDOW = 11  # pixels: a Gaussian of sigma 1.5, cut off at 3.5 sigma
+WINDOW = 11  # pixels; Gaussian of sigma 1.5, truncated at 3.5 sigma
 SIGMA = 1.5  # pixels
 STABILISERS = (0.01**2, 0.03**2)  # C1 and C2 for values in [0, 1]
 SCALE_EXPONENTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)  # finest first
@@ -18,14 +18,26 @@ MS_SSIM_MIN_SIZE = (WINDOW - 1) * 2 ** (len(SCALE_EXPONENTS) - 1) + 1  # pixels,
 
 
 def ssim_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H-10 W-10 3"]:
-    """Structural similarity in [-1, 1] at each pixel and channel whose whole window lies inside the picture.
+    """Compute the structural similarity at each pixel and channel whose window lies inside the image.
 
-    Gaussian window of 11 pixels and sigma 1.5, weighted (not unbiased) covariances, K = (0.01, 0.03), sRGB in [0, 1];
-    in double precision, since variances are differences of nearly equal numbers. Source: Wang et al., "Image quality
-    assessment: from error visibility to structural similarity", 2004, Eqn. 13 to 16.
+    The window is a Gaussian of 11 pixels and sigma 1.5. Covariances are weighted (not unbiased), K = (0.01, 0.03).
+    Double precision is used because variances are differences of nearly equal numbers.
+
+    Args:
+        prediction: rendered image, sRGB in [0, 1].
+        target: reference image, sRGB in [0, 1].
+
+    Returns:
+        Similarity in [-1, 1].
+
+    Raises:
+        NerfroError: the image is smaller than the window.
+
+    Source:
+        Wang et al., "Image quality assessment: from error visibility to structural similarity", 2004, Eqn. 13 to 16.
     """
     if min(prediction.shape[:2]) < WINDOW:
-        raise NerfroError(f"SSIM needs at least {WINDOW} x {WINDOW} pixels, got {list(prediction.shape[:2])}")
+        raise NerfroError(f"SSIM needs at least {WINDOW} x {WINDOW} pixels, got {list(prediction.shape[:2])}; use PSNR")
     luminance, contrast = _luminance_and_contrast(_channels(prediction), _channels(target))
     return (luminance * contrast).permute(1, 2, 0)
 
@@ -33,9 +45,15 @@ def ssim_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"])
 def ssim(
     prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], inside: Bool[Tensor, "H W"] | None = None
 ) -> Float[Tensor, ""]:
-    """Structural similarity, the mean of `ssim_map` over channels, and over all pixels or those of a mask.
+    """Compute the structural similarity (SSIM), the mean of `ssim_map`; higher is better.
 
-    NaN if no pixel of the mask has its whole window inside the picture.
+    Args:
+        prediction: rendered image, sRGB in [0, 1].
+        target: reference image, sRGB in [0, 1].
+        inside: mask of the pixels that count; by default, all pixels count.
+
+    Returns:
+        Mean in [-1, 1], without unit; NaN if no pixel of the mask has a window inside the image.
     """
     return mean_over(ssim_map(prediction, target).mean(-1), _with_whole_window(inside))
 
@@ -43,19 +61,31 @@ def ssim(
 def ms_ssim(
     prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], inside: Bool[Tensor, "H W"] | None = None
 ) -> Float[Tensor, ""]:
-    """Structural similarity over five scales, each half as fine as the one before.
+    """Compute the multiscale structural similarity (MS-SSIM) over five scales; higher is better.
 
-    prod_j cs_j^b_j, with the mean of contrast and structure on the scales 1 to 4 and of the whole similarity on the
-    coarsest; negative means count as 0. By channel, then the mean over channels, as pytorch-msssim and TensorFlow do
-    it. Scales are means over 2 x 2 pixels; an odd last row or column is a mean over what is there. Of a mask those
-    pixels count on coarser scales that are covered by half or more; NaN if on some scale none has its whole window
-    inside the picture. Source: Wang et al., "Multiscale structural similarity for image quality assessment", 2003, Eqn.
-    7.
+    The result is prod_j cs_j^b_j, where cs_j is the mean of contrast and structure on scales 1 to 4 and the mean SSIM
+    on the coarsest scale. Negative means count as 0. The product is computed per channel and then averaged, as in
+    pytorch-msssim and TensorFlow. Each scale averages 2 x 2 pixels of the finer one; an odd last row or column averages
+    the existing pixels. On coarser scales, a pixel belongs to the mask if at least half of it is covered.
+
+    Args:
+        prediction: rendered image, sRGB in [0, 1].
+        target: reference image, sRGB in [0, 1].
+        inside: mask of the pixels that count; by default, all pixels count.
+
+    Returns:
+        Similarity in [0, 1], without unit; NaN if on some scale no pixel of the mask has a window inside the image.
+
+    Raises:
+        NerfroError: the image is smaller than 161 x 161 pixels.
+
+    Source:
+        Wang et al., "Multiscale structural similarity for image quality assessment", 2003, Eqn. 7.
     """
     if min(prediction.shape[:2]) < MS_SSIM_MIN_SIZE:
         raise NerfroError(
             f"MS-SSIM needs at least {MS_SSIM_MIN_SIZE} x {MS_SSIM_MIN_SIZE} pixels for its five scales, "
-            f"got {list(prediction.shape[:2])}; take SSIM"
+            f"got {list(prediction.shape[:2])}; use SSIM"
         )
     x, y = _channels(prediction), _channels(target)
     weights = None if inside is None else inside.double()[None]
@@ -75,7 +105,7 @@ def ms_ssim(
 def _luminance_and_contrast(
     x: Float[Tensor, "C H W"], y: Float[Tensor, "C H W"]
 ) -> tuple[Float[Tensor, "C H-10 W-10"], Float[Tensor, "C H-10 W-10"]]:
-    """The two factors of SSIM: agreement of local means, and of local contrast and structure."""
+    """Compute the two factors of SSIM: similarity of local means, and of local contrast and structure."""
     c1, c2 = STABILISERS
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = _window_means(torch.stack([x, y, x * x, y * y, x * y]))
     luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
@@ -85,10 +115,10 @@ def _luminance_and_contrast(
 
 
 def _window_means(values: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H-10 W-10"]:
-    """Gaussian-weighted means around each pixel whose window lies inside; columns first, then rows."""
+    """Average with a separable Gaussian window around each pixel whose window lies inside the image."""
     offsets = torch.arange(WINDOW, dtype=values.dtype) - WINDOW // 2
     weights = torch.exp(-0.5 * (offsets / SIGMA) ** 2)
-    # Sums of shifted pictures are ten times faster than torch's convolution, which is slow in double precision.
+    # Sums of shifted images are ten times faster than convolution in torch, which is slow in double precision.
     for axis in (-1, -2):
         length = values.shape[axis] - WINDOW + 1
         means = torch.zeros_like(values.narrow(axis, 0, length))
@@ -107,5 +137,5 @@ def _halve(values: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
     return F.avg_pool2d(values, 2, ceil_mode=True)
 
 
-def _channels(picture: Float[Tensor, "H W 3"]) -> Float[Tensor, "3 H W"]:
-    return picture.double().permute(2, 0, 1)
+def _channels(image: Float[Tensor, "H W 3"]) -> Float[Tensor, "3 H W"]:
+    return image.double().permute(2, 0, 1)

@@ -1,48 +1,79 @@
-"""Tables of scores in memory, and their forms on paper: console, CSV, Markdown, LaTeX and HTML."""
+"""Tables of scores: contents, and output as console text, CSV, Markdown, LaTeX and HTML."""
 
 from __future__ import annotations
 
 import csv
 import html
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Literal
 
+import rich
 import rich.box
 import rich.console
 import rich.table
 import rich.text
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.results import Score
+from nerfro.evaluation.results import (
+    AS_GIVEN,
+    FULL,
+    METRICS,
+    EvaluationResult,
+    Region,
+    RunMetrics,
+    Score,
+    write_metrics_json,
+)
 from nerfro.files.atomic import write_atomically
 
 MISSING = "n/a"
 MEDALS = ("gold", "silver", "bronze")
-_MEDAL_SIGNS = {"gold": "🥇", "silver": "🥈", "bronze": "🥉"}
-_MEDAL_COLOURS = {"gold": "F7DC8A", "silver": "DADDE2", "bronze": "EBC3A0"}  # pale: black figures are read on them
+
+# Format of a cell for each mark. The LaTeX colours are pale, so that black numbers stay readable on these.
+_LATEX = {"": "%s", "best": r"\textbf{%s}"}
+_LATEX |= {
+    medal: rf"\cellcolor[HTML]{{{colour}}}%s"
+    for medal, colour in zip(MEDALS, ("F7DC8A", "DADDE2", "EBC3A0"), strict=True)
+}
+_MARKDOWN = {"": "%s", "best": "**%s**", "gold": "%s 🥇", "silver": "%s 🥈", "bronze": "%s 🥉"}
+_HTML = {"": "<td>%s</td>", "best": "<td><strong>%s</strong></td>"}
+_HTML |= {medal: f'<td class="{medal}">%s<span class="unseen"> {medal}</span></td>' for medal in MEDALS}
 
 
 @dataclass(frozen=True)
 class Column:
-    """One column of numbers."""
+    """One column of numbers.
 
-    title: str  # heading
-    better: Literal["higher", "lower"] | None = None  # which values are better; None if the column is not a competition
-    decimals: int = 2  # digits after the point, in all forms but CSV, which keeps every digit
-    group: str = ""  # heading above this column and those beside it of the same group; empty for none
+    Attributes:
+        title: heading.
+        better: whether higher or lower values are better, or None if the values are not ranked.
+        decimals: number of decimals in all formats except CSV, which keeps all digits.
+        group: heading above this column and its neighbours of the same group; may be empty.
+    """
+
+    title: str
+    better: Literal["higher", "lower"] | None = None
+    decimals: int = 2
+    group: str = ""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One line of a table: what it is about, and a number for each column; None where there is none."""
+    """One row of a table.
 
-    label: str  # what the line is about
-    values: tuple[Score, ...]  # the numbers
-    spreads: tuple[Score, ...] = ()  # standard deviation of each number, None where there is none; empty without any
+    Attributes:
+        label: heading of the row.
+        values: one number per column, or None for a missing number.
+        spreads: standard deviation of each number, or None; empty if no number has one.
+    """
+
+    label: str
+    values: tuple[Score, ...]
+    spreads: tuple[Score, ...] = ()
 
     def spread(self, column: int) -> Score:
         return self.spreads[column] if self.spreads else None
@@ -50,16 +81,25 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of numbers."""
+    """A table of numbers.
 
-    title: str  # what it shows
-    label_title: str  # heading of the rows' labels
-    columns: tuple[Column, ...]  # headings and meaning of the numbers
-    rows: tuple[Row, ...]  # the lines, in order
-    summary: tuple[Row, ...] = ()  # lines below a rule, such as means
-    mark_best: bool = False  # whether the best values of each column among `rows` are emphasised
-    medals: bool = False  # whether the best three are marked gold, silver and bronze instead
-    notes: tuple[str, ...] = ()  # footnotes, such as the reason for a missing number
+    Attributes:
+        title: caption.
+        label_title: heading of the row labels.
+        columns: columns of numbers.
+        rows: rows of numbers.
+        summary: rows below a rule, such as means. These are neither ranked nor marked.
+        mark: whether to mark nothing, the `best` value of each column, or the best three with `medals`.
+        notes: footnotes, such as the reason for a missing number.
+    """
+
+    title: str
+    label_title: str
+    columns: tuple[Column, ...]
+    rows: tuple[Row, ...]
+    summary: tuple[Row, ...] = ()
+    mark: Literal["", "best", "medals"] = ""
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for row in (*self.rows, *self.summary):
@@ -69,46 +109,96 @@ class Table:
                         f"table {self.title!r}: {len(numbers)} values of {row.label!r} for {len(self.columns)} columns"
                     )
 
-    def is_best(self, row: int, column: int) -> bool:
-        """Whether a value of `rows` is emphasised as the best of its column, or equal to it as printed."""
-        return self.mark_best and self._place(row, column) == 0
+    def mark_of(self, row: int, column: int) -> str:
+        """Return the mark of a number in `rows`: "best", one of `MEDALS`, or an empty string.
 
-    def medal(self, row: int, column: int) -> str | None:
-        """Which of `MEDALS` a value of `rows` wins, if any."""
-        place = self._place(row, column) if self.medals else None
-        return None if place is None or place >= len(MEDALS) else MEDALS[place]
-
-    def groups(self) -> list[tuple[str, int]]:
-        """Group headings, and over how many columns each stands."""
-        return [(group, len(list(columns))) for group, columns in groupby(column.group for column in self.columns)]
-
-    def _place(self, row: int, column: int) -> int | None:
-        """How many different values of a column are better than one of `rows`; None where there is no competition.
-
-        Values that print alike are placed alike: a reader cannot see a difference between them. The value after two
-        equal best ones is second, as in the paper's table.
+        Numbers that are printed alike have the same rank, because readers cannot distinguish them. The number after two
+        equal best ones is second, as in the table of the paper.
         """
         better, decimals = self.columns[column].better, self.columns[column].decimals
         value = self.rows[row].values[column]
-        if better is None or value is None:
-            return None
-        present = [other.values[column] for other in self.rows]
-        rivals = {round(other, decimals) for other in present if other is not None}
-        return sorted(rivals, reverse=better == "higher").index(round(value, decimals))
+        if not self.mark or better is None or value is None:
+            return ""
+        values = [other.values[column] for other in self.rows]
+        distinct = {round(other, decimals) for other in values if other is not None}
+        rank = sorted(distinct, reverse=better == "higher").index(round(value, decimals))
+        marks = MEDALS if self.mark == "medals" else ("best",)
+        return marks[rank] if rank < len(marks) else ""
+
+    def cells(self, row: Row) -> list[str]:
+        """Return the numbers of a row as printed."""
+        return [_cell(value, row.spread(j), self.columns[j].decimals) for j, value in enumerate(row.values)]
+
+    def marked_cells(self, row: int, forms: Mapping[str, str]) -> list[str]:
+        """Return the cells of one of `rows`, formatted by mark; `forms` maps each mark to a format with `%s`."""
+        return [forms[self.mark_of(row, j)] % cell for j, cell in enumerate(self.cells(self.rows[row]))]
+
+    def groups(self) -> list[tuple[str, int]]:
+        """Return the group headings and the number of columns of each group."""
+        return [(group, len(list(columns))) for group, columns in groupby(column.group for column in self.columns)]
+
+
+def views_table(result: EvaluationResult, title: str, region: Region = FULL) -> Table:
+    """Tabulate the scores of each view in one region, with means, and notes about missing scores."""
+    scores = {view.name: {m.name: view.score(m.name, region) for m in METRICS} for view in result.views}
+    notes = [_mask_note(result) if region != FULL else "", _missing_note(result, region)]
+    return _scores_table(title, "view", scores, notes, {"mean": result.means(region)})
+
+
+def regions_table(result: EvaluationResult, title: str) -> Table:
+    """Tabulate the mean scores of each region. Notes that `views_table` shows as well are omitted."""
+    scores = {str(region): result.means(region) for region in result.regions}
+    missing = {region: _missing_note(result, region) for region in result.regions}
+    notes = [f"{region}: {note}" for region, note in missing.items() if note and note != missing[FULL]]
+    return _scores_table(title, "region", scores, [_mask_note(result), *notes])
+
+
+def treatments_table(metrics: RunMetrics, title: str) -> Table:
+    """Tabulate the mean scores of the test views under each treatment (see `nerfro.evaluation.treatments`)."""
+    treated = {name: result.means() for name, result in metrics.treatments.items()}
+    return _scores_table(title, "test views", {AS_GIVEN: metrics.result.means()} | treated, [])
+
+
+def short(reason: str) -> str:
+    """Return a reason without the advice after its semicolon."""
+    return reason.partition(";")[0]
+
+
+def report(metrics: RunMetrics, title: str, folder: Path) -> None:
+    """Write metrics.json and the tables of all regions into a folder, and print the tables of views and means."""
+    write_metrics_json(folder / "metrics.json", metrics)
+    result = metrics.result
+    for region in result.regions:
+        full = region == FULL
+        table = views_table(result, title if full else f"{title}, {region}", region)
+        write_table(table, folder / ("metrics" if full else f"metrics_{region}"))
+    rich.print(to_rich(views_table(result, title)))
+    if len(result.regions) > 1:
+        rich.print(to_rich(regions_table(result, "means of the full images, of the object's mask, and of the crop")))
+    if metrics.treatments:
+        rich.print(to_rich(treatments_table(metrics, "means of the full images, or of right halves")))
+
+
+def write_table(table: Table, stem: Path | str) -> list[Path]:
+    """Write `<stem>.csv`, `<stem>.md` and `<stem>.tex`, and return the three paths."""
+    texts = {f"{stem}.csv": to_csv(table), f"{stem}.md": to_markdown(table), f"{stem}.tex": to_latex(table)}
+    for path, text in texts.items():
+        write_atomically(path, text)
+    return list(map(Path, texts))
 
 
 def to_rich(table: Table) -> rich.console.Group:
-    """Lay a table out for the console, `rich.print(to_rich(table))`; best values bold or with medals, footnotes below.
+    """Format a table for the console: `rich.print(to_rich(table))`.
 
-    Where the console is too narrow for all groups of columns, they are stacked.
+    If the console is too narrow for all groups of columns, the groups are stacked.
     """
-    # Footnotes are no caption of the drawn table: that would be wrapped to the table's width.
+    # A caption would be wrapped to the width of the table, so footnotes are separate texts.
     return rich.console.Group(_Drawn(table), *(rich.text.Text(note, style="dim") for note in table.notes))
 
 
 @dataclass(frozen=True)
 class _Drawn:
-    """A table for rich, in as many blocks of whole groups of columns as the console's width asks for."""
+    """Renderable table that splits into blocks of whole column groups to fit the width of the console."""
 
     table: Table
 
@@ -137,24 +227,23 @@ class _Drawn:
             heading = f"{above}\n{_heading(column)}" if grouped else _heading(column)
             drawn.add_column(rich.text.Text(heading), justify="right", no_wrap=True)
         for i, row in enumerate(table.rows):
-            cells = [rich.text.Text(self._text(i, j), style="bold" if table.is_best(i, j) else "") for j in columns]
+            cells = [self._text(i, j) for j in columns]
             drawn.add_row(rich.text.Text(row.label), *cells, end_section=i == len(table.rows) - 1)
         for row in table.summary:
-            texts = _cells(row, table)[start:stop]
-            drawn.add_row(rich.text.Text(row.label), *map(rich.text.Text, texts), style="bold")
+            drawn.add_row(*map(rich.text.Text, (row.label, *table.cells(row)[start:stop])), style="bold")
         return drawn
 
-    def _text(self, i: int, j: int) -> str:
-        cell, medal = _cells(self.table.rows[i], self.table)[j], self.table.medal(i, j)
-        if not self.table.medals:
-            return cell
-        return f"{cell} {_MEDAL_SIGNS[medal]}" if medal else f"{cell}   "  # a medal is two cells wide
+    def _text(self, i: int, j: int) -> rich.text.Text:
+        cell, mark = self.table.cells(self.table.rows[i])[j], self.table.mark_of(i, j)
+        if self.table.mark != "medals":
+            return rich.text.Text(cell, style="bold" if mark else "")
+        return rich.text.Text(_MARKDOWN[mark] % cell if mark else f"{cell}   ")  # a medal is two cells wide
 
 
 def to_csv(table: Table) -> str:
-    """Write a table as CSV: every digit, no marks; footnotes as last lines that begin with `#`.
+    """Format a table as CSV with all digits and without marks. Footnotes are the last lines and begin with `#`.
 
-    If a row has spreads, each column is followed by one of them, its heading with `std`.
+    If a row has standard deviations, each column is followed by a column `<title> std`.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -175,41 +264,27 @@ def to_csv(table: Table) -> str:
 
 
 def to_markdown(table: Table) -> str:
-    """Write a table as GitHub-flavoured Markdown: best values bold or with medals, summary rows in italics."""
+    """Format a table as GitHub-flavoured Markdown, with summary rows in italics."""
 
     def line(cells: Sequence[str]) -> str:
         return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-
-    def marked(i: int, j: int, cell: str) -> str:
-        medal = table.medal(i, j)
-        return f"**{cell}**" if table.is_best(i, j) else f"{cell} {_MEDAL_SIGNS[medal]}" if medal else cell
 
     headings = [f"{column.group} {_heading(column)}".strip() for column in table.columns]
     lines = [f"**{table.title}**", "", line([table.label_title, *headings])]
     lines.append("|" + "|".join([":---", *("---:" for _ in table.columns)]) + "|")
     for i, row in enumerate(table.rows):
-        lines.append(line([row.label, *(marked(i, j, cell) for j, cell in enumerate(_cells(row, table)))]))
+        lines.append(line([row.label, *table.marked_cells(i, _MARKDOWN)]))
     for row in table.summary:
-        lines.append(line([f"*{row.label}*", *(f"*{cell}*" for cell in _cells(row, table))]))
+        lines.append(line([f"*{row.label}*", *(f"*{cell}*" for cell in table.cells(row))]))
     lines += [text for note in table.notes for text in ("", note)]
     return "\n".join(lines) + "\n"
 
 
 def to_latex(table: Table) -> str:
-    r"""Write a table as LaTeX; the document needs `\usepackage{booktabs}`, and for medals `\usepackage[table]{xcolor}`.
+    r"""Format a table as LaTeX, with summary rows below a rule and footnotes below the table.
 
-    Best values are bold or coloured by their medals, summary rows stand below a rule, footnotes below the table.
+    The document needs `\usepackage{booktabs}`, and for medals `\usepackage[table]{xcolor}`.
     """
-
-    def marked(i: int, j: int, cell: str) -> str:
-        medal = table.medal(i, j)
-        if medal:
-            return rf"\cellcolor[HTML]{{{_MEDAL_COLOURS[medal]}}}{cell}"
-        return rf"\textbf{{{cell}}}" if table.is_best(i, j) else cell
-
-    def cells(row: Row) -> list[str]:
-        return [_latex(cell) for cell in _cells(row, table)]
-
     arrows = {"higher": r" $\uparrow$", "lower": r" $\downarrow$", None: ""}
     headings = [_latex(table.label_title), *(_latex(c.title) + arrows[c.better] for c in table.columns)]
     lines = [r"\begin{table}", r"\centering", rf"\caption{{{_latex(table.title)}}}"]
@@ -218,28 +293,23 @@ def to_latex(table: Table) -> str:
         lines += _latex_groups(table)
     lines += [_latex_row(headings), r"\midrule"]
     for i, row in enumerate(table.rows):
-        lines.append(_latex_row([_latex(row.label), *(marked(i, j, cell) for j, cell in enumerate(cells(row)))]))
+        # The numbers and "n/a" contain no special character but the sign of a standard deviation.
+        cells = [cell.replace("±", r"$\pm$") for cell in table.marked_cells(i, _LATEX)]
+        lines.append(_latex_row([_latex(row.label), *cells]))
     if table.summary:
         lines.append(r"\midrule")
     for row in table.summary:
-        lines.append(_latex_row([_latex(row.label), *cells(row)]))
+        lines.append(_latex_row([_latex(row.label), *map(_latex, table.cells(row))]))
     lines += [r"\bottomrule", r"\end{tabular}"]
     lines += [rf"\par\smallskip{{\footnotesize {_latex(note)}}}" for note in table.notes]
     return "\n".join([*lines, r"\end{table}"]) + "\n"
 
 
 def to_html(table: Table) -> str:
-    """Write a table as an HTML `<table>`; footnotes follow as paragraphs of class `note`.
+    """Format a table as an HTML `<table>`, with footnotes as paragraphs of class `note`.
 
-    Best values are `<strong>`; cells with medals have their names as class, and as text of class `unseen`.
+    Best values are `<strong>`. Cells with medals have the name of the medal as class, and as text of class `unseen`.
     """
-
-    def cell(i: int, j: int, text: str) -> str:
-        medal, text = table.medal(i, j), html.escape(text)
-        if medal:
-            return f'<td class="{medal}">{text}<span class="unseen"> {medal}</span></td>'
-        return f"<td><strong>{text}</strong></td>" if table.is_best(i, j) else f"<td>{text}</td>"
-
     grouped = any(column.group for column in table.columns)
     lines = ["<table>", f"<caption>{html.escape(table.title)}</caption>", "<thead>", "<tr>"]
     rows = 2 if grouped else 1
@@ -250,36 +320,53 @@ def to_html(table: Table) -> str:
     lines += [f'<th scope="col">{html.escape(_heading(column))}</th>' for column in table.columns]
     lines += ["</tr>", "</thead>", "<tbody>"]
     for i, row in enumerate(table.rows):
-        cells = "".join(cell(i, j, text) for j, text in enumerate(_cells(row, table)))
+        cells = "".join(table.marked_cells(i, _HTML))
         lines.append(f'<tr><th scope="row">{html.escape(row.label)}</th>{cells}</tr>')
     lines.append("</tbody>")
     if table.summary:
         lines.append("<tfoot>")
         for row in table.summary:
-            cells = "".join(f"<td>{html.escape(text)}</td>" for text in _cells(row, table))
+            cells = "".join(f"<td>{html.escape(text)}</td>" for text in table.cells(row))
             lines.append(f'<tr><th scope="row">{html.escape(row.label)}</th>{cells}</tr>')
         lines.append("</tfoot>")
     lines.append("</table>")
     return "\n".join([*lines, *(f'<p class="note">{html.escape(note)}</p>' for note in table.notes)]) + "\n"
 
 
-def write_table(table: Table, stem: Path | str) -> list[Path]:
-    """Write `<stem>.csv`, `<stem>.md` and `<stem>.tex`, and return the three paths."""
-    stem = Path(stem)
-    texts = {".csv": to_csv(table), ".md": to_markdown(table), ".tex": to_latex(table)}
-    paths = [stem.with_name(stem.name + suffix) for suffix in texts]
-    for path, text in zip(paths, texts.values(), strict=True):
-        write_atomically(path, text)
-    return paths
-
-
 def _heading(column: Column) -> str:
     return column.title + {"higher": " ↑", "lower": " ↓", None: ""}[column.better]
 
 
-def _cells(row: Row, table: Table) -> list[str]:
-    """The numbers of a row as they are printed."""
-    return [_cell(value, row.spread(j), table.columns[j].decimals) for j, value in enumerate(row.values)]
+def _scores_table(
+    title: str,
+    label_title: str,
+    rows: Mapping[str, Mapping[str, Score]],
+    notes: Sequence[str],
+    summary: Mapping[str, Mapping[str, Score]] | None = None,
+) -> Table:
+    """Tabulate scores by row label and metric. Metrics without any score are omitted, unless no metric has one."""
+    metrics = [m for m in METRICS if any(scores[m.name] is not None for scores in rows.values())] or list(METRICS)
+    columns = tuple(Column(metric.title, metric.better, metric.decimals) for metric in metrics)
+    body, foot = (
+        tuple(Row(label, tuple(scores[metric.name] for metric in metrics)) for label, scores in part.items())
+        for part in (rows, summary or {})
+    )
+    return Table(title, label_title, columns, body, foot, notes=tuple(note for note in notes if note))
+
+
+def _mask_note(result: EvaluationResult) -> str:
+    return f"Mask and crop {MISSING}: {result.notes['mask']}" if "mask" in result.notes else ""
+
+
+def _missing_note(result: EvaluationResult, region: Region) -> str:
+    """Name the metrics that are missing in a region, with the reasons, in one line."""
+    by_reason: dict[str, list[str]] = {}
+    for metric in METRICS:
+        reason = result.notes.get(metric.name if region == FULL else f"{region}.{metric.name}")
+        if reason is not None:
+            by_reason.setdefault(short(reason), []).append(metric.title)
+    missing = ", ".join(f"{', '.join(titles)} ({reason})" for reason, titles in by_reason.items())
+    return f"{MISSING}: {missing}" if missing else ""
 
 
 def _cell(value: Score, spread: Score, decimals: int) -> str:
@@ -289,7 +376,7 @@ def _cell(value: Score, spread: Score, decimals: int) -> str:
 
 
 def _latex_groups(table: Table) -> list[str]:
-    """The row of group headings, and the rules below them."""
+    """Format the row of group headings and the rules below it."""
     headings, rules, first = [""], [], 2
     for name, count in table.groups():
         headings.append(rf"\multicolumn{{{count}}}{{c}}{{{_latex(name)}}}")

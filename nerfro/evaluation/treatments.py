@@ -1,7 +1,7 @@
-"""Test views under other cameras and exposures than the data's, each scored under its own name.
+"""Scores of test views with corrected cameras and exposures.
 
-Trained cameras and gains are those of training views. What they say of a test view is scored apart, so that no number
-under `test` has been helped.
+Training refines cameras and exposures of training views only. Scores of test views that use such corrections are listed
+separately, so that the scores under `test` always belong to the cameras and exposures of the data set.
 """
 
 from __future__ import annotations
@@ -33,11 +33,19 @@ def score_split(
     subdivision: Subdivision,
     refine_steps: int = 0,
 ) -> tuple[EvaluationResult, dict[str, EvaluationResult]]:
-    """Score views as given, and once more for each treatment that is asked for, by its name.
+    """Score views with the given cameras, and once more for each applicable treatment.
 
-    `aligned`: cameras moved by the similarity that has moved the training cameras, and behind the lens that is believed
-    in. `exposed`: these, with a gain for each view and channel. `refined`: these, each camera refined by itself. Gains
-    and cameras are fitted on the left halves of photographs, and then the right halves are scored.
+    The treatments build on each other:
+
+    - `aligned`: test cameras are moved by the similarity transformation from the given to the refined training cameras,
+      and use the estimated lens.
+    - `exposed`: in addition, each view and channel has a gain.
+    - `refined`: in addition, each test camera is refined individually.
+
+    Gains and refined cameras are fitted on the left halves of the photographs, and the right halves are scored.
+
+    Returns:
+        Scores with the given cameras, and the scores of each treatment by name.
     """
     given, treated = score_views(model, views, metrics, folder, subdivision), {}
     if model.camera.moves:
@@ -58,7 +66,7 @@ def score_split(
 def _score_right(
     model: NerfModel, views: Views, metrics: ImageMetrics, folder: Path, subdivision: Subdivision, name: str
 ) -> tuple[Float[Tensor, "V 3"], EvaluationResult]:
-    """Gains that are fitted on left halves where exposures learn, else 1; and the scores of right halves."""
+    """Fit gains on left halves if exposures are estimated (otherwise 1), and score right halves."""
     cameras = views.cameras.to(model.device)
     height, width = cameras.height, cameras.width
     left, right = slice(width // 2), slice(width // 2, None)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation.results import FULL, METRICS, Metric, Region
-from nerfro.evaluation.score_tables import short
-from nerfro.evaluation.tables import MISSING, Column, Row, Table
+from nerfro.evaluation.tables import MISSING, Column, Row, Table, short
 from nerfro.report.runs import Budget, Run, Scored, shown
 from nerfro.training.settings import TABLE_ROW, settings
 
@@ -64,7 +63,8 @@ def to_table(comparison: Comparison, metrics: Sequence[Metric], region: Region) 
     title = "; ".join(
         [f"Trained for {comparison.budget.label}", *_what_was_scored(comparison, region), _seeds(comparison)]
     )
-    return Table(title, "method", tuple(columns), tuple(rows), medals=len(rows) > 1, notes=tuple(notes))
+    mark: Literal["", "medals"] = "medals" if len(rows) > 1 else ""
+    return Table(title, "method", tuple(columns), tuple(rows), mark=mark, notes=tuple(notes))
 
 
 def find_metrics(names: Sequence[str]) -> list[Metric]:

@@ -18,8 +18,8 @@ from torch import Tensor
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
 from nerfro.evaluation.error_maps import ErrorMap, error_maps
+from nerfro.evaluation.image_grid import Crop, most_different_crop
 from nerfro.evaluation.lpips import LpipsNetwork, find_lpips_networks
-from nerfro.evaluation.pictures import Crop, most_telling_crop
 from nerfro.evaluation.results import FULL, METRICS, Metric, Region, Score
 from nerfro.evaluation.tables import MISSING
 from nerfro.files.images import load_png, to_8bit
@@ -210,7 +210,7 @@ def _choose_crops(reference: Tensor, predictions: Sequence[Tensor]) -> tuple[Cro
     size = max(min(reference.shape[:2]) // CROP_SHARE, 1)
     crops: list[Crop] = []
     for _ in range(NUM_CROPS):
-        crops.append(most_telling_crop(reference, predictions, size, apart_from=crops))
+        crops.append(most_different_crop(reference, predictions, size, apart_from=crops))
     return tuple(crops)
 
 

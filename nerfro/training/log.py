@@ -14,8 +14,8 @@ from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from torch import Tensor
 
 from nerfro.cameras import Cameras
-from nerfro.evaluation.path_plot import picture_of_paths
-from nerfro.evaluation.pictures import triptych
+from nerfro.evaluation.image_grid import triptych
+from nerfro.evaluation.path_plot import image_of_paths
 from nerfro.files.lat_long import directions
 from nerfro.media.analytic import Vacuum
 from nerfro.models.base import NerfModel
@@ -67,7 +67,7 @@ class TrainingLog(Callback):
         }
         if not isinstance(pl_module.medium, Vacuum):
             shown = torch.linspace(0, len(rays) - 1, min(_NUM_PATHS, len(rays))).long().to(rays.origins.device)
-            pictures["val/paths"] = picture_of_paths(renderings[-1].path.of_rays(shown), pl_module.medium)
+            pictures["val/paths"] = image_of_paths(renderings[-1].path.of_rays(shown), pl_module.medium)
         for logger in loggers:
             _log_pictures(logger, pictures, trainer.global_step)
             for level, rendering in enumerate(renderings):

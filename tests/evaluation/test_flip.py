@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from nerfro.evaluation.flip import flip, flip_map
-from nerfro.evaluation.metrics import MeanOverPictures
+from nerfro.evaluation.metrics import MeanOverImages
 
 
 def pictures(seed: int) -> tuple[Tensor, Tensor]:
@@ -44,7 +44,7 @@ def test_pictures_need_not_be_contiguous_or_of_single_precision() -> None:
 def test_metric_is_the_mean_over_pictures_or_over_their_pixels_in_masks() -> None:
     inside = torch.zeros(24, 40, dtype=torch.bool)
     inside[3:9, 10:20] = True
-    metric, masked = MeanOverPictures(flip), MeanOverPictures(flip)
+    metric, masked = MeanOverImages(flip), MeanOverImages(flip)
     for seed in range(3):
         metric.update(*pictures(seed))
         masked.update(*pictures(seed), inside)

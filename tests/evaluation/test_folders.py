@@ -71,19 +71,19 @@ def test_transparency_is_dropped_or_composited(folders: tuple[Path, Path], tmp_p
 def test_pictures_without_a_partner_are_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:
     predictions, references = folders
     write(predictions / "c.png")
-    with pytest.raises(NerfroError, match=r"1 of 3 pictures have no reference in .*c\.png is the first"):
+    with pytest.raises(NerfroError, match=r"1 of 3 images have no reference in .*c\.png is the first"):
         match_folders(predictions, references, None)
     for name in ("c", "d", "e"):
         write(references / f"{name}.png")
-    with pytest.raises(NerfroError, match=r"2 of 5 pictures have no prediction in .*d\.png is the first"):
+    with pytest.raises(NerfroError, match=r"2 of 5 images have no prediction in .*d\.png is the first"):
         match_folders(predictions, references, None)
     (references / "d.png").unlink()
     (references / "e.png").unlink()
     write(references / "mask_a.png", channels=1)
-    with pytest.raises(NerfroError, match=r"2 of 3 pictures have no mask in .*b\.bmp is the first"):
+    with pytest.raises(NerfroError, match=r"2 of 3 images have no mask in .*b\.bmp is the first"):
         match_folders(predictions, references, None)
     write(tmp_path / "masks" / "a.png", channels=1)
-    with pytest.raises(NerfroError, match=r"2 of 3 pictures have no mask in masks="):
+    with pytest.raises(NerfroError, match=r"2 of 3 images have no mask in masks="):
         match_folders(predictions, references, tmp_path / "masks")
 
 
@@ -91,10 +91,10 @@ def test_folders_without_pictures_are_refused(folders: tuple[Path, Path], tmp_pa
     (tmp_path / "empty").mkdir()
     with pytest.raises(NerfroError, match=r"predictions=.*nowhere is not a folder"):
         match_folders(tmp_path / "nowhere", folders[1], None)
-    with pytest.raises(NerfroError, match=r"references=.*empty holds no pictures; allowed are \.png"):
+    with pytest.raises(NerfroError, match=r"references=.*empty holds no images; allowed are \.png"):
         match_folders(folders[0], tmp_path / "empty", None)
     write(folders[0] / "a.jpg")
-    with pytest.raises(NerfroError, match=r"a\.jpg and .*a\.png have one name"):
+    with pytest.raises(NerfroError, match=r"a\.jpg and .*a\.png have the same name"):
         match_folders(*folders, None)
 
 
@@ -112,5 +112,5 @@ def test_damaged_and_unfit_files_are_named(folders: tuple[Path, Path]) -> None:
     with pytest.raises(NerfroError, match=r"mask_a\.png has 11x10 pixels but its image has 12x10"):
         match_folders(*folders, None)[0].load("drop")
     write(references / "mask_a.png", channels=1, level=0)
-    with pytest.raises(NerfroError, match=r"mask .*mask_a\.png is empty: no pixel is covered by half"):
+    with pytest.raises(NerfroError, match=r"mask .*mask_a\.png is empty: it covers half of no pixel"):
         match_folders(*folders, None)[0].load("drop")

@@ -14,7 +14,7 @@ from torch import Tensor
 from nerfro.errors import NerfroError
 from nerfro.evaluation import pretrained
 from nerfro.evaluation.lpips import ALEX, VGG, Backbone, LpipsNetwork, find_lpips_networks, load_lpips_network
-from nerfro.evaluation.metrics import MeanOverPictures
+from nerfro.evaluation.metrics import MeanOverImages
 from nerfro.paths import ASSETS_DIR
 
 
@@ -94,7 +94,7 @@ def reference(
 
 
 def test_distance_is_that_of_the_published_packages(reference: Reference) -> None:
-    metric = MeanOverPictures(reference.network)
+    metric = MeanOverImages(reference.network)
     for prediction, target, expected in zip(
         reference.predictions, reference.targets, reference.results["distances"], strict=True
     ):
@@ -180,7 +180,7 @@ def test_distance_does_not_depend_on_mixed_precision(network: LpipsNetwork) -> N
 
 
 def test_model_that_holds_the_network_neither_trains_nor_stores_it(network: LpipsNetwork) -> None:
-    metric = MeanOverPictures(network)
+    metric = MeanOverImages(network)
     assert list(metric.parameters()) == []
     assert metric.state_dict() == {}
 
@@ -191,8 +191,8 @@ def test_missing_networks_are_reported_with_the_reason(tmp_path: Path, monkeypat
     assert networks == {}
     assert reasons.keys() == {"lpips", "lpips_vgg"}
     for name, title in (("lpips", "AlexNet"), ("lpips_vgg", "VGG-16")):
-        assert reasons[name].startswith(f"no weights; {title}'s are not in torch's cache")
-        assert f" at {tmp_path}" in reasons[name]
+        assert reasons[name].startswith(f"no weights; {title} is not in the cache of torch")
+        assert f" to {tmp_path}" in reasons[name]
         assert "\n" not in reasons[name]
 
 
@@ -221,6 +221,6 @@ def test_named_weights_are_never_passed_over(tmp_path: Path, backbone_file: Path
     torch.save(other, tmp_path / "other.pth")
     with pytest.raises(NerfroError, match=r"features\.3\.weight of shape \[192, 64, 5, 5\], found \[192, 3, 5, 5\]"):
         find_lpips_networks(tmp_path / "other.pth")
-    with pytest.raises(NerfroError, match=r"use the file of VGG-16 itself"):
+    with pytest.raises(NerfroError, match=r"use the published file of VGG-16"):
         find_lpips_networks(backbone_file, vgg=backbone_file)
     assert list(find_lpips_networks(backbone_file, download=False)[0]) == ["lpips"]

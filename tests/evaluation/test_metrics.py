@@ -10,7 +10,7 @@ from torch import Tensor
 from nerfro.errors import NerfroError
 from nerfro.evaluation.flip import flip
 from nerfro.evaluation.lpips import ALEX
-from nerfro.evaluation.metrics import MAX_PSNR, ImageMetrics, MeanOverPictures, psnr
+from nerfro.evaluation.metrics import MAX_PSNR, ImageMetrics, MeanOverImages, psnr
 from nerfro.evaluation.regions import mean_over
 from nerfro.evaluation.ssim import ms_ssim, ssim
 from nerfro.files.images import load_png, save_png
@@ -170,8 +170,8 @@ def test_missing_metrics_are_none_with_a_reason() -> None:
     assert [row.scores["ssim"] is None for row in result.views] == [False, True]
     assert result.mean("ssim") is None
     assert result.notes == {
-        "ssim": "pictures below 11 pixels",
-        "ms_ssim": "pictures below 161 pixels",
+        "ssim": "images below 11 pixels",
+        "ms_ssim": "images below 161 pixels",
         "lpips": "no cable",
         "lpips_vgg": "no file",
     }
@@ -179,7 +179,7 @@ def test_missing_metrics_are_none_with_a_reason() -> None:
 
 @pytest.mark.parametrize("metric", [psnr, ssim])
 def test_metric_over_pictures_is_a_mean_that_processes_share(metric: Callable[..., Tensor]) -> None:
-    alone, here, there = (MeanOverPictures(metric) for _ in range(3))
+    alone, here, there = (MeanOverImages(metric) for _ in range(3))
     for seed in range(3):
         alone.update(*pictures(seed))
         (here if seed == 1 else there).update(*pictures(seed))
@@ -215,7 +215,7 @@ def test_pictures_that_cannot_be_compared_are_refused() -> None:
         metrics.update(torch.zeros(16, 16, 3), torch.zeros(16, 17, 3))
     with pytest.raises(NerfroError, match="NaN"):
         metrics.update(torch.full((16, 16, 3), math.nan), torch.zeros(16, 16, 3))
-    with pytest.raises(NerfroError, match=r"mask \[16, 17\] does not fit a picture \[16, 16, 3\]"):
+    with pytest.raises(NerfroError, match=r"mask \[16, 17\] does not fit an image \[16, 16, 3\]"):
         metrics.update(torch.zeros(16, 16, 3), torch.zeros(16, 16, 3), coverage=torch.ones(16, 17))
 
 

@@ -114,7 +114,7 @@ def test_refused_connection_is_the_reason_in_one_line() -> None:
 
 
 def test_nothing_is_fetched_when_downloads_are_off(site: str, cache: Path) -> None:
-    with pytest.raises(NerfroError, match="no weights; AlexNet's are not in torch's cache: put"):
+    with pytest.raises(NerfroError, match="no weights; AlexNet is not in the cache of torch: download"):
         load_weights(Published("AlexNet", f"{site}/{right_name()}"), download=False)
     assert not cache.exists()
 

@@ -6,8 +6,7 @@ import torch
 from nerfro.evaluation.lpips import find_lpips_networks
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import METRICS, EvaluationResult, ViewScores
-from nerfro.evaluation.score_tables import regions_table, views_table
-from nerfro.evaluation.tables import Row
+from nerfro.evaluation.tables import Row, regions_table, views_table
 
 
 def scores(psnr: float | None) -> dict[str, float | None]:
@@ -56,14 +55,14 @@ def test_a_first_run_without_networks_tells_why_in_one_line(tmp_path: Path, monk
     for table in (views_table(result, "t"), regions_table(result, "t")):
         assert all(any(row.values[j] is not None for row in table.rows) for j in range(len(table.columns)))
     (note,) = views_table(result, "t").notes
-    assert note == "n/a: MS-SSIM (pictures below 161 pixels), LPIPS, LPIPS-VGG (no weights)"
+    assert note == "n/a: MS-SSIM (images below 161 pixels), LPIPS, LPIPS-VGG (no weights)"
     assert len(note) <= 80
     assert "https://download.pytorch.org/models/alexnet" in result.notes["lpips"]
 
 
 def test_a_column_with_some_numbers_stays() -> None:
     views = (ViewScores("a", {**scores(20.0), "ssim": 0.5}), ViewScores("b", scores(21.0)))
-    table = views_table(EvaluationResult(views, {"ssim": "pictures below 11 pixels"}), "t")
+    table = views_table(EvaluationResult(views, {"ssim": "images below 11 pixels"}), "t")
     assert [column.title for column in table.columns] == ["PSNR", "SSIM", "FLIP"]
     assert table.summary[0].values == (20.5, None, 0.5)
 

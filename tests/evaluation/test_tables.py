@@ -28,13 +28,13 @@ TABLE = Table(
         Row("w/o #H", (25.4579, 0.25, 1500.0)),
     ),
     summary=(Row("mean", (24.41, None, 1500.0)),),
-    mark_best=True,
+    mark="best",
     notes=("LPIPS n/a: no file at a_long_path/" + "x" * 100,),
 )
 
 
 def best_cells(table: Table) -> set[tuple[int, int]]:
-    return {(i, j) for i in range(len(table.rows)) for j in range(len(table.columns)) if table.is_best(i, j)}
+    return {(i, j) for i in range(len(table.rows)) for j in range(len(table.columns)) if table.mark_of(i, j) == "best"}
 
 
 def on_console(table: Table, styled: bool = False) -> str:

@@ -148,7 +148,7 @@ def test_evaluation_replaces_only_what_an_evaluation_wrote(
         before = content(folder)
         code, _, error = evaluate(f"out={folder}", "overwrite=true")
         assert code == 1
-        assert "it is no evaluation's folder; give another out=" in error
+        assert "it is not the folder of an evaluation; give another out=" in error
         assert content(folder) == before
     scores = tmp_path / "scores"
     assert evaluate(f"out={scores}").code == 0

@@ -4,7 +4,7 @@ from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation.error_maps import squared_error_map
-from nerfro.evaluation.pictures import GAP, LINE_HEIGHT, Crop, PictureRow, most_telling_crop, picture_grid, triptych
+from nerfro.evaluation.image_grid import GAP, LINE_HEIGHT, Crop, ImageRow, image_grid, most_different_crop, triptych
 from nerfro.files.drawing import magma
 from nerfro.files.images import round_to_8bit
 
@@ -26,8 +26,8 @@ def cell(grid: Tensor, column: int, top: int) -> Tensor:
 
 def test_grid_shows_pictures_and_errors_pixel_by_pixel() -> None:
     reference, first, second = (picture(seed) for seed in range(3))
-    row = PictureRow(reference, [first, second])
-    grid = picture_grid([row], ["reference", "a", "b"], width=ZOOM * WIDTH, error_limit=0.3)
+    row = ImageRow(reference, [first, second])
+    grid = image_grid([row], ["reference", "a", "b"], width=ZOOM * WIDTH, error_limit=0.3)
     below = LINE_HEIGHT + ZOOM * HEIGHT + GAP
     for column, shown in enumerate((reference, first, second)):
         torch.testing.assert_close(cell(grid, column, LINE_HEIGHT), enlarged(shown))
@@ -38,7 +38,7 @@ def test_grid_shows_pictures_and_errors_pixel_by_pixel() -> None:
 
 def test_scale_of_the_errors_is_drawn_with_them() -> None:
     reference = picture(0)
-    grid = picture_grid([PictureRow(reference, [reference])], ["reference", "a"], ZOOM * WIDTH, error_limit=0.05)
+    grid = image_grid([ImageRow(reference, [reference])], ["reference", "a"], ZOOM * WIDTH, error_limit=0.05)
     scale = cell(grid, 0, LINE_HEIGHT + ZOOM * HEIGHT + GAP).reshape(-1, 3)
     ends = round_to_8bit(magma(torch.tensor([[0.0, 0.05]]), 0.05))[0]
     for colour in ends:
@@ -47,7 +47,7 @@ def test_scale_of_the_errors_is_drawn_with_them() -> None:
 
 def test_pictures_are_reduced_by_averaging() -> None:
     reference = picture(0)
-    grid = picture_grid([PictureRow(reference, [reference])], ["reference", "a"], WIDTH // 2, error_limit=None)
+    grid = image_grid([ImageRow(reference, [reference])], ["reference", "a"], WIDTH // 2, error_limit=None)
     average = reference.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean((1, 3))
     shown = grid[LINE_HEIGHT : LINE_HEIGHT + HEIGHT // 2, : WIDTH // 2]
     assert (shown - average).abs().max() < 1.5 / 255
@@ -56,8 +56,8 @@ def test_pictures_are_reduced_by_averaging() -> None:
 def test_insets_show_the_crop_enlarged_inside_a_frame() -> None:
     reference, prediction = picture(0), picture(1)
     crop = Crop(top=3, left=20, size=8)
-    row = PictureRow(reference, [prediction], crops=[crop])
-    grid = picture_grid([row], ["reference", "a"], width=ZOOM * WIDTH, error_limit=None)
+    row = ImageRow(reference, [prediction], crops=[crop])
+    grid = image_grid([row], ["reference", "a"], width=ZOOM * WIDTH, error_limit=None)
     side, frame = ZOOM * WIDTH, 3
     top, left = LINE_HEIGHT + ZOOM * HEIGHT + GAP, side + GAP
     inset = grid[top : top + side, left : left + side]
@@ -71,8 +71,8 @@ def test_insets_show_the_crop_enlarged_inside_a_frame() -> None:
 
 def test_methods_without_a_picture_are_shown_as_missing() -> None:
     reference = picture(0)
-    row = PictureRow(reference, [None, reference], captions=["", "30 dB"], crops=[Crop(0, 0, 8)], label="view 3")
-    grid = picture_grid([row], ["reference", "a", "b"], width=ZOOM * WIDTH)
+    row = ImageRow(reference, [None, reference], captions=["", "30 dB"], crops=[Crop(0, 0, 8)], label="view 3")
+    grid = image_grid([row], ["reference", "a", "b"], width=ZOOM * WIDTH)
     missing = grid[LINE_HEIGHT : LINE_HEIGHT + ZOOM * HEIGHT, LINE_HEIGHT + ZOOM * WIDTH + GAP :][:, : ZOOM * WIDTH]
     assert torch.equal(missing[0], missing[0, :1].expand_as(missing[0]))  # one flat grey: no picture and no frame
     assert 0.5 < missing[0].mean() < 1
@@ -83,8 +83,8 @@ def test_text_is_written_where_it_was_given() -> None:
     reference = picture(0)
 
     def draw(title: str, caption: str, label: str) -> Tensor:
-        row = PictureRow(reference, [reference], label=label, captions=[caption])
-        return picture_grid([row], ["", title], ZOOM * WIDTH, error_limit=None)
+        row = ImageRow(reference, [reference], label=label, captions=[caption])
+        return image_grid([row], ["", title], ZOOM * WIDTH, error_limit=None)
 
     blank = draw("", "", "x")
     columns = slice(LINE_HEIGHT + ZOOM * WIDTH + GAP, None)
@@ -106,8 +106,8 @@ def test_automatic_crop_finds_where_methods_differ() -> None:
     different[10:16, 4:10] += 0.5
     alike[0:6, 20:26] += 3.0  # a large error that all methods share tells nothing about them
     different[0:6, 20:26] += 3.0
-    assert most_telling_crop(reference, [alike, different], 6) == Crop(top=10, left=4, size=6)
-    assert most_telling_crop(reference, [different], 6) == Crop(top=0, left=20, size=6)
+    assert most_different_crop(reference, [alike, different], 6) == Crop(top=10, left=4, size=6)
+    assert most_different_crop(reference, [different], 6) == Crop(top=0, left=20, size=6)
 
 
 def test_triptych_holds_prediction_reference_and_error() -> None:
@@ -121,14 +121,14 @@ def test_triptych_holds_prediction_reference_and_error() -> None:
 def test_grids_that_do_not_fit_are_refused() -> None:
     reference = picture(0)
     with pytest.raises(NerfroError, match="at least one row"):
-        picture_grid([], ["reference"])
+        image_grid([], ["reference"])
     with pytest.raises(NerfroError, match="3 titles for a reference and 1 predictions"):
-        picture_grid([PictureRow(reference, [reference])], ["reference", "a", "b"])
+        image_grid([ImageRow(reference, [reference])], ["reference", "a", "b"])
     with pytest.raises(NerfroError, match="2 captions for 1 predictions"):
-        picture_grid([PictureRow(reference, [reference], captions=["a", "b"])], ["reference", "a"])
-    with pytest.raises(NerfroError, match=r"\[12, 32, 3\] stands beside a reference \[24, 32, 3\]"):
-        picture_grid([PictureRow(reference, [reference[:12]])], ["reference", "a"])
-    with pytest.raises(NerfroError, match="does not lie inside a picture of 24 x 32"):
-        picture_grid([PictureRow(reference, [reference], crops=[Crop(20, 0, 8)])], ["reference", "a"])
+        image_grid([ImageRow(reference, [reference], captions=["a", "b"])], ["reference", "a"])
+    with pytest.raises(NerfroError, match=r"\[12, 32, 3\] is shown beside a reference \[24, 32, 3\]"):
+        image_grid([ImageRow(reference, [reference[:12]])], ["reference", "a"])
+    with pytest.raises(NerfroError, match="exceeds an image of 24 x 32"):
+        image_grid([ImageRow(reference, [reference], crops=[Crop(20, 0, 8)])], ["reference", "a"])
     with pytest.raises(NerfroError, match="crop of 25 pixels"):
-        most_telling_crop(reference, [reference], 25)
+        most_different_crop(reference, [reference], 25)

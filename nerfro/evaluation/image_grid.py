@@ -1,4 +1,4 @@
-"""Labelled grids of pictures: reference and methods side by side, with enlarged insets and error maps."""
+"""Labelled image grids: reference and methods side by side, with enlarged insets and error maps."""
 
 from __future__ import annotations
 
@@ -23,49 +23,62 @@ CROP_COLOURS = ((225, 60, 50), (45, 125, 235), (40, 165, 85))  # frames of the f
 
 @dataclass(frozen=True)
 class Crop:
-    """A square part of a picture, in pixels from the upper left corner."""
+    """A square crop of an image: position of its upper left corner and side, in pixels."""
 
     top: int
     left: int
     size: int
 
     def inside(self, height: int, width: int) -> bool:
-        """Whether it lies inside a picture."""
+        """Return whether the crop lies inside an image of the given size."""
         return min(self.top, self.left) >= 0 and self.top + self.size <= height and self.left + self.size <= width
 
     def of(self, picture: Float[Tensor, "H W C"]) -> Float[Tensor, "size size C"]:
-        """Cut the square out; refused if it does not lie inside the picture."""
+        """Crop an image; raises an error if the crop exceeds it."""
         height, width = picture.shape[:2]
         if not self.inside(height, width):
-            raise NerfroError(f"{self} does not lie inside a picture of {height} x {width} pixels; choose another one")
+            raise NerfroError(f"{self} exceeds an image of {height} x {width} pixels; choose another crop")
         return picture[self.top : self.top + self.size, self.left : self.left + self.size]
 
 
 @dataclass(frozen=True)
-class PictureRow:
-    """One view in a grid."""
+class ImageRow:
+    """One view in a grid.
 
-    reference: Float[Tensor, "H W 3"]  # ground truth, sRGB in [0, 1]
-    predictions: Sequence[Float[Tensor, "H W 3"] | None]  # the same view by each method; None where a method has none
-    label: str = ""  # written at the left, upwards; empty for none
-    captions: Sequence[str] = ()  # a text below each prediction, such as its PSNR; empty for none
-    crops: Sequence[Crop] = ()  # squares that are shown enlarged below the pictures
+    Attributes:
+        reference: ground truth, sRGB in [0, 1].
+        predictions: the view rendered by each method, or None for a missing image.
+        label: vertical text at the left; may be empty.
+        captions: text below each prediction, such as its PSNR; may be empty.
+        crops: insets, which are shown enlarged below the images.
+    """
+
+    reference: Float[Tensor, "H W 3"]
+    predictions: Sequence[Float[Tensor, "H W 3"] | None]
+    label: str = ""
+    captions: Sequence[str] = ()
+    crops: Sequence[Crop] = ()
 
 
-def picture_grid(
-    rows: Sequence[PictureRow],
+def image_grid(
+    rows: Sequence[ImageRow],
     titles: Sequence[str],
     width: int = 256,
     error_limit: float | None = SQUARED_ERROR_LIMIT,
 ) -> Float[Tensor, "H W 3"]:
-    """Draw views as rows and methods as columns, the reference first, each `width` pixels across.
+    """Draw views as rows and methods as columns.
 
-    Each row shows the pictures, below them the insets, below those the squared errors with their colour scale, up to
-    `error_limit` or None for no errors, in the column of the reference. Pictures are enlarged without smoothing, so
-    that pixels are seen as they are.
+    The first column shows the reference. Each row contains the images, the insets and the squared errors, with the
+    colour scale in the first column. Images are enlarged without smoothing, so that single pixels remain visible.
+
+    Args:
+        rows: at least one view.
+        titles: headings of the columns, including the reference.
+        width: width of each column in pixels.
+        error_limit: squared error at the end of the colour scale, or None for no error maps.
 
     Raises:
-        NerfroError: if there is no row, titles or captions do not fit the predictions, or sizes differ in a row.
+        NerfroError: there is no row, the number of titles or captions is wrong, or sizes differ within a row.
     """
     _check(rows, titles)
     margin = LINE_HEIGHT if any(row.label for row in rows) else 0
@@ -84,44 +97,50 @@ def picture_grid(
 def triptych(
     prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], error_limit: float = SQUARED_ERROR_LIMIT
 ) -> Float[Tensor, "H 3W 3"]:
-    """Prediction, reference and squared error side by side on the CPU, without text: the picture for a training log."""
+    """Concatenate prediction, reference and squared error for the training log, on the CPU and without text."""
     error = magma(squared_error_map(prediction, target), error_limit)
     return torch.cat([prediction.detach().cpu().float().clamp(0, 1), target.detach().cpu().float(), error], dim=1)
 
 
-def most_telling_crop(
+def most_different_crop(
     reference: Float[Tensor, "H W 3"],
     predictions: Sequence[Float[Tensor, "H W 3"]],
     size: int,
     apart_from: Sequence[Crop] = (),
 ) -> Crop:
-    """The square in which methods differ most: the largest sum of variances among their squared errors.
+    """Find the square in which methods differ most: the largest sum of the variances of the squared errors.
 
-    By one method, the square of its largest error is taken. It does not overlap those of `apart_from`.
+    With a single method, the square with the largest error is chosen.
+
+    Args:
+        reference: ground truth, sRGB in [0, 1].
+        predictions: image of each method, sRGB in [0, 1].
+        size: side of the square in pixels.
+        apart_from: squares that the result must not overlap.
 
     Raises:
-        NerfroError: if there is no prediction, or no room for the square.
+        NerfroError: there is no prediction, or there is no space for the square.
     """
     if not predictions or not 0 < size <= min(reference.shape[:2]):
         raise NerfroError(
-            f"cannot choose a crop of {size} pixels among {len(predictions)} pictures of {list(reference.shape[:2])}; "
+            f"cannot choose a crop of {size} pixels among {len(predictions)} images of {list(reference.shape[:2])}; "
             "give at least one prediction and a smaller crop"
         )
     errors = torch.stack([squared_error_map(prediction, reference) for prediction in predictions])
-    interest = errors.var(0, correction=0) if len(predictions) > 1 else errors[0]
-    sums = F.avg_pool2d(interest.double()[None, None], size, stride=1)[0, 0]
+    differences = errors.var(0, correction=0) if len(predictions) > 1 else errors[0]
+    sums = F.avg_pool2d(differences.double()[None, None], size, stride=1)[0, 0]
     for taken in apart_from:
         rows = slice(max(taken.top - size + 1, 0), taken.top + taken.size)
         sums[rows, max(taken.left - size + 1, 0) : taken.left + taken.size] = -torch.inf
     if sums.isneginf().all():
-        raise NerfroError(f"no room for another crop of {size} pixels; choose a smaller one")
+        raise NerfroError(f"there is no space for another crop of {size} pixels; choose a smaller one")
     top, left = divmod(int(sums.argmax()), sums.shape[1])
     return Crop(top, left, size)
 
 
-def _check(rows: Sequence[PictureRow], titles: Sequence[str]) -> None:
+def _check(rows: Sequence[ImageRow], titles: Sequence[str]) -> None:
     if not rows:
-        raise NerfroError("a picture grid needs at least one row; give a view that was rendered")
+        raise NerfroError("an image grid needs at least one row; give a rendered view")
     for row in rows:
         if len(row.predictions) + 1 != len(titles):
             raise NerfroError(
@@ -132,14 +151,14 @@ def _check(rows: Sequence[PictureRow], titles: Sequence[str]) -> None:
         for prediction in row.predictions:
             if prediction is not None and prediction.shape != row.reference.shape:
                 raise NerfroError(
-                    f"a prediction {list(prediction.shape)} stands beside a reference {list(row.reference.shape)}; "
-                    "all pictures of a row must be of one size"
+                    f"a prediction {list(prediction.shape)} is shown beside a reference {list(row.reference.shape)}; "
+                    "all images of a row must have the same size"
                 )
 
 
-def _row_band(row: PictureRow, margin: int, width: int, across: int, error_limit: float | None) -> np.ndarray:
-    """One row of the grid: a column of stacked cells for each picture, and the row's label."""
-    captions = ["", *row.captions] if row.captions else [None] * (1 + len(row.predictions))  # None: no room for them
+def _row_band(row: ImageRow, margin: int, width: int, across: int, error_limit: float | None) -> np.ndarray:
+    """Draw one row of the grid: a column of cells for each image, and the label."""
+    captions = ["", *row.captions] if row.captions else [None] * (1 + len(row.predictions))  # None reserves no space
     columns = [
         _column(row, picture, caption, width, error_limit)
         for picture, caption in zip([row.reference, *row.predictions], captions, strict=True)
@@ -155,9 +174,9 @@ def _row_band(row: PictureRow, margin: int, width: int, across: int, error_limit
 
 
 def _column(
-    row: PictureRow, picture: Tensor | None, caption: str | None, width: int, error_limit: float | None
+    row: ImageRow, picture: Tensor | None, caption: str | None, width: int, error_limit: float | None
 ) -> Image.Image:
-    """A picture, its caption, its insets and its error map, one above the other."""
+    """Stack an image, its caption, its insets and its error map."""
     height = round(width * row.reference.shape[0] / row.reference.shape[1])
     cells = [_picture_cell(row, picture, width, height)]
     if caption is not None:
@@ -178,7 +197,7 @@ def _column(
     return column
 
 
-def _picture_cell(row: PictureRow, picture: Tensor | None, width: int, height: int) -> Image.Image:
+def _picture_cell(row: ImageRow, picture: Tensor | None, width: int, height: int) -> Image.Image:
     cell = fit(picture, width, height)
     zoom = width / row.reference.shape[1]
     for crop, colour in zip(row.crops if picture is not None else (), cycle(CROP_COLOURS), strict=False):
@@ -189,7 +208,7 @@ def _picture_cell(row: PictureRow, picture: Tensor | None, width: int, height: i
 
 
 def _insets_cell(crops: Sequence[Crop], picture: Tensor | None, width: int) -> Image.Image:
-    """The crops side by side over the width of the column, framed in their colours."""
+    """Draw the insets side by side over the width of the column, with coloured frames."""
     side = (width - (len(crops) - 1) * GAP) // len(crops)
     cell = paper(width, side)
     for index, (crop, colour) in enumerate(zip(crops, cycle(CROP_COLOURS), strict=False)):
