@@ -13,7 +13,7 @@ import torch
 import trimesh
 from jaxtyping import Float
 
-from nerfro.capture.index_search import Estimate, find_numbers, indices_of
+from nerfro.capture.index_search import Estimate, find_indices
 from nerfro.capture.surroundings import divide_pixels, learn_surroundings
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.signed_distance import signed_distance_grid
@@ -43,7 +43,7 @@ def main() -> None:
     print("surface                  index   error    standard error   falls from")
     for error in given.errors:
         for kind in ("coat", "lack", "bumps") if error else ("as given",):
-            found = find_numbers(indices_of(_medium(spoiled(mesh, kind, error / 100))), through, surroundings)
+            found = find_indices(_medium(spoiled(mesh, kind, error / 100)), through, surroundings)
             low, high = basin(found)
             share = 100 * (found.values[0] / given.ior - 1)
             print(

@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import time
 
-from nerfro.capture.index_search import find_numbers, indices_of
+from nerfro.capture.index_search import find_indices
 from nerfro.capture.surroundings import divide_pixels, learn_surroundings
 from tests import ball_photographs as balls
 
@@ -26,8 +26,7 @@ def main() -> None:
         views = balls.photographs(iors, inner=inner)
         start = time.process_time()
         beside, through = divide_pixels(views, balls.mesh())
-        sought = indices_of(balls.solid([1.5, 1.5], inner))
-        found = find_numbers(sought, through, learn_surroundings(beside, balls.mesh(), False))
+        found = find_indices(balls.solid([1.5, 1.5], inner), through, learn_surroundings(beside, balls.mesh(), False))
         spent = time.process_time() - start
         each = list(zip(found.values, found.standard_errors, iors, strict=True))
         numbers = ", ".join(f"{value:.3f} ± {error:.4f}" for value, error, _ in each)

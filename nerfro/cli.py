@@ -43,7 +43,12 @@ EXIT_BROKEN_PIPE = 141  # as a shell tells of a program that SIGPIPE ended
 #   "loss=nearby": "near_camera"                          an option of a group (`experiment=NAME` is one, too)
 #   "medium.learn_surface": None                          a setting that is gone: refused on the command line and in
 #                                                         YAML files, dropped from the configurations of old runs
-RENAMED: dict[str, str | None] = {}
+RENAMED: dict[str, str | None] = {
+    "medium.learn_surface": None,
+    "optimizer.surface_learning_rate": None,
+    "optimizer.surface_start": None,
+    "search": None,
+}
 
 
 def entry_point(

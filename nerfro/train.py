@@ -29,7 +29,7 @@ from nerfro.training.reach import require_reach
 from nerfro.training.run_folder import LAST_CHECKPOINT, begin, own, require_same_run
 from nerfro.training.trainer import finish_logs, make_trainer, prepare_process
 from nerfro.training.viewer import Viewer
-from nerfro.viewing.learned_files import write_learned
+from nerfro.viewing.camera_files import write_cameras
 
 
 @entry_point("train", TrainConfig)
@@ -81,7 +81,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
         sys.exit(EXIT_INTERRUPTED)
 
     model.to(device)
-    write_learned(folder, model, training)
+    write_cameras(folder / "cameras.json", model.camera, training)
     metrics = ImageMetrics(*lpips, prefix=config.evaluation.split)
     result, treated = score_split(model, test, metrics, folder, subdivision, config.evaluation.refine_steps)
     title = f"{config.name} on {config.data.root}, {config.evaluation.split} views"

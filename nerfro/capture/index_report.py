@@ -1,4 +1,4 @@
-"""From photographs and a surface to its index, or a vessel's lengths: the search, its figures and its curve."""
+"""From photographs and a surface to its index: the search, its figures and its curve."""
 
 from __future__ import annotations
 
@@ -7,16 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from nerfro.capture.index_search import Estimate, Sought, find_numbers, indices_of, lengths_of
+from nerfro.capture.index_search import Estimate, find_indices
 from nerfro.capture.surroundings import Around
 from nerfro.cli import warn
 from nerfro.files.atomic import atomic_file, write_atomically
 from nerfro.media.solid import Solid
-from nerfro.media.vessel import SdfVessel
 from nerfro.progress import bar
 
 INDEX, CURVE = "index.json", "index.png"
-LENGTHS, LENGTHS_CURVE = "lengths.json", "lengths.png"
 
 
 def search_index(around: Around, medium: Solid, folder: Path) -> Estimate:
@@ -27,41 +25,21 @@ def search_index(around: Around, medium: Solid, folder: Path) -> Estimate:
         medium: the bodies.
         folder: to write to.
     """
-    found = _search(around, indices_of(medium), folder / CURVE)
+    through, surroundings = around.through, around.surroundings
+    with bar("search") as told:
+        found = find_indices(medium, through, surroundings, told)
+    for name, value, error, bend in zip(found.names, found.values, found.standard_errors, found.curvature, strict=True):
+        print(f"{name}: {value:.5g} +- {error:.2g} (views resampled); curvature of the error {bend:.3g}")
+    for doubt in found.doubts:
+        warn(f"the pictures do not tell the {' and '.join(found.names)}: {doubt}; look at {CURVE}")
+    _draw(found, folder / CURVE)
     figures = {"ior": _rounded(found.values), "standard_error": _rounded(found.standard_errors), "doubts": found.doubts}
     write_atomically(folder / INDEX, json.dumps(figures, indent=1) + "\n")
     return found
 
 
-def search_lengths(around: Around, vessel: SdfVessel, names: list[str], folder: Path) -> Estimate:
-    """Find some of a vessel's lengths; write lengths.json and lengths.png. Otherwise as `search_index`."""
-    found = _search(around, lengths_of(vessel, names), folder / LENGTHS_CURVE)
-    values, errors = (named_lengths(names, numbers) for numbers in (found.values, found.standard_errors))
-    figures = {"lengths": values, "standard_errors": errors, "doubts": found.doubts}
-    write_atomically(folder / LENGTHS, json.dumps(figures, indent=1) + "\n")
-    return found
-
-
-def named_lengths(names: list[str], values: np.ndarray) -> dict[str, float]:
-    """Lengths by their names, to five digits."""
-    return {name: float(f"{value:.5g}") for name, value in zip(names, values, strict=True)}
-
-
 def _rounded(values: np.ndarray) -> list[float]:
     return [round(float(x), 5) for x in values]
-
-
-def _search(around: Around, sought: Sought, curve: Path) -> Estimate:
-    """Search with a progress bar, print what was found, and draw it into a file."""
-    through, surroundings = around.through, around.surroundings
-    with bar("search") as told:
-        found = find_numbers(sought, through, surroundings, told)
-    for name, value, error, bend in zip(found.names, found.values, found.standard_errors, found.curvature, strict=True):
-        print(f"{name}: {value:.5g} +- {error:.2g} (views resampled); curvature of the error {bend:.3g}")
-    for doubt in found.doubts:
-        warn(f"the pictures do not tell the {' and '.join(found.names)}: {doubt}; look at {curve.name}")
-    _draw(found, curve)
-    return found
 
 
 def _draw(found: Estimate, file: Path) -> None:

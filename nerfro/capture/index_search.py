@@ -1,4 +1,4 @@
-"""Numbers of a medium, its index above all, found by where its rays end up in known surroundings.
+"""The refractive indices of a medium's bodies, found by where its rays end up in known surroundings.
 
 For each candidate, pixels of the object are traced, and what they show is compared with the surroundings in the
 direction in which their rays leave. The error has one wide valley around the true index: an error of 0.1 turns the
@@ -18,11 +18,11 @@ from jaxtyping import Bool, Float
 from nerfro.capture.surroundings import Pixels, Room, Surroundings, robust
 from nerfro.errors import NerfroError
 from nerfro.media.solid import Solid
-from nerfro.media.vessel import SdfVessel
 from nerfro.samplers.snell import Snell
 from nerfro.variants import variant
 
-LOWEST, HIGHEST = 1.0, 2.5  # indices
+LOWEST, HIGHEST = 1.0, 2.5  # indices that are searched
+_RANGE = HIGHEST - LOWEST
 # Candidates along each axis and pixels of the first look, by how many numbers are looked for.
 _COARSE = {1: (31, 12_000), 2: (13, 4_000)}
 # Candidates along each axis of closer looks, and how far they reach from its middle, as shares of what is searched.
@@ -48,54 +48,12 @@ _UNKNOWN = 0.1
 
 
 @dataclass(frozen=True)
-class Sought:
-    """Numbers of a medium that are looked for together, two at most.
-
-    Attributes:
-        names: for people.
-        lowest, highest: between which they are looked for.
-        medium: with candidates for the numbers.
-    """
-
-    names: list[str]
-    lowest: Float[np.ndarray, "K"]
-    highest: Float[np.ndarray, "K"]
-    medium: Callable[[Float[np.ndarray, "K"]], Solid]
-
-
-def indices_of(medium: Solid) -> Sought:
-    """The index of each body, the outer one first; the medium has one index for all colours then."""
-    num_bodies = len(medium.iors)
-    names = ["index"] if num_bodies == 1 else [f"index of body {body + 1}" for body in range(num_bodies)]
-    white = variant(medium, abbe=[])
-    lowest, highest = np.full(num_bodies, LOWEST), np.full(num_bodies, HIGHEST)
-    return Sought(names, lowest, highest, lambda iors: white.with_indices(torch.from_numpy(iors)))
-
-
-def lengths_of(vessel: SdfVessel, names: list[str]) -> Sought:
-    """Some of a vessel's lengths, in the unit in which they were given."""
-    unknown = [name for name in names if name not in vessel.lengths]
-    if unknown:
-        raise NerfroError(
-            f"search={unknown} is not looked for; this vessel has {', '.join(vessel.lengths)}"
-            + ("" if "level" in vessel.lengths else ", and no level: give a first guess of it, medium.level=")
-        )
-    lowest, highest = np.array([vessel.length_range(name) for name in names]).T
-    white = variant(vessel, abbe=[])
-
-    def vary(values: Float[np.ndarray, "K"]) -> SdfVessel:
-        return white.with_lengths(dict(zip(names, values.tolist(), strict=True)))
-
-    return Sought(names, lowest, highest, vary)
-
-
-@dataclass(frozen=True)
 class Estimate:
-    """Numbers of a medium and how they were found.
+    """Refractive indices of bodies, the outer one first, and how they were found.
 
     Attributes:
-        names: see `Sought`.
-        values: of the numbers.
+        names: of the bodies' indices, for people.
+        values: the indices.
         standard_errors: by resampling views. What is wrong with the surface is not in them.
         curvature: second derivative of the error along each number.
         wide, close: candidates of the first look and of the last, with their robust errors in the last column: 0 where
@@ -114,30 +72,29 @@ class Estimate:
     doubts: list[str]
 
 
-def find_numbers(
-    sought: Sought, through: Pixels, surroundings: Surroundings, progress: Callable[[float], None] = lambda done: None
+def find_indices(
+    medium: Solid, through: Pixels, surroundings: Surroundings, progress: Callable[[float], None] = lambda done: None
 ) -> Estimate:
-    """Search all that they may be, coarse then fine.
+    """Search the indices of a medium's bodies, one or two, over all that they may be: coarse, then fine.
 
     Args:
-        sought: what is looked for.
+        medium: the bodies; each is given one index for all colours.
         through: pixels that the object fills.
         surroundings: what is seen around it.
         progress: is told the share done.
 
     Raises:
-        NerfroError: there are more than two numbers, or no ray of the pixels meets the medium.
+        NerfroError: there are more than two bodies, or no ray of the pixels meets the medium.
     """
-    count, low, high = len(sought.names), sought.lowest, sought.highest
+    count = len(medium.iors)
     if count not in _COARSE:
-        raise NerfroError(
-            f"{', '.join(sought.names)}: {count} numbers are not searched for, but two at most; give some (medium.ior=)"
-        )
+        raise NerfroError(f"the indices of {count} bodies are not searched for, but of two at most; give medium.ior=")
+    names = ["index"] if count == 1 else [f"index of body {body + 1}" for body in range(count)]
     num_fine = _NEAR_PIXELS if isinstance(surroundings.boundary, Room) else _FINE_PIXELS[count]
-    search = _Search(sought, through.some(num_fine), surroundings)
+    search = _Search(medium, through.some(num_fine), surroundings)
     per_axis, num_pixels = _COARSE[count]
     num_pixels = min(num_pixels, num_fine // 4)
-    coarse = np.array(list(itertools.product(*np.linspace(low, high, per_axis).T)))
+    coarse = np.array(list(itertools.product(np.linspace(LOWEST, HIGHEST, per_axis), repeat=count)))
     share = len(coarse) * num_pixels / (len(coarse) * num_pixels + 4 * _AROUND[count] ** count * num_fine)
     costs = search.costs(coarse, num_pixels, False, lambda done: progress(share * done)).mean_error()
     middle = coarse[costs.argmin()]
@@ -146,9 +103,9 @@ def find_numbers(
     for part in _REACHES[count]:
         steps = np.linspace(-1, 1, _AROUND[count])
         for _ in range(_MOST_LOOKS):
-            reach = part * (high - low)[:, None] * search.valley(middle)
+            reach = part * _RANGE * search.valley(middle)
             aside = np.abs(reach).sum(1)
-            middle = middle.clip(low + aside, high - aside)
+            middle = middle.clip(LOWEST + aside, HIGHEST - aside)
             stencil = middle + np.array(list(itertools.product(steps, repeat=count))) @ reach.T
             begun, look = share + (1 - share) * look / looks, look + 1
             closest = part == _REACHES[count][-1]
@@ -161,7 +118,7 @@ def find_numbers(
             errors = fine.mean_error()
             found, curvature = _lowest(stencil, errors[None], reach)
             settled = (np.abs(np.linalg.solve(reach, found[0] - middle)) < 0.5).all()
-            middle = found[0].clip(low, high)
+            middle = found[0].clip(LOWEST, HIGHEST)
             if settled:
                 break
     progress(1.0)
@@ -169,9 +126,9 @@ def find_numbers(
     weights = np.random.default_rng(0).multinomial(num_views, np.full(num_views, 1 / num_views), _RESAMPLES)
     spread = _lowest(stencil, fine.mean_error(weights), reach)[0].std(0)
     known = fine.counts.sum() / max(1, search.num_pixels)
-    doubts = _doubts(sought, middle, spread, curvature[0], 1 - errors.min() / search.unrelated, known)
+    doubts = _doubts(names, middle, spread, curvature[0], 1 - errors.min() / search.unrelated, known)
     wide, close = np.column_stack([coarse, costs]), np.column_stack([stencil, errors])
-    return Estimate(sought.names, middle, spread, curvature[0], wide, close, search.unrelated, doubts)
+    return Estimate(names, middle, spread, curvature[0], wide, close, search.unrelated, doubts)
 
 
 def _lowest(
@@ -201,22 +158,21 @@ def _lowest(
 
 
 def _doubts(
-    sought: Sought, values: np.ndarray, standard_errors: np.ndarray, curvature: np.ndarray, depth: float, known: float
+    names: list[str], values: np.ndarray, standard_errors: np.ndarray, curvature: np.ndarray, depth: float, known: float
 ) -> list[str]:
     doubts = []
     if known < _UNKNOWN:
         doubts.append(f"of {1 - known:.0%} of the object's light no photograph shows where it comes from")
     if depth < _SHALLOW:
         doubts.append(
-            f"the best {' and '.join(sought.names)} explains only {max(0.0, depth):.1%} of what unrelated colours "
+            f"the best {' and '.join(names)} explains only {max(0.0, depth):.1%} of what unrelated colours "
             "leave unexplained: the object may be opaque, or its surroundings not known where its light comes from"
         )
-    columns = sought.names, values, standard_errors, curvature, sought.lowest, sought.highest
-    for name, value, error, bend, low, high in zip(*columns, strict=True):
-        end = _END * (high - low)
-        if not low + end < value < high - end:
-            doubts.append(f"the {name} is at the end of what is searched, {low:.4g} to {high:.4g}")
-        elif bend <= 0 or error > _LOOSE * (high - low):
+    end = _END * _RANGE
+    for name, value, error, bend in zip(names, values, standard_errors, curvature, strict=True):
+        if not LOWEST + end < value < HIGHEST - end:
+            doubts.append(f"the {name} is at the end of what is searched, {LOWEST:.4g} to {HIGHEST:.4g}")
+        elif bend <= 0 or error > _LOOSE * _RANGE:
             doubts.append(f"the {name} has a standard error of {error:.2g}: views do not agree on it")
     return doubts
 
@@ -236,10 +192,9 @@ class _Costs:
 
 
 class _Search:
-    def __init__(self, sought: Sought, through: Pixels, surroundings: Surroundings) -> None:
-        self._medium, self._surroundings = sought.medium, surroundings
-        self._lowest, self._highest = sought.lowest, sought.highest
-        medium = sought.medium(0.5 * (sought.lowest + sought.highest))
+    def __init__(self, medium: Solid, through: Pixels, surroundings: Surroundings) -> None:
+        self._white, self._surroundings = variant(medium, abbe=[]), surroundings
+        medium = self._white.with_indices(torch.full_like(medium.iors, 0.5 * (LOWEST + HIGHEST)))
         self._sampler = Snell(max_events=max(_MAX_EVENTS, 2 * len(medium.iors)))
         self._pixels = through[self._sampler(through.rays, medium).refracted]
         self.num_pixels = len(self._pixels)
@@ -261,7 +216,7 @@ class _Search:
         pixels = self._pixels.some(_SLOPE_PIXELS)
         residuals, known = self._residuals(pixels, place)
         derivatives = []
-        for away in _DIFFERENCE * np.diag(self._highest - self._lowest):
+        for away in _DIFFERENCE * _RANGE * np.eye(count):
             (ahead, known_ahead), (behind, known_behind) = (self._residuals(pixels, place + d) for d in (away, -away))
             derivatives.append(ahead - behind)
             known &= known_ahead & known_behind
@@ -277,7 +232,8 @@ class _Search:
         self, pixels: Pixels, values: Float[np.ndarray, "K"]
     ) -> tuple[Float[torch.Tensor, "P 3"], Bool[torch.Tensor, "P"]]:
         """How far off pixels are with a candidate, and for which it is known."""
-        trace = self._sampler.trace(pixels.rays, self._medium(values.clip(self._lowest, self._highest)))
+        medium = self._white.with_indices(torch.from_numpy(values.clip(LOWEST, HIGHEST)))
+        trace = self._sampler.trace(pixels.rays, medium)
         radiance, known = self._surroundings.radiance(trace.path.exits())
         return radiance - pixels.radiance, known & ~trace.exceeded
 

@@ -1,4 +1,4 @@
-"""From photographs and a surface to the medium: built with what is known, and searched for what is not."""
+"""From photographs and a surface to the medium, whose index is searched for where it is not known."""
 
 from __future__ import annotations
 
@@ -9,22 +9,13 @@ from typing import cast
 import torch
 from omegaconf import DictConfig
 
-from nerfro.capture.index_report import (
-    CURVE,
-    INDEX,
-    LENGTHS,
-    LENGTHS_CURVE,
-    named_lengths,
-    search_index,
-    search_lengths,
-)
+from nerfro.capture.index_report import CURVE, INDEX, search_index
 from nerfro.capture.preprocess_options import build_medium, index_settings, searches_index
 from nerfro.capture.surroundings import Around
 from nerfro.errors import NerfroError
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
-from nerfro.media.vessel import SdfVessel
 
 
 @dataclass
@@ -64,7 +55,7 @@ def find_medium(
     settings: dict[str, object],
     folder: Path,
 ) -> FoundMedium:
-    """The medium with a surface in it, and with the index or the lengths that are searched for.
+    """The medium with a surface in it, and with the index where that is searched for.
 
     Args:
         config, overrides: of this command line.
@@ -73,28 +64,19 @@ def find_medium(
         settings: what has to be said beside the overrides, so that the medium holds the surface.
         folder: to write to.
     """
-    if config.search and "wall" not in config.medium:
-        raise NerfroError(f"search={list(config.search)}: only a vessel has lengths to find; take medium=vessel")
-    if searches_index(config, overrides):
-        num_bodies = 1 + len(config.medium.get("inner_meshes", []))
-        medium = build_medium(config, settings, location, index_settings([1.5] * num_bodies))
-        if not isinstance(medium, Solid):
-            raise NerfroError("the index of this medium is not searched for; give medium.ior=, or take medium=object")
-        found = search_index(around, medium, folder)
-        result = FoundMedium(medium.with_indices(torch.from_numpy(found.values)), written=[INDEX, CURVE])
-        named = index_settings(found.values.tolist())
-    else:
-        medium = build_medium(config, settings, location, {})
-        if not config.search:
-            return FoundMedium(medium)
-        vessel = cast(SdfVessel, medium)
-        found = search_lengths(around, vessel, list(config.search), folder)
-        lengths = named_lengths(found.names, found.values)
-        result = FoundMedium(vessel.with_lengths(lengths), written=[LENGTHS, LENGTHS_CURVE])
-        named = {**lengths}
-    options: dict[str, object] = {f"medium.{name}": value for name, value in named.items()}
-    if found.doubts:
-        result.doubtful = options
-    else:
-        result.settings = options
-    return result
+    if not searches_index(config, overrides):
+        return FoundMedium(build_medium(config, settings, location, {}))
+    num_bodies = 1 + len(config.medium.get("inner_meshes", []))
+    medium = build_medium(config, settings, location, index_settings([1.5] * num_bodies))
+    if not isinstance(medium, Solid):
+        raise NerfroError("the index of this medium is not searched for; give medium.ior=, or take medium=object")
+    found = search_index(around, medium, folder)
+    options: dict[str, object] = {
+        f"medium.{name}": value for name, value in index_settings(found.values.tolist()).items()
+    }
+    return FoundMedium(
+        medium.with_indices(torch.from_numpy(found.values)),
+        settings={} if found.doubts else options,
+        doubtful=options if found.doubts else {},
+        written=[INDEX, CURVE],
+    )

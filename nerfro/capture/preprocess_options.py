@@ -6,7 +6,7 @@ import json
 import shlex
 import typing
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
@@ -15,7 +15,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 
 from nerfro.allowed import Count, Natural, NotNegative, Range, corners_of_box
 from nerfro.cameras import Cameras
-from nerfro.capture.index_report import CURVE, INDEX, LENGTHS, LENGTHS_CURVE
+from nerfro.capture.index_report import CURVE, INDEX
 from nerfro.capture.overlaps import REPORT, SHEET
 from nerfro.capture.refinement_report import FIGURES, PICTURES
 from nerfro.capture.revolution import Symmetry
@@ -39,7 +39,6 @@ class PreprocessConfig:
     Attributes:
         data: the views (options of the group `data`).
         medium: what becomes of the surface (options of the group `medium`).
-        search: lengths of a vessel, one or two, that are found from the photographs: wall, foot, level.
         refine: whether the surface is moved, after the index was found, until the photographs fit what is seen through
             it.
         refine_cameras: whether poses are refined with the hull, by the sky and the outlines of the masks. The
@@ -61,7 +60,6 @@ class PreprocessConfig:
 
     data: Any = MISSING
     medium: Any = MISSING
-    search: list[str] = field(default_factory=list)
     refine: bool = False
     refine_cameras: bool = False
     split: str = "train"
@@ -106,7 +104,6 @@ def claim(config: DictConfig, overrides: list[str]) -> Path:
     names = [SHEET, REPORT] if config.mesh is not None else [MESH, SHEET, REPORT]
     names += [MESH, FIGURES, PICTURES] if config.refine else []
     names += [CAMERAS] if config.refine_cameras else []
-    names += [LENGTHS, LENGTHS_CURVE] if config.search else []
     names += [INDEX, CURVE] if searches_index(config, overrides) else []
     refuse_existing([folder / name for name in [*names, FOUND]], config.overwrite)
     return folder

@@ -27,6 +27,7 @@ from torch import Tensor, nn
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.cube_map import texel_directions
 from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.capture.displacement import Displacement
 from nerfro.capture.record import Record
 from nerfro.capture.rims import RimFinder
 from nerfro.capture.room_picture import RoomPicture, picture_of
@@ -36,17 +37,12 @@ from nerfro.errors import NerfroError
 from nerfro.files.cache import content_hash
 from nerfro.geometry.interpolation import quadratic_spline, smooth
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.media import displacement
-from nerfro.media.displacement import Displacement
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.snell import Snell
 from nerfro.types import Exits, Path
 from nerfro.variants import variant
 
-_PIXELS = 6000  # of a step
 _JUDGED = 20_000  # held-back pixels, at most
-# Standard deviations of the smoothing that is tried, in shares of the object's size.
-_SMOOTHINGS = (0.005, 0.007, 0.01, 0.014)
 # Residuals of linear radiance count half at this.
 _HALF = 0.1
 # Part of the key of a record: raise it when the same inputs lead elsewhere than before.
@@ -57,7 +53,7 @@ _RIMS = 4000  # points of outlines of a step
 
 
 @dataclass(frozen=True)
-class _Stage:
+class Stage:
     """Steps at one pace.
 
     Attributes:
@@ -71,14 +67,29 @@ class _Stage:
     blur: tuple[float, float]
 
 
-# The first stages are too bold for a surface that is nearly right. They are left when it is worse by a share, and so
-# is whatever is not the best when a stage ends.
-_STAGES = (
-    _Stage(200, 2e-4, (3.0, 1.4)),
-    _Stage(300, 1.5e-4, (1.4, 0.5)),
-    _Stage(150, 4e-5, (0.7, 0.35)),
-    _Stage(100, 1e-5, (0.0, 0.0)),
-)
+@dataclass(frozen=True)
+class RefinementSettings:
+    """How a surface is refined. The defaults were chosen on the wavy body and on `starlamp`, see docs/capture.md.
+
+    Attributes:
+        stages: of the descent. The first ones are too bold for a surface that is nearly right. They are left when it
+            is worse by a share, and so is whatever is not the best when a stage ends.
+        num_pixels: pixels of a step.
+        levels: control points along each side of the splines that displace the surface.
+        smoothings: standard deviations of the smoothing that is tried, in shares of the object's size.
+    """
+
+    stages: tuple[Stage, ...] = (
+        Stage(200, 2e-4, (3.0, 1.4)),
+        Stage(300, 1.5e-4, (1.4, 0.5)),
+        Stage(150, 4e-5, (0.7, 0.35)),
+        Stage(100, 1e-5, (0.0, 0.0)),
+    )
+    num_pixels: int = 6000
+    levels: tuple[int, ...] = (12, 24, 48)
+    smoothings: tuple[float, ...] = (0.005, 0.007, 0.01, 0.014)
+
+
 _WORSE = 0.03
 _JUDGE_EVERY = 25  # steps
 # A surface that makes held-back photographs better by a smaller share is not taken: reflections, tint and what is
@@ -113,6 +124,7 @@ def refine_surface(
     learn_index: bool = False,
     progress: Callable[[float], None] = lambda done: None,
     record: FilePath | None = None,
+    settings: RefinementSettings = RefinementSettings(),
 ) -> Refined:
     """Move the outer surface of a medium by what photographs show through it.
 
@@ -126,28 +138,32 @@ def refine_surface(
         progress: is told the share done.
         record: file in which the state is kept now and then, and from which a descent on the same pixels that was
             interrupted goes on; it is removed at the end.
+        settings: of the descent.
 
     Raises:
         NerfroError: no pixel shows the surroundings through the object.
     """
-    descent = _Descent(mesh, medium, silhouettes, through, surroundings, learn_index)
+    descent = _Descent(mesh, medium, silhouettes, through, surroundings, learn_index, settings)
     error = descent.judged(medium)
     picture = _picture(surroundings, mesh, medium)
     descent.start, smoothed = descent.smoothed(medium, error)
     at = _Position(descent.state(), [error, smoothed], [0, 0])
-    kept = Record(record, _key(mesh, medium, through, learn_index))
+    kept = Record(record, _key(mesh, medium, through, learn_index, settings))
     if (found := kept.read()) is not None:
         at = _Position(**found["at"])
         descent.go_on(found["descent"])
-    while at.stage < len(_STAGES):
-        stage = _STAGES[at.stage]
+    stages = settings.stages
+    total = sum(stage.steps for stage in stages)
+    while at.stage < len(stages):
+        stage = stages[at.stage]
+        done = sum(before.steps for before in stages[: at.stage])
         while at.step < stage.steps:
             if at.step % _JUDGE_EVERY == 0:
                 share = at.step / stage.steps
                 sky = _blurred(picture, stage.blur[0] + (stage.blur[1] - stage.blur[0]) * share)
             descent.step(sky, stage.rate * 0.5 * (1 + math.cos(math.pi * at.step / stage.steps)))
             at.step += 1
-            progress(at.share)
+            progress((done + at.step) / total)
             if at.step % _JUDGE_EVERY == 0:
                 at.steps.append(at.steps[-1] + _JUDGE_EVERY)
                 at.errors.append(descent.judged(descent.moved()))
@@ -177,19 +193,12 @@ class _Position:
     stage: int = 0
     step: int = 0  # of the stage
 
-    @property
-    def share(self) -> float:
-        """Of all steps."""
-        done = sum(stage.steps for stage in _STAGES[: self.stage]) + self.step
-        return done / sum(stage.steps for stage in _STAGES)
 
-
-def _key(mesh: TriangleMesh, medium: SdfGrid, through: Pixels, learn_index: bool) -> str:
+def _key(mesh: TriangleMesh, medium: SdfGrid, through: Pixels, learn_index: bool, settings: RefinementSettings) -> str:
     """Hash of what a descent depends on; surroundings are learned from the same photographs."""
     tensors = medium.box, medium.distances, medium.iors.float(), through.index, through.radiance
     arrays = (tensor.detach().numpy() for tensor in tensors)
-    settings = (_VERSION, repr(_STAGES), repr(displacement.LEVELS), _PIXELS, learn_index)
-    return content_hash(*settings, mesh.vertices, mesh.faces, *arrays)
+    return content_hash(_VERSION, repr(settings), learn_index, mesh.vertices, mesh.faces, *arrays)
 
 
 class _Descent:
@@ -203,13 +212,15 @@ class _Descent:
         through: Pixels,
         surroundings: Surroundings,
         learn_index: bool,
+        settings: RefinementSettings,
     ) -> None:
+        self.settings = settings
         self.given, self.start, self.surroundings = medium, medium, surroundings
         self.iors = nn.Parameter(medium.iors.clone(), requires_grad=learn_index)
         # Rays that are reflected inside are no help: tiny errors of the surface turn them anywhere.
         self.sampler = Snell(max_events=2 * len(medium.iors))
         self.size = float(np.ptp(mesh.bounds, axis=0).max())
-        self.offsets = Displacement(tuple(medium.distances.shape[1:]), medium.box, self.size)
+        self.offsets = Displacement(tuple(medium.distances.shape[1:]), self.size, settings.levels)
         held_back = through.view % VALIDATION_EVERY == VALIDATION_EVERY - 1
         self.teachers = through[~held_back]
         self.judges = (through[held_back] if held_back.any() else through).some(_JUDGED)
@@ -267,7 +278,7 @@ class _Descent:
 
     def _loss(self, sky: Boundary) -> Tensor:
         medium = self._moved()
-        pixels = self.teachers[torch.randint(len(self.teachers), (_PIXELS,), generator=self.generator)]
+        pixels = self.teachers[torch.randint(len(self.teachers), (self.settings.num_pixels,), generator=self.generator)]
         path, usable = self._traced(pixels, medium)
         rays = pixels.rays[usable]
         path = self.sampler.refine(path[usable], rays, medium)
@@ -284,7 +295,7 @@ class _Descent:
         """The medium with its outer surface as smooth as the judges like it best, and their error; it has `error`."""
         distances = medium.distances[0]
         best = medium
-        for share in _SMOOTHINGS:
+        for share in self.settings.smoothings:
             sigma = share * self.size / float(medium.spacing.min())
             tried = medium.grown(distances - smooth(distances, 2 * math.ceil(3 * sigma) + 1, sigma))
             if (judged := self.judged(tried)) < error:

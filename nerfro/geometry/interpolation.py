@@ -91,40 +91,13 @@ def quadratic_spline(
     stride = (coefficients.shape[1] * coefficients.shape[2], coefficients.shape[2], 1)
     rows = [(centre[:, axis, None] + taps) * stride[axis] for axis in range(3)]
     block = coefficients.reshape(-1)[rows[0][:, :, None, None] + rows[1][:, None, :, None] + rows[2][:, None, None, :]]
-    value, gradient = _sum_of_products(block, weights, slopes)
-    return value.reshape(positions.shape[:-1]), gradient.reshape(positions.shape)
-
-
-def cubic_spline(
-    control: Float[Tensor, "X Y Z"], box: Float[Tensor, "2 3"], positions: Float[Tensor, "P 3"]
-) -> tuple[Float[Tensor, "P"], Float[Tensor, "P 3"]]:
-    """Cubic B-spline and its gradient, with gradients by its control points alone.
-
-    These are evenly spaced; the second and the last but one lie on the box, as in `bspline_basis`.
-    """
-    shape = constant(control.shape, control.device)
-    scale = (shape - 3) / (box[1] - box[0])
-    place = 1 + (positions.detach() - box[0]) * scale
-    first = torch.minimum((place.floor().long() - 1).clamp(min=0), shape - 4)
-    taps = first[..., None] + torch.arange(4, device=control.device)
-    t = place[..., None] - taps
-    weights, slopes = cubic_bspline(t), _cubic_slope(t) * scale[:, None].to(t)
-    i, j, k = taps.unbind(1)
-    rows = (i[:, :, None, None] * len(control[0]) + j[:, None, :, None]) * control.shape[2] + k[:, None, None, :]
-    return _sum_of_products(control.reshape(-1)[rows], weights, slopes)
-
-
-def _sum_of_products(
-    block: Float[Tensor, "P T T T"], weights: Float[Tensor, "P 3 T"], slopes: Float[Tensor, "P 3 T"]
-) -> tuple[Float[Tensor, "P"], Float[Tensor, "P 3"]]:
-    """Value and gradient of splines from the coefficients around each place, and weights and slopes along each axis."""
     along_z = torch.stack([(block * w[:, None, None, 2]).sum(-1) for w in (weights, slopes)], 1)
     plane = (along_z[:, 0] * weights[:, None, 1]).sum(-1)
     plane_y = (along_z[:, 0] * slopes[:, None, 1]).sum(-1)
     plane_z = (along_z[:, 1] * weights[:, None, 1]).sum(-1)
     value = (plane * weights[:, 0]).sum(-1)
     gradient = [(plane * slopes[:, 0]).sum(-1), *((p * weights[:, 0]).sum(-1) for p in (plane_y, plane_z))]
-    return value, torch.stack(gradient, -1)
+    return value.reshape(positions.shape[:-1]), torch.stack(gradient, -1).reshape(positions.shape)
 
 
 def bspline_basis(num_control: int, num_places: int) -> Float[Tensor, "num_places num_control"]:
@@ -137,11 +110,6 @@ def cubic_bspline(t: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """The cubic B-spline of unit spacing around 0."""
     t = t.abs()
     return torch.where(t < 1, 2 / 3 - t**2 + t**3 / 2, (2 - t).clamp(min=0) ** 3 / 6)
-
-
-def _cubic_slope(t: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    u = t.abs()
-    return t.sign() * torch.where(u < 1, u * (1.5 * u - 2), -0.5 * (2 - u).clamp(min=0) ** 2)
 
 
 def smooth(values: Float[Tensor, "X Y Z"], size: int, sigma: float) -> Float[Tensor, "X Y Z"]:

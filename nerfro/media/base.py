@@ -75,21 +75,6 @@ class Medium(nn.Module, ABC):
         """What paths depend on, of all that learns."""
         return list(self.parameters())
 
-    def surface_parameters(self) -> list[nn.Parameter]:
-        """Of these, what moves a surface; it learns at a rate of its own."""
-        return []
-
-    def settle(self, step: int | None = None) -> None:
-        """Have what is traced follow what has been learned, if it is time: after steps of training, and at their end.
-
-        Args:
-            step: how many are done; None for the end.
-        """
-
-    def prior(self) -> Float[Tensor, ""] | None:
-        """What is unlikely about what is learned now, to be added to the losses; None where nothing has a prior."""
-        return None
-
     def learned(self) -> dict[str, float]:
         """Physical quantities that learn, by names for the log."""
         return {}

@@ -6,9 +6,9 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import distance_transform_cdt
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerfro.allowed import NotNegative, Positive, Range, Resolution
 from nerfro.errors import NerfroError
@@ -21,7 +21,6 @@ from nerfro.geometry.signed_distance import signed_distance_grid
 from nerfro.kernels.available import require_bytes
 from nerfro.kernels.constants import constant
 from nerfro.media.base import Scalars, Vectors, lazy_buffer
-from nerfro.media.displacement import Displacement
 from nerfro.media.solid import Solid
 from nerfro.media.voxel_grid import BYTES_A_VERTEX, check_margin, grid_box
 from nerfro.paths import resolve_path
@@ -39,11 +38,6 @@ BLOCK, SURFACE_BLOCK = 4, 3
 # A quadratic spline that is continued by half a cell at a corner is a sum of coefficients whose weights are 2.19 and
 # -1.19 together: it is above 0 where the largest coefficient is less than 1.84 times the least.
 _CONTINUED = 1.8
-# Weights of the smoothness and of the outlines of a surface that learns, beside the error of pixels in training; and
-# places on outlines of a step.
-_SMOOTH, _OUTLINES, _HELD = 2e-3, 2e-3, 1000
-# Steps of training after which the grid of a surface that learns is made anew.
-_SETTLE_EVERY = 4
 # Part of the cache's key: raise it when the same mesh and settings give other distances than before.
 _VERSION = 3
 
@@ -59,7 +53,6 @@ class SdfGrid(Solid):
             here, because rays do not bend on them.
         inner_iors: their refractive indices.
         learn_ior: refine all indices in training, by the replay of paths.
-        learn_surface: refine the outer surface in training too; it learns by `optimizer.surface_learning_rate`.
         resolution: grid vertices a side.
         box_min, box_max: corners of the grid, world units; none for the mesh's bounds and a margin of air.
         shell_voxels: half width of the smooth interface that the Eikonal equation sees, voxels.
@@ -81,14 +74,6 @@ class SdfGrid(Solid):
     # learned.
     vertices: Float[Tensor, "V 3"]
     _traced: tuple[Tensor, int, Triangles, MeshIntersector] | None = None
-    # Where the surface learns: how far it has moved, and had when the grid was last made anew, the distances that it
-    # was given, the grid's vertices beside it; and where it is held: places, how far it shall move there, to which
-    # accuracy that is known.
-    displacement: Displacement
-    _settled: Float[Tensor, "Q"]
-    _given: Float[Tensor, "K X Y Z"]
-    _beside: Int[Tensor, "B"]
-    _held: tuple[Tensor, Tensor, float] | None = None
 
     def __init__(
         self,
@@ -108,7 +93,6 @@ class SdfGrid(Solid):
         learn_absorption: bool = False,
         abbe: list[Positive] = [],  # noqa: B006
         learn_ior: bool = False,
-        learn_surface: bool = False,
         cache: bool = True,
     ) -> None:
         if len(inner_meshes) != len(inner_iors):
@@ -137,8 +121,6 @@ class SdfGrid(Solid):
             values = torch.stack([smooth(2 * v - smooth(v, smoothing_size, smoothing_sigma), smoothing_size,
                                          smoothing_sigma) for v in values])  # fmt: skip
         self._set(values, torch.from_numpy(box).float())
-        if learn_surface:
-            self.let_surface_learn()
 
     @classmethod
     def from_distances(
@@ -180,7 +162,6 @@ class SdfGrid(Solid):
     def _of_distances(self, distances: Float[Tensor, "K X Y Z"], **changes: Any) -> Any:
         changed = variant(self, **changes)
         changed._forget_bounds()
-        changed._modules.pop("displacement", None)
         changed._set(distances, self.box)
         return changed
 
@@ -188,61 +169,6 @@ class SdfGrid(Solid):
         """Of the surfaces as they were."""
         for name in ("_coarse_clearance", "_coarse_slopes", "_empty_blocks"):
             self._buffers.pop(name, None)
-
-    def let_surface_learn(self) -> None:
-        """Add what moves the outer surface from where it is now."""
-        low, high = self.content_box
-        self.displacement = Displacement(tuple(self.distances.shape[1:]), self.box, float((high - low).max()))
-        self.register_buffer("_given", self.distances, persistent=False)
-        beside = (self.distances[0].abs() < float(self.spacing.max())).flatten().nonzero()[:, 0]
-        self.register_buffer("_beside", beside, persistent=False)
-        # In checkpoints, for a run that goes on traces what it would have traced.
-        self.register_buffer("_settled", self.displacement.state())
-        self.register_load_state_dict_post_hook(lambda medium, _: medium._follow())
-
-    def surface_parameters(self) -> list[nn.Parameter]:
-        return list(self.displacement.parameters()) if "displacement" in self._modules else []
-
-    def _surface_learns(self) -> bool:
-        return any(parameter.requires_grad for parameter in self.surface_parameters())
-
-    def hold(self, places: Float[Tensor, "P 3"], outwards: Float[Tensor, "P"], accuracy: float) -> None:
-        """Say how far the surface shall move at some places, as outlines tell it, and how well that is known.
-
-        All are in world units.
-        """
-        self._held = places.to(self.box), outwards.to(self.box), accuracy
-
-    def settle(self, step: int | None = None) -> None:
-        if self._surface_learns() and (step is None or step % _SETTLE_EVERY == 0):
-            self._settled = self.displacement.state()
-            self._follow()
-
-    @torch.no_grad()
-    def _follow(self) -> None:
-        """Move the distances, and what is made of them, to where the surface was last said to be."""
-        outer = self._given[0] - self.displacement(self._settled)
-        self.distances = torch.cat([outer[None], self._given[1:]])
-        self.coefficients = torch.cat([spline_coefficients(outer)[None], self.coefficients[1:]])
-        self._forget_bounds()
-
-    def prior(self) -> Float[Tensor, ""] | None:
-        """How rough the motion is, and how far it leaves outlines; see `capture.refinement`."""
-        if not self._surface_learns():
-            return None
-        unlikely = _SMOOTH * self.displacement.roughness()
-        if self._held is not None and len(self._held[0]):
-            places, outwards, accuracy = self._held
-            drawn = torch.randint(len(places), (_HELD,), device=places.device)
-            left = ((self.displacement.at(places[drawn])[0] - outwards[drawn]) / accuracy).square()
-            unlikely = unlikely + _OUTLINES * (left / (1 + left)).mean()
-        return unlikely
-
-    def learned(self) -> dict[str, float]:
-        if not self.surface_parameters():
-            return super().learned()
-        given, now = (values[0].flatten()[self._beside] for values in (self._given, self.distances))
-        return super().learned() | {"surface_motion": float((given - now).square().mean().sqrt())}
 
     def at_wavelength(self, wavelength: float) -> SdfGrid:
         self.coarse_clearance, self.coarse_slopes, self.empty_blocks  # noqa: B018 (made before they are shared)
@@ -347,11 +273,6 @@ class SdfGrid(Solid):
     def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
         """Splines of the distances and their exact gradients."""
         splines = [quadratic_spline(coefficients, self.box, positions) for coefficients in self.coefficients]
-        if torch.is_grad_enabled() and self._surface_learns():
-            # Nothing, but with the gradient by what moves the surface: exact at the surface that was traced.
-            (phi, gradient), learned = splines[0], self.displacement.at(positions.reshape(-1, 3))
-            (by, turned) = (values - values.detach() for values in learned)
-            splines[0] = phi - by.view(phi.shape), gradient - turned.view(gradient.shape)
         return torch.stack([phi for phi, _ in splines], -1), torch.stack([gradient for _, gradient in splines], -2)
 
 

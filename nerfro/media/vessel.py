@@ -20,9 +20,6 @@ from nerfro.paths import resolve_path
 from nerfro.registry import register
 from nerfro.variants import variant
 
-# Walls are searched for from a quarter of the given thickness to twice of it; so deep are distances exact.
-_THINNEST, _THICKEST = 0.25, 2.0
-
 
 @register("medium", "sdf_vessel")
 class SdfVessel(SdfGrid):
@@ -106,8 +103,8 @@ class SdfVessel(SdfGrid):
         if level is not None:
             self.lengths["level"] = level
         self._require_lengths_within()
-        # Deeper than any surface that is made of these distances.
-        band = min(BAND + _THICKEST * wall * self.unit / spacing, resolution)
+        # The wall's inner surface is made of these distances, and a refinement moves it.
+        band = min(BAND + 2 * wall * self.unit / spacing, resolution)
         settings = surface, box, resolution, band, crease_degrees, cache
         outer = side = torch.from_numpy(cached_distance(*settings))
         if not closed:
@@ -133,20 +130,10 @@ class SdfVessel(SdfGrid):
         values = super().absorption
         return values if values is None or len(values) == 2 else values * values.new_tensor([[1.0], [0.0], [1.0]])
 
-    def with_lengths(self, lengths: dict[str, float]) -> SdfVessel:
-        """The same vessel with some other `lengths`."""
-        changed = variant(self, lengths=self.lengths | lengths)
-        return changed._of_distances(changed._distances())
-
     def grown(self, outwards: Float[Tensor, "X Y Z"]) -> SdfVessel:
         """See `SdfGrid`; the cavity moves too, for the wall is as thick as it was."""
         changed = variant(self, _outer=self._outer - outwards, _side=self._side - outwards)
         return changed._of_distances(changed._distances())
-
-    def length_range(self, name: str) -> tuple[float, float]:
-        """Between which a length is looked for, given what the others are."""
-        wall, foot, level = (self.lengths.get(key, self.height) for key in ("wall", "foot", "level"))
-        return {"wall": (_THINNEST * wall, _THICKEST * wall), "foot": (0.0, level), "level": (foot, self.height)}[name]
 
     def _distances(self) -> Float[Tensor, "K X Y Z"]:
         """Signed distances of all within the outer surface, of the cavity and of all below the level, world units."""

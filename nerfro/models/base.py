@@ -26,7 +26,6 @@ from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.models.optimizer import OptimizerConfig, learning_rate_factor, training_progress
 from nerfro.samplers.base import PathSampler, PointSampler
-from nerfro.samplers.replay import even_gradient
 from nerfro.samplers.surface_normals import first_normals
 from nerfro.types import Batch, Exits, Path, Rays, Rendering
 
@@ -115,19 +114,13 @@ class NerfModel(LightningModule, ABC):
     def refined(self, path: Path, rays: Rays) -> Path:
         """Paths with gradients, but for those whose derivatives are too large, or not yet to be learned from."""
         steady = self.path_sampler.steady(path, self.medium)
-        moves = bool(self.medium.surface_parameters())
-        if moves:
-            steady = steady & path.refracted  # straight paths would learn nothing
-        if steady.all() and not moves:
+        if steady.all():
             return self.path_sampler.refine(path, rays, self.medium)
         rows = steady.nonzero()[:, 0]
         if not len(rows):
             return path
         # The others are not replayed at all: they have many events, and take most of the time.
         refined = self.path_sampler.refine(path[rows], rays[path.ray[rows]], self.medium)
-        if moves:
-            for name in ("positions", "directions", "exit_directions"):
-                even_gradient(getattr(refined, name))
         names = ["positions", "directions", "s", "exit_directions", *(["throughput"] if path.splits else [])]
         return path.changed(**{n: getattr(path, n).index_copy(0, rows, getattr(refined, n)) for n in names})
 
@@ -145,13 +138,10 @@ class NerfModel(LightningModule, ABC):
         """All that learns: parameters and initial learning rate by name. A model that adds parameters adds a group."""
         config, bending = self.optimizer_config, self.medium.bending_parameters()
         tint = [own for own in self.medium.parameters() if all(own is not other for other in bending)]
-        surface = self.medium.surface_parameters()
-        bending = [own for own in bending if all(own is not other for other in surface)]
         groups = {
             "fields": (list(self.fields.parameters()), config.learning_rate),
             "boundary": (list(self.boundary.parameters()), config.rate("boundary")),
             "medium": ([*bending, *self.path_sampler.parameters()], config.rate("medium")),
-            "surface": (surface, config.rate("surface")),
             "tint": (tint, config.rate("tint")),
             "camera": (self.camera.bending_parameters(), config.rate("camera")),
             "exposure": (self.camera.brightness_parameters(), config.rate("exposure")),
@@ -205,9 +195,6 @@ class NerfModel(LightningModule, ABC):
         shown = self.photographed(batch.per_pixel(renderings[-1].rgb.detach()))
         error = (shown - batch.rgb).square().mean()
         self.log("train/psnr", -10 * torch.log10(error))
-        if (unlikely := self.medium.prior()) is not None:
-            self.log("loss/surface", unlikely)
-            total = total + unlikely
         self.log("loss/total", total)
         for name, value in self.medium.learned().items():
             self.log(f"medium/{name}", value)
@@ -229,19 +216,9 @@ class NerfModel(LightningModule, ABC):
         for group in self.trainer.optimizers[0].param_groups:
             waits = self.global_step < self.optimizer_config.start(group["name"])
             group["lr"] = 0.0 if waits else group["initial_lr"] * factor
-            if group["name"] == "surface":  # steps that do not move it need no gradients by it, and are faster
-                for parameter in group["params"]:
-                    parameter.requires_grad_(not waits)
         # Not at the end of the step before, which comes after its checkpoint: a resumed run would miss the update.
         if self.global_step > 0:
             self.point_sampler.after_step(list(self.fields), batch.draws)  # type: ignore[arg-type]
-
-    def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
-        super().optimizer_step(*args, **kwargs)
-        self.medium.settle(self.global_step)
-
-    def on_train_end(self) -> None:
-        self.medium.settle()
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         groups = [

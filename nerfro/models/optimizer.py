@@ -25,9 +25,6 @@ class OptimizerConfig:
     medium_learning_rate: Optional[Positive] = None  # noqa: UP045 - of what bends rays: indices
     tint_learning_rate: Optional[Positive] = None  # noqa: UP045 - of what absorbs light
     exposure_learning_rate: Optional[Positive] = None  # noqa: UP045
-    # Of a surface that learns: how far a step moves it, as a share of the object's size; and steps before it does.
-    surface_learning_rate: Positive = 1e-4
-    surface_start: Natural = 150
     medium_start: Natural = 0  # steps before what bends rays learns, so that it is not misled by an unlearned scene
     # Steps before the first in which the boundary alone learns, from rays that miss the content's box; and steps after
     # which it learns again, from all rays: a scene that is not learned would be painted on it.

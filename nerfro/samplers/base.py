@@ -20,7 +20,6 @@ class PathSampler(nn.Module, ABC):
     """Bends rays into paths: traced without gradients, and refined where something learns from them."""
 
     needs_medium = True  # whether it asks the medium at all; if not, none is built
-    replays_surface = False  # whether `refine` has gradients by a surface that learns
     branching = ONE_PATH  # which parts of light that is partly reflected are followed
 
     @abstractmethod

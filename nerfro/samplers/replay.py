@@ -57,25 +57,6 @@ def with_gradient(value: Float[Tensor, "..."], replayed: Float[Tensor, "..."]) -
     return _ValueOf.apply(value, replayed)
 
 
-def even_gradient(values: Float[Tensor, "P *C"]) -> Float[Tensor, "P *C"]:
-    """The same values; gradients of single paths are no longer than twice the usual one, the others' median.
-
-    So the few pixels whose error has other reasons, opaque things and edges, do not drown what most of them say.
-    """
-    if values.requires_grad:
-        values.register_hook(_shortened)
-    return values
-
-
-def _shortened(gradient: Tensor) -> Tensor:
-    length = torch.linalg.vector_norm(gradient.flatten(1), dim=1)
-    some = length[length > 0]
-    if not len(some):
-        return gradient
-    factor = (2 * some.median() / length.clamp(min=torch.finfo(length.dtype).tiny)).clamp(max=1)
-    return gradient * factor.view(-1, *[1] * (gradient.ndim - 1))
-
-
 def smallest_cosine(path: Path, medium: Medium) -> Float[Tensor, "P"]:
     """Least |N . d| of a path just before and just after its events at sharp surfaces; 1 where there is none.
 

@@ -24,7 +24,7 @@ from nerfro.samplers.branching import ONE_PATH, Branching, Event
 from nerfro.samplers.compiled import snell_on_grid
 from nerfro.samplers.mesh_interfaces import snell_on_mesh
 from nerfro.samplers.polylines import Polylines
-from nerfro.samplers.replay import events, meet_solid, meet_triangles, replay, smallest_cosine
+from nerfro.samplers.replay import meet_solid, meet_triangles, replay, smallest_cosine
 from nerfro.samplers.snell_law import reflectance, refract
 from nerfro.samplers.straight import straight_path
 from nerfro.types import Path, Rays
@@ -102,15 +102,7 @@ class Snell(PathSampler):
         return [medium.at_wavelength(wavelength) for wavelength in self.wavelengths]
 
     def steady(self, path: Path, medium: Medium) -> Bool[Tensor, "P"]:
-        steady = smallest_cosine(path, medium) > _STEADY
-        if medium.surface_parameters() and isinstance(medium, Solid):
-            # Tiny errors of the surface turn rays that are reflected inside anywhere.
-            steady &= events(path).sum(1) <= 2 * len(medium.iors)
-        return steady
-
-    @property
-    def replays_surface(self) -> bool:  # type: ignore[override]
-        return self.interface == "sdf"
+        return smallest_cosine(path, medium) > _STEADY
 
     def releases_python(self, medium: Medium) -> bool:
         return self.interface == "sdf" and isinstance(medium, SdfGrid)

@@ -21,7 +21,6 @@ from nerfro.models.optimizer import OptimizerConfig
 from nerfro.registry import build, configure, find
 from nerfro.training.backdrop import settle_backdrop
 from nerfro.training.content import ContentConfig, settle_content
-from nerfro.training.outlines import hold_outlines
 
 
 @dataclass
@@ -197,11 +196,6 @@ def build_model(config: DictConfig, training: Views | None = None) -> NerfModel:
     build_losses(config.loss, known=False)  # mistakes are told before anything is read
     optimizer = OptimizerConfig(**config.optimizer)
     path_sampler = build(config.sampler.path)
-    if config.medium.get("learn_surface") and not path_sampler.replays_surface:
-        raise NerfroError(
-            "medium.learn_surface=true learns by rays that bend at signed distances; take sampler/path=snell with "
-            "sampler.path.interface=sdf, or leave it out"
-        )
     medium = build(config.medium) if path_sampler.needs_medium else Vacuum()
     settle_content(config, medium, None if training is None else training.cameras)
     camera = build(config.camera)
@@ -209,7 +203,6 @@ def build_model(config: DictConfig, training: Views | None = None) -> NerfModel:
         settle_backdrop(config, training.images)
         exposures = None if camera.exposure is None else exif_exposures([f.image for f in training.frames])
         camera.begin(training.cameras, exposures)
-        hold_outlines(medium, training)
     parts = Parts(
         medium=medium,
         path_sampler=path_sampler,

@@ -28,18 +28,12 @@ def require_memory(model: NerfModel, rays: Rays, device: torch.device, share: fl
     The rays are this `share` of a step's.
     """
     probed = rays[:: max(len(rays) // _PROBED_RAYS, 1)]
-    kept, fixed = _kept_bytes(model, probed), 0.0
-    if model.medium.surface_parameters() and len(probed) > 1:
-        # A grid that learns is kept as a whole, however many rays there are.
-        all_kept, few = kept * len(probed), probed[::2]
-        of_few = _kept_bytes(model, few) * len(few)
-        kept = max(all_kept - of_few, 0.0) / (len(probed) - len(few))
-        fixed = max(of_few - kept * len(few), 0.0)
+    kept = _kept_bytes(model, probed)
     state = sum(tensor.nbytes for tensor in model.state_dict().values())
     learned = sum(p.nbytes for p in model.parameters() if p.requires_grad)
     # Gradients and Adam's two moments beside the weights.
     num_rays = len(rays) / share
-    needed: float = 3 * learned + _STEP * fixed + kept * max(_STEP * num_rays, _EVALUATION * model.chunk_size)
+    needed: float = 3 * learned + kept * max(_STEP * num_rays, _EVALUATION * model.chunk_size)
     if device.type == "cuda":
         needed, there = needed + state, float(torch.cuda.mem_get_info(device)[0])
     else:

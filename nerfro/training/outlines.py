@@ -9,35 +9,13 @@ from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
 from nerfro.capture.outlines import meet_outlines
 from nerfro.capture.pixel_blocks import PixelBlocks
-from nerfro.capture.rims import RimFinder
-from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.data.base import Views
-from nerfro.data.masks import masked_views
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 
 # Outlines are looked at in pictures of at most so many pixels a side; one is known to about this, pixels.
 _MAX_PIXELS, _KNOWN = 256, 0.25
-
-
-@torch.no_grad()
-def hold_outlines(medium: Medium, views: Views) -> None:
-    """Tell a surface that learns where views see its outlines: it shall meet those of the masks there.
-
-    Where there are no masks, the outlines that the surface was given are right, and stay.
-    """
-    if not medium.surface_parameters():
-        return
-    assert isinstance(medium, SdfGrid)
-    views, mesh = masked_views(views), medium.meshes[0]
-    silhouettes = mask_silhouettes(views)
-    if silhouettes is None:
-        cameras = reduced(views.cameras)
-        silhouettes = Silhouettes.of(cameras, mesh_silhouettes(mesh, cameras, 1).float())
-    rims = RimFinder(mesh, silhouettes).points()
-    outwards = torch.zeros_like(rims.misfits) if views.masks is None else rims.misfits
-    medium.hold(rims.points, outwards, _KNOWN * float(rims.widths.mean()))
 
 
 def meet_masks(camera: RefinedCamera, views: Views, medium: Medium, panorama: Told | None) -> Told | None:

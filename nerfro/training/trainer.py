@@ -65,9 +65,7 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
     }
     if config.trainer.get("strategy") == "ddp":
         # The index grid is a buffer and would be sent around in every step, though all processes have the same one.
-        # A surface that waits, or is not met by a process's rays, has no gradient.
-        waits = bool(config.medium.get("learn_surface", False))
-        ours["strategy"] = DDPStrategy(broadcast_buffers=False, find_unused_parameters=waits)
+        ours["strategy"] = DDPStrategy(broadcast_buffers=False, find_unused_parameters=False)
     limit = config.trainer.get("max_time")
     if isinstance(limit, (int, float)):
         raise NerfroError(f"trainer.max_time={limit} has no unit; write DD:HH:MM:SS, such as 00:00:05:00")

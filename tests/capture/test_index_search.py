@@ -12,18 +12,16 @@ import pytest
 import torch
 
 import nerfro.preprocess
-from nerfro.capture.index_search import Estimate, find_numbers, indices_of, lengths_of
+from nerfro.capture.index_search import Estimate, find_indices
 from nerfro.capture.surroundings import divide_pixels, learn_surroundings
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
-from nerfro.media.vessel import SdfVessel
-from tests.ball_photographs import INNER, NUM_VIEWS, SIZE, cameras, mesh, photographs, photographs_of, save, solid
+from tests.ball_photographs import INNER, NUM_VIEWS, SIZE, cameras, mesh, photographs, save, solid
 
 
 def search(views: Views, num_bodies: int = 1, inner: float = INNER) -> Estimate:
     beside, through = divide_pixels(views, mesh())
-    sought = indices_of(solid([1.5] * num_bodies, inner))
-    return find_numbers(sought, through, learn_surroundings(beside, mesh(), False))
+    return find_indices(solid([1.5] * num_bodies, inner), through, learn_surroundings(beside, mesh(), False))
 
 
 @pytest.mark.parametrize("ior", [1.2, 1.5])
@@ -49,31 +47,6 @@ def test_indices_that_trade_are_not_taken_for_certain() -> None:
     assert (abs(found.values - [1.5, 1.33]) < 3 * found.standard_errors).all()
     assert found.standard_errors[0] > 3 * found.standard_errors[1] > 0
     assert any("views do not agree" in doubt for doubt in found.doubts)
-
-
-def vessel(folder: Path, **lengths: float) -> SdfVessel:
-    """A closed one with a wall of 0.1, filled to 0.8 over its lowest point, but for the given lengths."""
-    mesh().save(folder / "mesh.ply")
-    known = {"wall": 0.1, "level": 0.8} | lengths
-    return SdfVessel(str(folder / "mesh.ply"), closed=True, resolution=41, box_min=[-0.9] * 3, box_max=[0.9] * 3,
-                     cache=False, **known)  # fmt: skip
-
-
-@pytest.mark.parametrize(("name", "true", "guess"), [("level", 0.8, 0.5), ("wall", 0.1, 0.14)])
-def test_lengths_of_a_vessel(tmp_path: Path, name: str, true: float, guess: float) -> None:
-    beside, through = divide_pixels(photographs_of(vessel(tmp_path)), mesh())
-    sought = lengths_of(vessel(tmp_path, **{name: guess}), [name])
-    found = find_numbers(sought, through, learn_surroundings(beside, mesh(), False))
-    assert found.values[0] == pytest.approx(true, abs=0.007)  # a hundredth of the radius
-    assert 0 < found.standard_errors[0] < 0.01
-    assert not found.doubts
-
-
-def test_lengths_that_a_vessel_lacks_are_named(tmp_path: Path) -> None:
-    mesh().save(tmp_path / "mesh.ply")
-    full = SdfVessel(str(tmp_path / "mesh.ply"), 0.1, resolution=24, cache=False)
-    with pytest.raises(NerfroError, match=r"search=\['level'\] is not looked for; .* give a first guess"):
-        lengths_of(full, ["level"])
 
 
 def test_an_opaque_ball_has_no_index() -> None:
@@ -118,31 +91,3 @@ def test_preprocess_writes_the_index_and_trains_with_it(
     assert 0 < found["standard_error"][0] < 0.02
     assert (out / "index.png").is_file()
     assert f"medium.ior={found['ior'][0]:.4f}".rstrip("0") in capsys.readouterr().out
-
-
-def test_preprocess_finds_a_level_shows_it_and_trains_with_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    save(photographs_of(vessel(tmp_path)), tmp_path)
-    out = tmp_path / "out"
-    options = [
-        f"data.root={tmp_path}",
-        f"mesh={tmp_path / 'mesh.ply'}",
-        f"out={out}",
-        "data.near=0.5",
-        "medium=vessel",
-        "medium.wall=0.1",
-        "medium.level=0.6",
-        "medium.closed=true",
-        "search=[level]",
-        "medium.up=[0,0,1]",
-    ]  # fmt: skip; the cameras are level across another axis
-    monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", *options, "medium.cache=false", "medium.resolution=48"])
-    nerfro.preprocess.main()
-    found = json.loads((out / "lengths.json").read_text())
-    assert found["lengths"]["level"] == pytest.approx(0.8, abs=0.01)
-    assert (out / "lengths.png").is_file()
-    assert not (out / "index.json").exists()
-    command = capsys.readouterr().out.split("train on it: ")[1].split()
-    assert f"medium.level={found['lengths']['level']}" in command
-    assert {"medium=vessel", "medium.wall=0.1", "medium.closed=true"} <= set(command)

@@ -15,15 +15,14 @@ from torch import Tensor
 
 import nerfro.preprocess
 from nerfro.boundaries.base import Boundary
-from nerfro.capture import refinement, refinement_report
-from nerfro.capture.refinement import Refined, refine_surface
+from nerfro.capture import refinement_report
+from nerfro.capture.refinement import Refined, RefinementSettings, Stage, refine_surface
 from nerfro.capture.room_picture import picture_of
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.surroundings import Pixels, Room, Surroundings, divide_pixels, learn_surroundings
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import load_mesh
-from nerfro.media import displacement
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.snell import Snell
 from nerfro.types import Exits
@@ -42,12 +41,7 @@ def dented() -> SdfGrid:
     return SdfGrid.from_distances(ball.distances + dent, BOX, [1.5], 0.01)
 
 
-@pytest.fixture
-def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    stages = (refinement._Stage(150, 5e-4, (3.0, 1.0)), refinement._Stage(50, 1e-4, (0.0, 0.0)))
-    monkeypatch.setattr(refinement, "_STAGES", stages)
-    monkeypatch.setattr(displacement, "LEVELS", (8, 16))
-    monkeypatch.setattr(refinement, "_PIXELS", 2000)
+SHORT = RefinementSettings((Stage(150, 5e-4, (3.0, 1.0)), Stage(50, 1e-4, (0.0, 0.0))), 2000, (8, 16))
 
 
 @functools.cache
@@ -58,8 +52,8 @@ def shown() -> tuple[Silhouettes, Pixels, Surroundings]:
     return silhouettes, through, learn_surroundings(beside, mesh(), False)
 
 
-def refined(start: SdfGrid, learn_index: bool = False, **how: Any) -> Refined:
-    return refine_surface(mesh(), start, *shown(), learn_index, **how)
+def refined(start: SdfGrid, learn_index: bool = False, settings: RefinementSettings = SHORT, **how: Any) -> Refined:
+    return refine_surface(mesh(), start, *shown(), learn_index, settings=settings, **how)
 
 
 def degrees_off(medium: SdfGrid, num_views: int = 6) -> float:
@@ -73,7 +67,7 @@ def degrees_off(medium: SdfGrid, num_views: int = 6) -> float:
     return float(torch.rad2deg(torch.cat(errors)).median())
 
 
-def test_a_dent_is_found(short: None) -> None:
+def test_a_dent_is_found() -> None:
     before = solid([1.5])
     found = refined(before)
     assert degrees_off(found.medium) < 0.4 * degrees_off(before)
@@ -86,40 +80,37 @@ def test_a_dent_is_found(short: None) -> None:
     assert abs(radius[(vertices / radius[:, None]) @ AXIS < 0].mean() - RADIUS) < 0.1 * DEPTH
 
 
-def test_a_surface_that_is_right_stays(short: None) -> None:
+def test_a_surface_that_is_right_stays() -> None:
     before = dented()
     found = refined(before)
     assert found.medium is before
     assert len(found.errors) > 2  # others were tried
 
 
-def test_a_rough_surface_is_smoothed_as_much_as_its_judges_like(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(refinement, "_STAGES", ())
-    monkeypatch.setattr(refinement, "_SMOOTHINGS", (0.02, 0.04, 0.3))
+def test_a_rough_surface_is_smoothed_as_much_as_its_judges_like() -> None:
     right = dented()
     rough = 0.004 * torch.randn(right.distances.shape, generator=torch.Generator().manual_seed(0))
     start = right.grown(rough[0])
-    found = refined(start)
+    found = refined(start, settings=RefinementSettings(stages=(), smoothings=(0.02, 0.04, 0.3)))
     assert degrees_off(found.medium) < 0.6 * degrees_off(start)
     assert found.steps == [0, 0, 0]
     assert found.errors[1] < 0.9 * found.errors[0]
 
 
-def test_an_interrupted_refinement_goes_on(short: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stages = (refinement._Stage(50, 5e-4, (3.0, 1.0)), refinement._Stage(25, 1e-4, (0.0, 0.0)))
-    monkeypatch.setattr(refinement, "_STAGES", stages)
-    monkeypatch.setattr(refinement, "_PIXELS", 500)
+def test_an_interrupted_refinement_goes_on(tmp_path: Path) -> None:
+    fast = RefinementSettings((Stage(50, 5e-4, (3.0, 1.0)), Stage(25, 1e-4, (0.0, 0.0))), 500, (8, 16))
+    start = functools.partial(refined, solid([1.5]), settings=fast)
     record, told = tmp_path / "state", []
 
     def interrupted(done: float) -> None:
         if done > 0.6:
             raise KeyboardInterrupt
 
-    undisturbed = refined(solid([1.5]), learn_index=True)
+    undisturbed = start(learn_index=True)
     with pytest.raises(KeyboardInterrupt):
-        refined(solid([1.5]), learn_index=True, record=record, progress=interrupted)
+        start(learn_index=True, record=record, progress=interrupted)
     kept = record.read_bytes()
-    found = refined(solid([1.5]), learn_index=True, record=record, progress=told.append)
+    found = start(learn_index=True, record=record, progress=told.append)
     assert told[0] > 0.3  # not from the beginning
     assert found.errors == undisturbed.errors
     assert torch.equal(found.medium.distances, undisturbed.medium.distances)
@@ -128,7 +119,7 @@ def test_an_interrupted_refinement_goes_on(short: None, tmp_path: Path, monkeypa
         record.write_bytes(other)
         told.clear()
         with pytest.raises(KeyboardInterrupt):
-            refined(solid([1.5]), record=record, progress=lambda done: (told.append(done), interrupted(done)))
+            start(record=record, progress=lambda done: (told.append(done), interrupted(done)))
         assert told[0] < 0.1
 
 
@@ -147,13 +138,13 @@ class PaintedShell(Room):
         return sky((exits.positions + away[:, None] * exits.directions) / self.RADIUS), away
 
 
-def test_a_dent_is_found_by_near_surroundings(short: None) -> None:
+def test_a_dent_is_found_by_near_surroundings() -> None:
     room = PaintedShell()
     beside, through = divide_pixels(photographs_of(dented(), around=room), mesh())
     silhouettes = Silhouettes.of(cameras(), mesh_silhouettes(mesh(), cameras(), 1).float())
     around = Surroundings(room, None, 0.0, beside.radiance)
     before = solid([1.5])
-    found = refine_surface(mesh(), before, silhouettes, through, around)
+    found = refine_surface(mesh(), before, silhouettes, through, around, settings=SHORT)
     assert degrees_off(found.medium) < 0.4 * degrees_off(before)
 
 
@@ -189,7 +180,9 @@ def preprocess(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     return run
 
 
-def test_preprocess_writes_the_refined_surface(short: None, preprocess: Callable) -> None:
+def test_preprocess_writes_the_refined_surface(preprocess: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+    fast = functools.partial(refine_surface, settings=SHORT)
+    monkeypatch.setattr(refinement_report, "refine_surface", fast)
     out, printed = preprocess("room=false")
     assert "surface refined" in printed
     assert f"medium.mesh={out / 'mesh.ply'}" in printed
