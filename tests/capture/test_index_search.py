@@ -61,7 +61,7 @@ def test_masks_decide_which_pixels_are_the_objects() -> None:
     beside, through = divide_pixels(replace(views, masks=masks), mesh())
     assert len(through) == NUM_VIEWS * 8 * 8
     assert len(beside) == NUM_VIEWS * (SIZE * SIZE - 12 * 12)
-    with pytest.raises(NerfroError, match="0 through it"):
+    with pytest.raises(NerfroError, match="0 inside its silhouette"):
         divide_pixels(replace(views, masks=0 * masks), mesh())
 
 
