@@ -9,6 +9,7 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,9 @@ import trimesh
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from nerfro.scenes import llvm
+from nerfro.scenes.path_tracer import load_mitsuba
+
 # Workers of pytest-xdist share the cores; threads that wait for each other by spinning would slow all of them down.
 if "PYTEST_XDIST_WORKER" in os.environ:
     torch.set_num_threads(1)
@@ -25,6 +29,40 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 # A shell that starts the tests in the background has them ignore Ctrl-C, and all commands that they start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+_SKIPPED = "nerfro/skipped"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--last-skipped", action="store_true", help="run only the tests that the last run has skipped")
+
+
+class SkippedTests:
+    """Remembers the skipped tests of a run in pytest's cache, for `--last-skipped`."""
+
+    def __init__(self, cache: pytest.Cache) -> None:
+        self.cache = cache
+        self.names: set[str] = set()
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.skipped:
+            self.names.add(report.nodeid)
+
+    def pytest_sessionfinish(self) -> None:
+        self.cache.set(_SKIPPED, sorted(self.names))
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    worker = hasattr(config, "workerinput")  # of pytest-xdist
+    if not worker and not config.option.collectonly and config.cache is not None:
+        config.pluginmanager.register(SkippedTests(config.cache))
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("last_skipped"):
+        names = set(config.cache.get(_SKIPPED, []))
+        items[:] = [item for item in items if item.nodeid in names]
 
 
 @pytest.fixture(autouse=True)
@@ -43,6 +81,16 @@ def _random_pose(seed: int) -> np.ndarray:
 def random_pose() -> Callable[[int], np.ndarray]:
     """Camera-to-world matrix [4, 4] of a seed, with any orientation."""
     return _random_pose
+
+
+@pytest.fixture(scope="session")
+def mitsuba() -> ModuleType:
+    """Mitsuba with its fastest variant; tests are skipped where only the scalar variant works, which takes minutes."""
+    pytest.importorskip("mitsuba")
+    module = load_mitsuba()
+    if module.variant() == "scalar_rgb":
+        pytest.skip(f"needs Mitsuba with LLVM or CUDA, but {llvm.missing_llvm()}; {llvm.HINT}")
+    return module
 
 
 class Finished(NamedTuple):

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -59,7 +59,7 @@ def _built_quickly() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def few(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def few(mitsuba: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two photographs, large enough to find tags in."""
     return photograph(tmp_path_factory.mktemp("few"), resolution=400, photographs=2, spp=4)
 
@@ -118,6 +118,7 @@ def test_similarity_undoes_scale_turn_and_shift() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("mitsuba")
 def test_from_photographs_to_a_table(
     request: pytest.FixtureRequest,
     tmp_path: Path,
@@ -126,7 +127,6 @@ def test_from_photographs_to_a_table(
     train_here: Callable,
 ) -> None:
     """The commands of docs/capture.md as each prints the next, on fewer and smaller photographs, which are kept."""
-    pytest.importorskip("mitsuba")
     pytest.importorskip("pyapriltags")
     # Shares of pixels to 1 / 16 are enough for a hull of 48 voxels.
     monkeypatch.setattr(path_tracer, "SILHOUETTE_PLACES", path_tracer.SILHOUETTE_PLACES[::8])

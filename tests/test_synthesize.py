@@ -117,8 +117,8 @@ def test_sky_picture_is_the_sky_of_the_pictures():
         assert np.median(error) < 0.01  # nearest texel against an averaged pixel: edges differ, areas do not
 
 
+@pytest.mark.usefixtures("mitsuba")
 def test_interrupted_rendering_goes_on_where_it_stopped(tmp_path):
-    pytest.importorskip("mitsuba")
     _, folder = synthesize(small(tmp_path / "scene"))
     pictures = sorted(folder.rglob("r_*.png"))
     assert len(pictures) == 2 * 4
@@ -134,8 +134,8 @@ def test_interrupted_rendering_goes_on_where_it_stopped(tmp_path):
     assert not list(folder.rglob("*.partial"))
 
 
+@pytest.mark.usefixtures("mitsuba")
 def test_another_data_set_is_replaced_only_on_request_and_strangers_survive(tmp_path):
-    pytest.importorskip("mitsuba")
     _, folder = synthesize(small(tmp_path / "scene"))
     (folder / "notes.txt").write_text("mine")
     assert (folder / "interior.ply").is_file()
@@ -151,8 +151,8 @@ def test_another_data_set_is_replaced_only_on_request_and_strangers_survive(tmp_
 
 
 @pytest.mark.parametrize(("name", "content"), [("thesis.tex", "chapter 1"), ("meta.json", "{}"), ("meta.json", "[")])
+@pytest.mark.usefixtures("mitsuba")
 def test_a_folder_of_something_else_is_left_alone(tmp_path, name, content):
-    pytest.importorskip("mitsuba")
     (tmp_path / name).write_text(content)
     with pytest.raises(NerfroError, match="no data set of ours"):
         synthesize(small(tmp_path, overwrite=True))

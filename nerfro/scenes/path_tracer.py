@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-import warnings
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import ModuleType
@@ -12,6 +12,7 @@ import numpy as np
 
 from nerfro.errors import NerfroError
 from nerfro.light import to_linear
+from nerfro.scenes import llvm
 from nerfro.scenes.glass import EMBEDDED, PLUGIN, register_materials
 from nerfro.scenes.scene import Panel, Scene
 from nerfro.scenes.skies import Sky
@@ -22,17 +23,23 @@ VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "scalar_rgb")
 SILHOUETTE_PLACES = [((k + 0.5) / 128, (int(f"{k:07b}"[::-1], 2) + 0.5) / 128) for k in range(128)]
 SAMPLES_PER_PASS = 6_000_000  # a wavefront of paths is held in memory at once: about 1 GB per 10 M paths
 _TEXELS_PER_TASK, _EDGE_CONTRAST = 1 << 17, 0.1
-_GET_LLVM = "llvm_ad_rgb needs the LLVM library, 16 or newer (Debian: apt-get install libllvm19)"
 ROULETTE_DEPTH, MAX_DEPTH = 32, 1024  # light bounces long between the walls of a cube: cut late and without bias
 
 
 @functools.cache
 def load_mitsuba(variant: str = "auto") -> ModuleType:
-    """Import Mitsuba, choose its variant (one of `VARIANTS`, or the first that works here), register our material.
+    """Import Mitsuba, activate one of its variants, and register nerfro's materials for it.
+
+    Args:
+        variant: one of `VARIANTS`, or "auto" for the first of them that works on this machine. "auto" prints one line
+            if only the scalar variant works, which is about seventy times slower.
 
     Raises:
-        NerfroError: Mitsuba is not installed, or the variant does not run here.
+        NerfroError: Mitsuba is not installed, or the variant does not work on this machine.
     """
+    if variant not in ("auto", *VARIANTS):
+        raise NerfroError(f"unknown Mitsuba variant '{variant}'; choose auto, {', '.join(VARIANTS)}")
+    llvm.select_llvm()
     try:
         import drjit
         import mitsuba
@@ -41,19 +48,19 @@ def load_mitsuba(variant: str = "auto") -> ModuleType:
             f"rendering ground truth needs Mitsuba 3, which cannot be imported ({error}); "
             "install it with: pip install 'nerfro[synthesize]'"
         ) from error
-    if variant not in ("auto", *VARIANTS):
-        raise NerfroError(f"unknown Mitsuba variant '{variant}'; choose auto, {', '.join(VARIANTS)}")
-    for name in VARIANTS if variant == "auto" else (variant,):
-        backend = {"llvm": drjit.JitBackend.LLVM, "cuda": drjit.JitBackend.CUDA}.get(name.split("_")[0])
-        if backend is None or drjit.has_backend(backend):
-            if variant == "auto" and name == "scalar_rgb":
-                warnings.warn(f"rendering without LLVM, some seventy times slower; {_GET_LLVM}", stacklevel=2)
-            mitsuba.set_variant(name)
-            register_materials(name)
-            return mitsuba
-    raise NerfroError(
-        f"Mitsuba variant '{variant}' does not run on this machine; {_GET_LLVM}, or take variant=scalar_rgb"
-    )
+    chosen, reason = variant, llvm.missing_llvm()
+    if variant == "auto":
+        cuda = drjit.has_backend(drjit.JitBackend.CUDA)
+        chosen = "llvm_ad_rgb" if reason is None else "cuda_ad_rgb" if cuda else "scalar_rgb"
+        if chosen == "scalar_rgb":
+            print(f"nerfro: Mitsuba runs about seventy times slower, because {reason}; {llvm.HINT}", file=sys.stderr)
+    elif variant == "llvm_ad_rgb" and reason is not None:
+        raise NerfroError(f"variant=llvm_ad_rgb cannot run, because {reason}; {llvm.HINT}, or choose variant=auto")
+    elif variant == "cuda_ad_rgb" and not drjit.has_backend(drjit.JitBackend.CUDA):
+        raise NerfroError("variant=cuda_ad_rgb cannot run, because Dr.Jit finds no CUDA driver; choose variant=auto")
+    mitsuba.set_variant(chosen)
+    register_materials(chosen)
+    return mitsuba
 
 
 @dataclass(frozen=True)

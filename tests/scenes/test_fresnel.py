@@ -12,6 +12,8 @@ from nerfro.scenes.path_tracer import PathTracer, Pinhole, load_mitsuba
 from nerfro.scenes.surface import rounded_box, torus_angles
 from nerfro.scenes.viewpoints import look_at_origin
 
+pytestmark = pytest.mark.usefixtures("mitsuba")
+
 
 def reflectances(angles, n):
     """Fresnel's equations from air into glass: for light across and in the plane of incidence."""
@@ -25,8 +27,6 @@ def reflectances(angles, n):
 def glass(n):
     """The material that `PathTracer(fresnel=True)` gives to glass."""
     mi = load_mitsuba()
-    if mi.variant().startswith("scalar"):
-        pytest.skip("samples many angles at once, which needs LLVM or CUDA")
     box = rounded_box((1.0, 1.0, 0.1), 0.02, edge_steps=2)
     tracer = PathTracer(replace(torus.build(0.1), glass=box, ior=n, tint=(1.0, 1.0, 1.0)), True, Pinhole.square(0.5, 8))
     shapes = [shape for shape in tracer.scene.shapes() if shape.id() == "glass"]
@@ -46,7 +46,6 @@ def sampled(n, angles, number, from_inside=False):
 
 @pytest.mark.parametrize(("n", "percent"), [(1.52, 4.26), (1.33, 2.01)])
 def test_reflected_and_transmitted_shares_are_fresnels_and_sum_to_one(n, percent):
-    pytest.importorskip("mitsuba")
     brewster = np.arctan(n)
     angles = np.array([0.0, 0.3, 0.7, brewster, 1.3, 1.5, np.radians(89.99)])
     reflected, weight, cosine = sampled(n, angles, 0.0)
@@ -68,7 +67,6 @@ def test_reflected_and_transmitted_shares_are_fresnels_and_sum_to_one(n, percent
 
 
 def test_leaving_the_glass_undoes_entering_it():
-    pytest.importorskip("mitsuba")
     n = 1.52
     angles = np.array([0.0, 0.3, 0.8, 1.3])
     inside = np.arcsin(np.sin(angles) / n)
@@ -82,7 +80,6 @@ def test_leaving_the_glass_undoes_entering_it():
 
 def test_a_slab_transmits_what_infinitely_many_reflections_leave():
     """White in front of the camera, black behind it: T = 2 n / (n^2 + 1) at normal incidence."""
-    pytest.importorskip("mitsuba")
     n = 1.52
     ring, _ = torus_angles(0.02, 0.005, spacing=0.005)
     # Far outside the picture, as scenes have an interior.

@@ -48,7 +48,6 @@ def path_traced(
     glass: Surface, ior: float, absorption: tuple[float, float, float] = (0, 0, 0), inner: tuple | None = None
 ) -> Tensor:
     """Linear radiance by Mitsuba; `inner` is the surface and the index of a body inside."""
-    pytest.importorskip("mitsuba")
     ring, _ = torus_angles(0.02, 0.005, spacing=0.005)
     # Far outside the picture, as scenes have an interior.
     interior = replace(ring, vertices=ring.vertices + np.float32(50), colours=np.ones_like(ring.vertices))
@@ -100,6 +99,7 @@ def agreement(found: Tensor, expected: Tensor) -> float:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("mitsuba")
 @pytest.mark.parametrize("what", ["ball", "cube", "bottle"])
 def test_pictures_of_empty_glass_are_those_of_a_dielectric(what: str, tmp_path: FilePath) -> None:
     interface, inner, glass = "sdf", None, BALL if what == "ball" else CUBE
@@ -126,6 +126,7 @@ def test_pictures_of_empty_glass_are_those_of_a_dielectric(what: str, tmp_path: 
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("mitsuba")
 @pytest.mark.parametrize("what", ["ball", "cube"])
 def test_absorption_is_that_of_the_path_and_is_learned_from_a_picture(what: str) -> None:
     expected = path_traced(BALL if what == "ball" else CUBE, 1.5, COLOURED).float()
@@ -148,6 +149,7 @@ def test_absorption_is_that_of_the_path_and_is_learned_from_a_picture(what: str)
     )
 
 
+@pytest.mark.usefixtures("mitsuba")
 def test_a_dispersive_cube_is_that_of_three_colours() -> None:
     medium, rays = on_grid("cube", abbe=[5.0]), rays_of_picture()
     iors = [float(medium.at_wavelength(wavelength).iors) for wavelength in BRANCHES.wavelengths]

@@ -47,8 +47,6 @@ def pixel_directions(pose, size):
 def trace(surface, origins, directions, crossings):
     """Follow rays through `transmitting_glass` alone; return directions and weights after `crossings` events."""
     mi = load_mitsuba()
-    if mi.variant().startswith("scalar"):
-        pytest.skip("traces many rays at once, which needs LLVM or CUDA")
     material = {"type": "transmitting_glass", "int_ior": IOR, "tint": mi.ScalarColor3f(0.5)}
     scene = mi.load_dict({"type": "scene", "glass": path_tracer._mesh(mi, "glass", surface, material)})
 
@@ -70,8 +68,8 @@ def angle(first, second):
     return 2 * np.degrees(np.arcsin(np.clip(np.linalg.norm(first - second, axis=1) / 2, 0, 1)))
 
 
+@pytest.mark.usefixtures("mitsuba")
 def test_rays_through_a_ball_leave_as_snells_law_says():
-    pytest.importorskip("mitsuba")
     radius = 0.8
     generator = np.random.default_rng(0)
     directions = generator.normal(size=(500, 3))
@@ -87,9 +85,9 @@ def test_rays_through_a_ball_leave_as_snells_law_says():
     assert weight == pytest.approx(0.25)  # the tint counts once per crossing, and nothing is scaled by n^2
 
 
+@pytest.mark.usefixtures("mitsuba")
 def test_a_ray_that_meets_a_side_of_a_cube_is_reflected_totally():
     """Down through the top at 45 degrees, mirrored once at a side, out through the bottom: (x, y, z) -> (-x, y, z)."""
-    pytest.importorskip("mitsuba")
     heights = np.random.default_rng(1).uniform(-0.1, 0.1, 200)
     entry = np.stack([0.45 + heights, 3 * heights, np.full(200, 0.75)], -1)
     incoming = np.tile(np.array([np.sqrt(0.5), 0.0, -np.sqrt(0.5)]), (200, 1))
@@ -100,8 +98,8 @@ def test_a_ray_that_meets_a_side_of_a_cube_is_reflected_totally():
 
 
 @pytest.mark.parametrize("fresnel", [False, True])
+@pytest.mark.usefixtures("mitsuba")
 def test_white_furnace_is_white(white_torus, poses, fresnel, monkeypatch):
-    pytest.importorskip("mitsuba")
     monkeypatch.setattr(path_tracer, "SAMPLES_PER_PASS", 24 * 24 * 20)  # 32 samples are then two uneven passes
     tracer = PathTracer(white_torus, fresnel, Pinhole.square(CAMERA_ANGLE_X, 24))
     for seed, pose in enumerate(poses):
@@ -109,8 +107,8 @@ def test_white_furnace_is_white(white_torus, poses, fresnel, monkeypatch):
         assert picture.mean() == pytest.approx(1.0, abs=1e-3)
 
 
+@pytest.mark.usefixtures("mitsuba")
 def test_tint_counts_on_entry_and_on_exit(white_torus, poses):
-    pytest.importorskip("mitsuba")
     tint = np.array([0.5, 0.9, 0.7])
     tracer = PathTracer(replace(white_torus, tint=tuple(tint)), False, Pinhole.square(CAMERA_ANGLE_X, 24))
     picture, mask = tracer.render(poses[0], spp=16, seed=0), tracer.silhouette(poses[0]) > 0.5
@@ -119,9 +117,9 @@ def test_tint_counts_on_entry_and_on_exit(white_torus, poses):
     assert picture[0, 0] == pytest.approx(1.0, abs=1e-4)
 
 
+@pytest.mark.usefixtures("mitsuba")
 def test_background_pixels_show_the_sky_in_the_direction_of_the_pixel(poses):
     """A sky that encodes the direction itself finds a mirrored, turned or shifted camera or sky."""
-    pytest.importorskip("mitsuba")
     ring, _ = torus_angles(0.05, 0.02, spacing=0.01)
     tiny = replace(ring, colours=np.ones_like(ring.vertices))
     scene = replace(
@@ -136,8 +134,8 @@ def test_background_pixels_show_the_sky_in_the_direction_of_the_pixel(poses):
         assert np.abs(picture - expected)[background].max() < 2e-3
 
 
+@pytest.mark.usefixtures("mitsuba")
 def test_equal_seeds_give_equal_pictures(white_torus, poses):
-    pytest.importorskip("mitsuba")
     scene = replace(white_torus, sky=torus.sky)
     tracer = PathTracer(scene, False, Pinhole.square(CAMERA_ANGLE_X, 16))
     first, again, other = (tracer.render(poses[0], spp=8, seed=seed) for seed in (3, 3, 4))
@@ -156,7 +154,6 @@ def test_a_missing_mitsuba_is_told_with_the_extra_to_install():
 
 
 def test_an_unknown_variant_names_the_known_ones():
-    pytest.importorskip("mitsuba")
     with pytest.raises(NerfroError, match="choose auto, llvm_ad_rgb"):
         load_mitsuba("llvm")
 

@@ -16,7 +16,6 @@ from nerfro.media.solid import Solid
 from nerfro.media.vessel import SdfVessel
 from nerfro.rays import Rays
 from nerfro.samplers.snell import Snell
-from nerfro.scenes.path_tracer import load_mitsuba
 from tests.closed_forms import angle, make_rays
 
 RADIUS, HEIGHT, WALL, FOOT, LEVEL = 0.5, 1.6, 0.06, 0.16, 0.8
@@ -46,20 +45,16 @@ def rays() -> Rays:
 
 
 @pytest.fixture(scope="module")
-def by_mitsuba(rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
+def by_mitsuba(mitsuba: ModuleType, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
     """Directions beyond the glass; which rays have met water on their way; and which of these an edge is not near.
 
     Near an edge, rays a voxel beside each other go different ways, and after several total reflections, too.
     """
-    pytest.importorskip("mitsuba")
-    mi = load_mitsuba()
-    if mi.variant().startswith("scalar"):
-        pytest.skip("traces many rays at once, which needs LLVM or CUDA")
-    dry, wet = _interfaces(mi)
+    dry, wet = _interfaces(mitsuba)
     axes = torch.eye(3, dtype=torch.float64)
     shifts = VOXEL * torch.cat([torch.zeros(1, 3, dtype=torch.float64), axes, -axes])
     origins, directions = (rays.origins + shifts[:, None]).flatten(0, 1), rays.directions.repeat(len(shifts), 1)
-    traced, met = _trace(mi, make_rays(origins, directions, 0.5, 9.0), dry, wet)
+    traced, met = _trace(mitsuba, make_rays(origins, directions, 0.5, 9.0), dry, wet)
     found, *beside = traced.split(len(rays))
     through_water = met[: len(rays)]
     steady = torch.stack([angle(each, found) < STEADY for each in beside]).all(0)

@@ -8,6 +8,7 @@ import shutil
 import struct
 import subprocess
 from pathlib import Path
+from types import ModuleType
 
 import cv2
 import numpy as np
@@ -194,11 +195,9 @@ def test_the_volume_is_the_field_at_the_vertices_of_a_grid(scene: Scene, tmp_pat
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("glass", "least"), [("dielectric", 25), ("transmitting_glass", 32)])
-def test_mitsuba_renders_the_same_picture(scene: Scene, glass: str, least: float, tmp_path: Path) -> None:
-    mitsuba = pytest.importorskip("mitsuba")
-    from nerfro.scenes.path_tracer import load_mitsuba
-
-    load_mitsuba()
+def test_mitsuba_renders_the_same_picture(
+    scene: Scene, mitsuba: ModuleType, glass: str, least: float, tmp_path: Path
+) -> None:
     write(scene, "mitsuba", tmp_path / "ball.xml")
     named = {} if glass == "dielectric" else {"glass": glass}
     loaded = mitsuba.load_file(str(tmp_path / "ball.xml"), **named)
