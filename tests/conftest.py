@@ -22,6 +22,9 @@ from scipy.spatial.transform import Rotation
 from nerfro.scenes import llvm
 from nerfro.scenes.path_tracer import load_mitsuba
 
+# Before any test imports Mitsuba, which loads the library at once.
+llvm.select_llvm()
+
 # Workers of pytest-xdist share the cores; threads that wait for each other by spinning would slow all of them down.
 if "PYTEST_XDIST_WORKER" in os.environ:
     torch.set_num_threads(1)
