@@ -1,4 +1,4 @@
-"""`python -m nerfro.dashboard`: TensorBoard with all runs below a folder, named by experiment and scene."""
+"""`python -m nerfro.dashboard`: show all runs below a folder in TensorBoard, named by experiment and scene."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from omegaconf import DictConfig
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
 from nerfro.paths import user_path
-from nerfro.report.dashboard import LOOK_AGAIN, DashboardConfig, link_runs, serve
+from nerfro.report.dashboard import SEARCH_INTERVAL, DashboardConfig, link_runs, serve
 
 
 @entry_point("dashboard", DashboardConfig)
 def main(config: DictConfig) -> None:
-    """Serve until Ctrl-C."""
+    """Serve TensorBoard until Ctrl-C."""
     outputs = user_path(config.outputs)
     if not outputs.is_dir():
-        raise NerfroError(f"outputs={outputs} is not a folder; give the one that holds the run folders")
+        raise NerfroError(f"outputs={outputs} is not a folder; give the folder that contains the run folders")
     with tempfile.TemporaryDirectory(prefix="nerfro_dashboard_") as names:
         num_runs = link_runs(outputs, Path(names))
         url = serve(Path(names), config.host, config.port)
         print(
-            f"nerfro: {num_runs} runs below {outputs} on {url}; new ones appear by themselves; Ctrl-C ends it",
+            f"nerfro: {num_runs} runs below {outputs} on {url}; new runs appear automatically; press Ctrl-C to stop",
             flush=True,
         )
         if config.open:
             webbrowser.open(url)
         while True:
-            time.sleep(LOOK_AGAIN)
+            time.sleep(SEARCH_INTERVAL)
             link_runs(outputs, Path(names))
 
 

@@ -1,4 +1,4 @@
-"""`python -m nerfro.summary runs=[outputs]`: many runs in one table, and on one page."""
+"""`python -m nerfro.summary runs=[outputs]`: compare many runs in tables and in a report."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ from nerfro.paths import user_path
 from nerfro.report.comparison import compare, find_metrics, to_table
 from nerfro.report.page import report_page, table_page
 from nerfro.report.runs import find_runs
-from nerfro.report.views import Wanted
+from nerfro.report.views import Selection
 
 
 @dataclass
 class SummaryConfig:
-    """What `python -m nerfro.summary` is asked."""
+    """Options of `python -m nerfro.summary`."""
 
-    # Run folders, folders that hold some at any depth, or globs of either.
+    # Run folders, folders that contain these at any depth, or glob patterns.
     runs: Any = field(default_factory=lambda: ["outputs"])
-    # Folder for the tables, one for each budget, as .csv, .md, .tex and .html, and for the report; none only prints.
+    # Folder for the report and the tables (.csv, .md, .tex and .html, one table per budget); without it, only print.
     out: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    report: bool = False  # whether to write the page `report.html`, to `outputs/summary` if `out` is none
+    report: bool = False  # whether to write `report.html`; the default of `out` is then `outputs/summary`
     metrics: list[str] = field(default_factory=lambda: ["psnr", "ssim", "lpips"])  # columns, see docs/metrics.md
-    region: Annotated[str, Literal["full", "mask", "crop"]] = FULL  # of the pictures: full, mask or crop
+    region: Annotated[str, Literal["full", "mask", "crop"]] = FULL  # region of the scores: full, mask or crop
     methods: dict[str, str] = field(default_factory=dict)  # titles of experiments, in the order of the rows
-    scenes: dict[str, str] = field(default_factory=dict)  # titles of scenes, by the last part of the data's folder
-    views: Natural = 8  # number of views of each scene on the page, evenly spread; 0 for all
-    view: Any = None  # views of the figures, as in {torus: 3}; otherwise those of the median score
-    # Insets of the figures, as in {torus: [[top, left, size], ...]}, pixels; otherwise those where methods differ most.
+    scenes: dict[str, str] = field(default_factory=dict)  # titles of scenes, by the last component of the data folder
+    views: Natural = 8  # number of evenly spread views per scene in the report; 0 for all
+    view: Any = None  # view of each figure, such as {torus: 3}; by default the view of median score
+    # Insets of each figure in pixels, such as {torus: [[top, left, size], ...]}; by default where methods differ most.
     crops: Any = None
-    error_map: str = "squared_error"  # what the error maps show: squared_error, ssim, lpips, lpips_vgg or flip
-    overwrite: bool = False  # whether files in `out` may be replaced
+    error_map: str = "squared_error"  # metric of the error maps: squared_error, ssim, lpips, lpips_vgg or flip
+    overwrite: bool = False  # whether to replace files in `out`
 
 
 @entry_point("summary", SummaryConfig)
 def main(config: DictConfig) -> None:
-    """Read, compare, print, write."""
+    """Read and compare runs, and print and write the result."""
     metrics = find_metrics(config.metrics)
-    wanted = Wanted.of(config.views, config.view, config.crops, config.error_map, metrics[0], config.region)
+    selection = Selection.of(config.views, config.view, config.crops, config.error_map, metrics[0], config.region)
     places = list(config.runs) if isinstance(config.runs, ListConfig) else [str(config.runs)]
     runs, unfinished = find_runs(places)
-    wanted.check([run.scored for run in runs])
+    selection.check([run.test_set for run in runs])
     comparisons = compare(runs, config.methods, config.scenes)
     tables = {c.budget.file_name: to_table(c, metrics, config.region) for c in comparisons}
 
@@ -69,7 +69,7 @@ def main(config: DictConfig) -> None:
         write_atomically(out / f"{name}.html", table_page(table))
     print(f"tables: {out}")
     if config.report:
-        page = report_page(list(zip(comparisons, tables.values(), strict=True)), unfinished, wanted)
+        page = report_page(list(zip(comparisons, tables.values(), strict=True)), unfinished, selection)
         write_atomically(out / "report.html", page)
         print(f"report: {out / 'report.html'}, {len(page) / 2**20:.1f} MiB")
 

@@ -91,7 +91,7 @@ def test_logs_of_other_programs_keep_their_folder(tmp_path: Path) -> None:
         (["outputs=nowhere"], "outputs=nowhere is not a folder"),
         (["prot=1"], "prot is no setting; did you mean port?"),
         (["outputs=.", "port=-5"], "port=-5 is not allowed"),
-        (["outputs=.", "host=nosuchhost.invalid"], "host=nosuchhost.invalid is no address"),
+        (["outputs=.", "host=nosuchhost.invalid"], "host=nosuchhost.invalid is not an address"),
     ],
 )
 def test_refuses_in_one_line(

@@ -21,7 +21,7 @@ from nerfro.report.comparison import compare, find_metrics, to_table
 from nerfro.report.curves import HEIGHT, MAX_POINTS, WIDTH, draw_charts, read_curves
 from nerfro.report.page import report_page
 from nerfro.report.runs import find_runs
-from nerfro.report.views import Wanted, data_uri, scene_pictures
+from nerfro.report.views import Selection, data_uri, scene_images
 from nerfro.training.run_folder import record
 
 PSNR = find_metrics(["psnr"])[0]
@@ -65,10 +65,10 @@ def runs(tmp_path_factory: pytest.TempPathFactory, tiny_scene: Path) -> Path:
     return root
 
 
-def page(runs: Path, wanted: Wanted | None = None, unfinished: tuple[str, ...] = ()) -> str:
+def page(runs: Path, wanted: Selection | None = None, unfinished: tuple[str, ...] = ()) -> str:
     comparisons = compare(find_runs([str(runs)])[0], {}, {})
     compared = [(comparison, to_table(comparison, [PSNR], "full")) for comparison in comparisons]
-    return report_page(compared, unfinished, wanted or Wanted.of(8, None, None))
+    return report_page(compared, unfinished, wanted or Selection.of(8, None, None))
 
 
 def test_curves_are_read_by_name_without_empty_broken_or_endless_values(tmp_path: Path) -> None:
@@ -108,7 +108,7 @@ def test_long_logs_are_averaged_and_losses_of_zero_are_not_drawn() -> None:
 def test_figure_shows_the_view_of_the_median_score_and_insets_that_lie_apart(runs: Path) -> None:
     (comparison,) = compare(find_runs([str(runs)])[0], {}, {})
     (scored,) = comparison.scenes
-    pictures = scene_pictures(comparison, scored, Wanted.of(1, None, None))
+    pictures = scene_images(comparison, scored, Selection.of(1, None, None))
     # View 1 has twice the noise; of two views the lower score is the lower median.
     assert pictures.figure.index == 1
     assert [view.index for view in pictures.views] == [0, 1]
@@ -116,8 +116,8 @@ def test_figure_shows_the_view_of_the_median_score_and_insets_that_lie_apart(run
     assert first.size == second.size == 4
     assert abs(first.top - second.top) >= 4 or abs(first.left - second.left) >= 4
     assert pictures.methods == dict(enumerate(comparison.methods))
-    wanted = Wanted.of(8, {scored.name: 0}, {scored.name: [[1, 2, 5]]})
-    chosen = scene_pictures(comparison, scored, wanted)
+    wanted = Selection.of(8, {scored.name: 0}, {scored.name: [[1, 2, 5]]})
+    chosen = scene_images(comparison, scored, wanted)
     assert chosen.figure.index == 0
     assert [(crop.top, crop.left, crop.size) for crop in chosen.crops] == [(1, 2, 5)]
 
@@ -131,12 +131,12 @@ def test_small_pictures_are_embedded_bit_for_bit_and_large_ones_as_jpeg(runs: Pa
 
 
 def test_error_maps_of_another_kind_have_their_own_scale_and_name(runs: Path) -> None:
-    html = page(runs, Wanted.of(8, None, None, "flip"))
+    html = page(runs, Selection.of(8, None, None, "flip"))
     assert "FLIP of bad, view 1" in html
     assert "≥ 1<" in html
     assert "≥ 0.05" in page(runs)
     with pytest.raises(NerfroError, match="choose from squared_error, ssim, lpips, lpips_vgg, flip"):
-        Wanted.of(8, None, None, "foo")
+        Selection.of(8, None, None, "foo")
 
 
 def test_page_needs_nothing_from_outside_and_its_parts_find_each_other(runs: Path) -> None:
@@ -162,7 +162,7 @@ def test_page_without_its_data_keeps_the_rest(runs: Path, tmp_path: Path) -> Non
     for config in moved.glob("*/config.yaml"):
         config.write_text(re.sub(r"root: .*", "root: /nowhere/scene", config.read_text()))
     html = page(moved)
-    assert "The pictures cannot be shown" in html
+    assert "The images cannot be shown" in html
     assert "/nowhere/scene" in html
     assert "<image" not in html
     assert "train/psnr" in html
@@ -179,8 +179,8 @@ def test_pictures_of_another_data_set_are_refused(runs: Path, tmp_path: Path, ti
     (changed / "transforms_test.json").write_text(json.dumps(manifest))
     for run in comparison.runs:
         run.config["data"]["root"] = str(changed)  # type: ignore[index]
-    with pytest.raises(NerfroError, match="has it been changed since"):
-        scene_pictures(comparison, scored, Wanted.of(8, None, None))
+    with pytest.raises(NerfroError, match="has changed since these views"):
+        scene_images(comparison, scored, Selection.of(8, None, None))
 
 
 # Does what a reader does, and writes down what is seen.

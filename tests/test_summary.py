@@ -149,9 +149,9 @@ def test_of_repeated_runs_the_newest_counts_and_the_others_are_named(tmp_path: P
         os.utime(folder / "metrics.json", (stamp, stamp))
     (table,) = tables(tmp_path)
     assert cell(table, "a", "torus") == (25.0, None)
-    left_out = [note for note in table.notes if "left out" in note]
-    assert len(left_out) == 2
-    assert all(f"{tmp_path / 'new'} repeats it" in note for note in left_out)
+    omitted = [note for note in table.notes if "is omitted" in note]
+    assert len(omitted) == 2
+    assert all(f"{tmp_path / 'new'} is a newer run" in note for note in omitted)
 
 
 def test_missing_scores_are_missing_in_the_mean_too_and_have_their_reason(tmp_path: Path) -> None:
@@ -182,7 +182,7 @@ def test_a_difference_of_commits_is_told(tmp_path: Path) -> None:
         file = write_run(tmp_path / name, name, 20.0) / "run.json"
         file.write_text(json.dumps({**json.loads(file.read_text()), "commit": commit}))
     (table,) = tables(tmp_path)
-    assert "The runs are of different versions of the code: 1111111, 2222222" in table.notes
+    assert "The runs used different versions of the code: 1111111, 2222222" in table.notes
 
 
 def test_places_are_folders_and_globs_and_runs_without_scores_are_named(tmp_path: Path) -> None:
@@ -197,7 +197,7 @@ def test_places_are_folders_and_globs_and_runs_without_scores_are_named(tmp_path
         find_runs([str(tmp_path / "c")])
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "cell.json").write_text(json.dumps({"state": "failed", "reason": "no space left"}))
-    assert find_runs([str(tmp_path)])[1][1] == f"{tmp_path / 'd'} is left out: it failed: no space left"
+    assert find_runs([str(tmp_path)])[1][1] == f"{tmp_path / 'd'} is omitted: it failed: no space left"
     with pytest.raises(NerfroError, match="nowhere does not exist"):
         find_runs([str(tmp_path / "nowhere")])
 
@@ -346,14 +346,14 @@ def test_command_prints_writes_all_forms_and_refuses_to_overwrite(
 @pytest.mark.parametrize(
     ("override", "said"),
     [
-        ("metrics=[]", "metrics: none is given; choose from psnr"),
+        ("metrics=[]", "metrics: the list is empty; choose from psnr"),
         ("metrics=[psnr,foo]", "'foo' is not a metric; choose from psnr"),
         ("region=x", "choose 'full', 'mask', 'crop'"),
         ("views=-1", "views=-1"),
         ("view={ship: 0}", "'ship' is not a scene of these runs; choose from torus"),
         ("view={torus: 2}", "give 0 to 1"),
-        ("crops={torus: 5}", "does not name squares"),
-        ("crops={torus: [[8,8,9]]}", "does not lie inside 16 x 16 pixels"),
+        ("crops={torus: 5}", "is not in the form"),
+        ("crops={torus: [[8,8,9]]}", "exceeds 16 x 16 pixels"),
         ("runz=[x]", "runz"),
     ],
 )

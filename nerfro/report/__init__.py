@@ -1,1 +1,1 @@
-"""What run folders say together: tables over methods and scenes, and one page with pictures, curves and provenance."""
+"""Comparison of many runs: tables over methods and scenes, and an HTML report."""

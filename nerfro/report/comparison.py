@@ -1,4 +1,4 @@
-"""Runs that can be compared, and their table: methods as rows, scenes and metrics as columns, over seeds."""
+"""Comparison of runs: a table with methods as rows and scenes and metrics as columns, averaged over seeds."""
 
 from __future__ import annotations
 
@@ -10,19 +10,27 @@ from typing import Any, Literal
 from nerfro.errors import NerfroError
 from nerfro.evaluation.results import FULL, METRICS, Metric, Region
 from nerfro.evaluation.tables import MISSING, Column, Row, Table, short
-from nerfro.report.runs import Budget, Run, Scored, shown
+from nerfro.report.runs import Budget, EvaluationSet, Run, shown
 from nerfro.training.settings import TABLE_ROW, settings
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """All runs of one budget."""
+    """All runs with the same budget.
 
-    budget: Budget  # what each was allowed to spend
-    methods: tuple[str, ...]  # titles of the methods, in the order of the table
-    scenes: Mapping[Scored, str]  # what was scored, in the order of the table, with titles
-    cells: Mapping[tuple[str, Scored], tuple[Run, ...]]  # of a method on a scene, one for each seed, by seed
-    notes: tuple[str, ...]  # what a reader has to know
+    Attributes:
+        budget: training budget of each run.
+        methods: titles of the methods, in the order of the table.
+        scenes: titles of the test sets, in the order of the table.
+        cells: runs of a method on a test set, one per seed, sorted by seed.
+        notes: footnotes of the table.
+    """
+
+    budget: Budget
+    methods: tuple[str, ...]
+    scenes: Mapping[EvaluationSet, str]
+    cells: Mapping[tuple[str, EvaluationSet], tuple[Run, ...]]
+    notes: tuple[str, ...]
 
     @property
     def runs(self) -> list[Run]:
@@ -30,17 +38,25 @@ class Comparison:
 
 
 def compare(runs: Sequence[Run], methods: Mapping[str, str], scenes: Mapping[str, str]) -> list[Comparison]:
-    """Sort runs into comparisons, one for each budget; `methods` and `scenes` are titles, in their order.
+    """Group runs by budget, method and test set.
 
-    Runs of one experiment whose configurations differ in more than the seed are different methods, and are told apart
-    by the fields that differ. What has no title follows under its own name.
+    Runs of one experiment whose configurations differ in more than the seed are different methods; the title of each
+    method lists the fields that differ.
+
+    Args:
+        runs: evaluated runs.
+        methods: titles of experiments, in the order of the table. Other experiments follow under their names.
+        scenes: titles of scenes, in the order of the table. Other scenes follow under their names.
+
+    Returns:
+        One comparison per budget.
     """
     budgets = sorted({run.budget for run in runs}, key=lambda b: (b.seconds or 0, b.steps or 0, b.label))
     return [_comparison(budget, [r for r in runs if r.budget == budget], methods, scenes) for budget in budgets]
 
 
 def to_table(comparison: Comparison, metrics: Sequence[Metric], region: Region) -> Table:
-    """The scores of a comparison, means and standard deviations over seeds, the best three marked."""
+    """Tabulate means and standard deviations over seeds, with medals for the best three methods."""
     columns = [
         Column(metric.title, metric.better, metric.decimals, group=title)
         for title in comparison.scenes.values()
@@ -61,17 +77,25 @@ def to_table(comparison: Comparison, metrics: Sequence[Metric], region: Region) 
         if (reason := _reason(run, metric.name, region))
     )
     title = "; ".join(
-        [f"Trained for {comparison.budget.label}", *_what_was_scored(comparison, region), _seeds(comparison)]
+        [
+            f"Trained for {comparison.budget.label}",
+            *_common_description(comparison, region),
+            _describe_seeds(comparison),
+        ]
     )
     mark: Literal["", "medals"] = "medals" if len(rows) > 1 else ""
     return Table(title, "method", tuple(columns), tuple(rows), mark=mark, notes=tuple(notes))
 
 
 def find_metrics(names: Sequence[str]) -> list[Metric]:
-    """The metrics of these names, at least one; a name that is none is refused."""
+    """Return the metrics with the given names.
+
+    Raises:
+        NerfroError: there is no name, or a name is unknown.
+    """
     known = {metric.name: metric for metric in METRICS}
     if not names:
-        raise NerfroError(f"metrics: none is given; choose from {', '.join(known)}")
+        raise NerfroError(f"metrics: the list is empty; choose from {', '.join(known)}")
     for name in names:
         if name not in known:
             raise NerfroError(f"metrics: '{name}' is not a metric; choose from {', '.join(known)}")
@@ -83,23 +107,23 @@ def _comparison(
 ) -> Comparison:
     titles = _method_titles(runs, methods)
     names = {titles[run.folder]: run.name for run in runs}
-    cells: dict[tuple[str, Scored], tuple[Run, ...]] = {}
+    cells: dict[tuple[str, EvaluationSet], tuple[Run, ...]] = {}
     notes = []
     for run in sorted(runs, key=lambda r: (r.seed, -r.evaluated_at)):
-        place = titles[run.folder], run.scored
+        place = titles[run.folder], run.test_set
         others = cells.get(place, ())
         newer = next((other for other in others if other.seed == run.seed), None)
         if newer is None:
             cells[place] = (*others, run)
         else:
-            notes.append(f"{shown(run.folder)} is left out: {shown(newer.folder)} repeats it, and is newer")
+            notes.append(f"{shown(run.folder)} is omitted: {shown(newer.folder)} is a newer run with the same seed")
     commits = sorted({str(run.facts.get("commit"))[:7] for run in runs})
     if len(commits) > 1:
-        notes.append(f"The runs are of different versions of the code: {', '.join(commits)}")
+        notes.append(f"The runs used different versions of the code: {', '.join(commits)}")
     return Comparison(
         budget,
         tuple(sorted(names, key=lambda title: (*_rank(names[title], methods), title))),
-        _scene_titles({run.scored for run in runs}, scenes),
+        _scene_titles({run.test_set for run in runs}, scenes),
         cells,
         tuple(notes),
     )
@@ -110,36 +134,36 @@ def _rank(name: str, order: Mapping[str, str]) -> tuple[int, str]:
 
 
 def _method_titles(runs: Sequence[Run], titles: Mapping[str, str]) -> dict[Any, str]:
-    """Title of each run's method, by folder: its experiment's, with the fields in which its runs on a scene differ."""
+    """Return the title of each run's method, by folder, with the fields that differ among runs on the same test set."""
     named: dict[Any, str] = {}
     for name in {run.name for run in runs}:
         configs = {run.folder: _method(run) for run in runs if run.name == name}
         fields: set[str] = set()
-        for scene in {run.scored for run in runs}:
-            fields |= differing([configs[run.folder] for run in runs if run.name == name and run.scored == scene])
+        for test_set in {run.test_set for run in runs}:
+            fields |= differing([configs[run.folder] for run in runs if run.name == name and run.test_set == test_set])
         for folder, config in configs.items():
-            said = [field for field in sorted(fields) if field in config]
-            values = [f"{field.removesuffix('._target_')}={_value(config[field])}" for field in said]
+            shown_fields = [field for field in sorted(fields) if field in config]
+            values = [f"{field.removesuffix('._target_')}={_value(config[field])}" for field in shown_fields]
             named[folder] = titles.get(name, name) + (f" ({', '.join(values)})" if values else "")
     return named
 
 
 def _method(run: Run) -> dict[str, Any]:
-    """The fields of a configuration that make its method, with what lies in the data's folder named relative to it."""
+    """Return the fields of a configuration that define the method, with paths relative to the data set."""
     root = str(run.config["data"]["root"])
     fields = settings(run.config, TABLE_ROW)
     return {k: v.replace(root, "${data.root}") if isinstance(v, str) else v for k, v in fields.items()}
 
 
 def differing(configs: Sequence[Mapping[str, Any]]) -> set[str]:
-    """The fields whose values differ; those of a part only where the part is of the same class."""
+    """Return the fields with different values. Fields of components are compared within the same class only."""
     fields = set()
     for key in {key for config in configs for key in config}:
-        part = f"{key.rpartition('.')[0]}._target_"
+        target = f"{key.rpartition('.')[0]}._target_"
         values: dict[str, set[str]] = {}
         for config in configs:
-            kind = "" if key == part else str(config.get(part))
-            values.setdefault(kind, set()).add(repr(config.get(key)))
+            cls = "" if key == target else str(config.get(target))
+            values.setdefault(cls, set()).add(repr(config.get(key)))
         if any(len(found) > 1 for found in values.values()):
             fields.add(key)
     return fields
@@ -149,39 +173,36 @@ def _value(value: object) -> str:
     return value.rpartition(".")[2] if isinstance(value, str) and value.startswith("nerfro") else str(value)
 
 
-def _scene_titles(scored: set[Scored], titles: Mapping[str, str]) -> dict[Scored, str]:
-    """Titles of scenes in their order, each with that in which it differs from others of its name, or of all."""
-    ordered = sorted(scored, key=lambda s: (*_rank(s.name, titles), s.root, s.width * s.height, _parts(s)))
+def _scene_titles(test_sets: set[EvaluationSet], titles: Mapping[str, str]) -> dict[EvaluationSet, str]:
+    """Return the titles of test sets in order, each with the properties that distinguish it from the others."""
+    ordered = sorted(test_sets, key=lambda s: (*_rank(s.name, titles), s.root, s.width * s.height, _properties(s)))
     named = {}
     for scene in ordered:
         namesakes = [other for other in ordered if other.name == scene.name]
-        extra = [part for part in _parts(scene) if part and any(part not in _parts(other) for other in ordered)]
+        extra = [p for p in _properties(scene) if p and any(p not in _properties(other) for other in ordered)]
         if len({other.root for other in namesakes}) > 1:
             extra.append(scene.root)
-        extra += [f"{k}={v}" for k, v in scene.reading if len({dict(o.reading).get(k) for o in namesakes}) > 1]
+        extra += [f"{k}={v}" for k, v in scene.options if len({dict(o.options).get(k) for o in namesakes}) > 1]
         named[scene] = ", ".join([titles.get(scene.name, scene.name), *extra])
     return named
 
 
-def _parts(scored: Scored) -> tuple[str, str, str]:
-    """What the pictures are, in words; the last is empty for what is usual."""
-    views = f"{scored.num_views} {scored.split} view{'s' if scored.num_views != 1 else ''}"
-    return (
-        views,
-        f"{scored.width} x {scored.height} pixels",
-        "" if scored.protocol == "8bit" else "not rounded to 8 bits",
-    )
+def _properties(test_set: EvaluationSet) -> tuple[str, str, str]:
+    """Describe the images of a test set; the last text is empty for the default protocol."""
+    views = f"{test_set.num_views} {test_set.split} view{'s' if test_set.num_views != 1 else ''}"
+    protocol = "" if test_set.protocol == "8bit" else "not rounded to 8 bits"
+    return views, f"{test_set.width} x {test_set.height} pixels", protocol
 
 
-def _what_was_scored(comparison: Comparison, region: Region) -> list[str]:
-    """What is the same of all scenes; what differs stands in their titles."""
-    parts = [set(texts) for texts in zip(*map(_parts, comparison.scenes), strict=True)]
-    common = [text for texts in parts if len(texts) == 1 for text in texts if text]
+def _common_description(comparison: Comparison, region: Region) -> list[str]:
+    """Describe the properties that all test sets share; the titles of the test sets contain the others."""
+    properties = [set(texts) for texts in zip(*map(_properties, comparison.scenes), strict=True)]
+    common = [text for texts in properties if len(texts) == 1 for text in texts if text]
     return common + ([f"scores of the {region}"] if region != FULL else [])
 
 
-def _seeds(comparison: Comparison) -> str:
-    """How many runs stand behind the numbers."""
+def _describe_seeds(comparison: Comparison) -> str:
+    """Describe the number of runs per score."""
     counts = {place: len(runs) for place, runs in comparison.cells.items()}
     if set(counts.values()) == {1}:
         return "one run each"
@@ -194,7 +215,7 @@ def _seeds(comparison: Comparison) -> str:
 
 
 def _score(runs: Sequence[Run], metric: str, region: Region) -> tuple[float | None, float | None]:
-    """Mean and sample standard deviation over runs; None where a run has no value, or where there is one run."""
+    """Return mean and sample standard deviation over runs; None for missing values or a single run."""
     values = [run.metrics.result.mean(metric, region) for run in runs]
     present = [value for value in values if value is not None]
     if not present or len(present) < len(values):
@@ -203,7 +224,7 @@ def _score(runs: Sequence[Run], metric: str, region: Region) -> tuple[float | No
 
 
 def _reason(run: Run, metric: str, region: Region) -> str | None:
-    """Why a run has no value of a metric."""
+    """Return the reason why a run lacks a metric, or None if it has the metric."""
     if run.metrics.result.mean(metric, region) is not None:
         return None
     notes = run.metrics.result.notes

@@ -1,4 +1,4 @@
-"""Training curves of several runs, as small charts in one coordinate system each."""
+"""Training curves of several runs, drawn as small charts."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.ticker import LogLocator, MaxNLocator
 
-# Where conf/logger/ has Lightning's CSV logger write.
+# File of the CSV logger of Lightning, see conf/logger/.
 CURVES_FILE = Path("csv", "metrics.csv")
 FIRST = ("train/psnr", "val/psnr", "loss/total")
-MAX_POINTS = 200  # of a line; more cannot be told apart at the size of a chart
+MAX_POINTS = 200  # maximum number of points per line; a chart has only about 300 pixels
 
 WIDTH, HEIGHT = 320, 200
 LEFT, RIGHT, TOP, BOTTOM = 46, 10, 8, 22  # margins
@@ -22,7 +22,7 @@ LEFT, RIGHT, TOP, BOTTOM = 46, 10, 8, 22  # margins
 
 @dataclass(frozen=True)
 class Tick:
-    """A line of a chart's grid: where, in the chart's units, and what is written at it."""
+    """A grid line of a chart: position in chart units, and label."""
 
     at: float
     text: str
@@ -30,7 +30,7 @@ class Tick:
 
 @dataclass(frozen=True)
 class Line:
-    """A polyline as SVG's `points`, and the number of its method; a single point is given twice."""
+    """A polyline in the format of SVG `points`, with the index of its method. A single point is repeated."""
 
     method: int
     points: str
@@ -39,22 +39,29 @@ class Line:
 
 @dataclass(frozen=True)
 class Chart:
-    """One quantity over the optimisation steps."""
+    """A quantity as a function of the optimisation step.
 
-    name: str  # of the quantity
-    logarithmic: bool  # whether values are drawn on a logarithmic scale
-    x_ticks: tuple[Tick, ...]  # the grid
+    Attributes:
+        name: name of the quantity.
+        logarithmic: whether the vertical axis is logarithmic.
+        x_ticks, y_ticks: grid lines.
+        lines: one line per run that logged the quantity.
+    """
+
+    name: str
+    logarithmic: bool
+    x_ticks: tuple[Tick, ...]
     y_ticks: tuple[Tick, ...]
-    lines: tuple[Line, ...]  # one for each run that recorded the quantity
+    lines: tuple[Line, ...]
 
 
 Curve = tuple[np.ndarray, np.ndarray]  # steps and values
 
 
 def read_curves(folder: Path) -> dict[str, Curve]:
-    """What a run logged, by name; empty if it kept no CSV log.
+    """Read the logged quantities of a run by name; empty without a CSV log.
 
-    Rows that cannot be read, such as the last one of a run that was killed, are left out.
+    Unreadable rows are skipped, such as the last row of an interrupted run.
     """
     points: dict[str, dict[int, float]] = {}
     if (folder / CURVES_FILE).is_file():
@@ -72,7 +79,7 @@ def read_curves(folder: Path) -> dict[str, Curve]:
 
 
 def draw_charts(runs: Sequence[tuple[int, Mapping[str, Curve]]]) -> list[Chart]:
-    """Charts of PSNR and of every loss, from the number of the method, and what was logged, of each run."""
+    """Create charts of PSNR and of all losses; `runs` contains method index and curves of each run."""
     names = {name for _, curves in runs for name in curves}
     ordered = [name for name in FIRST if name in names] + sorted(names - set(FIRST))
     charts = (_chart(name, [(method, curves[name]) for method, curves in runs if name in curves]) for name in ordered)
@@ -89,7 +96,7 @@ def _chart(name: str, curves: Sequence[tuple[int, Curve]]) -> Chart:
     last = max(float(steps[-1]) for _, (steps, _) in kept)
     values = np.concatenate([values for _, (_, values) in kept])
     low, high = float(values.min()), float(values.max())
-    if low == high:  # a range of no height has no scale
+    if low == high:  # an empty range has no scale
         low, high = (low / 1.1, high * 1.1) if logarithmic else (low - 0.5, high + 0.5)
     if logarithmic:
         low, high = math.log10(low), math.log10(high)
@@ -118,7 +125,7 @@ def _chart(name: str, curves: Sequence[tuple[int, Curve]]) -> Chart:
 
 
 def _thin(steps: np.ndarray, values: np.ndarray) -> Curve:
-    """Means over equal numbers of neighbours, so that no more than `MAX_POINTS` are left."""
+    """Average neighbouring points, so that at most `MAX_POINTS` remain."""
     if len(steps) <= MAX_POINTS:
         return steps, values
     groups = np.array_split(np.arange(len(steps)), MAX_POINTS)
@@ -126,7 +133,7 @@ def _thin(steps: np.ndarray, values: np.ndarray) -> Curve:
 
 
 def _log_ticks(low: float, high: float) -> list[float]:
-    """Powers of ten, or where there are fewer than three of them also their double and fivefold."""
+    """Return powers of ten; if there are fewer than three, also twice and five times these."""
     for subs in ((1.0,), (1.0, 2.0, 5.0)):
         ticks = [float(v) for v in LogLocator(subs=subs, numticks=12).tick_values(low, high) if low <= v <= high]
         if len(ticks) >= 3:
@@ -135,7 +142,7 @@ def _log_ticks(low: float, high: float) -> list[float]:
 
 
 def _number(text: str | None) -> float | None:
-    """A finite number, or None."""
+    """Parse a finite number; returns None for any other text."""
     try:
         value = float(text or "nan")
     except ValueError:

@@ -1,4 +1,4 @@
-"""TensorBoard on the logs of many runs, each under a name that tells what it is."""
+"""TensorBoard for the logs of many runs, with descriptive run names."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from nerfro.errors import NerfroError
 from nerfro.files.foreign_config import foreign_config
 from nerfro.training.sweeps import scene_name
 
-_LOGS = "tensorboard"  # the folder in a run folder, see conf/logger/tensorboard.yaml
-LOOK_AGAIN = 5.0  # seconds between two searches for new runs
+_LOGS = "tensorboard"  # subfolder of a run folder, see conf/logger/tensorboard.yaml
+SEARCH_INTERVAL = 5.0  # seconds between two searches for new runs
 
 
 @dataclass
 class DashboardConfig:
-    """Options of `nerfro.dashboard`; conf/dashboard.yaml gives and explains the defaults."""
+    """Options of `nerfro.dashboard`; conf/dashboard.yaml documents the defaults."""
 
     outputs: str = MISSING
     host: str = MISSING
@@ -35,9 +35,12 @@ class DashboardConfig:
 
 
 def link_runs(outputs: Path, names: Path) -> int:
-    """Link the logs of every run at any depth of `outputs` into the folder `names`, and return the number of runs.
+    """Link the logs of every run below `outputs` into the folder `names`, because TensorBoard names runs by folder.
 
-    TensorBoard calls runs by folders. Links that are there stay; where links are not allowed, copies are made and grow.
+    Existing links remain. If links are not allowed, the logs are copied, and new content is appended on each call.
+
+    Returns:
+        Number of runs.
     """
     logs = sorted(path for path in outputs.rglob(_LOGS) if path.is_dir())
     for path in logs:
@@ -49,14 +52,14 @@ def link_runs(outputs: Path, names: Path) -> int:
             if not link.exists():
                 link.symlink_to(path.resolve(), target_is_directory=True)
                 continue
-        except OSError:  # Windows lets administrators alone make links
+        except OSError:  # on Windows, only administrators may create links
             link.mkdir()
         _copy_new(path, link)
     return len(logs)
 
 
 def _copy_new(logs: Path, copies: Path) -> None:
-    """Append to copies of files that only grow what they do not have yet."""
+    """Append the new content of log files, which only grow, to the copies."""
     for path in logs.glob("events.*"):
         with path.open("rb") as source, (copies / path.name).open("ab") as copy:
             source.seek(copy.tell())
@@ -64,41 +67,45 @@ def _copy_new(logs: Path, copies: Path) -> None:
 
 
 def run_name(folder: Path, outputs: Path) -> str:
-    """`experiment/scene/` and what tells the run from others: where it lies in `outputs`, without what was said."""
+    """Return the run name `experiment/scene/...`, followed by the path within `outputs` without repetitions."""
     rest = folder.relative_to(outputs).parts
     try:
         path = folder / "config.yaml"
         config = foreign_config(path.read_text(encoding="utf-8"), path)
         name, scene = _as_folder(config.name), _as_folder(scene_name(config.data.root))
-    # No run of ours, or one that is just being written.
+    # The folder is not a run of nerfro, or its configuration is incomplete at this moment.
     except (OSError, UnicodeDecodeError, OmegaConfBaseException, AttributeError, NerfroError):
         return "/".join(rest) or folder.resolve().name
-    said = {name, "sweeps"}
-    return "/".join([name, scene, *(part.removeprefix(f"{name}-{scene}-") for part in rest if part not in said)])
+    repeated = {name, "sweeps"}
+    return "/".join([name, scene, *(part.removeprefix(f"{name}-{scene}-") for part in rest if part not in repeated)])
 
 
 def _as_folder(name: str) -> str:
-    """A name from a run's file as that of one folder: it leads nowhere else."""
+    """Convert a name to a single folder name, so that it cannot refer to another place."""
     return re.sub(r"[^\w.=+-]+", "_", str(name)).strip(".") or "_"
 
 
 def serve(logs: Path, host: str, port: int) -> str:
-    """Start TensorBoard in the background and return its address."""
+    """Start TensorBoard in the background and return its address.
+
+    Raises:
+        NerfroError: the host or port cannot be used.
+    """
     from tensorboard import program
     from tensorboard.util import tb_logging
 
     try:
         socket.getaddrinfo(host, None)
     except OSError as error:
-        raise NerfroError(f"host={host} is no address of this machine ({error.strerror}); try localhost") from error
-    # Its warning about reduced functions without TensorFlow; nothing here needs it.
+        raise NerfroError(f"host={host} is not an address of this machine ({error.strerror}); try localhost") from error
+    # Suppress the warning about features that require TensorFlow, which are not used here.
     tb_logging.get_logger().setLevel(logging.ERROR)
     server = program.TensorBoard()
-    server.configure(logdir=str(logs), host=host, port=port, reload_interval=LOOK_AGAIN)
-    with contextlib.redirect_stderr(io.StringIO()):  # its advice to its own users
+    server.configure(logdir=str(logs), host=host, port=port, reload_interval=SEARCH_INTERVAL)
+    with contextlib.redirect_stderr(io.StringIO()):  # suppress the advice to users of the TensorBoard command
         try:
             return server.launch()
         except program.TensorBoardServerException as error:
             raise NerfroError(
-                f"{host}:{port} cannot be served on ({error.msg}); give another port, or port=0"
+                f"{host}:{port} is not available ({error.msg}); give another port, or port=0 for any free port"
             ) from error

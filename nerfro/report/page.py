@@ -1,4 +1,4 @@
-"""One HTML page on many runs, with everything it needs inside: tables, curves, pictures and provenance."""
+"""Self-contained HTML report of many runs: tables, training curves, images and provenance."""
 
 from __future__ import annotations
 
@@ -20,25 +20,33 @@ from nerfro.report import curves
 from nerfro.report.comparison import Comparison
 from nerfro.report.curves import Chart, draw_charts, read_curves
 from nerfro.report.runs import Run, device, duration, shown
-from nerfro.report.views import JPEG_QUALITY, PNG_SIDE, ScenePictures, Wanted, data_uri, scene_pictures
+from nerfro.report.views import JPEG_QUALITY, PNG_SIDE, SceneImages, Selection, data_uri, scene_images
 
 _TEMPLATES = PACKAGE_DIR / "report"
 
 
 @dataclass(frozen=True)
 class SceneSection:
-    """What the page says about one scene of a comparison."""
+    """Section of one scene.
 
-    id: str  # of the section, unique on the page
-    title: str  # of the scene
-    charts: Sequence[Chart]  # training curves
-    pictures: ScenePictures | None  # views, or None if they cannot be shown
-    reason: str  # why they cannot
+    Attributes:
+        id: unique identifier on the page.
+        title: title of the scene.
+        charts: training curves.
+        images: views, or None if these cannot be shown.
+        reason: reason for missing views.
+    """
+
+    id: str
+    title: str
+    charts: Sequence[Chart]
+    images: SceneImages | None
+    reason: str
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """How one run came to be, as text."""
+    """Origin of one run, as text."""
 
     method: str
     scene: str
@@ -50,7 +58,7 @@ class Provenance:
 
 @dataclass(frozen=True)
 class Section:
-    """What the page says about the runs of one budget."""
+    """Section of the runs with one budget."""
 
     id: str
     title: str
@@ -60,15 +68,15 @@ class Section:
     runs: Sequence[Provenance]
 
 
-def report_page(compared: Sequence[tuple[Comparison, Table]], unfinished: Sequence[str], wanted: Wanted) -> str:
-    """Write the page, with a line on each run that is not evaluated."""
+def report_page(compared: Sequence[tuple[Comparison, Table]], unfinished: Sequence[str], selection: Selection) -> str:
+    """Create the page; `unfinished` contains one line about each run without scores."""
     sections = [
         Section(
             id=f"b{number}",
             title=f"Trained for {comparison.budget.label}",
             methods=comparison.methods,
             table=Markup(to_html(table)),
-            scenes=_scenes(f"b{number}", comparison, wanted),
+            scenes=_scenes(f"b{number}", comparison, selection),
             runs=[_provenance(comparison, run) for run in comparison.runs],
         )
         for number, (comparison, table) in enumerate(compared)
@@ -86,24 +94,24 @@ def report_page(compared: Sequence[tuple[Comparison, Table]], unfinished: Sequen
 
 
 def table_page(table: Table) -> str:
-    """A page with nothing but a table."""
+    """Create a page with a single table."""
     return fill_template(_TEMPLATES / "table.html.jinja", title=table.title, table=Markup(to_html(table)))
 
 
-def _scenes(prefix: str, comparison: Comparison, wanted: Wanted) -> list[SceneSection]:
+def _scenes(prefix: str, comparison: Comparison, selection: Selection) -> list[SceneSection]:
     sections = []
-    for number, (scored, title) in enumerate(comparison.scenes.items()):
-        pictures, reason = None, ""
+    for number, (test_set, title) in enumerate(comparison.scenes.items()):
+        images, reason = None, ""
         try:
-            pictures = scene_pictures(comparison, scored, wanted)
-        except NerfroError as error:  # data that has moved away does not spoil the rest of the page
+            images = scene_images(comparison, test_set, selection)
+        except NerfroError as error:  # a missing data set does not prevent the rest of the page
             reason = str(error)
         logged = [
             (method, read_curves(run.folder))
             for method, name in enumerate(comparison.methods)
-            for run in comparison.cells.get((name, scored), ())
+            for run in comparison.cells.get((name, test_set), ())
         ]
-        sections.append(SceneSection(f"{prefix}s{number}", title, draw_charts(logged), pictures, reason))
+        sections.append(SceneSection(f"{prefix}s{number}", title, draw_charts(logged), images, reason))
     return sections
 
 
@@ -113,15 +121,15 @@ def _provenance(comparison: Comparison, run: Run) -> Provenance:
     commit = facts.get("commit") or "not a git checkout"
     texts: dict[str, Any] = {
         "command": facts["command"],
-        "commit": f"{commit}, with changes kept in git.diff" if facts.get("modified") else commit,
+        "commit": f"{commit}, with the changes in git.diff" if facts.get("modified") else commit,
         "device": device(run.config, facts),
         "spent": _spent(metrics.steps, metrics.train_seconds, metrics.rays_per_second),
         "versions": ", ".join(f"{name} {version}" for name, version in facts["versions"].items() if version),
         "python": facts["python"],
     }
     config = OmegaConf.to_yaml(OmegaConf.create(json.loads(json.dumps(run.config))))
-    method, scored = place
-    return Provenance(method, comparison.scenes[scored], run.seed, shown(run.folder), texts, config)
+    method, test_set = place
+    return Provenance(method, comparison.scenes[test_set], run.seed, shown(run.folder), texts, config)
 
 
 def _spent(steps: int | None, seconds: float | None, rays_per_second: float | None) -> str:

@@ -1,4 +1,4 @@
-"""Run folders as other tools see them: what was trained at which cost, and what it scored."""
+"""Reader of run folders: configuration, training budget and scores of each run."""
 
 from __future__ import annotations
 
@@ -23,26 +23,33 @@ from nerfro.paths import EMBEDDED_PREFIX, user_path
 from nerfro.training.run_folder import CELL_FILE
 from nerfro.training.sweeps import scene_name
 
-_FACTS = {"command", "machine", "python", "threads", "versions"}  # of run.json
+_FACTS = {"command", "machine", "python", "threads", "versions"}  # required keys of run.json
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What a training was allowed to spend; only runs of one budget can be compared."""
+    """Training budget. Only runs with the same budget are compared.
 
-    seconds: float | None  # wall-clock time, None if it was not limited
-    steps: int | None  # optimisation steps, None if they were not limited
-    rays: int | None  # of a step; None if only the time was limited
-    device: str | None  # on which the time was spent; None if only steps were limited: they cost the same everywhere
+    Attributes:
+        seconds: limit of the wall-clock time in seconds, or None.
+        steps: limit of the optimisation steps, or None.
+        rays: rays per step, or None without a limit of steps.
+        device: device, or None without a limit of time, because steps are comparable between devices.
+    """
+
+    seconds: float | None
+    steps: int | None
+    rays: int | None
+    device: str | None
 
     @property
     def file_name(self) -> str:
-        """The label as a file name, without suffix."""
+        """Label as a file name without suffix."""
         return re.sub(r"\W+", "_", self.label.replace(",", "")).strip("_")
 
     @property
     def label(self) -> str:
-        """As in "4 min on 1 CPU thread (x86_64)" or "200,000 steps of 1,024 rays"."""
+        """Description, such as "4 min on 1 CPU thread (x86_64)" or "200,000 steps of 1,024 rays"."""
         steps = "" if self.steps is None else f"{self.steps:,} steps of {self.rays:,} rays"
         if self.seconds is None:
             return steps
@@ -50,50 +57,79 @@ class Budget:
 
 
 @dataclass(frozen=True)
-class Scored:
-    """What a run was scored on; scores of different ones are different quantities."""
+class EvaluationSet:
+    """Images that a run was scored on. Scores on different test sets are not comparable.
 
-    root: str  # folder of the data
-    split: str  # of the data
-    num_views: int  # pictures that were scored
-    width: int  # of the pictures, in pixels
+    Attributes:
+        root: folder of the data set.
+        split: split of the data set.
+        num_views: number of scored images.
+        width, height: size of the images in pixels.
+        protocol: "8bit" or "float", see `EvaluationResult`.
+        options: other options of the data format, except the bounds of rays.
+    """
+
+    root: str
+    split: str
+    num_views: int
+    width: int
     height: int
-    protocol: str  # "8bit" or "float", see `EvaluationResult`
-    reading: tuple[tuple[str, str], ...]  # options of the data source, apart from the folder and the range of its rays
+    protocol: str
+    options: tuple[tuple[str, str], ...]
 
     @property
     def name(self) -> str:
-        """Last part of the folder's name."""
+        """Name of the scene: the last component of the folder."""
         return scene_name(self.root)
 
 
 @dataclass(frozen=True)
 class Run:
-    """An evaluated run."""
+    """An evaluated run.
 
-    folder: Path  # where it lies
-    name: str  # of its experiment
-    seed: int  # of its random draws
-    config: Mapping[str, Any]  # its resolved configuration
-    facts: Mapping[str, Any]  # its run.json: command, commit, versions and machine
-    metrics: RunMetrics  # scores and what was spent
-    budget: Budget  # what it was allowed to spend
-    scored: Scored  # what it was scored on
-    evaluated_at: float  # when its scores were written, seconds since the epoch
+    Attributes:
+        folder: run folder.
+        name: name of the experiment.
+        seed: random seed.
+        config: resolved configuration.
+        facts: content of run.json: command, commit, versions and machine.
+        metrics: scores, steps and training time.
+        budget: training budget.
+        test_set: images that were scored.
+        evaluated_at: time of the evaluation, seconds since the epoch.
+    """
+
+    folder: Path
+    name: str
+    seed: int
+    config: Mapping[str, Any]
+    facts: Mapping[str, Any]
+    metrics: RunMetrics
+    budget: Budget
+    test_set: EvaluationSet
+    evaluated_at: float
 
 
 def find_runs(places: Sequence[str]) -> tuple[list[Run], list[str]]:
-    """Read all evaluated runs below some folders, by folder, and say in a line why each other run is left out.
+    """Read all evaluated runs below some folders.
+
+    Args:
+        places: run folders, folders that contain these at any depth, or glob patterns.
+
+    Returns:
+        Evaluated runs sorted by folder, and one line about each run that is omitted.
 
     Raises:
-        NerfroError: a place does not exist, none holds an evaluated run, or a run's files are damaged.
+        NerfroError: a place does not exist, there is no evaluated run, or the files of a run are damaged.
     """
     folders: set[Path] = set()
     for place in places:
         matches = [Path(match) for match in glob.glob(str(user_path(place)), recursive=True)]
         if not matches:
-            raise NerfroError(f"runs: {place} does not exist; give run folders, folders that hold some, or globs")
-        # A cell of a sweep that failed early has nothing but the record of its failure.
+            raise NerfroError(
+                f"runs: {place} does not exist; give run folders, folders that contain these, or glob patterns"
+            )
+        # A run of a sweep that failed early contains only the record of the failure.
         found = (file for match in matches for name in ("run.json", CELL_FILE) for file in match.rglob(name))
         folders |= {file.parent.resolve() for file in found}
     runs, unfinished = [], []
@@ -101,15 +137,15 @@ def find_runs(places: Sequence[str]) -> tuple[list[Run], list[str]]:
         if (folder / "metrics.json").is_file():
             runs.append(read_run(folder))
         else:
-            unfinished.append(f"{shown(folder)} is left out: {_why_unfinished(folder)}")
+            unfinished.append(f"{shown(folder)} is omitted: {_why_unfinished(folder)}")
     if not runs:
-        reason = f"; {unfinished[0]}" if unfinished else "; nerfro.train writes one into every run folder"
+        reason = f"; {unfinished[0]}" if unfinished else "; nerfro.train writes this file into every run folder"
         raise NerfroError(f"runs: no metrics.json beside a run.json below {', '.join(places)}{reason}")
     return runs, unfinished
 
 
 def _why_unfinished(folder: Path) -> str:
-    """The reason that a sweep recorded for a run without scores, if one did."""
+    """Return the reason for a run without scores, if a sweep recorded it."""
     try:
         reason = json.loads((folder / CELL_FILE).read_text(encoding="utf-8"))["reason"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
@@ -123,15 +159,15 @@ def read_run(folder: Path) -> Run:
     try:
         text = (folder / "config.yaml").read_text(encoding="utf-8")
         config: Any = OmegaConf.to_container(foreign_config(text, folder / "config.yaml"))
-        facts = read_json(folder / "run.json", "repair it or leave the run out")
+        facts = read_json(folder / "run.json", "repair it, or omit the run")
         absent = _FACTS - facts.keys()
         if absent:
-            raise NerfroError(f"{folder / 'run.json'} lacks {first_of(sorted(absent))}; leave the run out")
+            raise NerfroError(f"{folder / 'run.json'} lacks {first_of(sorted(absent))}; omit the run")
         data, trainer, root = config["data"], config["trainer"], str(config["data"]["root"])
         view = metrics.result.views[0].name
         with Image.open(folder / "images" / f"{view}.png") as image:
             width, height = image.size
-        reading = sorted((key, str(value)) for key, value in data.items() if key not in ("root", "near", "far"))
+        options = sorted((key, str(value)) for key, value in data.items() if key not in ("root", "near", "far"))
         return Run(
             folder=folder,
             name=str(config["name"]),
@@ -140,29 +176,29 @@ def read_run(folder: Path) -> Run:
             facts=facts,
             metrics=metrics,
             budget=_budget(trainer, int(config["batches"]["size"]), facts),
-            scored=Scored(
+            test_set=EvaluationSet(
                 root=root if root.startswith(EMBEDDED_PREFIX) else str(user_path(root).resolve()),
                 split=str(config["evaluation"]["split"]),
                 num_views=len(metrics.result.views),
                 width=width,
                 height=height,
                 protocol=metrics.result.protocol,
-                reading=tuple(reading),
+                options=tuple(options),
             ),
             evaluated_at=(folder / "metrics.json").stat().st_mtime,
         )
     except OSError as error:
         reason = f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}"
-        raise NerfroError(f"the run {shown(folder)} cannot be read: {reason}; repair it or leave it out") from error
+        raise NerfroError(f"the run {shown(folder)} cannot be read: {reason}; repair or omit it") from error
     except (OmegaConfBaseException, KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
         reason = str(error).strip().split("\n", 1)[0]
         raise NerfroError(
-            f"the run {shown(folder)} is not as nerfro.train writes it ({type(error).__name__}: {reason}); leave it out"
+            f"the run {shown(folder)} is not in the format of nerfro.train ({type(error).__name__}: {reason}); omit it"
         ) from error
 
 
 def duration(seconds: float) -> str:
-    """As in "1 h 30 min", "4 min" or "20 s"."""
+    """Format a duration, such as "1 h 30 min", "4 min" or "20 s"."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     parts = [f"{number} {unit}" for number, unit in ((hours, "h"), (minutes, "min"), (rest, "s")) if number]
@@ -170,12 +206,12 @@ def duration(seconds: float) -> str:
 
 
 def shown(folder: Path) -> str:
-    """A folder as the user would type it: relative to the current one where it lies below it."""
+    """Format a folder relative to the current folder, if it lies below this."""
     return str(folder.relative_to(Path.cwd())) if folder.is_relative_to(Path.cwd()) else str(folder)
 
 
 def device(config: Mapping[str, Any], facts: Mapping[str, Any]) -> str:
-    """What a run was trained on, as in "NVIDIA H200" or "2 CPU threads (x86_64)"."""
+    """Return the training device, such as "NVIDIA H200" or "2 CPU threads (x86_64)"."""
     trainer = config["trainer"]
     if facts.get("gpu") and trainer["accelerator"] != "cpu":
         number = trainer["devices"]

@@ -1,4 +1,4 @@
-"""The pictures of a comparison's page: some views of a scene by every method, their errors, and insets."""
+"""Images of the report: some views of a scene by every method, with error maps and insets."""
 
 from __future__ import annotations
 
@@ -24,27 +24,37 @@ from nerfro.evaluation.results import FULL, METRICS, Metric, Region, Score
 from nerfro.evaluation.tables import MISSING
 from nerfro.files.images import load_png, to_8bit
 from nerfro.report.comparison import Comparison
-from nerfro.report.runs import Run, Scored
+from nerfro.report.runs import EvaluationSet, Run
 from nerfro.training.config import build_data
 
 ERROR_MAPS = ("squared_error", "ssim", "lpips", "lpips_vgg", "flip")
 NUM_CROPS = 2
-CROP_SHARE = 4  # an inset's side is this part of the picture's shorter one
-PNG_SIDE = 256  # pixels; larger pictures are embedded as JPEG, or a page of many would not load
+CROP_DIVISOR = 4  # ratio of the shorter side of an image to the side of an inset
+PNG_SIDE = 256  # pixels; larger images are embedded as JPEG to limit the size of the page
 JPEG_QUALITY = 95
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """Which pictures a page shows."""
+class Selection:
+    """Images that the report shows.
 
-    num_views: int  # of each scene, evenly spread; 0 for all
-    view: Mapping[str, int]  # of the figure, by the scene's name
-    crops: Mapping[str, tuple[Crop, ...]]  # insets of the figure, by the scene's name
-    error_map: str  # one of `ERROR_MAPS`
-    lpips_networks: Mapping[str, LpipsNetwork]  # those that it needs
-    metric: Metric  # whose value stands below each picture
-    region: Region  # that it was measured on
+    Attributes:
+        num_views: number of evenly spread views per scene; 0 for all.
+        view: view of the figure, by scene.
+        crops: insets of the figure, by scene.
+        error_map: one of `ERROR_MAPS`.
+        lpips_networks: networks for the error map.
+        metric: metric shown below each image.
+        region: region of this metric.
+    """
+
+    num_views: int
+    view: Mapping[str, int]
+    crops: Mapping[str, tuple[Crop, ...]]
+    error_map: str
+    lpips_networks: Mapping[str, LpipsNetwork]
+    metric: Metric
+    region: Region
 
     @classmethod
     def of(
@@ -55,8 +65,12 @@ class Wanted:
         error_map: str = "squared_error",
         metric: Metric = METRICS[0],
         region: Region = FULL,
-    ) -> Wanted:
-        """Check the form of what the user gave; `view` and `crops` may be None."""
+    ) -> Selection:
+        """Parse the options of the user; `view` and `crops` may be None.
+
+        Raises:
+            NerfroError: an option has the wrong format, or the error map is unknown or not available.
+        """
         if error_map not in ERROR_MAPS:
             raise NerfroError(f"error_map={error_map} is not an error map; choose from {', '.join(ERROR_MAPS)}")
         networks, reasons = find_lpips_networks() if error_map.startswith("lpips") else ({}, {})
@@ -67,7 +81,7 @@ class Wanted:
         try:
             chosen = {str(scene): int(index) for scene, index in (view or {}).items()}
         except (AttributeError, TypeError, ValueError) as error:
-            raise NerfroError(f"view={view} does not name views of scenes; give {{SCENE: INDEX}}") from error
+            raise NerfroError(f"view={view} is not in the form {{SCENE: INDEX}}; give views by scene") from error
         try:
             insets = {
                 str(scene): tuple(Crop(*map(int, square)) for square in squares)
@@ -75,12 +89,12 @@ class Wanted:
             }
         except (AttributeError, TypeError, ValueError) as error:
             raise NerfroError(
-                f"crops={crops} does not name squares; give {{SCENE: [[TOP, LEFT, SIZE], ...]}} in pixels"
+                f"crops={crops} is not in the form {{SCENE: [[TOP, LEFT, SIZE], ...]}}; give squares in pixels"
             ) from error
         return cls(num_views, chosen, insets, error_map, networks, metric, region)
 
-    def check(self, scenes: Sequence[Scored]) -> None:
-        """Refuse what fits no scene."""
+    def check(self, scenes: Sequence[EvaluationSet]) -> None:
+        """Raise an error for views and crops that do not exist in a scene."""
         named = {scene.name: scene for scene in scenes}
         for name in (*self.view, *self.crops):
             if name not in named:
@@ -93,13 +107,13 @@ class Wanted:
             for crop in self.crops.get(scene.name, ()):
                 if crop.size < 1 or not crop.inside(scene.height, scene.width):
                     raise NerfroError(
-                        f"crops.{scene.name}: {crop} does not lie inside {scene.width} x {scene.height} pixels"
+                        f"crops.{scene.name}: {crop} exceeds {scene.width} x {scene.height} pixels; choose another crop"
                     )
 
 
 @dataclass(frozen=True)
-class Shown:
-    """A picture on the page: what it shows in words, and its value of the metric; the picture itself as a data URI."""
+class PageImage:
+    """An image on the page: label, formatted score, and content as a data URI."""
 
     label: str
     score: str
@@ -108,57 +122,74 @@ class Shown:
 
 @dataclass(frozen=True)
 class View:
-    """A view by all methods that rendered it."""
+    """A view rendered by all methods.
 
-    index: int  # of the view in its split
-    reference: Shown  # the ground truth
-    predictions: Mapping[int, Shown]  # of the methods, by their number in the comparison
-    errors: Mapping[int, Shown]
+    Attributes:
+        index: index of the view in its split.
+        reference: ground truth.
+        predictions, errors: images and error maps, by index of the method in the comparison.
+    """
+
+    index: int
+    reference: PageImage
+    predictions: Mapping[int, PageImage]
+    errors: Mapping[int, PageImage]
 
 
 @dataclass(frozen=True)
-class ScenePictures:
-    """What a page shows of a scene."""
+class SceneImages:
+    """Images of one scene.
 
-    width: int  # of each picture, in pixels
+    Attributes:
+        width, height: size of each image in pixels.
+        views: views to choose from.
+        figure: one of the views, shown as the figure.
+        crops: insets of the figure.
+        error_title: title of the error maps.
+        error_limit: error at the end of the colour scale.
+        methods: titles of the methods by index; methods without a run on this scene are absent.
+        seeds: seeds of the runs that rendered the images.
+    """
+
+    width: int
     height: int
-    views: tuple[View, ...]  # those that can be chosen
-    figure: View  # the view of the figure, one of them
-    crops: tuple[Crop, ...]  # its insets
-    error_title: str  # what the error maps show
-    error_limit: float  # error at the last colour of their scale
-    methods: Mapping[int, str]  # titles by number; those that have not been trained on this scene are absent
-    seeds: Sequence[int]  # of the runs whose pictures these are
+    views: tuple[View, ...]
+    figure: View
+    crops: tuple[Crop, ...]
+    error_title: str
+    error_limit: float
+    methods: Mapping[int, str]
+    seeds: Sequence[int]
 
 
-def scene_pictures(comparison: Comparison, scored: Scored, wanted: Wanted) -> ScenePictures:
-    """Gather the pictures of a scene, of each method those of its first seed, with their scores.
+def scene_images(comparison: Comparison, test_set: EvaluationSet, selection: Selection) -> SceneImages:
+    """Collect the images and scores of a scene, from the first seed of each method.
 
     Raises:
-        NerfroError: the references cannot be read, or a run's pictures are missing or of another size.
+        NerfroError: the references cannot be read, or the images of a run are missing or have another size.
     """
-    cells = [comparison.cells.get((method, scored)) for method in comparison.methods]
+    cells = [comparison.cells.get((method, test_set)) for method in comparison.methods]
     runs = {number: cell[0] for number, cell in enumerate(cells) if cell}
     titles = {number: comparison.methods[number] for number in runs}
     first = next(iter(runs.values()))
-    references: Views = build_data(OmegaConf.create(dict(first.config))).load(scored.split)
+    references: Views = build_data(OmegaConf.create(dict(first.config))).load(test_set.split)
     cameras = references.cameras
-    if (len(references), cameras.height, cameras.width) != (scored.num_views, scored.height, scored.width):
-        raise NerfroError(f"{scored.root} does not hold the views that were scored; has it been changed since?")
-    figure = wanted.view.get(scored.name, _median_view(list(runs.values()), wanted))
-    count = min(wanted.num_views or scored.num_views, scored.num_views)
+    if (len(references), cameras.height, cameras.width) != (test_set.num_views, test_set.height, test_set.width):
+        raise NerfroError(f"{test_set.root} has changed since these views were scored; restore the data set")
+    figure = selection.view.get(test_set.name, _median_view(list(runs.values()), selection))
+    count = min(selection.num_views or test_set.num_views, test_set.num_views)
     views = {
-        index: _view(index, references.images[index], runs, titles, wanted)
-        for index in sorted({round(i) for i in np.linspace(0, scored.num_views - 1, count)} | {figure})
+        index: _view(index, references.images[index], runs, titles, selection)
+        for index in sorted({round(i) for i in np.linspace(0, test_set.num_views - 1, count)} | {figure})
     }
     reference, predictions = references.images[figure], [_prediction(run, figure) for run in runs.values()]
-    error = _error_map(predictions[0], reference, wanted)
-    crops = wanted.crops.get(scored.name)
+    error = _error_map(predictions[0], reference, selection)
+    crops = selection.crops.get(test_set.name)
     if crops is None:
         crops = _choose_crops(reference, predictions)
-    return ScenePictures(
-        width=scored.width,
-        height=scored.height,
+    return SceneImages(
+        width=test_set.width,
+        height=test_set.height,
         views=tuple(views.values()),
         figure=views[figure],
         crops=crops,
@@ -169,37 +200,39 @@ def scene_pictures(comparison: Comparison, scored: Scored, wanted: Wanted) -> Sc
     )
 
 
-def _median_view(runs: Sequence[Run], wanted: Wanted) -> int:
-    """The view whose mean score over methods is the median: neither the best nor the worst that could be shown."""
+def _median_view(runs: Sequence[Run], selection: Selection) -> int:
+    """Return the view whose mean score over methods is the median, so that the figure is representative."""
     scores = []
     for index in range(len(runs[0].metrics.result.views)):
-        values = [_score(run, index, wanted) for run in runs]
+        values = [_score(run, index, selection) for run in runs]
         scores.append(statistics.fmean([value for value in values if value is not None] or [0.0]))
     return scores.index(statistics.median_low(scores))
 
 
-def _score(run: Run, view: int, wanted: Wanted) -> Score:
-    return run.metrics.result.views[view].score(wanted.metric.name, wanted.region)
+def _score(run: Run, view: int, selection: Selection) -> Score:
+    return run.metrics.result.views[view].score(selection.metric.name, selection.region)
 
 
-def _view(index: int, reference: Tensor, runs: Mapping[int, Run], titles: Mapping[int, str], wanted: Wanted) -> View:
-    metric = wanted.metric
+def _view(
+    index: int, reference: Tensor, runs: Mapping[int, Run], titles: Mapping[int, str], selection: Selection
+) -> View:
+    metric = selection.metric
     predictions, errors = {}, {}
     for number, run in runs.items():
-        picture, title = _prediction(run, index), titles[number]
-        value = _score(run, index, wanted)
+        image, title = _prediction(run, index), titles[number]
+        value = _score(run, index, selection)
         score = f"{metric.title} {MISSING if value is None else f'{value:.{metric.decimals}f}'}"
-        error = _error_map(picture, reference, wanted)
-        predictions[number] = Shown(f"{title}, view {index}", score, data_uri(picture))
-        errors[number] = Shown(f"{error.title} of {title}, view {index}", score, data_uri(error.colours()))
-    return View(index, Shown(f"reference, view {index}", "", data_uri(reference)), predictions, errors)
+        error = _error_map(image, reference, selection)
+        predictions[number] = PageImage(f"{title}, view {index}", score, data_uri(image))
+        errors[number] = PageImage(f"{error.title} of {title}, view {index}", score, data_uri(error.colours()))
+    return View(index, PageImage(f"reference, view {index}", "", data_uri(reference)), predictions, errors)
 
 
-def _error_map(prediction: Tensor, reference: Tensor, wanted: Wanted) -> ErrorMap:
-    for found in error_maps(prediction, reference, wanted.lpips_networks):
-        if found.name == wanted.error_map:
+def _error_map(prediction: Tensor, reference: Tensor, selection: Selection) -> ErrorMap:
+    for found in error_maps(prediction, reference, selection.lpips_networks):
+        if found.name == selection.error_map:
             return found
-    raise NerfroError(f"pictures of {list(reference.shape[:2])} pixels are too small for error_map={wanted.error_map}")
+    raise NerfroError(f"images of {list(reference.shape[:2])} pixels are too small for error_map={selection.error_map}")
 
 
 def _prediction(run: Run, index: int) -> Float[Tensor, "H W 3"]:
@@ -207,18 +240,18 @@ def _prediction(run: Run, index: int) -> Float[Tensor, "H W 3"]:
 
 
 def _choose_crops(reference: Tensor, predictions: Sequence[Tensor]) -> tuple[Crop, ...]:
-    size = max(min(reference.shape[:2]) // CROP_SHARE, 1)
+    size = max(min(reference.shape[:2]) // CROP_DIVISOR, 1)
     crops: list[Crop] = []
     for _ in range(NUM_CROPS):
         crops.append(most_different_crop(reference, predictions, size, apart_from=crops))
     return tuple(crops)
 
 
-def data_uri(picture: Float[Tensor, "H W 3"]) -> str:
-    """A picture as text: PNG up to `PNG_SIDE` pixels a side, JPEG beyond."""
-    exact = max(picture.shape[:2]) <= PNG_SIDE
+def data_uri(rgb: Float[Tensor, "H W 3"]) -> str:
+    """Encode an image as a data URI: PNG up to `PNG_SIDE` pixels per side, otherwise JPEG."""
+    exact = max(rgb.shape[:2]) <= PNG_SIDE
     encoded = io.BytesIO()
-    image = Image.fromarray(to_8bit(picture).numpy())
+    image = Image.fromarray(to_8bit(rgb).numpy())
     if exact:
         image.save(encoded, format="PNG", optimize=True)
     else:
