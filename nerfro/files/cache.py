@@ -1,4 +1,4 @@
-"""Arrays that are dear to compute, kept on disk under a hash of everything they depend on."""
+"""Disk cache of expensive arrays, under a hash of all their inputs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -15,20 +15,20 @@ from nerfro.errors import NerfroError
 from nerfro.files.atomic import atomic_file
 from nerfro.paths import user_path
 
-# Bytes of all entries together; those that have not been used for longest go first.
+# Maximum size of all entries in bytes; the least recently used entries are removed first.
 LIMIT = 32 * 2**30
 _ENTRIES = ("distance_*.npz", "occupancy_*.npz", "mapped_*.npy")
 _ABANDONED_SECONDS = 86400.0
-_CHECKSUM = "checksum"  # of an entry's arrays, beside them
+_CHECKSUM = "checksum"  # name of the array that holds the checksum of an entry
 
 
 def cache_dir() -> Path:
-    """Where computed grids are kept: `NERFRO_CACHE`, else ~/.cache/nerfro."""
+    """Return the folder of the cache: the environment variable `NERFRO_CACHE`, or ~/.cache/nerfro."""
     return Path(os.environ.get("NERFRO_CACHE") or "~/.cache/nerfro").expanduser()
 
 
 def content_hash(*parts: np.ndarray | str | float | int | bool) -> str:
-    """Hexadecimal hash of arrays (type, shape and bytes) and plain values, in order."""
+    """Compute a hexadecimal hash of arrays (type, shape and bytes) and plain values, in order."""
     digest = hashlib.sha256()
     for part in parts:
         if isinstance(part, np.ndarray):
@@ -40,12 +40,12 @@ def content_hash(*parts: np.ndarray | str | float | int | bool) -> str:
 
 
 def file_hash(path: Path | str) -> str:
-    """Hexadecimal hash of a file's content."""
+    """Compute a hexadecimal hash of the content of a file."""
     return hashlib.sha256(user_path(path).read_bytes()).hexdigest()[:32]
 
 
 def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write a compressed .npz so that the file is either complete or not there."""
+    """Write a compressed .npz file atomically."""
     with atomic_file(path) as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
@@ -67,7 +67,7 @@ def load_array(path: Path) -> np.ndarray:
 
 @contextlib.contextmanager
 def _reading(path: Path, trouble: str, advice: str) -> Iterator[None]:
-    """Errors within it that tell of a missing or damaged file name it."""
+    """Convert errors about a missing or damaged file to a message that names the file."""
     try:
         yield
     except FileNotFoundError as error:
@@ -80,12 +80,12 @@ def _reading(path: Path, trouble: str, advice: str) -> Iterator[None]:
 def cached_arrays(
     key: str, compute: Callable[[], dict[str, np.ndarray]], enabled: bool = True
 ) -> dict[str, np.ndarray]:
-    """Arrays from the cache, or computed and kept there; a damaged or unwritable cache costs time, never the result.
+    """Return arrays from the cache, or compute and save them. A damaged or unwritable cache only costs time.
 
     Args:
-        key: name of the entry, with a hash of all that the arrays depend on in it.
-        compute: makes the arrays.
-        enabled: whether to read and write the cache at all.
+        key: name of the entry, which contains a hash of all inputs.
+        compute: function that computes the arrays.
+        enabled: whether to use the cache.
     """
     if not enabled:
         return compute()
@@ -103,20 +103,29 @@ def cached_arrays(
 
 
 def make_room(folder: Path, num_bytes: int) -> None:
-    """Remove what killed processes left, and what was used longest ago while there would be more than the limit.
+    """Remove partial files of killed processes, and the least recently used entries above the size limit.
 
-    A process that has a file mapped keeps it after it is removed.
+    Other processes may remove entries at the same time. A process that has mapped an entry into memory keeps the data.
     """
     for pattern in _ENTRIES:
-        for partial in folder.glob(f".{pattern}*.partial"):
-            if time.time() - partial.stat().st_mtime > _ABANDONED_SECONDS:
+        for partial, status in _statuses(folder.glob(f".{pattern}*.partial")):
+            if time.time() - status.st_mtime > _ABANDONED_SECONDS:
                 partial.unlink(missing_ok=True)
-    files = [path for pattern in _ENTRIES for path in folder.glob(pattern)]
-    total = num_bytes + sum(path.stat().st_size for path in files)
-    for path in sorted(files, key=lambda path: path.stat().st_mtime):
+    entries = _statuses(path for pattern in _ENTRIES for path in folder.glob(pattern))
+    total = num_bytes + sum(status.st_size for _, status in entries)
+    for path, status in sorted(entries, key=lambda entry: entry[1].st_mtime):
         if total > LIMIT:
-            total -= path.stat().st_size
+            total -= status.st_size
             path.unlink(missing_ok=True)
+
+
+def _statuses(paths: Iterable[Path]) -> list[tuple[Path, os.stat_result]]:
+    """Query the status of files; files that have just been removed are left out."""
+    found = []
+    for path in paths:
+        with contextlib.suppress(FileNotFoundError):
+            found.append((path, path.stat()))
+    return found
 
 
 def _checksum(arrays: Mapping[str, np.ndarray]) -> str:

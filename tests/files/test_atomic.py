@@ -32,6 +32,13 @@ def test_text_is_utf8_and_has_the_permissions_of_other_new_files(tmp_path: Path)
     assert len(modes) == 1
 
 
+def test_the_permissions_of_new_files_in_other_threads_are_not_touched(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "umask", lambda mask: pytest.fail("the umask belongs to the whole process"))
+    write_atomically(tmp_path / "table.md", "PSNR")
+
+
 def test_folder_that_cannot_be_made_is_an_error_of_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(NerfroError, match="cannot write") as caught:

@@ -81,6 +81,25 @@ def test_cache_does_not_grow_without_end(tmp_path: Path, monkeypatch: pytest.Mon
     assert sorted(path.name for path in tmp_path.iterdir()) == ["distance_4.npz", "mine.npz"]
 
 
+def test_entries_that_another_process_removes_meanwhile_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("distance_0.npz", "distance_1.npz", ".distance_2.npz.partial"):
+        (tmp_path / name).write_bytes(bytes(10))
+    listed = Path.glob
+
+    def removed_after_listing(folder: Path, pattern: str) -> list[Path]:
+        found = list(listed(folder, pattern))
+        for path in found:
+            if path.name != "distance_1.npz":
+                path.unlink()
+        return found
+
+    monkeypatch.setattr(Path, "glob", removed_after_listing)
+    cache.make_room(tmp_path, 0)
+    assert [path.name for path in tmp_path.iterdir()] == ["distance_1.npz"]
+
+
 def test_a_folder_that_cannot_be_made_costs_only_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("NERFRO_CACHE", str(tmp_path / "file" / "below"))
