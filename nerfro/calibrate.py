@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 from omegaconf import DictConfig
-from rich.progress import track
 
 from nerfro.capture.calibrate_options import CalibrateConfig, check_options, make_target
 from nerfro.capture.calibrated_data import FILES, ray_range, relative, split_views, write_calibrated
@@ -21,6 +20,7 @@ from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing
 from nerfro.paths import user_path
+from nerfro.progress import track
 
 # Limits above which a warning is printed: reprojection error in pixels, and relative deviation of the focal length.
 _MAX_ERROR, _MAX_FOCAL_DEVIATION = 0.7, 0.02
@@ -48,7 +48,7 @@ def main(config: DictConfig) -> None:
     else:
         sightings = {
             image.name: outside(target.find(luminance(image)), mask)
-            for image, mask in zip(track(images, f"looking for {target.feature}"), masks, strict=True)
+            for image, mask in zip(track(f"detecting {target.feature}", images), masks, strict=True)
         }
         calibration = calibrate(sightings, size, config.lens, known, target.min_features, target.feature)
         quads, points = [sheet.corners for sheet in target.sheets()], np.empty((0, 3))

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from tqdm import tqdm
 
 from nerfro.capture.mask_files import (
     MaskConfig,
@@ -57,10 +57,8 @@ def main(config: DictConfig) -> None:
             raise NerfroError(f"{frames[view].name}: the outline or mask is empty; draw it around the object")
     missing = len(frames) - len(done)
     print(f"{len(kept)} existing masks, {len(outlined)} outlines; segmenting {missing} further views")
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns) as progress:
-        task = progress.add_task("cutting out", total=missing)
-        found = propagate(images, cameras, done, config.hull_only, lambda: progress.advance(task))
+    with tqdm(total=missing, desc="segmenting", unit="view", dynamic_ncols=True) as progress:
+        found = propagate(images, cameras, done, config.hull_only, progress.update)
     made = [view for view in range(len(frames)) if view not in kept]
     for view in made:
         save_mask(frames[view], found.masks[view])

@@ -1,4 +1,4 @@
-"""The bars that long work has, outside training."""
+"""Progress bars for long work outside training."""
 
 from __future__ import annotations
 
@@ -6,23 +6,21 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from tqdm import tqdm
 
 Item = TypeVar("Item")
 
-PATIENCE = 2.0  # seconds; what is faster has no bar
+DELAY = 2.0  # seconds after which a bar appears, so that short work has none
+_FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
 
 
-def told(what: str, items: Iterable[Item], total: int | None = None) -> Iterable[Item]:
-    """The items, and on standard error how many of them are done, if they take long."""
-    return tqdm(items, what, total, delay=PATIENCE, dynamic_ncols=True)
+def track(description: str, items: Iterable[Item], total: int | None = None) -> Iterable[Item]:
+    """Iterate over items and show a progress bar with the remaining time on standard error."""
+    return tqdm(items, description, total, delay=DELAY, dynamic_ncols=True)
 
 
 @contextmanager
-def bar(what: str) -> Iterator[Callable[[float], None]]:
-    """A bar with the time left, for what is told the share that is done of it."""
-    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
-    with Progress(*columns) as progress:
-        task = progress.add_task(what, total=1)
-        yield lambda done: progress.update(task, completed=done)
+def bar(description: str) -> Iterator[Callable[[float], None]]:
+    """Show a progress bar with the remaining time; the yielded function sets the completed fraction in [0, 1]."""
+    with tqdm(total=1.0, desc=description, bar_format=_FORMAT, delay=DELAY, dynamic_ncols=True) as progress:
+        yield lambda done: progress.update(done - progress.n)

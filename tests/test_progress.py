@@ -34,10 +34,11 @@ def test_pictures_and_grids_have_bars_once_they_take_long(
         "evaluation.every=0",
         "evaluation.supersample=1",
     ]
+    monkeypatch.setattr(progress, "DELAY", 1e9)
     quick = train_here(*run, f"hydra.run.dir={tmp_path / 'quick'}")
     assert quick.code == 0, quick.err
     assert not [name for name in ("reading", *work) if name in quick.err]
-    monkeypatch.setattr(progress, "PATIENCE", 0)
+    monkeypatch.setattr(progress, "DELAY", 0)
     told = train_here(*run, f"hydra.run.dir={tmp_path / 'told'}")
     assert told.code == 0, told.err
     for name in ("reading", *work):

@@ -22,7 +22,7 @@ from nerfro.camera.least_squares import Told, axes_across, robust_weights
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
 from nerfro.light import to_linear
-from nerfro.progress import told
+from nerfro.progress import track
 from nerfro.rays import Rays
 from nerfro.subdivision import pixel_rays
 
@@ -62,7 +62,7 @@ def align(
     pictures = _reduced(cameras, photographed)
     gains, generator = pictures.new_ones(len(cameras), 3), torch.Generator().manual_seed(0)
     information = None
-    for share, num in told("panorama", _STEPS):
+    for share, num in track("panorama", _STEPS):
         blur = max(share * pictures.shape[-1], _LEAST_BLUR)
         overlap = _overlap(camera, cameras, pictures, of_sky, blur, num, generator)
         if overlap is None:

@@ -18,7 +18,7 @@ from nerfro.cameras import Cameras
 from nerfro.capture.rims import RimFinder
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.progress import told as bar
+from nerfro.progress import track
 
 _STEPS = 8
 _LONGEST = 2.0  # pixels that a camera is moved in a step, at most
@@ -60,7 +60,7 @@ def meet_outlines(
     begun = camera.numbers()
     given = Told(begun, torch.eye(len(begun)).to(begun) / _GIVEN**2)
     finder = RimFinder(mesh, silhouettes)
-    for step in bar("outlines", range(_STEPS + 1)):
+    for step in track("outlines", range(_STEPS + 1)):
         slopes, error, weights, view = _seen(camera, cameras, reduced, finder)
         variance = float((weights * error[:, 0].square()).sum() / weights.sum()) + _LEAST**2
         if step < _STEPS:

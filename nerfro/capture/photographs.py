@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from rich.progress import track
 
 from nerfro.capture.targets import Sighting
 from nerfro.data.frames import list_images
 from nerfro.data.image_files import read_mask, read_rgb, to_unit
 from nerfro.errors import NerfroError
 from nerfro.light import to_linear
+from nerfro.progress import track
 
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear sRGB (ITU-R BT.709)
 
@@ -24,7 +24,7 @@ def list_photographs(folder: Path) -> tuple[list[Path], tuple[int, int]]:
     repeated = [stem for stem, count in Counter(image.stem for image in images).items() if count > 1]
     if repeated:
         raise NerfroError(f"{folder} contains several images named {repeated[0]}; keep one of each name")
-    shapes = {image: read_rgb(image, "drop").shape[1::-1] for image in track(images, "reading")}
+    shapes = {image: read_rgb(image, "drop").shape[1::-1] for image in track("reading", images)}
     ((size, _),) = Counter(shapes.values()).most_common(1)
     odd = next((image for image in images if shapes[image] != size), None)
     if odd is not None:

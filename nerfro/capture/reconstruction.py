@@ -13,8 +13,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 from PIL import Image
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn, track
 from scipy.ndimage import binary_dilation
+from tqdm import tqdm
 
 from nerfro.capture.calibration import Intrinsics, LensModel
 from nerfro.capture.model_import import require_pycolmap
@@ -22,6 +22,7 @@ from nerfro.data.image_files import read_mask, to_unit
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing
 from nerfro.paths import user_path
+from nerfro.progress import track
 
 Pairs = Literal["sequential", "all"]
 
@@ -182,22 +183,25 @@ def _map(
         options.ba_refine_principal_point = False
     options.random_seed, options.num_threads = _SEED, threads
     folder.mkdir(parents=True, exist_ok=True)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns) as progress:
-        task = progress.add_task("placing cameras", total=len(images))
+    with tqdm(total=len(images), desc="registering images", unit="image", dynamic_ncols=True) as progress:
+
+        def advance(count: int = 1) -> None:
+            # Registrations in a model that COLMAP discards are counted again in the next one.
+            progress.update(min(count, len(images) - progress.n))
+
         return pycolmap.incremental_mapping(
             database,
             images[0].parent,
             folder,
             options,
-            initial_image_pair_callback=lambda: progress.advance(task, 2),
-            next_image_callback=lambda: progress.advance(task),
+            initial_image_pair_callback=lambda: advance(2),
+            next_image_callback=advance,
         )
 
 
 def _chunks(items: Sequence[Any], size: int, description: str) -> Iterator[Sequence[Any]]:
     starts = range(0, len(items), size)
-    return (items[start : start + size] for start in track(starts, description))
+    return (items[start : start + size] for start in track(description, starts))
 
 
 def _num_registered(models: dict[int, Any]) -> int:

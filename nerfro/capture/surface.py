@@ -5,19 +5,27 @@ from __future__ import annotations
 import numpy as np
 import torch
 from jaxtyping import Float
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from nerfro.capture.pose_conventions import overlap
 from nerfro.capture.revolution import Symmetry, fit_revolution
 from nerfro.capture.silhouette_fit import fit_surface
 from nerfro.capture.silhouettes import frame_pixels
-from nerfro.capture.visual_hull import Silhouettes, carve_grid, extract_surface, find_box, reaches_border, remove_strays
+from nerfro.capture.visual_hull import (
+    NUM_LEVELS,
+    Silhouettes,
+    carve_grid,
+    extract_surface,
+    find_box,
+    reaches_border,
+    remove_strays,
+)
 from nerfro.cli import warn
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError, first_of
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
+from nerfro.progress import bar
 
 _FEWEST_VIEWS, _FEW_VIEWS = 3, 12
 _COARSE_VOXELS = 64
@@ -100,20 +108,19 @@ def make_mesh(
         symmetry: also fit a body of revolution. `auto` uses this body if its overlap with the masks is at least as
             large, `axis` also if the overlap is slightly smaller.
     """
-    with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()) as progress:
-        box = object_box(silhouettes, wrong_masks) if corners is None else corners
-        carving = progress.add_task("carving", total=3)
+    box = object_box(silhouettes, wrong_masks) if corners is None else corners
+    with bar("carving") as progress:
         distances, corner, spacing = carve_grid(
-            silhouettes, box, resolution, wrong_masks, lambda done: progress.update(carving, completed=done)
+            silhouettes, box, resolution, wrong_masks, lambda level: progress(level / NUM_LEVELS)
         )
-        num_parts, num_kept = remove_strays(distances, keep)
-        mesh = extract_surface(distances, corner, spacing)
-        if smoothing > 0:
-            fitting = progress.add_task("fitting", total=1)
-            mesh = fit_surface(mesh, silhouettes, smoothing, lambda done: progress.update(fitting, completed=done))
-        if symmetry is not None:
-            turning = progress.add_task("finding the axis", total=1)
-            revolution = fit_revolution(mesh, silhouettes, lambda done: progress.update(turning, completed=done))
+    num_parts, num_kept = remove_strays(distances, keep)
+    mesh = extract_surface(distances, corner, spacing)
+    if smoothing > 0:
+        with bar("fitting") as progress:
+            mesh = fit_surface(mesh, silhouettes, smoothing, progress)
+    if symmetry is not None:
+        with bar("finding the axis") as progress:
+            revolution = fit_revolution(mesh, silhouettes, progress)
     if symmetry is not None:
         mesh = _choose_symmetry(revolution, mesh, silhouettes, symmetry)
     if num_kept < num_parts:

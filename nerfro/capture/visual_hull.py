@@ -21,6 +21,7 @@ from nerfro.geometry.mesh import TriangleMesh, merge_vertices
 
 # Number of refinements. Each halves the voxels and evaluates only voxels near the surface of the coarser level.
 _LEVELS = 2
+NUM_LEVELS = _LEVELS + 1
 # Width of the neighbourhood in voxels of the coarser level, more than a voxel's diagonal.
 _BAND = 2.0
 # Components below this fraction of the volume of the largest component are removed.

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from nerfro.cameras import Cameras
 from nerfro.data.lazy_images import LazyImages
-from nerfro.progress import told
+from nerfro.progress import track
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Views:
         """
         for images in (self.images, self.masks):
             if isinstance(images, LazyImages):
-                deque(told("reading", images.all_levels(), len(images)), maxlen=0)
+                deque(track("reading", images.all_levels(), len(images)), maxlen=0)
         return self
 
 

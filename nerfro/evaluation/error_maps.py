@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.flip import flip_map
+from nerfro.evaluation import flip
 from nerfro.evaluation.lpips import LpipsNetwork
 from nerfro.evaluation.ssim import WINDOW, ssim_map
 from nerfro.files.drawing import GAP, LINE_HEIGHT, colour_scale, fit, magma, paper, write
@@ -72,7 +72,9 @@ def error_maps(
             title = f"LPIPS, {network.backbone.published.title}"
             with torch.no_grad():
                 maps.append(ErrorMap(name, title, network.distance_map(prediction, target), 1.0))
-    return [*maps, ErrorMap("flip", "FLIP", flip_map(prediction, target), 1.0)]
+    if flip.is_available():
+        maps.append(ErrorMap("flip", "FLIP", flip.flip_map(prediction, target), 1.0))
+    return maps
 
 
 def squared_error_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:

@@ -9,12 +9,18 @@ Source:
 
 from __future__ import annotations
 
-import flip_evaluator
+import importlib.util
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfro.evaluation.regions import mean_over
+
+
+def is_available() -> bool:
+    """Test whether flip-evaluator is installed; the package has no wheel for Linux on ARM."""
+    return importlib.util.find_spec("flip_evaluator") is not None
 
 
 def flip_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
@@ -27,6 +33,8 @@ def flip_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"])
     Returns:
         Values in [0, 1], float32; 0 for an invisible difference.
     """
+    import flip_evaluator  # not available on every platform, see `is_available`
+
     images = [image.detach().cpu().float().contiguous().numpy() for image in (target, prediction)]
     errors, _, _ = flip_evaluator.evaluate(*images, "LDR", applyMagma=False, computeMeanError=False)
     return torch.from_numpy(errors[..., 0]).to(prediction.device)

@@ -14,6 +14,7 @@ from torchmetrics.utilities import dim_zero_cat
 from nerfro.errors import NerfroError
 from nerfro.evaluation.error_maps import squared_error_map
 from nerfro.evaluation.flip import flip
+from nerfro.evaluation.flip import is_available as flip_available
 from nerfro.evaluation.lpips import LpipsNetwork
 from nerfro.evaluation.regions import crop_rectangle, mean_over, object_pixels
 from nerfro.evaluation.results import FULL, METRICS, OBJECT_REGIONS, EvaluationResult, Region, Score, ViewScores
@@ -178,7 +179,9 @@ class ImageMetrics(torchmetrics.Metric):
 
     def _score(self, prediction: Tensor, target: Tensor, inside: Tensor | None) -> Float[Tensor, "K"]:
         """Compute the scores in the order of `METRICS`; NaN if a network is missing or the image is too small."""
-        metrics: dict[str, ImageMetric] = {"psnr": psnr, "ssim": ssim, "ms_ssim": ms_ssim, "flip": flip}
+        metrics: dict[str, ImageMetric] = {"psnr": psnr, "ssim": ssim, "ms_ssim": ms_ssim}
+        if flip_available():
+            metrics["flip"] = flip
         metrics.update(self.lpips_networks.items())  # type: ignore[arg-type]
         scores = torch.full((len(METRICS),), torch.nan, dtype=torch.float64, device=prediction.device)
         for index, metric in enumerate(METRICS):
@@ -203,6 +206,8 @@ class ImageMetrics(torchmetrics.Metric):
     def _reason(self, metric: str, region: Region) -> str:
         if metric.startswith("lpips") and metric not in self.lpips_networks:
             return self.reasons.get(metric, "no network was given")
+        if metric == "flip" and not flip_available():
+            return "the package flip-evaluator is not installed"
         where = {FULL: "images", "mask": "images or masks", "crop": "crops"}[region]
         return f"{where} below {self.min_sizes[metric]} pixels"
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.kernels.constants import constant
-from nerfro.progress import told
+from nerfro.progress import track
 from nerfro.rays import Rays
 
 
@@ -127,7 +127,7 @@ def smooth(values: Float[Tensor, "X Y Z"], size: int, sigma: float) -> Float[Ten
         )
     taps = torch.exp(-0.5 * ((torch.arange(size, dtype=torch.float64) - size // 2) / sigma) ** 2)
     weights = (taps / taps.sum()).tolist()
-    for axis in told("smoothing", range(3)):
+    for axis in track("smoothing", range(3)):
         # Shifted sums of whole grids: much faster than a convolution with a single channel.
         first, *others = _shifted(values, axis, size // 2)
         values = weights[0] * first

@@ -69,7 +69,10 @@ class MeshIntersector:
             from embreex.mesh_construction import TriangleMesh as EmbreeMesh
             from embreex.rtcore_scene import EmbreeScene
         except ImportError as error:
-            raise NerfroError("sampler.path.interface=mesh needs Embree; pip install embreex, or take =sdf") from error
+            raise NerfroError(
+                f"intersections with triangles need Embree ({error}); pip install embreex (no wheel for Linux on "
+                "ARM), or set sampler.path.interface=sdf"
+            ) from error
         self._scene = EmbreeScene()
         # The scene keeps a pointer to the mesh, not the mesh.
         self._mesh = EmbreeMesh(self._scene, np.asarray(corners, np.float32))

@@ -10,7 +10,7 @@ from numba import prange
 
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.kernels.compilation import compiled, compiled_parallel
-from nerfro.progress import told
+from nerfro.progress import track
 
 PLANES = 16  # of a grid, between two looks of the progress bar
 
@@ -36,7 +36,7 @@ def occupancy_fraction(
         spacing = (end - origin) / (resolution - 1)
         order, starts = triangles_by_plane(triangles, origin[0], spacing[0], resolution, float(spacing[0]))
         counts = np.zeros((resolution,) * 3, np.uint16)
-        for first in told("occupancy", range(0, resolution, PLANES)):
+        for first in track("occupancy", range(0, resolution, PLANES)):
             planes = counts[first : first + PLANES]
             _count_inside(triangles, order, starts[first:], origin, spacing, offsets, first, planes)
         votes.append((counts.astype(np.float32) / subsamples**3).transpose(np.argsort(axes)))

@@ -13,7 +13,7 @@ from nerfro.geometry.mesh import TriangleMesh, require_inside
 from nerfro.geometry.normals import corner_normals
 from nerfro.geometry.occupancy import PLANES, occupancy_fraction, triangles_by_plane
 from nerfro.kernels.compilation import compiled, compiled_parallel
-from nerfro.progress import told
+from nerfro.progress import track
 
 _LEAST_DEPTH = 0.01  # of a vertex in the mesh, voxels
 
@@ -68,7 +68,7 @@ def _distance_to(
     """Distance to the nearest triangle, a lower bound beyond `reach`, and the smooth surface's height over it."""
     order, starts = triangles_by_plane(triangles, origin[0], spacing[0], resolution, reach)
     distance, height = (np.full((resolution,) * 3, value, np.float32) for value in (np.inf, 0.0))
-    for first in told("distances", range(0, resolution, PLANES)):
+    for first in track("distances", range(0, resolution, PLANES)):
         planes = slice(first, first + PLANES)
         found = distance[planes], height[planes]
         _narrow_band(triangles, normals, order, starts[first:], origin, spacing, first, reach, *found)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerfro.fields.base import Field
 from nerfro.models.base import NerfModel
-from nerfro.progress import told
+from nerfro.progress import track
 from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Exits
 
@@ -50,7 +50,7 @@ class BoundaryFirst(Callback):
         first, last = _RATES
         batches = self._batches.to(model.device, learning[0].dtype)
         num_pixels = min(_NUM_PIXELS, int(_SHARE * batches.num_pixels))
-        for step in told("boundary", range(self._num_steps)):
+        for step in track("boundary", range(self._num_steps)):
             rays, view, rgb = batches.missing(box, num_pixels, step, camera)
             if len(rays) < _FEWEST:
                 break

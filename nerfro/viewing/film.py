@@ -1,7 +1,10 @@
-"""Films of frames that are already written."""
+"""Encoding of rendered frames as films."""
 
 from __future__ import annotations
 
+import contextlib
+import shutil
+import subprocess
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -10,37 +13,64 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from nerfro.errors import NerfroError
 from nerfro.files.atomic import atomic_file, write_atomically
 
-# Constant quality of H.264: 0 is lossless, 18 hardly told from it, 51 the worst.
+# Constant rate factor of H.264: 0 is lossless, 18 is visually lossless, 51 is the worst.
 _QUALITY = 18
 
 
 def write_film(file: Path, frames: Sequence[Path], seconds: float) -> None:
-    """Write frames (.png) as .mp4 (H.264, plays everywhere) or as .gif that begins again for ever."""
+    """Encode frames as a film.
+
+    Args:
+        file: output, .mp4 (H.264) or .gif (endless loop).
+        frames: PNG files in order.
+        seconds: duration of the film.
+
+    Raises:
+        NerfroError: no ffmpeg is installed, or encoding fails.
+    """
     writer = {".mp4": _write_mp4, ".gif": _write_gif}[file.suffix]
     writer(file, frames, len(frames) / seconds)
 
 
-def _write_mp4(file: Path, frames: Sequence[Path], rate: float) -> None:
-    # Brings its own encoder.
-    from imageio_ffmpeg import write_frames
+def find_ffmpeg() -> str:
+    """Return the path of ffmpeg: the one of the system, or the one of the package imageio-ffmpeg.
 
-    first = _even(_pixels(frames[0]))
-    options = ["-crf", str(_QUALITY), "-movflags", "+faststart"]
+    Raises:
+        NerfroError: neither is installed.
+    """
+    if (found := shutil.which("ffmpeg")) is not None:
+        return found
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+
+        return get_ffmpeg_exe()
+    except (ImportError, RuntimeError) as error:
+        raise NerfroError(
+            "a film in .mp4 format needs ffmpeg, which is not installed; install ffmpeg, or pip install "
+            "'nerfro[video]', or set film=[gif] or film=[]"
+        ) from error
+
+
+def _write_mp4(file: Path, frames: Sequence[Path], rate: float) -> None:
+    height, width = _even(_pixels(frames[0])).shape[:2]
     with tempfile.TemporaryDirectory() as folder:
-        made = Path(folder, file.name)
-        sink = write_frames(
-            made, first.shape[1::-1], fps=rate, codec="libx264", quality=None, macro_block_size=2,
-            ffmpeg_log_level="error", output_params=options,
-        )  # fmt: skip
-        sink.send(None)
-        try:
-            for frame in frames:
-                sink.send(np.ascontiguousarray(_even(_pixels(frame))))
-        finally:
-            sink.close()
-        write_atomically(file, made.read_bytes())
+        encoded = Path(folder, file.name)
+        pixels = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(rate), "-i", "-"]
+        options = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", str(_QUALITY), "-movflags", "+faststart"]
+        command = [find_ffmpeg(), "-loglevel", "error", *pixels, *options, str(encoded)]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+            assert process.stdin is not None
+            with contextlib.suppress(BrokenPipeError):  # ffmpeg has failed, and its message says why
+                for frame in frames:
+                    process.stdin.write(_even(_pixels(frame)).tobytes())
+            messages = process.communicate()[1].decode(errors="replace").strip().splitlines()
+        if process.returncode:
+            reason = messages[-1:] or ["no message"]
+            raise NerfroError(f"ffmpeg cannot write {file.name} ({reason[0]}); set film=[gif] or film=[]")
+        write_atomically(file, encoded.read_bytes())
 
 
 def _write_gif(file: Path, frames: Sequence[Path], rate: float) -> None:
