@@ -27,7 +27,8 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
         if code is None:
             return printed.out
         assert code == 1
-        message = [line for line in printed.err.split("\n") if line and not line.startswith("\r")]  # without progress bars
+        # Progress bars start with a carriage return.
+        message = [line for line in printed.err.split("\n") if line and not line.startswith("\r")]
         assert len(message) == 1
         assert message[0].startswith("nerfro: error: ")
         return f"{message[0]}\n"
