@@ -20,7 +20,7 @@ from torch import Tensor
 import nerfro
 from nerfro.cameras import Cameras
 from nerfro.evaluation.render_view import render_view
-from nerfro.models.base import NerfModel
+from nerfro.rendering import Renderer
 from nerfro.subdivision import divergence, neighbour_rays, pixel_rays
 
 CLASSES = ("past the glass", "things inside", "edges", "sky through the glass")
@@ -35,13 +35,13 @@ def main() -> None:
     parser.add_argument("--edge", type=float, default=8.0, help="pixel angles from which neighbours part")
     arguments = parser.parse_args()
     scene = nerfro.load(arguments.run, device="cpu")
-    model, views = scene.model, scene.views().checked()
+    model, views = scene.renderer, scene.views().checked()
     wanted = {"side": arguments.supersample, "divergence": arguments.divergence, "contrast": arguments.contrast}
     subdivision = replace(scene.subdivision, **{name: value for name, value in wanted.items() if value is not None})
     errors, classes = [], []
     for view in range(min(len(views), arguments.views or len(views))):
         rendered = render_view(model, views.cameras, view, subdivision)
-        prediction = model.photographed(rendered.radiance)
+        prediction = model.scene.colour_space.to_display(rendered.radiance)
         errors.append((prediction - views.images[view].reshape(-1, 3)).square().mean(-1))
         classes.append(classify(model, views.cameras, view, rendered.opacity, arguments.edge))
     print(f"{arguments.run}, {len(errors)} test views, {subdivision.side}^2 rays in divided pixels\n")
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 @torch.inference_mode()
-def classify(model: NerfModel, cameras: Cameras, view: int, opacity: Tensor, edge: float) -> Tensor:
+def classify(model: Renderer, cameras: Cameras, view: int, opacity: Tensor, edge: float) -> Tensor:
     """Row of CLASSES for each pixel of a view."""
     size = cameras.height * cameras.width
     parted, refracted = [], []

@@ -32,8 +32,8 @@ from nerfro.files import lat_long
 from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import RoundedBox
-from nerfro.models.base import NerfModel
 from nerfro.rays import Rays
+from nerfro.rendering import Renderer
 from nerfro.samplers.snell import Snell
 from nerfro.scenes.skies import lat_long_texture
 from nerfro.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
@@ -167,8 +167,8 @@ def main() -> None:
 def trained_run(run: Path, num_views: int) -> None:
     """Print the mean PSNR of test views by rays a side of divided pixels, and by what the sky is asked in these."""
     scene = nerfro.load(run, device="cpu")
-    model, views = scene.model, scene.views().checked()
-    sky = model.boundary
+    model, views = scene.renderer, scene.views().checked()
+    sky = model.scene.boundary
     assert isinstance(sky, EnvironmentMap)
     chosen = range(0, len(views), len(views) // num_views)[:num_views]
     print(f"{run}, test views {', '.join(map(str, chosen))}\n")
@@ -177,7 +177,7 @@ def trained_run(run: Path, num_views: int) -> None:
     for side in (2, 3):
         row, rays = [], 0.0
         for boundary in (sky, ByFootprint(sky, averaged=True), ByFootprint(sky, averaged=False)):
-            model.boundary = boundary
+            model.scene.boundary = boundary
             shown = [rendered(model, views.cameras, view, replace(scene.subdivision, side=side)) for view in chosen]
             errors = [
                 (rgb - views.images[view].reshape(-1, 3)).square().mean()
@@ -188,7 +188,7 @@ def trained_run(run: Path, num_views: int) -> None:
         print(f"| {side}x{side} | {rays:.1f} | " + " | ".join(row) + " |", flush=True)
 
 
-def rendered(model: NerfModel, cameras: Cameras, view: int, subdivision: Subdivision) -> tuple[Tensor, float]:
+def rendered(model: Renderer, cameras: Cameras, view: int, subdivision: Subdivision) -> tuple[Tensor, float]:
     """A view (sRGB) as `render_view` makes it, but for the footprints of parts, half their spacing; rays a pixel."""
     size = cameras.height * cameras.width
     pixels = torch.arange(view * size, (view + 1) * size)
@@ -197,7 +197,7 @@ def rendered(model: NerfModel, cameras: Cameras, view: int, subdivision: Subdivi
     beside = torch.cat(
         [model.exit_directions(neighbour_rays(cameras, some)) for some in pixels.split(model.chunk_size)]
     )
-    shown, radiance = model.photographed(central.radiance), central.radiance.clone()
+    shown, radiance = model.scene.colour_space.to_display(central.radiance), central.radiance.clone()
     divided = divergence(cameras, pixels, central.exit_directions, beside) >= subdivision.divergence
     divided |= contrast(lambda some: shown[some - pixels[0]], cameras, pixels) >= (subdivision.contrast or math.inf)
     side = subdivision.side
@@ -206,7 +206,7 @@ def rendered(model: NerfModel, cameras: Cameras, view: int, subdivision: Subdivi
         exits = model.exit_directions(parts).view(-1, side, side, 3)
         widths = 0.5 * torch.maximum(*(spacing(exits, axis) for axis in (1, 2))).flatten()
         radiance[some] = model.render(replace(parts, radii=widths)).radiance.view(-1, side**2, 3).mean(1)
-    return model.photographed(radiance), 2 + side**2 * float(divided.float().mean())
+    return model.scene.colour_space.to_display(radiance), 2 + side**2 * float(divided.float().mean())
 
 
 def spacing(directions: Float[Tensor, "*batch 3"], axis: int) -> Float[Tensor, "*batch"]:

@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 import nerfro
+from nerfro.evaluation.metrics import psnr
 from nerfro.light import to_srgb
-from nerfro.models.base import psnr
 from nerfro.scenes.path_tracer import load_mitsuba
 
 

@@ -38,12 +38,13 @@ import nerfro
 from nerfro.evaluation.render_view import render_view
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.kernels.allocator import keep_freed_memory
-from nerfro.models.base import NerfModel
 from nerfro.paths import ASSETS_DIR, CONF_DIR
 from nerfro.registry import build, discover
+from nerfro.rendering import Renderer
 from nerfro.subdivision import Subdivision
 from nerfro.training.config import TrainConfig, build_model
 from nerfro.training.data_module import RayDataModule, traced
+from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.trainer import lightning_precision
 from nerfro.types import Batch
@@ -123,9 +124,10 @@ class Training:
             self.config: DictConfig = compose("train", [*overrides])
         pl.seed_everything(self.config.seed, verbose=False)
         wanted, views = self.config.batches, build(self.config.data).load("train")
-        self.model: NerfModel = build_model(self.config)
+        self.renderer: Renderer = build_model(self.config)
+        self.module = TrainingModule.of(self.renderer, self.config)
         batches = RayBatches(views, wanted.size, wanted.batching, self.config.seed, jitter=wanted.jitter)
-        self.batches = traced(batches, self.model, self.config)
+        self.batches = traced(batches, self.renderer, self.config)
         self.num_rays = wanted.size
 
     def run(self, num_steps: int, data: RayDataModule | None = None) -> Steps:
@@ -143,7 +145,7 @@ class Training:
             num_sanity_val_steps=0,
             use_distributed_sampler=False,
         )
-        trainer.fit(self.model, datamodule=data or RayDataModule(self.batches, None, 0))
+        trainer.fit(self.module, datamodule=data or RayDataModule(self.batches, None, 0))
         return steps
 
 
@@ -193,7 +195,7 @@ def report_profile(experiment: str, num_steps: int) -> None:
     """Share of a step's time by part, its matrix work, and the rate of that work against the machine's."""
     paper = experiment.startswith("paper")
     training = paper_recipe(experiment) if paper else Training(f"+experiment={experiment}")
-    model = training.model
+    model, module = training.renderer, training.module
     training.run(3)
     with FlopCounterMode(display=False) as counter:
         training.run(1)
@@ -201,16 +203,16 @@ def report_profile(experiment: str, num_steps: int) -> None:
     seconds = float(np.mean(training.run(num_steps).seconds[1:]))
     parts = {
         "point sampling": [(model.point_sampler, "forward")],
-        "fields, forward": [(field, "forward") for field in model.fields],
-        "boundary, forward": [(model.boundary, "forward")],
-        "losses, forward": [(loss, "forward") for loss in model.losses.values()],
+        "fields, forward": [(field, "forward") for field in model.scene.fields],
+        "boundary, forward": [(model.scene.boundary, "forward")],
+        "losses, forward": [(loss, "forward") for loss in module.losses.values()],
     }
     around = {
         "batch of pixels and paths, or waiting for it": [(RayDataModule, "transfer_batch_to_device")],
         "update of the density grid": [(model.point_sampler, "after_step")],
         "backward pass": [(torch.Tensor, "backward")],
     }
-    whole = {"training step": [(model, "training_step")], "Adam": [(torch.optim.Adam, "step")]}
+    whole = {"training step": [(module, "training_step")], "Adam": [(torch.optim.Adam, "step")]}
     with ExitStack() as stack:
         for name, methods in (parts | around | whole).items():
             for owner, method in methods:
@@ -384,7 +386,7 @@ def report_view(path: Path, side: int = 400, turns: int = 5) -> None:
     Processor time hardly depends on what else the machine does; the fastest of the turns counts.
     """
     scene = nerfro.load(path)
-    cameras, model = scene.cameras("test").resized(side, side), scene.model
+    cameras, model = scene.cameras("test").resized(side, side), scene.renderer
     print(f"| {side}x{side} view of `{scene.name}` | s | processor, s |\n|---|---|---|")
     for name, sampling in (("one ray a pixel", Subdivision()), ("supersampled", scene.subdivision)):
         measured = [spent(lambda: render_view(model, cameras, 0, sampling)) for _ in range(turns)]  # noqa: B023
@@ -393,8 +395,8 @@ def report_view(path: Path, side: int = 400, turns: int = 5) -> None:
         "tracing": [(model.path_sampler, "forward")],
         "which rays may meet anything": [(model, "_may_meet")],
         "choosing samples": [(model.point_sampler, "forward")],
-        "field": [(field, "forward") for field in model.fields],
-        "sky": [(model.boundary, "forward")],
+        "field": [(field, "forward") for field in model.scene.fields],
+        "sky": [(model.scene.boundary, "forward")],
     }
     fastest, of_parts = float("inf"), dict.fromkeys(parts, 0.0)
     for _ in range(turns):

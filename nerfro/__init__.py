@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import importlib
+import warnings
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from nerfro.samplers.bend import bend
     from nerfro.training.load import load
-    from nerfro.viewing.scene import Scene
+    from nerfro.viewing.trained_scene import TrainedScene
 
 __version__ = "0.1.0"
-__all__ = ["Scene", "__version__", "bend", "load"]
+__all__ = ["TrainedScene", "__version__", "bend", "load"]
 
-_HOMES = {"Scene": "nerfro.viewing.scene", "bend": "nerfro.samplers.bend", "load": "nerfro.training.load"}
+_HOMES = {
+    "TrainedScene": "nerfro.viewing.trained_scene",
+    "bend": "nerfro.samplers.bend",
+    "load": "nerfro.training.load",
+}
 
 
 def __getattr__(name: str) -> Any:
     """What is imported when it is asked for: `import nerfro` itself costs nothing."""
+    if name == "Scene":
+        warnings.warn("nerfro.Scene is now nerfro.TrainedScene; this name goes with the next release", stacklevel=2)
+        name = "TrainedScene"
     if name not in _HOMES:
         raise AttributeError(f"module 'nerfro' has no attribute '{name}'")
     return getattr(importlib.import_module(_HOMES[name]), name)

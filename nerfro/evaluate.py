@@ -52,7 +52,7 @@ def _evaluate_checkpoint(config: DictConfig) -> None:
         metrics = ImageMetrics(networks, reasons, config.protocol == "8bit", prefix=config.split)
         record(folder, config)
         steps = trained.evaluation.get("refine_steps", 0)  # which older checkpoints lack
-        result, treated = score_split(scene.model, views, metrics, folder, scene.subdivision, steps)
+        result, treated = score_split(scene.renderer, views, metrics, folder, scene.subdivision, steps)
         for index, view in enumerate(result.views):
             prediction = load_png(folder / "images" / f"{view.name}.png")
             write_error_sheet(folder, view.name, prediction, views.images[index], networks)

@@ -20,14 +20,11 @@ from nerfro.draws import Draws
 from nerfro.fields.base import Field
 from nerfro.fields.nerf import NerfField
 from nerfro.losses.base import Loss
-from nerfro.losses.photometric import Photometric
 from nerfro.media.base import Medium
 from nerfro.media.shapes import Ball
-from nerfro.models.base import NerfModel, Parts
-from nerfro.models.optimizer import OptimizerConfig
 from nerfro.models.refractive import RefractiveModel
 from nerfro.registry import Plugin, build
-from nerfro.rendering import composite
+from nerfro.rendering import Components, Renderer, composite
 from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.snell import Snell
 from nerfro.samplers.straight import Straight
@@ -45,7 +42,7 @@ def check(plugin: Plugin, fields: Mapping[str, object] | None = None) -> None:
     """Check a registered plugin against the contract of its kind."""
     _require(bool(plugin.summary), "the class has no docstring, which `python -m nerfro.plugins` shows")
     base, keeps_contract = _CONTRACTS[plugin.kind]
-    part = build({"_target_": plugin.target, **(fields or {})}, parts=example_parts())
+    part = build({"_target_": plugin.target, **(fields or {})}, components=example_components())
     _require(isinstance(part, base), f"a {plugin.kind} derives from {base.__module__}.{base.__name__}")
     keeps_contract(part)
 
@@ -196,17 +193,17 @@ def _check_boundary(boundary: Boundary) -> None:
 
 def _check_loss(loss: Loss) -> None:
     rendering = example_rendering()
-    value = loss([rendering, rendering], example_batch(), RefractiveModel(example_parts()))
+    value = loss([rendering, rendering], example_batch(), RefractiveModel(example_components()).scene)
     _require(value.shape == (), "a loss is a scalar")
     _require(bool(value.isfinite()), "a loss is finite")
 
 
-def _check_model(model: NerfModel) -> None:
+def _check_model(model: Renderer) -> None:
     renderings = model(example_rays())
     _require(len(renderings) >= 1, "forward returns a rendering for each level")
     _require(renderings[-1].rgb.shape == (NUM_RAYS, 3), "rgb is [R, 3]")
     renderings[-1].rgb.sum().backward()
-    _require_gradients(model.fields)
+    _require_gradients(model.scene.fields)
 
 
 def _check_data(source: DataSource) -> None:
@@ -229,21 +226,19 @@ _CONTRACTS: dict[str, tuple[type, Callable[[Any], None]]] = {
     "field": (Field, _check_field),
     "boundary": (Boundary, _check_boundary),
     "loss": (Loss, _check_loss),
-    "model": (NerfModel, _check_model),
+    "model": (Renderer, _check_model),
     "data": (DataSource, _check_data),
 }
 
 
-def example_parts() -> Parts:
-    """Parts of a small model on straight rays before a black sky."""
-    return Parts(
+def example_components() -> Components:
+    """Components of a small model on straight rays before a black sky."""
+    return Components(
         medium=Ball(),
         path_sampler=Straight(),
         point_sampler=Stratified(8),
         make_field=lambda: NerfField(width=16, depth=2, skip=1, view_width=8),
         boundary=ConstantBoundary(),
-        losses={"photometric": Photometric()},
-        optimizer=OptimizerConfig(),
     )
 
 

@@ -24,6 +24,7 @@ from nerfro.training.camera_steps import CameraSteps
 from nerfro.training.config import TrainConfig, build_data, build_model
 from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.memory import require_memory
+from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.reach import require_reach
 from nerfro.training.run_folder import LAST_CHECKPOINT, begin, own, require_same_run
@@ -50,26 +51,26 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     batches = RayBatches(training, wanted.size, wanted.batching, config.seed, *precrop, wanted.jitter, wanted.object)
     subdivision = Subdivision.of(config.evaluation)
     lpips = find_lpips_networks(config.evaluation.lpips_backbone, config.evaluation.lpips_vgg_backbone)
-    model = build_model(config, training)
+    renderer = build_model(config, training)
     require_same_run(folder, checkpoint, config)
     throughput, interruption = Throughput(), StopOnSignal()
     # Cameras move by sky and outlines before the sky is learned.
     cameras, boundary = CameraSteps(batches, training), BoundaryFirst(batches, config.optimizer.boundary_first)
     trainer = make_trainer(config, folder, throughput, [interruption, cameras, boundary, Viewer(config, source, test)])
-    batches = traced(batches.share(trainer.global_rank, trainer.world_size), model, config)
+    batches = traced(batches.share(trainer.global_rank, trainer.world_size), renderer, config)
     few = batches.smaller(4096)
     first = few.batch(0)
-    require_reach(model, first)
+    require_reach(renderer, first)
     share, device = few.batch_size / batches.batch_size, trainer.strategy.root_device
-    memory = require_memory(model, first.rays, device, share)
+    memory = require_memory(renderer, first.rays, device, share)
     if trainer.is_global_zero:
-        begin(folder, config, model)
+        begin(folder, config, renderer)
         print(memory, flush=True)
     if config.compile is not None:
-        compile_networks(model, config.compile)
+        compile_networks(renderer, config.compile)
 
     datamodule = RayDataModule(batches, validation, config.evaluation.every)
-    trainer.fit(model, datamodule=datamodule, ckpt_path=checkpoint, weights_only=True)
+    trainer.fit(TrainingModule.of(renderer, config), datamodule=datamodule, ckpt_path=checkpoint, weights_only=True)
     trainer.save_checkpoint(folder / LAST_CHECKPOINT)
     finish_logs(trainer)
     leave()
@@ -80,10 +81,10 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
         print(f"nerfro: interrupted after step {trainer.global_step} and saved; to go on, repeat it with {command}")
         sys.exit(EXIT_INTERRUPTED)
 
-    model.to(device)
-    write_cameras(folder / "cameras.json", model.camera, training)
+    renderer.to(device)
+    write_cameras(folder / "cameras.json", renderer.scene.camera, training)
     metrics = ImageMetrics(*lpips, prefix=config.evaluation.split)
-    result, treated = score_split(model, test, metrics, folder, subdivision, config.evaluation.refine_steps)
+    result, treated = score_split(renderer, test, metrics, folder, subdivision, config.evaluation.refine_steps)
     title = f"{config.name} on {config.data.root}, {config.evaluation.split} views"
     spent = trainer.global_step, throughput.seconds, throughput.rays_per_second
     report(RunMetrics(result, *spent, treated), title, folder)

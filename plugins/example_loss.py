@@ -6,8 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.losses.base import Loss, Model
+from nerfro.losses.base import Loss
 from nerfro.registry import register
+from nerfro.rendering import Scene
 from nerfro.types import Batch, Rendering
 
 
@@ -15,7 +16,7 @@ from nerfro.types import Batch, Rendering
 class OpacityEntropy(Loss):
     """Entropy of the finest level's opacity: rays shall either pass or be stopped, not be dimmed by fog."""
 
-    def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
+    def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         # `opacity` sums the polylines of each ray, and `per_pixel` averages the rays of each pixel.
         opacity = batch.per_pixel(renderings[-1].opacity).clamp(1e-5, 1 - 1e-5)
         return -(opacity * torch.log(opacity) + (1 - opacity) * torch.log(1 - opacity)).mean()

@@ -8,10 +8,10 @@ import pytest
 
 from nerfro.evaluation.render_view import render_view
 from nerfro.kernels.constants import constant
-from nerfro.models.base import NerfModel
 from nerfro.registry import build
 from nerfro.subdivision import Subdivision
 from nerfro.training.config import build_model
+from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from tests.pretended_gpu import GPU, OnGpu, PretendedGpu
 from tests.test_experiments import SMALL, composed, shrunk
@@ -49,26 +49,27 @@ MET = "types.py: to (to)"
 def test_training_and_rendering_stay_on_the_gpu(
     experiment: list[str], waits: set[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(NerfModel, "log", lambda *values, **options: None)
-    monkeypatch.setattr(NerfModel, "global_step", STEP)
+    monkeypatch.setattr(TrainingModule, "log", lambda *values, **options: None)
+    monkeypatch.setattr(TrainingModule, "global_step", STEP)
     overrides = [f"+experiment={experiment[0]}", *experiment[1:], *SMALL, "data.downscale=16"]
     config = composed(*overrides, *shrunk(composed(*overrides)))
-    model, views = build_model(config), build(config.data).load("train")
+    renderer, views = build_model(config), build(config.data).load("train")
+    module = TrainingModule.of(renderer, config)
     # What is computed and kept while the model is on the CPU must move with it.
-    model.render(views.cameras.image_rays(0))
+    renderer.render(views.cameras.image_rays(0))
     constant.cache_clear()
     with PretendedGpu() as gpu, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*CUDA is not available.*")
-        model.to(GPU)
+        module.to(GPU)
         batches, cameras = RayBatches(views, 8, config.batches.batching).to(GPU), views.cameras.to(GPU)
         gpu.waits.clear()
         batch = batches.batch(STEP)
-        loss = model.training_step(batch, 0)["loss"]
+        loss = module.training_step(batch, 0)["loss"]
         loss.backward()
-        model.point_sampler.after_step(list(model.fields), batch.draws)
+        renderer.point_sampler.after_step(list(renderer.scene.fields), batch.draws)
         assert {wait for wait in gpu.waits if not wait.startswith(TRACING)} == waits
-        rendered = render_view(model, cameras, 0, Subdivision())
+        rendered = render_view(renderer, cameras, 0, Subdivision())
     assert isinstance(loss, OnGpu)
     assert isinstance(rendered.radiance, OnGpu)
-    assert all(isinstance(tensor, OnGpu) for tensor in (*model.parameters(), *model.buffers()))
-    assert all(parameter.grad is not None for parameter in model.parameters())
+    assert all(isinstance(tensor, OnGpu) for tensor in (*module.parameters(), *module.buffers()))
+    assert all(parameter.grad is not None for parameter in module.parameters())

@@ -26,15 +26,16 @@ from nerfro.files.images import save_png
 from nerfro.media.analytic import Luneburg
 from nerfro.media.base import Medium
 from nerfro.media.shapes import Ball
-from nerfro.models.base import NerfModel, Parts
-from nerfro.models.optimizer import OptimizerConfig
 from nerfro.registry import discover, find
+from nerfro.rendering import Components, Renderer
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.straight import straight_path
 from nerfro.samplers.stratified import Stratified
 from nerfro.testing import example_rays
 from nerfro.training.config import build_model
-from nerfro.training.run_folder import load_checkpoint
+from nerfro.training.module import TrainingModule
+from nerfro.training.optimizer import OptimizerConfig
+from nerfro.training.run_folder import load_checkpoint, restore
 from nerfro.types import Exits, Radiance, Samples
 
 discover()
@@ -159,15 +160,13 @@ class Slanted(Field):
         return Radiance(torch.ones_like(samples.s), 0.5 + self.scale * samples.positions)
 
 
-def make_model(make_field: Callable[[], Field] = Slanted, **fields: Any) -> NerfModel:
-    parts = Parts(
+def make_model(make_field: Callable[[], Field] = Slanted, **fields: Any) -> Renderer:
+    parts = Components(
         medium=IndexField(width=8, depth=2, skip=0),
         path_sampler=BoxMarch(16),
         point_sampler=Stratified(64),
         make_field=make_field,
         boundary=ConstantBoundary([0.2, 0.3, 0.4]),
-        losses={},
-        optimizer=OptimizerConfig(),
     )
     return EikonalFields(parts, **{"resolution": 16, "box_min": [-5.0] * 3, "box_max": [5.0] * 3, **fields})
 
@@ -181,7 +180,7 @@ def test_stages_have_their_shares_of_the_budget() -> None:
 
 def test_each_stage_trains_its_own_part() -> None:
     model = make_model(lambda: NerfField(width=8, depth=2, skip=1, view_width=8))
-    torch.nn.init.normal_(model.medium.last.weight, std=0.2)
+    torch.nn.init.normal_(model.scene.medium.last.weight, std=0.2)
     model.train()
     trained = {}
     for stage in (SCENE, INDEX, INTERIOR):
@@ -189,7 +188,7 @@ def test_each_stage_trains_its_own_part() -> None:
         model.sharpen(0)
         model.zero_grad(set_to_none=True)
         model(example_rays())[-1].rgb.sum().backward()
-        parts = {"scene": model.fields, "index": model.medium, "interior": model.interior}
+        parts = {"scene": model.scene.fields, "index": model.scene.medium, "interior": model.interior}
         trained[stage] = {name for name, part in parts.items() if any(p.grad is not None for p in part.parameters())}
     assert trained == {SCENE: {"scene"}, INDEX: {"index"}, INTERIOR: {"interior"}}
 
@@ -200,7 +199,7 @@ def test_what_the_first_stage_saw_inside_the_box_is_dropped() -> None:
     first = model(rays)[-1]
     model.stage.fill_(INDEX)
     second = model(rays)[-1]
-    inside = (first.samples.positions.abs() <= model.medium.box[1]).all(-1)
+    inside = (first.samples.positions.abs() <= model.scene.medium.box[1]).all(-1)
     assert inside.any()
     assert bool((second.weights[inside] == 0).all())
     # Before the box nothing has changed.
@@ -217,21 +216,21 @@ def test_sharp_grids_show_what_the_field_and_the_boundary_show() -> None:
     rays = replace(example_rays(), origins=example_rays().origins + torch.tensor([2.5, 0, 0]))
     from_grids = model(rays)[-1].rgb
     from_fields = model.eval()(rays)[-1].rgb
-    past = (model(rays)[-1].samples.positions.abs().amax(-1) > model.medium.box[1, 0] + 0.5).all(-1)
+    past = (model(rays)[-1].samples.positions.abs().amax(-1) > model.scene.medium.box[1, 0] + 0.5).all(-1)
     assert past.sum() > 5
     torch.testing.assert_close(from_grids[past], from_fields[past], atol=1e-4, rtol=0)
 
 
 def test_grids_get_sharper_level_by_level() -> None:
     model = make_model(blur=2.0, num_levels=3)
-    model.boundary = EnvironmentMap([16])
-    torch.nn.init.normal_(model.boundary.texels)
+    model.scene.boundary = EnvironmentMap([16])
+    torch.nn.init.normal_(model.scene.boundary.texels)
     directions = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
     errors = []
     for level in range(3):
         model.sharpen(level)
         with torch.no_grad():
-            error = model._blurred.sky_towards(directions) - model.boundary(Exits(directions))
+            error = model._blurred.sky_towards(directions) - model.scene.boundary(Exits(directions))
         errors.append(float(error.square().mean()))
     assert errors[0] > errors[1] > errors[2]
 
@@ -242,12 +241,12 @@ def test_impossible_shares_are_refused() -> None:
 
 
 def test_several_processes_are_refused_before_training() -> None:
-    model = make_model()
-    model.trainer = SimpleNamespace(world_size=1)  # type: ignore[assignment]
-    model.setup("fit")
-    model.trainer = SimpleNamespace(world_size=2)  # type: ignore[assignment]
+    module = TrainingModule(make_model(), {}, OptimizerConfig())
+    module.trainer = SimpleNamespace(world_size=1)  # type: ignore[assignment]
+    module.setup("fit")
+    module.trainer = SimpleNamespace(world_size=2)  # type: ignore[assignment]
     with pytest.raises(NerfroError, match="trains in one process"):
-        model.setup("fit")
+        module.setup("fit")
 
 
 # All of it, from the command line.
@@ -259,8 +258,8 @@ def test_the_three_stages_train_from_the_command_line(
     finished = train_here("+experiment=eikonal_fields", *tiny(tiny_scene), f"hydra.run.dir={tmp_path}")
     assert finished.code == 0, finished.err
     checkpoint, _ = load_checkpoint(tmp_path / "checkpoints" / "last.ckpt")
-    assert int(checkpoint["state_dict"]["stage"]) == INTERIOR
-    assert checkpoint["state_dict"]["medium.last.weight"].abs().max() > 0  # zero before training
+    assert int(checkpoint["state_dict"]["renderer.stage"]) == INTERIOR
+    assert checkpoint["state_dict"]["renderer.scene.medium.last.weight"].abs().max() > 0  # zero before training
     assert json.loads((tmp_path / "metrics.json").read_text())["steps"] == 9
 
 
@@ -321,13 +320,13 @@ def test_the_index_of_a_homogeneous_ball_is_recovered(train_here: Callable[..., 
     )
     assert finished.code == 0, finished.err
     checkpoint, config = load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")
-    model = build_model(OmegaConf.create(config))
-    assert float(model.medium.last.weight.detach().abs().max()) == 0  # it begins without a ball
-    model.load_state_dict(checkpoint["state_dict"])
+    untrained = build_model(OmegaConf.create(config))
+    assert float(untrained.scene.medium.last.weight.detach().abs().max()) == 0  # it begins without a ball
+    model = restore(checkpoint, config)
     directions = torch.nn.functional.normalize(torch.randn(1000, 3), dim=-1)
     inside = directions * (RADIUS - SHELL) * torch.rand(1000, 1) ** (1 / 3)
     with torch.no_grad():
-        n, _ = model.medium(inside)
+        n, _ = model.scene.medium(inside)
     assert float(n.mean()) == pytest.approx(IOR, rel=0.02)
     assert float(n.std()) < 0.02 * IOR
 

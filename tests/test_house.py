@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from nerfro.paths import PACKAGE_DIR
 # From above to below: a package imports what follows it, and itself.
 ORDER = (
     "commands", "testing", "report", "training", "viewing", "evaluation", "scenes", "capture", "models", "losses",
-    "boundaries", "camera", "samplers", "fields", "media", "data", "geometry", "kernels", "files", "core",
+    "rendering", "boundaries", "camera", "samplers", "fields", "media", "data", "geometry", "kernels", "files", "core",
 )  # fmt: skip
 FILES = {
     ".".join(("nerfro", *file.relative_to(PACKAGE_DIR).with_suffix("").parts)).removesuffix(".__init__"): file
@@ -64,6 +65,15 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
     while free := [module for module, others in left.items() if not others & left.keys()]:
         left = {module: others for module, others in left.items() if module not in free}
     assert sorted(left) == []
+
+
+def test_only_training_imports_lightning() -> None:
+    users = {
+        module
+        for module, file in FILES.items()
+        if re.search(r"^\s*(import|from) lightning", file.read_text("utf-8"), re.M)
+    }
+    assert {room(module) for module in users} == {"training"}
 
 
 @pytest.mark.parametrize("module", sorted(filter(is_command, FILES)))

@@ -30,7 +30,7 @@ def test_importing_nerfro_imports_nothing_heavy() -> None:
 def test_what_is_not_there_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="has no attribute 'lod'"):
         _ = nerfro.lod
-    assert {"Scene", "bend", "load"} <= set(nerfro.__all__)
+    assert {"TrainedScene", "bend", "load"} <= set(nerfro.__all__)
 
 
 def test_a_run_is_loaded_rendered_and_exported(
@@ -54,6 +54,12 @@ def test_a_run_is_loaded_rendered_and_exported(
         written = load_png(run / "images" / f"test_{view:03d}.png")
         torch.testing.assert_close(written, rgb[view], atol=0.5 / 255 + 1e-6, rtol=0)
     assert float(scene.ior) == 1.5
+    program = (
+        f"import sys, nerfro; scene = nerfro.load({str(run)!r}, device='cpu'); "
+        "scene.render(scene.cameras('test').select([0])); assert 'lightning' not in sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
     with pytest.raises(NerfroError, match=r"checkpoint .* does not exist"):
         nerfro.load(tmp_path / "gone")
 

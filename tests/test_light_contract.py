@@ -23,7 +23,9 @@ from nerfro.samplers.hierarchical import Hierarchical
 from nerfro.samplers.snell import Snell, trace_interfaces
 from nerfro.samplers.straight import straight_path
 from nerfro.samplers.stratified import Stratified
-from nerfro.testing import NUM_RAYS, example_batch, example_draws, example_parts, example_path, example_rays
+from nerfro.testing import NUM_RAYS, example_batch, example_components, example_draws, example_path, example_rays
+from nerfro.training.module import TrainingModule
+from nerfro.training.optimizer import OptimizerConfig
 from nerfro.types import Exits, Path, Radiance
 
 
@@ -41,10 +43,10 @@ def split_path(of_straight: float) -> Path:
 
 
 def rendered(path: Path) -> Tensor:
-    model = RefractiveModel(replace(example_parts(), boundary=EnvironmentMap([4]))).eval()
+    model = RefractiveModel(replace(example_components(), boundary=EnvironmentMap([4]))).eval()
     torch.manual_seed(1)
-    torch.nn.init.normal_(model.boundary.texels)
-    for parameter in model.fields.parameters():
+    torch.nn.init.normal_(model.scene.boundary.texels)
+    for parameter in model.scene.fields.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
     with torch.no_grad():
         return model.render_path(path)[-1].rgb
@@ -93,11 +95,11 @@ def test_random_numbers_are_drawn_for_each_ray(sampler: Stratified | Hierarchica
 
 @pytest.mark.parametrize("loss", [Photometric(), BoundaryRegulariser(start=0), Distortion()])
 def test_losses_take_rays_that_split(loss: Photometric | BoundaryRegulariser | Distortion) -> None:
-    model, batch = RefractiveModel(example_parts()).eval(), example_batch()
+    model, batch = RefractiveModel(example_components()).eval(), example_batch()
     with torch.no_grad():
         bent = model.render_path(example_path())
         split = model.render_path(split_path(0.0))  # a second polyline that brings nothing
-        assert loss([*split], batch, model) == pytest.approx(float(loss([*bent], batch, model)), rel=1e-5)
+        assert loss([*split], batch, model.scene) == pytest.approx(float(loss([*bent], batch, model.scene)), rel=1e-5)
 
 
 def test_samples_follow_the_gradients_of_their_path() -> None:
@@ -171,11 +173,11 @@ def test_a_png_sky_is_decoded_and_encoded_again(tmp_path: FilePath) -> None:
 
 
 def test_all_that_learns_has_a_group_and_a_rate() -> None:
-    model = RefractiveModel(example_parts())
+    model = RefractiveModel(example_components())
     assert set(model.parameter_groups()) == {"fields"}
-    model.medium.index = torch.nn.Parameter(torch.tensor(1.5))
-    model.camera.shift = torch.nn.Parameter(torch.zeros(3))
-    groups = model.configure_optimizers().param_groups
+    model.scene.medium.index = torch.nn.Parameter(torch.tensor(1.5))
+    model.scene.camera.shift = torch.nn.Parameter(torch.zeros(3))
+    groups = TrainingModule(model, {}, OptimizerConfig()).configure_optimizers().param_groups
     assert [group["name"] for group in groups] == ["fields", "medium", "camera"]
     assert sum(len(group["params"]) for group in groups) == len(list(model.parameters()))
     assert model.paths_learn

@@ -16,8 +16,7 @@ from nerfro.evaluation.render_view import render_view
 from nerfro.subdivision import Subdivision
 from nerfro.fields.nerf import NerfField
 from nerfro.media.analytic import Vacuum
-from nerfro.models.base import Parts
-from nerfro.models.optimizer import OptimizerConfig
+from nerfro.rendering import Components
 from nerfro.models.refractive import RefractiveModel
 from nerfro.samplers.straight import Straight
 from nerfro.samplers.stratified import Stratified
@@ -31,7 +30,7 @@ def cameras(side):
 
 torch.set_num_threads(1)
 field = lambda: NerfField(width=64, depth=4, skip=2, view_width=32)
-parts = Parts(Vacuum(), Straight(), Stratified(64), field, ConstantBoundary(), {}, OptimizerConfig(), chunk_size=256)
+parts = Components(Vacuum(), Straight(), Stratified(64), field, ConstantBoundary(), chunk_size=256)
 model = RefractiveModel(parts)
 render_view(model, cameras(16), 0, Subdivision())
 one_chunk = peak()

@@ -23,9 +23,8 @@ from nerfro.losses.boundary import BoundaryRegulariser
 from nerfro.losses.photometric import Photometric
 from nerfro.losses.smoothness import Smoothness
 from nerfro.media.voxel_grid import VoxelGrid
-from nerfro.models.base import Parts
-from nerfro.models.optimizer import OptimizerConfig
 from nerfro.models.refractive import RefractiveModel
+from nerfro.rendering import Components
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.hierarchical import Hierarchical
 from nerfro.testing import example_batch
@@ -71,21 +70,14 @@ def batch(recorded: dict[str, Tensor]) -> Batch:
 @pytest.fixture(scope="module")
 def model(recorded: dict[str, Tensor], medium: VoxelGrid) -> RefractiveModel:
     num_coarse, steps = int(recorded["num_coarse"]), int(recorded["steps_per_coarse"])
-    losses: dict[str, Loss] = {
-        "photometric": Photometric(),
-        "boundary": BoundaryRegulariser(weight=0.025, start=0),
-        "smoothness": Smoothness(weight=1.0, start=0, tile_size=len(recorded["sky_patch_directions"])),
-    }
     width = recorded["weight/coarse_mlp/Dense_0/kernel"].shape[1]
     view_width = recorded["weight/coarse_mlp/Dense_10/kernel"].shape[1]
-    parts = Parts(
+    parts = Components(
         medium=medium,
         path_sampler=Eikonal("euler", num_coarse * steps),
         point_sampler=Hierarchical(num_coarse, int(recorded["num_fine"]), draw="vertices", offset=0.0),
         make_field=lambda: NerfField(width=width, view_width=view_width),
         boundary=Skybox(width=recorded["weight/bkgd_mlp/Dense_0/kernel"].shape[1]),
-        losses=losses,
-        optimizer=OptimizerConfig(),
     )
     model = RefractiveModel(parts, boundary_direction="last_coarse", colour="srgb").eval()
     for name, layer in layers(model).items():
@@ -102,11 +94,11 @@ def renderings(model: RefractiveModel, batch: Batch) -> list[Rendering]:
 def layers(model: RefractiveModel) -> dict[str, nn.Linear]:
     """Our layers by the authors' names."""
     named: dict[str, nn.Linear] = {}
-    for network, field in zip(("coarse_mlp", "fine_mlp"), model.fields, strict=True):
+    for network, field in zip(("coarse_mlp", "fine_mlp"), model.scene.fields, strict=True):
         mlp = field.mlp
         for i, layer in enumerate((*mlp.trunk.layers, mlp.density, mlp.bottleneck, mlp.view, mlp.rgb)):
             named[f"{network}/Dense_{i}"] = layer
-    for i, layer in enumerate((*model.boundary.trunk.layers, model.boundary.rgb)):
+    for i, layer in enumerate((*model.scene.boundary.trunk.layers, model.scene.boundary.rgb)):
         named[f"bkgd_mlp/Dense_{i}"] = layer
     return named
 
@@ -139,13 +131,18 @@ def test_parity_of_the_rendering(
 def test_parity_of_the_losses_and_their_gradients(
     recorded: dict[str, Tensor], renderings: list[Rendering], model: RefractiveModel, batch: Batch
 ) -> None:
-    values = {name: loss(renderings, batch, model) for name, loss in model.losses.items()}
-    fine_only = model.losses["photometric"](renderings[1:], batch, model)
+    losses: dict[str, Loss] = {
+        "photometric": Photometric(),
+        "boundary": BoundaryRegulariser(weight=0.025, start=0),
+        "smoothness": Smoothness(weight=1.0, start=0, tile_size=len(recorded["sky_patch_directions"])),
+    }
+    values = {name: loss(renderings, batch, model.scene) for name, loss in losses.items()}
+    fine_only = losses["photometric"](renderings[1:], batch, model.scene)
     assert_relative(fine_only, recorded["loss_rgb_fine"], 1e-3)
     assert_relative(values["photometric"] - fine_only, recorded["loss_rgb_coarse"], 1e-3)
     assert_relative(values["boundary"], recorded["loss_boundary"], 1e-3)
     assert_relative(values["smoothness"], recorded["loss_smoothness"], 1e-3)
-    total = sum(loss.weight_at(0) * values[name] for name, loss in model.losses.items())
+    total = sum(loss.weight_at(0) * values[name] for name, loss in losses.items())
     assert_relative(total, recorded["loss_total"], 1e-3)
     model.zero_grad()
     total.backward()

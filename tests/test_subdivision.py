@@ -19,7 +19,7 @@ from nerfro.samplers.hierarchical import Hierarchical
 from nerfro.samplers.snell import Snell
 from nerfro.samplers.straight import Straight
 from nerfro.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
-from nerfro.testing import example_parts
+from nerfro.testing import example_components
 from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Batch
 
@@ -208,7 +208,7 @@ def test_batches_and_renderings_do_not_depend_on_the_process_or_the_chunk(views:
     """Each pixel has the same rays, paths, numbers and samples, whoever traces it and beside whichever others."""
     batches = batches_of(views, Subdivision(2, 8.0, 0.2), 60, jitter=True)
     whole = batches.batch(4)
-    model = RefractiveModel(replace(example_parts(), point_sampler=Hierarchical(8, 8)))
+    model = RefractiveModel(replace(example_components(), point_sampler=Hierarchical(8, 8)))
     sampled = model.render_path(whole.path, whole.draws)[-1].samples.s
     assert len(whole.draws.ray.unique()) == len(whole.rays) > 60
     for rank in range(3):

@@ -11,8 +11,8 @@ from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
 from nerfro.data.base import Views
 from nerfro.data.pixel_store import PixelStore
-from nerfro.models.base import NerfModel
 from nerfro.rays import Rays
+from nerfro.rendering import Renderer
 
 # Pixels per view and step, and candidates drawn per pixel; the candidates with the most contrast are used.
 _NUM_PIXELS, _DRAWN = 600, 3
@@ -22,16 +22,16 @@ _SCALE, _LONGEST = 0.3, 3.0
 
 
 @torch.no_grad()
-def refine_on_left(model: NerfModel, views: Views, gains: Float[Tensor, "V 3"], steps: int) -> Cameras:
+def refine_on_left(renderer: Renderer, views: Views, gains: Float[Tensor, "V 3"], steps: int) -> Cameras:
     """Refine each camera so that the rendering of the fixed scene matches the left half of the photograph.
 
     Args:
-        model: trained model, which stays unchanged.
+        renderer: trained model, which stays unchanged.
         views: test views.
         gains: gain of each view and channel.
         steps: number of Gauss-Newton steps.
     """
-    cameras, device = views.cameras.to(model.device), model.device
+    cameras, device = views.cameras.to(renderer.scene.device), renderer.scene.device
     part = RefinedCamera(hold_world=False).to(device)
     part.begin(cameras)
     photographs, gains = PixelStore(views.images).to(device), gains.to(device)
@@ -41,7 +41,7 @@ def refine_on_left(model: NerfModel, views: Views, gains: Float[Tensor, "V 3"], 
         return photographs[pixels]
 
     def shown(rays: Rays, view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
-        return model.shown(rays, gains[view])
+        return renderer.scene.colour_space.to_display(renderer.radiance(rays), gains[view])
 
     for step in range(steps):
         row = torch.randint(cameras.height, shape, generator=generator)

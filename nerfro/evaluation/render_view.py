@@ -7,29 +7,31 @@ from dataclasses import replace
 import torch
 
 from nerfro.cameras import Cameras
-from nerfro.models.base import NerfModel, RenderedRays
+from nerfro.rendering import RenderedRays, Renderer
 from nerfro.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays
 
 
-def render_view(model: NerfModel, cameras: Cameras, view: int, subdivision: Subdivision) -> RenderedRays:
+def render_view(renderer: Renderer, cameras: Cameras, view: int, subdivision: Subdivision) -> RenderedRays:
     """Render all pixels of one view, row by row; radiance is the mean over the rays of divided pixels."""
-    rendered = model.render(cameras.image_rays(view))
+    rendered = renderer.render(cameras.image_rays(view))
     if subdivision.side == 1:
         return rendered
     size = cameras.height * cameras.width
     pixels = torch.arange(view * size, (view + 1) * size, device=cameras.device)
     with torch.inference_mode():
-        neighbours = [model.exit_directions(neighbour_rays(cameras, some)) for some in pixels.split(model.chunk_size)]
+        neighbours = [
+            renderer.exit_directions(neighbour_rays(cameras, some)) for some in pixels.split(renderer.chunk_size)
+        ]
     angles = divergence(cameras, pixels, rendered.exit_directions, torch.cat(neighbours))
     divided = angles >= subdivision.divergence
     if subdivision.contrast is not None:
-        shown = model.photographed(rendered.radiance)
+        shown = renderer.scene.colour_space.to_display(rendered.radiance)
         divided |= contrast(lambda some: shown[some - pixels[0]], cameras, pixels) >= subdivision.contrast
     chosen = divided.nonzero()[:, 0]
     if len(chosen) == 0:
         return rendered
     radiance, num_parts = rendered.radiance.clone(), subdivision.side**2
-    for some in chosen.split(max(1, model.chunk_size // num_parts)):
-        parts = model.render(part_rays(cameras, pixels[some], subdivision.side)).radiance
+    for some in chosen.split(max(1, renderer.chunk_size // num_parts)):
+        parts = renderer.render(part_rays(cameras, pixels[some], subdivision.side)).radiance
         radiance[some] = parts.view(-1, num_parts, 3).mean(1)
     return replace(rendered, radiance=radiance)

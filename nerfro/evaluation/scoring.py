@@ -17,12 +17,12 @@ from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.render_view import render_view
 from nerfro.evaluation.results import EvaluationResult
 from nerfro.files.images import save_png
-from nerfro.models.base import NerfModel
+from nerfro.rendering import Renderer
 from nerfro.subdivision import Subdivision
 
 
 def score_views(
-    model: NerfModel,
+    renderer: Renderer,
     views: Views,
     metrics: ImageMetrics,
     folder: Path,
@@ -31,15 +31,15 @@ def score_views(
 ) -> EvaluationResult:
     """Render all views, write these as 8-bit sRGB to `folder/<subfolder>/<prefix>_NNN.png`, and compute the scores.
 
-    The memory holds the rays and images of one view and the samples of `model.chunk_size` rays.
+    The memory holds the rays and images of one view and the samples of `renderer.chunk_size` rays.
     """
     height, width = views.cameras.height, views.cameras.width
-    cameras = views.cameras.to(model.device)
+    cameras = views.cameras.to(renderer.scene.device)
     progress = tqdm(total=len(views) * height * width, unit="ray", unit_scale=True, desc="evaluate", dynamic_ncols=True)
     with progress:
         for view in range(len(views)):
-            rendered = render_view(model, cameras, view, subdivision)
-            rgb = model.photographed(rendered.radiance).reshape(height, width, 3).cpu()
+            rendered = render_view(renderer, cameras, view, subdivision)
+            rgb = renderer.scene.colour_space.to_display(rendered.radiance).reshape(height, width, 3).cpu()
             save_png(folder / subfolder / f"{metrics.prefix}_{view:03d}.png", rgb)
             coverage = None if views.masks is None else views.masks[view]
             metrics.update(rgb, views.images[view], view, coverage)

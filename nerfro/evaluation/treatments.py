@@ -21,12 +21,12 @@ from nerfro.evaluation.render_view import render_view
 from nerfro.evaluation.results import EvaluationResult
 from nerfro.evaluation.scoring import score_views
 from nerfro.files.images import save_png
-from nerfro.models.base import NerfModel
+from nerfro.rendering import Renderer
 from nerfro.subdivision import Subdivision
 
 
 def score_split(
-    model: NerfModel,
+    renderer: Renderer,
     views: Views,
     metrics: ImageMetrics,
     folder: Path,
@@ -47,36 +47,38 @@ def score_split(
     Returns:
         Scores with the given cameras, and the scores of each treatment by name.
     """
-    given, treated = score_views(model, views, metrics, folder, subdivision), {}
-    if model.camera.moves:
-        views = replace(views, cameras=model.camera.aligned(views.cameras))
+    given, treated = score_views(renderer, views, metrics, folder, subdivision), {}
+    if renderer.scene.camera.moves:
+        views = replace(views, cameras=renderer.scene.camera.aligned(views.cameras))
         metrics.reset()
-        treated["aligned"] = score_views(model, views, metrics, folder, subdivision, "images_aligned")
+        treated["aligned"] = score_views(renderer, views, metrics, folder, subdivision, "images_aligned")
     gains = torch.ones(len(views), 3)
-    if model.camera.exposure is not None:
+    if renderer.scene.camera.exposure is not None:
         metrics.reset()
-        gains, treated["exposed"] = _score_right(model, views, metrics, folder, subdivision, "exposed")
+        gains, treated["exposed"] = _score_right(renderer, views, metrics, folder, subdivision, "exposed")
     if refine_steps:
-        views = replace(views, cameras=refine_on_left(model, views, gains, refine_steps))
+        views = replace(views, cameras=refine_on_left(renderer, views, gains, refine_steps))
         metrics.reset()
-        _, treated["refined"] = _score_right(model, views, metrics, folder, subdivision, "refined")
+        _, treated["refined"] = _score_right(renderer, views, metrics, folder, subdivision, "refined")
     return given, treated
 
 
 def _score_right(
-    model: NerfModel, views: Views, metrics: ImageMetrics, folder: Path, subdivision: Subdivision, name: str
+    renderer: Renderer, views: Views, metrics: ImageMetrics, folder: Path, subdivision: Subdivision, name: str
 ) -> tuple[Float[Tensor, "V 3"], EvaluationResult]:
     """Fit gains on left halves if exposures are estimated (otherwise 1), and score right halves."""
-    cameras = views.cameras.to(model.device)
+    cameras = views.cameras.to(renderer.scene.device)
     height, width = cameras.height, cameras.width
     left, right = slice(width // 2), slice(width // 2, None)
     gains = torch.ones(len(views), 3)
     for view in range(len(views)):
-        radiance = render_view(model, cameras, view, subdivision).radiance.view(height, width, 3).cpu()
+        radiance = render_view(renderer, cameras, view, subdivision).radiance.view(height, width, 3).cpu()
         target = views.images[view]
-        if model.camera.exposure is not None:
-            gains[view] = fit_gain(model.encode, radiance[:, left].flatten(0, 1), target[:, left].flatten(0, 1))
-        rgb = model.photographed(gains[view] * radiance)
+        if renderer.scene.camera.exposure is not None:
+            gains[view] = fit_gain(
+                renderer.scene.colour_space.to_srgb, radiance[:, left].flatten(0, 1), target[:, left].flatten(0, 1)
+            )
+        rgb = renderer.scene.colour_space.to_display(gains[view] * radiance)
         save_png(folder / f"images_{name}" / f"{metrics.prefix}_{view:03d}.png", rgb)
         coverage = None if views.masks is None else views.masks[view][:, right].contiguous()
         metrics.update(rgb[:, right].contiguous(), target[:, right].contiguous(), view, coverage)

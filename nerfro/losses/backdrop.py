@@ -8,8 +8,9 @@ from torch import Tensor
 
 from nerfro.allowed import Natural, NotNegative
 from nerfro.errors import NerfroError
-from nerfro.losses.base import Loss, Model
+from nerfro.losses.base import Loss
 from nerfro.registry import register
+from nerfro.rendering import Scene
 from nerfro.types import Batch, Rendering
 
 # A level of 255, and what rounding adds.
@@ -43,7 +44,7 @@ class Backdrop(Loss):
             raise NerfroError(f"loss=backdrop: colour={list(colour)} is no sRGB colour; give three numbers in [0, 1]")
         self.register_buffer("colour", None if colour is None else torch.tensor(colour), persistent=False)
 
-    def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
+    def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         if self.colour is None:
             return batch.rgb.new_zeros(())
         rendering = renderings[-1]

@@ -3,26 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Protocol
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfro.allowed import Natural, NotNegative, checked
-from nerfro.boundaries.base import Boundary
+from nerfro.rendering import Scene
 from nerfro.types import Batch, Rendering
-
-
-class Model(Protocol):
-    """What losses know of the model (`nerfro.models.base.NerfModel`)."""
-
-    boundary: Boundary
-
-    def encode(self, radiance: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]: ...
-
-    def difference(
-        self, radiance: Float[Tensor, "*batch 3"], rgb: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]: ...
 
 
 @checked("loss")
@@ -46,5 +33,5 @@ class Loss(nn.Module, ABC):
         return self.weight * min(1.0, (step - self.start + 1) / (self.ramp + 1))
 
     @abstractmethod
-    def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
+    def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         """Unweighted value, averaged over the batch."""

@@ -7,8 +7,9 @@ from torch import Tensor
 
 from nerfro.allowed import Natural, NotNegative
 from nerfro.distributed import rank_and_size, sum_over_processes
-from nerfro.losses.base import Loss, Model
+from nerfro.losses.base import Loss
 from nerfro.registry import register
+from nerfro.rendering import Scene
 from nerfro.types import Batch, Rendering
 
 
@@ -35,14 +36,14 @@ class BoundaryRegulariser(Loss):
         super().__init__(weight, start, ramp)
         self.threshold, self.refracted_only = threshold, refracted_only
 
-    def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
+    def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         fine = renderings[-1]
         path = fine.path
         counts = batch.per_pixel(path.per_ray(fine.transmittance.detach())) > self.threshold
         if self.refracted_only:
             counts = counts & (batch.per_pixel(path.first_of_ray(path.refracted).to(fine.rgb)) > 0.5)
         background = path.per_ray(fine.transmittance[:, None] * fine.boundary_rgb.detach())
-        shown = model.encode(batch.per_pixel(background))
+        shown = scene.colour_space.to_srgb(batch.per_pixel(background))
         error = (shown - batch.rgb).abs().sum(-1)
         # Processes average their gradients: each brings its sum as often as there are processes.
         return (error * counts).sum() * rank_and_size()[1] / (sum_over_processes(counts.sum()) + 1)

@@ -7,8 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.allowed import Natural, NotNegative
-from nerfro.losses.base import Loss, Model
+from nerfro.losses.base import Loss
 from nerfro.registry import register
+from nerfro.rendering import Scene
 from nerfro.types import Batch, Rendering
 
 
@@ -24,7 +25,7 @@ class Distortion(Loss):
     def __init__(self, weight: NotNegative = 1e-2, start: Natural = 0, ramp: Natural = 0) -> None:
         super().__init__(weight, start, ramp)
 
-    def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
+    def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         rendering = renderings[-1]
         weights, edges = rendering.weights, rendering.samples.edges
         near, far = rendering.path.near[:, None], rendering.path.far[:, None]

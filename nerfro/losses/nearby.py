@@ -7,8 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.allowed import Natural, NotNegative, corners_of_box
-from nerfro.losses.base import Loss, Model
+from nerfro.losses.base import Loss
 from nerfro.registry import register
+from nerfro.rendering import Scene
 from nerfro.types import Batch, Rendering
 
 
@@ -38,7 +39,7 @@ class Nearby(Loss):
         middle = torch.from_numpy(corners_of_box(box_min, box_max)).float().mean(0)
         self.register_buffer("middle", middle, persistent=False)
 
-    def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
+    def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         rendering = renderings[-1]
         path = rendering.path
         distance = (path.positions[:, 0].detach() - self.middle).norm(dim=-1).clamp(min=1e-6)

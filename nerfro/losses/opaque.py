@@ -6,8 +6,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.allowed import Natural, NotNegative
-from nerfro.losses.base import Loss, Model
+from nerfro.losses.base import Loss
 from nerfro.registry import register
+from nerfro.rendering import Scene
 from nerfro.types import Batch, Rendering
 
 
@@ -22,6 +23,6 @@ class Opaque(Loss):
     def __init__(self, weight: NotNegative = 1e-2, start: Natural = 0, ramp: Natural = 0) -> None:
         super().__init__(weight, start, ramp)
 
-    def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
+    def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         passed = renderings[-1].transmittance.square()
         return batch.per_pixel(renderings[-1].path.per_ray(passed)).mean()

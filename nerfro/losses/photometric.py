@@ -7,8 +7,9 @@ from torch import Tensor
 from torch.nn.functional import mse_loss
 
 from nerfro.allowed import Natural, NotNegative
-from nerfro.losses.base import Loss, Model
+from nerfro.losses.base import Loss
 from nerfro.registry import register
+from nerfro.rendering import Scene
 from nerfro.types import Batch, Rendering
 
 
@@ -28,8 +29,9 @@ class Photometric(Loss):
         super().__init__(weight, start, ramp)
         self.coarse = coarse
 
-    def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
+    def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         value = batch.rgb.new_zeros(())
         for rendering, factor in zip(renderings, [self.coarse] * (len(renderings) - 1) + [1.0], strict=True):
-            value = value + factor * mse_loss(*model.difference(batch.per_pixel(rendering.rgb), batch.rgb))
+            radiance = batch.per_pixel(rendering.rgb)
+            value = value + factor * mse_loss(*scene.colour_space.prediction_and_target(radiance, batch.rgb))
         return value

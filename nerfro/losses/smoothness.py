@@ -8,8 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.allowed import Natural, NotNegative, Range
-from nerfro.losses.base import Loss, Model
+from nerfro.losses.base import Loss
 from nerfro.registry import register
+from nerfro.rendering import Scene
 from nerfro.types import Batch, Exits, Rendering
 
 
@@ -31,8 +32,10 @@ class Smoothness(Loss):
         super().__init__(weight, start, ramp)
         self.tile_size = tile_size
 
-    def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
-        return tile_roughness(model.encode(model.boundary(Exits(batch.cameras.tile(self.tile_size, batch.draws)))))
+    def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
+        return tile_roughness(
+            scene.colour_space.to_srgb(scene.boundary(Exits(batch.cameras.tile(self.tile_size, batch.draws))))
+        )
 
 
 def tile_roughness(rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:

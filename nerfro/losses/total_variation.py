@@ -10,8 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.allowed import Count, Natural, NotNegative, Range
-from nerfro.losses.base import Loss, Model
+from nerfro.losses.base import Loss
 from nerfro.registry import register
+from nerfro.rendering import Scene
 from nerfro.types import Batch, Exits, Rendering
 
 
@@ -38,11 +39,11 @@ class TotalVariation(Loss):
         super().__init__(weight, start, ramp)
         self.num_directions, self.angle = num_directions, angle
 
-    def forward(self, renderings: list[Rendering], batch: Batch, model: Model) -> Float[Tensor, ""]:
+    def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         index = torch.arange(self.num_directions, device=batch.rgb.device)
         numbers = batch.draws.uniform(index, 3, "total variation")
         first, second = direction_pairs(numbers, math.radians(self.angle))
-        rgb = model.encode(model.boundary(Exits(torch.cat([first, second]))))
+        rgb = scene.colour_space.to_srgb(scene.boundary(Exits(torch.cat([first, second]))))
         return (rgb[self.num_directions :] - rgb[: self.num_directions]).abs().mean()
 
 

@@ -8,14 +8,13 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from nerfro.draws import Draws
-from nerfro.models.base import NerfModel, Parts
 from nerfro.registry import register
-from nerfro.rendering import composite
+from nerfro.rendering import Components, Renderer, composite
 from nerfro.types import Path, Rendering
 
 
 @register("model", "mip_nerf")
-class MipNerfModel(NerfModel):
+class MipNerfModel(Renderer):
     """mip-NeRF: one field for all levels, resampled where it had weight, with a boundary term (constant or a sky).
 
     Args:
@@ -24,14 +23,14 @@ class MipNerfModel(NerfModel):
 
     empty_shows_boundary = True
 
-    def __init__(self, parts: Parts, colour: Literal["linear", "srgb"] = "linear") -> None:
-        super().__init__(parts, [parts.make_field()], colour)
+    def __init__(self, components: Components, colour: Literal["linear", "srgb"] = "linear") -> None:
+        super().__init__(components, 1, colour)
 
     def render_path(
         self, path: Path, draws: Draws | None = None, teaches_background: Bool[Tensor, "R"] | None = None
     ) -> list[Rendering]:
         boundary_rgb = self.background(path, teaches_background)
-        (field,) = self.fields
+        (field,) = self.scene.fields
         renderings: list[Rendering] = []
         for _ in range(self.point_sampler.num_levels):
             samples = self.point_sampler(path, renderings[-1] if renderings else None, draws)

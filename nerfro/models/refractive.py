@@ -8,14 +8,13 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from nerfro.draws import Draws
-from nerfro.models.base import NerfModel, Parts
 from nerfro.registry import register
-from nerfro.rendering import composite
+from nerfro.rendering import Components, Renderer, composite
 from nerfro.types import Path, Rendering
 
 
 @register("model", "refractive")
-class RefractiveModel(NerfModel):
+class RefractiveModel(Renderer):
     """Radiance fields sampled along bent rays, with a boundary term (paper, section 2); one field for each level.
 
     Args:
@@ -28,11 +27,11 @@ class RefractiveModel(NerfModel):
 
     def __init__(
         self,
-        parts: Parts,
+        components: Components,
         boundary_direction: Literal["exit", "last_coarse"] = "exit",
         colour: Literal["linear", "srgb"] = "linear",
     ) -> None:
-        super().__init__(parts, [parts.make_field() for _ in range(parts.point_sampler.num_levels)], colour)
+        super().__init__(components, components.point_sampler.num_levels, colour)
         self.boundary_direction = boundary_direction
 
     def render_path(
@@ -41,8 +40,8 @@ class RefractiveModel(NerfModel):
         samples = self.point_sampler(path, None, draws)
         directions = None if self.boundary_direction == "exit" else samples.directions[:, -1]
         boundary_rgb = self.background(path, teaches_background, directions)
-        renderings = [composite(samples, self.fields[0](samples), boundary_rgb, path)]
-        for field in self.fields[1:]:
+        renderings = [composite(samples, self.scene.fields[0](samples), boundary_rgb, path)]
+        for field in self.scene.fields[1:]:
             samples = self.point_sampler(path, renderings[-1], draws)
             renderings.append(composite(samples, field(samples), boundary_rgb, path))
         return renderings

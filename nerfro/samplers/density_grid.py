@@ -17,10 +17,9 @@ from nerfro.fields.base import Field
 from nerfro.geometry.contraction import contract, contracted_box, expand, shrinkage
 from nerfro.kernels.arrays import arrays
 from nerfro.registry import register
-from nerfro.rendering import volume_weights
 from nerfro.samplers.base import PointSampler
 from nerfro.samplers.measures import Contracted, WithinBox
-from nerfro.samplers.stepfun import invert_cdf, midpoints, spread_uniform
+from nerfro.samplers.stepfun import invert_cdf, midpoints, spread_uniform, volume_weights
 from nerfro.samplers.stratified import cone_samples
 from nerfro.types import Path, Rendering, Samples
 

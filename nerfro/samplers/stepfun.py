@@ -13,6 +13,25 @@ from nerfro.types import Path
 _MIN_TOTAL_WEIGHT = 1e-5
 
 
+def volume_weights(
+    density: Float[Tensor, "R N"], deltas: Float[Tensor, "R N"]
+) -> tuple[Float[Tensor, "R N"], Float[Tensor, "R"]]:
+    """Weights w_i = T_i (1 - exp(-sigma_i delta_i)) and the final transmittance T_{N+1} (paper, Eqn. volrend).
+
+    Args:
+        density: per world unit.
+        deltas: interval lengths in world units.
+
+    Returns:
+        Weights and transmittance; together they sum to one on every ray.
+    """
+    optical_depth = density * deltas
+    total = optical_depth.cumsum(-1)
+    transmittance = torch.exp(-torch.cat([torch.zeros_like(total[:, :1]), total], dim=-1))
+    weights = -torch.expm1(-optical_depth) * transmittance[:, :-1]
+    return weights, transmittance[:, -1]
+
+
 def spread_uniform(path: Path, num_samples: int, draws: Draws | None, stream: str = "samples") -> Float[Tensor, "P N"]:
     """Spread numbers over [0, 1), ascending along each polyline.
 

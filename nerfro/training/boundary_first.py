@@ -8,8 +8,9 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from nerfro.fields.base import Field
-from nerfro.models.base import NerfModel
 from nerfro.progress import track
+from nerfro.rendering import Renderer
+from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Exits
 
@@ -37,26 +38,27 @@ class BoundaryFirst(Callback):
         self._batches, self._num_steps = batches, num_steps
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        assert isinstance(pl_module, NerfModel)
-        model, camera = pl_module, pl_module.camera
-        learning = [parameter for parameter in model.boundary.parameters() if parameter.requires_grad]
-        box = occupied(model)
+        assert isinstance(pl_module, TrainingModule)
+        scene = pl_module.scene
+        learning = [parameter for parameter in scene.boundary.parameters() if parameter.requires_grad]
+        box = occupied(pl_module.renderer)
         if trainer.global_step > 0 or not learning or box is None:
             return
         # The views' gains as well: a sky that is the mean of photographs of unlike brightness would hold them back.
-        learning += [parameter for parameter in camera.parameters() if parameter.requires_grad]
+        learning += [parameter for parameter in scene.camera.parameters() if parameter.requires_grad]
         optimizer = trainer.optimizers[0]
         group = next(group for group in optimizer.param_groups if group["name"] == "boundary")
         first, last = _RATES
-        batches = self._batches.to(model.device, learning[0].dtype)
+        batches = self._batches.to(scene.device, learning[0].dtype)
         num_pixels = min(_NUM_PIXELS, int(_SHARE * batches.num_pixels))
         for step in track("boundary", range(self._num_steps)):
-            rays, view, rgb = batches.missing(box, num_pixels, step, camera)
+            rays, view, rgb = batches.missing(box, num_pixels, step, scene.camera)
             if len(rays) < _FEWEST:
                 break
             group["lr"] = group["initial_lr"] * first * (last / first) ** (step / self._num_steps)
-            radiance = model.boundary(Exits.unbent(rays))
-            loss = torch.nn.functional.mse_loss(*model.difference(radiance, rgb, camera.gains(view)))
+            radiance = scene.boundary(Exits.unbent(rays))
+            compared = scene.colour_space.prediction_and_target(radiance, rgb, scene.camera.gains(view))
+            loss = torch.nn.functional.mse_loss(*compared)
             # Not by backward(): gradients of several processes would be waited for.
             gradients = torch.autograd.grad(loss, learning, allow_unused=True)
             for parameter, gradient in zip(learning, gradients, strict=True):
@@ -65,14 +67,14 @@ class BoundaryFirst(Callback):
         optimizer.zero_grad()
 
 
-def occupied(model: NerfModel) -> Float[Tensor, "2 3"] | None:
+def occupied(renderer: Renderer) -> Float[Tensor, "2 3"] | None:
     """Corners of the box outside of which there is nothing but the boundary; None where the field fills all space."""
-    field = model.fields[0]
+    field = renderer.scene.fields[0]
     assert isinstance(field, Field)
     if field.bounds is None:
         return None
-    boxes = [field.bounds.to(model.device)]
-    if model.path_sampler.needs_medium:
-        boxes.append(model.medium.content_box.to(model.device))
+    boxes = [field.bounds.to(renderer.scene.device)]
+    if renderer.path_sampler.needs_medium:
+        boxes.append(renderer.scene.medium.content_box.to(renderer.scene.device))
     low, high = torch.stack(boxes, 1)
     return torch.stack([low.amin(0), high.amax(0)])

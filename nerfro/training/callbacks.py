@@ -12,7 +12,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
 from tqdm import tqdm
 
-from nerfro.models.optimizer import training_progress
+from nerfro.training.module import training_progress
 from nerfro.types import Batch
 
 

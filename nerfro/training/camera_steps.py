@@ -15,11 +15,12 @@ from nerfro.camera.panorama import align
 from nerfro.camera.refined import RefinedCamera
 from nerfro.data.base import Views
 from nerfro.geometry.interpolation import misses
-from nerfro.models.base import NerfModel
 from nerfro.rays import Rays
+from nerfro.rendering import Renderer
 from nerfro.subdivision import pixel_rays
 from nerfro.training.boundary_first import occupied
 from nerfro.training.data_module import RayDataModule
+from nerfro.training.module import TrainingModule
 from nerfro.training.outlines import meet_masks
 from nerfro.training.ray_batches import RayBatches
 
@@ -46,13 +47,14 @@ class CameraSteps(Callback):
         self._told: dict[str, Told] = {}  # by what
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        assert isinstance(pl_module, NerfModel)
-        model, camera, box = pl_module, pl_module.camera, occupied(pl_module)
+        assert isinstance(pl_module, TrainingModule)
+        scene, box = pl_module.scene, occupied(pl_module.renderer)
+        camera = scene.camera
         if trainer.global_step > 0 or box is None or not isinstance(camera, RefinedCamera):
             return
-        batches = self._batches.to(model.device)
+        batches = self._batches.to(scene.device)
         panorama = align(camera, batches.cameras, batches.photographed, lambda rays: misses(box, rays))
-        known = {"panorama": panorama, "outlines": meet_masks(camera, self._views, model.medium, panorama)}
+        known = {"panorama": panorama, "outlines": meet_masks(camera, self._views, scene.medium, panorama)}
         self._told = {name: told for name, told in known.items() if told is not None}
 
     def state_dict(self) -> dict[str, Any]:
@@ -62,8 +64,8 @@ class CameraSteps(Callback):
         self._told = {name: Told(**told) for name, told in state_dict.items()}
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
-        assert isinstance(pl_module, NerfModel)
-        camera, step = pl_module.camera, trainer.global_step
+        assert isinstance(pl_module, TrainingModule)
+        camera, step = pl_module.scene.camera, trainer.global_step
         if not isinstance(camera, RefinedCamera) or step < camera.start or (step - camera.start) % camera.every:
             return
         cast(RayDataModule, trainer.datamodule).make_anew()  # type: ignore[attr-defined]
@@ -71,18 +73,18 @@ class CameraSteps(Callback):
         reach = max(_LEAST_REACH, _FIRST_REACH * _SHRINKING**before)
         # Not asked whether errors fall: every camera has painted its own ghost, which holds it where it is.
         how = Step(reach, _SCALE * reach, _LONGEST, share=min(1.0, _WHOLE / (before + 1)), checked=False)
-        _move(pl_module, camera, self._batches, step, how, self._told)
+        _move(pl_module.renderer, camera, self._batches, step, how, self._told)
 
 
 @torch.no_grad()
 def _move(
-    model: NerfModel, camera: RefinedCamera, batches: RayBatches, step: int, how: Step, told: dict[str, Told]
+    renderer: Renderer, camera: RefinedCamera, batches: RayBatches, step: int, how: Step, told: dict[str, Told]
 ) -> None:
     """A step of all cameras by pixels with contrast, drawn anew for each training step.
 
     Where a panorama tells how they are turned, what is seen past the object does not: the sky has learned it from them.
     """
-    batches, box = batches.to(model.device), occupied(model)
+    batches, box = batches.to(renderer.scene.device), occupied(renderer)
     candidates = batches.of_each_view(_DRAWN * camera.num_pixels, step)
     past = None
     if "panorama" in told and box is not None:
@@ -91,6 +93,6 @@ def _move(
     pixels = telling(candidates, camera.num_pixels, batches.photographed, batches.cameras, past)
 
     def shown(rays: Rays, view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
-        return model.shown(rays, camera.gains(view))
+        return renderer.scene.colour_space.to_display(renderer.radiance(rays), camera.gains(view))
 
     improve(camera, batches.cameras, pixels, batches.photographed, shown, how, list(told.values()))

@@ -16,11 +16,11 @@ from nerfro.data.validation_views import WithValidationViews
 from nerfro.errors import NerfroError
 from nerfro.losses.base import Loss
 from nerfro.media.analytic import Vacuum
-from nerfro.models.base import NerfModel, Parts
-from nerfro.models.optimizer import OptimizerConfig
 from nerfro.registry import build, configure, find
+from nerfro.rendering import Components, Renderer
 from nerfro.training.backdrop import settle_backdrop
 from nerfro.training.content import ContentConfig, settle_content
+from nerfro.training.optimizer import OptimizerConfig
 
 
 @dataclass
@@ -186,7 +186,7 @@ def build_losses(nodes: DictConfig, known: bool = True) -> dict[str, Loss]:
     return losses
 
 
-def build_model(config: DictConfig, training: Views | None = None) -> NerfModel:
+def build_model(config: DictConfig, training: Views | None = None) -> Renderer:
     """Compose the model of a configuration (see `TrainConfig`); fills in what it leaves to the data.
 
     Args:
@@ -194,7 +194,6 @@ def build_model(config: DictConfig, training: Views | None = None) -> NerfModel:
         training: views, where they are loaded already; without them, a checkpoint must tell what was believed of them.
     """
     build_losses(config.loss, known=False)  # mistakes are told before anything is read
-    optimizer = OptimizerConfig(**config.optimizer)
     path_sampler = build(config.sampler.path)
     medium = build(config.medium) if path_sampler.needs_medium else Vacuum()
     settle_content(config, medium, None if training is None else training.cameras)
@@ -203,16 +202,13 @@ def build_model(config: DictConfig, training: Views | None = None) -> NerfModel:
         settle_backdrop(config, training.images)
         exposures = None if camera.exposure is None else exif_exposures([f.image for f in training.frames])
         camera.begin(training.cameras, exposures)
-    parts = Parts(
+    components = Components(
         medium=medium,
         path_sampler=path_sampler,
         point_sampler=build(config.sampler.points),
         make_field=lambda: build(config.field),
         boundary=build(config.boundary),
         camera=camera,
-        losses=build_losses(config.loss),
-        optimizer=optimizer,
-        seed=config.seed,
         chunk_size=config.evaluation.chunk_size,
     )
-    return build(config.model, parts=parts)
+    return build(config.model, components=components)

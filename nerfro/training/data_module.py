@@ -15,8 +15,9 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from nerfro.data.base import Views
-from nerfro.models.base import NerfModel
+from nerfro.rendering import Renderer
 from nerfro.subdivision import Subdivision
+from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.watched import WatchedPixels
 from nerfro.types import Batch
@@ -45,10 +46,10 @@ class RayDataModule(LightningDataModule):
 
     def train_dataloader(self) -> Iterator[int]:
         assert self.trainer is not None  # Lightning attaches it before it asks
-        device, model = self.trainer.strategy.root_device, cast(NerfModel, self.trainer.lightning_module)
-        self._batches = self.batches.to(device, cast(torch.dtype, model.dtype))
+        device, module = self.trainer.strategy.root_device, cast(TrainingModule, self.trainer.lightning_module)
+        self._batches = self.batches.to(device, cast(torch.dtype, module.dtype))
         self.end_thread()
-        if device.type == "cpu" and can_trace_ahead(model):
+        if device.type == "cpu" and can_trace_ahead(module.renderer):
             self._ahead = OneAhead(self._batches.batch)
         # Lightning asks after it has restored a checkpoint, so a resumed run goes on with the batch it would have had.
         return itertools.count(self.trainer.global_step)
@@ -60,7 +61,7 @@ class RayDataModule(LightningDataModule):
         """Of pixels of validation views, with the rays that training gives such pixels as the medium is now; dB."""
         assert self.trainer is not None
         assert self.watched is not None
-        return self.watched.psnr(cast(NerfModel, self.trainer.lightning_module), self.batches.subdivision)
+        return self.watched.psnr(cast(TrainingModule, self.trainer.lightning_module).renderer, self.batches.subdivision)
 
     def transfer_batch_to_device(self, batch: int, device: torch.device, dataloader_idx: int) -> Batch | int:
         assert self.trainer is not None
@@ -127,20 +128,20 @@ class OneAhead:
             return self._make(step)
 
 
-def can_trace_ahead(model: NerfModel) -> bool:
+def can_trace_ahead(renderer: Renderer) -> bool:
     """Whether a thread can trace the next step's rays meanwhile: nothing that bends them learns, and a core is free."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with torch.enable_grad():
-        return cores > 1 and not model.paths_learn and model.path_sampler.releases_python(model.medium)
+        return cores > 1 and not renderer.paths_learn and renderer.path_sampler.releases_python(renderer.scene.medium)
 
 
-def traced(batches: RayBatches, model: NerfModel, config: DictConfig) -> RayBatches:
+def traced(batches: RayBatches, renderer: Renderer, config: DictConfig) -> RayBatches:
     """The batches with their paths, and with several rays in pixels for which one does not stand."""
     subdivision = Subdivision.of(config.batches)
     return batches.traced(
-        lambda rays, view: model.path_sampler(model.camera(rays, view), model.medium),
-        lambda rays, view: model.exit_directions(model.camera(rays, view)),
-        subdivision if model.path_sampler.needs_medium else None,  # straight rays do not diverge
+        lambda rays, view: renderer.path_sampler(renderer.scene.camera(rays, view), renderer.scene.medium),
+        lambda rays, view: renderer.exit_directions(renderer.scene.camera(rays, view)),
+        subdivision if renderer.path_sampler.needs_medium else None,  # straight rays do not diverge
     )
 
 

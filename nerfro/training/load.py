@@ -14,10 +14,10 @@ from nerfro.registry import discover
 from nerfro.subdivision import Subdivision
 from nerfro.training.config import build_data
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint, restore
-from nerfro.viewing.scene import Scene
+from nerfro.viewing.trained_scene import TrainedScene
 
 
-def load(run: str | Path, device: str = "auto", root: str | Path | None = None) -> Scene:
+def load(run: str | Path, device: str = "auto", root: str | Path | None = None) -> TrainedScene:
     """The trained scene of a run.
 
     Args:
@@ -41,9 +41,9 @@ def checkpoint_of(run: str | Path) -> Path:
     return path / LAST_CHECKPOINT if path.is_dir() else path
 
 
-def scene_of(checkpoint: dict[str, Any], config: DictConfig, device: torch.device) -> Scene:
+def scene_of(checkpoint: dict[str, Any], config: DictConfig, device: torch.device) -> TrainedScene:
     """The scene of a checkpoint and its configuration, of which the data and how it is evaluated may have changed."""
-    model = restore(checkpoint, config).to(device)
+    renderer = restore(checkpoint, config).to(device)
     corners = [config.content.box_min, config.content.box_max]  # which the model has settled
     content = None if None in corners else torch.tensor([list(corner) for corner in corners])
-    return Scene(model, build_data(config), Subdivision.of(config.evaluation), config.name, content)
+    return TrainedScene(renderer, build_data(config), Subdivision.of(config.evaluation), config.name, content)

@@ -18,7 +18,8 @@ from nerfro.evaluation.image_grid import triptych
 from nerfro.evaluation.path_plot import image_of_paths
 from nerfro.files.lat_long import directions
 from nerfro.media.analytic import Vacuum
-from nerfro.models.base import NerfModel
+from nerfro.rendering import Scene
+from nerfro.training.module import TrainingModule
 from nerfro.types import Batch, Exits, Rays, Rendering
 
 _SKY_HEIGHT = 128  # rows of the picture of the sky
@@ -52,22 +53,23 @@ class TrainingLog(Callback):
     ) -> None:
         if not outputs:
             return
-        assert isinstance(pl_module, NerfModel)
+        assert isinstance(pl_module, TrainingModule)
+        renderer = pl_module.renderer
         loggers = [logger for logger in trainer.loggers if isinstance(logger, (TensorBoardLogger, WandbLogger))]
         if not loggers:
             return
         rays = _middle_row(trainer.datamodule.validation.cameras.to(pl_module.device), batch)  # type: ignore[attr-defined]
         with torch.inference_mode():
-            renderings: list[Rendering] = pl_module(rays)
+            renderings: list[Rendering] = renderer(rays)
         maps = torch.cat([outputs["depth"], outputs["opacity"]], 1)[..., None].expand(-1, -1, 3)
         pictures = {
             "val/prediction_reference_error": _to_8bit(triptych(outputs["prediction"], outputs["target"])),
             "val/depth_opacity": _to_8bit(maps),
-            "val/sky": sky(pl_module),
+            "val/sky": sky(renderer.scene),
         }
-        if not isinstance(pl_module.medium, Vacuum):
+        if not isinstance(renderer.scene.medium, Vacuum):
             shown = torch.linspace(0, len(rays) - 1, min(_NUM_PATHS, len(rays))).long().to(rays.origins.device)
-            pictures["val/paths"] = image_of_paths(renderings[-1].path.of_rays(shown), pl_module.medium)
+            pictures["val/paths"] = image_of_paths(renderings[-1].path.of_rays(shown), renderer.scene.medium)
         for logger in loggers:
             _log_pictures(logger, pictures, trainer.global_step)
             for level, rendering in enumerate(renderings):
@@ -78,7 +80,7 @@ class TrainingLog(Callback):
 
 
 def learning_rates(trainer: Trainer) -> dict[str, float]:
-    """Present learning rate of each part of the model that learns (`NerfModel.parameter_groups`)."""
+    """Present learning rate of each part of the model that learns (`Renderer.parameter_groups`)."""
     return {group["name"]: group["lr"] for group in trainer.optimizers[0].param_groups}
 
 
@@ -95,14 +97,14 @@ def peak_memory(device: torch.device) -> int:
 
 
 @torch.inference_mode()
-def sky(model: NerfModel, height: int = _SKY_HEIGHT) -> UInt8[np.ndarray, "H 2*H 3"]:
-    """The model's boundary as a lat-long picture (see files/lat_long.py)."""
-    was_training = model.boundary.training
-    model.boundary.eval()
+def sky(scene: Scene, height: int = _SKY_HEIGHT) -> UInt8[np.ndarray, "H 2*H 3"]:
+    """The background as a lat-long picture (see files/lat_long.py)."""
+    was_training = scene.boundary.training
+    scene.boundary.eval()
     try:
-        return _to_8bit(model.encode(model.boundary(Exits(directions(height).to(model.device)))))
+        return _to_8bit(scene.colour_space.to_srgb(scene.boundary(Exits(directions(height).to(scene.device)))))
     finally:
-        model.boundary.train(was_training)
+        scene.boundary.train(was_training)
 
 
 def _middle_row(cameras: Cameras, view: int) -> Rays:

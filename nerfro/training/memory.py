@@ -11,8 +11,8 @@ from torch import Tensor
 from nerfro.draws import Draws
 from nerfro.errors import NerfroError
 from nerfro.kernels.available import available_bytes, number_in
-from nerfro.models.base import NerfModel
 from nerfro.rays import Rays
+from nerfro.rendering import Renderer
 
 _PROBED_RAYS = 128
 # Of what autograd keeps of as many rays: a step with its backward pass, and an evaluation, in which nothing is kept.
@@ -21,19 +21,19 @@ _STEP, _EVALUATION = 2.0, 0.5
 _LATER_BYTES = 250e6
 
 
-def require_memory(model: NerfModel, rays: Rays, device: torch.device, share: float = 1.0) -> str:
+def require_memory(renderer: Renderer, rays: Rays, device: torch.device, share: float = 1.0) -> str:
     """What a run will need at most, in one line.
 
     A few rays are rendered, and what autograd keeps of them is counted: it grows with rays, and is most of what does.
     The rays are this `share` of a step's.
     """
     probed = rays[:: max(len(rays) // _PROBED_RAYS, 1)]
-    kept = _kept_bytes(model, probed)
-    state = sum(tensor.nbytes for tensor in model.state_dict().values())
-    learned = sum(p.nbytes for p in model.parameters() if p.requires_grad)
+    kept = _kept_bytes(renderer, probed)
+    state = sum(tensor.nbytes for tensor in renderer.state_dict().values())
+    learned = sum(p.nbytes for p in renderer.parameters() if p.requires_grad)
     # Gradients and Adam's two moments beside the weights.
     num_rays = len(rays) / share
-    needed: float = 3 * learned + kept * max(_STEP * num_rays, _EVALUATION * model.chunk_size)
+    needed: float = 3 * learned + kept * max(_STEP * num_rays, _EVALUATION * renderer.chunk_size)
     if device.type == "cuda":
         needed, there = needed + state, float(torch.cuda.mem_get_info(device)[0])
     else:
@@ -48,9 +48,9 @@ def require_memory(model: NerfModel, rays: Rays, device: torch.device, share: fl
     return f"memory: about {needed / 1e9:.1f} GB{of}, {kept / 1e3:.0f} kB of it for each of {num_rays:.0f} rays a step"
 
 
-def _kept_bytes(model: NerfModel, rays: Rays) -> float:
+def _kept_bytes(renderer: Renderer, rays: Rays) -> float:
     """Bytes that autograd keeps of each ray for the backward pass, parameters left out."""
-    of_model = {tensor.untyped_storage().data_ptr() for tensor in model.state_dict().values()}
+    of_model = {tensor.untyped_storage().data_ptr() for tensor in renderer.state_dict().values()}
     kept: dict[int, int] = {}
 
     def keep(tensor: Tensor) -> Tensor:
@@ -59,8 +59,8 @@ def _kept_bytes(model: NerfModel, rays: Rays) -> float:
             kept[storage.data_ptr()] = storage.nbytes()
         return tensor
 
-    draws = Draws(model.seed, 0, torch.arange(len(rays), device=rays.near.device))
+    draws = Draws(0, 0, torch.arange(len(rays), device=rays.near.device))
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        renderings = model(rays, draws)  # what is kept lives as long as this does, so that no address occurs twice
+        renderings = renderer(rays, draws)  # what is kept lives as long as this does, so that no address occurs twice
         del renderings
     return sum(kept.values()) / len(rays)

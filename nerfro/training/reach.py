@@ -8,7 +8,7 @@ from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.cli import warn
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
-from nerfro.models.base import NerfModel
+from nerfro.rendering import Renderer
 from nerfro.types import Batch
 
 # A share of rays that may pass the field where nothing else learns what they see.
@@ -16,24 +16,24 @@ _FEW = 0.1
 
 
 @torch.no_grad()
-def require_reach(model: NerfModel, batch: Batch) -> None:
+def require_reach(renderer: Renderer, batch: Batch) -> None:
     """Refuse a field that no ray meets; warn where many pass it and see a constant.
 
     Raises:
         NerfroError: every ray of the batch passes the field's box.
     """
-    field = model.fields[0]
+    field = renderer.scene.fields[0]
     assert isinstance(field, Field)
     if (bounds := field.bounds) is None:
         return
-    path = model.trace(batch.rays, batch.path)
+    path = renderer.trace(batch.rays, batch.path)
     enters, leaves = path.span(bounds.to(path.s))
     missed = float((enters >= leaves).double().mean())
     box = f"the field's box from {_rounded(bounds[0])} to {_rounded(bounds[1])}"
     advice = "set content.box_min and content.box_max (or those of field) around what the cameras see"
     if missed == 1:
         raise NerfroError(f"no ray of the training views meets {box}, and nothing is outside of it; {advice}")
-    if missed > _FEW and isinstance(model.boundary, ConstantBoundary):
+    if missed > _FEW and isinstance(renderer.scene.boundary, ConstantBoundary):
         warn(f"{missed:.0%} of the rays pass {box} and see boundary=constant alone, which learns nothing; {advice}")
 
 

@@ -18,7 +18,6 @@ from typing import Any
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.errors import Interrupted, NerfroError, first_of
@@ -26,8 +25,8 @@ from nerfro.files.atomic import write_atomically
 from nerfro.files.foreign_config import foreign_config
 from nerfro.files.owned import held, remove_unfinished, require_own
 from nerfro.kernels.precision import fast_bfloat16
-from nerfro.models.base import NerfModel
 from nerfro.paths import PACKAGE_DIR, user_path
+from nerfro.rendering import Renderer
 from nerfro.training import backdrop, content
 from nerfro.training.config import build_model
 from nerfro.training.settings import RESUMING, first_difference, settings
@@ -45,6 +44,8 @@ def own(folder: Path, config: DictConfig) -> Iterator[Path | None]:
 
     A folder is refused that another process writes to, or that holds anything that this run did not make.
     """
+    from lightning.pytorch.utilities import rank_zero_only  # loading a run must not import Lightning
+
     checkpoint = find_checkpoint(config.ckpt_path, folder)
     if rank_zero_only.rank != 0:  # type: ignore[attr-defined]  # of several processes the first one has looked
         yield checkpoint
@@ -63,9 +64,9 @@ def own(folder: Path, config: DictConfig) -> Iterator[Path | None]:
             raise
 
 
-def begin(folder: Path, config: DictConfig, model: NerfModel) -> None:
+def begin(folder: Path, config: DictConfig, renderer: Renderer) -> None:
     """Refuse a disk that is too full, write what repeats the run, and say in a line or two what it is."""
-    require_room(folder, needed_bytes(model))
+    require_room(folder, needed_bytes(renderer))
     record(folder, config)
     found = f"{content.describe(config.content)}{backdrop.describe(config)}"
     print(f"nerfro: {config.name} on {config.data.root} -> {folder}\n{found}", end="", flush=True)
@@ -81,9 +82,9 @@ def require_room(folder: Path, needed_bytes: int) -> None:
         )
 
 
-def needed_bytes(model: NerfModel) -> int:
+def needed_bytes(renderer: Renderer) -> int:
     """What a run writes: weights and Adam's two moments, beside an old checkpoint until the new one is whole."""
-    weights = sum(parameter.numel() * parameter.element_size() for parameter in model.parameters())
+    weights = sum(parameter.numel() * parameter.element_size() for parameter in renderer.parameters())
     return 2 * 3 * weights + _SPARE_BYTES
 
 
@@ -152,17 +153,21 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], DictConfig]:
     return checkpoint, config
 
 
-def restore(checkpoint: dict, config: DictConfig) -> NerfModel:
+def restore(checkpoint: dict, config: DictConfig) -> Renderer:
     """The trained model of a checkpoint."""
-    model = build_model(config)
+    prefix = "renderer."
+    weights = {n.removeprefix(prefix): w for n, w in checkpoint["state_dict"].items() if n.startswith(prefix)}
+    if not weights:
+        raise NerfroError("an earlier release wrote this checkpoint, with other names of weights; train the run again")
+    renderer = build_model(config)
     try:
-        model.load_state_dict(checkpoint["state_dict"])
+        renderer.load_state_dict(weights)
     except RuntimeError as error:
         reason = str(error).strip().split("\n")[-1].strip()
         raise NerfroError(
             f"the checkpoint's weights do not fit its configuration: {reason}; was nerfro updated?"
         ) from error
-    return model.eval()
+    return renderer.eval()
 
 
 def require_same_run(folder: Path, checkpoint: Path | None, config: DictConfig) -> None:

@@ -9,12 +9,12 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from omegaconf import DictConfig
 
 from nerfro.data.base import DataSource, Views
-from nerfro.models.base import NerfModel
+from nerfro.training.module import TrainingModule
 from nerfro.types import Batch
 from nerfro.viewing.baking import bake_surface
 from nerfro.viewing.live import LivePage
-from nerfro.viewing.scene import Scene
 from nerfro.viewing.server import PageServer
+from nerfro.viewing.trained_scene import TrainedScene
 
 _LOSS_SECONDS = 1.0  # between two points of the curve: on a GPU each waits for the step
 
@@ -39,15 +39,15 @@ class Viewer(Callback):
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         # What cannot be shown, or nowhere, is refused before the first step.
         if self._config.viewer and trainer.is_global_zero:
-            assert isinstance(pl_module, NerfModel)
-            bake_surface(pl_module)
+            assert isinstance(pl_module, TrainingModule)
+            bake_surface(pl_module.renderer)
             self._server = PageServer("localhost", self._config.viewer_port)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._server is None:
             return
-        assert isinstance(pl_module, NerfModel)
-        scene = Scene(pl_module, self._source, name=self._config.name)
+        assert isinstance(pl_module, TrainingModule)
+        scene = TrainedScene(pl_module.renderer, self._source, name=self._config.name)
         self._live = LivePage(self._server, scene, self._views, self._config.evaluation.split)
         print(f"nerfro: the model as it learns: {self._server.url}", flush=True)
 

@@ -17,8 +17,9 @@ from tqdm import tqdm
 from nerfro.camera.exposure import fit_gain
 from nerfro.cameras import Cameras
 from nerfro.data.base import Views
-from nerfro.models.base import NerfModel, psnr
+from nerfro.rendering import Renderer
 from nerfro.subdivision import PixelRays, Subdivision, contrast, subdivide
+from nerfro.training.module import TrainingModule
 from nerfro.types import Batch, mean_per_pixel
 
 # Pixels that are looked at, of at most so many views: the same ones each time, or their scores could not be compared.
@@ -55,34 +56,34 @@ class WatchedPixels:
             contrasts.append(contrast(picture.__getitem__, views.cameras, drawn))
         return cls(views.cameras, *map(torch.cat, (indices, colours, contrasts)))
 
-    def rays(self, model: NerfModel, subdivision: Subdivision) -> PixelRays:
+    def rays(self, renderer: Renderer, subdivision: Subdivision) -> PixelRays:
         """The rays that training gives such pixels."""
-        contrast = self.contrast.to(model.device)
+        contrast = self.contrast.to(renderer.scene.device)
         return subdivide(
-            self.cameras.to(model.device),
-            self.index.to(model.device),
+            self.cameras.to(renderer.scene.device),
+            self.index.to(renderer.scene.device),
             subdivision,
-            lambda rays, view: model.path_sampler(rays, model.medium),
-            lambda rays, view: model.exit_directions(rays),
+            lambda rays, view: renderer.path_sampler(rays, renderer.scene.medium),
+            lambda rays, view: renderer.exit_directions(rays),
             lambda rows: contrast[rows],
         )
 
-    def psnr(self, model: NerfModel, subdivision: Subdivision) -> Float[Tensor, ""]:
+    def psnr(self, renderer: Renderer, subdivision: Subdivision) -> Float[Tensor, ""]:
         """Peak signal-to-noise ratio of the model's pixels, dB; learned exposures are replaced by the best gains.
 
         Args:
             model: that renders the pixels.
             subdivision: which pixels get several rays.
         """
-        found, rgb = self.rays(model, subdivision), self.rgb.to(model.device)
-        radiance = mean_per_pixel(model.radiance(found.rays), found.pixel, len(rgb))
-        if model.camera.exposure is None:
-            return psnr(model.photographed(radiance), rgb)
-        views = self.index.to(model.device) // (self.cameras.height * self.cameras.width)
-        gains = torch.ones_like(radiance)
+        found, rgb = self.rays(renderer, subdivision), self.rgb.to(renderer.scene.device)
+        radiance = mean_per_pixel(renderer.radiance(found.rays), found.pixel, len(rgb))
+        if renderer.scene.camera.exposure is None:
+            return _psnr(renderer.scene.colour_space.to_display(radiance), rgb)
+        views = self.index.to(renderer.scene.device) // (self.cameras.height * self.cameras.width)
+        gains, colour_space = torch.ones_like(radiance), renderer.scene.colour_space
         for view in views.unique():
-            gains[views == view] = fit_gain(model.encode, radiance[views == view], rgb[views == view])
-        return psnr(model.photographed(radiance, gains), rgb)
+            gains[views == view] = fit_gain(colour_space.to_srgb, radiance[views == view], rgb[views == view])
+        return _psnr(colour_space.to_display(radiance, gains), rgb)
 
 
 class FallingBehind(Callback):
@@ -105,8 +106,8 @@ class FallingBehind(Callback):
         self._behind = self.told = False
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        assert isinstance(pl_module, NerfModel)
-        self.comparable = not pl_module.camera.moves
+        assert isinstance(pl_module, TrainingModule)
+        self.comparable = not pl_module.scene.camera.moves
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Batch, batch_idx: int
@@ -151,3 +152,7 @@ class FallingBehind(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         vars(self).update(state_dict)
+
+
+def _psnr(prediction: Float[Tensor, "P 3"], target: Float[Tensor, "P 3"]) -> Float[Tensor, ""]:
+    return -10 * torch.log10((prediction - target).square().mean())

@@ -22,7 +22,7 @@ from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import BLOCK, SdfGrid
 from nerfro.media.solid import Solid
-from nerfro.models.base import NerfModel
+from nerfro.rendering import ColourSpace, Renderer
 from nerfro.types import Exits
 from nerfro.viewing import packing
 from nerfro.viewing.volume import UNSEEN, Volume
@@ -49,13 +49,13 @@ class Baked:
         return {name: packing.pack(voxels, compression) for name, voxels in self.voxels.items()}
 
 
-def bake_surface(model: NerfModel) -> Baked:
+def bake_surface(renderer: Renderer) -> Baked:
     """The bodies on which rays bend, as the grid whose splines `samplers/snell_cpu.py` follows.
 
     Raises:
         NerfroError: the medium has no surface.
     """
-    medium: Medium = model.medium
+    medium: Medium = renderer.scene.medium
     if isinstance(medium, Vacuum):
         return Baked({"iors": [], "nested": False, "absorption": [], "vertices": [2, 2, 2], "low": [0, 0, 0],
                       "high": [1, 1, 1], "step": 1.0, "clearance": 1.0, "block": BLOCK, "shortest": 1.0,
@@ -92,7 +92,7 @@ def bake_surface(model: NerfModel) -> Baked:
             "clearance": unit,
             "block": BLOCK,
             "shortest": MIN_SEARCH_STEP * float((high - low).min()),
-            "events": getattr(model.path_sampler, "max_events", 16),
+            "events": getattr(renderer.path_sampler, "max_events", 16),
         },
         {"distances": packing.two_bytes(slices), "clearance": blocks[..., None]},
     )
@@ -130,18 +130,18 @@ def cube_directions(size: int) -> Float[Tensor, "6*size*size 3"]:
     return F.normalize(torch.stack([torch.stack(face, -1) for face in faces]), dim=-1).view(-1, 3)
 
 
-def volume_arrays(volume: Volume, colour: str) -> Baked:
+def volume_arrays(volume: Volume, colour_space: ColourSpace) -> Baked:
     """What is inside, as the logarithm of its density and the root of its colour.
 
     Args:
         volume: with linear radiance.
-        colour: what the model adds up, see `NerfModel`.
+        colour_space: in which rays add up radiance.
     """
     sides = volume.box[1] - volume.box[0]
     cell = float((sides / (torch.tensor(volume.density.shape) - 1)).min())
     thinnest, span = UNSEEN / cell, math.log(_SOLID / UNSEEN)
     levels = (volume.density.clamp(min=thinnest) / thinnest).log().div(span).clamp(max=1)
-    rgb = (to_srgb(volume.rgb) if colour == "srgb" else volume.rgb).clamp(min=0)
+    rgb = (to_srgb(volume.rgb) if colour_space is ColourSpace.SRGB else volume.rgb).clamp(min=0)
     brightest = max(float(rgb.max()), 1e-6)
     content = torch.cat([(rgb / brightest).sqrt(), levels[..., None]], -1).mul(255).round().byte()
     slices = content.permute(2, 1, 0, 3).numpy()

@@ -20,7 +20,7 @@ from nerfro.viewing.meshes import write_mesh
 from nerfro.viewing.mitsuba_scene import files_beside, write_mitsuba
 from nerfro.viewing.page import page_of
 from nerfro.viewing.points import write_points
-from nerfro.viewing.scene import SKY_HEIGHT, Scene
+from nerfro.viewing.trained_scene import SKY_HEIGHT, TrainedScene
 from nerfro.viewing.volume import RESOLUTION, bake, find_half_depth
 
 
@@ -48,7 +48,7 @@ class Export:
     """One kind of file."""
 
     suffixes: tuple[str, ...]  # of the file's name
-    write: Callable[[Scene, Path, DictConfig], str]  # writes the file and says in a few words what it holds
+    write: Callable[[TrainedScene, Path, DictConfig], str]  # writes the file and says in a few words what it holds
     files: Callable[[Path], list[Path]] = lambda out: [out]  # all that it writes
 
 
@@ -66,31 +66,31 @@ def find_export(what: str, out: Path) -> Export:
     return export
 
 
-def _mesh(scene: Scene, out: Path, config: DictConfig) -> str:
+def _mesh(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     return write_mesh(scene, out, config.resolution or RESOLUTION, find_half_depth(scene, config.half_depth))
 
 
-def _points(scene: Scene, out: Path, config: DictConfig) -> str:
+def _points(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     return write_points(scene, out, config.count)
 
 
-def _sky(scene: Scene, out: Path, config: DictConfig) -> str:
+def _sky(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     sky = scene.sky_of_height(config.resolution or SKY_HEIGHT)
     save_lat_long(out, sky)
     return f"the sky: {sky.shape[1]}x{sky.shape[0]} pixels, lat-long, z up"
 
 
-def _volume(scene: Scene, out: Path, config: DictConfig) -> str:
+def _volume(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     volume = bake(scene, config.resolution or RESOLUTION)
     save_arrays(out, {name: getattr(volume, name).numpy() for name in ("density", "rgb", "box")})
     return f"the inside: {'x'.join(map(str, volume.density.shape))} vertices with density and linear rgb"
 
 
-def _mitsuba(scene: Scene, out: Path, config: DictConfig) -> str:
+def _mitsuba(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     return write_mitsuba(scene, out, config.resolution or RESOLUTION, find_half_depth(scene, config.half_depth))
 
 
-def _page(scene: Scene, out: Path, config: DictConfig) -> str:
+def _page(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     page = page_of(scene, config.resolution or RESOLUTION)
     write_atomically(out, page)
     return f"an interactive page of {len(page) / 1e6:.1f} MB"

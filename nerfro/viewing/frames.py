@@ -21,8 +21,8 @@ from nerfro.files.exr import save_exr
 from nerfro.files.images import save_picture, save_png
 from nerfro.viewing.layers import Layer
 from nerfro.viewing.render_request import Shots
-from nerfro.viewing.scene import Scene
 from nerfro.viewing.sweep import Sweep
+from nerfro.viewing.trained_scene import TrainedScene
 
 _RECORD = "frames.json"
 
@@ -31,7 +31,7 @@ _RECORD = "frames.json"
 class Rendering:
     """What every frame has in common."""
 
-    scenes: Sequence[Scene]  # shown side by side
+    scenes: Sequence[TrainedScene]  # shown side by side
     labels: Sequence[str]  # above each, where there are several
     layer: Layer
     sweep: Sweep | None  # what changes over the film

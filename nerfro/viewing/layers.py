@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.cameras import Cameras
-from nerfro.viewing.scene import RenderedViews, Scene
+from nerfro.viewing.trained_scene import RenderedViews, TrainedScene
 
 Pictures = Float[Tensor, "V H W C"]
 
@@ -26,7 +26,7 @@ class Layer:
     # The values as sRGB in [0, 1]; depth is drawn between the bounds of the camera's rays.
     shown: Callable[[RenderedViews, Cameras], Pictures]
 
-    def of(self, scene: Scene) -> Scene:
+    def of(self, scene: TrainedScene) -> TrainedScene:
         """The scene of which it is rendered."""
         return scene if self.glass and self.inside else scene.with_(glass=self.glass, inside=self.inside)
 

@@ -14,8 +14,8 @@ from nerfro.allowed import Range
 from nerfro.data.base import Views
 from nerfro.viewing.baking import Baked
 from nerfro.viewing.page import document, frame_of, parts_of
-from nerfro.viewing.scene import Scene
 from nerfro.viewing.server import PageServer
+from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import RESOLUTION
 
 LOOK_AGAIN = 3.0  # seconds between two looks at a checkpoint that may be replaced
@@ -53,7 +53,7 @@ class LivePage:
         resolution: vertices of the inside's grid along its longest side, at first.
     """
 
-    def __init__(self, server: PageServer, scene: Scene, views: Views, split: str, resolution: int = 48) -> None:
+    def __init__(self, server: PageServer, scene: TrainedScene, views: Views, split: str, resolution: int = 48) -> None:
         self._server, self._scene, self._cameras = server, scene, views.cameras
         self._resolution = resolution
         frame = {**frame_of(scene, views, split), "version": 0}
@@ -72,18 +72,18 @@ class LivePage:
         low, high = _RESOLUTIONS
         self._resolution = round(min(max(self._resolution * min(max(finer, 0.7), 1.3), low), high))
 
-    def show(self, scene: Scene) -> None:
+    def show(self, scene: TrainedScene) -> None:
         """Show another state of the scene."""
-        moves = any(parameter.requires_grad for parameter in scene.model.medium.parameters())
+        moves = any(parameter.requires_grad for parameter in scene.renderer.scene.medium.parameters())
         self._scene = scene
         parts = self._parts(surface=moves)
         arrays = {name: uri for part in parts.values() for name, uri in part.packed(_FASTEST).items()}
         self._server.publish({name: part.facts for name, part in parts.items()}, arrays)
 
     def _parts(self, surface: bool) -> dict[str, Baked]:
-        model = self._scene.model
-        was_training = model.training
-        model.eval()
+        renderer = self._scene.renderer
+        was_training = renderer.training
+        renderer.eval()
         parts = parts_of(self._scene, self._cameras, self._resolution, surface)
-        model.train(was_training)
+        renderer.train(was_training)
         return parts

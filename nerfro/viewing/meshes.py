@@ -17,16 +17,16 @@ from nerfro.geometry.mesh import TriangleMesh
 from nerfro.light import to_srgb
 from nerfro.media.solid import Solid
 from nerfro.viewing.changes import absorption_of
-from nerfro.viewing.scene import Scene
+from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import ColouredMesh, bake, solid_surface
 
 # Opacity of glass in a .ply, which knows no glass.
 _GLASS_RGBA = (255, 255, 255, 60)
 
 
-def write_mesh(scene: Scene, out: Path, resolution: int, half_depth: float) -> str:
+def write_mesh(scene: TrainedScene, out: Path, resolution: int, half_depth: float) -> str:
     """Write the surfaces of glass, and of what is solid inside: .glb with glass as a material, or .ply with colours."""
-    glass = scene.surface if isinstance(scene.model.medium, Solid) else []
+    glass = scene.surface if isinstance(scene.renderer.scene.medium, Solid) else []
     solid = find_solid(scene, resolution, half_depth)
     if not glass and solid is None:
         raise NerfroError("there is nothing to write: no glass, and nothing inside is solid; raise half_depth")
@@ -38,7 +38,7 @@ def write_mesh(scene: Scene, out: Path, resolution: int, half_depth: float) -> s
     return f"{sum(len(mesh.faces) for mesh in glass)} triangles of glass, {inside}"
 
 
-def find_solid(scene: Scene, resolution: int, half_depth: float) -> ColouredMesh | None:
+def find_solid(scene: TrainedScene, resolution: int, half_depth: float) -> ColouredMesh | None:
     """What is solid inside; None where nothing is."""
     try:
         return solid_surface(scene, bake(scene, resolution), half_depth)
@@ -56,9 +56,11 @@ def with_normals(
     return unique[:, :3], index.reshape(-1, 3), unique[:, 3:]
 
 
-def _gltf_meshes(scene: Scene, glass: list[TriangleMesh], solid: ColouredMesh | None) -> list[GltfMesh]:
+def _gltf_meshes(scene: TrainedScene, glass: list[TriangleMesh], solid: ColouredMesh | None) -> list[GltfMesh]:
     meshes = []
-    for number, (mesh, ior, absorption) in enumerate(zip(glass, scene.ior, absorption_of(scene.model), strict=True)):
+    for number, (mesh, ior, absorption) in enumerate(
+        zip(glass, scene.ior, absorption_of(scene.renderer.scene), strict=True)
+    ):
         thickness = float((mesh.bounds[1] - mesh.bounds[0]).min())
         material = _glass(f"glass {number}", float(ior), absorption.numpy(), thickness)
         vertices, faces, normals = with_normals(mesh)

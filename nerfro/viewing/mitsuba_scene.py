@@ -20,14 +20,14 @@ from nerfro.media.solid import Solid
 from nerfro.scenes.path_tracer import envmap_texture
 from nerfro.viewing.changes import absorption_of
 from nerfro.viewing.meshes import find_solid, with_normals
-from nerfro.viewing.scene import SKY_HEIGHT, Scene
+from nerfro.viewing.trained_scene import SKY_HEIGHT, TrainedScene
 
 _MAX_DEPTH, _SAMPLES = 64, 64
 # Mitsuba's skies stand on edge (y up); this turns y to our z.
 _UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
-def write_mitsuba(scene: Scene, out: Path, resolution: int, half_depth: float) -> str:
+def write_mitsuba(scene: TrainedScene, out: Path, resolution: int, half_depth: float) -> str:
     """Write OUT.xml, and OUT_glass.ply, OUT_inside.ply and OUT_sky.hdr beside it.
 
     Glass is Mitsuba's `dielectric`, which also reflects in part; the parameter `glass` names another material, such as
@@ -38,11 +38,11 @@ def write_mitsuba(scene: Scene, out: Path, resolution: int, half_depth: float) -
     Raises:
         NerfroError: bodies lie inside bodies.
     """
-    glass = scene.surface if isinstance(scene.model.medium, Solid) else []
+    glass = scene.surface if isinstance(scene.renderer.scene.medium, Solid) else []
     if len(glass) > 1:
         raise NerfroError("bodies inside bodies are not written for Mitsuba; write them with what=mesh")
     solid = find_solid(scene, resolution, half_depth)
-    absorption = absorption_of(scene.model)
+    absorption = absorption_of(scene.renderer.scene)
     root = ElementTree.Element("scene", version="3.0.0")
     _add(_add(root, "integrator", type="volpath" if absorption.any() else "path"), "integer", name="max_depth",
          value=str(_MAX_DEPTH))  # fmt: skip
@@ -77,7 +77,7 @@ def files_beside(out: Path) -> list[Path]:
     return [out, *(out.with_name(f"{out.stem}_{part}") for part in ("glass.ply", "inside.ply", "sky.hdr"))]
 
 
-def _add_sky(root: ElementTree.Element, scene: Scene, file: Path) -> None:
+def _add_sky(root: ElementTree.Element, scene: TrainedScene, file: Path) -> None:
     def sky(directions: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         flat = torch.from_numpy(directions.reshape(-1, 3)).float()
         return scene.seen_beyond(flat).numpy().reshape(directions.shape)

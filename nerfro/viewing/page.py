@@ -18,8 +18,9 @@ from nerfro.errors import NerfroError
 from nerfro.files.images import to_8bit
 from nerfro.files.templates import fill_template
 from nerfro.paths import ASSETS_DIR
+from nerfro.rendering import ColourSpace
 from nerfro.viewing.baking import Baked, bake_sky, bake_surface, volume_arrays
-from nerfro.viewing.scene import Scene
+from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import UNSEEN, bake
 
 _TEMPLATES = ASSETS_DIR / "_page"
@@ -29,7 +30,7 @@ _SEARCH_RESOLUTION = 64  # of the grid on which a field without bounds is looked
 _SPLITS = ("test", "val", "train")  # of which the first that the data has gives the cameras
 
 
-def page_of(scene: Scene, resolution: int) -> str:
+def page_of(scene: TrainedScene, resolution: int) -> str:
     """The page of a trained scene, the inside with `resolution` vertices along its longest side.
 
     Raises:
@@ -47,13 +48,17 @@ def page_split(source: DataSource) -> str:
 
 
 def parts_of(
-    scene: Scene, cameras: Cameras, resolution: int, surface: bool = True, progress: bool = False
+    scene: TrainedScene, cameras: Cameras, resolution: int, surface: bool = True, progress: bool = False
 ) -> dict[str, Baked]:
     """All that a model may change: sky and inside, and the surface on demand."""
-    model = scene.model
-    parts = {"surface": bake_surface(model)} if surface else {}
+    renderer = scene.renderer
+    parts = {"surface": bake_surface(renderer)} if surface else {}
     inside = bake(scene, resolution, volume_box(scene, cameras), progress, contracted_beyond(scene))
-    return {**parts, "volume": volume_arrays(inside, model.colour), "sky": bake_sky(model.boundary, model.device)}
+    return {
+        **parts,
+        "volume": volume_arrays(inside, renderer.scene.colour_space),
+        "sky": bake_sky(renderer.scene.boundary, renderer.scene.device),
+    }
 
 
 def document(title: str, frame: dict[str, Any], parts: dict[str, Baked], live: bool = False) -> str:
@@ -67,19 +72,19 @@ def document(title: str, frame: dict[str, Any], parts: dict[str, Baked], live: b
     return fill_template(_TEMPLATES / "page.html.jinja", title=title, scene=scene, arrays=arrays, asset=asset)
 
 
-def frame_of(scene: Scene, views: Views, split: str) -> dict[str, Any]:
+def frame_of(scene: TrainedScene, views: Views, split: str) -> dict[str, Any]:
     """All that does not change while a model learns: cameras, photographs, and where the scene is."""
-    model, cameras = scene.model, views.cameras
-    box = model.medium.content_box.float().cpu()
+    renderer, cameras = scene.renderer, views.cameras
+    box = renderer.scene.medium.content_box.float().cpu()
     if not (box[1] > box[0]).all():
         box = volume_box(scene, cameras)
         if contracted_beyond(scene) is not None:  # what is seen sharply is half as wide as contracted space
             box = box.mean(0) + 0.5 * (box - box.mean(0))
     # Where light begins to be added up along a ray.
-    near = float(cameras.near) if contracted_beyond(scene) is None else float(model.point_sampler.near)  # type: ignore[arg-type]
+    near = float(cameras.near) if contracted_beyond(scene) is None else float(renderer.point_sampler.near)  # type: ignore[arg-type]
     return {
-        "linear": model.colour == "linear",
-        "reflection": model.path_sampler.branching.num_events > 0,
+        "linear": renderer.scene.colour_space is ColourSpace.LINEAR,
+        "reflection": renderer.path_sampler.branching.num_events > 0,
         "orbit": {
             "target": box.mean(0).tolist(),
             "radius": float((box[1] - box[0]).norm() / 2),
@@ -115,7 +120,7 @@ def _photograph(rgb: Float[Tensor, "H W 3"]) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()
 
 
-def volume_box(scene: Scene, cameras: Cameras) -> Float[Tensor, "2 3"]:
+def volume_box(scene: TrainedScene, cameras: Cameras) -> Float[Tensor, "2 3"]:
     """Bounds of what the field holds: those of its samples, or, where these know none, found among the cameras.
 
     Where space is contracted, they are those of the cube around contracted space.
@@ -123,7 +128,7 @@ def volume_box(scene: Scene, cameras: Cameras) -> Float[Tensor, "2 3"]:
     Raises:
         NerfroError: nothing says where to look.
     """
-    box = getattr(scene.model.point_sampler, "box", None)
+    box = getattr(scene.renderer.point_sampler, "box", None)
     if isinstance(box, Tensor):
         return box.float().cpu()
     eyes = cameras.camera_to_world[..., 3].float().cpu()
@@ -140,9 +145,9 @@ def volume_box(scene: Scene, cameras: Cameras) -> Float[Tensor, "2 3"]:
     return torch.maximum(torch.minimum(corners, box[1]), box[0])
 
 
-def contracted_beyond(scene: Scene) -> float | None:
+def contracted_beyond(scene: TrainedScene) -> float | None:
     """Radius of the ball that samples see as it is, where they lie in all of space; None where they are in a box."""
-    radius: float | None = getattr(scene.model.point_sampler, "radius", None)
+    radius: float | None = getattr(scene.renderer.point_sampler, "radius", None)
     return radius
 
 

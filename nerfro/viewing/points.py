@@ -14,7 +14,7 @@ from nerfro.files.images import to_8bit
 from nerfro.files.ply import write_ply
 from nerfro.light import to_srgb
 from nerfro.subdivision import pixel_rays
-from nerfro.viewing.scene import Scene
+from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import ask
 
 # Rays of which less light than this stops inside tell of nothing.
@@ -26,7 +26,7 @@ _NEIGHBOURS, _ALONE = 16, 3.0
 _SPARE = 1.2  # points that are looked for, for each that is wanted: some are alone
 
 
-def write_points(scene: Scene, out: Path, count: int) -> str:
+def write_points(scene: TrainedScene, out: Path, count: int) -> str:
     """Write points with colours (8-bit sRGB) as .ply."""
     positions, radiance = find_points(scene, count)
     colours = to_8bit(to_srgb(radiance)).numpy()
@@ -36,7 +36,7 @@ def write_points(scene: Scene, out: Path, count: int) -> str:
 
 
 @torch.inference_mode()
-def find_points(scene: Scene, count: int, seed: int = 0) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
+def find_points(scene: TrainedScene, count: int, seed: int = 0) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
     """Where rays of random training pixels lose most of their light, world units, and its linear radiance.
 
     Rays are followed through the glass, so that points lie where things are, and not where they seem to be.
@@ -44,23 +44,23 @@ def find_points(scene: Scene, count: int, seed: int = 0) -> tuple[Float[Tensor, 
     Raises:
         NerfroError: the rays meet nothing.
     """
-    model, cameras = scene.model, scene.cameras("train")
+    renderer, cameras = scene.renderer, scene.cameras("train")
     generator = torch.Generator().manual_seed(seed)
     positions: list[Tensor] = []
     radiance: list[Tensor] = []
     found = 0
     with tqdm(total=count, unit="point", unit_scale=True, desc="export", dynamic_ncols=True) as progress:
-        for _ in range(max(1, _PATIENCE * count // model.chunk_size)):
-            pixels = torch.randint(len(cameras) * cameras.height * cameras.width, (model.chunk_size,),
+        for _ in range(max(1, _PATIENCE * count // renderer.chunk_size)):
+            pixels = torch.randint(len(cameras) * cameras.height * cameras.width, (renderer.chunk_size,),
                                    generator=generator)  # fmt: skip
-            rendering = model(pixel_rays(cameras, pixels.to(model.device)))[-1]
+            rendering = renderer(pixel_rays(cameras, pixels.to(renderer.scene.device)))[-1]
             heaviest = rendering.weights.argmax(-1, keepdim=True)
             # Of light that splits, the main path alone.
             hit = rendering.path.first_of_ray(rendering.weights.sum(-1) > _SOLID)
             where, towards = rendering.path.at(rendering.samples.s.gather(1, heaviest))
             where, towards = (rendering.path.first_of_ray(values[:, 0])[hit] for values in (where, towards))
             positions.append(where.cpu())
-            radiance.append(model.linear(ask(scene.field, where, towards)[1]).cpu())
+            radiance.append(renderer.scene.colour_space.to_linear(ask(scene.field, where, towards)[1]).cpu())
             found += len(where)
             progress.update(min(len(where), count - progress.n))
             if found >= _SPARE * count:

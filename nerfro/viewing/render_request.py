@@ -21,7 +21,7 @@ from nerfro.viewing.camera_files import read_cameras
 from nerfro.viewing.camera_paths import PATHS, Flight, Surroundings, fly
 from nerfro.viewing.film import find_ffmpeg
 from nerfro.viewing.layers import LAYERS
-from nerfro.viewing.scene import Scene
+from nerfro.viewing.trained_scene import TrainedScene
 
 FILMS = ("mp4", "gif")
 Angle = Annotated[float, Range(more_than=0, less_than=180)]
@@ -123,16 +123,16 @@ def labels(config: DictConfig) -> list[str]:
     return list(config.labels or [path.name if path.is_dir() else path.absolute().parent.parent.name for path in paths])
 
 
-def prepared(config: DictConfig, scene: Scene) -> Scene:
+def prepared(config: DictConfig, scene: TrainedScene) -> TrainedScene:
     """A loaded scene as it is to be rendered: rays a pixel and at once, and its sky."""
     wanted = {"side": config.supersample, "divergence": config.divergence, "contrast": config.contrast}
     rays = replace(scene.subdivision, **{name: value for name, value in wanted.items() if value is not None})
-    model = variant(scene.model, chunk_size=config.chunk_size or scene.model.chunk_size)
-    scene = replace(scene, model=model, subdivision=rays)
+    renderer = variant(scene.renderer, chunk_size=config.chunk_size or scene.renderer.chunk_size)
+    scene = replace(scene, renderer=renderer, subdivision=rays)
     return scene if config.sky is None else scene.with_(sky=config.sky)
 
 
-def find_shots(config: DictConfig, scene: Scene) -> Shots:
+def find_shots(config: DictConfig, scene: TrainedScene) -> Shots:
     """The cameras that are asked for, at their resolution."""
     shots = _views(config.views, scene) if config.views is not None else _flight(config, scene)
     cameras = shots.cameras
@@ -143,7 +143,7 @@ def find_shots(config: DictConfig, scene: Scene) -> Shots:
     return shots if config.sweep is None else shots.over_time(config.frames)
 
 
-def _flight(config: DictConfig, scene: Scene) -> Shots:
+def _flight(config: DictConfig, scene: TrainedScene) -> Shots:
     """A still, or a path around the object or of a file."""
     around = Surroundings.of(scene.cameras("train"), scene.bounds)
     if config.position is not None:
@@ -157,7 +157,7 @@ def _flight(config: DictConfig, scene: Scene) -> Shots:
     return Shots(cameras, _numbered("frame", len(cameras), 4), len(cameras) > 1)
 
 
-def _views(given: str, scene: Scene) -> Shots:
+def _views(given: str, scene: TrainedScene) -> Shots:
     split, _, number = given.partition(":")
     cameras = scene.cameras(split)
     names = _numbered(split, len(cameras), 3)

@@ -14,14 +14,14 @@ from torch import Tensor
 from nerfro.errors import NerfroError
 from nerfro.files.lat_long import load_lat_long
 from nerfro.paths import user_path
-from nerfro.viewing.scene import Scene
+from nerfro.viewing.trained_scene import TrainedScene
 
 
 @dataclass(frozen=True)
 class Sweep:
     """Something that changes over a film."""
 
-    at: Callable[[Scene, float], Scene]  # the scene at a share of the film, from 0 to 1
+    at: Callable[[TrainedScene, float], TrainedScene]  # the scene at a share of the film, from 0 to 1
     files: Sequence[Path] = ()  # what it is read from
 
 
@@ -43,7 +43,7 @@ def read_sweep(text: str) -> Sweep:
         raise NerfroError(f"sweep={text} is not known; give {known}, or sky:FILE,FILE")
     first, last = map(float, ends)
 
-    def change(scene: Scene, share: float) -> Scene:
+    def change(scene: TrainedScene, share: float) -> TrainedScene:
         value = first + share * (last - first)
         return scene.with_(ior=value) if name == "medium.ior" else scene.with_(absorption=[value] * 3)
 
@@ -58,7 +58,7 @@ def _between_skies(files: list[Path]) -> Sweep:
     height = max(len(sky) for sky in skies)
     skies = [_enlarged(sky, height) for sky in skies]
 
-    def change(scene: Scene, share: float) -> Scene:
+    def change(scene: TrainedScene, share: float) -> TrainedScene:
         place = share * (len(skies) - 1)
         before = min(int(place), len(skies) - 2)
         return scene.with_(sky=torch.lerp(skies[before], skies[before + 1], place - before))

@@ -17,8 +17,8 @@ from nerfro.geometry.contraction import expand, shrinkage
 from nerfro.geometry.interpolation import trilinear
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.types import Samples
-from nerfro.viewing.scene import Scene
 from nerfro.viewing.surface import level_set, without_crumbs
+from nerfro.viewing.trained_scene import TrainedScene
 
 RESOLUTION = 128
 # Optical depth along a cell below which nobody sees its colour.
@@ -38,7 +38,7 @@ class Volume:
 
 @torch.inference_mode()
 def bake(
-    scene: Scene,
+    scene: TrainedScene,
     resolution: int = RESOLUTION,
     box: Float[Tensor, "2 3"] | None = None,
     progress: bool = True,
@@ -55,7 +55,7 @@ def bake(
     """
     if box is None:
         box = scene.bounds if scene.content is None else scene.content
-    field, device = scene.field, scene.model.device
+    field, device = scene.field, scene.renderer.scene.device
     sides = box[1] - box[0]
     counts = ((resolution - 1) * sides / sides.max()).ceil().long() + 1
     axes = [torch.linspace(float(a), float(b), int(n)) for a, b, n in zip(*box, counts, strict=True)]
@@ -78,7 +78,7 @@ def bake(
         colours = [ask(field, where, direction.expand_as(where))[1].cpu() for direction in along]
         rgb[rows] = torch.stack(colours).mean(0)
     shape = [int(n) for n in counts]
-    return Volume(density.view(shape), scene.model.linear(rgb).view(*shape, 3), box, radius)
+    return Volume(density.view(shape), scene.renderer.scene.colour_space.to_linear(rgb).view(*shape, 3), box, radius)
 
 
 def ask(
@@ -92,7 +92,7 @@ def ask(
     return found.density[:, 0].float(), found.rgb[:, 0].float()
 
 
-def find_half_depth(scene: Scene, given: float | None) -> float:
+def find_half_depth(scene: TrainedScene, given: float | None) -> float:
     """The length that `solid_surface` goes by: the given one, or a hundredth of the object's longest side."""
     return float((scene.bounds[1] - scene.bounds[0]).max()) / 100 if given is None else given
 
@@ -107,7 +107,7 @@ class ColouredMesh:
 
 
 @torch.inference_mode()
-def solid_surface(scene: Scene, volume: Volume, half_depth: float) -> ColouredMesh:
+def solid_surface(scene: TrainedScene, volume: Volume, half_depth: float) -> ColouredMesh:
     """Marching cubes around what is solid: where half the light is lost within `half_depth` world units.
 
     Small parts apart from the rest are left out.
@@ -129,7 +129,7 @@ def solid_surface(scene: Scene, volume: Volume, half_depth: float) -> ColouredMe
     gradients = torch.stack(torch.gradient(padded.clamp(min=1e-3 * level).log()), -1) / spacing
     normals = -functional.normalize(trilinear(gradients, box, vertices), dim=-1)
     radiance = [
-        ask(scene.field, places.to(scene.model.device), towards)[1].cpu()
+        ask(scene.field, places.to(scene.renderer.scene.device), towards)[1].cpu()
         for places, towards in zip(vertices.split(_POINTS_AT_ONCE), (-normals).split(_POINTS_AT_ONCE), strict=True)
     ]
-    return ColouredMesh(mesh, normals, scene.model.linear(torch.cat(radiance)))
+    return ColouredMesh(mesh, normals, scene.renderer.scene.colour_space.to_linear(torch.cat(radiance)))

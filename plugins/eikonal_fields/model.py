@@ -13,12 +13,10 @@ from nerfro.draws import Draws
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.fields.selection import inside_box
-from nerfro.models.base import NerfModel, Parts
-from nerfro.models.optimizer import learning_rate_factor, training_progress
 from nerfro.registry import register
-from nerfro.rendering import composite
+from nerfro.rendering import Components, Renderer, composite
 from nerfro.samplers.straight import straight_path
-from nerfro.types import Batch, Path, Radiance, Rays, Rendering, Samples
+from nerfro.types import Path, Radiance, Rays, Rendering, Samples
 
 from .background import Background
 
@@ -34,7 +32,7 @@ class Stage(IntEnum):
 
 
 @register("model", "eikonal_fields")
-class EikonalFields(NerfModel):
+class EikonalFields(Renderer):
     """Eikonal Fields: the scene along straight rays, then the index in a box, then what is inside it.
 
     1. Scene: a radiance field and the boundary, on straight rays.
@@ -49,12 +47,14 @@ class EikonalFields(NerfModel):
         interior: radiance field of the third stage.
     """
 
+    trains_in_parallel = False  # a stage leaves out parameters, whose gradients other processes would wait for
+
     stage: Tensor
     box: Float[Tensor, "2 3"]
 
     def __init__(
         self,
-        parts: Parts,
+        components: Components,
         scene_share: float = 0.4,
         index_share: float = 0.4,
         box_min: list[float] = (-1.0, -1.0, -1.0),  # type: ignore[assignment]
@@ -66,7 +66,7 @@ class EikonalFields(NerfModel):
         """Compose the model.
 
         Args:
-            parts: what it is composed of; its medium has parameters.
+            components: that it is composed of; its medium has parameters.
             scene_share, index_share: of the budget for the first two stages; the third has the rest.
             box_min, box_max: corners of the box in which radiance is sampled, world units.
             resolution: vertices a side of the grids of the second stage.
@@ -76,7 +76,7 @@ class EikonalFields(NerfModel):
         Raises:
             NerfroError: a number is out of range.
         """
-        super().__init__(parts, [parts.make_field()])
+        super().__init__(components, num_fields=1)
         if not (scene_share > 0 and index_share > 0 and scene_share + index_share <= 1):
             raise NerfroError(
                 f"model=eikonal_fields: scene_share={scene_share} index_share={index_share}; "
@@ -87,7 +87,7 @@ class EikonalFields(NerfModel):
                 f"model=eikonal_fields: resolution={resolution} blur={blur} num_levels={num_levels}; "
                 "take at least 2 vertices, a positive blur and 1 level or more"
             )
-        self.interior = parts.make_field()
+        self.interior = components.make_field()
         self.scene_share, self.index_share = scene_share, index_share
         self.resolution, self.blur, self.num_levels = resolution, blur, num_levels
         self.register_buffer("box", torch.tensor([list(box_min), list(box_max)]), persistent=False)
@@ -106,42 +106,33 @@ class EikonalFields(NerfModel):
         rest = 1 - self.scene_share - self.index_share
         return Stage.INTERIOR, min((progress - self.index_share) / rest, 1.0) if rest > 0 else 1.0
 
-    def setup(self, stage: str) -> None:
-        if self.trainer.world_size > 1:
-            # A stage leaves out parameters, whose gradients the other processes would wait for.
-            raise NerfroError("model=eikonal_fields trains in one process; set trainer.devices=1")
-
-    def on_train_batch_start(self, batch: Batch, batch_index: int) -> None:
-        super().on_train_batch_start(batch, batch_index)
-        stage, done = self.stage_at(training_progress(self.trainer))
+    def begin_step(self, progress: float) -> float:
+        stage, done = self.stage_at(progress)
         self.stage.fill_(int(stage))
-        self.log("train/stage", float(stage))
-        for group in self.trainer.optimizers[0].param_groups:
-            factor = learning_rate_factor(self.global_step, done, self.optimizer_config)
-            group["lr"] = group["initial_lr"] * factor
         if stage == Stage.INDEX:
             self.sharpen(min(int(done * self.num_levels), self.num_levels - 1))
         else:
             self._sharp = self._blurred = None
+        return done
 
     def sharpen(self, level: int) -> None:
         """Blur what is seen around the box as it is at a level of the second stage."""
         if self._sharp is None:
-            (field,) = self.fields
+            scene = self.scene
+            (field,) = scene.fields
             self._sharp = Background.fit(
                 field,  # type: ignore[arg-type]
-                self.boundary,
+                scene.boundary,
                 self.box,
-                self.medium.box,
+                scene.medium.box,
                 self.resolution,
             )
         if self._blurred is None or level != self._level:
             self._level, self._blurred = level, self._sharp.blurred(self.blur / 2**level)
 
-    def parameter_groups(self) -> dict[str, tuple[list[nn.Parameter], float]]:
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         # Parameters outside of a stage get no gradient, which Adam skips.
-        interior = list(self.interior.parameters()), self.optimizer_config.learning_rate
-        return {**super().parameter_groups(), "interior": interior}
+        return {**super().parameter_groups(), "interior": list(self.interior.parameters())}
 
     def trace(self, rays: Rays, path: Path | None = None) -> Path:
         """Paths of rays as the present stage sees them, traced anew: what bends them is learned, or was."""
@@ -149,17 +140,17 @@ class EikonalFields(NerfModel):
         if stage == Stage.SCENE:
             return straight_path(rays)
         with torch.set_grad_enabled(stage == Stage.INDEX and torch.is_grad_enabled()):
-            return self.path_sampler(rays, self.medium)
+            return self.path_sampler(rays, self.scene.medium)
 
     def render_path(
         self, path: Path, draws: Draws | None = None, teaches_background: Bool[Tensor, "R"] | None = None
     ) -> list[Rendering]:
         stage = Stage(int(self.stage))
         samples = self.point_sampler(path, None, draws)
-        (field,) = self.fields
+        (field,) = self.scene.fields
         if stage == Stage.SCENE:
             return [composite(samples, field(samples), self.background(path, teaches_background), path)]
-        outside = ~inside_box(samples.positions.detach(), *self.medium.box)
+        outside = ~inside_box(samples.positions.detach(), *self.scene.medium.box)
         if stage == Stage.INDEX and self.training:
             assert self._blurred is not None  # made at the start of the step
             radiance = radiance_where(self._blurred.radiance_at, samples, outside)

@@ -13,7 +13,7 @@ from nerfro.camera.given import GivenCamera
 from nerfro.light import to_srgb
 from nerfro.losses.photometric import Photometric
 from nerfro.models.refractive import RefractiveModel
-from nerfro.testing import NUM_RAYS, example_batch, example_parts
+from nerfro.testing import NUM_RAYS, example_batch, example_components
 
 
 def test_gains_are_one_on_average_whatever_is_learned() -> None:
@@ -35,24 +35,28 @@ def test_gains_start_from_the_exposures_that_files_tell() -> None:
 def test_a_group_of_its_own_learns_gains_and_bends_no_ray() -> None:
     camera = GivenCamera(exposure=True)
     camera.begin(example_batch().cameras)
-    model = RefractiveModel(replace(example_parts(), camera=camera))
+    model = RefractiveModel(replace(example_components(), camera=camera))
     assert set(model.parameter_groups()) == {"fields", "exposure"}
     assert not model.paths_learn
 
 
 def test_a_rendering_is_exposed_before_losses_see_it() -> None:
-    model, batch = RefractiveModel(example_parts()), example_batch()
+    model, batch = RefractiveModel(example_components()), example_batch()
     gain = torch.rand(NUM_RAYS, 3) + 0.5
     (rendering,) = model(batch.rays)
     exposed = rendering.exposed(gain)
     torch.testing.assert_close(exposed.rgb, gain * rendering.rgb)
     torch.testing.assert_close(exposed.boundary_rgb, gain * rendering.boundary_rgb)
-    expected = mse_loss(model.encode(gain * rendering.rgb), batch.rgb)
-    torch.testing.assert_close(Photometric()([exposed], batch, model), expected)
+    expected = mse_loss(model.scene.colour_space.to_srgb(gain * rendering.rgb), batch.rgb)
+    torch.testing.assert_close(Photometric()([exposed], batch, model.scene), expected)
 
 
 @pytest.mark.parametrize("factors", [(1.0, 1.0, 1.0), (0.4, 0.9, 1.7), (3.0, 0.2, 1.0)])
 def test_the_gain_of_a_picture_is_found_again_though_parts_of_it_saturate(factors: tuple[float, ...]) -> None:
     radiance, gain = 1.5 * torch.rand(500, 3), torch.tensor(factors)
-    found = fit_gain(RefractiveModel(example_parts()).encode, radiance, to_srgb(gain * radiance).clamp(max=1))
+    found = fit_gain(
+        RefractiveModel(example_components()).scene.colour_space.to_srgb,
+        radiance,
+        to_srgb(gain * radiance).clamp(max=1),
+    )
     torch.testing.assert_close(found, gain, rtol=1e-4, atol=0)

@@ -73,7 +73,7 @@ def test_cameras_of_other_views_come_back_on_left_halves(train_here: Callable[..
     assert done.code == 0, done.err
     scene = load(tmp_path / "run", "cpu")
     moved = replace(true, camera_to_world=disturbed(true, math.radians(0.5), 0.01, 1).float())
-    found = refine_on_left(scene.model, replace(views, cameras=moved), torch.ones(len(views), 3), 6)
+    found = refine_on_left(scene.renderer, replace(views, cameras=moved), torch.ones(len(views), 3), 6)
     before, after = (motion_between(true.camera_to_world, each.camera_to_world) for each in (moved, found))
     # From 0.480 to 0.036 degrees, and from 0.027 to 0.002 of 3 world units.
     assert float(after[0].median()) < 0.15 * float(before[0].median())
@@ -180,7 +180,7 @@ def test_cameras_move_by_sky_and_masks_before_training_and_what_these_told_is_ke
         folder = tmp_path / f"run_{masks}"
         done = train_here(*options, f"hydra.run.dir={folder}")
         assert done.code == 0, done.err
-        cameras.append(load(folder, "cpu").model.camera)
+        cameras.append(load(folder, "cpu").renderer.scene.camera)
         kept.append(load_checkpoint(folder / "checkpoints" / "last.ckpt")[0]["callbacks"]["CameraSteps"])
     without, with_masks = cameras
     assert bool((without.motions.motion[:, :3] != 0).all())

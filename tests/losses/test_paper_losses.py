@@ -16,53 +16,50 @@ from nerfro.losses.boundary import BoundaryRegulariser
 from nerfro.losses.photometric import Photometric
 from nerfro.losses.smoothness import Smoothness, tile_roughness
 from nerfro.media.analytic import Luneburg
-from nerfro.models.base import NerfModel, Parts
-from nerfro.models.optimizer import OptimizerConfig
 from nerfro.models.refractive import RefractiveModel
+from nerfro.rendering import Components, Renderer
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.hierarchical import Hierarchical
 from nerfro.testing import NUM_RAYS, example_batch, example_rendering
 
 
 @pytest.fixture(scope="module")
-def model() -> NerfModel:
-    parts = Parts(
+def model() -> Renderer:
+    parts = Components(
         medium=Luneburg(),
         path_sampler=Eikonal("leapfrog", 32),
         point_sampler=Hierarchical(8, 8),
         make_field=lambda: NerfField(width=16, depth=2, skip=1, view_width=8),
         boundary=Skybox(width=8),
-        losses={},
-        optimizer=OptimizerConfig(),
     )
     return RefractiveModel(parts, colour="srgb")
 
 
-def gradient_norms(model: NerfModel, value: Tensor) -> dict[str, float]:
+def gradient_norms(model: Renderer, value: Tensor) -> dict[str, float]:
     model.zero_grad()
     value.backward()
-    parts = {"coarse": model.fields[0], "fine": model.fields[1], "boundary": model.boundary}
+    parts = {"coarse": model.scene.fields[0], "fine": model.scene.fields[1], "boundary": model.scene.boundary}
     return {
         name: sum(float(p.grad.abs().sum()) for p in part.parameters() if p.grad is not None)
         for name, part in parts.items()
     }
 
 
-def test_photometric_loss_is_the_mean_over_rays_and_channels_of_both_levels(model: NerfModel) -> None:
+def test_photometric_loss_is_the_mean_over_rays_and_channels_of_both_levels(model: Renderer) -> None:
     batch = example_batch()
     coarse = replace(example_rendering(), rgb=batch.rgb + 0.1)
     fine = replace(coarse, rgb=batch.rgb - 0.3)
-    torch.testing.assert_close(Photometric()([coarse, fine], batch, model), torch.tensor(0.09 + 0.01))
-    torch.testing.assert_close(Photometric(coarse=0.1)([coarse, fine], batch, model), torch.tensor(0.09 + 0.001))
+    torch.testing.assert_close(Photometric()([coarse, fine], batch, model.scene), torch.tensor(0.09 + 0.01))
+    torch.testing.assert_close(Photometric(coarse=0.1)([coarse, fine], batch, model.scene), torch.tensor(0.09 + 0.001))
 
 
-def test_photometric_loss_reaches_both_fields_and_the_boundary(model: NerfModel) -> None:
+def test_photometric_loss_reaches_both_fields_and_the_boundary(model: Renderer) -> None:
     batch = example_batch()
-    norms = gradient_norms(model, Photometric()(model(batch.rays), batch, model))
+    norms = gradient_norms(model, Photometric()(model(batch.rays), batch, model.scene))
     assert min(norms.values()) > 0
 
 
-def test_boundary_regulariser_by_hand(model: NerfModel) -> None:
+def test_boundary_regulariser_by_hand(model: Renderer) -> None:
     batch = example_batch()
     transmittance = torch.linspace(0, 1, NUM_RAYS)
     rendering = replace(example_rendering(), transmittance=transmittance)
@@ -72,36 +69,36 @@ def test_boundary_regulariser_by_hand(model: NerfModel) -> None:
             count += 1
             passed = transmittance[ray] * rendering.boundary_rgb[ray]
             total += sum(abs(float(passed[c] - batch.rgb[ray, c])) for c in range(3))
-    value = BoundaryRegulariser()([rendering, rendering], batch, model)
+    value = BoundaryRegulariser()([rendering, rendering], batch, model.scene)
     assert value.item() == pytest.approx(total / (count + 1), rel=1e-5)
 
 
-def test_boundary_regulariser_counts_no_ray_that_is_mostly_blocked(model: NerfModel) -> None:
+def test_boundary_regulariser_counts_no_ray_that_is_mostly_blocked(model: Renderer) -> None:
     rendering = replace(example_rendering(), transmittance=torch.full((NUM_RAYS,), 0.5))
-    assert BoundaryRegulariser()([rendering], example_batch(), model) == 0
+    assert BoundaryRegulariser()([rendering], example_batch(), model.scene) == 0
 
 
-def test_boundary_regulariser_can_be_restricted_to_refracted_rays(model: NerfModel) -> None:
+def test_boundary_regulariser_can_be_restricted_to_refracted_rays(model: Renderer) -> None:
     batch = example_batch()
     rendering = replace(example_rendering(), transmittance=torch.ones(NUM_RAYS))
     refracted = rendering.path.refracted
     assert 0 < refracted.sum() < NUM_RAYS
     error = (rendering.boundary_rgb - batch.rgb).abs().sum(-1)[refracted]
-    value = BoundaryRegulariser(refracted_only=True)([rendering], batch, model)
+    value = BoundaryRegulariser(refracted_only=True)([rendering], batch, model.scene)
     torch.testing.assert_close(value, error.sum() / (len(error) + 1))
 
 
-def test_boundary_regulariser_teaches_the_fine_density_only(model: NerfModel) -> None:
+def test_boundary_regulariser_teaches_the_fine_density_only(model: Renderer) -> None:
     with torch.no_grad():
-        for field in model.fields:
+        for field in model.scene.fields:
             field.mlp.density.bias.fill_(-3.0)  # thin enough for light to pass
     batch = example_batch()
     renderings = model(batch.rays)
     assert (renderings[-1].transmittance > 0.5).any()
-    norms = gradient_norms(model, BoundaryRegulariser()(renderings, batch, model))
+    norms = gradient_norms(model, BoundaryRegulariser()(renderings, batch, model.scene))
     assert norms["coarse"] == norms["boundary"] == 0
     assert norms["fine"] > 0
-    colour = model.fields[1].mlp.rgb
+    colour = model.scene.fields[1].mlp.rgb
     assert colour.weight.grad is None or (colour.weight.grad == 0).all()
 
 
@@ -119,9 +116,9 @@ def test_roughness_of_a_ramp_is_half_its_squared_slope() -> None:
     torch.testing.assert_close(tile_roughness(ramp), torch.tensor(0.5 * 0.01))
 
 
-def test_smoothness_teaches_the_boundary_only(model: NerfModel) -> None:
+def test_smoothness_teaches_the_boundary_only(model: Renderer) -> None:
     batch = example_batch()
-    norms = gradient_norms(model, Smoothness(tile_size=8)(model(batch.rays), batch, model))
+    norms = gradient_norms(model, Smoothness(tile_size=8)(model(batch.rays), batch, model.scene))
     assert norms["coarse"] == norms["fine"] == 0
     assert norms["boundary"] > 0
 

@@ -14,12 +14,12 @@ from nerfro.losses.boundary import BoundaryRegulariser
 from nerfro.losses.photometric import Photometric
 from nerfro.models.refractive import RefractiveModel
 from nerfro.samplers.stratified import point_samples
-from nerfro.testing import example_batch, example_parts, example_path
+from nerfro.testing import example_batch, example_components, example_path
 from nerfro.types import Batch, Rendering
 
 # Rays of three pixels: one through the first, three through the second, four through the last.
 PIXEL = torch.tensor([0, 1, 2, 2, 1, 2, 1, 2])
-MODEL = RefractiveModel(example_parts())
+MODEL = RefractiveModel(example_components())
 
 
 def rendering(colour: Tensor, background: Tensor, passed: Tensor) -> Rendering:
@@ -45,7 +45,7 @@ def test_values_of_a_pixel_are_the_mean_over_its_rays_in_any_order() -> None:
 def test_pixels_are_compared_and_not_their_rays() -> None:
     given, rendered = batch(), rendering(torch.rand(8, 3), torch.rand(8, 3), torch.rand(8))
     expected = (to_srgb(given.per_pixel(rendered.rgb)) - given.rgb).square().mean()
-    torch.testing.assert_close(Photometric()([rendered], given, MODEL), expected)
+    torch.testing.assert_close(Photometric()([rendered], given, MODEL.scene), expected)
 
 
 def test_the_regulariser_compares_the_background_of_a_pixel_as_well() -> None:
@@ -53,14 +53,14 @@ def test_the_regulariser_compares_the_background_of_a_pixel_as_well() -> None:
     rendered = rendering(torch.rand(8, 3), torch.rand(8, 3), passed)
     background = to_srgb(given.per_pixel(passed[:, None] * rendered.boundary_rgb))
     expected = (background - given.rgb).abs().sum(-1)[:2].sum() / (2 + 1)
-    torch.testing.assert_close(BoundaryRegulariser()([rendered], given, MODEL), expected)
+    torch.testing.assert_close(BoundaryRegulariser()([rendered], given, MODEL.scene), expected)
 
 
 @pytest.mark.parametrize("absorbs", [False, True])
 def test_a_background_learns_from_chosen_rays_and_what_bends_them_from_all(absorbs: bool) -> None:
     sky = EnvironmentMap([4])
     torch.nn.init.normal_(sky.texels)
-    model = RefractiveModel(replace(example_parts(), boundary=sky))
+    model = RefractiveModel(replace(example_components(), boundary=sky))
     directions = torch.nn.functional.normalize(torch.randn(8, 3), dim=-1).requires_grad_()
     absorption = torch.tensor([[0.0] * 3, [0.1, 0.2, 0.3]], requires_grad=True)
     path = example_path(8).changed(exit_directions=directions, **({"absorption": absorption} if absorbs else {}))
@@ -85,7 +85,7 @@ def test_a_background_learns_from_chosen_rays_and_what_bends_them_from_all(absor
 def test_a_saturated_pixel_is_no_error_where_both_clip_and_keeps_a_gradient_where_one_does() -> None:
     photograph = torch.tensor([1.0, 1.0, 0.6])  # saturated, saturated, not
     radiance = torch.tensor([3.0, 0.5, 3.0], requires_grad=True)
-    prediction, target = MODEL.difference(radiance, photograph)
+    prediction, target = MODEL.scene.colour_space.prediction_and_target(radiance, photograph)
     (prediction - target).square().sum().backward()
     lamp, too_dark, too_bright = radiance.grad
     assert lamp == 0
@@ -93,8 +93,8 @@ def test_a_saturated_pixel_is_no_error_where_both_clip_and_keeps_a_gradient_wher
 
 
 def test_in_the_authors_arithmetic_nothing_is_encoded_or_clipped() -> None:
-    model = RefractiveModel(example_parts(), colour="srgb")
+    model = RefractiveModel(example_components(), colour="srgb")
     radiance, photograph = 1.2 * torch.rand(50, 3), torch.rand(50, 3).round()
-    prediction, target = model.difference(radiance, photograph)
+    prediction, target = model.scene.colour_space.prediction_and_target(radiance, photograph)
     assert prediction is radiance
     assert target is photograph

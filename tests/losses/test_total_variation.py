@@ -12,6 +12,7 @@ import torch
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.errors import NerfroError
 from nerfro.losses.total_variation import TotalVariation, direction_pairs
+from nerfro.rendering import ColourSpace
 from nerfro.testing import example_batch, example_draws
 
 BATCH = example_batch()
@@ -27,13 +28,13 @@ def test_pairs_are_the_angle_apart_and_uniform() -> None:
     torch.testing.assert_close((first * second).sum(-1), torch.full((20_000,), math.cos(0.3)), rtol=0, atol=1e-5)
 
 
-def model(boundary) -> SimpleNamespace:
-    return SimpleNamespace(boundary=boundary, encode=lambda radiance: radiance)
+def scene(boundary) -> SimpleNamespace:
+    return SimpleNamespace(boundary=boundary, colour_space=ColourSpace.SRGB)
 
 
 def test_value_is_that_of_a_linear_sky() -> None:
     # For C = d . a the mean of |C(d') - C(d)| is angle |a| / 2, the mean of |cos| over the sphere, to second order.
-    sky = model(lambda exits: (exits.directions * 0.8).sum(-1, keepdim=True).expand(-1, 3) * 0.5 / math.sqrt(3))
+    sky = scene(lambda exits: (exits.directions * 0.8).sum(-1, keepdim=True).expand(-1, 3) * 0.5 / math.sqrt(3))
     value = TotalVariation(num_directions=100_000, angle=1.0)([], BATCH, sky)
     assert float(value) == pytest.approx(math.radians(1.0) * 0.4 / 2, rel=0.02)
 
@@ -44,7 +45,7 @@ def test_descending_it_flattens_a_sky() -> None:
     optimiser, values = torch.optim.Adam(boundary.parameters(), lr=0.05), []
     for step in range(100):
         batch = replace(BATCH, draws=example_draws(step=step))
-        value = loss([], batch, model(boundary))
+        value = loss([], batch, scene(boundary))
         values.append(float(value.detach()))
         optimiser.zero_grad()
         value.backward()

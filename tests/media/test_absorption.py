@@ -14,7 +14,7 @@ from nerfro.rendering import composite
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.snell import Snell
 from nerfro.samplers.stratified import point_samples
-from nerfro.testing import example_parts, example_rays
+from nerfro.testing import example_components, example_rays
 from nerfro.types import Path, Radiance
 from tests.closed_forms import beam
 
@@ -59,17 +59,17 @@ def test_a_reflection_past_the_ball_is_not_tinted() -> None:
 
 
 def test_absorption_learns_without_tracing_again() -> None:
-    model = RefractiveModel(replace(example_parts(), medium=Ball(learn_absorption=True), path_sampler=Snell()))
+    model = RefractiveModel(replace(example_components(), medium=Ball(learn_absorption=True), path_sampler=Snell()))
     assert not model.paths_learn, "paths may be traced ahead"
-    parameters, _ = model.parameter_groups()["tint"]
+    parameters = model.parameter_groups()["tint"]
     assert [tuple(parameter.shape) for parameter in parameters] == [(1, 3)]
     with torch.no_grad():
         path = model.trace(example_rays())
     renderings = model.render_path(model.trace(example_rays(), path))
     (gradient,) = torch.autograd.grad(renderings[-1].rgb.sum(), parameters)
     assert (gradient != 0).all()
-    assert set(model.medium.learned()) == {f"absorption_1_{colour}" for colour in ("red", "green", "blue")}
-    assert max(model.medium.learned().values()) == pytest.approx(0.02)
+    assert set(model.scene.medium.learned()) == {f"absorption_1_{colour}" for colour in ("red", "green", "blue")}
+    assert max(model.scene.medium.learned().values()) == pytest.approx(0.02)
 
 
 def test_absorption_is_given_for_all_bodies_or_for_each() -> None:

@@ -11,17 +11,17 @@ from torch import Tensor
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.skybox import Skybox
 from nerfro.fields.nerf import NerfField
-from nerfro.losses.photometric import Photometric
 from nerfro.media.analytic import Luneburg
-from nerfro.models.base import Parts
 from nerfro.models.mip_nerf import MipNerfModel
-from nerfro.models.optimizer import OptimizerConfig
 from nerfro.models.refractive import RefractiveModel
+from nerfro.rendering import Components
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.hierarchical import Hierarchical
 from nerfro.samplers.straight import Straight
 from nerfro.samplers.stratified import Stratified
 from nerfro.testing import example_rays
+from nerfro.training.module import TrainingModule
+from nerfro.training.optimizer import OptimizerConfig
 from nerfro.types import Exits
 
 
@@ -33,33 +33,31 @@ class Compass(Boundary):
 
 
 @pytest.fixture
-def parts() -> Parts:
-    return Parts(
+def parts() -> Components:
+    return Components(
         medium=Luneburg(),
         path_sampler=Eikonal("leapfrog", 64),
         point_sampler=Hierarchical(8, 8),
         make_field=lambda: NerfField(width=16, depth=2, skip=1, view_width=8),
         boundary=Skybox(width=8),
-        losses={"photometric": Photometric()},
-        optimizer=OptimizerConfig(learning_rate=1e-3, boundary_learning_rate=1e-2),
         chunk_size=7,
     )
 
 
-def test_refractive_model_has_a_field_for_each_level_and_mip_nerf_one_for_all(parts: Parts) -> None:
-    assert len(RefractiveModel(parts).fields) == 2
-    assert len(MipNerfModel(parts).fields) == 1
-    assert len(RefractiveModel(replace(parts, point_sampler=Stratified(8))).fields) == 1
+def test_refractive_model_has_a_field_for_each_level_and_mip_nerf_one_for_all(parts: Components) -> None:
+    assert len(RefractiveModel(parts).scene.fields) == 2
+    assert len(MipNerfModel(parts).scene.fields) == 1
+    assert len(RefractiveModel(replace(parts, point_sampler=Stratified(8))).scene.fields) == 1
 
 
-def test_levels_of_the_refractive_model_learn_separate_weights(parts: Parts) -> None:
-    coarse, fine = RefractiveModel(parts).fields
+def test_levels_of_the_refractive_model_learn_separate_weights(parts: Components) -> None:
+    coarse, fine = RefractiveModel(parts).scene.fields
     shared = {id(p) for p in coarse.parameters()} & {id(p) for p in fine.parameters()}
     assert not shared
     assert not torch.equal(coarse.mlp.rgb.weight, fine.mlp.rgb.weight)
 
 
-def test_boundary_is_asked_where_the_path_leaves_or_at_the_last_coarse_sample(parts: Parts) -> None:
+def test_boundary_is_asked_where_the_path_leaves_or_at_the_last_coarse_sample(parts: Components) -> None:
     rays, parts = example_rays(), replace(parts, boundary=Compass())
     path = parts.path_sampler(rays, parts.medium)
     leaving = RefractiveModel(parts, "exit").eval()(rays)
@@ -69,7 +67,7 @@ def test_boundary_is_asked_where_the_path_leaves_or_at_the_last_coarse_sample(pa
         torch.testing.assert_close(rendering.boundary_rgb, 0.5 + 0.5 * early[0].samples.directions[:, -1])
 
 
-def test_rays_that_bend_see_another_sky_than_straight_ones(parts: Parts) -> None:
+def test_rays_that_bend_see_another_sky_than_straight_ones(parts: Components) -> None:
     rays = example_rays()
     bent, straight = (
         RefractiveModel(replace(parts, path_sampler=sampler, boundary=Compass())).eval()(rays)[-1]
@@ -83,7 +81,7 @@ def test_rays_that_bend_see_another_sky_than_straight_ones(parts: Parts) -> None
 
 
 @pytest.mark.parametrize("training", [True, False])
-def test_rendering_is_as_in_evaluation_and_leaves_the_mode_as_it_was(training: bool, parts: Parts) -> None:
+def test_rendering_is_as_in_evaluation_and_leaves_the_mode_as_it_was(training: bool, parts: Components) -> None:
     model = RefractiveModel(parts).train(training)
     first, second = model.render(example_rays()), model.render(example_rays())
     assert torch.equal(first.radiance, second.radiance), "nothing random"
@@ -92,14 +90,14 @@ def test_rendering_is_as_in_evaluation_and_leaves_the_mode_as_it_was(training: b
     assert not first.radiance.requires_grad
 
 
-def test_an_error_while_rendering_leaves_the_mode_as_it_was(parts: Parts) -> None:
+def test_an_error_while_rendering_leaves_the_mode_as_it_was(parts: Components) -> None:
     model = RefractiveModel(replace(parts, point_sampler=Stratified(7, draw="vertices"))).train()
     with pytest.raises(Exception, match="needs a multiple of 7"):
         model.render(example_rays())
     assert model.training
 
 
-def test_chunks_bound_how_many_rays_are_rendered_at_once(parts: Parts, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_bound_how_many_rays_are_rendered_at_once(parts: Components, monkeypatch: pytest.MonkeyPatch) -> None:
     model, sizes = RefractiveModel(parts).eval(), []
     whole = model(example_rays())  # 24 rays
     forward = model.path_sampler.forward
@@ -111,19 +109,19 @@ def test_chunks_bound_how_many_rays_are_rendered_at_once(parts: Parts, monkeypat
     torch.testing.assert_close(rendered.radiance, whole[-1].rgb)
 
 
-def test_optimizer_gives_the_boundary_its_own_rate(parts: Parts) -> None:
+def test_optimizer_gives_the_boundary_its_own_rate(parts: Components) -> None:
     model = RefractiveModel(parts)
-    groups = model.configure_optimizers().param_groups
+    optimizer = OptimizerConfig(learning_rate=1e-3, boundary_learning_rate=1e-2)
+    groups = TrainingModule(model, {}, optimizer).configure_optimizers().param_groups
     rates = {id(p): group["initial_lr"] for group in groups for p in group["params"]}
-    assert {rates[id(p)] for p in model.fields.parameters()} == {1e-3}
-    assert {rates[id(p)] for p in model.boundary.parameters()} == {1e-2}
+    assert {rates[id(p)] for p in model.scene.fields.parameters()} == {1e-3}
+    assert {rates[id(p)] for p in model.scene.boundary.parameters()} == {1e-2}
     assert len(rates) == len(list(model.parameters())), "every weight is learned"
 
 
-def test_model_whose_boundary_has_no_weights_can_be_optimised(parts: Parts) -> None:
-    groups = RefractiveModel(replace(parts, boundary=Compass())).configure_optimizers().param_groups
-    assert len(groups) == 1
+def test_model_whose_boundary_has_no_weights_can_be_optimised(parts: Components) -> None:
+    assert set(RefractiveModel(replace(parts, boundary=Compass())).parameter_groups()) == {"fields"}
 
 
-def test_index_grid_does_not_burden_the_checkpoint(parts: Parts) -> None:
-    assert not [name for name in RefractiveModel(parts).state_dict() if name.startswith("medium")]
+def test_index_grid_does_not_burden_the_checkpoint(parts: Components) -> None:
+    assert not [name for name in RefractiveModel(parts).state_dict() if "medium" in name]

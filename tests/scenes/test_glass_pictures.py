@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from nerfro.cameras import Cameras
+from nerfro.evaluation.metrics import psnr
 from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball, RoundedBox
-from nerfro.models.base import psnr
 from nerfro.samplers.snell import Snell
 from nerfro.scenes import path_tracer, torus
 from nerfro.scenes.path_tracer import PathTracer, Pinhole

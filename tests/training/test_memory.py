@@ -14,9 +14,8 @@ from nerfro.fields.nerf import NerfField
 from nerfro.kernels import available
 from nerfro.kernels.available import available_bytes, require_bytes
 from nerfro.media.analytic import Vacuum
-from nerfro.models.base import NerfModel, Parts
-from nerfro.models.optimizer import OptimizerConfig
 from nerfro.models.refractive import RefractiveModel
+from nerfro.rendering import Components, Renderer
 from nerfro.samplers.straight import Straight
 from nerfro.samplers.stratified import Stratified
 from nerfro.testing import example_rays
@@ -24,13 +23,11 @@ from nerfro.training import memory
 from nerfro.training.memory import require_memory
 
 
-def model_of(width: int) -> NerfModel:
+def model_of(width: int) -> Renderer:
     def field() -> NerfField:
         return NerfField(width=width, depth=8, skip=4, view_width=8)
 
-    return RefractiveModel(
-        Parts(Vacuum(), Straight(), Stratified(8), field, ConstantBoundary(), {}, OptimizerConfig(), chunk_size=256)
-    )
+    return RefractiveModel(Components(Vacuum(), Straight(), Stratified(8), field, ConstantBoundary(), chunk_size=256))
 
 
 def test_what_autograd_keeps_is_counted_and_grows_with_the_network() -> None:

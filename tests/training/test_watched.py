@@ -20,6 +20,7 @@ from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
 from nerfro.light import to_srgb
 from nerfro.media.shapes import Ball
+from nerfro.rendering import ColourSpace
 from nerfro.samplers.snell import Snell
 from nerfro.subdivision import Subdivision
 from nerfro.training.data_module import NO_PICTURE, RayDataModule, RotatingView, looks_every
@@ -153,8 +154,7 @@ def bending() -> Any:
     """What is asked of a model that bends rays by a ball."""
     ball, sampler = Ball(0.6, 1.5), Snell()
     return SimpleNamespace(
-        device=torch.device("cpu"),
-        medium=ball,
+        scene=SimpleNamespace(device=torch.device("cpu"), medium=ball, colour_space=ColourSpace.LINEAR),
         path_sampler=sampler,
         exit_directions=lambda rays: sampler.main(rays, ball).exit_directions,
     )
@@ -165,7 +165,7 @@ def test_watched_pixels_have_the_rays_that_training_gives_them(contrast: float |
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val")
     model = bending()
     batches = RayBatches(views, 256, "single_image")
-    trace = lambda rays, view: model.path_sampler(rays, model.medium)  # noqa: E731
+    trace = lambda rays, view: model.path_sampler(rays, model.scene.medium)  # noqa: E731
     batch = batches.traced(trace, subdivision=Subdivision(2, 8.0, contrast)).batch(0)
     watched = WatchedPixels.of(views)
     found = watched.rays(model, Subdivision(2, 8.0, contrast))
@@ -187,8 +187,7 @@ def test_where_exposures_learn_each_watched_view_has_the_gain_that_suits_it(
         bending(),
     )
     model.radiance = lambda rays: 0.3 + 0.2 * rays.directions
-    model.encode, model.photographed = to_srgb, lambda rgb, gains=1.0: to_srgb(gains * rgb).clamp(0, 1)
-    model.camera = GivenCamera(exposure=learns)
+    model.scene.camera = GivenCamera(exposure=learns)
     rays = watched.rays(model, Subdivision(side, 8.0))
     shown = mean_per_pixel(model.radiance(rays.rays), rays.pixel, len(watched.index))
     gains = torch.tensor([[0.7, 0.8, 0.9], [1.4, 1.2, 1.1]])[watched.index // 256]

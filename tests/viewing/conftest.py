@@ -14,14 +14,13 @@ from nerfro.data.base import DataSource, Views
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
 from nerfro.media.shapes import Ball
-from nerfro.models.base import Parts
-from nerfro.models.optimizer import OptimizerConfig
 from nerfro.models.refractive import RefractiveModel
+from nerfro.rendering import Components
 from nerfro.samplers.snell import Snell
 from nerfro.samplers.stratified import Stratified
 from nerfro.scenes.viewpoints import look_at_origin
 from nerfro.types import Radiance, Samples
-from nerfro.viewing.scene import Scene
+from nerfro.viewing.trained_scene import TrainedScene
 
 RADIUS, INSIDE_RADIUS, INSIDE_CENTRE, IOR = 0.8, 0.3, (0.1, 0.0, 0.05), 1.3
 
@@ -59,16 +58,14 @@ class Photographs(DataSource):
 
 
 @pytest.fixture
-def scene() -> Scene:
+def scene() -> TrainedScene:
     sky = EnvironmentMap([64])
     sky.set_lat_long(sky_of(lat_long.directions(128)))
-    parts = Parts(
+    parts = Components(
         medium=Ball(RADIUS, IOR),
         path_sampler=Snell(),
         point_sampler=Stratified(num_samples=256),
         make_field=SolidBall,
         boundary=sky,
-        losses={},
-        optimizer=OptimizerConfig(),
     )
-    return Scene(RefractiveModel(parts).eval(), Photographs())
+    return TrainedScene(RefractiveModel(parts).eval(), Photographs())

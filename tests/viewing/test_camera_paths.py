@@ -12,13 +12,13 @@ import torch
 from nerfro.errors import NerfroError
 from nerfro.viewing.camera_files import read_cameras
 from nerfro.viewing.camera_paths import PATHS, Flight, Surroundings, fly
-from nerfro.viewing.scene import Scene
+from nerfro.viewing.trained_scene import TrainedScene
 
 CENTRE = torch.tensor([0.5, -0.2, 0.1])
 
 
 @pytest.fixture
-def around(scene: Scene) -> Surroundings:
+def around(scene: TrainedScene) -> Surroundings:
     return Surroundings.of(scene.cameras("train"), torch.stack([CENTRE - 1, CENTRE + 1]))
 
 
@@ -57,7 +57,7 @@ def test_a_dolly_comes_nearer_and_a_spiral_rises(around: Surroundings) -> None:
     torch.testing.assert_close(heights[0], -heights[-1])
 
 
-def test_up_is_what_is_up_in_the_photographs(scene: Scene) -> None:
+def test_up_is_what_is_up_in_the_photographs(scene: TrainedScene) -> None:
     cameras = scene.cameras("train")
     turn = torch.tensor([[1.0, 0, 0], [0, 0.0, 1], [0, -1, 0]])  # z to y
     turned = cameras._each(lambda values: turn @ values if values.ndim == 3 else values)

@@ -24,14 +24,14 @@ from nerfro.geometry.mesh import TriangleMesh
 from nerfro.light import to_linear, to_srgb
 from nerfro.subdivision import Subdivision
 from nerfro.viewing.exports import ExportConfig, find_export
-from nerfro.viewing.scene import Scene
 from nerfro.viewing.surface import without_crumbs
+from nerfro.viewing.trained_scene import TrainedScene
 from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, colour, sky_of
 
 CELL = 2.12 * RADIUS / 47  # of the box with its margin of air
 
 
-def write(scene: Scene, what: str, out: Path, **options: object) -> str:
+def write(scene: TrainedScene, what: str, out: Path, **options: object) -> str:
     config = OmegaConf.structured(ExportConfig(checkpoint="-", what=what, out=str(out)))
     return find_export(what, out).write(scene, out, OmegaConf.merge(config, {"resolution": 48, **options}))
 
@@ -50,7 +50,7 @@ def chunks(file: Path) -> tuple[dict, bytes]:
     return json.loads(content[20 : 20 + size]), content[28 + size :]
 
 
-def test_glb_holds_glass_as_glass_and_the_inside_as_light(scene: Scene, tmp_path: Path) -> None:
+def test_glb_holds_glass_as_glass_and_the_inside_as_light(scene: TrainedScene, tmp_path: Path) -> None:
     write(scene, "mesh", tmp_path / "ball.glb")
     loaded = trimesh.load(tmp_path / "ball.glb")
     glass, inside = (loaded.geometry[name] for name in ("glass_0", "inside"))
@@ -70,7 +70,7 @@ def test_glb_holds_glass_as_glass_and_the_inside_as_light(scene: Scene, tmp_path
     np.testing.assert_allclose(lifted, [INSIDE_CENTRE[0], INSIDE_CENTRE[2], -INSIDE_CENTRE[1]], atol=1e-6)
 
 
-def test_glb_is_laid_out_as_the_specification_asks(scene: Scene, tmp_path: Path) -> None:
+def test_glb_is_laid_out_as_the_specification_asks(scene: TrainedScene, tmp_path: Path) -> None:
     write(scene, "mesh", tmp_path / "ball.glb")
     document, binary = chunks(tmp_path / "ball.glb")
     assert document["asset"]["version"] == "2.0"
@@ -120,7 +120,7 @@ def validated(file: Path) -> dict:
     return json.loads(done.stdout)
 
 
-def test_glb_passes_khronos_validator(scene: Scene, tmp_path: Path) -> None:
+def test_glb_passes_khronos_validator(scene: TrainedScene, tmp_path: Path) -> None:
     write(scene.with_(absorption=[0.1, 0.2, 0.3]), "mesh", tmp_path / "ball.glb")
     report = validated(tmp_path / "ball.glb")
     assert report["issues"]["messages"] == []
@@ -130,7 +130,7 @@ def test_glb_passes_khronos_validator(scene: Scene, tmp_path: Path) -> None:
     assert validated(tmp_path / "bad.glb")["issues"]["numErrors"] > 0
 
 
-def test_ply_holds_both_with_colours(scene: Scene, tmp_path: Path) -> None:
+def test_ply_holds_both_with_colours(scene: TrainedScene, tmp_path: Path) -> None:
     write(scene, "mesh", tmp_path / "ball.ply")
     loaded = trimesh.load(tmp_path / "ball.ply", process=False)
     alpha = loaded.visual.vertex_colors[:, 3]
@@ -141,7 +141,7 @@ def test_ply_holds_both_with_colours(scene: Scene, tmp_path: Path) -> None:
     np.testing.assert_allclose(loaded.visual.vertex_colors[alpha == 255, :3], expected, atol=1)
 
 
-def test_points_lie_where_things_are_and_not_where_they_seem_to_be(scene: Scene, tmp_path: Path) -> None:
+def test_points_lie_where_things_are_and_not_where_they_seem_to_be(scene: TrainedScene, tmp_path: Path) -> None:
     assert "500 points" in write(scene, "points", tmp_path / "points.ply", count=500)
     loaded = trimesh.load(tmp_path / "points.ply")
     assert len(loaded.vertices) == 500
@@ -161,13 +161,13 @@ def test_crumbs_are_left_out() -> None:
     assert trimesh.Trimesh(kept.vertices, kept.faces).volume == pytest.approx(large.volume)
 
 
-def test_points_of_nothing_are_refused(scene: Scene, tmp_path: Path) -> None:
+def test_points_of_nothing_are_refused(scene: TrainedScene, tmp_path: Path) -> None:
     with pytest.raises(NerfroError, match="no ray of the training cameras loses half its light inside"):
         write(scene.with_(inside=False), "points", tmp_path / "points.ply", count=1)
 
 
 @pytest.mark.parametrize("suffix", [".hdr", ".exr", ".png"])
-def test_the_sky_is_read_by_other_programs(scene: Scene, suffix: str, tmp_path: Path) -> None:
+def test_the_sky_is_read_by_other_programs(scene: TrainedScene, suffix: str, tmp_path: Path) -> None:
     write(scene, "sky", tmp_path / f"sky{suffix}")
     if suffix == ".exr":
         picture = OpenEXR.File(str(tmp_path / "sky.exr")).channels()["RGB"].pixels
@@ -182,7 +182,7 @@ def test_the_sky_is_read_by_other_programs(scene: Scene, suffix: str, tmp_path: 
     np.testing.assert_allclose(picture[10, 20], sky_of(torch.tensor(towards)), atol=6e-3)
 
 
-def test_the_volume_is_the_field_at_the_vertices_of_a_grid(scene: Scene, tmp_path: Path) -> None:
+def test_the_volume_is_the_field_at_the_vertices_of_a_grid(scene: TrainedScene, tmp_path: Path) -> None:
     write(scene, "volume", tmp_path / "inside.npz")
     with np.load(tmp_path / "inside.npz") as file:
         density, rgb, box = (file[name] for name in ("density", "rgb", "box"))
@@ -196,7 +196,7 @@ def test_the_volume_is_the_field_at_the_vertices_of_a_grid(scene: Scene, tmp_pat
 @pytest.mark.slow
 @pytest.mark.parametrize(("glass", "least"), [("dielectric", 25), ("transmitting_glass", 32)])
 def test_mitsuba_renders_the_same_picture(
-    scene: Scene, mitsuba: ModuleType, glass: str, least: float, tmp_path: Path
+    scene: TrainedScene, mitsuba: ModuleType, glass: str, least: float, tmp_path: Path
 ) -> None:
     write(scene, "mitsuba", tmp_path / "ball.xml")
     named = {} if glass == "dielectric" else {"glass": glass}

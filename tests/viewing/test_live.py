@@ -11,8 +11,8 @@ import pytest
 
 from nerfro.viewing import live
 from nerfro.viewing.live import LivePage
-from nerfro.viewing.scene import Scene
 from nerfro.viewing.server import PageServer
+from nerfro.viewing.trained_scene import TrainedScene
 from tests.viewing.chromium import needs_chromium, open_page
 
 
@@ -38,7 +38,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now
 
 
-def test_bakes_take_their_share_of_the_time(scene: Scene, server: PageServer, clock: list[float]) -> None:
+def test_bakes_take_their_share_of_the_time(scene: TrainedScene, server: PageServer, clock: list[float]) -> None:
     page = LivePage(server, scene, scene.views(), "test", resolution=24)
 
     def version() -> int:
@@ -59,16 +59,16 @@ def test_bakes_take_their_share_of_the_time(scene: Scene, server: PageServer, cl
     assert version() == 2, "nobody has looked for a long time"
 
 
-def test_training_mode_and_weights_stay(scene: Scene, server: PageServer) -> None:
-    scene.model.train()
+def test_training_mode_and_weights_stay(scene: TrainedScene, server: PageServer) -> None:
+    scene.renderer.train()
     page = LivePage(server, scene, scene.views(), "test", resolution=8)
     page.show(scene)
-    assert scene.model.training
+    assert scene.renderer.training
     assert set(json.loads(server.state(0))["news"]["scene"]) == {"volume", "sky", "version"}, "the surface stays"
 
 
 @needs_chromium
-def test_browser_shows_news_and_losses(scene: Scene, server: PageServer, tmp_path: Path) -> None:
+def test_browser_shows_news_and_losses(scene: TrainedScene, server: PageServer, tmp_path: Path) -> None:
     page = LivePage(server, scene, scene.views(), "test", resolution=8)
     server.add_loss(3, 0.5)
     server.add_loss(7, 0.25)

@@ -17,12 +17,12 @@ from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.cameras import Cameras
 from nerfro.data.blender import BlenderData
 from nerfro.errors import NerfroError
+from nerfro.evaluation.metrics import psnr
 from nerfro.fields.base import Field
 from nerfro.files import lat_long, radiance_hdr
 from nerfro.light import to_linear
 from nerfro.media.analytic import Luneburg
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.models.base import psnr
 from nerfro.paths import resolve_path
 from nerfro.samplers.density_grid import DensityGridSampler
 from nerfro.samplers.snell import Snell
@@ -30,8 +30,9 @@ from nerfro.subdivision import Subdivision
 from nerfro.testing import example_draws
 from nerfro.types import Radiance, Samples
 from nerfro.variants import variant
+from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.page import page_of, upwards
-from nerfro.viewing.scene import Scene
+from nerfro.viewing.trained_scene import TrainedScene
 from tests.media.vessels import spherical_vessel
 from tests.viewing.chromium import ask, needs_chromium, open_page
 from tests.viewing.conftest import IOR, RADIUS, sky_of
@@ -60,12 +61,12 @@ def picture(text: str) -> Float[torch.Tensor, "H W 3"]:
     return torch.from_numpy(pixels.reshape(size, size, 4)[::-1, :, :3] / 255.0).float()
 
 
-def one_ray(scene: Scene, cameras: Cameras | None = None) -> Float[torch.Tensor, "V H W 3"]:
+def one_ray(scene: TrainedScene, cameras: Cameras | None = None) -> Float[torch.Tensor, "V H W 3"]:
     return scene.render(cameras or scene.cameras("test"), Subdivision()).rgb
 
 
 @pytest.fixture
-def glass_cube(scene: Scene) -> Scene:
+def glass_cube(scene: TrainedScene) -> TrainedScene:
     """The embedded scene's glass, sky and cameras around the ball inside, and a bubble in the glass."""
     mesh = "embedded:torus/mesh.ply"
     box = torch.tensor([[-1.5] * 3, [1.5] * 3])
@@ -74,11 +75,13 @@ def glass_cube(scene: Scene) -> Scene:
     bubble = torch.linalg.vector_norm(axes - torch.tensor([-0.3, -0.3, 0.2]), dim=-1) - 0.15
     medium = SdfGrid.from_distances(torch.stack([outer.distances[0], bubble]), box, [1.5, 1.05], outer.shell)
     sky = EnvironmentMap([128], str(resolve_path("embedded:torus/sky.png")))
-    return Scene(variant(scene.model, medium=medium, boundary=sky), BlenderData("embedded:torus", 2.0, 6.0, 2))
+    return TrainedScene(
+        with_changed_scene(scene.renderer, medium=medium, boundary=sky), BlenderData("embedded:torus", 2.0, 6.0, 2)
+    )
 
 
 @needs_chromium
-def test_five_cameras_of_a_cube_with_bodies_inside_agree_with_nerfro(glass_cube: Scene, tmp_path: Path) -> None:
+def test_five_cameras_of_a_cube_with_bodies_inside_agree_with_nerfro(glass_cube: TrainedScene, tmp_path: Path) -> None:
     views = [0, 4, 8, 12, 16]
     page = page_of(glass_cube, 64)
     found = ask(page, f"(() => {{ {SHOT} return {views}.map((view) => shot(view, 64)); }})()", tmp_path)
@@ -88,10 +91,12 @@ def test_five_cameras_of_a_cube_with_bodies_inside_agree_with_nerfro(glass_cube:
 
 
 @needs_chromium
-def test_a_vessel_agrees_with_nerfro(scene: Scene, tmp_path: Path) -> None:
+def test_a_vessel_agrees_with_nerfro(scene: TrainedScene, tmp_path: Path) -> None:
     vessel = spherical_vessel(tmp_path, level=0.9, resolution=64)
     sky = EnvironmentMap([128], str(resolve_path("embedded:torus/sky.png")))
-    vessel_scene = Scene(variant(scene.model, medium=vessel, boundary=sky), BlenderData("embedded:torus", 2.0, 6.0, 2))
+    vessel_scene = TrainedScene(
+        with_changed_scene(scene.renderer, medium=vessel, boundary=sky), BlenderData("embedded:torus", 2.0, 6.0, 2)
+    )
     # A liquid of the wall's index must change the picture, and air has no index to change.
     code = f"""(() => {{ {SHOT}
       const seen = [shot(0, 64), shot(9, 64)];
@@ -104,7 +109,7 @@ def test_a_vessel_agrees_with_nerfro(scene: Scene, tmp_path: Path) -> None:
     expected = one_ray(vessel_scene, vessel_scene.cameras("test").select([0, 9]))
     assert min(float(psnr(picture(shot), rgb)) for shot, rgb in zip(found["seen"], expected, strict=True)) > 30
     with_glass = vessel.with_indices(torch.tensor([1.5, 1.0, 1.5]))
-    expected = one_ray(replace(vessel_scene, model=variant(vessel_scene.model, medium=with_glass)),
+    expected = one_ray(replace(vessel_scene, renderer=with_changed_scene(vessel_scene.renderer, medium=with_glass)),
                        vessel_scene.cameras("test").select([9]))  # fmt: skip
     assert psnr(picture(found["filled"]), expected[0]) > 30
     assert psnr(picture(found["filled"]), picture(found["seen"][1])) < 30
@@ -126,12 +131,13 @@ class Surroundings(Field):
 
 
 @needs_chromium
-def test_contracted_surroundings_are_shown(scene: Scene, tmp_path: Path) -> None:
+def test_contracted_surroundings_are_shown(scene: TrainedScene, tmp_path: Path) -> None:
     sampler = DensityGridSampler(512, 256, [-2.0] * 3, [2.0] * 3, radius=2.0, near=1.0, resolution=48, looks=0.9)
     field = Surroundings()
     for step in range(3):
         sampler.after_step([field], example_draws(step=step * sampler.every))
-    everywhere = replace(scene, model=variant(scene.model, point_sampler=sampler, fields=torch.nn.ModuleList([field])))
+    renderer = with_changed_scene(scene.renderer, fields=torch.nn.ModuleList([field]))
+    everywhere = replace(scene, renderer=variant(renderer, point_sampler=sampler))
     found = ask(page_of(everywhere, 96), f"(() => {{ {SHOT} return [0, 1, 2].map((v) => shot(v, 32)); }})()", tmp_path)
     expected, without = one_ray(everywhere), one_ray(everywhere.with_(inside=False))
     for shot, rgb, empty in zip(found, expected, without, strict=True):
@@ -140,7 +146,7 @@ def test_contracted_surroundings_are_shown(scene: Scene, tmp_path: Path) -> None
 
 
 @needs_chromium
-def test_controls_change_what_they_say(scene: Scene, tmp_path: Path) -> None:
+def test_controls_change_what_they_say(scene: TrainedScene, tmp_path: Path) -> None:
     lamp = lat_long.directions(32)
     lamp = 4 * (lamp[..., 2:] > 0.5) * torch.tensor([1.0, 0.5, 0.1]) + 0.1
     hdr = base64.b64encode(radiance_hdr.encode(lamp.numpy())).decode()
@@ -162,7 +168,7 @@ def test_controls_change_what_they_say(scene: Scene, tmp_path: Path) -> None:
     found = ask(page_of(scene, 48), script, tmp_path)
     shots = {name: picture(text) for name, text in found["shots"].items()}
 
-    def agrees(name: str, changed: Scene) -> bool:
+    def agrees(name: str, changed: TrainedScene) -> bool:
         return float(psnr(shots[name], one_ray(changed)[0])) > 30
 
     assert agrees("start", scene)
@@ -181,7 +187,7 @@ def test_controls_change_what_they_say(scene: Scene, tmp_path: Path) -> None:
     assert (found["camera"], found["photograph"], found["alt"], found["unnamed"]) == (1, True, "photograph test_001", 0)
 
 
-def _check_reflection(scene: Scene, without: torch.Tensor, with_it: torch.Tensor) -> None:
+def _check_reflection(scene: TrainedScene, without: torch.Tensor, with_it: torch.Tensor) -> None:
     """On a ball: (1 - F) of the light that came before, and F of the sky that the first surface mirrors."""
     rays = scene.cameras("test").image_rays(0)
     along = (rays.origins * rays.directions).sum(-1)
@@ -202,7 +208,7 @@ def _check_reflection(scene: Scene, without: torch.Tensor, with_it: torch.Tensor
 
 
 @needs_chromium
-def test_fragment_shows_one_camera_alone(scene: Scene, tmp_path: Path) -> None:
+def test_fragment_shows_one_camera_alone(scene: TrainedScene, tmp_path: Path) -> None:
     file = tmp_path / "page.html"
     file.write_text(page_of(scene, 32), encoding="utf-8")
     shot = tmp_path / "shot.png"
@@ -216,14 +222,14 @@ def test_fragment_shows_one_camera_alone(scene: Scene, tmp_path: Path) -> None:
 
 
 @needs_chromium
-def test_browser_without_webgl2_is_told(scene: Scene, tmp_path: Path) -> None:
+def test_browser_without_webgl2_is_told(scene: TrainedScene, tmp_path: Path) -> None:
     file = tmp_path / "page.html"
     file.write_text(page_of(scene, 8), encoding="utf-8")
     dom = open_page(file.as_uri(), tmp_path, "--disable-3d-apis", "--dump-dom")
     assert "This page needs WebGL2" in dom.partition('id="message"')[2][:200]
 
 
-def test_page_loads_nothing_and_names_its_cameras(scene: Scene) -> None:
+def test_page_loads_nothing_and_names_its_cameras(scene: TrainedScene) -> None:
     page = page_of(scene, 8)
     assert 'src="http' not in page
     assert "import " not in page.partition("<script>")[2]
@@ -231,18 +237,18 @@ def test_page_loads_nothing_and_names_its_cameras(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize(("branches", "begins"), [("none", "false"), ("all", "true")])
-def test_page_begins_with_the_light_that_the_model_follows(scene: Scene, branches: str, begins: str) -> None:
-    scene = replace(scene, model=variant(scene.model, path_sampler=Snell(branches=branches)))
+def test_page_begins_with_the_light_that_the_model_follows(scene: TrainedScene, branches: str, begins: str) -> None:
+    scene = replace(scene, renderer=variant(scene.renderer, path_sampler=Snell(branches=branches)))
     assert f'"reflection": {begins}' in page_of(scene, 8)
 
 
-def test_page_of_a_medium_without_surface_is_refused(scene: Scene) -> None:
-    lens = replace(scene, model=variant(scene.model, medium=Luneburg()))
+def test_page_of_a_medium_without_surface_is_refused(scene: TrainedScene) -> None:
+    lens = replace(scene, renderer=with_changed_scene(scene.renderer, medium=Luneburg()))
     with pytest.raises(NerfroError, match="bodies with a surface"):
         page_of(lens, 8)
 
 
-def test_up_is_where_cameras_have_it(scene: Scene) -> None:
+def test_up_is_where_cameras_have_it(scene: TrainedScene) -> None:
     cameras = scene.cameras("test")
     assert upwards(cameras).tolist() == [0, 0, 1]
     turn = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])

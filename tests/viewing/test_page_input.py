@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from nerfro.evaluation.metrics import psnr
 from nerfro.files import lat_long
-from nerfro.models.base import psnr
 from nerfro.viewing.page import page_of
-from nerfro.viewing.scene import Scene
+from nerfro.viewing.trained_scene import TrainedScene
 from tests.viewing.chromium import needs_chromium
 from tests.viewing.devtools import Browser
 from tests.viewing.test_page import SHOT, one_ray, picture
@@ -23,7 +23,7 @@ VIEW = "({ azimuth: page.orbit.azimuth, elevation: page.orbit.elevation, radius:
 
 
 @pytest.fixture
-def browser(scene: Scene, tmp_path: Path) -> Iterator[Browser]:
+def browser(scene: TrainedScene, tmp_path: Path) -> Iterator[Browser]:
     file = tmp_path / "page.html"
     file.write_text(page_of(scene, 24), encoding="utf-8")
     with Browser(file.as_uri(), tmp_path, (800, 400)) as browser:
@@ -105,7 +105,7 @@ def test_a_test_camera_is_chosen_with_the_keyboard_and_left_by_dragging(browser:
 
 
 @pytest.mark.parametrize("suffix", [".png", ".hdr"])
-def test_a_dropped_picture_is_the_sky(browser: Browser, scene: Scene, suffix: str, tmp_path: Path) -> None:
+def test_a_dropped_picture_is_the_sky(browser: Browser, scene: TrainedScene, suffix: str, tmp_path: Path) -> None:
     directions = lat_long.directions(64)
     lat_long.save_lat_long(tmp_path / f"sky{suffix}", 0.5 + 0.3 * directions.roll(1, -1))
     before = picture(browser.evaluate(f"(() => {{ {SHOT} return shot(0, 32); }})()"))

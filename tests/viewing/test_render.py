@@ -16,12 +16,12 @@ from PIL import Image
 import nerfro.render
 from nerfro.files.lat_long import save_lat_long
 from nerfro.subdivision import Subdivision
-from nerfro.viewing.scene import Scene
+from nerfro.viewing.trained_scene import TrainedScene
 
 
 @pytest.fixture
 def render(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    scene: TrainedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., tuple[int, str]]:
     """The entry point in this process, on the scene in closed form; exit code and what it printed."""
     (tmp_path / "a.ckpt").write_bytes(b"scene")
@@ -94,7 +94,7 @@ def test_an_interrupted_rendering_goes_on_and_another_is_not_mixed_in(render: Ca
     assert not np.array_equal(read("O/frame_0001.png"), whole)
 
 
-def test_test_views_are_those_of_the_scene(render: Callable[..., tuple[int, str]], scene: Scene) -> None:
+def test_test_views_are_those_of_the_scene(render: Callable[..., tuple[int, str]], scene: TrainedScene) -> None:
     assert render("views=test", "resolution=null")[0] == 0
     ours = scene.render(scene.cameras(), Subdivision()).rgb
     for view in range(3):
@@ -111,7 +111,7 @@ def test_a_still_from_numbers_shows_what_lies_there(render: Callable[..., tuple[
 
 
 @pytest.mark.parametrize("what", ["depth", "normals", "opacity", "exits", "glass", "inside", "sky"])
-def test_every_layer_is_drawn_and_written_as_it_is(what: str, render: Callable, scene: Scene) -> None:
+def test_every_layer_is_drawn_and_written_as_it_is(what: str, render: Callable, scene: TrainedScene) -> None:
     assert render("views=test:1", f"what={what}")[0] == 0
     code, err = render("views=test:1", f"what={what}", "format=exr")
     assert code == 0, err
@@ -126,7 +126,9 @@ def test_every_layer_is_drawn_and_written_as_it_is(what: str, render: Callable, 
     assert shown.std() > 5
 
 
-def test_a_sweep_of_the_index_goes_from_air_to_glass(render: Callable[..., tuple[int, str]], scene: Scene) -> None:
+def test_a_sweep_of_the_index_goes_from_air_to_glass(
+    render: Callable[..., tuple[int, str]], scene: TrainedScene
+) -> None:
     assert render("views=test:0", "frames=3", "sweep=medium.ior:1.0:1.6")[0] == 0
     camera = scene.cameras().select([0]).resized(16, 16)
     for frame, ior in enumerate((1.0, 1.3, 1.6)):
@@ -146,7 +148,7 @@ def test_skies_turn_into_each_other_and_one_replaces_the_scenes(render: Callable
     np.testing.assert_allclose(read("P/test_000.png"), 255 * (1.055 * 0.5 ** (1 / 2.4) - 0.055), atol=2)
 
 
-def test_runs_stand_side_by_side_under_their_names(render: Callable[..., tuple[int, str]], scene: Scene) -> None:
+def test_runs_stand_side_by_side_under_their_names(render: Callable[..., tuple[int, str]], scene: TrainedScene) -> None:
     Path("b.ckpt").write_bytes(b"another")
     code, err = render("checkpoint=[a.ckpt,b.ckpt]", "labels=[one,two]", "views=test:0", "resolution=64")
     assert code == 0, err

@@ -13,11 +13,12 @@ from nerfro.files import lat_long
 from nerfro.samplers.snell import Snell
 from nerfro.subdivision import Subdivision
 from nerfro.variants import variant
-from nerfro.viewing.scene import Scene
+from nerfro.viewing.changes import with_changed_scene
+from nerfro.viewing.trained_scene import TrainedScene
 from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, SolidBall, colour, sky_of
 
 
-def rays_of(scene: Scene) -> tuple[torch.Tensor, torch.Tensor]:
+def rays_of(scene: TrainedScene) -> tuple[torch.Tensor, torch.Tensor]:
     rays = scene.cameras().image_rays(0)
     return rays.origins, rays.directions
 
@@ -33,7 +34,7 @@ def exact_exits(origins: torch.Tensor, directions: torch.Tensor) -> tuple[torch.
     return impact, torch.cos(deviation) * directions + torch.sin(deviation) * inwards
 
 
-def test_glass_bends_as_in_closed_form_and_shows_the_sky_behind(scene: Scene) -> None:
+def test_glass_bends_as_in_closed_form_and_shows_the_sky_behind(scene: TrainedScene) -> None:
     origins, directions = rays_of(scene)
     impact, exits = exact_exits(origins, directions)
     rendered = scene.with_(inside=False).render(scene.cameras().select([0]))
@@ -48,7 +49,7 @@ def test_glass_bends_as_in_closed_form_and_shows_the_sky_behind(scene: Scene) ->
     assert not rendered.opacity.any()
 
 
-def test_normals_are_those_of_the_first_surface(scene: Scene) -> None:
+def test_normals_are_those_of_the_first_surface(scene: TrainedScene) -> None:
     origins, directions = rays_of(scene)
     towards = -(origins * directions).sum(-1)
     impact = (origins + towards[:, None] * directions).norm(dim=-1)
@@ -59,7 +60,7 @@ def test_normals_are_those_of_the_first_surface(scene: Scene) -> None:
     assert not normals[impact > 1.05 * RADIUS].any()
 
 
-def test_without_glass_things_lie_where_straight_rays_meet_them(scene: Scene) -> None:
+def test_without_glass_things_lie_where_straight_rays_meet_them(scene: TrainedScene) -> None:
     origins, directions = rays_of(scene)
     offset = origins - torch.tensor(INSIDE_CENTRE)
     towards = -(offset * directions).sum(-1)
@@ -76,13 +77,13 @@ def test_without_glass_things_lie_where_straight_rays_meet_them(scene: Scene) ->
     assert not rendered.normals.any()
 
 
-def test_glass_of_the_index_of_air_is_no_glass(scene: Scene) -> None:
+def test_glass_of_the_index_of_air_is_no_glass(scene: TrainedScene) -> None:
     camera = scene.cameras().select([1])
     air, nothing = scene.with_(ior=1.0).render(camera), scene.with_(glass=False).render(camera)
     torch.testing.assert_close(air.rgb, nothing.rgb, atol=1e-5, rtol=0)
 
 
-def test_a_changed_scene_leaves_the_first_as_it_was(scene: Scene) -> None:
+def test_a_changed_scene_leaves_the_first_as_it_was(scene: TrainedScene) -> None:
     camera = scene.cameras().select([0])
     before = scene.render(camera).rgb
     changed = scene.with_(ior=1.7, sky=torch.full((8, 16, 3), 0.2))
@@ -90,10 +91,10 @@ def test_a_changed_scene_leaves_the_first_as_it_was(scene: Scene) -> None:
     assert float(scene.ior[0]) == pytest.approx(IOR)
     assert (changed.render(camera).rgb - before).abs().max() > 0.1
     assert torch.equal(scene.render(camera).rgb, before)
-    assert changed.model.fields is scene.model.fields, "what is not changed is shared"
+    assert changed.renderer.scene.fields is scene.renderer.scene.fields, "what is not changed is shared"
 
 
-def test_the_sky_is_read_and_replaced_as_linear_radiance(scene: Scene, tmp_path) -> None:
+def test_the_sky_is_read_and_replaced_as_linear_radiance(scene: TrainedScene, tmp_path) -> None:
     torch.testing.assert_close(scene.sky, sky_of(lat_long.directions(512)), atol=5e-3, rtol=0)
     # A lamp that no picture of eight bits could hold.
     sky = torch.full((64, 128, 3), 0.25)
@@ -107,7 +108,7 @@ def test_the_sky_is_read_and_replaced_as_linear_radiance(scene: Scene, tmp_path)
     assert rendered.rgb.max() == 1
 
 
-def test_pictures_do_not_depend_on_chunks_and_carry_their_subdivision(scene: Scene) -> None:
+def test_pictures_do_not_depend_on_chunks_and_carry_their_subdivision(scene: TrainedScene) -> None:
     camera = scene.cameras().select([2])
     whole, pieces = scene.render(camera), scene.render(camera, chunk_size=100)
     for one, other in zip(whole, pieces, strict=True):
@@ -126,16 +127,18 @@ class Bounded(SolidBall):
 
 @pytest.mark.parametrize(("branches", "glass"), [("none", True), ("all", True), ("none", False)])
 def test_rays_that_pass_the_object_are_not_sampled_and_look_the_same(
-    scene: Scene, branches: str, glass: bool, monkeypatch: pytest.MonkeyPatch
+    scene: TrainedScene, branches: str, glass: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fields = torch.nn.ModuleList([Bounded()])
-    model = variant(scene.model, fields=fields, path_sampler=Snell(branches=branches))
-    tinted = replace(scene, model=model).with_(absorption=[0.1, 0.5, 1.0] if glass else None, glass=glass)
+    renderer = variant(with_changed_scene(scene.renderer, fields=fields), path_sampler=Snell(branches=branches))
+    tinted = replace(scene, renderer=renderer).with_(absorption=[0.1, 0.5, 1.0] if glass else None, glass=glass)
     sampled: list[int] = []
-    counted = tinted.model.point_sampler.register_forward_hook(lambda _, inputs, __: sampled.append(inputs[0].num_rays))
+    counted = tinted.renderer.point_sampler.register_forward_hook(
+        lambda _, inputs, __: sampled.append(inputs[0].num_rays)
+    )
     skipped = tinted.render(scene.cameras())
     num_sampled = sum(sampled)
-    monkeypatch.setattr(tinted.model, "_may_meet", lambda rays, path: torch.ones(len(rays)).bool())
+    monkeypatch.setattr(tinted.renderer, "_may_meet", lambda rays, path: torch.ones(len(rays)).bool())
     whole = tinted.render(scene.cameras())
     counted.remove()
     assert 0 < num_sampled < 0.7 * (sum(sampled) - num_sampled)
@@ -144,17 +147,17 @@ def test_rays_that_pass_the_object_are_not_sampled_and_look_the_same(
     assert (skipped.opacity > 0.9).any()
 
 
-def test_all_rays_are_sampled_where_a_field_has_no_bounds(scene: Scene) -> None:
+def test_all_rays_are_sampled_where_a_field_has_no_bounds(scene: TrainedScene) -> None:
     rays = scene.cameras().image_rays(0)
-    path = scene.model.trace(rays)
-    assert scene.model._may_meet(rays, path).all()
-    bounded = variant(scene.model, fields=torch.nn.ModuleList([Bounded()]))
+    path = scene.renderer.trace(rays)
+    assert scene.renderer._may_meet(rays, path).all()
+    bounded = with_changed_scene(scene.renderer, fields=torch.nn.ModuleList([Bounded()]))
     assert not bounded._may_meet(rays, path).all()
-    both = variant(scene.model, fields=torch.nn.ModuleList([Bounded(), scene.field]))
+    both = with_changed_scene(scene.renderer, fields=torch.nn.ModuleList([Bounded(), scene.field]))
     assert both._may_meet(rays, path).all()
 
 
-def test_the_surface_is_that_of_the_ball_with_its_normals(scene: Scene) -> None:
+def test_the_surface_is_that_of_the_ball_with_its_normals(scene: TrainedScene) -> None:
     (mesh,) = scene.surface
     assert mesh.is_closed
     assert abs(torch.from_numpy(mesh.vertices).norm(dim=-1) - RADIUS).max() < 1e-4
@@ -172,7 +175,7 @@ def test_the_surface_is_that_of_the_ball_with_its_normals(scene: Scene) -> None:
         ({"glass": False, "ior": 1.4}, None),
     ],
 )
-def test_what_a_scene_cannot_be_is_refused_in_one_line(scene: Scene, changes: dict, message: str | None) -> None:
+def test_what_a_scene_cannot_be_is_refused_in_one_line(scene: TrainedScene, changes: dict, message: str | None) -> None:
     if message is None:
         assert len(scene.with_(**changes).ior) == 0
         with pytest.raises(NerfroError, match="no bodies on which rays bend"):

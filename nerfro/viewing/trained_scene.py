@@ -19,15 +19,15 @@ from nerfro.evaluation.render_view import render_view
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.models.base import NerfModel
 from nerfro.paths import user_path
+from nerfro.rendering import Renderer
 from nerfro.subdivision import Subdivision
 from nerfro.types import Exits
 from nerfro.variants import variant
 from nerfro.viewing.changes import with_absorption, with_indices, with_sky, without_glass, without_inside
 from nerfro.viewing.surface import surface_of
 
-# Rows of the sky that `Scene.sky` is drawn with: the default environment map's finest texels.
+# Rows of the sky that `TrainedScene.sky` is drawn with: the default environment map's finest texels.
 SKY_HEIGHT = 512
 
 
@@ -44,7 +44,7 @@ class RenderedViews(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Scene:
+class TrainedScene:
     """A trained model with the data that it was trained on; `nerfro.load` makes one of a run.
 
     Attributes:
@@ -55,7 +55,7 @@ class Scene:
         content: corners of the box outside of which the field holds nothing, world units, where it has one.
     """
 
-    model: NerfModel
+    renderer: Renderer
     source: DataSource
     subdivision: Subdivision = field(default_factory=Subdivision)
     name: str = ""
@@ -67,7 +67,7 @@ class Scene:
 
     def cameras(self, split: str = "test") -> Cameras:
         """The cameras of a split of the data, on the scene's device."""
-        return self.views(split).cameras.to(self.model.device)
+        return self.views(split).cameras.to(self.renderer.scene.device)
 
     def render(
         self,
@@ -84,15 +84,15 @@ class Scene:
             chunk_size: rays rendered at once, as the run was evaluated by default.
             progress: whether to show a bar with the time that is left.
         """
-        scene = self if chunk_size is None else replace(self, model=variant(self.model, chunk_size=chunk_size))
+        scene = self if chunk_size is None else replace(self, renderer=variant(self.renderer, chunk_size=chunk_size))
         views = tqdm(range(len(cameras)), unit="view", desc="render", disable=not progress, dynamic_ncols=True)
         rendered = [scene._render_view(cameras, view, subdivision or self.subdivision) for view in views]
         return RenderedViews(*(torch.stack(parts) for parts in zip(*rendered, strict=True)))
 
     def _render_view(self, cameras: Cameras, view: int, subdivision: Subdivision) -> tuple[Tensor, ...]:
-        found = render_view(self.model, cameras.to(self.model.device), view, subdivision)
-        rgb = self.model.photographed(found.radiance)
-        radiance = self.model.linear(found.radiance)
+        found = render_view(self.renderer, cameras.to(self.renderer.scene.device), view, subdivision)
+        colour_space = self.renderer.scene.colour_space
+        rgb, radiance = colour_space.to_display(found.radiance), colour_space.to_linear(found.radiance)
         values = rgb, found.depth, found.opacity, found.normals, found.exit_directions, radiance
         return tuple(value.float().cpu().view(cameras.height, cameras.width, *value.shape[1:]) for value in values)
 
@@ -108,30 +108,31 @@ class Scene:
     @torch.inference_mode()
     def seen_beyond(self, directions: Float[Tensor, "D 3"]) -> Float[Tensor, "D 3"]:
         """Linear radiance from beyond the volume in unit directions, as seen from its middle; on the CPU."""
-        model = self.model
-        parts = directions.to(model.device).split(model.chunk_size)
-        return model.linear(torch.cat([model.boundary(Exits(part)) for part in parts]).float()).cpu()
+        scene = self.renderer.scene
+        parts = directions.to(scene.device).split(self.renderer.chunk_size)
+        radiance = torch.cat([scene.boundary(Exits(part)) for part in parts])
+        return scene.colour_space.to_linear(radiance.float()).cpu()
 
     @property
     def surface(self) -> list[TriangleMesh]:
         """The surfaces on which rays bend, the outer body's first; world units."""
-        return surface_of(self.model.medium, getattr(self.model.path_sampler, "interface", "sdf") == "mesh")
+        return surface_of(self.renderer.scene.medium, getattr(self.renderer.path_sampler, "interface", "sdf") == "mesh")
 
     @property
     def field(self) -> Field:
         """The radiance field that the finest sampling level asks."""
-        finest: Field = self.model.fields[-1]  # type: ignore[assignment]
+        finest: Field = self.renderer.scene.fields[-1]  # type: ignore[assignment]
         return finest
 
     @property
     def ior(self) -> Float[Tensor, "K"]:
         """Refractive index of each body, the outer one's first; none without bodies."""
-        return self.model.medium.indices.cpu()
+        return self.renderer.scene.medium.indices.cpu()
 
     @property
     def bounds(self) -> Float[Tensor, "2 3"]:
         """Corners of the box around the glass, or around all that the field holds where there is no glass."""
-        box = self.model.medium.content_box.float().cpu()
+        box = self.renderer.scene.medium.content_box.float().cpu()
         if (box[1] > box[0]).all():
             return box
         if self.content is None:
@@ -145,7 +146,7 @@ class Scene:
         absorption: Sequence[float] | Tensor | None = None,
         glass: bool = True,
         inside: bool = True,
-    ) -> Scene:
+    ) -> TrainedScene:
         """The scene with some parts changed; it shares all others with this one, which stays as it is.
 
         Args:
@@ -158,16 +159,16 @@ class Scene:
         Raises:
             NerfroError: the model has no such part.
         """
-        model = self.model
+        renderer = self.renderer
         if sky is not None:
             picture = sky if isinstance(sky, Tensor) else lat_long.load_lat_long(user_path(sky))
-            model = with_sky(model, picture)
+            renderer = with_sky(renderer, picture)
         if ior is not None:
-            model = with_indices(model, torch.as_tensor(ior))
+            renderer = with_indices(renderer, torch.as_tensor(ior))
         if absorption is not None:
-            model = with_absorption(model, torch.as_tensor(absorption))
+            renderer = with_absorption(renderer, torch.as_tensor(absorption))
         if not glass:
-            model = without_glass(model)
+            renderer = without_glass(renderer)
         if not inside:
-            model = without_inside(model)
-        return replace(self, model=model)
+            renderer = without_inside(renderer)
+        return replace(self, renderer=renderer)

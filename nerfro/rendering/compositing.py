@@ -2,30 +2,11 @@
 
 from __future__ import annotations
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.samplers.stepfun import volume_weights
 from nerfro.types import Path, Radiance, Rendering, Samples
-
-
-def volume_weights(
-    density: Float[Tensor, "R N"], deltas: Float[Tensor, "R N"]
-) -> tuple[Float[Tensor, "R N"], Float[Tensor, "R"]]:
-    """Weights w_i = T_i (1 - exp(-sigma_i delta_i)) and the final transmittance T_{N+1} (paper, Eqn. volrend).
-
-    Args:
-        density: per world unit.
-        deltas: interval lengths in world units.
-
-    Returns:
-        Weights and transmittance; together they sum to one on every ray.
-    """
-    optical_depth = density * deltas
-    total = optical_depth.cumsum(-1)
-    transmittance = torch.exp(-torch.cat([torch.zeros_like(total[:, :1]), total], dim=-1))
-    weights = -torch.expm1(-optical_depth) * transmittance[:, :-1]
-    return weights, transmittance[:, -1]
 
 
 def composite(samples: Samples, radiance: Radiance, boundary_rgb: Float[Tensor, "P 3"], path: Path) -> Rendering:

@@ -12,7 +12,8 @@ import pytest
 from lightning.pytorch.callbacks import Timer
 
 from nerfro.errors import NerfroError
-from nerfro.models.optimizer import OptimizerConfig, learning_rate_factor, training_progress
+from nerfro.training.module import training_progress
+from nerfro.training.optimizer import OptimizerConfig, learning_rate_factor
 
 PAPER = OptimizerConfig(learning_rate=5e-4, final_learning_rate=5e-6, warmup_steps=2500, warmup_factor=0.01)
 

@@ -9,11 +9,12 @@ import torch
 
 from nerfro.media.analytic import Luneburg, Vacuum
 from nerfro.media.shapes import Ball
-from nerfro.rendering import composite, volume_weights
+from nerfro.rendering import composite
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.hierarchical import Hierarchical
 from nerfro.samplers.integrators import INTEGRATORS
 from nerfro.samplers.snell import Snell
+from nerfro.samplers.stepfun import volume_weights
 from nerfro.samplers.straight import Straight, straight_path
 from nerfro.samplers.stratified import Stratified, point_samples
 from nerfro.testing import NUM_RAYS, example_path, example_rays, example_rendering, example_samples

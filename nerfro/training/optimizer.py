@@ -1,13 +1,10 @@
-"""Adam's settings, how far a run is, and the learning rate that follows from both."""
+"""Settings of Adam and the learning rate schedule."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from typing import Optional
-
-from lightning.pytorch import Trainer
-from lightning.pytorch.callbacks import Timer
 
 from nerfro.allowed import Natural, NotNegative, Positive, checked
 
@@ -51,17 +48,3 @@ def learning_rate_factor(step: int, progress: float, config: OptimizerConfig) ->
         ascent = math.sin(0.5 * math.pi * min(step / config.warmup_steps, 1.0))
         factor *= config.warmup_factor + (1.0 - config.warmup_factor) * ascent
     return factor
-
-
-def training_progress(trainer: Trainer) -> float:
-    """Share of the run's budget that is spent, in [0, 1]: of `max_steps` or of `max_time`, whichever is more.
-
-    Under `max_time` the schedules end when the time does, so such a run depends on the machine's speed.
-    """
-    progress = trainer.global_step / trainer.max_steps if trainer.max_steps > 0 else 0.0
-    timer = next((c for c in trainer.callbacks if isinstance(c, Timer)), None)  # type: ignore[attr-defined]
-    if timer is not None:
-        elapsed, remaining = timer.time_elapsed(), timer.time_remaining()
-        if remaining is not None and elapsed + remaining > 0:
-            progress = max(progress, elapsed / (elapsed + remaining))
-    return min(progress, 1.0)

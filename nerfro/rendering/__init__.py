@@ -1,0 +1,8 @@
+"""The scene, and the renderer that turns rays into radiance: trace, sample, query, composite."""
+
+from nerfro.rendering.colour_space import ColourSpace
+from nerfro.rendering.compositing import composite
+from nerfro.rendering.renderer import Components, RenderedRays, Renderer
+from nerfro.rendering.scene import Scene
+
+__all__ = ["ColourSpace", "Components", "RenderedRays", "Renderer", "Scene", "composite"]

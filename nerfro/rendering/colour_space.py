@@ -1,0 +1,58 @@
+"""Conversion between the radiance that rays add up and the sRGB values of photographs."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+from jaxtyping import Float
+from torch import Tensor
+
+from nerfro.light import clipped_alike, to_linear, to_srgb
+
+
+class ColourSpace(Enum):
+    """Colour space in which fields and background return radiance and in which rays add it up."""
+
+    LINEAR = "linear"
+    SRGB = "srgb"  # as in the authors' code
+
+    def to_srgb(
+        self, radiance: Float[Tensor, "*batch 3"], gains: Float[Tensor, "*batch 3"] | None = None
+    ) -> Float[Tensor, "*batch 3"]:
+        """Encode radiance, multiplied by the gains, as sRGB.
+
+        Values are not clipped, so that a prediction that is too bright keeps its gradient.
+        """
+        radiance = radiance if gains is None else radiance * gains
+        return radiance if self is ColourSpace.SRGB else to_srgb(radiance)
+
+    def to_display(
+        self, radiance: Float[Tensor, "*batch 3"], gains: Float[Tensor, "*batch 3"] | None = None
+    ) -> Float[Tensor, "*batch 3"]:
+        """Encode radiance, multiplied by the gains, as sRGB in [0, 1], as a photograph shows it."""
+        return self.to_srgb(radiance, gains).clamp(0, 1)
+
+    def to_linear(self, radiance: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Convert radiance of this colour space to linear radiance."""
+        return to_linear(radiance.clamp(min=0)) if self is ColourSpace.SRGB else radiance
+
+    def prediction_and_target(
+        self,
+        radiance: Float[Tensor, "*batch 3"],
+        rgb: Float[Tensor, "*batch 3"],
+        gains: Float[Tensor, "*batch 3"] | None = None,
+    ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]:
+        """Return the sRGB values that a loss compares.
+
+        Both are equal where prediction and photograph are saturated, because the photograph gives only a lower bound.
+
+        Args:
+            radiance: predicted, in this colour space.
+            rgb: values of the photograph, sRGB in [0, 1].
+            gains: brightness of each photograph relative to the scene, a factor of linear radiance.
+
+        Returns:
+            Prediction and target, sRGB. The prediction is not clipped.
+        """
+        prediction = self.to_srgb(radiance, gains)
+        return prediction, rgb if self is ColourSpace.SRGB else clipped_alike(rgb, prediction)

@@ -1,0 +1,226 @@
+"""The renderer: traces rays, samples their paths, queries the fields and composites radiance."""
+
+from __future__ import annotations
+
+import dataclasses
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from nerfro.allowed import checked
+from nerfro.boundaries.base import Boundary, background_radiance
+from nerfro.camera.base import Camera
+from nerfro.camera.given import GivenCamera
+from nerfro.draws import Draws
+from nerfro.fields.base import Field
+from nerfro.geometry.interpolation import intersect_box
+from nerfro.media.base import Medium
+from nerfro.rays import Rays
+from nerfro.rendering.colour_space import ColourSpace
+from nerfro.rendering.scene import Scene
+from nerfro.samplers.base import PathSampler, PointSampler
+from nerfro.samplers.surface_normals import first_normals
+from nerfro.types import Exits, Path, Rendering
+
+
+@dataclass(frozen=True)
+class Components:
+    """Components that a model is composed of."""
+
+    medium: Medium  # refractive index and absorption
+    path_sampler: PathSampler  # turns rays into paths
+    point_sampler: PointSampler  # chooses samples on paths
+    make_field: Callable[[], Field]  # makes a new radiance field
+    boundary: Boundary  # background radiance, from beyond the volume
+    camera: Camera = dataclasses.field(default_factory=GivenCamera)  # estimate of the training cameras
+    chunk_size: int = 8192  # rays that are rendered at once in evaluation, which bounds the memory
+
+
+@dataclass(frozen=True)
+class RenderedRays:
+    """Result of rendering R rays in evaluation.
+
+    Attributes:
+        radiance: in the scene's colour space.
+        depth: expected arc length along the path, world units.
+        opacity: of what the fields hold, in [0, 1].
+        exit_directions: unit directions in which the rays leave the volume.
+        normals: unit normals, towards the camera, where the rays first meet a surface; zero where they meet none.
+    """
+
+    radiance: Float[Tensor, "R 3"]
+    depth: Float[Tensor, "R"]
+    opacity: Float[Tensor, "R"]
+    exit_directions: Float[Tensor, "R 3"]
+    normals: Float[Tensor, "R 3"]
+
+
+@checked("model")
+class Renderer(nn.Module, ABC):
+    """Render rays through a scene. A model derives from this class and adds how it renders a path.
+
+    Args:
+        components: that the model is composed of.
+        num_fields: number of radiance fields: one for each sampling level, or one for all.
+        colour: what fields and background return and rays add up: `linear` radiance, or `srgb` as in the authors' code.
+
+    Attributes:
+        scene: what is learned about the world.
+        path_sampler, point_sampler: how rays become paths and where paths are sampled.
+        chunk_size: rays that are rendered at once in evaluation.
+    """
+
+    # Whether a straight path that misses all fields shows only the background, so that pictures need no samples on it.
+    empty_shows_boundary: ClassVar[bool] = False
+    # Whether every step has gradients by all parameters, which processes that train together wait for.
+    trains_in_parallel: ClassVar[bool] = True
+
+    def __init__(self, components: Components, num_fields: int, colour: Literal["linear", "srgb"] = "linear") -> None:
+        super().__init__()
+        fields = [components.make_field() for _ in range(num_fields)]
+        medium, boundary, camera = components.medium, components.boundary, components.camera
+        self.scene = Scene(medium, fields, boundary, camera, ColourSpace(colour))
+        self.path_sampler, self.point_sampler = components.path_sampler, components.point_sampler
+        self.chunk_size = components.chunk_size
+
+    @abstractmethod
+    def render_path(
+        self, path: Path, draws: Draws | None = None, teaches_background: Bool[Tensor, "R"] | None = None
+    ) -> list[Rendering]:
+        """Render paths: sample them, query the scene's fields and background, and composite.
+
+        Args:
+            path: P polylines of R rays.
+            draws: random numbers of a training step; None in evaluation, which is deterministic.
+            teaches_background: rays from which the background learns; None for all. See `background`.
+
+        Returns:
+            One rendering for each sampling level, the finest one last.
+        """
+
+    def begin_step(self, progress: float) -> float:
+        """Prepare for a training step. A model that trains in stages overrides this method.
+
+        Args:
+            progress: share of the training budget that is spent, in [0, 1].
+
+        Returns:
+            Share of the learning rate schedule that is done, in [0, 1].
+        """
+        return progress
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Return all learned parameters by optimizer group. A model that adds parameters adds a group."""
+        groups = self.scene.parameter_groups()
+        groups["medium"] += self.path_sampler.parameters()
+        return {name: parameters for name, parameters in groups.items() if parameters}
+
+    def forward(self, rays: Rays, draws: Draws | None = None) -> list[Rendering]:
+        """Trace rays and render their paths, one rendering for each sampling level."""
+        return self.render_path(self.trace(rays), draws)
+
+    def background(
+        self,
+        path: Path,
+        teaches_background: Bool[Tensor, "R"] | None = None,
+        directions: Float[Tensor, "P 3"] | None = None,
+    ) -> Float[Tensor, "P 3"]:
+        """Evaluate the background radiance where polylines leave, or in other `directions`; some rays teach it."""
+        teaches = None if teaches_background is None else path.of_ray(teaches_background)
+        return background_radiance(self.scene.boundary, path.exits(directions), teaches)
+
+    def trace(self, rays: Rays, path: Path | None = None) -> Path:
+        """Trace rays, or complete paths that were traced before.
+
+        Paths have gradients by the parameters that they depend on, and the absorption of the medium.
+        """
+        medium = self.scene.medium
+        path = self.path_sampler(rays, medium) if path is None else path
+        return medium.tinted(self._refined(path, rays) if self.paths_learn else path)
+
+    def exit_directions(self, rays: Rays) -> Float[Tensor, "R 3"]:
+        """Unit direction in which the main polyline of each ray leaves, without its branches and their cost."""
+        return self.path_sampler.main(rays, self.scene.medium).exit_directions
+
+    @property
+    def paths_learn(self) -> bool:
+        """Whether paths change during training; then none may be traced before the step that needs it."""
+        parameters = [*self.scene.path_parameters(), *self.path_sampler.parameters()]
+        return torch.is_grad_enabled() and any(parameter.requires_grad for parameter in parameters)
+
+    @torch.inference_mode()
+    def render(self, rays: Rays) -> RenderedRays:
+        """Render any number of rays in chunks, as in evaluation.
+
+        Memory is bounded by the samples and activations of `chunk_size` rays plus the result.
+        """
+        return RenderedRays(*self._in_chunks(self._render_chunk, rays))
+
+    @torch.no_grad()
+    def radiance(self, rays: Rays) -> Float[Tensor, "R 3"]:
+        """Render the radiance of any number of rays in chunks, without the other results of `render`."""
+        return self._in_chunks(lambda chunk: self._render_traced(chunk, self.trace(chunk)), rays)[0]
+
+    def _refined(self, path: Path, rays: Rays) -> Path:
+        """Paths with gradients, but for those whose derivatives are too large, or not yet to be learned from."""
+        medium = self.scene.medium
+        steady = self.path_sampler.steady(path, medium)
+        if steady.all():
+            return self.path_sampler.refine(path, rays, medium)
+        rows = steady.nonzero()[:, 0]
+        if not len(rows):
+            return path
+        # The others are not replayed at all: they have many events, and take most of the time.
+        refined = self.path_sampler.refine(path[rows], rays[path.ray[rows]], medium)
+        names = ["positions", "directions", "s", "exit_directions", *(["throughput"] if path.splits else [])]
+        return path.changed(**{n: getattr(path, n).index_copy(0, rows, getattr(refined, n)) for n in names})
+
+    def _in_chunks(self, render: Callable[[Rays], tuple[Tensor, ...]], rays: Rays) -> list[Tensor]:
+        """Concatenate what is rendered of `chunk_size` rays at a time, in evaluation mode."""
+        was_training = self.training
+        self.eval()
+        try:
+            chunks = [render(rays[i : i + self.chunk_size]) for i in range(0, len(rays), self.chunk_size)]
+        finally:
+            self.train(was_training)
+        return [torch.cat(parts) for parts in zip(*chunks, strict=True)]
+
+    def _render_chunk(self, rays: Rays) -> tuple[Tensor, ...]:
+        path = self.trace(rays)
+        exits, normals = path.first_of_ray(path.exit_directions), first_normals(path, self.scene.medium)
+        return *self._render_traced(rays, path), exits, normals
+
+    def _render_traced(self, rays: Rays, path: Path) -> tuple[Tensor, Tensor, Tensor]:
+        """Radiance, depth and opacity of rays by their paths."""
+        meets = self._may_meet(rays, path)
+        if meets.all():
+            rendering = self.render_path(path)[-1]
+            return rendering.rgb, rendering.depth, rendering.opacity
+        # Most rays of a picture pass by the object, unbent.
+        rgb, depth = torch.empty_like(rays.directions), path.first_of_ray(path.far).clone()
+        opacity = torch.zeros_like(depth)
+        passing, rows = (~meets).nonzero()[:, 0], meets.nonzero()[:, 0]
+        rgb[passing] = self.scene.boundary(Exits.unbent(rays[passing])).to(rgb)
+        if len(rows):
+            rendering = self.render_path(path.of_rays(rows))[-1]
+            rgb[rows], depth[rows], opacity[rows] = (
+                part.to(rgb) for part in (rendering.rgb, rendering.depth, rendering.opacity)
+            )
+        return rgb, depth, opacity
+
+    def _may_meet(self, rays: Rays, path: Path) -> Bool[Tensor, "R"]:
+        """Whether each ray may meet what the fields hold; the others are straight and show the background."""
+        meets = torch.full((len(rays),), not self.empty_shows_boundary, device=rays.near.device)
+        for field in self.scene.fields:
+            box: Tensor | None = field.bounds  # type: ignore[assignment]
+            if box is None:
+                return torch.ones_like(meets)
+            enter, leave = intersect_box(box, rays.origins, rays.directions)
+            meets |= (enter <= leave) & (leave >= 0)
+        meets[path.ray[path.refracted]] = True
+        return meets

@@ -1,0 +1,74 @@
+"""The scene: everything that is learned about the world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import nn
+
+from nerfro.boundaries.base import Boundary
+from nerfro.camera.base import Camera
+from nerfro.camera.given import GivenCamera
+from nerfro.errors import NerfroError
+from nerfro.fields.base import Field
+from nerfro.media.base import Medium
+from nerfro.rendering.colour_space import ColourSpace
+
+
+class Scene(nn.Module):
+    """Refractive medium, radiance fields, background and estimated cameras: everything that is learned.
+
+    Args:
+        medium: refractive index and absorption.
+        fields: radiance fields inside the volume, coarsest sampling level first; one may serve all levels.
+        boundary: background radiance, from beyond the volume.
+        camera: estimate of the training cameras; by default they are as the data gives them.
+        colour_space: of the radiance that fields and background return.
+
+    Raises:
+        NerfroError: exposures are learned, which needs linear radiance, but the colour space is sRGB.
+    """
+
+    def __init__(
+        self,
+        medium: Medium,
+        fields: Sequence[Field],
+        boundary: Boundary,
+        camera: Camera | None = None,
+        colour_space: ColourSpace = ColourSpace.LINEAR,
+    ) -> None:
+        super().__init__()
+        self.camera = GivenCamera() if camera is None else camera
+        self.medium, self.fields, self.boundary = medium, nn.ModuleList(fields), boundary
+        self.colour_space = colour_space
+        if colour_space is ColourSpace.SRGB and self.camera.exposure is not None:
+            raise NerfroError("camera.exposure=true needs linear radiance; take model.colour=linear")
+        self.register_buffer("_on_device", torch.empty(0), persistent=False)  # a scene may have no other tensor
+
+    @property
+    def device(self) -> torch.device:
+        """Device of all parameters and buffers."""
+        on_device: torch.Tensor = self._on_device  # type: ignore[assignment]
+        return on_device.device
+
+    def path_parameters(self) -> list[nn.Parameter]:
+        """Return the parameters that paths depend on: of the cameras and of what bends rays."""
+        return [*self.camera.bending_parameters(), *self.medium.bending_parameters()]
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Return all parameters by the name of their optimizer group."""
+        bending = self.medium.bending_parameters()
+        return {
+            "fields": list(self.fields.parameters()),
+            "boundary": list(self.boundary.parameters()),
+            "medium": bending,
+            "tint": [own for own in self.medium.parameters() if all(own is not other for other in bending)],
+            "camera": self.camera.bending_parameters(),
+            "exposure": self.camera.brightness_parameters(),
+        }
+
+    def measurements(self) -> dict[str, float]:
+        """Return physical quantities that are learned, such as indices, by their names in the log."""
+        found = {"medium": self.medium.learned(), "camera": self.camera.learned()}
+        return {f"{part}/{name}": value for part, values in found.items() for name, value in values.items()}

@@ -1,0 +1,132 @@
+"""The training of a model as a LightningModule: losses, optimizer, schedules and logging."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import Timer
+from omegaconf import DictConfig
+from torch import Tensor, nn
+
+from nerfro.errors import NerfroError
+from nerfro.losses.base import Loss
+from nerfro.rendering import Renderer, Scene
+from nerfro.training.config import build_losses
+from nerfro.training.optimizer import OptimizerConfig, learning_rate_factor
+from nerfro.types import Batch
+
+
+class TrainingModule(LightningModule):
+    """Train a model, which is a `Renderer` and its `Scene`, on batches of pixels.
+
+    Args:
+        renderer: the model that `model=` chooses.
+        losses: training losses by name.
+        optimizer: settings of Adam and of the learning rate schedule.
+    """
+
+    def __init__(self, renderer: Renderer, losses: Mapping[str, Loss], optimizer: OptimizerConfig) -> None:
+        super().__init__()
+        self.renderer = renderer
+        self.losses = nn.ModuleDict(dict(losses))
+        self.optimizer_config = optimizer
+        self._is_logged_step = True
+
+    @classmethod
+    def of(cls, renderer: Renderer, config: DictConfig) -> TrainingModule:
+        """Train a model with the losses and the optimizer of a run's configuration."""
+        return cls(renderer, build_losses(config.loss), OptimizerConfig(**config.optimizer))
+
+    @property
+    def scene(self) -> Scene:
+        """Everything that is learned about the world."""
+        return self.renderer.scene
+
+    def setup(self, stage: str) -> None:
+        if self.trainer.world_size > 1 and not self.renderer.trains_in_parallel:
+            raise NerfroError(f"{type(self.renderer).__name__} trains in one process; set trainer.devices=1")
+
+    def training_step(self, batch: Batch, batch_index: int) -> dict[str, Tensor]:
+        """Compute the loss of a batch, and the mean squared error of its pixels (sRGB)."""
+        camera, colour_space = self.scene.camera, self.scene.colour_space
+        path = self.renderer.trace(camera(batch.rays, batch.ray_view), batch.path)
+        renderings = self.renderer.render_path(path, batch.draws, batch.teaches_background[batch.pixel])
+        if (gains := camera.gains(batch.ray_view)) is not None:
+            renderings = [rendering.exposed(gains) for rendering in renderings]
+        total = torch.zeros((), device=self.device)
+        for name, loss in self.losses.items():
+            weight = loss.weight_at(self.global_step)  # type: ignore[operator]
+            self.log(f"weight/{name}", weight)
+            if weight > 0:
+                value = loss(renderings, batch, self.scene)
+                self.log(f"loss/{name}", value)
+                total = total + weight * value
+        shown = colour_space.to_display(batch.per_pixel(renderings[-1].rgb.detach()))
+        error = (shown - batch.rgb).square().mean()
+        self.log("train/psnr", -10 * torch.log10(error))
+        self.log("loss/total", total)
+        for name, measurement in self.scene.measurements().items():
+            self.log(name, measurement)
+        return {"loss": total, "squared_error": error}
+
+    def log(self, *args: Any, **kwargs: Any) -> None:
+        """Log a value, in training only in the steps that are written: logging took a tenth of the time of a step."""
+        if self._is_logged_step or not self.trainer.training:
+            super().log(*args, **kwargs)
+
+    def on_train_batch_start(self, batch: Batch, batch_index: int) -> None:
+        every: int = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
+        self._is_logged_step = (self.global_step + 1) % every == 0
+        # Under a time limit every process has its own idea of it, and parameters would drift apart at different rates.
+        progress = self.trainer.strategy.broadcast(training_progress(self.trainer))
+        factor = learning_rate_factor(self.global_step, self.renderer.begin_step(progress), self.optimizer_config)
+        for group in self.trainer.optimizers[0].param_groups:
+            waits = self.global_step < self.optimizer_config.start(group["name"])
+            group["lr"] = 0.0 if waits else group["initial_lr"] * factor
+        # Not at the end of the step before, which comes after its checkpoint: a resumed run would miss the update.
+        if self.global_step > 0:
+            self.renderer.point_sampler.after_step(list(self.scene.fields), batch.draws)  # type: ignore[arg-type]
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        groups = []
+        for name, parameters in self.renderer.parameter_groups().items():
+            rate = self.optimizer_config.rate(name)
+            groups.append({"params": parameters, "lr": rate, "initial_lr": rate, "name": name})
+        # Lightning cannot clip the gradients of a fused optimizer under mixed precision.
+        fused = self._trainer is None or not self._trainer.gradient_clip_val
+        return torch.optim.Adam(groups, eps=self.optimizer_config.adam_epsilon, fused=fused)
+
+    def validation_step(self, view: int, batch_index: int) -> dict[str, Tensor] | None:
+        if not self.trainer.is_global_zero:
+            return None  # one process evaluates, the others wait
+        data = self.trainer.datamodule  # type: ignore[attr-defined]
+        with torch.autocast(self.device.type, enabled=False):  # directions in half precision would miss their pixels
+            held = data.watched_psnr()
+        self.log("val/psnr", held, prog_bar=True, batch_size=1, rank_zero_only=True)
+        if view < 0:
+            return None  # no picture is due
+        views = data.validation
+        target = views.images[view].to(self.device)
+        with torch.autocast(self.device.type, enabled=False):
+            rays = views.cameras.to(self.device).image_rays(view)
+        rendered = self.renderer.render(rays)
+        prediction = self.scene.colour_space.to_display(rendered.radiance).reshape(target.shape)
+        depth, opacity = (m.reshape(target.shape[:2]) for m in (rendered.depth / views.cameras.far, rendered.opacity))
+        return {"prediction": prediction, "target": target, "depth": depth, "opacity": opacity}
+
+
+def training_progress(trainer: Trainer) -> float:
+    """Share of the run's budget that is spent, in [0, 1]: of `max_steps` or of `max_time`, whichever is more.
+
+    Under `max_time` the schedules end when the time does, so such a run depends on the machine's speed.
+    """
+    progress = trainer.global_step / trainer.max_steps if trainer.max_steps > 0 else 0.0
+    timer = next((c for c in trainer.callbacks if isinstance(c, Timer)), None)  # type: ignore[attr-defined]
+    if timer is not None:
+        elapsed, remaining = timer.time_elapsed(), timer.time_remaining()
+        if remaining is not None and elapsed + remaining > 0:
+            progress = max(progress, elapsed / (elapsed + remaining))
+    return min(progress, 1.0)
