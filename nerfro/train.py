@@ -81,8 +81,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
         print(f"nerfro: interrupted after step {trainer.global_step} and saved; to go on, repeat it with {command}")
         sys.exit(EXIT_INTERRUPTED)
 
-    renderer.to(device)
-    write_cameras(folder / "cameras.json", renderer.scene.camera, training)
+    write_cameras(folder / "cameras.json", renderer.to(device).scene.camera, training)
     metrics = ImageMetrics(*lpips, prefix=config.evaluation.split)
     result, treated = score_split(renderer, test, metrics, folder, subdivision, config.evaluation.refine_steps)
     title = f"{config.name} on {config.data.root}, {config.evaluation.split} views"
