@@ -34,7 +34,9 @@ def test_a_medium_with_parameters_learns_in_the_refractive_model(
         done = train_here(*options, f"trainer.max_steps={steps}", f"hydra.run.dir={folder}")
         assert done.code == 0, done.err
         state = load_checkpoint(folder / "checkpoints" / "last.ckpt")[0]["state_dict"]
-        weights.append(torch.cat([value.flatten() for name, value in state.items() if name.startswith("medium.")]))
+        weights.append(
+            torch.cat([value.flatten() for name, value in state.items() if name.startswith("renderer.scene.medium.")])
+        )
     assert (weights[0] - weights[1]).abs().max() > 1e-4
 
 
@@ -63,6 +65,6 @@ def test_an_index_that_is_off_is_mended_in_training(train_here: Callable[..., An
     done = train_here(*options, f"hydra.run.dir={tmp_path / 'run'}")
     assert done.code == 0, done.err
     state = load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")[0]["state_dict"]
-    assert state["medium.iors"].item() == pytest.approx(
+    assert state["renderer.scene.medium.iors"].item() == pytest.approx(
         1.45, rel=0.01
     )  # 1.462 from above and from below: the grid's ball is not the photographs'

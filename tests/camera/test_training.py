@@ -145,9 +145,9 @@ def test_a_run_whose_cameras_learn_goes_on_as_if_it_had_not_stopped(
         states.append(load_checkpoint(tmp_path / name / "checkpoints" / "last.ckpt")[0]["state_dict"])
     assert states[0].keys() == states[1].keys()
     assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
-    assert float(states[0]["camera.motions.motion"].abs().max()) > 0
-    assert float(states[0]["camera.lens"].abs().max()) > 0
-    assert float(states[0]["camera.exposure.log_gain"].abs().max()) > 0
+    assert float(states[0]["renderer.scene.camera.motions.motion"].abs().max()) > 0
+    assert float(states[0]["renderer.scene.camera.lens"].abs().max()) > 0
+    assert float(states[0]["renderer.scene.camera.exposure.log_gain"].abs().max()) > 0
 
 
 def test_cameras_wait_for_the_scene(
@@ -161,7 +161,7 @@ def test_cameras_wait_for_the_scene(
         )  # fmt: skip
         assert done.code == 0, done.err
         state = load_checkpoint(folder / "checkpoints" / "last.ckpt")[0]["state_dict"]
-        assert bool((state["camera.motions.motion"][:, 3:] != 0).any()) is moves
+        assert bool((state["renderer.scene.camera.motions.motion"][:, 3:] != 0).any()) is moves
 
 
 def test_cameras_move_by_sky_and_masks_before_training_and_what_these_told_is_kept(

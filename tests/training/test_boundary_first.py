@@ -37,7 +37,7 @@ def weights(
 def test_the_boundary_alone_has_learned_before_the_first_step(weights: Callable[..., dict[str, Tensor]]) -> None:
     without, learned = weights("without", "optimizer.boundary_first=0"), weights("with", "optimizer.boundary_first=20")
     changed = {name for name, value in learned.items() if not torch.equal(value, without[name])}
-    assert changed == {"boundary.texels"}
+    assert changed == {"renderer.scene.boundary.texels"}
 
 
 def test_a_run_that_goes_on_does_not_learn_it_again(

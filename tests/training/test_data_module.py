@@ -144,7 +144,7 @@ def test_nothing_is_traced_ahead_where_paths_learn_or_python_is_needed(ball: Sdf
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1}, raising=False)
 
     def model(path_sampler, learns: bool = False) -> Any:
-        return SimpleNamespace(path_sampler=path_sampler, medium=ball, paths_learn=learns)
+        return SimpleNamespace(path_sampler=path_sampler, scene=SimpleNamespace(medium=ball), paths_learn=learns)
 
     assert can_trace_ahead(model(Snell()))
     assert not can_trace_ahead(model(Snell(), learns=True))
@@ -165,9 +165,10 @@ def test_a_batch_is_made_when_its_step_begins_if_paths_learn(
     batches.to = lambda device, dtype: batches
     batches.forget = lambda: None
     data = RayDataModule(batches, None, 0)
-    model = SimpleNamespace(path_sampler=Snell(), medium=ball, paths_learn=learns, dtype=torch.float32)
+    renderer = SimpleNamespace(path_sampler=Snell(), scene=SimpleNamespace(medium=ball), paths_learn=learns)
+    module = SimpleNamespace(renderer=renderer, dtype=torch.float32)
     strategy = SimpleNamespace(root_device=torch.device("cpu"))
-    data.trainer = SimpleNamespace(strategy=strategy, lightning_module=model, global_step=5, training=True)  # type: ignore[assignment]
+    data.trainer = SimpleNamespace(strategy=strategy, lightning_module=module, global_step=5, training=True)  # type: ignore[assignment]
     steps = iter(data.train_dataloader())
     first, _second = next(steps), next(steps)
     assert not made
