@@ -121,8 +121,9 @@ class NerfModel(LightningModule, ABC):
             return path
         # The others are not replayed at all: they have many events, and take most of the time.
         refined = self.path_sampler.refine(path[rows], rays[path.ray[rows]], self.medium)
-        names = ["positions", "directions", "s", "exit_directions", *(["throughput"] if path.splits else [])]
-        return path.changed(**{n: getattr(path, n).index_copy(0, rows, getattr(refined, n)) for n in names})
+        names = ["positions", "directions", "s", *(["throughput"] if path.splits else [])]
+        columns = {name: getattr(path, name).index_copy(0, rows, getattr(refined, name)) for name in names}
+        return dataclasses.replace(path, **columns)
 
     @property
     def paths_learn(self) -> bool:
