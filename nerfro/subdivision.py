@@ -118,7 +118,7 @@ def subdivide(
     part = torch.arange(num_parts, device=pixels.device).repeat(len(parted))
     return PixelRays(
         rays=rays[whole].followed_by(parts),
-        path=path.of_rays(whole).followed_by(trace(parts, view[pixel])),
+        path=Path.joined([path.of_rays(whole), trace(parts, view[pixel])]),
         pixel=torch.cat([whole, pixel]),
         part=torch.cat([torch.zeros_like(whole), part]),
         diverges=diverges,

@@ -6,7 +6,9 @@ as rays where no ray splits; what is documented with R then has P rows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
@@ -21,110 +23,119 @@ __all__ = ["Batch", "Exits", "Path", "Radiance", "Rays", "Rendering", "Samples"]
 
 @dataclass(frozen=True)
 class Path:
-    """Rays as polylines in arc length: vertex i is left along directions[i] until s[i + 1].
+    """Rays as polylines in arc length.
 
-    Light that splits takes several polylines of one ray, each complete from the camera on; rendering adds up what they
-    bring. A straight ray is a path of two vertices. Rows with fewer vertices than others repeat their last one (s and
-    all).
+    Vertex i is left in `directions[i]`, along which the polyline runs straight until vertex i + 1. A straight ray is a
+    path of two vertices. Rows with fewer vertices than others repeat their last one (arc length included).
+
+    Light that splits at a surface takes several polylines of one ray, each complete from the camera on. Rendering sums
+    what they contribute (`per_ray`). `unbranched` makes the ordinary path, one polyline per ray; `dataclasses.replace`
+    derives a path from another, `path[rows]` and `of_rays` select from it, and `joined` concatenates.
+
+    Attributes:
+        positions: vertices, world units.
+        directions: unit direction in which each vertex is left; at the last vertex, in which the polyline leaves the
+            bounded volume.
+        s: arc length from the camera at each vertex, non-decreasing, world units. `s[:, 0]` is near; `s[:, -1]` is far,
+            or more where the object is left later.
+        refracted: whether the polyline met the medium (an index other than 1) at all.
+        radii: pixel cone radius at unit distance, from the rays.
+        splits: whether rays may have several polylines. If not, `ray` counts from 0 and `throughput` is 1 everywhere.
+        ray: ray that each polyline belongs to, non-decreasing; every ray has at least one polyline.
+        throughput: linear factor of the light that the polyline contributes; those of one ray sum to at most 1.
+        body: innermost body of the medium in which each vertex is left, numbered from 1; 0 in air, or where the index
+            varies continuously.
+        surface: body on whose surface each vertex lies, numbered from 0; -1 where there is no sharp surface, as at both
+            ends.
+        across: body on the other side of that surface, numbered as `body`: the one that transmitted light enters, and
+            that reflected light does not. 0 where there is no surface.
+        triangle: triangle that each vertex lies on, where the trace met triangles; otherwise -1.
+        absorption: of air and of each body for red, green and blue, per world unit; empty where all is clear.
+        band: number of the wavelength at which the polyline is bent, where the index depends on it; otherwise 0.
     """
 
-    positions: Float[Tensor, "P S 3"]  # vertices
-    directions: Float[Tensor, "P S 3"]  # unit direction in which each vertex is left
-    # Arc length from the camera at each vertex, non-decreasing. s[:, 0] is near; s[:, -1] is far, or more where
-    # the object is left later.
+    positions: Float[Tensor, "P S 3"]
+    directions: Float[Tensor, "P S 3"]
     s: Float[Tensor, "P S"]
-    exit_directions: Float[Tensor, "P 3"]  # unit direction in which the polyline leaves the bounded volume
-    refracted: Bool[Tensor, "P"]  # whether the polyline met the medium (n not 1) at all
-    radii: Float[Tensor, "P"]  # pixel cone radius at unit distance, carried along from the rays
-    # The ray that each polyline belongs to, non-decreasing, every ray with one polyline at least; by default each
-    # ray has one.
-    ray: Int[Tensor, "P"] = None  # type: ignore[assignment]  # filled in below
-    # Linear factor of the light that the polyline brings; 1 by default. Those of a ray sum to at most 1.
-    throughput: Float[Tensor, "P 3"] = None  # type: ignore[assignment]
-    # Innermost body of the medium in which each vertex is left, numbered from 1; 0 in air, or where the index
-    # varies continuously.
-    body: Int[Tensor, "P S"] = None  # type: ignore[assignment]
-    # Absorption of air and of each body, for each colour channel, per world unit; 0 by default.
-    absorption: Float[Tensor, "K+1 3"] = None  # type: ignore[assignment]
-    # Number of the wavelength at which the polyline is bent, where the index depends on it; 0 by default.
-    band: Int[Tensor, "P"] = None  # type: ignore[assignment]
-    # Which of these were given. Known here, so that the ordinary path is neither summed up nor weighted, bit for bit.
-    _given: frozenset[str] = field(init=False, repr=False)
+    refracted: Bool[Tensor, "P"]
+    radii: Float[Tensor, "P"]
+    splits: bool
+    ray: Int[Tensor, "P"]
+    throughput: Float[Tensor, "P 3"]
+    body: Int[Tensor, "P S"]
+    surface: Int[Tensor, "P S"]
+    across: Int[Tensor, "P S"]
+    triangle: Int[Tensor, "P S"]
+    absorption: Float[Tensor, "B 3"]
+    band: Int[Tensor, "P"]
 
-    def __post_init__(self) -> None:
-        zero = self.s.new_zeros(())
-        defaults = {
-            "ray": lambda: torch.arange(len(self.s), device=self.s.device),
-            "throughput": lambda: (zero + 1).expand(len(self.s), 3),
-            "body": lambda: zero.to(torch.int8).expand(self.s.shape),
-            "absorption": lambda: zero.expand(1, 3),
-            "band": lambda: zero.to(torch.int8).expand(len(self.s)),
-        }
-        missing = [name for name in defaults if getattr(self, name) is None]
-        object.__setattr__(self, "_given", frozenset(defaults) - frozenset(missing))
-        for name in missing:
-            object.__setattr__(self, name, defaults[name]())
+    @classmethod
+    def unbranched(
+        cls,
+        positions: Float[Tensor, "R S 3"],
+        directions: Float[Tensor, "R S 3"],
+        s: Float[Tensor, "R S"],
+        refracted: Bool[Tensor, "R"],
+        radii: Float[Tensor, "R"],
+    ) -> Path:
+        """Make a path of one polyline per ray, in clear media and without sharp surfaces.
 
-    @property
-    def splits(self) -> bool:
-        """Whether rays may have several polylines."""
-        return "ray" in self._given
+        The remaining fields are expanded constants, which take no memory. Arguments are described in the class.
+        """
+        none = torch.full((), -1, dtype=torch.int8, device=s.device)
+        of_vertices, air = none.expand(s.shape), (none + 1).expand(s.shape)
+        return cls(
+            positions, directions, s, refracted, radii,
+            splits=False, ray=torch.arange(len(s), device=s.device), throughput=s.new_ones(()).expand(len(s), 3),
+            body=air, surface=of_vertices, across=air, triangle=of_vertices,
+            absorption=s.new_empty(0, 3), band=(none + 1).expand(len(s)),
+        )  # fmt: skip
+
+    @classmethod
+    def joined(cls, paths: Sequence[Path]) -> Path:
+        """Concatenate paths: the polylines of the rays of the first one, then those of the next."""
+        num_vertices = max(path.s.shape[1] for path in paths)
+        columns: dict[str, list[Any]] = {field.name: [] for field in fields(cls)}
+        num_rays = 0
+        for path in paths:
+            for name, value in vars(path).items():
+                if name == "ray":
+                    value = value + num_rays
+                elif name in _OF_VERTICES:
+                    last = value[:, -1:].expand(-1, num_vertices - value.shape[1], *value.shape[2:])
+                    value = torch.cat([value, last], 1)
+                columns[name].append(value)
+            num_rays += path.num_rays
+        splits, absorption = any(columns.pop("splits")), max(columns.pop("absorption"), key=len)
+        together = {name: torch.cat(values) for name, values in columns.items()}
+        return cls(splits=splits, absorption=absorption, **together)
 
     @property
     def absorbs(self) -> bool:
-        """Whether it may cross bodies that absorb."""
-        return "absorption" in self._given
+        """Whether the path may cross bodies that absorb."""
+        return len(self.absorption) > 0
 
     @property
     def num_rays(self) -> int:
-        """Number of rays; of as many polylines where none splits."""
+        """Number of rays; equal to the number of polylines where none splits."""
         return int(self.ray[-1]) + 1 if self.splits and len(self.ray) else len(self.ray)
 
     def per_ray(self, values: Float[Tensor, "P *C"]) -> Float[Tensor, "R *C"]:
-        """What the polylines of each ray bring together: the sum of their values, each times its throughput."""
-        if "throughput" in self._given:
-            values = values * (self.throughput if values.ndim > 1 else self.throughput.mean(-1))
+        """Sum the values of the polylines of each ray, weighted by their throughput."""
         if not self.splits:
             return values
+        values = values * (self.throughput if values.ndim > 1 else self.throughput.mean(-1))
         return values.new_zeros(self.num_rays, *values.shape[1:]).index_add(0, self.ray, values)
 
     def of_ray(self, values: Shaped[Tensor, "R *C"]) -> Shaped[Tensor, "P *C"]:
-        """The value of its ray for each polyline."""
+        """Broadcast a value per ray to the polylines of the ray."""
         return values[self.ray] if self.splits else values
 
     def first_of_ray(self, values: Shaped[Tensor, "P *C"]) -> Shaped[Tensor, "R *C"]:
-        """The value of its first polyline, the main one, for each ray."""
+        """Select the value of the first polyline of each ray, which is the main one."""
         if not self.splits:
             return values
         return values[torch.searchsorted(self.ray, torch.arange(self.num_rays, device=self.ray.device))]
-
-    def moved(
-        self,
-        positions: Float[Tensor, "P S 3"],
-        directions: Float[Tensor, "P S 3"],
-        s: Float[Tensor, "P S"],
-        exit_directions: Float[Tensor, "P 3"],
-        throughput: Float[Tensor, "P 3"] | None = None,
-    ) -> Path:
-        """The same polylines through other vertices, as a refinement makes them."""
-        changed = {} if throughput is None else {"throughput": throughput}
-        return self.changed(positions=positions, directions=directions, s=s, exit_directions=exit_directions, **changed)
-
-    def changed(self, **tensors: Tensor) -> Path:
-        """The same polylines with some other tensors."""
-        return Path(**(self._tensors() | tensors))
-
-    def to(self, like: Tensor) -> Path:
-        """The same polylines on the device and in the precision of a tensor."""
-        tensors = self._tensors()
-        for name, tensor in tensors.items():
-            tensors[name] = tensor.to(like) if tensor.is_floating_point() else tensor.to(like.device)
-        return Path(**tensors)
-
-    def _tensors(self) -> dict[str, Tensor]:
-        """What the path was made of."""
-        names = (*_OF_ALL_PATHS, *sorted(self._given))
-        return {name: getattr(self, name) for name in names}
 
     def transmitted(self, s: Float[Tensor, "P N"]) -> Float[Tensor, "P N 3"]:
         """Share of light that comes from arc lengths `s` through what absorbs before them (Beer-Lambert), linear."""
@@ -155,44 +166,29 @@ class Path:
         return self.s[:, -1]
 
     @property
-    def exit_positions(self) -> Float[Tensor, "R 3"]:
+    def exit_positions(self) -> Float[Tensor, "P 3"]:
         return self.positions[:, -1]
 
+    @property
+    def exit_directions(self) -> Float[Tensor, "P 3"]:
+        """Unit direction in which each polyline leaves the bounded volume."""
+        return self.directions[:, -1]
+
     def __getitem__(self, index: slice | Tensor) -> Path:
-        """Some of the polylines, each as that of a ray of its own."""
-        tensors = self._tensors()
-        tensors.pop("ray", None)
-        return Path(**{name: tensor if name in _OF_BODIES else tensor[index] for name, tensor in tensors.items()})
+        """Select polylines, each as that of a ray of its own."""
+        rows = {name: value[index] for name, value in vars(self).items() if name not in _OF_PATHS}
+        rows["ray"] = torch.arange(len(rows["s"]), device=self.s.device)
+        return replace(self, **rows)
 
     def of_rays(self, rows: Int[Tensor, "C"]) -> Path:
-        """Some of the rays, with all their polylines."""
+        """Select rays, each with all its polylines."""
         if not self.splits:
             return self[rows]
         counts = torch.bincount(self.ray, minlength=self.num_rays)
         first, num = (counts.cumsum(0) - counts)[rows], counts[rows]
         ray = torch.arange(len(rows), device=rows.device).repeat_interleave(num)
         place = torch.arange(len(ray), device=rows.device) - (num.cumsum(0) - num)[ray]
-        return self[first[ray] + place].changed(ray=ray)
-
-    def followed_by(self, other: Path) -> Path:
-        """The polylines of these rays and after them those of others."""
-        num_vertices = max(self.s.shape[1], other.s.shape[1])
-
-        def joined(name: str) -> Tensor:
-            parts: list[Tensor] = [getattr(part, name) for part in (self, other)]
-            if name in _OF_BODIES:
-                return max(parts, key=len)
-            if name == "ray":
-                parts[1] = parts[1] + self.num_rays
-            if name in _OF_VERTICES:
-                missing = [num_vertices - p.shape[1] for p in parts]
-                parts = [
-                    torch.cat([p, p[:, -1:].expand(-1, m, *p.shape[2:])], 1)
-                    for p, m in zip(parts, missing, strict=True)
-                ]
-            return torch.cat(parts)
-
-        return Path(**{name: joined(name) for name in self._tensors() | other._tensors()})
+        return replace(self[first[ray] + place], ray=ray)
 
     def span(self, box: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
         """Arc lengths between which the path runs inside a box, from its first entry to its last exit.
@@ -229,9 +225,9 @@ class Path:
         return vertex.clamp(min=0)
 
 
-_OF_ALL_PATHS = ("positions", "directions", "s", "exit_directions", "refracted", "radii")
-_OF_VERTICES = frozenset({"positions", "directions", "s", "body"})
-_OF_BODIES = frozenset({"absorption"})
+# Fields of `Path` with a column for each vertex, and those that have no row for each polyline.
+_OF_VERTICES = frozenset({"positions", "directions", "s", "body", "surface", "across", "triangle"})
+_OF_PATHS = frozenset({"splits", "absorption"})
 
 
 @dataclass(frozen=True)

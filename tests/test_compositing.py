@@ -145,7 +145,7 @@ def corner() -> Path:
     positions = torch.tensor([[[0.0, 0, 0], [2, 0, 0], [2, 3, 0]]])
     directions = torch.tensor([[[1.0, 0, 0], [0, 1, 0], [0, 1, 0]]])
     s = torch.tensor([[1.0, 3, 6]])
-    return Path(positions, directions, s, directions[:, -1], torch.tensor([True]), torch.tensor([0.01]))
+    return Path.unbranched(positions, directions, s, torch.tensor([True]), torch.tensor([0.01]))
 
 
 def test_point_of_a_bent_path_follows_the_nearest_former_vertex() -> None:

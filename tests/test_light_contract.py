@@ -31,15 +31,11 @@ from nerfro.types import Exits, Path, Radiance
 
 def split_path(of_straight: float) -> Path:
     """Two polylines for each example ray: bent by a ball, and straight on, which brings the given share."""
-    bent, straight = example_path(), straight_path(example_rays())
-    both = bent.followed_by(straight)
+    both = Path.joined([example_path(), straight_path(example_rays())])
     order = torch.stack([torch.arange(NUM_RAYS), torch.arange(NUM_RAYS) + NUM_RAYS], 1).flatten()
-    chosen = both[order]
     share = torch.tensor([1 - of_straight, of_straight]).repeat(NUM_RAYS)
-    return Path(
-        chosen.positions, chosen.directions, chosen.s, chosen.exit_directions, chosen.refracted, chosen.radii,
-        ray=torch.arange(NUM_RAYS).repeat_interleave(2), throughput=share[:, None].expand(-1, 3), body=chosen.body,
-    )  # fmt: skip
+    ray = torch.arange(NUM_RAYS).repeat_interleave(2)
+    return replace(both[order], splits=True, ray=ray, throughput=share[:, None].expand(-1, 3))
 
 
 def rendered(path: Path) -> Tensor:
@@ -61,11 +57,7 @@ def test_a_ray_is_the_sum_of_its_polylines_weighted_by_throughput() -> None:
 
 def test_one_polyline_a_ray_is_the_same_bit_for_bit_however_it_is_said() -> None:
     path = example_path()
-    said = Path(
-        path.positions, path.directions, path.s, path.exit_directions, path.refracted, path.radii,
-        ray=torch.arange(NUM_RAYS), throughput=torch.ones(NUM_RAYS, 3),
-    )  # fmt: skip
-    assert torch.equal(rendered(said), rendered(path))
+    assert torch.equal(rendered(replace(path, splits=True)), rendered(path))
 
 
 def test_opacity_and_depth_are_those_of_rays() -> None:
@@ -83,11 +75,8 @@ def test_opacity_and_depth_are_those_of_rays() -> None:
 @pytest.mark.parametrize("sampler", [Stratified(8), Hierarchical(8, 8), DensityGridSampler(8, 16)])
 def test_random_numbers_are_drawn_for_each_ray(sampler: Stratified | Hierarchical | DensityGridSampler) -> None:
     same = straight_path(example_rays())
-    twice = Path(
-        *(getattr(same, name).repeat_interleave(2, 0) for name in
-          ("positions", "directions", "s", "exit_directions", "refracted", "radii")),
-        ray=torch.arange(NUM_RAYS).repeat_interleave(2),
-    )  # fmt: skip
+    rows = torch.arange(NUM_RAYS).repeat_interleave(2)
+    twice = replace(same[rows], splits=True, ray=rows)
     samples = sampler(twice, None, example_draws())
     assert torch.equal(samples.s[::2], samples.s[1::2]), "polylines of a ray share its numbers"
     assert torch.equal(samples.s[::2], sampler(same, None, example_draws()).s), "and splitting changes nobody's"
@@ -105,7 +94,7 @@ def test_losses_take_rays_that_split(loss: Photometric | BoundaryRegulariser | D
 def test_samples_follow_the_gradients_of_their_path() -> None:
     path = example_path()
     positions = path.positions.clone().requires_grad_()
-    moving = path.moved(positions, path.directions, path.s, path.exit_directions)
+    moving = replace(path, positions=positions)
     for sampler in (Stratified(8), DensityGridSampler(8, 16)):
         samples = sampler(moving, None)
         assert not samples.s.requires_grad

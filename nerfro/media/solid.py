@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import replace
 from typing import TypeVar
 
 import torch
@@ -110,7 +111,7 @@ class Solid(Medium):
         of_bodies = self.absorption
         if of_bodies is None:
             return path
-        return path.changed(absorption=torch.cat([torch.zeros_like(of_bodies[:1]), of_bodies]).to(path.s))
+        return replace(path, absorption=torch.cat([torch.zeros_like(of_bodies[:1]), of_bodies]).to(path.s))
 
     def bending_parameters(self) -> list[nn.Parameter]:
         return [parameter for parameter in self.parameters() if parameter is not self._absorption]

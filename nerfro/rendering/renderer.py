@@ -177,8 +177,9 @@ class Renderer(nn.Module, ABC):
             return path
         # The others are not replayed at all: they have many events, and take most of the time.
         refined = self.path_sampler.refine(path[rows], rays[path.ray[rows]], medium)
-        names = ["positions", "directions", "s", "exit_directions", *(["throughput"] if path.splits else [])]
-        return path.changed(**{n: getattr(path, n).index_copy(0, rows, getattr(refined, n)) for n in names})
+        names = ["positions", "directions", "s", *(["throughput"] if path.splits else [])]
+        columns = {name: getattr(path, name).index_copy(0, rows, getattr(refined, name)) for name in names}
+        return dataclasses.replace(path, **columns)
 
     def _in_chunks(self, render: Callable[[Rays], tuple[Tensor, ...]], rays: Rays) -> list[Tensor]:
         """Concatenate what is rendered of `chunk_size` rays at a time, in evaluation mode."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Int
@@ -35,10 +35,8 @@ def traced_in_bands(rays: Rays, media: Sequence[Solid], trace: Callable[[Rays, S
     bent = first.path.refracted
     rows = first.path.ray[bent].unique_consecutive()
     traces = [first, *(trace(rays[rows], medium) for medium in media[1:])]
-    path, of_rays = first.path, [first.path.ray]
-    for other in traces[1:]:
-        path = path.followed_by(other.path)
-        of_rays.append(rows[other.path.ray])
+    path = Path.joined([trace.path for trace in traces])
+    of_rays = [first.path.ray, *(rows[trace.path.ray] for trace in traces[1:])]
     band = torch.cat([torch.full_like(ray, number) for number, ray in enumerate(of_rays)])
     num_bands = len(media) // 3
     # One colour, but all of them where nothing is bent.
@@ -46,7 +44,8 @@ def traced_in_bands(rays: Rays, media: Sequence[Solid], trace: Callable[[Rays, S
     colours = torch.where(path.refracted[:, None], colours, 1.0)
     ray = torch.cat(of_rays)
     order = ray.argsort(stable=True)
-    path = path.changed(throughput=path.throughput * colours, band=band)[order].changed(ray=ray[order])
+    path = replace(path, throughput=path.throughput * colours, band=band, splits=True)
+    path = replace(path[order], ray=ray[order])
     num_events, exceeded = (
         torch.cat([getattr(part, name) for part in traces])[order] for name in ("num_events", "exceeded")
     )
@@ -59,7 +58,4 @@ def refined_in_bands(
     """Refine each band's polylines in its medium; arguments as for `traced_in_bands`."""
     rows = [(path.band == band).nonzero()[:, 0] for band in range(len(media))]
     parts = [refine(path[some], rays[path.ray[some]], medium) for some, medium in zip(rows, media, strict=True)]
-    together = parts[0]
-    for part in parts[1:]:
-        together = together.followed_by(part)
-    return together[torch.cat(rows).argsort()].changed(ray=path.ray)
+    return replace(Path.joined(parts)[torch.cat(rows).argsort()], ray=path.ray)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from nerfro.kernels.lookup import MediumGrid
     from nerfro.media.sdf_grid import SdfGrid
     from nerfro.media.voxel_grid import VoxelGrid
+    from nerfro.samplers.snell_cpu import Polylines
 
 # Vertices that a first attempt has room for; the few rays that need more are traced again. Those of many reflections
 # are slow, so there is room for all that is usual.
@@ -30,52 +32,49 @@ def snell_on_grid(
     rays: Rays, medium: SdfGrid, min_step: float, max_events: int, branching: Branching
 ) -> tuple[Path, Int[Tensor, "P"], Bool[Tensor, "P"]]:
     """`samplers.snell.trace_interfaces` by the compiled kernel."""
-    from nerfro.samplers.snell_cpu import trace_snell
+    from nerfro.samplers.snell_cpu import Settings, trace_snell
 
     solids = _for_kernels(medium)
-    shortest = float((solids.high - solids.low).min())
-    settings = (
-        solids, min_step * shortest, max_events, branching.num_events, branching.least_weight, branching.main_only
+    settings = Settings(
+        min_step * float((solids.high - solids.low).min()), max_events, branching.num_events, branching.least_weight,
+        branching.main_only,
     )  # fmt: skip
-    of_rays, room = _ray_arrays(rays), _ROOM if branching.num_events and not branching.main_only else 1
-    arguments: list[Any] = [*of_rays, *settings, _CAPACITY, room]
-    *columns, counts = trace_snell(*arguments)
+    room = _ROOM if branching.num_events and not branching.main_only else 1
+    rows, counts = trace_snell(*_ray_arrays(rays), solids, settings, _CAPACITY, room)
     kept, needed = (counts <= (room, _CAPACITY)).all(1), counts.max(0, initial=1)
     width = max(int(needed[1]), 2)
-    parts = [_rows(columns, np.where(kept, counts[:, 0], 0), width)]
+    parts = [_polylines(rows, np.where(kept, counts[:, 0], 0), width)]
     if not kept.all():
         rest = (~kept).nonzero()[0]
-        arguments = [*(array[rest] for array in of_rays), *settings, width, int(needed[0])]
-        *columns, counts = trace_snell(*arguments)
-        ray, columns = _rows(columns, counts[:, 0], width)
-        parts.append((rest[ray], columns))
-    ray = np.concatenate([ray for ray, _ in parts])
-    order = slice(None) if len(parts) == 1 else np.argsort(ray, kind="stable")
-    together = zip(*(columns for _, columns in parts), strict=True)
-    columns = [each[0] if len(each) == 1 else np.concatenate(each)[order] for each in together]
-    *vertices, body, weight, events, exceeded = columns
-    num_events = torch.from_numpy(events)
-    split = (torch.from_numpy(ray[order]), torch.from_numpy(weight)) if branching.num_events else (None, None)
-    return _path(rays, vertices, num_events > 0, body, *split), num_events, torch.from_numpy(exceeded)
+        rows, counts = trace_snell(*_ray_arrays(rays[torch.from_numpy(rest)]), solids, settings, width, int(needed[0]))
+        again = _polylines(rows, counts[:, 0], width)
+        parts.append((rest[again[0]], *again[1:]))
+        order = np.argsort(np.concatenate([part[0] for part in parts]), kind="stable")
+        parts = [tuple(np.concatenate(column)[order] for column in zip(*parts, strict=True))]
+    owner, *columns = (torch.from_numpy(column) for column in parts[0])
+    positions, directions, s, body, surface, across, weight, num_events, exceeded = columns
+    radii = rays.radii[owner] if branching.num_events else rays.radii
+    path = Path.unbranched(positions, directions, s, num_events > 0, radii)
+    path = replace(path, body=body, surface=surface, across=across)
+    if branching.num_events:
+        path = replace(path, splits=True, ray=owner, throughput=weight[:, None].expand(-1, 3))
+    return path, num_events, exceeded
 
 
-def _rows(
-    columns: Sequence[np.ndarray], counts: Int[np.ndarray, "R"], width: int
-) -> tuple[Int[np.ndarray, "P"], list[np.ndarray]]:
-    """The ray of each polyline that is there, and the arrays of these polylines, with `width` vertices.
+def _polylines(rows: Polylines, counts: Int[np.ndarray, "R"], width: int) -> tuple[np.ndarray, ...]:
+    """Return the ray of each polyline, its arrays with a column per vertex, its weight, events and excess.
 
     Args:
-        columns: what `trace_snell` returns but for the counts.
+        rows: traced.
         counts: polylines of each ray that are wanted, as many as there is room for at most.
         width: number of vertices.
     """
     from nerfro.samplers.snell_cpu import polylines_of_width
 
-    positions, directions, s, bodies, weights, events, exceeded = columns
-    valid = np.arange(weights.shape[1]) < counts[:, None]
-    ray, place = valid.nonzero()
-    chosen = polylines_of_width(positions, directions, s, bodies, events, ray, place, width)
-    return ray, [*chosen, weights[valid], events[valid], exceeded[valid]]
+    valid = np.arange(rows.weight.shape[1]) < counts[:, None]
+    ray, place = (np.ascontiguousarray(indices) for indices in valid.nonzero())
+    of_vertices = polylines_of_width(rows, ray, place, width)
+    return ray, *of_vertices, rows.weight[valid], rows.num_events[valid], rows.exceeded[valid]
 
 
 def eikonal_on_grid(
@@ -86,13 +85,13 @@ def eikonal_on_grid(
 
     settings = (_for_kernels(medium), step, tolerance, max_steps)
     vertices, (refracted, exceeded) = _with_enough_vertices(rays, march_adaptive, settings, 3)
-    return _path(rays, vertices, torch.from_numpy(refracted)), torch.from_numpy(exceeded)
+    return _path(rays, vertices, refracted), torch.from_numpy(exceeded)
 
 
 def uniform_on_grid(rays: Rays, medium: VoxelGrid, integrator: str, num_steps: int) -> Path:
     """`samplers.eikonal.march_uniform` by the compiled kernel."""
     *vertices, refracted = _march_uniform(rays, medium, integrator, num_steps, keep_all=True)
-    return _path(rays, vertices, torch.from_numpy(refracted))
+    return _path(rays, vertices, refracted)
 
 
 def uniform_exit_on_grid(rays: Rays, medium: VoxelGrid, integrator: str, num_steps: int) -> Float[Tensor, "R 3"]:
@@ -132,8 +131,9 @@ def _with_enough_vertices(
     return [column[:, :width] for column in columns], rest
 
 
-def _ray_arrays(rays: Rays) -> list[np.ndarray]:
-    return arrays(rays.origins, rays.directions, rays.near, rays.far)
+def _ray_arrays(rays: Rays) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    origins, directions, near, far = arrays(rays.origins, rays.directions, rays.near, rays.far)
+    return origins, directions, near, far
 
 
 def _for_kernels(medium: VoxelGrid | SdfGrid) -> MediumGrid:
@@ -164,19 +164,6 @@ def _for_kernels(medium: VoxelGrid | SdfGrid) -> MediumGrid:
     return MediumGrid(values, clearance, None, False, 0.0, low, high, inverse_spacing, inverse_spacing, *no_bodies)
 
 
-def _path(
-    rays: Rays,
-    vertices: Sequence[np.ndarray],
-    refracted: Tensor,
-    body: np.ndarray | None = None,
-    ray: Tensor | None = None,
-    weight: Tensor | None = None,
-) -> Path:
-    arrays = [*vertices] if body is None else [*vertices, body]
-    positions, directions, s, *bodies = (torch.from_numpy(np.ascontiguousarray(array)) for array in arrays)
-    radii = rays.radii if ray is None else rays.radii[ray]
-    throughput = None if weight is None else weight[:, None].expand(-1, 3)
-    return Path(
-        positions, directions, s, directions[:, -1], refracted, radii,
-        ray, throughput, bodies[0] if bodies else None,  # type: ignore[arg-type]
-    )  # fmt: skip
+def _path(rays: Rays, vertices: Sequence[np.ndarray], refracted: np.ndarray) -> Path:
+    positions, directions, s = (torch.from_numpy(np.ascontiguousarray(array)) for array in vertices)
+    return Path.unbranched(positions, directions, s, torch.from_numpy(refracted), rays.radii)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from dataclasses import replace
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Bool
@@ -20,7 +21,7 @@ from nerfro.samplers.base import PathSampler
 from nerfro.samplers.compiled import eikonal_on_grid, uniform_on_grid
 from nerfro.samplers.integrators import INTEGRATORS, Integrator, RayState, leapfrog
 from nerfro.samplers.polylines import Polylines
-from nerfro.samplers.replay import Vertices, assembled, events, with_gradient
+from nerfro.samplers.replay import Vertices, assembled, is_interior, with_gradient
 from nerfro.types import Path, Rays
 
 # Share of a step by which a replay may reach the end of one earlier than the trace.
@@ -78,8 +79,9 @@ class Eikonal(PathSampler):
             return replay_adaptive(path, rays, medium, self.max_steps)
         rays = rays[path.ray]
         replayed = march_uniform(rays, medium, INTEGRATORS[self.integrator], self.num_steps)
-        names = ("positions", "directions", "s", "exit_directions")
-        return path.moved(*(with_gradient(getattr(path, name), getattr(replayed, name)) for name in names))
+        names = ("positions", "directions", "s")
+        columns: dict[str, Any] = {n: with_gradient(getattr(path, n), getattr(replayed, n)) for n in names}
+        return replace(path, **columns)
 
     def releases_python(self, medium: Medium) -> bool:
         return isinstance(medium, VoxelGrid) or (self.integrator == "adaptive" and isinstance(medium, SdfGrid))
@@ -104,7 +106,7 @@ def march_uniform(rays: Rays, medium: Medium, integrator: Integrator, num_steps:
     lengths = (positions[:, 1:] - positions[:, :-1]).norm(dim=-1)
     s = torch.cat([rays.near[:, None], rays.near[:, None] + lengths.cumsum(-1)], -1)
     refracted = torch.stack([(state.gradients != 0).any(-1) for state in states], -1).any(-1)
-    return Path(positions, directions, s, directions[:, -1], refracted, rays.radii)
+    return Path.unbranched(positions, directions, s, refracted, rays.radii)
 
 
 class _NewVertices:
@@ -125,7 +127,8 @@ class _NewVertices:
         self._keep(rows[(x[rows] - tangent).square().sum(-1) > self.tolerance**2], x, d, s)
 
     def _keep(self, rows: Tensor, *state: Tensor) -> None:
-        self.lines.append(rows, *(values[rows] for values in state))
+        x, d, s = state
+        self.lines.append(rows, x[rows], d[rows], s[rows])
         for kept, values in zip(self.kept, state, strict=True):
             kept[rows] = values[rows]
 
@@ -134,7 +137,7 @@ class _KnownVertices:
     """The vertices of a replay: where the trace has them."""
 
     def __init__(self, path: Path) -> None:
-        self.s, self.last = path.s, events(path).sum(-1)
+        self.s, self.last = path.s, is_interior(path).sum(-1)
         self.next = torch.ones_like(path.ray)
         self.found: list[Vertices] = []
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.branching import Branching, Event
-from nerfro.samplers.polylines import Polylines
+from nerfro.samplers.polylines import Crossed, Polylines
 from nerfro.samplers.snell_law import reflectance, refract
 from nerfro.types import Path, Rays
 
@@ -40,7 +40,7 @@ def snell_on_mesh(
     if len(within):
         inside[within] = (medium.signed_distances(x[within].to(medium.box))[0] < 0).cpu()
     lines = Polylines(len(rays), x)
-    lines.append(rows, x, d, s, medium.innermost(inside))
+    lines.append(rows, x, d, s, Crossed(medium.innermost(inside)))
     num_events, exceeded = torch.zeros_like(rows), torch.zeros(len(rays), dtype=torch.bool)
     last_face = torch.full_like(rows, -1)
     weight, ray = torch.ones_like(s), rows
@@ -58,7 +58,8 @@ def snell_on_mesh(
         flipped = inside[active]
         body = triangles.body[face][:, None]
         flipped = flipped.scatter(1, body, ~flipped.gather(1, body))
-        n_before, n_after = (iors[medium.innermost(flags)] for flags in (inside[active], flipped))
+        across = medium.innermost(flipped)
+        n_before, n_after = iors[medium.innermost(inside[active])], iors[across]
         visible = n_before != n_after
         over = visible & (num_events[active] >= max_events)
         exceeded[active] = over
@@ -68,7 +69,7 @@ def snell_on_mesh(
         reflected &= visible
         keep = ~over
         active, face, hit, length, visible = active[keep], face[keep], hit[keep], length[keep], visible[keep]
-        turned, reflected, flipped = turned[keep], reflected[keep], flipped[keep]
+        turned, reflected, flipped, across = turned[keep], reflected[keep], flipped[keep], across[keep]
         if branching.num_events:
             normal, n_before, n_after = normal[keep], n_before[keep], n_after[keep]
             share = torch.where(visible, reflectance(d[active], normal, n_before, n_after), 0.0)
@@ -77,8 +78,8 @@ def snell_on_mesh(
             state = (x, d, s, inside, num_events, exceeded, weight, ray, start, last_face)
             x, d, s, inside, num_events, exceeded, weight, ray, start, last_face = (v[event.source] for v in state)
             lines.take(event.source)
-            met = (face, hit, length, visible, flipped, normal, n_before, n_after)
-            face, hit, length, visible, flipped, normal, n_before, n_after = (v[event.place] for v in met)
+            met = (face, hit, length, visible, flipped, across, normal, n_before, n_after)
+            face, hit, length, visible, flipped, across, normal, n_before, n_after = (v[event.place] for v in met)
             active, reflected = event.active, event.reflected
             weight[active] *= event.factor
             turned, _ = refract(d[active], normal, n_before, n_after, reflected)
@@ -88,9 +89,11 @@ def snell_on_mesh(
         d[active] = torch.where(visible[:, None], turned, d[active])
         num_events[active] += visible
         bent = active[visible]
-        lines.append(bent, x[bent], d[bent], s[bent], medium.innermost(inside[bent]))
+        at_surface = Crossed(
+            medium.innermost(inside[bent]), triangles.body[face[visible]], across[visible], face[visible]
+        )
+        lines.append(bent, x[bent], d[bent], s[bent], at_surface)
         active = torch.cat([active, retry])
     lines.append_ends(far[ray], box, num_events > 0, x, d, s)
     split = (ray, weight) if branching.num_events else (None, None)
-    path = lines.path(rays, num_events > 0, *split).to(rays.origins)
-    return path, num_events.to(device), exceeded.to(device)
+    return lines.path(rays, num_events > 0, *split), num_events.to(device), exceeded.to(device)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -25,12 +28,21 @@ def distance_to_end(
     return torch.where(refracted, torch.maximum(far - s, out), far - s)
 
 
+class Crossed(NamedTuple):
+    """Bodies and surface of a vertex, as in `Path`; by default those of a vertex in air, on no surface."""
+
+    body: Int[Tensor, "A"] | int = 0
+    surface: Int[Tensor, "A"] | int = -1
+    across: Int[Tensor, "A"] | int = 0
+    triangle: Int[Tensor, "A"] | int = -1
+
+
 class Polylines:
     """Paths under construction: rows of vertices, each row as long as it needs to be."""
 
     def __init__(self, num_rays: int, like: Float[Tensor, "..."]) -> None:
         self._vertices = like.new_zeros(num_rays, 4, 7)
-        self._bodies = torch.zeros(num_rays, 4, dtype=torch.int8, device=like.device)
+        self._crossed = torch.zeros(num_rays, 4, len(Crossed._fields), dtype=torch.int32, device=like.device)
         self.counts = torch.zeros(num_rays, dtype=torch.long, device=like.device)
 
     def append(
@@ -39,19 +51,20 @@ class Polylines:
         positions: Float[Tensor, "A 3"],
         directions: Float[Tensor, "A 3"],
         s: Float[Tensor, "A"],
-        bodies: Int[Tensor, "A"] | int = 0,
+        crossed: Crossed = Crossed(),  # noqa: B008 - immutable
     ) -> None:
-        """Add one vertex to each of the given rows; `bodies` are those in which it is left."""
+        """Add one vertex to each of the given rows."""
         if len(rows) and int(self.counts[rows].max()) == self._vertices.shape[1]:
             self._vertices = torch.cat([self._vertices, torch.zeros_like(self._vertices)], 1)
-            self._bodies = torch.cat([self._bodies, torch.zeros_like(self._bodies)], 1)
+            self._crossed = torch.cat([self._crossed, torch.zeros_like(self._crossed)], 1)
         self._vertices[rows, self.counts[rows]] = torch.cat([positions, directions, s[:, None]], -1)
-        self._bodies[rows, self.counts[rows]] = bodies.to(torch.int8) if isinstance(bodies, Tensor) else bodies
+        for i, numbers in enumerate(crossed):
+            self._crossed[rows, self.counts[rows], i] = numbers.int() if isinstance(numbers, Tensor) else numbers
         self.counts[rows] += 1
 
     def take(self, rows: Int[Tensor, "T"]) -> None:
         """Go on with these rows in the place of all, some more than once."""
-        self._vertices, self._bodies, self.counts = self._vertices[rows], self._bodies[rows], self.counts[rows]
+        self._vertices, self._crossed, self.counts = self._vertices[rows], self._crossed[rows], self.counts[rows]
 
     def append_ends(
         self,
@@ -70,22 +83,31 @@ class Polylines:
     def path(
         self,
         rays: Rays,
-        refracted: Bool[Tensor, "R"],
-        ray: Int[Tensor, "R"] | None = None,
-        weight: Float[Tensor, "R"] | None = None,
+        refracted: Bool[Tensor, "P"],
+        ray: Int[Tensor, "P"] | None = None,
+        weight: Float[Tensor, "P"] | None = None,
     ) -> Path:
-        """The finished paths; shorter rows repeat their last vertex.
+        """Return the finished paths, as precise as the rays and on their device; short rows repeat their last vertex.
 
-        Where rays split, `ray` and `weight` are the ray of each row and its share.
+        Args:
+            rays: that were traced.
+            refracted: whether each row met the medium.
+            ray, weight: ray of each row and its share of the light, where rays split.
         """
+        like = rays.origins
         capacity = int(self.counts.max()) if len(self.counts) else 2
-        index = torch.arange(capacity, device=self.counts.device).minimum(self.counts[:, None] - 1)
-        vertices = self._vertices.gather(1, index[..., None].expand(-1, -1, 7))
-        directions = vertices[..., 3:6]
-        bodies = self._bodies.gather(1, index)
+        index = torch.arange(capacity, device=self.counts.device).minimum(self.counts[:, None] - 1)[..., None]
+        vertices = self._vertices.gather(1, index.expand(-1, -1, 7)).to(like)
+        crossed = self._crossed.gather(1, index.expand(-1, -1, self._crossed.shape[-1])).to(like.device)
+        *numbers, triangle = crossed.unbind(-1)
+        body, surface, across = (values.to(torch.int8) for values in numbers)
+        if ray is not None:
+            ray = ray.to(like.device)
         radii = rays.radii if ray is None else rays.radii[ray]
-        throughput = None if weight is None else weight.to(directions)[:, None].expand(-1, 3)
-        return Path(
-            vertices[..., :3], directions, vertices[..., 6], directions[:, -1], refracted, radii,
-            ray, throughput, bodies,  # type: ignore[arg-type]
-        )  # fmt: skip
+        path = Path.unbranched(
+            vertices[..., :3], vertices[..., 3:6], vertices[..., 6], refracted.to(like.device), radii
+        )
+        path = replace(path, body=body, surface=surface, across=across, triangle=triangle)
+        if ray is None or weight is None:
+            return path
+        return replace(path, splits=True, ray=ray, throughput=weight.to(like)[:, None].expand(-1, 3))

@@ -23,7 +23,7 @@ from nerfro.samplers.base import PathSampler
 from nerfro.samplers.branching import ONE_PATH, Branching, Event
 from nerfro.samplers.compiled import snell_on_grid
 from nerfro.samplers.mesh_interfaces import snell_on_mesh
-from nerfro.samplers.polylines import Polylines
+from nerfro.samplers.polylines import Crossed, Polylines
 from nerfro.samplers.replay import meet_solid, meet_triangles, replay, smallest_cosine
 from nerfro.samplers.snell_law import reflectance, refract
 from nerfro.samplers.straight import straight_path
@@ -88,9 +88,9 @@ class Snell(PathSampler):
 
     def _refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
         if self.interface == "mesh" and isinstance(medium, SdfGrid):
-            meet = meet_triangles(medium.triangles(), medium.traced_triangles()[1])
+            meet = meet_triangles(medium.triangles(), path.triangle)
         elif isinstance(medium, Solid):
-            meet = meet_solid(medium)
+            meet = meet_solid(medium, path.surface)
         else:
             return straight_path(rays[path.ray])
         return replay(path, rays, medium, meet, self.branching)
@@ -145,7 +145,7 @@ def trace_interfaces(
     enter, leave = intersect_box(medium.box, x, d)
     in_box = ((x >= medium.box[0]) & (x <= medium.box[1])).all(-1, keepdim=True)
     lines = Polylines(num_rays, x)
-    lines.append(rows, x, d, s, medium.innermost(in_box & (medium.signed_distances(x)[0] < 0)))
+    lines.append(rows, x, d, s, Crossed(medium.innermost(in_box & (medium.signed_distances(x)[0] < 0))))
     num_events = torch.zeros_like(rows)
     exceeded = torch.zeros_like(rows, dtype=torch.bool)
     weight, ray = torch.ones_like(s), rows
@@ -165,7 +165,7 @@ def trace_interfaces(
         n_before = medium.index_inside(inside[active])
         flipped = inside[active]
         flipped.scatter_(1, body[:, None], ~flipped.gather(1, body[:, None]))
-        n_after = medium.index_inside(flipped)
+        across, n_after = medium.innermost(flipped), medium.index_inside(flipped)
         visible = n_before != n_after
         over = visible & (num_events[active] >= max_events)
         exceeded[active] = over
@@ -175,16 +175,20 @@ def trace_interfaces(
         turned, reflected = refract(d[active], normal, n_before, n_after)
         reflected &= visible
         keep = ~over
-        met = (active, before, after, flipped, normal, n_before, n_after, visible, turned, reflected)
-        active, before, after, flipped, normal, n_before, n_after, visible, turned, reflected = (v[keep] for v in met)
+        met = (active, before, after, body, flipped, across, normal, n_before, n_after, visible, turned, reflected)
+        active, before, after, body, flipped, across, normal, n_before, n_after, visible, turned, reflected = (
+            values[keep] for values in met
+        )
         if branching.num_events:
             share = torch.where(visible, reflectance(d[active], normal, n_before, n_after), 0.0)
             event = Event(branching, active, weight, num_events, share, reflected)
             state = (x, d, s, inside, num_events, exceeded, weight, ray)
             x, d, s, inside, num_events, exceeded, weight, ray = (values[event.source] for values in state)
             lines.take(event.source)
-            of_event = (before, after, flipped, normal, n_before, n_after, visible)
-            before, after, flipped, normal, n_before, n_after, visible = (v[event.place] for v in of_event)
+            of_event = (before, after, body, flipped, across, normal, n_before, n_after, visible)
+            before, after, body, flipped, across, normal, n_before, n_after, visible = (
+                values[event.place] for values in of_event
+            )
             active, reflected = event.active, event.reflected
             weight[active] *= event.factor
             turned, _ = refract(d[active], normal, n_before, n_after, reflected)
@@ -195,7 +199,8 @@ def trace_interfaces(
         d[active] = torch.where(visible[:, None], turned, d[active])
         num_events[active] += visible
         bent = active[visible]
-        lines.append(bent, x[bent], d[bent], s[bent], medium.innermost(inside[bent]))
+        at_surface = Crossed(medium.innermost(inside[bent]), body[visible], across[visible])
+        lines.append(bent, x[bent], d[bent], s[bent], at_surface)
     refracted = num_events > 0
     lines.append_ends(rays.far[ray], medium.box, refracted, x, d, s)
     split = (ray, weight) if branching.num_events else (None, None)

@@ -1,73 +1,93 @@
-"""Refraction and total reflection at the zero level of signed-distance grids, one thread per ray.
+"""Refraction and reflection at the zero level of signed-distance grids, one thread per ray.
 
-The same algorithm as `samplers.snell.trace_interfaces`, for one ray at a time.
+The same algorithm as `samplers.snell.trace_interfaces`, for one ray at a time. A *segment* is the straight part of a
+polyline between two *events*, at which light is refracted or reflected at a surface. Where light splits, the
+transmitted part is followed first; the reflected part becomes a *pending branch*, which shares the polyline up to the
+event and is followed later, the last one first.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, Int8
 from numba import prange
 
 from nerfro.kernels.compilation import compiled, compiled_parallel
-from nerfro.kernels.lookup import (
-    block_at,
-    blocks_from,
-    box_span,
-    end_of_blocks,
-    lengths_of_block,
-    put_end,
-    put_vertex,
-    slopes_along,
-    spline_value,
-    spline_value_gradient,
-)
+from nerfro.kernels.lookup import box_span, distance_out, spline_value_gradient
+from nerfro.samplers.surface_search_cpu import Line, advance, signed_distance, surface_ahead
 
-# Root search ends at this fraction of the shortest step.
-_ROOT_TOLERANCE = 1e-6
-_BEYOND_WALL = 1e-3  # of the shortest step
 _BLOCK = 64  # rays that share a thread's scratch memory
-_ROOT_ITERATIONS = 60
-_SECANTS = 6  # without bisection between them
 
 
-@compiled
-def _root(coefficients, low, inverse_spacing, x, y, z, dx, dy, dz, start, end, at_start, at_end, tolerance):
-    """Shrink [start, end] around a change of sign (Anderson and Bjorck's method); start keeps its sign, so does end.
+class Settings(NamedTuple):
+    """How rays are traced (`samplers.snell.Snell`, `samplers.branching.Branching`)."""
 
-    The value at the end is known, that at the start too or not a number. Secants close in from one side until one steps
-    over the root; bisection takes turns with them where they do not.
-    """
-    if math.isnan(at_start):
-        at_start = spline_value(coefficients, low, inverse_spacing, x + start * dx, y + start * dy, z + start * dz)
-    start_inside = at_start < 0.0
-    weight_start, weight_end, moved = at_start, at_end, 0
-    for iteration in range(_ROOT_ITERATIONS):
-        if end - start <= tolerance:
-            break
-        if (iteration >= _SECANTS and iteration % 2 == 0) or weight_end == weight_start:
-            middle = 0.5 * (start + end)
-        else:
-            middle = (start * weight_end - end * weight_start) / (weight_end - weight_start)
-            # A step past the root brings the far end in as well.
-            middle = min(max(middle, start + 0.25 * tolerance), end - 0.25 * tolerance)
-        value = spline_value(coefficients, low, inverse_spacing, x + middle * dx, y + middle * dy, z + middle * dz)
-        # The end that stays loses weight, or it would stay for ever: as much as the function bends.
-        if (value < 0.0) == start_inside:
-            if moved == 1:
-                weight_end *= 1.0 - value / weight_start if abs(value) < abs(weight_start) else 0.5
-            start, weight_start, moved = middle, value, 1
-        else:
-            if moved == 2:
-                weight_start *= 1.0 - value / weight_end if abs(value) < abs(weight_end) else 0.5
-            end, weight_end, moved = middle, value, 2
-    return start, end
+    min_step: float  # shortest step of the search for surfaces, world units
+    max_events: int
+    num_splits: int  # first events of a polyline at which light may split
+    least_weight: float
+    main_only: bool
+
+
+class Branch(NamedTuple):
+    """A part of a ray's light on its way: what is known at its last vertex."""
+
+    line: Line  # the vertex, and the direction in which light leaves it
+    s: float  # arc length there
+    weight: float  # share of the ray's light
+    num_vertices: int
+    num_events: int
+
+
+class Event(NamedTuple):
+    """What light does at a surface."""
+
+    line: Line  # of the part that is followed on
+    reflected: bool  # whether that is the reflected part
+    mirrored: Line  # of the reflected part, which becomes a branch where light splits
+    share: float  # of the light in that branch; 0 where light does not split
+
+
+class Polylines(NamedTuple):
+    """Polylines of one ray, one row each (B rows, V vertices); fields as in `types.Path`."""
+
+    positions: Float[np.ndarray, "B V 3"]
+    directions: Float[np.ndarray, "B V 3"]
+    s: Float[np.ndarray, "B V"]
+    body: Int8[np.ndarray, "B V"]
+    surface: Int8[np.ndarray, "B V"]
+    across: Int8[np.ndarray, "B V"]
+    weight: Float[np.ndarray, "B"]
+    num_events: Int[np.ndarray, "B"]
+    exceeded: Bool[np.ndarray, "B"]  # whether the limit of events was met
+
+
+class Pending(NamedTuple):
+    """Stack of reflected branches that are followed later (N entries, K bodies)."""
+
+    line: Float[np.ndarray, "N 6"]
+    s: Float[np.ndarray, "N"]
+    weight: Float[np.ndarray, "N"]
+    num_vertices: Int[np.ndarray, "N"]
+    num_events: Int[np.ndarray, "N"]
+    surface: Int[np.ndarray, "N"]  # on which the reflection takes place
+    inside: Bool[np.ndarray, "N K"]
+
+
+class Scratch(NamedTuple):
+    """Memory of a thread."""
+
+    inside: Bool[np.ndarray, "K"]  # whether the ray is inside each body's surface
+    known: Float[np.ndarray, "4 K"]  # of the search for surfaces
+    pending: Pending
 
 
 @compiled
 def _innermost(inside, solids):
-    """Number of the body that a point belongs to, from 1 on; 0 in none (`media.solid`)."""
+    """Return the number of the body that a point belongs to, from 1 on; 0 in none (`media.solid`)."""
     number = 0
     for body in range(len(inside)):
         if inside[body]:
@@ -80,286 +100,282 @@ def _innermost(inside, solids):
 
 
 @compiled
-def _index(inside, solids):
-    """Index of the body that a point belongs to, 1 in none."""
-    number = _innermost(inside, solids)
+def _index(number, solids):
+    """Return the refractive index of a body that is numbered from 1 on; 1 for number 0, the air."""
     return solids.iors[number - 1] if number > 0 else 1.0
 
 
 @compiled
-def _surface_ahead(solids, inside, known, x, y, z, dx, dy, dz, min_step):
-    """The first surface on a line: body (-1 where there is none), and arc lengths before and after it.
-
-    Blocks in which there is no surface are jumped over. In the others steps are as long as the distance to the nearest
-    surface, as in sphere tracing, or longer: within a block the distance changes no faster than its slopes there; and
-    across a block in which it only grows or only falls, there is at most one surface of each body, between values of
-    other signs. `known` is scratch memory: values of the bodies at the last two places, and the lowest and highest
-    slopes along the line in the present block.
-    """
-    low, inverse_spacing, splines, bodies = solids.low, solids.inverse_spacing, solids.values, len(inside)
-    _, leave = box_span(low, solids.high, x, y, z, dx, dy, dz)
-    small = solids.inverse_small
-    # The line in blocks, and how far it goes for one of them.
-    rx, ry, rz = dx * small[0], dy * small[1], dz * small[2]
-    bx, by, bz = blocks_from(low, small, x, y, z)
-    qx, qy, qz = lengths_of_block(rx, ry, rz)
-    beyond = _BEYOND_WALL * min_step
-    t, before, crossed, across = 0.0, 0.0, False, False
-    wall, monotone = 0.0, False
-    while not crossed:
-        i, j, k = block_at(solids.empty.shape, bx + t * rx, by + t * ry, bz + t * rz)
-        reach = solids.empty[i, j, k]
-        # Behind a block there may be a surface in it, even where there is none any more.
-        if reach > 0 and not across:
-            before = t
-            known[1, :] = math.nan
-            t = max(t, end_of_blocks(i, j, k, reach, bx, by, bz, qx, qy, qz)) + beyond
-            if t >= leave:
-                return -1, 0.0, 0.0
-            continue
-        if reach == 0:
-            wall = max(t, end_of_blocks(i, j, k, 1, bx, by, bz, qx, qy, qz))
-            monotone = slopes_along(solids.slopes, i, j, k, dx, dy, dz, known[2], known[3])
-        while True:
-            px, py, pz = x + t * dx, y + t * dy, z + t * dz
-            distance = math.inf
-            for body in range(bodies):
-                known[0, body] = known[1, body]
-                value = spline_value(splines[body], low, inverse_spacing, px, py, pz)
-                known[1, body] = value
-                crossed = crossed or (value < 0.0) != inside[body]
-                distance = min(distance, abs(value))
-            if crossed:
-                break
-            if t >= leave:
-                return -1, 0.0, 0.0
-            before, across = t, False
-            if reach > 0:
-                break
-            free = wall - t
-            for body in range(bodies):
-                # The fastest that the value may go to zero; not a number at the border, where nothing is known.
-                towards = known[3, body] if inside[body] else -known[2, body]
-                if not towards <= 0.0:
-                    reached = abs(known[1, body]) / towards
-                    free = min(free, reached) if reached >= 0.0 else 0.0
-            step = max(distance, min_step, free)
-            across = monotone and wall - t > step
-            # A little beyond the wall, to be in the next block for sure.
-            t = min((wall if across else t + step) + beyond, leave)
-            if t > wall:
-                break
-    # The first of the surfaces that were crossed in this step.
-    hit, hit_before, hit_after = -1, 0.0, math.inf
-    tolerance = _ROOT_TOLERANCE * min_step
-    for body in range(bodies):
-        if (known[1, body] < 0.0) != inside[body]:
-            first, last = _root(
-                splines[body], low, inverse_spacing, x, y, z, dx, dy, dz,
-                before, t, known[0, body], known[1, body], tolerance,
-            )  # fmt: skip
-            if last < hit_after:
-                hit, hit_before, hit_after = body, first, last
-    return hit, hit_before, hit_after
-
-
-@compiled
-def _turned(dx, dy, dz, nx, ny, nz, ratio):
-    """Direction after a surface with a gradient of any length, refracted or totally reflected, and which of the two."""
-    norm = math.sqrt(nx * nx + ny * ny + nz * nz)
-    nx, ny, nz = nx / norm, ny / norm, nz / norm
+def _transmitted(line, nx, ny, nz, ratio):
+    """Refract a line at a surface with a unit normal (Snell's law); returns also whether it is totally reflected."""
+    x, y, z, dx, dy, dz = line
     cosine = -(nx * dx + ny * dy + nz * dz)
     if cosine < 0.0:
         nx, ny, nz, cosine = -nx, -ny, -nz, -cosine
     squared = 1.0 - ratio * ratio * (1.0 - cosine * cosine)
-    reflected = squared <= 0.0
-    scale, along = ratio, ratio * cosine
-    if reflected:
-        scale, along = 1.0, 2.0 * cosine
-    else:
-        along -= math.sqrt(squared)
-    dx, dy, dz = scale * dx + along * nx, scale * dy + along * ny, scale * dz + along * nz
+    if squared <= 0.0:
+        return line, True
+    along = ratio * cosine - math.sqrt(squared)
+    dx, dy, dz = ratio * dx + along * nx, ratio * dy + along * ny, ratio * dz + along * nz
     norm = math.sqrt(dx * dx + dy * dy + dz * dz)
-    return dx / norm, dy / norm, dz / norm, reflected
+    return Line(x, y, z, dx / norm, dy / norm, dz / norm), False
 
 
 @compiled
-def _mirrored(dx, dy, dz, nx, ny, nz, ratio):
-    """Direction after reflection at a surface with a gradient of any length, and Fresnel's share of it."""
+def _reflected(line, nx, ny, nz, ratio):
+    """Reflect a line at a surface with a unit normal; returns also Fresnel's share of the light, 1 where total."""
+    x, y, z, dx, dy, dz = line
+    cosine = -(nx * dx + ny * dy + nz * dz)
+    dx, dy, dz = dx + 2.0 * cosine * nx, dy + 2.0 * cosine * ny, dz + 2.0 * cosine * nz
+    norm = math.sqrt(dx * dx + dy * dy + dz * dz)
+    cosine = abs(cosine)
+    transmitted = math.sqrt(max(1.0 - ratio * ratio * (1.0 - cosine * cosine), 0.0))
+    perpendicular = (ratio * cosine - transmitted) / (ratio * cosine + transmitted)
+    parallel = (cosine - ratio * transmitted) / (cosine + ratio * transmitted)
+    share = 0.5 * (perpendicular * perpendicular + parallel * parallel)
+    return Line(x, y, z, dx / norm, dy / norm, dz / norm), share
+
+
+@compiled
+def _event(solids, hit, near, far, ratio, settings, branch):
+    """Decide what light does at a surface.
+
+    Args:
+        solids: bodies.
+        hit: body whose surface it is.
+        near, far: the arriving line, begun just before and just behind the surface.
+        ratio: of the index before the surface to that behind it.
+        settings: of the trace.
+        branch: that arrives.
+    """
+    _, nx, ny, nz = spline_value_gradient(solids.values[hit], solids.low, solids.inverse_spacing, far.x, far.y, far.z)
     norm = math.sqrt(nx * nx + ny * ny + nz * nz)
     nx, ny, nz = nx / norm, ny / norm, nz / norm
-    cosine = -(nx * dx + ny * dy + nz * dz)
-    mx, my, mz = dx + 2.0 * cosine * nx, dy + 2.0 * cosine * ny, dz + 2.0 * cosine * nz
-    norm = math.sqrt(mx * mx + my * my + mz * mz)
-    cosine = abs(cosine)
-    beyond = math.sqrt(max(1.0 - ratio * ratio * (1.0 - cosine * cosine), 0.0))
-    across = (ratio * cosine - beyond) / (ratio * cosine + beyond)
-    within = (cosine - ratio * beyond) / (cosine + ratio * beyond)
-    return mx / norm, my / norm, mz / norm, 0.5 * (across * across + within * within)
+    transmitted, total = _transmitted(far, nx, ny, nz, ratio)
+    if not total and branch.num_events >= settings.num_splits:
+        return Event(transmitted, False, transmitted, 0.0)
+    mirrored, share = _reflected(near, nx, ny, nz, ratio)
+    if total:
+        return Event(mirrored, True, mirrored, 0.0)
+    if branch.weight * min(share, 1.0 - share) >= settings.least_weight:
+        return Event(transmitted, False, mirrored, share)
+    if share > 0.5:
+        return Event(mirrored, True, mirrored, 0.0)
+    return Event(transmitted, False, mirrored, 0.0)
 
 
 @compiled
-def _trace_ray(
-    solids, origin, direction, near, far, min_step, max_events, num_splits, least_weight, main_only, scratch, rows
-):  # fmt: skip
-    """One ray's polylines into its rows: their number, and the largest number of vertices.
+def _put_vertex(rows, row, branch, body, surface, across):
+    """Append a branch's present vertex to its row; beyond the capacity vertices are counted, not kept."""
+    i, line = branch.num_vertices, branch.line
+    if i < rows.s.shape[1]:
+        position, direction = rows.positions[row, i], rows.directions[row, i]
+        position[0], position[1], position[2] = line.x, line.y, line.z
+        direction[0], direction[1], direction[2] = line.dx, line.dy, line.dz
+        rows.s[row, i] = branch.s
+        rows.body[row, i], rows.surface[row, i], rows.across[row, i] = body, surface, across
+    return Branch(line, branch.s, branch.weight, i + 1, branch.num_events)
 
-    What follows a row's last vertex is left as it is.
-    """
-    positions, directions, lengths, bodies, weights, events, exceeded = rows
-    # `waiting` are parts of the light that are followed later, the last one first: each shares most of the polyline
-    # before it.
-    inside, known, waiting, waiting_numbers, waiting_inside = scratch
-    room = lengths.shape[0]
-    dx, dy, dz = float(direction[0]), float(direction[1]), float(direction[2])
-    s, end = float(near), float(far)
-    x, y, z = origin[0] + s * dx, origin[1] + s * dy, origin[2] + s * dz
-    count = put_vertex(positions[0], directions[0], lengths[0], 0, x, y, z, dx, dy, dz, s)
-    enter, leave = box_span(solids.low, solids.high, x, y, z, dx, dy, dz)
-    if not (enter < leave and leave > 0.0 and enter < end - s):
-        weights[0], events[0], exceeded[0] = 1.0, 0, False
-        return 1, put_end(
-            positions[0], directions[0], lengths[0], count, solids.low, solids.high, False, x, y, z, dx, dy, dz, s, end
-        )
-    jump = max(enter, 0.0)
-    x, y, z, s = x + jump * dx, y + jump * dy, z + jump * dz, s + jump
+
+@compiled
+def _put_end(solids, rows, row, branch, far, exceeded):
+    """Append the last vertex of a row, at far; a bent path has left the box by then, if need be later."""
+    line, ahead = branch.line, far - branch.s
+    if branch.num_events > 0:
+        x, y, z, dx, dy, dz = line
+        ahead = max(ahead, distance_out(solids.low, solids.high, x, y, z, dx, dy, dz))
+    end = Branch(advance(line, ahead), branch.s + ahead, branch.weight, branch.num_vertices, branch.num_events)
+    rows.weight[row], rows.num_events[row], rows.exceeded[row] = branch.weight, branch.num_events, exceeded
+    return _put_vertex(rows, row, end, 0, -1, 0).num_vertices
+
+
+@compiled
+def _push(pending, size, branch, mirrored, s, weight, hit, inside):
+    """Put the reflected part of a branch on the stack; returns the size of the stack."""
+    for i in range(6):
+        pending.line[size, i] = mirrored[i]
+    pending.s[size], pending.weight[size], pending.surface[size] = s, weight, hit
+    pending.num_vertices[size], pending.num_events[size] = branch.num_vertices, branch.num_events + 1
     for body in range(len(inside)):
-        value = spline_value(solids.values[body], solids.low, solids.inverse_spacing, x, y, z)
-        inside[body] = value < 0.0
-    bodies[0, 0] = _innermost(inside, solids)
-    num_events, weight, num_waiting, polyline, most = 0, 1.0, 0, 0, 0
-    while True:
-        row = min(polyline, room - 1)  # rows beyond the room are counted, not kept
-        too_many = False
-        while True:
-            hit, before, after = _surface_ahead(solids, inside, known, x, y, z, dx, dy, dz, min_step)
-            if hit < 0:
-                break
-            n_before = _index(inside, solids)
-            inside[hit] = not inside[hit]
-            n_after = _index(inside, solids)
-            if n_before == n_after:
-                x, y, z, s = x + after * dx, y + after * dy, z + after * dz, s + after
-                continue
-            if num_events >= max_events:
-                too_many = True
-                break
-            _, nx, ny, nz = spline_value_gradient(
-                solids.values[hit], solids.low, solids.inverse_spacing,
-                x + after * dx, y + after * dy, z + after * dz,
-            )  # fmt: skip
-            tx, ty, tz, reflected = _turned(dx, dy, dz, nx, ny, nz, n_before / n_after)
-            if num_events < num_splits and not reflected:
-                mx, my, mz, share = _mirrored(dx, dy, dz, nx, ny, nz, n_before / n_after)
-                if weight * min(share, 1.0 - share) >= least_weight:
-                    if not main_only:
-                        waiting[num_waiting, 0] = x + before * dx
-                        waiting[num_waiting, 1] = y + before * dy
-                        waiting[num_waiting, 2] = z + before * dz
-                        waiting[num_waiting, 3], waiting[num_waiting, 4], waiting[num_waiting, 5] = mx, my, mz
-                        waiting[num_waiting, 6], waiting[num_waiting, 7] = s + before, weight * share
-                        waiting_numbers[num_waiting, 0], waiting_numbers[num_waiting, 1] = count, num_events + 1
-                        for body in range(len(inside)):
-                            waiting_inside[num_waiting, body] = inside[body]
-                        waiting_inside[num_waiting, hit] = not inside[hit]
-                        num_waiting += 1
-                    weight *= 1.0 - share
-                elif share > 0.5:
-                    tx, ty, tz, reflected = mx, my, mz, True
-            num_events += 1
-            if reflected:
-                inside[hit] = not inside[hit]
-                after = before
-            x, y, z, s = x + after * dx, y + after * dy, z + after * dz, s + after
-            dx, dy, dz = tx, ty, tz
-            if count < lengths.shape[1]:
-                bodies[row, count] = _innermost(inside, solids)
-            count = put_vertex(positions[row], directions[row], lengths[row], count, x, y, z, dx, dy, dz, s)
-        count = put_end(
-            positions[row], directions[row], lengths[row], count, solids.low, solids.high, num_events > 0,
-            x, y, z, dx, dy, dz, s, end,
-        )  # fmt: skip
-        weights[row], events[row], exceeded[row] = weight, num_events, too_many
-        polyline, most = polyline + 1, max(most, count)
-        if num_waiting == 0:
-            return polyline, most
-        num_waiting -= 1
-        x, y, z = waiting[num_waiting, 0], waiting[num_waiting, 1], waiting[num_waiting, 2]
-        dx, dy, dz = waiting[num_waiting, 3], waiting[num_waiting, 4], waiting[num_waiting, 5]
-        s, weight = waiting[num_waiting, 6], waiting[num_waiting, 7]
-        count, num_events = waiting_numbers[num_waiting, 0], waiting_numbers[num_waiting, 1]
-        for body in range(len(inside)):
-            inside[body] = waiting_inside[num_waiting, body]
-        before_row, row = row, min(polyline, room - 1)
-        for i in range(min(count, lengths.shape[1])):
-            for axis in range(3):
-                positions[row, i, axis] = positions[before_row, i, axis]
-                directions[row, i, axis] = directions[before_row, i, axis]
-            lengths[row, i], bodies[row, i] = lengths[before_row, i], bodies[before_row, i]
-        if count < lengths.shape[1]:
-            bodies[row, count] = _innermost(inside, solids)
-        count = put_vertex(positions[row], directions[row], lengths[row], count, x, y, z, dx, dy, dz, s)
+        pending.inside[size, body] = inside[body]
+    return size + 1
 
 
-@compiled_parallel
-def trace_snell(
-    origins, directions, near, far, solids, min_step, max_events, num_splits, least_weight, main_only, capacity, room
-):
-    """Polylines of all rays, which may split at their first events (`samplers.branching`).
+@compiled
+def _resume(solids, scratch, top, rows, former, row):
+    """Begin a row with the pending branch on top of the stack.
+
+    Args:
+        solids: bodies.
+        scratch: with the stack.
+        top: index of the branch on the stack.
+        rows: of the ray.
+        former: row that was followed last; it shares the vertices before the reflection.
+        row: that begins.
+    """
+    pending, inside = scratch.pending, scratch.inside
+    for body in range(len(inside)):
+        inside[body] = pending.inside[top, body]
+    count, surface = pending.num_vertices[top], pending.surface[top]
+    for i in range(min(count, rows.s.shape[1])):
+        for axis in range(3):
+            rows.positions[row, i, axis] = rows.positions[former, i, axis]
+            rows.directions[row, i, axis] = rows.directions[former, i, axis]
+        rows.s[row, i], rows.body[row, i] = rows.s[former, i], rows.body[former, i]
+        rows.surface[row, i], rows.across[row, i] = rows.surface[former, i], rows.across[former, i]
+    body = _innermost(inside, solids)
+    inside[surface] = not inside[surface]
+    across = _innermost(inside, solids)
+    inside[surface] = not inside[surface]
+    x, y, z, dx, dy, dz = pending.line[top]
+    branch = Branch(Line(x, y, z, dx, dy, dz), pending.s[top], pending.weight[top], count, pending.num_events[top])
+    return _put_vertex(rows, row, branch, body, surface, across)
+
+
+@compiled
+def _follow(solids, settings, scratch, rows, row, branch, num_pending):
+    """Follow a branch from event to event, until it meets no surface or the limit of events.
 
     Returns:
-        positions [R, B, V, 3], directions [R, B, V, 3], s [R, B, V]: with V the capacity and B the room for a ray's
-            polylines, in the rays' precision. There are two vertices more than events; nothing is in the rest.
-        bodies [R, B, V]: number of the body in which each vertex is left, see `types.Path`.
-        weights [R, B]: share of the ray's light.
-        events [R, B]: refractions and reflections.
-        exceeded [R, B]: whether the limit of events was met; the polyline goes straight on from there.
-        counts [R, 2]: polylines of each ray and the most vertices of one, more than B and V where these do not suffice.
+        The branch at its last event, whether it met the limit, and the number of pending branches.
     """
-    num_rays, num_bodies = origins.shape[0], solids.values.shape[0]
-    out_positions = np.empty((num_rays, room, capacity, 3), origins.dtype)
-    out_directions = np.empty((num_rays, room, capacity, 3), origins.dtype)
-    out_s = np.empty((num_rays, room, capacity), origins.dtype)
-    bodies = np.zeros((num_rays, room, capacity), np.int8)
-    weights = np.empty((num_rays, room), origins.dtype)
-    events = np.empty((num_rays, room), np.int64)
-    exceeded = np.empty((num_rays, room), np.bool_)
-    counts = np.empty((num_rays, 2), np.int64)
-    for block in prange((num_rays + _BLOCK - 1) // _BLOCK):
-        scratch = (
-            np.empty(num_bodies, np.bool_), np.empty((4, num_bodies)), np.empty((num_splits, 8)),
-            np.empty((num_splits, 2), np.int64), np.empty((num_splits, num_bodies), np.bool_),
-        )  # fmt: skip
-        for ray in range(block * _BLOCK, min((block + 1) * _BLOCK, num_rays)):
-            rows = (
-                out_positions[ray], out_directions[ray], out_s[ray], bodies[ray], weights[ray], events[ray],
-                exceeded[ray],
-            )  # fmt: skip
-            counts[ray] = _trace_ray(
-                solids, origins[ray], directions[ray], near[ray], far[ray],
-                min_step, max_events, num_splits, least_weight, main_only, scratch, rows,
-            )  # fmt: skip
-    return out_positions, out_directions, out_s, bodies, weights, events, exceeded, counts
+    inside = scratch.inside
+    while True:
+        here = branch.line
+        hit, before, after = surface_ahead(solids, inside, scratch.known, here, settings.min_step)
+        if hit < 0:
+            return branch, False, num_pending
+        body = _innermost(inside, solids)
+        inside[hit] = not inside[hit]
+        across = _innermost(inside, solids)
+        n_before, n_across = _index(body, solids), _index(across, solids)
+        near, far = advance(here, before), advance(here, after)
+        if n_before == n_across:
+            branch = Branch(far, branch.s + after, branch.weight, branch.num_vertices, branch.num_events)
+            continue
+        if branch.num_events >= settings.max_events:
+            return branch, True, num_pending
+        event = _event(solids, hit, near, far, n_before / n_across, settings, branch)
+        weight = branch.weight
+        if event.share > 0.0:
+            if not settings.main_only:
+                inside[hit] = not inside[hit]
+                num_pending = _push(
+                    scratch.pending, num_pending, branch, event.mirrored, branch.s + before, weight * event.share,
+                    hit, inside,
+                )  # fmt: skip
+                inside[hit] = not inside[hit]
+            weight *= 1.0 - event.share
+        if event.reflected:
+            inside[hit] = not inside[hit]
+        length = before if event.reflected else after
+        branch = Branch(event.line, branch.s + length, weight, branch.num_vertices, branch.num_events + 1)
+        branch = _put_vertex(rows, row, branch, body if event.reflected else across, hit, across)
+
+
+@compiled
+def _trace_ray(solids, line, near, far, settings, scratch, rows):
+    """Trace one ray's polylines into its rows; returns their number, and the largest number of vertices.
+
+    What follows a row's last vertex is left as it is. Rows beyond those that there are are counted, not kept.
+    """
+    inside, last_row = scratch.inside, len(rows.weight) - 1
+    branch = Branch(advance(line, near), near, 1.0, 0, 0)
+    x, y, z, dx, dy, dz = branch.line
+    enter, leave = box_span(solids.low, solids.high, x, y, z, dx, dy, dz)
+    misses = not (enter < leave and leave > 0.0 and enter < far - near)
+    entry = advance(branch.line, max(enter, 0.0))
+    for body in range(len(inside)):
+        inside[body] = not misses and signed_distance(solids, body, entry, 0.0) < 0.0
+    branch = _put_vertex(rows, 0, branch, _innermost(inside, solids), -1, 0)
+    if misses:
+        return 1, _put_end(solids, rows, 0, branch, far, False)
+    branch = Branch(entry, near + max(enter, 0.0), 1.0, branch.num_vertices, 0)
+    row, num_polylines, most_vertices, num_pending = 0, 0, 0, 0
+    while True:
+        branch, exceeded, num_pending = _follow(solids, settings, scratch, rows, row, branch, num_pending)
+        num_polylines += 1
+        most_vertices = max(most_vertices, _put_end(solids, rows, row, branch, far, exceeded))
+        if num_pending == 0:
+            return num_polylines, most_vertices
+        num_pending -= 1
+        former, row = row, min(num_polylines, last_row)
+        branch = _resume(solids, scratch, num_pending, rows, former, row)
 
 
 @compiled_parallel
-def polylines_of_width(positions, directions, s, bodies, events, ray, place, width):
-    """Vertices [P, W] of polylines `place` of rays `ray`, with the last one repeated where there are fewer.
+def trace_snell(origins, directions, near, far, solids, settings, capacity, room):
+    """Trace the polylines of all rays, which may split at their first events (`samplers.branching`).
 
-    Takes what `trace_snell` returns of that name, and returns positions, directions, s and bodies.
+    Args:
+        origins, directions, near, far: of the rays [R, ...].
+        solids: bodies, a `kernels.lookup.MediumGrid`.
+        settings: how rays are traced.
+        capacity: room for the vertices of a polyline, V.
+        room: for the polylines of a ray, B.
+
+    Returns:
+        rows: `Polylines` of all rays, with a leading axis R, in the precision of the rays. There are two vertices more
+            than events; nothing is in the rest.
+        counts [R, 2]: polylines of each ray and the most vertices of one, more than B and V where these do not suffice.
     """
-    number, capacity = len(ray), s.shape[2]
-    out_positions, out_directions = np.empty((number, width, 3), s.dtype), np.empty((number, width, 3), s.dtype)
-    out_s, out_bodies = np.empty((number, width), s.dtype), np.zeros((number, width), np.int8)
+    num_rays, num_bodies, num_splits = origins.shape[0], solids.values.shape[0], settings.num_splits
+    rows = Polylines(
+        np.empty((num_rays, room, capacity, 3), origins.dtype), np.empty((num_rays, room, capacity, 3), origins.dtype),
+        np.empty((num_rays, room, capacity), origins.dtype), np.empty((num_rays, room, capacity), np.int8),
+        np.empty((num_rays, room, capacity), np.int8), np.empty((num_rays, room, capacity), np.int8),
+        np.empty((num_rays, room), origins.dtype), np.empty((num_rays, room), np.int64),
+        np.empty((num_rays, room), np.bool_),
+    )  # fmt: skip
+    counts = np.empty((num_rays, 2), np.int64)
+    for block in prange((num_rays + _BLOCK - 1) // _BLOCK):
+        pending = Pending(
+            np.empty((num_splits, 6)), np.empty(num_splits), np.empty(num_splits), np.empty(num_splits, np.int64),
+            np.empty(num_splits, np.int64), np.empty(num_splits, np.int64),
+            np.empty((num_splits, num_bodies), np.bool_),
+        )  # fmt: skip
+        scratch = Scratch(np.empty(num_bodies, np.bool_), np.empty((4, num_bodies)), pending)
+        for ray in range(block * _BLOCK, min((block + 1) * _BLOCK, num_rays)):
+            x, d = origins[ray], directions[ray]
+            line = Line(
+                np.float64(x[0]), np.float64(x[1]), np.float64(x[2]),
+                np.float64(d[0]), np.float64(d[1]), np.float64(d[2]),
+            )  # fmt: skip
+            row = Polylines(
+                rows.positions[ray], rows.directions[ray], rows.s[ray], rows.body[ray], rows.surface[ray],
+                rows.across[ray], rows.weight[ray], rows.num_events[ray], rows.exceeded[ray],
+            )  # fmt: skip
+            start, end = np.float64(near[ray]), np.float64(far[ray])
+            counts[ray] = _trace_ray(solids, line, start, end, settings, scratch, row)
+    return rows, counts
+
+
+@compiled_parallel
+def polylines_of_width(rows, ray, place, width):
+    """Select polylines `place` of rays `ray`, with vertices [P, W]; the last one is repeated where there are fewer.
+
+    Args:
+        rows: what `trace_snell` returns.
+        ray, place: of each of the P polylines.
+        width: number of vertices, W.
+
+    Returns:
+        positions, directions, s, body, surface and across.
+    """
+    number, capacity, dtype = len(ray), rows.s.shape[2], rows.s.dtype
+    positions, directions = np.empty((number, width, 3), dtype), np.empty((number, width, 3), dtype)
+    s = np.empty((number, width), dtype)
+    body, surface, across = (
+        np.empty((number, width), np.int8), np.empty((number, width), np.int8), np.empty((number, width), np.int8)
+    )  # fmt: skip
     for p in prange(number):
         r, b = ray[p], place[p]
-        last = min(events[r, b] + 2, capacity, width) - 1
+        last = min(rows.num_events[r, b] + 2, capacity, width) - 1
         for i in range(width):
             j = min(i, last)
             for axis in range(3):
-                out_positions[p, i, axis] = positions[r, b, j, axis]
-                out_directions[p, i, axis] = directions[r, b, j, axis]
-            out_s[p, i] = s[r, b, j]
-        for i in range(last):
-            out_bodies[p, i] = bodies[r, b, i]
-    return out_positions, out_directions, out_s, out_bodies
+                positions[p, i, axis] = rows.positions[r, b, j, axis]
+                directions[p, i, axis] = rows.directions[r, b, j, axis]
+            s[p, i], body[p, i] = rows.s[r, b, j], rows.body[r, b, j]
+            surface[p, i], across[p, i] = rows.surface[r, b, j], rows.across[r, b, j]
+    return positions, directions, s, body, surface, across

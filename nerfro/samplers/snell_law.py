@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional
 
 
 def refract(
@@ -61,3 +62,19 @@ def reflectance(
     across = (ratio * cosine - beyond) / (ratio * cosine + beyond)
     within = (cosine - ratio * beyond) / (cosine + ratio * beyond)
     return torch.where(total, 1.0, 0.5 * (across.square() + within.square()))
+
+
+def turning_normals(
+    before: Float[Tensor, "*batch 3"],
+    after: Float[Tensor, "*batch 3"],
+    n_before: Float[Tensor, "*batch"],
+    n_after: Float[Tensor, "*batch"],
+) -> Float[Tensor, "*batch 3"]:
+    """Return unit normals of surfaces from how they turn rays: by Snell's law, n d changes along the normal alone.
+
+    Args:
+        before, after: unit directions of rays before and after the surface.
+        n_before, n_after: index of the media in which the rays arrive and leave; equal for reflected rays.
+    """
+    change = n_before[..., None] * before - n_after[..., None] * after
+    return functional.normalize(change, dim=-1, eps=torch.finfo(change.dtype).tiny)

@@ -31,4 +31,4 @@ def straight_path(rays: Rays) -> Path:
     positions = rays.origins[:, None] + s[..., None] * rays.directions[:, None]
     directions = rays.directions[:, None].expand_as(positions)
     refracted = torch.zeros(len(rays), dtype=torch.bool, device=s.device)
-    return Path(positions, directions, s, rays.directions, refracted, rays.radii)
+    return Path.unbranched(positions, directions, s, refracted, rays.radii)

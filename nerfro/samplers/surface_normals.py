@@ -1,4 +1,4 @@
-"""The surface's normal where a path first meets it, told by how the path turns there."""
+"""Surface normals for pictures and exports, from how paths turn at the first surface that they meet."""
 
 from __future__ import annotations
 
@@ -9,39 +9,34 @@ from torch.nn import functional
 
 from nerfro.media.base import Medium
 from nerfro.media.solid import Solid
+from nerfro.samplers.replay import indices_of
+from nerfro.samplers.snell_law import turning_normals
 from nerfro.types import Path
 
 
 def first_normals(path: Path, medium: Medium) -> Float[Tensor, "R 3"]:
-    """Unit normals, towards the camera, at the first event of each ray; zero where it meets nothing.
+    """Return unit normals, towards the camera, at the first event of each ray; zero where it meets nothing.
 
-    Snell's law says that n' d' - n d is along the normal, for reflected light with n' = n. Where the index varies
-    continuously, the normal is that of its level surfaces at the first vertex where the path turns.
+    Where the index varies continuously, the normal is that of its level surfaces at the first vertex where the path
+    turns.
     """
     normals = path.directions.new_zeros(len(path.s), 3)
     rows = path.refracted.nonzero()[:, 0]  # which few rays of a picture are
-    normals[rows] = _turning_normals(path[rows], medium).to(normals)
+    normals[rows] = _bent_normals(path[rows], medium).to(normals)
     return path.first_of_ray(normals)
 
 
-def _turning_normals(path: Path, medium: Medium) -> Float[Tensor, "P 3"]:
-    """The same of polylines that meet the medium."""
+def _bent_normals(path: Path, medium: Medium) -> Float[Tensor, "P 3"]:
+    """The same for polylines that meet the medium."""
+    rows = torch.arange(len(path.s), device=path.s.device)
     before, after = path.directions[:, :-1], path.directions[:, 1:]
-    turns = (before != after).any(-1)
-    first = turns.byte().argmax(-1)[:, None]
-
-    def there(values: Tensor) -> Tensor:
-        index = first if values.ndim == 2 else first[..., None].expand(-1, 1, values.shape[-1])
-        return values.gather(1, index)[:, 0]
-
-    arriving = there(before)
+    events = (path.surface[:, 1:] >= 0) | (before != after).any(-1)
+    first = events.byte().argmax(-1)
+    arriving = before[rows, first]
     if isinstance(medium, Solid):
-        iors = torch.cat([medium.iors.new_ones(1), medium.iors.detach()]).to(before)
-        bodies = path.body.long()
-        n_before, n_after = (iors[there(body)][:, None] for body in (bodies[:, :-1], bodies[:, 1:]))
-        normals = n_after * there(after) - n_before * arriving
+        n_before, n_after = (indices_of(medium, path.s)[path.body[rows, first + i].long()] for i in range(2))
+        normals = turning_normals(arriving, after[rows, first], n_before.detach(), n_after.detach())
     else:
-        _, normals = medium(there(path.positions[:, 1:]))
+        _, normals = medium(path.positions[rows, first + 1])
     towards = -(normals * arriving).sum(-1, keepdim=True).sign()
-    normals = functional.normalize(normals * towards, dim=-1)
-    return torch.where(turns.any(-1, keepdim=True), normals, 0.0)
+    return torch.where(events.any(-1, keepdim=True), functional.normalize(normals * towards, dim=-1), 0.0)

@@ -48,11 +48,10 @@ class BoxMarch(PathSampler):
         bent = self._march(rays[rows], rays.near[rows] + enter[rows], medium)
         last = torch.ones(self.num_steps + 3, dtype=torch.long, device=rows.device)
         last[0] = 0
-        return Path(
+        return Path.unbranched(
             straight.positions[:, last].index_copy(0, rows, bent.positions),
             straight.directions[:, last].index_copy(0, rows, bent.directions),
             straight.s[:, last].index_copy(0, rows, bent.s),
-            straight.exit_directions.index_copy(0, rows, bent.exit_directions),
             straight.refracted.index_copy(0, rows, bent.refracted),
             rays.radii,
         )
@@ -72,11 +71,10 @@ class BoxMarch(PathSampler):
         far = torch.maximum(rays.far, inner.far)  # rounding may put the last step behind it
         start = rays.origins + rays.near[:, None] * rays.directions
         stop = inner.exit_positions + (far - inner.far)[:, None] * inner.exit_directions
-        return Path(
+        return Path.unbranched(
             torch.cat([start[:, None], inner.positions, stop[:, None]], 1),
             torch.cat([rays.directions[:, None], chords, inner.exit_directions[:, None].expand(-1, 2, -1)], 1),
             torch.cat([rays.near[:, None], inner.s, far[:, None]], 1),
-            inner.exit_directions,
             inner.refracted,
             rays.radii,
         )

@@ -58,7 +58,7 @@ def loss(weights: torch.Tensor, s: torch.Tensor, measure: torch.Tensor | None = 
     """Of weights on intervals between arc lengths [5, 7], which may have other lengths in contracted space."""
     ends = s[:, [0, -1]]
     vectors = torch.zeros(5, 2, 3)
-    path = Path(vectors, vectors, ends, vectors[:, 0], torch.zeros(5, dtype=torch.bool), torch.ones(5))
+    path = Path.unbranched(vectors, vectors, ends, torch.zeros(5, dtype=torch.bool), torch.ones(5))
     positions = torch.zeros(5, 6, 3)
     samples = Samples(positions, positions, s[:, :-1], s, torch.ones(5), measure=measure)
     colour = torch.zeros(5, 3)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -28,7 +30,7 @@ def loss_around(path: Path) -> Nearby:
 
 def first_camera(path: Path) -> Path:
     positions = path.positions - path.positions[:, :1] + path.positions[:1, :1]
-    return path.moved(positions, path.directions, path.s, path.exit_directions)
+    return replace(path, positions=positions)
 
 
 def test_white_fog_before_white_clears_where_it_is_near_alone() -> None:

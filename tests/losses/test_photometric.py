@@ -63,7 +63,9 @@ def test_a_background_learns_from_chosen_rays_and_what_bends_them_from_all(absor
     model = RefractiveModel(replace(example_components(), boundary=sky))
     directions = torch.nn.functional.normalize(torch.randn(8, 3), dim=-1).requires_grad_()
     absorption = torch.tensor([[0.0] * 3, [0.1, 0.2, 0.3]], requires_grad=True)
-    path = example_path(8).changed(exit_directions=directions, **({"absorption": absorption} if absorbs else {}))
+    path = example_path(8)
+    path = replace(path, directions=torch.cat([path.directions[:, :-1], directions[:, None]], 1))
+    path = replace(path, absorption=absorption) if absorbs else path
     teaches = PIXEL != 1
 
     def gradients(held: Tensor) -> list[Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path as FilePath
 
 import pytest
@@ -247,6 +248,68 @@ class NestedBalls(Solid):
         return distances - torch.tensor([0.8, 0.4], dtype=torch.float64), offsets / distances[..., None]
 
 
+class CementedHalves(Solid):
+    """A ball of two glasses: the second one fills the half x > 0 and reaches a rounding error beyond the first one."""
+
+    box = BOX.double()
+
+    def __init__(self) -> None:
+        super().__init__([1.5, 1.7], 0.02)
+        self.radii = torch.tensor([0.8, 0.8 + 2e-7], dtype=torch.float64)
+
+    def signed_distances(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        radius = positions.norm(dim=-1, keepdim=True)
+        curved, plane = radius - self.radii, -positions[..., :1]
+        is_plane = torch.cat([torch.zeros_like(plane), plane], -1) > curved
+        is_plane[..., 0] = False
+        axis = positions.new_tensor([-1.0, 0, 0])
+        gradients = torch.where(is_plane[..., None], axis, (positions / radius)[..., None, :])
+        return torch.where(is_plane, plane, curved), gradients
+
+
+@pytest.mark.parametrize("what", ["radius of the first", "radius of the second", "iors"])
+def test_gradients_belong_to_the_body_that_light_met_where_two_bodies_touch(what: str) -> None:
+    rays, sampler = _bundle(100), Snell(branches="all", least_weight=1e-3)
+
+    def moved(step: Tensor) -> CementedHalves:
+        medium = CementedHalves()
+        if what == "iors":
+            medium.iors = medium.iors + step
+        else:
+            medium.radii = medium.radii + step * torch.tensor([what.endswith("first"), what.endswith("second")])
+        return medium
+
+    def traced(step: float) -> Path:
+        return trace_interfaces(rays, moved(torch.tensor(step).double()), 16, sampler.branching)[0]
+
+    def values(path: Path) -> Tensor:
+        column = torch.arange(18).clamp(max=path.s.shape[1] - 1)
+        every = (path.positions[:, column], path.directions[:, column], path.throughput)
+        return torch.cat([tensor.flatten(1).double() for tensor in every], -1)
+
+    # As training has it: in single precision, in which the nearest surface is either one.
+    path = traced(0.0)
+    names = ("positions", "directions", "s", "radii", "throughput")
+    single = replace(path, **{name: getattr(path, name).float() for name in names})
+
+    def refined(step: Tensor) -> Tensor:
+        medium = moved(step)
+        medium.iors, medium.radii, medium.box = medium.iors.float(), medium.radii.float(), medium.box.float()
+        return values(sampler.refine(single, rays.to(torch.float32), medium))
+
+    zero = torch.zeros((), dtype=torch.float64)
+    found = torch.autograd.functional.jvp(refined, zero, torch.ones_like(zero))[1]
+    h = 1e-8
+    after, before = traced(h), traced(-h)
+    assert torch.equal(after.surface, before.surface)
+    expected = (values(after) - values(before)) / (2 * h)
+    error = (found - expected).norm(dim=-1) / (1 + expected.norm(dim=-1))
+    steady = smallest_cosine(path, moved(zero)) > 0.15
+    reflected = (path.surface == 1) & (path.body == path.body.roll(1, 1))
+    assert (steady & reflected.any(-1)).sum() > 50
+    assert error[steady].max() < 1e-2
+
+
 # --- rays with all their polylines ---
 
 
@@ -258,7 +321,7 @@ def test_rays_are_chosen_and_joined_with_all_their_polylines() -> None:
     for place, ray in enumerate(rows.tolist()):
         assert torch.equal(chosen.positions[chosen.ray == place], path.positions[path.ray == ray])
         assert torch.equal(chosen.throughput[chosen.ray == place], path.throughput[path.ray == ray])
-    both = chosen.followed_by(Snell()(_bundle(3), Ball().double()))
+    both = Path.joined([chosen, Snell()(_bundle(3), Ball().double())])
     assert both.num_rays == 7
     assert both.ray[-3:].tolist() == [4, 5, 6]
     torch.testing.assert_close(both.per_ray(torch.ones(len(both.s), 3).double()), torch.ones(7, 3).double())

@@ -50,8 +50,8 @@ def _trace(rays: Rays, squared: Squared, integrator: str, dtype: torch.dtype = t
     """Trace in the given precision; the vertices come back in double."""
     path = march_uniform(rays.to(dtype), FunctionMedium(squared), INTEGRATORS[integrator], NUM_STEPS + 1)
     assert path.positions.dtype == dtype
-    values = (getattr(path, field.name) for field in dataclasses.fields(path) if field.init)
-    return Path(*(t.double() if t.is_floating_point() else t for t in values))
+    names = ("positions", "directions", "s", "radii")
+    return dataclasses.replace(path, **{name: getattr(path, name).double() for name in names})
 
 
 # --- layers: n sin(theta) is conserved ---

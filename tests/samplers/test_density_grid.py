@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -73,7 +75,7 @@ def straight(s: torch.Tensor, aside: float) -> Path:
     ones = torch.ones_like(s)
     positions = torch.stack([s - 4, aside * ones, 0 * ones], -1)[None]
     directions = torch.stack([ones, 0 * ones, 0 * ones], -1)[None]
-    return Path(positions, directions, s[None], directions[:, -1], torch.zeros(1).bool(), torch.zeros(1))
+    return Path.unbranched(positions, directions, s[None], torch.zeros(1).bool(), torch.zeros(1))
 
 
 @pytest.mark.parametrize("aside", [0.0, 0.5, 2.0])
@@ -120,7 +122,8 @@ def split_in_two(shares: tuple[float, float]) -> Path:
     """Each of 64 rays as two equal polylines with shares of its light."""
     path = example_path(64)
     rows = torch.arange(64).repeat_interleave(2)
-    return path[rows].changed(ray=rows, throughput=torch.tensor(shares).repeat(64)[:, None].expand(-1, 3))
+    throughput = torch.tensor(shares).repeat(64)[:, None].expand(-1, 3)
+    return replace(path[rows], splits=True, ray=rows, throughput=throughput)
 
 
 def test_branches_are_sampled_by_their_weight_in_training() -> None:

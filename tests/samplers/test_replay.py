@@ -231,7 +231,7 @@ def test_polylines_of_one_ray_bring_it_their_gradients_together() -> None:
     rays.origins.requires_grad_()
     path = sampler(rays, medium)
     twice = torch.tensor([0, 0, 1, 2])
-    split = replace(path[twice], ray=twice)
+    split = replace(path[twice], splits=True, ray=twice)
     (single,) = torch.autograd.grad(sampler.refine(path, rays, medium).exit_directions.sum(), rays.origins)
     (double,) = torch.autograd.grad(sampler.refine(split, rays, medium).exit_directions.sum(), rays.origins)
     torch.testing.assert_close(double, single * torch.tensor([[2.0], [1.0], [1.0]]))
