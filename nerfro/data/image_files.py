@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import io
-import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import ExifTags, Image, TiffImagePlugin, UnidentifiedImageError
 from scipy.sparse import csr_array
 
 from nerfro.errors import NerfroError
-from nerfro.files.png16 import decode_png16, is_png16
+from nerfro.files.deep_images import read_16bit
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 Alpha = Literal["drop", "white", "black"]
@@ -34,20 +32,30 @@ def to_levels(values: Float[np.ndarray, "H W *C"]) -> UInt16[np.ndarray, "H W *C
 
 def read_levels(path: Path) -> Levels:
     """Read the 8- or 16-bit levels [H, W, C] of a file; C is 1 (grey), 2 (grey, alpha), 3 (RGB) or 4 (RGBA)."""
-    with _naming(path):
-        content = path.read_bytes()
-        return decode_png16(content) if is_png16(content) else _read_8bit(content, path)
+    with _open(path) as (image, bits):
+        return read_16bit(path) if bits > 8 else _read_8bit(image)
 
 
 def read_size(path: Path) -> tuple[int, int, int]:
     """Read width, height and bits per channel from the header of an image file."""
+    with _open(path) as (image, bits):
+        return *image.size, bits
+
+
+@contextlib.contextmanager
+def _open(path: Path) -> Iterator[tuple[Image.Image, int]]:
+    """Open an image file with Pillow; yield it with its bits per channel, of which Pillow silently keeps 8."""
     with _naming(path), path.open("rb") as file:
-        start = file.read(29)
-        if is_png16(start):
-            return (*struct.unpack_from(">II", start, 16), 16)
+        header = file.read(25)
+        file.seek(0)
         with Image.open(file) as image:
             _require_upright(image, path)
-            return *image.size, 8
+            bits = 8
+            if image.format == "PNG":
+                bits = max(bits, header[24])
+            elif isinstance(image, TiffImagePlugin.TiffImageFile):
+                bits = max(bits, *image.tag_v2.get(TiffImagePlugin.BITSPERSAMPLE, (8,)))
+            yield image, bits
 
 
 @contextlib.contextmanager
@@ -59,7 +67,7 @@ def _naming(path: Path) -> Iterator[None]:
         raise NerfroError(f"image {path} does not exist; restore it or remove its frame") from error
     except UnidentifiedImageError as error:
         raise NerfroError(f"image {path} cannot be read (it is not an image); copy or export it again") from error
-    # Pillow reports a corrupt PNG as SyntaxError or ValueError; PngError is a ValueError.
+    # Pillow reports a corrupt PNG as SyntaxError or ValueError.
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise NerfroError(f"image {path} cannot be read ({error}); copy or export it again") from error
 
@@ -93,17 +101,10 @@ def _positive(value: object) -> float | None:
     return number if 0 < number < float("inf") else None
 
 
-def _read_8bit(content: bytes, path: Path) -> UInt8[np.ndarray, "H W C"]:
-    with Image.open(io.BytesIO(content)) as image:
-        # Pillow silently reduces colour TIFF and PNG to 8 bits. Tag 258 is BitsPerSample.
-        deep_tiff = image.format == "TIFF" and max(image.tag_v2.get(258, (1,))) > 8
-        if deep_tiff or image.mode in ("I", "F") or image.mode.startswith("I;"):
-            raise NerfroError(f"image {path} has more than 8 bits per channel; save it as 8- or 16-bit PNG")
-        if image.mode not in ("L", "LA", "RGB", "RGBA"):
-            transparent = image.has_transparency_data
-            image = image.convert("RGBA" if transparent else "L" if image.mode == "1" else "RGB")
-        _require_upright(image, path)
-        levels = np.asarray(image)
+def _read_8bit(image: Image.Image) -> UInt8[np.ndarray, "H W C"]:
+    if image.mode not in ("L", "LA", "RGB", "RGBA"):
+        image = image.convert("RGBA" if image.has_transparency_data else "L" if image.mode == "1" else "RGB")
+    levels = np.asarray(image)
     return levels.reshape(*levels.shape[:2], -1)
 
 

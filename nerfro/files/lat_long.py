@@ -16,9 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.files import radiance_hdr
-from nerfro.files.atomic import write_atomically
-from nerfro.files.exr import load_exr, save_exr
+from nerfro.files.deep_images import read_radiance, write_radiance
 from nerfro.files.images import save_png
 from nerfro.light import to_linear, to_srgb
 
@@ -55,10 +53,8 @@ def load_lat_long(path: Path | str) -> Float[Tensor, "H 2*H 3"]:
     if not path.is_file():
         raise NerfroError(f"the sky {path} does not exist; correct boundary.image")
     try:
-        if suffix == ".hdr":
-            rgb = radiance_hdr.decode(path.read_bytes())
-        elif suffix == ".exr":
-            rgb = load_exr(path)[..., :3]
+        if suffix in (".hdr", ".exr"):
+            rgb = read_radiance(path)
         else:
             with Image.open(path) as image:
                 rgb = to_linear(np.array(image.convert("RGB")) / 255)
@@ -79,11 +75,8 @@ def save_lat_long(path: Path | str, radiance: Float[Tensor, "H 2*H 3"]) -> None:
     if suffix == ".png":
         save_png(path, to_srgb(radiance).clamp(0, 1))
         return
-    linear = radiance.float().numpy()
-    if suffix == ".hdr":
-        write_atomically(path, radiance_hdr.encode(linear))
-    elif suffix == ".exr":
-        save_exr(path, linear)
+    if suffix in (".hdr", ".exr"):
+        write_radiance(path, radiance.float().numpy())
     else:
         raise NerfroError(f"a sky is not written as {suffix}, which loses detail; use .png, .hdr or .exr")
 

@@ -16,8 +16,8 @@ from tqdm import tqdm
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.cache import content_hash
+from nerfro.files.deep_images import write_radiance
 from nerfro.files.drawing import GAP, LINE_HEIGHT, fit, paper, write
-from nerfro.files.exr import save_exr
 from nerfro.files.images import save_picture, save_png
 from nerfro.viewing.layers import Layer
 from nerfro.viewing.render_request import Shots
@@ -96,7 +96,7 @@ def _fingerprint(shots: Shots, request: Sequence[object]) -> str:
 
 def _write(file: Path, pictures: list[tuple[Tensor, Tensor]], labels: Sequence[str]) -> None:
     if file.suffix == ".exr":
-        save_exr(file, pictures[0][0].numpy())
+        write_radiance(file, pictures[0][0].numpy())
     elif len(pictures) == 1:
         save_png(file, pictures[0][1])
     else:

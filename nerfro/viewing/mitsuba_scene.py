@@ -13,8 +13,8 @@ from jaxtyping import Float
 
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
-from nerfro.files import radiance_hdr
 from nerfro.files.atomic import write_atomically
+from nerfro.files.deep_images import write_radiance
 from nerfro.files.ply import write_ply
 from nerfro.media.solid import Solid
 from nerfro.scenes.path_tracer import envmap_texture
@@ -82,7 +82,7 @@ def _add_sky(root: ElementTree.Element, scene: TrainedScene, file: Path) -> None
         flat = torch.from_numpy(directions.reshape(-1, 3)).float()
         return scene.seen_beyond(flat).numpy().reshape(directions.shape)
 
-    write_atomically(file, radiance_hdr.encode(envmap_texture(sky, 2 * SKY_HEIGHT, _UPRIGHT)))
+    write_radiance(file, envmap_texture(sky, 2 * SKY_HEIGHT, _UPRIGHT))
     emitter = _add(root, "emitter", type="envmap")
     _add(emitter, "string", name="filename", value=file.name)
     _add(_add(emitter, "transform", name="to_world"), "matrix", value=_matrix(_UPRIGHT, np.zeros(3)))

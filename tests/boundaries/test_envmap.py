@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
@@ -13,7 +12,7 @@ import torch.nn.functional as F
 from nerfro.boundaries import cube_map
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.errors import NerfroError
-from nerfro.files import lat_long, radiance_hdr
+from nerfro.files import lat_long
 from nerfro.files.images import save_png
 from nerfro.light import to_srgb
 from nerfro.types import Exits
@@ -123,28 +122,6 @@ def test_a_finer_picture_is_averaged_not_sampled() -> None:
     boundary.set_lat_long(stripes)
     colours = boundary(Exits(cube_map.texel_directions(4)))
     torch.testing.assert_close(colours, torch.full_like(colours, 0.4), rtol=0, atol=0.01)
-
-
-@pytest.mark.parametrize("width", [4, 300])
-def test_hdr_files_keep_bright_radiance(width: int) -> None:
-    # Eight bits of mantissa shared by the channels: the error is below 1/256 of the brightest channel.
-    picture = np.random.default_rng(0).lognormal(0, 3, (5, width, 3)).astype(np.float32)
-    picture[0, 0] = 0
-    decoded = radiance_hdr.decode(radiance_hdr.encode(picture))
-    assert (np.abs(decoded - picture) <= picture.max(-1, keepdims=True) / 256 + 1e-30).all()
-
-
-def test_hdr_runs_are_decoded() -> None:
-    # Written by hand: one scanline of eight pixels, each channel a run, an exponent of 129 doubles mantissa / 256.
-    header = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 8\n"
-    body = bytes([2, 2, 0, 8, 136, 127, 136, 63, 4, 1, 2, 3, 4, 132, 9, 136, 129])
-    decoded = radiance_hdr.decode(header + body)
-    assert decoded.shape == (1, 8, 3)
-    np.testing.assert_allclose(decoded[0, :, 0], 127.5 / 128)
-    np.testing.assert_allclose(decoded[0, :, 1], 63.5 / 128)
-    np.testing.assert_allclose(decoded[0, :, 2], (np.array([1, 2, 3, 4, 9, 9, 9, 9]) + 0.5) / 128)
-    with pytest.raises(ValueError, match="cut short"):
-        radiance_hdr.decode(header + body[:-3])
 
 
 def test_state_restores_the_sky() -> None:

@@ -19,7 +19,8 @@ from nerfro.data.blender import BlenderData
 from nerfro.errors import NerfroError
 from nerfro.evaluation.metrics import psnr
 from nerfro.fields.base import Field
-from nerfro.files import lat_long, radiance_hdr
+from nerfro.files import lat_long
+from nerfro.files.deep_images import write_radiance
 from nerfro.light import to_linear
 from nerfro.media.analytic import Luneburg
 from nerfro.media.sdf_grid import SdfGrid
@@ -149,7 +150,8 @@ def test_contracted_surroundings_are_shown(scene: TrainedScene, tmp_path: Path) 
 def test_controls_change_what_they_say(scene: TrainedScene, tmp_path: Path) -> None:
     lamp = lat_long.directions(32)
     lamp = 4 * (lamp[..., 2:] > 0.5) * torch.tensor([1.0, 0.5, 0.1]) + 0.1
-    hdr = base64.b64encode(radiance_hdr.encode(lamp.numpy())).decode()
+    write_radiance(tmp_path / "lamp.hdr", lamp.numpy())
+    hdr = base64.b64encode((tmp_path / "lamp.hdr").read_bytes()).decode()
     script = f"""(() => {{
       {SHOT}
       const shots = {{ start: shot(0, 32) }};

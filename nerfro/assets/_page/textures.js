@@ -39,7 +39,7 @@ function sharedExponent(upper, rest) {
   });
 }
 
-// A picture of Radiance's .hdr format: width, height and linear radiance, four numbers a pixel; see files/radiance_hdr.py.
+// A picture of Radiance's .hdr format: width, height and linear radiance, four numbers a pixel; see files/deep_images.py.
 function decodeHdr(bytes) {
   let at = 0;
   const line = () => {

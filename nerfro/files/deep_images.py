@@ -1,0 +1,80 @@
+"""Image files with 16-bit or floating-point channels, read and written by OpenImageIO."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt16
+
+from nerfro.files.atomic import write_atomically
+
+
+def read_16bit(path: Path) -> UInt16[np.ndarray, "H W C"]:
+    """Read the levels of a PNG or TIFF file with 16 bits per channel.
+
+    Returns:
+        Levels from 0 to 65535, not multiplied by alpha; C is 1 (grey), 2 (grey, alpha), 3 (RGB) or 4 (RGBA).
+
+    Raises:
+        OSError: the file is truncated or corrupt, or its channels are not integers of 16 bits.
+    """
+    levels, _ = _read(path)
+    if levels.dtype != np.uint16:
+        raise OSError(f"its channels are {levels.dtype}; save it with 8 or 16 bits per channel")
+    return levels
+
+
+def read_radiance(path: Path) -> Float[np.ndarray, "H W 3"]:
+    """Read linear RGB radiance from an OpenEXR (.exr) or Radiance (.hdr) file.
+
+    Raises:
+        OSError: the file is truncated or corrupt, or has no channels R, G and B.
+    """
+    pixels, names = _read(path)
+    if names[:3] != ("R", "G", "B"):
+        raise OSError(f"it has the channels {', '.join(names)}, but R, G and B are needed")
+    rgb = pixels[..., :3].astype(np.float32)
+    if path.suffix.lower() != ".hdr":
+        return rgb
+    # A mantissa m of 8 bits stands for the interval from m to m + 1 (Ward, Real Pixels, Graphics Gems II, 1991).
+    # OpenImageIO returns its lower end, which is 0.25 % too dark on average, and this code returns its middle.
+    brightest = rgb.max(-1, keepdims=True)
+    half_step = np.ldexp(np.float32(1), np.frexp(brightest)[1] - 9)
+    return np.where(brightest > 0, rgb + half_step, 0)
+
+
+def write_radiance(path: Path, values: Float[np.ndarray, "H W C"]) -> None:
+    """Write one or three channels as OpenEXR in single precision (.exr), or three as Radiance RGBE (.hdr)."""
+    import OpenImageIO
+
+    height, width, num_channels = values.shape
+    spec = OpenImageIO.ImageSpec(width, height, num_channels, OpenImageIO.FLOAT)
+    spec.channelnames = ("R", "G", "B") if num_channels == 3 else ("Y",)
+    spec.attribute("compression", "zip")
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder, f"image{path.suffix.lower()}")
+        output = OpenImageIO.ImageOutput.create(str(file))
+        if output is None:
+            raise OSError(OpenImageIO.geterror())
+        written = output.open(str(file), spec) and output.write_image(np.ascontiguousarray(values, np.float32))
+        if not (output.close() and written):
+            raise OSError(output.geterror())
+        write_atomically(path, file.read_bytes())
+
+
+def _read(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the pixels [H, W, C] in the type of the file, and the names of the channels."""
+    import OpenImageIO
+
+    configuration = OpenImageIO.ImageSpec()
+    configuration.attribute("oiio:UnassociatedAlpha", 1)  # Otherwise, colours are multiplied by alpha.
+    image = OpenImageIO.ImageInput.open(str(path), configuration)
+    if image is None:
+        raise OSError(OpenImageIO.geterror().partition("\n")[0])
+    pixels, error = image.read_image(format=image.spec().format), image.geterror()
+    image.close()
+    if pixels is None:
+        raise OSError(error.partition("\n")[0])
+    return pixels, tuple(image.spec().channelnames)
