@@ -54,7 +54,7 @@ LENSES = [None, coefficients([0.05, -0.02], [0.002, -0.001])]
 def test_slopes_are_those_of_central_differences(distortion: tuple[float, ...] | None) -> None:
     given = cameras(distortion)
     made, (view, row, column) = part(given), pixels(given)
-    made.motions.hold_world = False
+    made.motions.fix_gauge = False
     made.motions.motion *= 0.01  # turns are composed to first order
     made.motions.of_world = made.motions.of_world[:0]
     rays = given.rays(view, row, column)
@@ -80,7 +80,7 @@ def test_slopes_are_those_of_central_differences(distortion: tuple[float, ...] |
 def test_rays_are_those_of_the_cameras_that_are_believed_in(distortion: tuple[float, ...] | None) -> None:
     given = cameras(distortion)
     made, (view, row, column) = part(given), pixels(given)
-    moved, expected = made(given.rays(view, row, column), view), made.believed(given).rays(view, row, column)
+    moved, expected = made(given.rays(view, row, column), view), made.estimated(given).rays(view, row, column)
     torch.testing.assert_close(moved.origins, expected.origins)
     torch.testing.assert_close(moved.directions, expected.directions, rtol=0, atol=1e-9)
 
@@ -153,7 +153,7 @@ def test_a_unit_of_each_parameter_moves_points_by_a_pixel() -> None:
 
 def test_cameras_in_a_world_that_is_known_may_move_together() -> None:
     given = cameras()
-    made = RefinedCamera(hold_world=False).double()
+    made = RefinedCamera(fix_gauge=False).double()
     made.begin(given)
     with torch.no_grad():
         made.motions.motion.normal_()
