@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 
 class PerView(nn.Module):
-    """Module whose tensors are empty until `begin` is called or a checkpoint is loaded, which sets the number of views."""
+    """Module whose tensors are empty until `begin` or the loading of a checkpoint sets the number of views."""
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
         for name, tensor in (*self._parameters.items(), *self._buffers.items()):

@@ -65,7 +65,7 @@ def test_a_turn_of_all_is_not_told() -> None:
     camera = RefinedCamera()
     found = panorama(camera, TRUE)
     assert found is not None
-    together = camera.motions.together()
+    together = camera.motions.common_rotations()
     torch.testing.assert_close(together.mT @ together, torch.eye(3))
     motions = torch.nn.functional.pad(together.view(-1, 3, 3), (0, 0, 0, 3)).flatten(0, 1)
     assert float((found.information @ motions).abs().max()) < 1e-5 * float(found.information.diagonal().mean())
