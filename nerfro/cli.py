@@ -44,6 +44,7 @@ EXIT_BROKEN_PIPE = 141  # as a shell tells of a program that SIGPIPE ended
 #   "medium.learn_surface": None                          a setting that is gone: refused on the command line and in
 #                                                         YAML files, dropped from the configurations of old runs
 RENAMED: dict[str, str | None] = {
+    "camera.hold_world": "camera.fix_gauge",
     "medium.learn_surface": None,
     "optimizer.surface_learning_rate": None,
     "optimizer.surface_start": None,

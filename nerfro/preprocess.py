@@ -59,7 +59,7 @@ def main(config: DictConfig) -> None:
             camera = refine_cameras(views, silhouettes, wrong_masks, hull if mesh is None else mesh)
             write_cameras(folder / CAMERAS, camera, views)
             written.append(CAMERAS)
-            views = replace(views, cameras=camera.believed(views.cameras))
+            views = replace(views, cameras=camera.estimated(views.cameras))
             silhouettes = replace(silhouettes, cameras=views.cameras)
         if mesh is None:
             mesh, location = hull(silhouettes), str(folder / MESH)

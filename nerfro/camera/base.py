@@ -1,4 +1,4 @@
-"""What a camera part is."""
+"""Interface of the camera model: estimated poses, lens and exposures of the training views."""
 
 from __future__ import annotations
 
@@ -13,55 +13,63 @@ from nerfro.rays import Rays
 
 
 class Camera(nn.Module, ABC):
-    """What is believed of the training views: their rays before they are traced, and how bright they were taken.
+    """Estimated poses, lens and exposures of the training views. Derive from this class to add a camera model.
 
-    What it learns is a part of the model.
+    The parameters of a camera model are trained with the scene.
 
     Args:
-        exposure: whether each training view has a gain of its own.
+        exposure: whether to estimate a gain for each training view.
+
+    Attributes:
+        moves: whether the model changes the poses or the lens of the data set.
     """
 
-    moves = False  # whether cameras are believed to be elsewhere than the data say
+    moves = False
 
     def __init__(self, exposure: bool = False) -> None:
         super().__init__()
         self.exposure = Exposure() if exposure else None
 
     def begin(self, cameras: Cameras, exposures: Float[Tensor, "V"] | None = None) -> None:
-        """Look at the training views before anything learns.
+        """Initialize the model for the training views.
 
         Args:
-            cameras: as the data give them.
-            exposures: how bright each view was taken, in any unit, where files tell.
+            cameras: cameras of the data set.
+            exposures: relative exposure of each view, in any unit, if the files record it.
         """
         if self.exposure is not None:
             self.exposure.begin(len(cameras), exposures)
 
     @abstractmethod
     def forward(self, rays: Rays, view: Int[Tensor, "R"]) -> Rays:
-        """The rays of views as they are believed to be, given those of the data's cameras."""
+        """Map rays of the cameras of the data set to rays of the estimated cameras.
+
+        Args:
+            rays: rays in world units.
+            view: index of the training view of each ray.
+        """
 
     def gains(self, view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"] | None:
-        """By which factors photographs are brighter than the scene, in linear radiance; None where all are alike."""
+        """Return the gain of linear radiance of each ray's photograph, or None if exposures are not estimated."""
         return None if self.exposure is None else self.exposure(view)
 
     def bending_parameters(self) -> list[nn.Parameter]:
-        """What rays depend on, of all that learns."""
+        """Return the parameters that change rays."""
         brightness = set(self.brightness_parameters())
         return [parameter for parameter in self.parameters() if parameter not in brightness]
 
     def brightness_parameters(self) -> list[nn.Parameter]:
-        """What the views' gains depend on."""
+        """Return the parameters that change gains."""
         return [] if self.exposure is None else list(self.exposure.parameters())
 
-    def believed(self, cameras: Cameras) -> Cameras:
-        """The training cameras as they are believed to be, given those of the data."""
+    def estimated(self, cameras: Cameras) -> Cameras:
+        """Return the estimated training cameras, given those of the data set."""
         return cameras
 
     def aligned(self, cameras: Cameras) -> Cameras:
-        """Other cameras of the data, moved as the training cameras were on the whole."""
+        """Apply the similarity transformation between the given and the estimated training cameras to other cameras."""
         return cameras
 
     def learned(self) -> dict[str, float]:
-        """Physical quantities that learn, by names for the log."""
+        """Return estimated physical quantities by name, for the log."""
         return {} if self.exposure is None else {"gain_spread": self.exposure.spread}

@@ -1,4 +1,4 @@
-"""How bright each photograph was taken, and in which white balance."""
+"""Exposure and white balance of photographs, as a gain per view and colour channel."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from torch import Tensor, nn
 
 from nerfro.camera.per_view import PerView
 
-# Newton's steps to a gain; each doubles the digits.
+# Number of Gauss-Newton steps that fit a gain.
 _STEPS = 20
 
 
 class Exposure(PerView):
-    """A gain of linear radiance for each view and colour channel; their logarithms are zero on average.
+    """Gain of linear radiance for each view and colour channel.
 
-    Without that a brighter scene in darker photographs would be as good.
+    The mean logarithm of the gains is zero, because the overall brightness of the scene is otherwise ambiguous.
     """
 
     start: Float[Tensor, "V"]
@@ -28,7 +28,7 @@ class Exposure(PerView):
         self.register_buffer("start", torch.zeros(0))
 
     def begin(self, num_views: int, exposures: Float[Tensor, "V"] | None = None) -> None:
-        """Start from the views' relative exposures, or from none."""
+        """Initialize the gains with the relative exposures of the views, or with 1."""
         self.log_gain.data = self.log_gain.new_zeros(num_views, 3)
         self.start = self.start.new_zeros(num_views) if exposures is None else exposures.log().to(self.start)
 
@@ -36,20 +36,26 @@ class Exposure(PerView):
         return self.gains()[view]
 
     def gains(self) -> Float[Tensor, "V 3"]:
-        """Of all views."""
+        """Return the gains of all views."""
         logarithm = self.log_gain + self.start[:, None]
         return torch.exp(logarithm - logarithm.mean(0))
 
     @property
     def spread(self) -> float:
-        """Standard deviation of the gains' logarithms over views."""
+        """Standard deviation of the logarithmic gains over views."""
         return float(self.gains().detach().log().std(0, unbiased=False).mean())
 
 
 def fit_gain(
     encode: Callable[[Tensor], Tensor], radiance: Float[Tensor, "P 3"], target: Float[Tensor, "P 3"]
 ) -> Float[Tensor, "3"]:
-    """Gain of each channel of linear radiance that brings what it is encoded as nearest to a picture (Gauss-Newton)."""
+    """Fit the gain of each channel that best maps rendered radiance to a photograph (Gauss-Newton).
+
+    Args:
+        encode: conversion from linear radiance to the colour space of the photograph.
+        radiance: rendered linear radiance of each pixel.
+        target: colours of the photograph in [0, 1].
+    """
     with torch.inference_mode(False), torch.enable_grad():
         radiance, target = radiance.double().clone(), target.double().clone()
         logarithm = torch.zeros(3, dtype=torch.float64, device=radiance.device)
@@ -57,7 +63,7 @@ def fit_gain(
             each = logarithm.expand_as(radiance).clone().requires_grad_()
             shown = encode(each.exp() * radiance)
             (slope,) = torch.autograd.grad(shown.sum(), each)
-            # Saturated pixels tell nothing where the photograph is saturated, too.
+            # Pixels that are saturated in both images carry no information.
             error = torch.where((target >= 1) & (shown > 1), 0.0, shown.detach() - target)
             slope = torch.where((target >= 1) & (shown > 1), 0.0, slope)
             step = (slope * error).sum(0) / slope.square().sum(0).clamp(min=1e-12)

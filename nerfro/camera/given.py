@@ -1,4 +1,4 @@
-"""Cameras as the data give them."""
+"""Camera model that keeps the cameras of the data set."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from nerfro.registry import register
 
 @register("camera", "given")
 class GivenCamera(Camera):
-    """Rays stay as the data's cameras give them.
+    """Keep the cameras of the data set.
 
     Args:
-        exposure: whether each training view has a gain of its own, for each colour channel.
+        exposure: whether to estimate a gain for each training view and colour channel.
     """
 
     def __init__(self, exposure: bool = False) -> None:
         super().__init__(exposure)
 
     def forward(self, rays: Rays, view: Int[Tensor, "R"]) -> Rays:
-        """The same rays."""
+        """Return the rays unchanged."""
         return rays

@@ -1,4 +1,4 @@
-"""What all ways in which cameras take steps of Gauss-Newton share: equations, robust weights, what is known already."""
+"""Common parts of the Gauss-Newton solvers for cameras: normal equations, robust weights and priors."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize, one_hot
 
-# Of the mean of the normal equations' diagonal, added to it.
+# Damping of the normal equations, relative to the mean of the diagonal.
 DAMPING = 1e-3
 _TINY = 1e-9
 
 
 @dataclass(frozen=True)
-class Told:
-    """What is known of all cameras together.
+class PriorInformation:
+    """Gaussian prior of the parameters of all cameras.
 
     Attributes:
-        numbers: six of each camera, then the lens where it is refined, as `RefinedCamera` counts them: pixels.
-        information: the inverse of their covariance; 0 along what is not told.
+        numbers: mean of the parameters in pixels: six per camera, followed by the lens if it is refined (see
+            `RefinedCamera.numbers`).
+        information: information matrix, the inverse of the covariance; zero for directions without information.
     """
 
     numbers: Float[Tensor, "N"]
@@ -29,14 +30,14 @@ class Told:
 
 
 def axes_across(directions: Float[Tensor, "R 3"]) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
-    """Two unit axes for each unit direction, perpendicular to it and to each other."""
+    """Return two unit axes that are perpendicular to each direction and to each other."""
     least = one_hot(directions.abs().argmin(-1), 3).to(directions)
     first = normalize(torch.linalg.cross(directions, least), dim=-1)
     return first, torch.linalg.cross(directions, first)
 
 
 def robust_weights(error: Float[Tensor, "R 3"], scale: float) -> Float[Tensor, "R"]:
-    """Weights of least squares by which colours that are off by more than `scale` count less (Geman and McClure)."""
+    """Compute Geman-McClure weights, which reduce the influence of errors above `scale`."""
     return 1 / (1 + (error / scale).square().sum(-1)).square()
 
 
@@ -48,9 +49,18 @@ def normal_equations(
     num_views: int,
     damping: float = DAMPING,
 ) -> tuple[Float[Tensor, "M M"], Float[Tensor, "M"]]:
-    """Normal equations of all cameras' six numbers, and of those that all share behind them.
+    """Accumulate the normal equations of all cameras.
 
-    `damping` is added to the diagonal, a share of its mean: what is not told of a camera stays.
+    Args:
+        slopes: derivatives of C residuals by N parameters: six of the camera, followed by the shared parameters.
+        error: residuals.
+        weights: weight of each observation.
+        view: index of the camera of each observation.
+        num_views: number of cameras V.
+        damping: damping relative to the mean of the diagonal, which keeps undetermined parameters unchanged.
+
+    Returns:
+        Matrix and gradient for 6 V camera parameters, followed by the shared parameters.
     """
     num = slopes.shape[-1]
     squares = torch.einsum("r,rci,rcj->rij", weights, slopes, slopes)
@@ -61,29 +71,29 @@ def normal_equations(
     added = damping * own.diagonal(dim1=1, dim2=2).mean(-1) + _TINY
     own = own + added[:, None, None] * torch.eye(6).to(own)
     shared = shared + (damping * shared.trace() / max(len(shared), 1) + _TINY) * torch.eye(num - 6).to(shared)
-    together = each[:, :6, 6:].flatten(0, 1)
-    matrix = torch.cat([torch.block_diag(*own), together], 1)
-    matrix = torch.cat([matrix, torch.cat([together.mT, shared], 1)])
+    mixed = each[:, :6, 6:].flatten(0, 1)
+    matrix = torch.cat([torch.block_diag(*own), mixed], 1)
+    matrix = torch.cat([matrix, torch.cat([mixed.mT, shared], 1)])
     return matrix, torch.cat([gradient[:, :6].flatten(), gradient[:, 6:].sum(0)])
 
 
-def with_told(
+def with_priors(
     matrix: Float[Tensor, "N N"],
     vector: Float[Tensor, "N"],
     numbers: Float[Tensor, "N"],
     variance: Float[Tensor, ""] | float,
-    told: Iterable[Told],
+    priors: Iterable[PriorInformation],
 ) -> tuple[Float[Tensor, "N N"], Float[Tensor, "N"]]:
-    """Normal equations joined with what is told already, each in units of its own errors' variance.
+    """Add priors to normal equations.
 
     Args:
-        matrix, vector: of errors that have this variance.
-        numbers: where all are now.
-        variance: of the errors.
-        told: what is known.
+        matrix, vector: matrix and gradient of the normal equations.
+        numbers: current parameters in pixels.
+        variance: variance of the residuals, which scales the priors.
+        priors: priors of the parameters.
     """
-    for each in told:
-        information = (variance * each.information).to(matrix)
+    for prior in priors:
+        information = (variance * prior.information).to(matrix)
         matrix = matrix + information
-        vector = vector + information @ (numbers - each.numbers).to(vector)
+        vector = vector + information @ (numbers - prior.numbers).to(vector)
     return matrix, vector

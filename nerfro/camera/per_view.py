@@ -1,4 +1,4 @@
-"""Tensors with a row for each training view."""
+"""Base class of modules with one row of parameters per training view."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 
 class PerView(nn.Module):
-    """A module whose tensors have no row until `begin`, or until a checkpoint brings as many as there were."""
+    """Module whose tensors are empty until `begin` or the loading of a checkpoint sets the number of views."""
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
         for name, tensor in (*self._parameters.items(), *self._buffers.items()):

@@ -1,4 +1,4 @@
-"""Cameras that are refined with the scene."""
+"""Camera model that refines poses and lens during training."""
 
 from __future__ import annotations
 
@@ -21,7 +21,17 @@ from nerfro.registry import register
 
 
 class _Motions(PerView):
-    """Turn and shift of each camera along its own axes, counted in pixels; the world as a whole stays."""
+    """Rotation and translation of each camera in its own axes, in units of pixels.
+
+    Attributes:
+        poses: camera-to-world matrices of the data set.
+        focal, distortion: focal lengths and distortion coefficients of the data set.
+        units: rotation or translation that moves the image by one pixel, for each parameter.
+        weights: weights of the parameters for the gauge.
+        of_world: basis of the camera motions that a similarity transformation of the world causes, or empty.
+        focal_unit: change of the logarithmic focal length that moves the image by one pixel.
+        motion: parameters in pixels.
+    """
 
     poses: Float[Tensor, "V 3 4"]
     focal: Float[Tensor, "V 2"]
@@ -32,9 +42,9 @@ class _Motions(PerView):
     focal_unit: Float[Tensor, "1"]
     motion: Float[Tensor, "V 6"]
 
-    def __init__(self, hold_world: bool = True) -> None:
+    def __init__(self, fix_gauge: bool = True) -> None:
         super().__init__()
-        self.hold_world = hold_world
+        self.fix_gauge = fix_gauge
         shapes = {
             "motion": (6,),
             "poses": (3, 4),
@@ -59,7 +69,7 @@ class _Motions(PerView):
             "distortion": distortion,
             "units": 1 / pixels[:, :6],
             "weights": weights,
-            "of_world": world_motions(poses, weights) if self.hold_world else weights.new_zeros(0, *weights.shape),
+            "of_world": world_motions(poses, weights) if self.fix_gauge else weights.new_zeros(0, *weights.shape),
             "focal_unit": 1 / pixels[:, 6].square().mean().sqrt()[None],
         }
         for name, tensor in found.items():
@@ -67,21 +77,21 @@ class _Motions(PerView):
             setattr(self, name, tensor.to(buffer))
 
     def forward(self) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 3"]]:
-        """Rotation of each camera and shift of its centre, along its own axes as given."""
-        motion = self.held()
+        """Return rotation and translation of each camera, in the given camera axes."""
+        motion = self.fixed()
         return rotations(motion[:, :3]), motion[:, 3:]
 
-    def held(self) -> Float[Tensor, "V 6"]:
-        """Turn and shift of each camera, without what is the world's; radians and world units."""
+    def fixed(self) -> Float[Tensor, "V 6"]:
+        """Return rotations (radians) and translations (world units), without the motion of the world."""
         return without_world(self.motion * self.units, self.of_world, self.weights)
 
-    def together(self) -> Float[Tensor, "3*V 3"]:
-        """Orthonormal turns by which all cameras turn alike, each about its own centre; pixels about its own axes."""
+    def common_rotations(self) -> Float[Tensor, "3*V 3"]:
+        """Return an orthonormal basis of common rotations of all cameras, each about its centre; units of pixels."""
         own = self.moved()[..., :3].mT / self.units[:, :3, None]
         return torch.linalg.qr(own.flatten(0, 1))[0]
 
     def moved(self) -> Float[Tensor, "V 3 4"]:
-        """The cameras' poses as they are believed to be."""
+        """Return the estimated poses."""
         turns, shifts = self()
         axes = self.poses[..., :3]
         return torch.cat([axes @ turns, self.poses[..., 3:] + axes @ shifts[..., None]], -1)
@@ -89,20 +99,20 @@ class _Motions(PerView):
 
 @register("camera", "refined")
 class RefinedCamera(Camera):
-    """Rotation and position of each training camera, and the lens that all share, refined with the scene.
+    """Refine the pose of each training camera, and optionally the common lens, during training.
 
-    Before training, cameras turn until photographs of the sky agree (`panorama`), where there is one, and move until
-    the surface is seen in its masks (`capture.outlines`), where there are any. Between training steps each takes a step
-    of Gauss-Newton towards its photograph (`gauss_newton`). A motion that all cameras share is taken out, to first
-    order: the world stays where the data have put it, with its surface.
+    Before training, cameras are rotated until photographs of a distant sky agree (`panorama`), and moved until the
+    surface projects into its silhouettes (`capture.outlines`), if the data contain these. Between training steps, each
+    camera takes Gauss-Newton steps (`gauss_newton`). The motion that a similarity transformation of the world would
+    cause is removed to first order, so that the world and the surface keep their place.
 
     Args:
-        start: training steps before the first of these steps, so that the scene is there.
-        every: training steps between two of them.
-        num_pixels: of each photograph that are looked at in one.
-        lens: whether the focal length and the principal point, shared by all views, are refined.
-        exposure: whether each training view has a gain of its own, for each colour channel.
-        hold_world: whether the motion that all share is taken out; not for cameras in a world that is known.
+        start: training step of the first Gauss-Newton step. Earlier, the scene is too inaccurate.
+        every: number of training steps between two Gauss-Newton steps.
+        num_pixels: number of pixels of each photograph in a Gauss-Newton step.
+        lens: whether to refine the focal length and the principal point, which all views share.
+        exposure: whether to estimate a gain for each training view and colour channel.
+        fix_gauge: whether to remove the motion of the world. Disable this for cameras of a scene that is fixed.
     """
 
     moves = True
@@ -115,12 +125,12 @@ class RefinedCamera(Camera):
         num_pixels: Count = 300,
         lens: bool = False,
         exposure: bool = False,
-        hold_world: bool = True,
+        fix_gauge: bool = True,
     ) -> None:
         super().__init__(exposure)
         self.start, self.every, self.num_pixels = start, every, num_pixels
-        self.motions = _Motions(hold_world)
-        self.register_buffer("lens", torch.zeros(3) if lens else None)  # focal length and principal point, pixels
+        self.motions = _Motions(fix_gauge)
+        self.register_buffer("lens", torch.zeros(3) if lens else None)  # focal length and principal point in pixels
 
     def begin(self, cameras: Cameras, exposures: Float[Tensor, "V"] | None = None) -> None:
         super().begin(cameras, exposures)
@@ -143,57 +153,60 @@ class RefinedCamera(Camera):
         by_origin: Float[Tensor, "R C 3"],
         by_direction: Float[Tensor, "R C 3"],
     ) -> Float[Tensor, "R C N"]:
-        """Derivatives by the motion of each ray's camera in pixels (6), and by the lens (3 more, if it is refined).
+        """Convert derivatives by rays to derivatives by camera parameters in pixels.
 
         Args:
-            rays: of the data's cameras.
-            view: of each.
-            by_origin: derivatives of anything by the origins of the rays as they are believed to be.
-            by_direction: by their directions.
+            rays: rays of the cameras of the data set.
+            view: index of the training view of each ray.
+            by_origin: derivatives of C quantities by the origins of the estimated rays.
+            by_direction: derivatives by the directions of the estimated rays.
+
+        Returns:
+            Derivatives by the six parameters of the camera, followed by three of the lens if it is refined.
         """
         axes, moved = self.motions.poses[view, :, :3], self(rays, view)
-        across = torch.linalg.cross(moved.directions[:, None].expand_as(by_direction), by_direction)
-        found = torch.cat([across @ axes, by_origin @ axes], -1) * self.motions.units[view, None]
+        by_rotation = torch.linalg.cross(moved.directions[:, None].expand_as(by_direction), by_direction)
+        by_motion = torch.cat([by_rotation @ axes, by_origin @ axes], -1) * self.motions.units[view, None]
         if self.lens is None:
-            return found
-        kept, of_lens = self.lens.clone(), []
-        for number in range(len(kept)):  # half a pixel to both sides
+            return by_motion
+        kept, by_lens = self.lens.clone(), []
+        for number in range(len(kept)):  # central differences over one pixel
             ends = []
             for half in (0.5, -0.5):
                 self.lens[number] = kept[number] + half
                 ends.append(self(rays, view).directions)
             self.lens.copy_(kept)
-            of_lens.append((by_direction * (ends[0] - ends[1])[:, None]).sum(-1))
-        return torch.cat([found, torch.stack(of_lens, -1)], -1)
+            by_lens.append((by_direction * (ends[0] - ends[1])[:, None]).sum(-1))
+        return torch.cat([by_motion, torch.stack(by_lens, -1)], -1)
 
     def numbers(self) -> Float[Tensor, "N"]:
-        """Turns and shifts of all cameras along their own axes, then the lens where it is refined; pixels."""
+        """Return the parameters of all cameras in pixels, followed by the lens if it is refined."""
         motion = self.motions.motion.flatten()
         return motion if self.lens is None else torch.cat([motion, self.lens])
 
     def split(self, numbers: Float[Tensor, "N"]) -> tuple[Float[Tensor, "V 6"], Float[Tensor, "L"]]:
-        """The motions of the cameras and the lens, of such numbers."""
+        """Split such parameters into motions of the cameras and lens."""
         num = self.motions.motion.numel()
         return numbers[:num].view(-1, 6), numbers[num:]
 
     def position(self) -> tuple[Tensor, Tensor | None]:
-        """Where cameras and lens are, for `move_back`."""
+        """Return a copy of the parameters for `move_back`."""
         return self.motions.motion.clone(), None if self.lens is None else self.lens.clone()
 
     def move(self, motion: Float[Tensor, "V 6"], lens: Float[Tensor, "L"]) -> None:
-        """Turn and shift cameras, and change the lens that all share, by pixels."""
+        """Add to the parameters of cameras and lens, in pixels."""
         self.motions.motion += motion
         if self.lens is not None:
             self.lens += lens
 
     def move_back(self, position: tuple[Tensor, Tensor | None], worse: Bool[Tensor, "V"], lens: bool) -> None:
-        """Put some cameras, and the lens, where they were."""
+        """Restore the parameters of the cameras `worse`, and of the lens if `lens` is true."""
         self.motions.motion[worse] = position[0][worse]
         if lens and position[1] is not None:
             self.lens = position[1]
 
     def _through_lens(self, local: Float[Tensor, "R 3"], view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
-        """Directions along the cameras' axes, of the same pixels behind the lens as it is believed to be."""
+        """Return the directions, in camera axes, of the same pixels through the estimated lens."""
         growth, shift = self._lens()
         ideal = local[:, :2] / -local[:, 2:]
         flipped = ideal * ideal.new_tensor([1.0, -1.0])  # y down, as in the image
@@ -206,21 +219,21 @@ class RefinedCamera(Camera):
         return torch.cat([flipped * ideal.new_tensor([1.0, -1.0]), -torch.ones_like(local[:, 2:])], -1)
 
     def _lens(self) -> tuple[Float[Tensor, ""], Float[Tensor, "2"]]:
-        """Factor of the focal length, and shift of the principal point in pixels."""
+        """Return the factor of the focal length, and the shift of the principal point in pixels."""
         assert self.lens is not None
         return torch.exp(self.lens[0] * self.motions.focal_unit[0]), self.lens[1:]
 
     @torch.no_grad()
-    def believed(self, cameras: Cameras) -> Cameras:
+    def estimated(self, cameras: Cameras) -> Cameras:
         poses = self.motions.moved().to(cameras.camera_to_world)
         return self._with_lens(replace(cameras, camera_to_world=poses))
 
     @torch.no_grad()
     def aligned(self, cameras: Cameras) -> Cameras:
-        """Other cameras, moved by the similarity of the training cameras, behind the lens that is believed in."""
+        """Apply the similarity transformation of the training cameras, and the estimated lens, to other cameras."""
         old, new, weights = (x.double() for x in (self.motions.poses, self.motions.moved(), self.motions.weights))
-        whole = similarity(old, new, weights[:, 0], weights[:, 3])
-        poses = whole.moved(cameras.camera_to_world.to(whole.shift)).to(cameras.camera_to_world)
+        transformation = similarity(old, new, weights[:, 0], weights[:, 3])
+        poses = transformation.apply(cameras.camera_to_world.to(transformation.shift)).to(cameras.camera_to_world)
         return self._with_lens(replace(cameras, camera_to_world=poses))
 
     def _with_lens(self, cameras: Cameras) -> Cameras:
@@ -232,7 +245,7 @@ class RefinedCamera(Camera):
 
     def learned(self) -> dict[str, float]:
         with torch.no_grad():
-            found = {"motion_pixels": float((self.motions.held() / self.motions.units).square().sum(-1).mean().sqrt())}
+            found = {"motion_pixels": float((self.motions.fixed() / self.motions.units).square().sum(-1).mean().sqrt())}
             if self.lens is not None:
                 growth, (x, y) = self._lens()
                 found |= {"focal_length_factor": float(growth), "principal_x": float(x), "principal_y": float(y)}
@@ -240,7 +253,7 @@ class RefinedCamera(Camera):
 
 
 def rotations(vectors: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3 3"]:
-    """Rotations about axes by the vectors' lengths, in radians."""
+    """Convert rotation vectors (axis times angle in radians) to rotation matrices."""
     x, y, z = vectors.unbind(-1)
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)

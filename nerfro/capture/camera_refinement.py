@@ -59,14 +59,14 @@ def refine_cameras(
         )
     motions = camera.motions
     for _ in range(1 if isinstance(surface, TriangleMesh) else _ROUNDS):
-        mesh, before = surface, motions.held()
+        mesh, before = surface, motions.fixed()
         if not isinstance(mesh, TriangleMesh):
-            mesh = mesh(replace(silhouettes, cameras=camera.believed(views.cameras)), _VOXELS)
+            mesh = mesh(replace(silhouettes, cameras=camera.estimated(views.cameras)), _VOXELS)
         # The first hulls are as inaccurate as the poses, so any distance to the masks is accepted.
         meet_outlines(camera, views.cameras, lambda cameras: cameras, silhouettes, mesh, [panorama], math.inf)
-        if float(((motions.held() - before) / motions.units).square().sum(-1).mean().sqrt()) < _CONVERGED:
+        if float(((motions.fixed() - before) / motions.units).square().sum(-1).mean().sqrt()) < _CONVERGED:
             break
-    turned, shifted = motion_between(views.cameras.camera_to_world, camera.believed(views.cameras).camera_to_world)
+    turned, shifted = motion_between(views.cameras.camera_to_world, camera.estimated(views.cameras).camera_to_world)
     relative = float((shifted / object_distances(views.cameras)).median())
     print(f"cameras refined: median rotation {turned.median():.2g} degrees, translation {relative:.2%} of the distance")
     return camera

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.camera.least_squares import Told, normal_equations, with_told
+from nerfro.camera.least_squares import PriorInformation, normal_equations, with_priors
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
 from nerfro.capture.rims import RimFinder
@@ -37,9 +37,9 @@ def meet_outlines(
     reduced: Callable[[Cameras], Cameras],
     silhouettes: Silhouettes,
     mesh: TriangleMesh,
-    told: Sequence[Told] = (),
+    told: Sequence[PriorInformation] = (),
     farthest: float = _FARTHEST,
-) -> Told | None:
+) -> PriorInformation | None:
     """Move the cameras until the outlines of a surface are those of its masks.
 
     Masks that are too wide everywhere, or too narrow, by the same part of a pixel, do not disturb.
@@ -58,7 +58,7 @@ def meet_outlines(
     """
     before = camera.position()
     begun = camera.numbers()
-    given = Told(begun, torch.eye(len(begun)).to(begun) / _GIVEN**2)
+    given = PriorInformation(begun, torch.eye(len(begun)).to(begun) / _GIVEN**2)
     finder = RimFinder(mesh, silhouettes)
     for step in track("outlines", range(_STEPS + 1)):
         slopes, error, weights, view = _seen(camera, cameras, reduced, finder)
@@ -66,7 +66,7 @@ def meet_outlines(
         if step < _STEPS:
             matrix, vector = normal_equations(slopes, error, weights, view, len(cameras))
             matrix, vector = _any_width(matrix, vector)
-            matrix, vector = with_told(matrix, vector, camera.numbers(), _ALIKE * variance, [*told, given])
+            matrix, vector = with_priors(matrix, vector, camera.numbers(), _ALIKE * variance, [*told, given])
             motion, lens = camera.split(-torch.linalg.solve(matrix, vector).to(camera.motions.motion))
             motion = motion * (_LONGEST / motion.norm(dim=-1, keepdim=True).clamp(min=_LONGEST))
             camera.move(motion, lens)
@@ -77,7 +77,7 @@ def meet_outlines(
         return None
     matrix, vector = normal_equations(slopes, error, weights, view, len(cameras), damping=0.0)
     numbers = camera.numbers()
-    return Told(numbers, (_any_width(matrix, vector)[0] / (_ALIKE * variance)).to(numbers))
+    return PriorInformation(numbers, (_any_width(matrix, vector)[0] / (_ALIKE * variance)).to(numbers))
 
 
 def _seen(
@@ -90,7 +90,7 @@ def _seen(
 
     The last slope is that by a width of which all masks are too wide.
     """
-    believed = reduced(camera.believed(cameras))
+    believed = reduced(camera.estimated(cameras))
     rims = finder.points(believed)
     of_views = rims.points.split(torch.bincount(rims.views, minlength=len(cameras)).tolist())
     place = torch.cat([believed.select([view]).project(points)[0][0] for view, points in enumerate(of_views)])

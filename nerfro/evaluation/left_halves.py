@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerfro.camera.gauss_newton import Step, improve, telling
+from nerfro.camera.gauss_newton import Step, gauss_newton_step, informative_pixels
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
 from nerfro.data.base import Views
@@ -32,7 +32,7 @@ def refine_on_left(renderer: Renderer, views: Views, gains: Float[Tensor, "V 3"]
         steps: number of Gauss-Newton steps.
     """
     cameras, device = views.cameras.to(renderer.scene.device), renderer.scene.device
-    part = RefinedCamera(hold_world=False).to(device)
+    part = RefinedCamera(fix_gauge=False).to(device)
     part.begin(cameras)
     photographs, gains = PixelStore(views.images).to(device), gains.to(device)
     generator, shape = torch.Generator().manual_seed(0), (len(views), _DRAWN * _NUM_PIXELS)
@@ -47,7 +47,7 @@ def refine_on_left(renderer: Renderer, views: Views, gains: Float[Tensor, "V 3"]
         row = torch.randint(cameras.height, shape, generator=generator)
         column = torch.randint(cameras.width // 2, shape, generator=generator)
         drawn = (torch.arange(len(views))[:, None] * cameras.height + row) * cameras.width + column
-        pixels = telling(drawn.to(device), _NUM_PIXELS, photographed, cameras)
+        pixels = informative_pixels(drawn.to(device), _NUM_PIXELS, photographed, cameras)
         reach = _REACH[0] * (_REACH[1] / _REACH[0]) ** (step / max(steps - 1, 1))
-        improve(part, cameras, pixels, photographed, shown, Step(reach, _SCALE, _LONGEST))
-    return part.believed(cameras).to(views.cameras.device)
+        gauss_newton_step(part, cameras, pixels, photographed, shown, Step(reach, _SCALE, _LONGEST))
+    return part.estimated(cameras).to(views.cameras.device)

@@ -9,8 +9,8 @@ from jaxtyping import Float, Int
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from nerfro.camera.gauss_newton import Step, improve, telling
-from nerfro.camera.least_squares import Told
+from nerfro.camera.gauss_newton import Step, gauss_newton_step, informative_pixels
+from nerfro.camera.least_squares import PriorInformation
 from nerfro.camera.panorama import align
 from nerfro.camera.refined import RefinedCamera
 from nerfro.data.base import Views
@@ -44,7 +44,7 @@ class CameraSteps(Callback):
 
     def __init__(self, batches: RayBatches, views: Views) -> None:
         self._batches, self._views = batches, views
-        self._told: dict[str, Told] = {}  # by what
+        self._told: dict[str, PriorInformation] = {}  # by what
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, TrainingModule)
@@ -61,7 +61,7 @@ class CameraSteps(Callback):
         return {name: dict(vars(told)) for name, told in self._told.items()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._told = {name: Told(**told) for name, told in state_dict.items()}
+        self._told = {name: PriorInformation(**told) for name, told in state_dict.items()}
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
         assert isinstance(pl_module, TrainingModule)
@@ -72,13 +72,18 @@ class CameraSteps(Callback):
         before = (step - camera.start) // camera.every
         reach = max(_LEAST_REACH, _FIRST_REACH * _SHRINKING**before)
         # Not asked whether errors fall: every camera has painted its own ghost, which holds it where it is.
-        how = Step(reach, _SCALE * reach, _LONGEST, share=min(1.0, _WHOLE / (before + 1)), checked=False)
+        how = Step(reach, _SCALE * reach, _LONGEST, fraction=min(1.0, _WHOLE / (before + 1)), keep_improvements=False)
         _move(pl_module.renderer, camera, self._batches, step, how, self._told)
 
 
 @torch.no_grad()
 def _move(
-    renderer: Renderer, camera: RefinedCamera, batches: RayBatches, step: int, how: Step, told: dict[str, Told]
+    renderer: Renderer,
+    camera: RefinedCamera,
+    batches: RayBatches,
+    step: int,
+    how: Step,
+    told: dict[str, PriorInformation],
 ) -> None:
     """A step of all cameras by pixels with contrast, drawn anew for each training step.
 
@@ -90,9 +95,9 @@ def _move(
     if "panorama" in told and box is not None:
         view = candidates.flatten() // (batches.cameras.height * batches.cameras.width)
         past = misses(box, camera(pixel_rays(batches.cameras, candidates.flatten()), view)).view(candidates.shape)
-    pixels = telling(candidates, camera.num_pixels, batches.photographed, batches.cameras, past)
+    pixels = informative_pixels(candidates, camera.num_pixels, batches.photographed, batches.cameras, past)
 
     def shown(rays: Rays, view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
         return renderer.scene.colour_space.to_display(renderer.radiance(rays), camera.gains(view))
 
-    improve(camera, batches.cameras, pixels, batches.photographed, shown, how, list(told.values()))
+    gauss_newton_step(camera, batches.cameras, pixels, batches.photographed, shown, how, list(told.values()))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from nerfro.camera.least_squares import Told
+from nerfro.camera.least_squares import PriorInformation
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
 from nerfro.capture.outlines import meet_outlines
@@ -18,7 +18,9 @@ from nerfro.media.sdf_grid import SdfGrid
 _MAX_PIXELS, _KNOWN = 256, 0.25
 
 
-def meet_masks(camera: RefinedCamera, views: Views, medium: Medium, panorama: Told | None) -> Told | None:
+def meet_masks(
+    camera: RefinedCamera, views: Views, medium: Medium, panorama: PriorInformation | None
+) -> PriorInformation | None:
     """Move cameras until the surface is seen in its masks; what these tell, or none where one of both is missing.
 
     Args:

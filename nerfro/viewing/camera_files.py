@@ -77,7 +77,7 @@ def write_cameras(file: Path, camera: Camera, views: Views) -> None:
     """
     if not camera.moves and camera.exposure is None:
         return
-    given, believed = views.cameras, camera.believed(views.cameras).to("cpu")
+    given, believed = views.cameras, camera.estimated(views.cameras).to("cpu")
     turned, shifted = (values.tolist() for values in motion_between(given.camera_to_world, believed.camera_to_world))
     gains = None if camera.exposure is None else camera.exposure.gains().tolist()
     frames = []

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.cameras import disturbed
-from nerfro.camera.gauss_newton import Step, improve, telling
+from nerfro.camera.gauss_newton import Step, gauss_newton_step, informative_pixels
 from nerfro.camera.refined import RefinedCamera
 from nerfro.camera.similarity import motion_between
 from nerfro.light import to_srgb
@@ -37,31 +37,31 @@ def photographed(pixels: Tensor) -> Tensor:
 def looked_at(step: int, num: int = 300) -> Tensor:
     generator = torch.Generator().manual_seed(step)
     drawn = torch.randint(SIZE * SIZE, (NUM_VIEWS, 2 * num), generator=generator)
-    return telling(drawn + SIZE * SIZE * torch.arange(NUM_VIEWS)[:, None], num, photographed, TRUE)
+    return informative_pixels(drawn + SIZE * SIZE * torch.arange(NUM_VIEWS)[:, None], num, photographed, TRUE)
 
 
 def steps(camera: RefinedCamera, given: object, how: Step, num: int) -> None:
     for step in range(num):
-        improve(camera, given, looked_at(step), photographed, shown, how)
+        gauss_newton_step(camera, given, looked_at(step), photographed, shown, how)
 
 
 def test_disturbed_cameras_find_back_by_what_is_seen_through_the_ball() -> None:
     given = replace(TRUE, camera_to_world=disturbed(TRUE, math.radians(0.5), 0.01, 0).float())
-    camera = RefinedCamera(hold_world=False)
+    camera = RefinedCamera(fix_gauge=False)
     camera.begin(given)
-    steps(camera, given, Step(reach=0.5, scale=0.3, longest=3.0), 6)
+    steps(camera, given, Step(difference_pixels=0.5, scale=0.3, max_pixels=3.0), 6)
     before = motion_between(TRUE.camera_to_world, given.camera_to_world)
-    after = motion_between(TRUE.camera_to_world, camera.believed(given).camera_to_world)
+    after = motion_between(TRUE.camera_to_world, camera.estimated(given).camera_to_world)
     for old, new in zip(before, after, strict=True):
         assert float(new.median()) < 0.06 * float(old.median())
 
 
 def test_the_lens_that_all_share_is_found_with_them() -> None:
     given = replace(TRUE, fx=1.02 * TRUE.fx, fy=1.02 * TRUE.fy, cx=TRUE.cx + 0.5, cy=TRUE.cy - 0.3)
-    camera = RefinedCamera(lens=True, hold_world=False)
+    camera = RefinedCamera(lens=True, fix_gauge=False)
     camera.begin(given)
-    steps(camera, given, Step(reach=0.5, scale=0.3, longest=3.0), 8)
-    found = camera.believed(given)
+    steps(camera, given, Step(difference_pixels=0.5, scale=0.3, max_pixels=3.0), 8)
+    found = camera.estimated(given)
     assert float(found.fx[0]) == pytest.approx(float(TRUE.fx[0]), rel=2e-3)
     assert float(found.cx[0]) == pytest.approx(float(TRUE.cx[0]), abs=0.1)
     assert float(found.cy[0]) == pytest.approx(float(TRUE.cy[0]), abs=0.1)
@@ -69,18 +69,18 @@ def test_the_lens_that_all_share_is_found_with_them() -> None:
 
 def test_a_camera_stays_where_its_error_would_not_fall() -> None:
     """At the truth no step is for the better; and where nothing is checked, none is longer than allowed."""
-    camera = RefinedCamera(hold_world=False)
+    camera = RefinedCamera(fix_gauge=False)
     camera.begin(TRUE)
     wrong = 1 - PHOTOGRAPHS
 
     def inverted(pixels: Tensor) -> Tensor:
         return wrong[pixels]
 
-    far = Step(reach=0.5, scale=10.0, longest=0.25, checked=False)
-    improve(camera, TRUE, looked_at(0), inverted, shown, far)
+    far = Step(difference_pixels=0.5, scale=10.0, max_pixels=0.25, keep_improvements=False)
+    gauss_newton_step(camera, TRUE, looked_at(0), inverted, shown, far)
     assert float(camera.motions.motion.norm(dim=-1).max()) == pytest.approx(0.25, rel=1e-4)
     camera.begin(TRUE)
-    improve(camera, TRUE, looked_at(0), photographed, shown, Step(0.5, 0.3, 3.0))
+    gauss_newton_step(camera, TRUE, looked_at(0), photographed, shown, Step(0.5, 0.3, 3.0))
     assert float(camera.motions.motion.abs().max()) < 1e-4
 
 
@@ -89,7 +89,7 @@ def test_pixels_with_contrast_are_looked_at_first() -> None:
     pictures[:, :, : SIZE // 2] = 0.5
     flat = pictures.view(-1, 3)
     drawn = torch.randint(SIZE * SIZE, (NUM_VIEWS, 400)) + SIZE * SIZE * torch.arange(NUM_VIEWS)[:, None]
-    chosen = telling(drawn, 50, lambda pixels: flat[pixels], TRUE)
+    chosen = informative_pixels(drawn, 50, lambda pixels: flat[pixels], TRUE)
     assert chosen.shape == (50 * NUM_VIEWS,)
     assert (chosen.view(NUM_VIEWS, 50) // SIZE**2 == torch.arange(NUM_VIEWS)[:, None]).all()
     assert float((chosen % SIZE >= SIZE // 2 - 1).float().mean()) > 0.95

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.cameras import disturbed
-from nerfro.camera.least_squares import Told
+from nerfro.camera.least_squares import PriorInformation
 from nerfro.camera.panorama import align
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
@@ -22,7 +22,9 @@ TRUE = cameras()
 PHOTOGRAPHS = photographs([1.45]).images.reshape(-1, 3)
 
 
-def panorama(camera: RefinedCamera, given: Cameras, box: Tensor = BOX, gains: Tensor | None = None) -> Told | None:
+def panorama(
+    camera: RefinedCamera, given: Cameras, box: Tensor = BOX, gains: Tensor | None = None
+) -> PriorInformation | None:
     def photographed(pixels: Tensor) -> Tensor:
         colours = PHOTOGRAPHS[pixels]
         view = pixels // (TRUE.height * TRUE.width)
@@ -56,14 +58,14 @@ def test_the_shared_lens_is_found_with_them() -> None:
     given = replace(TRUE, fx=1.02 * TRUE.fx, fy=1.02 * TRUE.fy)
     camera = RefinedCamera(lens=True)
     assert panorama(camera, given) is not None
-    assert float(camera.believed(given).fx[0]) == pytest.approx(float(TRUE.fx[0]), rel=2e-3)
+    assert float(camera.estimated(given).fx[0]) == pytest.approx(float(TRUE.fx[0]), rel=2e-3)
 
 
 def test_a_turn_of_all_is_not_told() -> None:
     camera = RefinedCamera()
     found = panorama(camera, TRUE)
     assert found is not None
-    together = camera.motions.together()
+    together = camera.motions.common_rotations()
     torch.testing.assert_close(together.mT @ together, torch.eye(3))
     motions = torch.nn.functional.pad(together.view(-1, 3, 3), (0, 0, 0, 3)).flatten(0, 1)
     assert float((found.information @ motions).abs().max()) < 1e-5 * float(found.information.diagonal().mean())

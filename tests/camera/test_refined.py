@@ -54,7 +54,7 @@ LENSES = [None, coefficients([0.05, -0.02], [0.002, -0.001])]
 def test_slopes_are_those_of_central_differences(distortion: tuple[float, ...] | None) -> None:
     given = cameras(distortion)
     made, (view, row, column) = part(given), pixels(given)
-    made.motions.hold_world = False
+    made.motions.fix_gauge = False
     made.motions.motion *= 0.01  # turns are composed to first order
     made.motions.of_world = made.motions.of_world[:0]
     rays = given.rays(view, row, column)
@@ -80,7 +80,7 @@ def test_slopes_are_those_of_central_differences(distortion: tuple[float, ...] |
 def test_rays_are_those_of_the_cameras_that_are_believed_in(distortion: tuple[float, ...] | None) -> None:
     given = cameras(distortion)
     made, (view, row, column) = part(given), pixels(given)
-    moved, expected = made(given.rays(view, row, column), view), made.believed(given).rays(view, row, column)
+    moved, expected = made(given.rays(view, row, column), view), made.estimated(given).rays(view, row, column)
     torch.testing.assert_close(moved.origins, expected.origins)
     torch.testing.assert_close(moved.directions, expected.directions, rtol=0, atol=1e-9)
 
@@ -102,7 +102,7 @@ def test_a_motion_that_all_cameras_share_is_taken_out() -> None:
     poses = given.camera_to_world
     turn = rotations(small * torch.tensor([[0.3, -0.7, 0.5]], dtype=torch.float64))[0]
     world = Similarity(torch.tensor(1 + small).double(), turn, small * torch.tensor([1.0, 2.0, -1.0]).double())
-    shared = world.moved(poses)
+    shared = world.apply(poses)
     turns, shifts = poses[..., :3].mT @ shared[..., :3], poses[..., :3].mT @ (shared[..., 3:] - poses[..., 3:])
     vector = torch.stack([turns[:, 2, 1], turns[:, 0, 2], turns[:, 1, 0]], -1)
     before = made.motions.moved()
@@ -122,7 +122,7 @@ def test_all_that_moves_pixels_is_held_to_no_motion_on_the_whole() -> None:
     weights = made.motions.weights
     whole = similarity(given.camera_to_world, made.motions.moved(), weights[:, 0], weights[:, 3])
     moved = motion_between(given.camera_to_world, made.motions.moved())
-    common = motion_between(given.camera_to_world, whole.moved(given.camera_to_world))
+    common = motion_between(given.camera_to_world, whole.apply(given.camera_to_world))
     # To first order: cameras move by a tenth of a pixel, and what they share is of the order of that squared.
     assert float(common[0].max()) < 0.02 * float(moved[0].median())
     assert float(common[1].max()) < 0.02 * float(moved[1].median())
@@ -153,7 +153,7 @@ def test_a_unit_of_each_parameter_moves_points_by_a_pixel() -> None:
 
 def test_cameras_in_a_world_that_is_known_may_move_together() -> None:
     given = cameras()
-    made = RefinedCamera(hold_world=False).double()
+    made = RefinedCamera(fix_gauge=False).double()
     made.begin(given)
     with torch.no_grad():
         made.motions.motion.normal_()
@@ -175,9 +175,9 @@ def test_a_similarity_is_found_again() -> None:
     turn = rotations(torch.tensor([[0.5, -1.0, 2.0]], dtype=torch.float64))[0]
     made = Similarity(torch.tensor(1.7).double(), turn, torch.tensor([3.0, -1.0, 0.5]).double())
     for some in (poses, poses[:2], poses[:1]):
-        found = similarity(some, made.moved(some), *torch.rand(2, len(some), dtype=torch.float64) + 0.5)
+        found = similarity(some, made.apply(some), *torch.rand(2, len(some), dtype=torch.float64) + 0.5)
         torch.testing.assert_close(found.rotation, made.rotation)
-        torch.testing.assert_close(found.moved(some), made.moved(some))
+        torch.testing.assert_close(found.apply(some), made.apply(some))
         if len(some) > 1:
             torch.testing.assert_close(found.scale, made.scale)
 
@@ -188,7 +188,7 @@ def test_other_cameras_go_along_with_the_training_cameras() -> None:
     weights = made.motions.weights
     whole = similarity(given.camera_to_world, made.motions.moved(), weights[:, 0], weights[:, 3])
     others = replace(cameras(), camera_to_world=cameras().camera_to_world.flip(0))
-    torch.testing.assert_close(made.aligned(others).camera_to_world, whole.moved(others.camera_to_world))
+    torch.testing.assert_close(made.aligned(others).camera_to_world, whole.apply(others.camera_to_world))
 
 
 def test_weights_of_any_number_of_views_are_read_back() -> None:

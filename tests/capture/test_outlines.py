@@ -10,7 +10,7 @@ import torch
 import trimesh
 
 from benchmarks.cameras import disturbed
-from nerfro.camera.least_squares import Told
+from nerfro.camera.least_squares import PriorInformation
 from nerfro.camera.refined import RefinedCamera
 from nerfro.camera.similarity import motion_between
 from nerfro.cameras import Cameras
@@ -32,13 +32,13 @@ def silhouettes() -> Silhouettes:
     return Silhouettes.of(TRUE, soft_masks(ellipsoid()))
 
 
-def met(camera: RefinedCamera, given: Cameras, seen: Silhouettes, sure: list[int] | None = None) -> Told:
+def met(camera: RefinedCamera, given: Cameras, seen: Silhouettes, sure: list[int] | None = None) -> PriorInformation:
     """Move cameras; some of the six numbers of each are known to be right."""
     camera.begin(given)
     surely = torch.zeros_like(camera.motions.motion)
     surely[:, sure or []] = 1e6
     information = torch.nn.functional.pad(surely.flatten(), (0, len(camera.numbers()) - surely.numel())).diag()
-    known = [Told(camera.numbers(), information)]
+    known = [PriorInformation(camera.numbers(), information)]
     told = meet_outlines(camera, given, lambda cameras: cameras, seen, ellipsoid(), known)
     assert told is not None
     return told
@@ -56,7 +56,7 @@ def test_disturbed_cameras_see_the_surface_where_it_is(too_wide: float) -> None:
     given = replace(TRUE, camera_to_world=disturbed(TRUE, math.radians(0.5), 0.01, 0).float())
     camera, seen = RefinedCamera(), silhouettes()
     met(camera, given, replace(seen, distances=seen.distances + too_wide))
-    assert pixels_off(camera.believed(given)) < 0.15 * pixels_off(given)
+    assert pixels_off(camera.estimated(given)) < 0.15 * pixels_off(given)
 
 
 def test_shifts_are_found_where_turns_are_known() -> None:
@@ -64,7 +64,7 @@ def test_shifts_are_found_where_turns_are_known() -> None:
     camera = RefinedCamera()
     met(camera, given, silhouettes(), [0, 1, 2])
     before = motion_between(TRUE.camera_to_world, given.camera_to_world)[1]
-    after = motion_between(TRUE.camera_to_world, camera.believed(given).camera_to_world)[1]
+    after = motion_between(TRUE.camera_to_world, camera.estimated(given).camera_to_world)[1]
     assert float(after.median()) < 0.15 * float(before.median())
 
 
@@ -89,7 +89,7 @@ def test_the_shared_lens_is_found_where_cameras_are_known() -> None:
     given = replace(TRUE, cx=TRUE.cx + 0.4, cy=TRUE.cy - 0.3)
     camera = RefinedCamera(lens=True)
     met(camera, given, silhouettes(), [0, 1, 2, 3, 4, 5])
-    found = camera.believed(given)
+    found = camera.estimated(given)
     assert float(found.cx[0]) == pytest.approx(float(TRUE.cx[0]), abs=0.03)
     assert float(found.cy[0]) == pytest.approx(float(TRUE.cy[0]), abs=0.03)
 
@@ -98,7 +98,7 @@ def test_shifts_are_told_apart_from_turns_hardly() -> None:
     """A pixel to the side is known to hundredths; a turn that undoes it leaves little to see."""
     camera = RefinedCamera()
     told = met(camera, TRUE, silhouettes())
-    assert pixels_off(camera.believed(TRUE)) < 0.05
+    assert pixels_off(camera.estimated(TRUE)) < 0.05
     of_view = torch.stack([told.information[6 * v : 6 * v + 6, 6 * v : 6 * v + 6] for v in range(NUM_VIEWS)])
     assert torch.equal(of_view, of_view.mT) or torch.allclose(of_view, of_view.mT, rtol=1e-3)
     # About y a turn to the left, along x a shift to the right.
