@@ -48,6 +48,20 @@ RENAMED: dict[str, str | None] = {
     "optimizer.surface_learning_rate": None,
     "optimizer.surface_start": None,
     "search": None,
+    "batches.supersample": "batches.subdivision.side",
+    "batches.divergence": "batches.subdivision.divergence",
+    "batches.contrast": "batches.subdivision.contrast",
+    "batches.contrast_start": "batches.subdivision.contrast_start",
+    "batches.hold_back": "batches.num_validation_views",
+    "batches.object": "batches.object_fraction",
+    "evaluation.supersample": "evaluation.subdivision.side",
+    "evaluation.divergence": "evaluation.subdivision.divergence",
+    "evaluation.contrast": "evaluation.subdivision.contrast",
+    "supersample": "subdivision.side",  # of evaluate and render
+    "divergence": "subdivision.divergence",
+    "contrast": "subdivision.contrast",
+    "optimizer.boundary_first": "optimizer.boundary_steps",
+    "trainer.accumulate_grad_batches": None,
 }
 
 
