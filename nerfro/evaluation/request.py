@@ -67,7 +67,7 @@ def require_one_task(config: DictConfig) -> None:
         task, others = "checkpoint", ("references", "masks", "alpha")
     default = OmegaConf.structured(EvaluateConfig)
     for name in others:
-        if config[name] != getattr(EvaluateConfig, name):
+        if config[name] != default[name]:
             raise NerfroError(f"{name}={config[name]} has no effect with {task}=...; remove it")
 
 
