@@ -61,6 +61,10 @@ RENAMED: dict[str, str | None] = {
     "divergence": "subdivision.divergence",
     "contrast": "subdivision.contrast",
     "optimizer.boundary_first": "optimizer.boundary_steps",
+    "sampler.points.every": "sampler.points.update_every",
+    "sampler.points.looks": "sampler.points.update_fraction",
+    "sampler.points.trust": "sampler.points.max_bin_alpha",
+    "sampler.points.num_shown": "sampler.points.num_samples_evaluation",
     "trainer.accumulate_grad_batches": None,
 }
 

@@ -211,7 +211,7 @@ def tiny_default_run(tiny_scene: Path) -> list[str]:
         "sampler.points.num_samples=8",
         "sampler.points.num_bins=16",
         "sampler.points.resolution=16",
-        "sampler.points.every=3",  # the grid is updated at steps that write a checkpoint
+        "sampler.points.update_every=3",  # the grid is updated at steps that write a checkpoint
         "field.num_levels=4",
         "field.log2_table_size=10",
         "field.width=16",
