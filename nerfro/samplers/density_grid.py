@@ -35,9 +35,9 @@ class DensityGridSampler(PointSampler):
 
     The grid covers the box of the content. Each cell keeps the largest density that was found in it, with exponential
     decay, and a fraction of the cells is updated from the finest field at regular steps of training. This is the
-    occupancy grid of Instant-NGP (Mueller et al. 2022, appendix C), but it keeps densities, so that samples can be drawn
-    from them along a bent path. The predicted weights include transmittance, so that few samples lie behind opaque cells. A fraction of
-    the samples is spread evenly, so that no region is left out.
+    occupancy grid of Instant-NGP (Mueller et al. 2022, appendix C), but it keeps densities, so that samples can be
+    drawn from them along a bent path. The predicted weights include transmittance, so that few samples lie behind
+    opaque cells. A fraction of the samples is spread evenly, so that no region is left out.
 
     Args:
         num_samples: number of intervals on each path.
