@@ -47,8 +47,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     test = source.load(config.evaluation.split).checked()
     validation = source.load("val").checked() if config.evaluation.every > 0 and "val" in source.splits else None
     wanted, training = config.batches, source.load("train")
-    precrop = wanted.precrop_steps, wanted.precrop_fraction
-    fraction = wanted.object_fraction
+    precrop, fraction = (wanted.precrop_steps, wanted.precrop_fraction), wanted.object_fraction
     batches = RayBatches(training, wanted.size, wanted.batching, config.seed, *precrop, wanted.jitter, fraction)
     subdivision = Subdivision(**config.evaluation.subdivision)
     lpips = find_lpips_networks(config.evaluation.lpips_backbone, config.evaluation.lpips_vgg_backbone)
@@ -71,7 +70,6 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
         print(memory, flush=True)
     if config.compile is not None:
         compile_networks(renderer, config.compile)
-
     trainer.fit(TrainingModule.of(renderer, config), datamodule=datamodule, ckpt_path=checkpoint, weights_only=True)
     trainer.save_checkpoint(folder / LAST_CHECKPOINT)
     finish_logs(trainer)
