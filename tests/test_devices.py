@@ -29,7 +29,7 @@ ADAPTIVE = ["sampler.path.integrator=adaptive", "sampler.path.max_steps=60", "sa
 ONCE = "kernels/constants.py: constant (tensor)"
 SELECTED = "fields/selection.py: evaluate_selected (nonzero)"
 # Paths through triangles come back from the CPU.
-MET = "types.py: to (to)"
+MET = "samplers/polylines.py: path (to)"
 
 
 @pytest.mark.parametrize(
