@@ -30,13 +30,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("run", type=Path)
     parser.add_argument("--views", type=int, help="test views that are looked at; all by default")
-    for option, kind in (("supersample", int), ("divergence", float), ("contrast", float)):
-        parser.add_argument(f"--{option}", type=kind, help=f"evaluation.{option}; as trained by default")
+    for option, kind in (("side", int), ("divergence", float), ("contrast", float)):
+        parser.add_argument(f"--{option}", type=kind, help=f"evaluation.subdivision.{option}; as trained by default")
     parser.add_argument("--edge", type=float, default=8.0, help="pixel angles from which neighbours part")
     arguments = parser.parse_args()
     scene = nerfro.load(arguments.run, device="cpu")
     model, views = scene.renderer, scene.views().checked()
-    wanted = {"side": arguments.supersample, "divergence": arguments.divergence, "contrast": arguments.contrast}
+    wanted = {name: getattr(arguments, name) for name in ("side", "divergence", "contrast")}
     subdivision = replace(scene.subdivision, **{name: value for name, value in wanted.items() if value is not None})
     errors, classes = [], []
     for view in range(min(len(views), arguments.views or len(views))):

@@ -49,6 +49,24 @@ RENAMED: dict[str, str | None] = {
     "optimizer.surface_learning_rate": None,
     "optimizer.surface_start": None,
     "search": None,
+    "batches.supersample": "batches.subdivision.side",
+    "batches.divergence": "batches.subdivision.divergence",
+    "batches.contrast": "batches.subdivision.contrast",
+    "batches.contrast_start": "batches.subdivision.contrast_start",
+    "batches.hold_back": "batches.num_validation_views",
+    "batches.object": "batches.object_fraction",
+    "evaluation.supersample": "evaluation.subdivision.side",
+    "evaluation.divergence": "evaluation.subdivision.divergence",
+    "evaluation.contrast": "evaluation.subdivision.contrast",
+    "supersample": "subdivision.side",  # of evaluate and render
+    "divergence": "subdivision.divergence",
+    "contrast": "subdivision.contrast",
+    "optimizer.boundary_first": "optimizer.boundary_steps",
+    "sampler.points.every": "sampler.points.update_every",
+    "sampler.points.looks": "sampler.points.update_fraction",
+    "sampler.points.trust": "sampler.points.max_bin_alpha",
+    "sampler.points.num_shown": "sampler.points.num_samples_evaluation",
+    "trainer.accumulate_grad_batches": None,
 }
 
 

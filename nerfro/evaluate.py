@@ -22,7 +22,7 @@ from nerfro.training.run_folder import load_checkpoint
 
 # Options of an evaluation that take the place of those that the run was trained with.
 _ADOPTED = (
-    "chunk_size", "lpips_backbone", "lpips_vgg_backbone", "supersample", "divergence", "contrast", "refine_steps",
+    "chunk_size", "lpips_backbone", "lpips_vgg_backbone", "refine_steps",
 )  # fmt: skip
 
 
@@ -42,6 +42,7 @@ def _evaluate_checkpoint(config: DictConfig) -> None:
     for name in _ADOPTED:
         if config[name] is not None:
             trained.evaluation[name] = config[name]
+    trained.evaluation.subdivision.update({k: v for k, v in config.subdivision.items() if v is not None})
     device = find_device(config.device)
     with own_folder(config, path.parent.parent / f"evaluate_{config.split}") as folder:
         scene = scene_of(checkpoint, trained, device)

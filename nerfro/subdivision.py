@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Optional
+from typing import Optional
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -51,10 +51,14 @@ class Subdivision:
     contrast: Optional[Positive] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     contrast_start: Natural = 0
 
-    @classmethod
-    def of(cls, options: Any) -> Subdivision:
-        """What a run's `batches` or `evaluation` asks for; runs of former releases do not name `contrast`."""
-        return cls(options.supersample, options.divergence, options.get("contrast"), options.get("contrast_start", 0))
+
+@dataclass
+class SubdivisionChanges:
+    """Attributes of a `Subdivision` that are replaced; None keeps the value that the run was evaluated with."""
+
+    side: Optional[Side] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    divergence: Optional[NotNegative] = None  # noqa: UP045
+    contrast: Optional[Positive] = None  # noqa: UP045
 
 
 @dataclass(frozen=True)

@@ -47,29 +47,29 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     test = source.load(config.evaluation.split).checked()
     validation = source.load("val").checked() if config.evaluation.every > 0 and "val" in source.splits else None
     wanted, training = config.batches, source.load("train")
-    precrop = wanted.precrop_steps, wanted.precrop_fraction
-    batches = RayBatches(training, wanted.size, wanted.batching, config.seed, *precrop, wanted.jitter, wanted.object)
-    subdivision = Subdivision.of(config.evaluation)
+    precrop, fraction = (wanted.precrop_steps, wanted.precrop_fraction), wanted.object_fraction
+    batches = RayBatches(training, wanted.size, wanted.batching, config.seed, *precrop, wanted.jitter, fraction)
+    subdivision = Subdivision(**config.evaluation.subdivision)
     lpips = find_lpips_networks(config.evaluation.lpips_backbone, config.evaluation.lpips_vgg_backbone)
     renderer = build_model(config, training)
     require_same_run(folder, checkpoint, config)
     throughput, interruption = Throughput(), StopOnSignal()
     # Cameras move by sky and outlines before the sky is learned.
-    cameras, boundary = CameraSteps(batches, training), BoundaryFirst(batches, config.optimizer.boundary_first)
+    cameras, boundary = CameraSteps(training), BoundaryFirst(config.optimizer.boundary_steps)
     trainer = make_trainer(config, folder, throughput, [interruption, cameras, boundary, Viewer(config, source, test)])
     batches = traced(batches.share(trainer.global_rank, trainer.world_size), renderer, config)
+    datamodule = RayDataModule(batches, validation, config.evaluation.every)
     few = batches.smaller(4096)
     first = few.batch(0)
     require_reach(renderer, first)
     share, device = few.batch_size / batches.batch_size, trainer.strategy.root_device
+    del batches, few  # the data module moves the pixels to the training device
     memory = require_memory(renderer, first.rays, device, share)
     if trainer.is_global_zero:
         begin(folder, config, renderer)
         print(memory, flush=True)
     if config.compile is not None:
         compile_networks(renderer, config.compile)
-
-    datamodule = RayDataModule(batches, validation, config.evaluation.every)
     trainer.fit(TrainingModule.of(renderer, config), datamodule=datamodule, ckpt_path=checkpoint, weights_only=True)
     trainer.save_checkpoint(folder / LAST_CHECKPOINT)
     finish_logs(trainer)

@@ -181,8 +181,8 @@ def tiny_run(tiny_scene: Path) -> list[str]:
         "loss.boundary.weight=0.025",
         "loss.boundary.ramp=0",
         "loss.smoothness.weight=1",
-        "evaluation.supersample=1",
-        "batches.supersample=1",
+        "evaluation.subdivision.side=1",
+        "batches.subdivision.side=1",
         "batches.jitter=false",
         "medium.resolution=32",
         "medium.smoothing_size=3",
@@ -211,7 +211,7 @@ def tiny_default_run(tiny_scene: Path) -> list[str]:
         "sampler.points.num_samples=8",
         "sampler.points.num_bins=16",
         "sampler.points.resolution=16",
-        "sampler.points.every=3",  # the grid is updated at steps that write a checkpoint
+        "sampler.points.update_every=3",  # the grid is updated at steps that write a checkpoint
         "field.num_levels=4",
         "field.log2_table_size=10",
         "field.width=16",
@@ -219,7 +219,7 @@ def tiny_default_run(tiny_scene: Path) -> list[str]:
         "batches.size=32",
         "loss.boundary={weight: 0.01, start: 2}",
         "loss.smoothness={weight: 0.1, start: 3, tile_size: 4}",
-        "evaluation.supersample=2",
+        "evaluation.subdivision.side=2",
         "trainer.accelerator=cpu",
         "trainer.max_time=null",
         "logger=none",

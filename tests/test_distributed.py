@@ -26,7 +26,7 @@ PRESETS = {
     "default": [
         "field.precision=float32",
         "optimizer.adam_epsilon=1e-8",
-        "evaluation.supersample=1",
+        "evaluation.subdivision.side=1",
         "loss.total_variation.weight=0.01",
         "+loss.distortion.weight=0.01",
     ],

@@ -281,7 +281,7 @@ def tiny(root: Path) -> list[str]:
         "boundary.resolutions=[4,8]",
         "model.resolution=16",
         "batches.size=64",
-        "evaluation.supersample=1",
+        "evaluation.subdivision.side=1",
         "evaluation.every=0",
         "trainer.accelerator=cpu",
         "trainer.max_time=null",

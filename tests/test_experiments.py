@@ -46,7 +46,7 @@ def shrunk(config: DictConfig) -> list[str]:
         "medium": {"resolution": 32, "smoothing_size": 3},
         "field": {"width": 8, "view_width": 8, "num_levels": 2, "log2_table_size": 8},
         "boundary": {"width": 8},
-        "evaluation": {"supersample": 1},
+        "evaluation.subdivision": {"side": 1},
         "loss.smoothness": {"tile_size": 4},
         "sampler.path": {"num_steps": 48},
         "sampler.points": {"num_coarse": 8, "num_fine": 8, "num_samples": 16, "resolution": 16},

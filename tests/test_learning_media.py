@@ -61,7 +61,12 @@ def test_an_index_that_is_off_is_mended_in_training(train_here: Callable[..., An
     options += ["sampler.points.num_samples=4", "sampler.points.num_bins=16", "sampler.points.resolution=16"]
     options += ["field.num_levels=2", "field.log2_table_size=8", "field.width=16", "loss.boundary.start=0"]
     options += ["optimizer.medium_learning_rate=0.006", "optimizer.medium_start=60", "evaluation.every=0"]
-    options += ["trainer.accelerator=cpu", "trainer.max_time=null", "trainer.max_steps=220", "evaluation.supersample=1"]
+    options += [
+        "trainer.accelerator=cpu",
+        "trainer.max_time=null",
+        "trainer.max_steps=220",
+        "evaluation.subdivision.side=1",
+    ]
     done = train_here(*options, f"hydra.run.dir={tmp_path / 'run'}")
     assert done.code == 0, done.err
     state = load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")[0]["state_dict"]

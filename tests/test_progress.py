@@ -32,7 +32,7 @@ def test_pictures_and_grids_have_bars_once_they_take_long(
         "medium.smoothing_size=5",
         "trainer.max_steps=1",
         "evaluation.every=0",
-        "evaluation.supersample=1",
+        "evaluation.subdivision.side=1",
     ]
     monkeypatch.setattr(progress, "DELAY", 1e9)
     quick = train_here(*run, f"hydra.run.dir={tmp_path / 'quick'}")

@@ -235,7 +235,7 @@ def test_wrong_losses_are_refused(losses: dict[str, object], message: str) -> No
         (["+expriment=mipnerf"], ["expriment is no setting; did you mean experiment?"]),
         (["batchs.size=3"], ["batchs is no setting; did you mean batches?"]),
         (["+batchs.size=3"], ["batchs is no setting; did you mean batches?"]),
-        (["+batches.foo=3"], ["batches.foo is no setting; known: batching, contrast, contrast_start, divergence"]),
+        (["+batches.foo=3"], ["batches.foo is no setting; known: batching, jitter, num_validation_views"]),
         (["+evaluation.foo=1"], ["evaluation.foo is no setting; known: chunk_size"]),
         (["+sampler.point.num_samples=5"], ["sampler.point is no setting; did you mean points?"]),
         (["+optimizer.foo=1"], ["optimizer.foo is no setting; known: adam_epsilon"]),

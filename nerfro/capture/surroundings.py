@@ -245,7 +245,7 @@ class Room(Boundary):
         self.field = HashGridField(
             low, high, radius, finest_resolution=512, log2_table_size=17, direction_bands=1, initial_depth=3.0
         )
-        self.sampler = DensityGridSampler(box_min=low, box_max=high, radius=radius, looks=0.25, decay=0.6)
+        self.sampler = DensityGridSampler(box_min=low, box_max=high, radius=radius, update_fraction=0.25, decay=0.6)
         self.draws: Draws | None = None  # random numbers of the current training step
 
     def forward(self, exits: Exits) -> Float[Tensor, "P 3"]:

@@ -29,8 +29,10 @@ class PixelStore:
         self._levels = levels.view(-1, 3)
 
     def to(self, device: torch.device | str) -> PixelStore:
+        """Move the colours to a device; a store on another device keeps no copy on the host."""
         moved = object.__new__(PixelStore)
-        moved._array, moved._levels = self._array, self._levels.to(device)
+        moved._levels = self._levels.to(device)
+        moved._array = self._array if moved._levels.device == self._levels.device else None
         return moved
 
     def forget(self) -> None:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,11 +14,12 @@ from typing import Annotated, Literal, Optional
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.allowed import Natural, NotNegative, NumRays, Positive, Side
+from nerfro.allowed import Natural, NumRays
 from nerfro.errors import Interrupted, NerfroError
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.files.owned import held, remove_unfinished, require_own
 from nerfro.paths import user_path
+from nerfro.subdivision import SubdivisionChanges
 
 REQUEST_FILE = "evaluate.yaml"
 
@@ -30,10 +32,8 @@ class EvaluateConfig:
     split: str = "test"  # split to render
     root: Optional[str] = None  # folder of the data set, if it has moved since training
     chunk_size: Optional[NumRays] = None  # rays rendered at once, which limits memory; by default as in training
-    # Rays per pixel (see docs/experiments.md); by default as in training.
-    supersample: Optional[Side] = None
-    divergence: Optional[NotNegative] = None
-    contrast: Optional[Positive] = None
+    # Which pixels get several rays (see docs/experiments.md); by default as in training.
+    subdivision: SubdivisionChanges = dataclasses.field(default_factory=SubdivisionChanges)
     # Steps that refine test cameras on left image halves, to score right halves; by default as in training.
     refine_steps: Optional[Natural] = None
     predictions: Optional[str] = None  # folder of images to score, instead of a checkpoint
@@ -62,11 +62,12 @@ def require_one_task(config: DictConfig) -> None:
         raise NerfroError(f"predictions={config.predictions} need references; give references=DIR")
     others: tuple[str, ...]
     if config.checkpoint is None:
-        task, others = "predictions", ("split", "root", "chunk_size", "supersample", "divergence", "contrast")
+        task, others = "predictions", ("split", "root", "chunk_size", "subdivision")
     else:
         task, others = "checkpoint", ("references", "masks", "alpha")
+    default = OmegaConf.structured(EvaluateConfig)
     for name in others:
-        if config[name] != getattr(EvaluateConfig, name):
+        if config[name] != default[name]:
             raise NerfroError(f"{name}={config[name]} has no effect with {task}=...; remove it")
 
 

@@ -1,4 +1,4 @@
-"""Sampling where a remembered density says that something is: the role of a coarse network, at the cost of a lookup."""
+"""Importance sampling by a grid of the field's density, which replaces a coarse network at the cost of a lookup."""
 
 from __future__ import annotations
 
@@ -18,47 +18,50 @@ from nerfro.geometry.contraction import contract, contracted_box, contraction_sc
 from nerfro.kernels.arrays import arrays
 from nerfro.registry import register
 from nerfro.samplers.base import PointSampler
-from nerfro.samplers.measures import Contracted, WithinBox
+from nerfro.samplers.measures import ContractedLength, LengthInBox
 from nerfro.samplers.stepfun import invert_cdf, midpoints, spread_uniform, volume_weights
 from nerfro.samplers.stratified import cone_samples
 from nerfro.types import Path, Rendering, Samples
 
-# Remembered optical depth below which a sample of a picture is not worth asking the field.
+# Optical depth by the grid below which a sample is not worth a query of the field.
 _EMPTY = 0.005
-# In training: samples of the faintest branches, and the weight from which a branch is asked everywhere.
+# In training: samples on the faintest branches, and the weight from which all samples of a branch are queried.
 _FEWEST, _HEAVY = 8, 0.5
 
 
 @register("sampler/points", "density_grid")
 class DensityGridSampler(PointSampler):
-    """Inverse transform sampling of weights that a grid of the field's density predicts on arc length.
+    """Draw samples in proportion to the rendering weights that a grid of the field's density predicts.
 
-    The grid lies over the content's box. It remembers the largest density found in each cell, decaying, and looks at
-    some cells of the finest field now and then while training (Instant-NGP's occupancy grid, appendix C, kept as
-    density so that it can be drawn from along a bent path). Weights include transmittance, so that nothing is sampled
-    behind what is opaque, and a share of the samples stays uniform, so that nothing is forgotten.
+    The grid covers the box of the content. Each cell keeps the largest density that was found in it, with exponential
+    decay, and a fraction of the cells is updated from the finest field at regular steps of training. This is the
+    occupancy grid of Instant-NGP (Mueller et al. 2022, appendix C), but it keeps densities, so that samples can be
+    drawn from them along a bent path. The predicted weights include transmittance, so that few samples lie behind
+    opaque cells. A fraction of the samples is spread evenly, so that no region is left out.
 
     Args:
-        num_samples: intervals on each path.
-        num_bins: places along the path at which the grid is asked.
-        box_min, box_max: corners of the content's box; nothing is sampled outside.
-        radius: of a ball around the box's middle, world units, to sample all of space instead, evenly in the length
-            that paths have where what is beyond the ball is contracted (see `field=hash_grid`); none for the box alone.
-        near: arc length at which samples begin then, whatever the path's; they go on to practical infinity.
-        resolution: cells of the grid along each side.
-        uniform: share of the samples that are spread evenly.
-        every: steps between two looks at the field.
-        looks: share of the cells that are looked at then, drawn at random; of those in which places of the world lie.
-        decay: factor of a cell's remembered density at each look.
-        trust: most of the light that one bin is believed to stop. A cell remembers its densest place, but many rays
-            cross it elsewhere, and what they meet behind it would get next to no samples if the cell were opaque.
-        num_shown: intervals in evaluation, where noise does not average out over steps; none for as many.
+        num_samples: number of intervals on each path.
+        num_bins: number of bins along the path at whose midpoints the grid is queried.
+        box_min, box_max: corners of the content's box, world units; there are no samples outside.
+        radius: radius of a ball around the middle of the box, world units. With it, samples cover all of space, evenly
+            in the length of the path in space that is contracted outside the ball (see `field=hash_grid`). None for the
+            box alone.
+        near: arc length at which samples begin if there is a radius; they reach practical infinity.
+        resolution: cells along each side of the grid.
+        uniform: fraction of the samples that is spread evenly.
+        update_every: training steps between two updates of the grid.
+        update_fraction: fraction of the cells that an update queries, drawn at random.
+        decay: factor of the density of a cell at each update.
+        max_bin_alpha: upper bound on the opacity (alpha) of one bin. A cell keeps its largest density, but many rays
+            cross it elsewhere; without the bound, what these rays meet behind it would get next to no samples.
+        num_samples_evaluation: number of intervals in evaluation, where noise does not average out over steps; None
+            for `num_samples`.
     """
 
     num_levels = 1
     box: Float[Tensor, "2 3"]
     density: Float[Tensor, "C C C"]
-    inside: Int[Tensor, "P"] | None  # numbers of the cells that are looked at; none for all
+    inside: Int[Tensor, "M"] | None  # numbers of the cells that updates query; None for all
 
     def __init__(
         self,
@@ -70,21 +73,22 @@ class DensityGridSampler(PointSampler):
         near: NotNegative = 0.0,
         resolution: Annotated[int, Range(at_least=2, at_most=1024)] = 64,
         uniform: Share = 0.2,
-        every: Count = 16,
-        looks: Share = 1 / 16,
+        update_every: Count = 16,
+        update_fraction: Share = 1 / 16,
         decay: Share = 0.9,
-        trust: Annotated[float, Range(more_than=0, at_most=1)] = 0.4,
-        num_shown: Annotated[int, Range(at_least=1, at_most=8192)] | None = None,
+        max_bin_alpha: Annotated[float, Range(more_than=0, at_most=1)] = 0.4,
+        num_samples_evaluation: Annotated[int, Range(at_least=1, at_most=8192)] | None = None,
     ) -> None:
         super().__init__()
         self.num_samples, self.num_bins, self.resolution = num_samples, num_bins, resolution
-        self.uniform, self.every, self.looks, self.decay = uniform, every, looks, decay
-        self.trust, self.num_shown = trust, num_shown
+        self.uniform, self.decay, self.max_bin_alpha = uniform, decay, max_bin_alpha
+        self.update_every, self.update_fraction = update_every, update_fraction
+        self.num_samples_evaluation = num_samples if num_samples_evaluation is None else num_samples_evaluation
         self.radius, self.near = radius, near
         box = torch.from_numpy(corners_of_box(box_min, box_max)).float()
         self.register_buffer("box", box if radius is None else contracted_box(box, radius), persistent=False)
         self.register_buffer("density", torch.zeros(resolution, resolution, resolution))
-        inside = None if radius is None else _cells_of_the_world(resolution)
+        inside = None if radius is None else _cells_in_ball(resolution)
         self.register_buffer("inside", inside, persistent=False)
 
     def forward(self, path: Path, previous: Rendering | None, draws: Draws | None = None) -> Samples:
@@ -92,8 +96,8 @@ class DensityGridSampler(PointSampler):
             draw = self.draw_compiled if path.s.device.type == "cpu" else self.draw
             samples = draw(path, draws)
             if draws is not None:
-                samples = replace(samples, occupied=self._asked(path, samples))
-        # The kernel has found positions too; they are asked of the path only where it has gradients to give.
+                samples = replace(samples, occupied=self._queried(path, samples))
+        # The kernel returns positions without gradients, which only some paths have.
         if not path.positions.requires_grad:
             return samples
         along = Samples.along(path, samples.s, samples.edges)
@@ -106,7 +110,7 @@ class DensityGridSampler(PointSampler):
         lacks are at its end and have no length.
         """
         if draws is None:
-            return spread_uniform(path, (self.num_shown or self.num_samples) + 1, None)
+            return spread_uniform(path, self.num_samples_evaluation + 1, None)
         num = self._num_intervals(path)[:, None]
         edge = torch.arange(self.num_samples + 1, device=num.device).minimum(num)
         return (edge + draws.for_rays(path.ray, self.num_samples + 1).gather(1, edge)) / (num + 1)
@@ -118,10 +122,10 @@ class DensityGridSampler(PointSampler):
         return (self.num_samples * _weight(path)).ceil().clamp(min=min(self.num_samples, _FEWEST)).long()
 
     @staticmethod
-    def _asked(path: Path, samples: Samples) -> Bool[Tensor, "P N"] | None:
-        """Which samples the field is asked at in training: all but those of faint branches where nothing is remembered.
+    def _queried(path: Path, samples: Samples) -> Bool[Tensor, "P N"] | None:
+        """Samples at which the field is queried in training: all but those of faint branches in empty cells.
 
-        The field may have grown since the grid has looked; heavy branches find that out.
+        The field may have become dense since the last update of the grid, which heavy branches discover.
         """
         if not path.splits:
             return None
@@ -132,13 +136,13 @@ class DensityGridSampler(PointSampler):
         """Draw samples with PyTorch; the reference implementation of the compiled kernel."""
         u = self._quantiles(path, draws)
         if self.radius is None:
-            measure: WithinBox | Contracted = WithinBox.of(path, self.box)
+            measure: LengthInBox | ContractedLength = LengthInBox.of(path, self.box)
         else:
-            measure = Contracted.of(path, self.centre, self.radius, self.near)
+            measure = ContractedLength.of(path, self.centre, self.radius, self.near)
         places = torch.linspace(0, 1, self.num_bins + 1, device=u.device) * measure.total[:, None]
         positions, _ = path.at(measure.arc_length(midpoints(places)).to(path.s.dtype))
-        believed = (self.lookup(self.contracted(positions)) * places.diff(dim=1)).clamp(max=self._deepest)
-        weights, _ = volume_weights(believed, torch.ones_like(believed))
+        estimated = (self.lookup(self.contracted(positions)) * places.diff(dim=1)).clamp(max=self._max_bin_depth)
+        weights, _ = volume_weights(estimated, torch.ones_like(estimated))
         share = weights / weights.sum(-1, keepdim=True).clamp(min=1e-6)
         places = invert_cdf(places, share + self._floor, u)
         edges = measure.arc_length(places).to(path.s.dtype)
@@ -146,8 +150,8 @@ class DensityGridSampler(PointSampler):
             samples = cone_samples(path, edges)
         else:
             samples = Samples.along(path, measure.arc_length(midpoints(places)).to(path.s.dtype), edges)
-            smaller = contraction_scale(samples.positions, self.centre, self.radius)
-            lengths = (places.diff(dim=1) / smaller).to(path.s.dtype)
+            scale = contraction_scale(samples.positions, self.centre, self.radius)
+            lengths = (places.diff(dim=1) / scale).to(path.s.dtype)
             samples = replace(samples, lengths=lengths, measure=places.to(path.s.dtype))
         depth = self.lookup(self.contracted(samples.positions)) * places.diff(dim=1)
         return replace(samples, occupied=depth >= _EMPTY)
@@ -157,12 +161,12 @@ class DensityGridSampler(PointSampler):
         from nerfro.samplers.density_grid_cpu import draw  # compiled code, so only where it is used
 
         if draws is None:
-            num_samples, of_path, key = self.num_shown or self.num_samples, (path.ray[:0], path.ray[:0]), (0, 0, 0, 0)
+            num_samples, of_path, key = self.num_samples_evaluation, (path.ray[:0], path.ray[:0]), (0, 0, 0, 0)
         else:
             of_path = draws.ray[path.ray], self._num_intervals(path)
             num_samples, key = self.num_samples, draws.counters("samples")
         tensors = path.positions, path.directions, path.s, *self.box, self.density, *of_path
-        settings = self.num_bins, self._floor, self.trust, _EMPTY, self.radius or 0.0, self.near
+        settings = self.num_bins, self._floor, self.max_bin_alpha, _EMPTY, self.radius or 0.0, self.near
         arguments: list[Any] = [*arrays(*tensors), key, num_samples, *settings]
         drawn = draw(*arguments)
         edges, s, positions, directions, occupied, *of_measure = (torch.from_numpy(array) for array in drawn)
@@ -174,63 +178,62 @@ class DensityGridSampler(PointSampler):
         return self.box.mean(0)
 
     def contracted(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Where the grid has what is at these positions of the world."""
+        """Map positions in world space to the space of the grid."""
         return positions if self.radius is None else contract(positions, self.centre, self.radius)
 
     @property
-    def _deepest(self) -> float:
-        """Optical depth of a bin that stops as much light as one is believed to stop."""
-        return -math.log1p(-self.trust) if self.trust < 1 else math.inf
+    def _max_bin_depth(self) -> float:
+        """Optical depth of a bin whose opacity is `max_bin_alpha`."""
+        return -math.log1p(-self.max_bin_alpha) if self.max_bin_alpha < 1 else math.inf
 
     @property
     def _floor(self) -> float:
-        """Weight of each bin that makes `uniform` of the samples even, when the shares sum to one."""
+        """Weight of each bin that spreads the fraction `uniform` of the samples evenly, where weights sum to one."""
         return self.uniform / (1 - self.uniform) / self.num_bins
 
     def lookup(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Remembered density of the cell that each position of the grid lies in; per contracted length."""
+        """Density of the cell at each position in the space of the grid, per unit of (contracted) length."""
         cell = ((positions - self.box[0]) / (self.box[1] - self.box[0]) * self.resolution).long()
         x, y, z = cell.clamp(0, self.resolution - 1).unbind(-1)
         return self.density.view(-1)[(x * self.resolution + y) * self.resolution + z]
 
     @torch.no_grad()
     def after_step(self, fields: Sequence[Field], draws: Draws) -> None:
-        """Look at some of the cells, at a random place in each."""
-        if draws.step % self.every:
+        """Update some of the cells from the finest field, each at a random position in it."""
+        if draws.step % self.update_every:
             return
         device, inside = self.density.device, self.inside
         num_cells = self.resolution**3 if inside is None else len(inside)
-        words = draws.words(torch.arange(int(num_cells * self.looks), device=device), 4, "density grid")
+        words = draws.words(torch.arange(int(num_cells * self.update_fraction), device=device), 4, "density grid")
         cells = words[:, 0] * num_cells >> 32
         cells = cells if inside is None else inside[cells]
         corners = torch.stack(
             [cells // self.resolution**2, cells // self.resolution % self.resolution, cells % self.resolution], dim=-1
         )
         unit = (corners + (words[:, 1:] >> 8) * 2.0**-24) / self.resolution
-        places = self.box[0] + unit * (self.box[1] - self.box[0])
-        found = self._look(fields[-1], places)
+        density = self._query(fields[-1], self.box[0] + unit * (self.box[1] - self.box[0]))
         flat = self.density.view(-1)
         # A cell that was drawn twice must not depend on the order of writing, or runs could not be repeated.
         flat[cells] = flat[cells] * self.decay
-        flat.scatter_reduce_(0, cells, found, "amax")
+        flat.scatter_reduce_(0, cells, density, "amax")
 
-    def _look(self, field: Field, places: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
-        """A field's density at places of the grid."""
+    def _query(self, field: Field, contracted: Float[Tensor, "M 3"]) -> Float[Tensor, "M"]:
+        """Density of a field at positions in the space of the grid."""
         if self.radius is None:
-            return field.density(places)
-        positions = expand(places, self.centre, self.radius)
-        outside = (places - self.centre).norm(dim=-1) >= 2 * self.radius  # where no place of the world lies
+            return field.density(contracted)
+        positions = expand(contracted, self.centre, self.radius)
+        outside = (contracted - self.centre).norm(dim=-1) >= 2 * self.radius  # beyond infinity
         density = field.density(positions) / contraction_scale(positions, self.centre, self.radius)
         return torch.where(outside, 0.0, density)
 
 
 def _weight(path: Path) -> Float[Tensor, "P"]:
-    """Share of its ray's light that a polyline brings, of the colour of which it brings most."""
+    """Largest throughput of each polyline over the channels, at most 1."""
     return path.throughput.amax(-1).clamp(max=1)
 
 
-def _cells_of_the_world(resolution: int) -> Int[Tensor, "P"]:
-    """Cells of the cube around contracted space, but for those in its corners, in which no place of the world lies."""
+def _cells_in_ball(resolution: int) -> Int[Tensor, "M"]:
+    """Cells of the cube around contracted space that meet the ball; the others, in its corners, are beyond infinity."""
     edges = torch.linspace(-1, 1, resolution + 1).square()
     nearest = torch.minimum(edges[:-1], edges[1:])
     return ((nearest[:, None, None] + nearest[:, None] + nearest).flatten() < 1).nonzero()[:, 0]

@@ -1,4 +1,4 @@
-"""The length in which a polyline is sampled evenly: its own within a box, or that in contracted space."""
+"""Measures of a polyline in which it is sampled evenly: arc length within a box, or contracted length."""
 
 from __future__ import annotations
 
@@ -13,55 +13,70 @@ from nerfro.types import Path
 
 
 @dataclass(frozen=True)
-class WithinBox:
-    """Arc length itself, from a path's first entry into a box to its last exit."""
+class LengthInBox:
+    """Arc length from a path's first entry into a box to its last exit.
+
+    Attributes:
+        first: arc length of the first entry.
+        total: arc length from there to the last exit.
+    """
 
     first: Float[Tensor, "P"]
-    total: Float[Tensor, "P"]  # of all that is sampled
+    total: Float[Tensor, "P"]
 
     @classmethod
-    def of(cls, path: Path, box: Float[Tensor, "2 3"]) -> WithinBox:
+    def of(cls, path: Path, box: Float[Tensor, "2 3"]) -> LengthInBox:
         first, last = path.span(box)
         return cls(first, last - first)
 
-    def arc_length(self, place: Float[Tensor, "P N"]) -> Float[Tensor, "P N"]:
-        return self.first[:, None] + place
+    def arc_length(self, length: Float[Tensor, "P N"]) -> Float[Tensor, "P N"]:
+        """Convert lengths from 0 to `total` to arc lengths."""
+        return self.first[:, None] + length
 
 
 @dataclass(frozen=True)
-class Contracted:
-    """Arc length times the contraction scale, added up over all runs; from near to practical infinity.
+class ContractedLength:
+    """Length of a polyline in contracted space, from `near` to practical infinity.
 
-    The first run is followed back, and the last one on, as far as is needed, whatever the path's own ends.
+    The first segment is extended backwards and the last one forwards as far as is needed, beyond the path's own ends.
+
+    Attributes:
+        cumulative: contracted length at the start of each segment, and in total.
+        start_length: signed contracted length from the segment's closest approach to its start.
+        closest: arc length of the segment's closest approach to the centre.
+        impact: distance from the centre there (impact parameter).
+        radius: radius of the ball beyond which space is contracted.
     """
 
-    marks: Float[Tensor, "P S+1"]  # measure at the beginning of each run, and in all
-    begin: Float[Tensor, "P S"]  # contracted length from the run's nearest place to the centre to its beginning
-    passing: Float[Tensor, "P S"]  # arc length at that place
-    aside: Float[Tensor, "P S"]  # distance from the centre there
+    cumulative: Float[Tensor, "P S+1"]
+    start_length: Float[Tensor, "P S"]
+    closest: Float[Tensor, "P S"]
+    impact: Float[Tensor, "P S"]
     radius: float
 
     @classmethod
-    def of(cls, path: Path, centre: Float[Tensor, "3"], radius: float, near: float) -> Contracted:
+    def of(cls, path: Path, centre: Float[Tensor, "3"], radius: float, near: float) -> ContractedLength:
         positions, directions, s = (x.detach().double() for x in (path.positions, path.directions, path.s))
         offsets = centre - positions
         along = (offsets * directions).sum(-1)
-        aside = (offsets.square().sum(-1) - along.square()).clamp(min=0).sqrt()
-        passing = s + along
+        impact = (offsets.square().sum(-1) - along.square()).clamp(min=0).sqrt()
+        closest = s + along
         start = torch.cat([s[:, 1:2].clamp(max=near), s[:, 1:]], 1)
-        end = torch.cat([s[:, 1:], passing[:, -1:] + FAR * aside[:, -1:].clamp(min=radius)], 1)
-        begin = contracted_length(start - passing, aside, radius)
-        lengths = contracted_length(end - passing, aside, radius) - begin
-        marks = torch.cat([torch.zeros_like(begin[:, :1]), lengths.cumsum(1)], 1)
-        return cls(marks, begin, passing, aside, radius)
+        end = torch.cat([s[:, 1:], closest[:, -1:] + FAR * impact[:, -1:].clamp(min=radius)], 1)
+        start_length = contracted_length(start - closest, impact, radius)
+        lengths = contracted_length(end - closest, impact, radius) - start_length
+        cumulative = torch.cat([torch.zeros_like(lengths[:, :1]), lengths.cumsum(1)], 1)
+        return cls(cumulative, start_length, closest, impact, radius)
 
     @property
     def total(self) -> Float[Tensor, "P"]:
-        return self.marks[:, -1]
+        return self.cumulative[:, -1]
 
-    def arc_length(self, place: Float[Tensor, "P N"]) -> Float[Tensor, "P N"]:
-        """Arc lengths at places from 0 to `total`."""
-        last = self.begin.shape[1] - 1
-        run = (torch.searchsorted(self.marks, place.contiguous().double()) - 1).clamp(0, last)
-        begin, passing, aside, mark = (x.gather(1, run) for x in (self.begin, self.passing, self.aside, self.marks))
-        return passing + world_length(begin + place - mark, aside, self.radius)
+    def arc_length(self, length: Float[Tensor, "P N"]) -> Float[Tensor, "P N"]:
+        """Convert contracted lengths from 0 to `total` to arc lengths."""
+        last = self.start_length.shape[1] - 1
+        segment = (torch.searchsorted(self.cumulative, length.contiguous().double()) - 1).clamp(0, last)
+        start_length, closest, impact, before = (
+            x.gather(1, segment) for x in (self.start_length, self.closest, self.impact, self.cumulative)
+        )
+        return closest + world_length(start_length + length - before, impact, self.radius)

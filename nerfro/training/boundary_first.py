@@ -30,12 +30,11 @@ class BoundaryFirst(Callback):
     on from a checkpoint has it behind it.
 
     Args:
-        batches: of the run.
         num_steps: how many.
     """
 
-    def __init__(self, batches: RayBatches, num_steps: int) -> None:
-        self._batches, self._num_steps = batches, num_steps
+    def __init__(self, num_steps: int) -> None:
+        self._num_steps = num_steps
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, TrainingModule)
@@ -49,7 +48,7 @@ class BoundaryFirst(Callback):
         optimizer = trainer.optimizers[0]
         group = next(group for group in optimizer.param_groups if group["name"] == "boundary")
         first, last = _RATES
-        batches = self._batches.to(scene.device, learning[0].dtype)
+        batches: RayBatches = trainer.datamodule.batches  # type: ignore[attr-defined]
         num_pixels = min(_NUM_PIXELS, int(_SHARE * batches.num_pixels))
         for step in track("boundary", range(self._num_steps)):
             rays, view, rgb = batches.missing(box, num_pixels, step, scene.camera)

@@ -38,12 +38,11 @@ class CameraSteps(Callback):
     """Moves the training cameras by sky and outlines before training, and at some steps, with the scene held.
 
     Args:
-        batches: of the run.
-        views: of the run.
+        views: training views.
     """
 
-    def __init__(self, batches: RayBatches, views: Views) -> None:
-        self._batches, self._views = batches, views
+    def __init__(self, views: Views) -> None:
+        self._views = views
         self._told: dict[str, PriorInformation] = {}  # by what
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -52,7 +51,7 @@ class CameraSteps(Callback):
         camera = scene.camera
         if trainer.global_step > 0 or box is None or not isinstance(camera, RefinedCamera):
             return
-        batches = self._batches.to(scene.device)
+        batches = cast(RayDataModule, trainer.datamodule).batches  # type: ignore[attr-defined]
         panorama = align(camera, batches.cameras, batches.photographed, lambda rays: misses(box, rays))
         known = {"panorama": panorama, "outlines": meet_masks(camera, self._views, scene.medium, panorama)}
         self._told = {name: told for name, told in known.items() if told is not None}
@@ -68,12 +67,13 @@ class CameraSteps(Callback):
         camera, step = pl_module.scene.camera, trainer.global_step
         if not isinstance(camera, RefinedCamera) or step < camera.start or (step - camera.start) % camera.every:
             return
-        cast(RayDataModule, trainer.datamodule).make_anew()  # type: ignore[attr-defined]
+        data = cast(RayDataModule, trainer.datamodule)  # type: ignore[attr-defined]
+        data.make_anew()
         before = (step - camera.start) // camera.every
         reach = max(_LEAST_REACH, _FIRST_REACH * _SHRINKING**before)
         # Not asked whether errors fall: every camera has painted its own ghost, which holds it where it is.
         how = Step(reach, _SCALE * reach, _LONGEST, fraction=min(1.0, _WHOLE / (before + 1)), keep_improvements=False)
-        _move(pl_module.renderer, camera, self._batches, step, how, self._told)
+        _move(pl_module.renderer, camera, data.batches, step, how, self._told)
 
 
 @torch.no_grad()
@@ -89,7 +89,7 @@ def _move(
 
     Where a panorama tells how they are turned, what is seen past the object does not: the sky has learned it from them.
     """
-    batches, box = batches.to(renderer.scene.device), occupied(renderer)
+    box = occupied(renderer)
     candidates = batches.of_each_view(_DRAWN * camera.num_pixels, step)
     past = None
     if "panorama" in told and box is not None:

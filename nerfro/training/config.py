@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Optional
 
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from nerfro.allowed import Count, Natural, NotNegative, NumRays, Positive, Range, Resolution, Side
+from nerfro.allowed import Count, Natural, NotNegative, NumRays, Positive, Range, Resolution
 from nerfro.data.base import DataSource, Views
 from nerfro.data.exposure import exif_exposures
 from nerfro.data.validation_views import WithValidationViews
@@ -18,6 +18,7 @@ from nerfro.losses.base import Loss
 from nerfro.media.analytic import Vacuum
 from nerfro.registry import build, configure, find
 from nerfro.rendering import Components, Renderer
+from nerfro.subdivision import Subdivision
 from nerfro.training.backdrop import settle_backdrop
 from nerfro.training.content import ContentConfig, settle_content
 from nerfro.training.optimizer import OptimizerConfig
@@ -39,19 +40,14 @@ class BatchesConfig:
     # Pixels of `single_image` at a time, or of `all_images`.
     batching: Annotated[str, Literal["single_image", "all_images"]] = "single_image"
     jitter: bool = False  # draw each ray anywhere inside its pixel instead of through its centre
-    # Share of the pixels of a step that is drawn of the object's alone, which masks tell; the others are of all pixels.
-    object: Annotated[float, Range(at_least=0, at_most=1)] = 0.0
+    # Fraction of the pixels of a step that is drawn from the object's alone, which masks mark; the others are from all.
+    object_fraction: Annotated[float, Range(at_least=0, at_most=1)] = 0.0
     # Training views, spread over the cameras' places, that are not trained on: they are the `val` split then.
-    hold_back: Natural = 0
+    num_validation_views: Natural = 0
     precrop_steps: Natural = 0  # number of first steps that see only the central window of the images
     precrop_fraction: Annotated[float, Range(more_than=0, at_most=1)] = 0.5  # side of that window
-    # Rays in each direction of a pixel whose ray leaves `divergence` pixels or more away from the ray beside it;
-    # 1 gives all pixels one ray.
-    supersample: Side = 1
-    divergence: NotNegative = 8.0
-    # And of a pixel of the object whose photograph differs from a neighbour's by this much (sRGB); none for no others.
-    contrast: Optional[Positive] = None  # noqa: UP045
-    contrast_start: Natural = 0  # steps before: details are learned last, and more rays make slower steps
+    # Which pixels get several rays, in training and in validation.
+    subdivision: Subdivision = dataclasses.field(default_factory=lambda: Subdivision(divergence=8.0))
 
 
 @dataclass
@@ -67,12 +63,7 @@ class EvaluationConfig:
     # Steps between two pictures of validation views while training; PSNR of some of their pixels is taken five times as
     # often. 0 for never.
     every: Natural = 500
-    # Rays along each side of a pixel that is supersampled, see `divergence`; 1 for one central ray.
-    supersample: Side = 1
-    # Supersample pixels whose ray leaves this many pixels or more away from the one beside it; 0 for all.
-    divergence: NotNegative = 0.0
-    # And pixels whose colour differs from a neighbour's by this much (sRGB); none for no others.
-    contrast: Optional[Positive] = None  # noqa: UP045
+    subdivision: Subdivision = dataclasses.field(default_factory=Subdivision)  # which pixels get several rays
     # Steps in which test cameras are refined on the left halves of their photographs, to be scored on the right ones
     # under a name of their own; 0 for none.
     refine_steps: Natural = 0
@@ -101,7 +92,6 @@ class TrainerConfig:
     precision: Annotated[str, Literal["32-true", "fastest", "16-mixed", "bf16-mixed", "64-true"]] = "32-true"
     gradient_clip_val: Optional[Positive] = None  # noqa: UP045
     gradient_clip_algorithm: Annotated[Optional[str], Literal["norm", "value"]] = None  # noqa: UP045
-    accumulate_grad_batches: Optional[Count] = None  # noqa: UP045
     log_every_n_steps: Count = 50
     deterministic: Any = None
     benchmark: Optional[bool] = None  # noqa: UP045
@@ -160,8 +150,8 @@ class TrainConfig:
 
 
 def build_data(config: DictConfig) -> DataSource:
-    """The data of a run; views that it holds back are their `val` split."""
-    source, number = build(config.data), OmegaConf.select(config, "batches.hold_back")  # which older checkpoints lack
+    """Build the data set of a run; training views that are left out for validation are its `val` split."""
+    source, number = build(config.data), config.batches.num_validation_views
     return WithValidationViews(source, number) if number else source
 
 

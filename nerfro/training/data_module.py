@@ -29,7 +29,10 @@ NO_PICTURE = -1
 
 
 class RayDataModule(LightningDataModule):
-    """Random training pixels, resident on the training device, and one validation view at a time.
+    """Random training pixels and one validation view at a time.
+
+    The pixels move to the training device when training begins. All that needs training pixels later takes them from
+    `batches`, so that there is one copy.
 
     Every fifth look at the validation views (`looks_every`) is a picture of one of them; some of their pixels are
     looked at each time.
@@ -47,10 +50,10 @@ class RayDataModule(LightningDataModule):
     def train_dataloader(self) -> Iterator[int]:
         assert self.trainer is not None  # Lightning attaches it before it asks
         device, module = self.trainer.strategy.root_device, cast(TrainingModule, self.trainer.lightning_module)
-        self._batches = self.batches.to(device, cast(torch.dtype, module.dtype))
+        self.batches = self.batches.to(device, cast(torch.dtype, module.dtype))
         self.end_thread()
         if device.type == "cpu" and can_trace_ahead(module.renderer):
-            self._ahead = OneAhead(self._batches.batch)
+            self._ahead = OneAhead(self.batches.batch)
         # Lightning asks after it has restored a checkpoint, so a resumed run goes on with the batch it would have had.
         return itertools.count(self.trainer.global_step)
 
@@ -70,7 +73,7 @@ class RayDataModule(LightningDataModule):
         if self._ahead is not None:
             return self._ahead(batch)
         with torch.no_grad():
-            return self._batches.batch(batch)
+            return self.batches.batch(batch)
 
     def teardown(self, stage: str) -> None:
         self.end_thread()
@@ -137,7 +140,7 @@ def can_trace_ahead(renderer: Renderer) -> bool:
 
 def traced(batches: RayBatches, renderer: Renderer, config: DictConfig) -> RayBatches:
     """The batches with their paths, and with several rays in pixels for which one does not stand."""
-    subdivision = Subdivision.of(config.batches)
+    subdivision = Subdivision(**config.batches.subdivision)
     return batches.traced(
         lambda rays, view: renderer.path_sampler(renderer.scene.camera(rays, view), renderer.scene.medium),
         lambda rays, view: renderer.exit_directions(renderer.scene.camera(rays, view)),

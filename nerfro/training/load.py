@@ -46,4 +46,6 @@ def scene_of(checkpoint: dict[str, Any], config: DictConfig, device: torch.devic
     renderer = restore(checkpoint, config).to(device)
     corners = [config.content.box_min, config.content.box_max]  # which the model has settled
     content = None if None in corners else torch.tensor([list(corner) for corner in corners])
-    return TrainedScene(renderer, build_data(config), Subdivision.of(config.evaluation), config.name, content)
+    return TrainedScene(
+        renderer, build_data(config), Subdivision(**config.evaluation.subdivision), config.name, content
+    )

@@ -47,7 +47,7 @@ class RayBatches:
         precrop_steps: Natural = 0,
         precrop_fraction: float = 0.5,
         jitter: bool = False,
-        object_share: Annotated[float, Range(at_least=0, at_most=1)] = 0.0,
+        object_fraction: Annotated[float, Range(at_least=0, at_most=1)] = 0.0,
     ) -> None:
         if len(views) == 0:
             raise NerfroError("there are no training images; give at least one")
@@ -72,11 +72,11 @@ class RayBatches:
             usable = views.usable
             self._usable = {window: _Usable((view == 1 for view in usable), len(views), window) for window in windows}
             self._check_usable(np.diff(self._usable[self._crop].starts), views.names)
-        self._object_share = object_share
+        self._object_fraction = object_fraction
         self._of_object: dict[Window, _Usable] | None = None
-        if object_share > 0 and views.masks is None:
-            warn("batches.object: not every training photograph has a mask, so pixels are drawn of all alike")
-        elif object_share > 0:
+        if object_fraction > 0 and views.masks is None:
+            warn("batches.object_fraction: not every training photograph has a mask, so pixels are drawn of all alike")
+        elif object_fraction > 0:
             self._of_object = {window: _of_object(views, batching, window) for window in windows}
 
     def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> RayBatches:
@@ -232,7 +232,7 @@ class RayBatches:
             views = generator.integers(len(self._cameras), size=self.batch_size)
             pixels = generator.integers(num_pixels, size=self.batch_size)
         if self._of_object is not None:
-            of_object, count = self._of_object[window], round(self._object_share * self.batch_size)
+            of_object, count = self._of_object[window], round(self._object_fraction * self.batch_size)
             # Spread over the batch, so that processes have the same number each.
             rows = np.arange(count) * self.batch_size // max(1, count)
             views[rows], pixels[rows] = of_object.find(generator.integers(of_object.starts[-1], size=len(rows)))
@@ -255,13 +255,15 @@ def _of_object(views: Views, batching: Batching, window: Window) -> _Usable:
     """The pixels of which the object fills more than a half."""
     assert views.masks is not None
     if batching == "single_image":
-        raise NerfroError("batches.object draws pixels of the object from all images; take batches.batching=all_images")
+        raise NerfroError("batches.object_fraction draws from all images at a time; take batches.batching=all_images")
     filled = (view > 0.5 for view in views.masks)
     if views.usable is not None:
         filled = (mask & (view == 1) for mask, view in zip(filled, views.usable, strict=True))
     found = _Usable(filled, len(views), window)
     if found.starts[-1] == 0:
-        raise NerfroError("batches.object draws pixels of the object, and the masks have none; correct them, or take 0")
+        raise NerfroError(
+            "batches.object_fraction draws pixels of the object, but the masks have none; correct them, or take 0"
+        )
     return found
 
 

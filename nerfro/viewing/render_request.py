@@ -12,10 +12,11 @@ from typing import Annotated, Any, Optional
 import torch
 from omegaconf import MISSING, DictConfig, ListConfig
 
-from nerfro.allowed import Count, NotNegative, Positive, Range
+from nerfro.allowed import Count, Positive, Range
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.paths import user_path
+from nerfro.subdivision import SubdivisionChanges
 from nerfro.variants import variant
 from nerfro.viewing.camera_files import read_cameras
 from nerfro.viewing.camera_paths import PATHS, Flight, Surroundings, fly
@@ -50,10 +51,8 @@ class RenderConfig:
     sky: Optional[str] = None  # lat-long picture that replaces the sky (.hdr, .exr, .png, .jpg)
     # Something that changes from the first frame to the last: medium.ior:1.0:1.6, or sky:a.hdr,b.hdr.
     sweep: Optional[str] = None
-    # Rays per pixel (see docs/experiments.md); as trained by default.
-    supersample: Optional[Count] = None
-    divergence: Optional[NotNegative] = None
-    contrast: Optional[Positive] = None
+    # Which pixels get several rays (see docs/experiments.md); as trained by default.
+    subdivision: SubdivisionChanges = dataclasses.field(default_factory=SubdivisionChanges)
     chunk_size: Optional[Count] = None  # rays rendered at once, which bounds the memory; as trained by default
     out: str = MISSING  # folder of the frames and films; an interrupted rendering goes on where it was
     format: str = "png"  # of the frames; exr for values as they are: linear radiance, world units, unit vectors
@@ -125,10 +124,10 @@ def labels(config: DictConfig) -> list[str]:
 
 def prepared(config: DictConfig, scene: TrainedScene) -> TrainedScene:
     """A loaded scene as it is to be rendered: rays a pixel and at once, and its sky."""
-    wanted = {"side": config.supersample, "divergence": config.divergence, "contrast": config.contrast}
-    rays = replace(scene.subdivision, **{name: value for name, value in wanted.items() if value is not None})
+    changes = {name: value for name, value in config.subdivision.items() if value is not None}
+    subdivision = replace(scene.subdivision, **changes)
     renderer = variant(scene.renderer, chunk_size=config.chunk_size or scene.renderer.chunk_size)
-    scene = replace(scene, renderer=renderer, subdivision=rays)
+    scene = replace(scene, renderer=renderer, subdivision=subdivision)
     return scene if config.sky is None else scene.with_(sky=config.sky)
 
 

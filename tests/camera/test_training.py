@@ -32,7 +32,7 @@ SMALL = [
     "data.near=0.5", "boundary.resolutions=[4,8,16,32]", "batches.size=384", "evaluation.split=train",
     "sampler.points.num_samples=4", "sampler.points.num_bins=16", "sampler.points.resolution=16",
     "field.num_levels=2", "field.log2_table_size=8", "field.width=16", "loss.boundary.start=0", "evaluation.every=0",
-    "trainer.accelerator=cpu", "trainer.max_time=null", "evaluation.supersample=1", "batches.supersample=1",
+    "trainer.accelerator=cpu", "trainer.max_time=null", "evaluation.subdivision.side=1", "batches.subdivision.side=1",
     "medium.ior=1.45",
 ]  # fmt: skip
 

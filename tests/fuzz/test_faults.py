@@ -71,7 +71,7 @@ def report(what: str, seconds: float, moments: Counter[str]) -> None:
 def test_killed_training_that_goes_on_ends_with_the_same_weights(world: World, tmp_path: Path) -> None:
     draw, num_steps = random.Random(0), 40
     options = [*world.train_options(world.root / "data"), "trainer.max_time=null", f"trainer.max_steps={num_steps}"]
-    options += ["checkpoint={every_steps: 1, every_seconds: null}", "evaluation.supersample=8"]
+    options += ["checkpoint={every_steps: 1, every_seconds: null}", "evaluation.subdivision.side=8"]
     log, right = tmp_path / "log", tmp_path / "right" / "run"
     forked.run("train", [*options, f"hydra.run.dir={tmp_path / 'compiles' / 'run'}"], log)
     forked.run("train", [*options, f"hydra.run.dir={right}"], log)
@@ -98,7 +98,7 @@ def test_killed_training_that_goes_on_ends_with_the_same_weights(world: World, t
 @pytest.mark.slow
 def test_killed_evaluation_that_is_repeated_has_the_same_scores(world: World, tmp_path: Path) -> None:
     draw, log = random.Random(1), tmp_path / "log"
-    options = [f"checkpoint={world.root / 'run' / LAST_CHECKPOINT}", "device=cpu", "supersample=16"]
+    options = [f"checkpoint={world.root / 'run' / LAST_CHECKPOINT}", "device=cpu", "subdivision.side=16"]
     for out in ("compiles", "right"):
         forked.run("evaluate", [*options, f"out={tmp_path / out}"], log)
     right = tmp_path / "right"

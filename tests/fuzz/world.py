@@ -70,8 +70,8 @@ class World:
             "trainer.max_steps=1",
             "trainer.max_time=00:00:00:10",  # for those that ask for more steps
             "evaluation.every=0",
-            "evaluation.supersample=1",
-            "batches.supersample=1",
+            "evaluation.subdivision.side=1",
+            "batches.subdivision.side=1",
         ]
 
     def command(self, name: str, *arguments: str, seconds: int = SECONDS) -> Ended:

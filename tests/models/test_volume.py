@@ -75,7 +75,7 @@ def scores(space: dict, boundary: Boundary, num_steps: int = 150) -> list[float]
         **space, num_levels=6, base_resolution=8, finest_resolution=64, log2_table_size=14, width=32, initial_depth=3.0,
         direction_bands=1,
     )  # fmt: skip
-    sampler = DensityGridSampler(24, 48, **space, near=0.3, resolution=32, every=4, decay=0.6)
+    sampler = DensityGridSampler(24, 48, **space, near=0.3, resolution=32, update_every=4, decay=0.6)
     parameters = [*field.parameters(), *boundary.parameters()]
     optimizer = torch.optim.Adam(parameters, eps=1e-15)
     for step in range(num_steps):

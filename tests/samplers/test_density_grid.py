@@ -24,11 +24,11 @@ class DenseBall(Field):
         return Radiance(50.0 * inside, torch.zeros_like(samples.positions))
 
 
-ALL_OF_SPACE = {"radius": 0.7, "near": 0.3, "trust": 0.4}
+ALL_OF_SPACE = {"radius": 0.7, "near": 0.3, "max_bin_alpha": 0.4}
 
 
 def trained_sampler(**space: float) -> DensityGridSampler:
-    sampler = DensityGridSampler(num_samples=16, num_bins=64, resolution=32, every=1, **space)
+    sampler = DensityGridSampler(num_samples=16, num_bins=64, resolution=32, update_every=1, **space)
     for step in range(200):
         sampler.after_step([DenseBall()], example_draws(step=step))
     return sampler
@@ -58,11 +58,11 @@ def test_samples_gather_where_the_density_is() -> None:
     assert inside[dense].mean() > 0.6
 
 
-@pytest.mark.parametrize(("trust", "behind"), [(1.0, 0.0), (0.4, 0.26)])
+@pytest.mark.parametrize(("max_bin_alpha", "behind"), [(1.0, 0.0), (0.4, 0.26)])
 def test_what_stands_behind_a_cell_of_which_a_ray_meets_the_empty_part_gets_samples(
-    trust: float, behind: float
+    max_bin_alpha: float, behind: float
 ) -> None:
-    sampler = DensityGridSampler(num_samples=64, num_bins=64, resolution=32, uniform=0.01, trust=trust)
+    sampler = DensityGridSampler(num_samples=64, num_bins=64, resolution=32, uniform=0.01, max_bin_alpha=max_bin_alpha)
     sampler.density[15:17] = 1e3  # four bins look opaque: two of a cell that something fills in part, and two behind
     path = straight(torch.tensor([0.0, 8.0]), 0.1)
     drawn = sampler(path, None)
@@ -98,7 +98,7 @@ def test_samples_of_all_space_do_not_depend_on_where_a_line_has_vertices() -> No
 
 
 def test_pictures_have_their_own_number_of_samples() -> None:
-    sampler = DensityGridSampler(num_samples=16, num_shown=40)
+    sampler = DensityGridSampler(num_samples=16, num_samples_evaluation=40)
     assert sampler(example_path(4), None, example_draws(4)).s.shape == (4, 16)
     assert sampler(example_path(4), None).s.shape == (4, 40)
 
@@ -150,7 +150,7 @@ def test_a_ray_that_does_not_split_is_sampled_as_ever() -> None:
 
 
 @pytest.mark.parametrize("resolution", [8, 9])
-def test_every_place_of_the_world_is_in_a_cell_that_is_looked_at(resolution: int) -> None:
+def test_every_place_of_the_world_is_in_a_cell_that_is_updated(resolution: int) -> None:
     sampler = DensityGridSampler(box_min=[-1] * 3, box_max=[1] * 3, radius=1.0, resolution=resolution)
     middle = (torch.arange(301) - 150) / 150.5  # of the cube around the ball; some lie in all cells that touch it
     places = torch.cartesian_prod(middle, middle, middle[::7])

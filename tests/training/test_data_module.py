@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
+import weakref
+from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
+from nerfro.data.blender import BlenderData
+from nerfro.data.pixel_store import PixelStore
 from nerfro.kernels import compilation
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.snell import Snell
 from nerfro.training.data_module import OneAhead, RayDataModule, can_trace_ahead
 from nerfro.types import Rays
+from tests.pretended_gpu import GPU, PretendedGpu
 
 
 @pytest.fixture(scope="module")
@@ -179,3 +186,26 @@ def test_a_batch_is_made_when_its_step_begins_if_paths_learn(
     assert data.transfer_batch_to_device(3, torch.device("cpu"), 0) == 3, "a validation view stays its number"
     data.teardown("fit")
     assert not running()
+
+
+def test_there_is_one_copy_of_the_training_pixels(
+    train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They move to the training device once, and steps of the cameras and of the background use them there."""
+    moves, move = [], PixelStore.to
+    monkeypatch.setattr(PixelStore, "to", lambda self, device: moves.append(device) or move(self, device))
+    steps = ["trainer.max_steps=4", "camera=refined", "camera.start=1", "camera.every=1", "optimizer.boundary_steps=2"]
+    finished = train_here(*tiny_default_run, *steps, "evaluation.every=0", f"hydra.run.dir={tmp_path / 'run'}")
+    assert finished.code == 0, finished.err
+    assert len(moves) == 1
+
+
+def test_pixels_on_another_device_keep_no_copy_on_the_host(tiny_scene: Path) -> None:
+    pixels = PixelStore(BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train").images)
+    array, references = weakref.ref(pixels._array), pixels.to("cpu")
+    with PretendedGpu():
+        moved = references.to(GPU)
+    del pixels, references
+    gc.collect()
+    assert array() is None
+    assert moved._levels.device == GPU

@@ -125,7 +125,7 @@ def test_a_share_of_the_pixels_is_of_the_object(views, masked):
     masks[4, 7] = 0.4  # covered by less than a half
     of_object = (masks > 0.5).flatten()
     for given in (views, masked):
-        batches = RayBatches(replace(given, masks=masks), 64, "all_images", seed=0, object_share=0.25)
+        batches = RayBatches(replace(given, masks=masks), 64, "all_images", seed=0, object_fraction=0.25)
         wanted = of_object if given.usable is None else of_object & given.usable.flatten()
         counts = torch.zeros(len(wanted))
         for step in range(300):
@@ -140,7 +140,7 @@ def test_a_share_of_the_pixels_is_of_the_object(views, masked):
 
 
 def test_without_masks_there_are_no_pixels_of_the_object(views, capsys):
-    batches = RayBatches(views, 64, "all_images", seed=3, object_share=0.25)
+    batches = RayBatches(views, 64, "all_images", seed=3, object_fraction=0.25)
     assert "not every training photograph has a mask" in capsys.readouterr().out
     assert torch.equal(batches.batch(5).index, RayBatches(views, 64, "all_images", seed=3).batch(5).index)
 
@@ -148,9 +148,9 @@ def test_without_masks_there_are_no_pixels_of_the_object(views, capsys):
 def test_pixels_of_an_object_need_all_images_and_an_object(views):
     masks = torch.zeros(NUM_VIEWS, HEIGHT, WIDTH)
     with pytest.raises(NerfroError, match="all_images"):
-        RayBatches(replace(views, masks=masks + 1), 64, object_share=0.25)
+        RayBatches(replace(views, masks=masks + 1), 64, object_fraction=0.25)
     with pytest.raises(NerfroError, match="the masks have none"):
-        RayBatches(replace(views, masks=masks), 64, "all_images", object_share=0.25)
+        RayBatches(replace(views, masks=masks), 64, "all_images", object_fraction=0.25)
 
 
 def test_every_view_has_its_own_usable_pixels(views, masked):

@@ -33,7 +33,7 @@ def test_every_setting_that_is_named_exists() -> None:
         ("field.width", Role.METHOD),
         ("trainer.precision", Role.METHOD),
         ("trainer.max_steps", Role.BUDGET),
-        ("evaluation.divergence", Role.SCORING),
+        ("evaluation.subdivision.divergence", Role.SCORING),
         ("evaluation.every", Role.WATCHING),
         ("logger.wandb.name", Role.WATCHING),
         ("checkpoints", Role.METHOD),

@@ -133,10 +133,12 @@ class Surroundings(Field):
 
 @needs_chromium
 def test_contracted_surroundings_are_shown(scene: TrainedScene, tmp_path: Path) -> None:
-    sampler = DensityGridSampler(512, 256, [-2.0] * 3, [2.0] * 3, radius=2.0, near=1.0, resolution=48, looks=0.9)
+    sampler = DensityGridSampler(
+        512, 256, [-2.0] * 3, [2.0] * 3, radius=2.0, near=1.0, resolution=48, update_fraction=0.9
+    )
     field = Surroundings()
     for step in range(3):
-        sampler.after_step([field], example_draws(step=step * sampler.every))
+        sampler.after_step([field], example_draws(step=step * sampler.update_every))
     renderer = with_changed_scene(scene.renderer, fields=torch.nn.ModuleList([field]))
     everywhere = replace(scene, renderer=variant(renderer, point_sampler=sampler))
     found = ask(page_of(everywhere, 96), f"(() => {{ {SHOT} return [0, 1, 2].map((v) => shot(v, 32)); }})()", tmp_path)

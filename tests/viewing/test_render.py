@@ -29,7 +29,7 @@ def render(
     monkeypatch.chdir(tmp_path)
 
     def run(*arguments: str) -> tuple[int, str]:
-        common = ["checkpoint=a.ckpt", "out=O", "resolution=16", "supersample=1"]
+        common = ["checkpoint=a.ckpt", "out=O", "resolution=16", "subdivision.side=1"]
         monkeypatch.setattr(sys, "argv", ["nerfro.render", *common, *arguments])
         code = 0
         try:
