@@ -28,8 +28,6 @@ ADAPTIVE = ["sampler.path.integrator=adaptive", "sampler.path.max_steps=60", "sa
 # A constant is copied to the device once. Fields are asked for samples in the object alone, whose number must be known.
 ONCE = "kernels/constants.py: constant (tensor)"
 SELECTED = "fields/selection.py: evaluate_selected (nonzero)"
-# Paths through triangles come back from the CPU.
-MET = "samplers/polylines.py: path (to)"
 
 
 @pytest.mark.parametrize(
@@ -37,7 +35,7 @@ MET = "samplers/polylines.py: path (to)"
     [
         (["refractive", "sampler.path.max_events=2"], {ONCE, SELECTED}),
         (["refractive", "sampler/path=eikonal", "sampler.path.max_steps=60"], {ONCE, SELECTED}),
-        (["refractive", "sampler.path.interface=mesh"], {ONCE, SELECTED, MET}),
+        (["refractive", "sampler.path.interface=mesh"], {ONCE, SELECTED}),
         (["refractive_room", "sampler.path.max_events=2"], {ONCE}),
         (["straight"], {ONCE}),
         (["mipnerf"], set()),

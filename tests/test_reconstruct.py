@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import json
 import os
@@ -18,7 +19,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 import nerfro.reconstruct
 import nerfro.train
-from nerfro.capture import refinement, stages
+from nerfro.capture import refinement, refinement_report, stages
 from nerfro.capture.stages import finished, option
 from nerfro.files.images import save_png
 from tests.ball_photographs import RADIUS, SIZE, cameras, photographs, save
@@ -254,8 +255,9 @@ def test_posed_photographs_of_a_ball_become_a_scene(
 
     monkeypatch.setattr(stages, "finished", here)
     monkeypatch.setattr(nerfro.train, "find_lpips_networks", lambda *files: ({}, {}))
-    monkeypatch.setattr(refinement, "_STAGES", (refinement._Stage(20, 1e-4, (3.0, 1.0)),))
-    monkeypatch.setattr(refinement, "_PIXELS", 1000)
+    short = refinement.RefinementSettings((refinement.Stage(20, 1e-4, (3.0, 1.0)),), 1000)
+    fast = functools.partial(refinement.refine_surface, settings=short)
+    monkeypatch.setattr(refinement_report, "refine_surface", fast)
     train = ["evaluation.split=train", "evaluation.every=0", "evaluation.subdivision.side=1", "logger=none",
              "trainer.accelerator=cpu", "trainer.max_steps=2", "trainer.max_time=null", "batches.size=64",
              "boundary.resolutions=[4,8]", "field.num_levels=2", "field.log2_table_size=8",

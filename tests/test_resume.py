@@ -45,8 +45,8 @@ from nerfro.registry import register
 class Waiting(Loss):
     """Waits a little in every step."""
 
-    def forward(self, renderings, batch, model):
-        print(f"at step {model.global_step}", flush=True)
+    def forward(self, renderings, batch, scene):
+        print(f"at step {batch.draws.step}", flush=True)
         time.sleep(0.15)
         return renderings[-1].rgb.sum() * 0
 '''

@@ -151,7 +151,8 @@ class TrainConfig:
 
 def build_data(config: DictConfig) -> DataSource:
     """Build the data set of a run; training views that are left out for validation are its `val` split."""
-    source, number = build(config.data), config.batches.num_validation_views
+    source = build(config.data)
+    number = OmegaConf.select(config, "batches.num_validation_views")  # checkpoints of older releases lack it
     return WithValidationViews(source, number) if number else source
 
 

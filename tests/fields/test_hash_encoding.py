@@ -34,7 +34,7 @@ def test_levels_grow_geometrically_and_hash_only_what_does_not_fit() -> None:
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [((0, 4, 8, 10), "1 or more"), ((2, 8, 4, 10), "base_resolution <= finest"), ((2, 4, 8, 40), "4 to 24")],
+    [((0, 4, 8, 10), "num_levels >= 1"), ((2, 8, 4, 10), "base_resolution <= finest"), ((2, 4, 8, 40), "4 to 24")],
 )
 def test_impossible_grids_are_refused(arguments: tuple[int, int, int, int], message: str) -> None:
     with pytest.raises(NerfroError, match=message):

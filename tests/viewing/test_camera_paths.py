@@ -100,7 +100,7 @@ def test_transforms_are_read_without_their_pictures(around: Surroundings, tmp_pa
         ({"camera_path": [{"fov": 40}]}, "camera 0 has no 'camera_to_world'"),
         ({"camera_path": [{"fov": 400, "camera_to_world": torch.eye(4).flatten().tolist()}]}, "fov=400 must be"),
         ({"camera_path": [{"fov": 40, "camera_to_world": [1, 2]}]}, "camera 0 has shape 2"),
-        ({"frames": [{"transform_matrix": (2 * torch.eye(4)).tolist()}], "fl_x": 3}, "is no rotation"),
+        ({"frames": [{"transform_matrix": (2 * torch.eye(4)).tolist()}], "fl_x": 3}, "is not a rotation"),
         ({"frames": [{"transform_matrix": torch.eye(4).tolist()}]}, "has neither 'fl_x'"),
     ],
 )
