@@ -49,7 +49,7 @@ class Watching(Loss):
 
     def forward(self, renderings, batch, scene):
         time.sleep(0.05 * (1 + dist.get_rank()))
-        mine = torch.cat([tensor.detach().double().flatten() for tensor in model.state_dict().values()])
+        mine = torch.cat([tensor.detach().double().flatten() for tensor in scene.state_dict().values()])
         both = [torch.empty_like(mine) for _ in range(2)]
         dist.all_gather(both, mine)
         assert torch.equal(*both), "the models of the two processes differ"
