@@ -43,11 +43,25 @@ EXIT_BROKEN_PIPE = 141  # as a shell tells of a program that SIGPIPE ended
 #   "loss=nearby": "near_camera"                          an option of a group (`experiment=NAME` is one, too)
 #   "medium.learn_surface": None                          a setting that is gone: refused on the command line and in
 #                                                         YAML files, dropped from the configurations of old runs
+#   "medium[SdfGrid].smoothing_size": None                the same in old runs for one class, where others keep it
 RENAMED: dict[str, str | None] = {
     "medium.learn_surface": None,
     "optimizer.surface_learning_rate": None,
     "optimizer.surface_start": None,
     "search": None,
+    "boundary.direction_degree": None,
+    "field.base_resolution": None,
+    "field.direction_degree": None,
+    "field.normalise": None,
+    "loss.boundary.threshold": None,
+    "loss.total_variation.num_directions": None,
+    "medium.crease_degrees": None,
+    "medium.edge_radius": None,
+    "medium.half_side": None,
+    "medium.half_width": None,
+    "medium.subsamples": None,
+    "medium[SdfGrid].smoothing_sigma": None,
+    "medium[SdfGrid].smoothing_size": None,
 }
 
 
@@ -277,8 +291,9 @@ def _renamed_key(key: str) -> str | None:
 def _move(config: DictConfig, old: str, new: str | None) -> bool:
     """Move a node of a configuration to its new place, or drop it; whether there is one."""
     parent, _, name = old.rpartition(".")
+    parent, _, owner = parent.rstrip("]").partition("[")
     node = OmegaConf.select(config, parent) if parent else config
-    if not isinstance(node, DictConfig) or name not in node:
+    if not isinstance(node, DictConfig) or name not in node or not str(node.get("_target_", "")).endswith(owner):
         return False
     value = node._get_node(name)
     del node[name]

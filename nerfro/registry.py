@@ -155,7 +155,22 @@ def build(node: DictConfig | Mapping[str, object], **parts: object) -> Any:
     plugin = next((p for p in _plugins.values() if p.target == target), None)
     if plugin is None:
         raise NerfroError(f"'{target}' is not registered, so it is not built; `python -m nerfro.plugins` lists what is")
-    return plugin.cls(**configure(plugin, node), **{name: parts[name] for name in plugin.parts if name in parts})
+    return create(plugin, node, **{name: parts[name] for name in plugin.parts if name in parts})
+
+
+def create(plugin: Plugin, node: DictConfig | Mapping[str, object], **parts: object) -> Any:
+    """Instantiate a plugin from its configuration node and the parts that its constructor asks for."""
+    values = configure(plugin, node)
+    attributes = {name: values.pop(name) for name in _settings(plugin.cls)}
+    made = plugin.cls(**values, **parts)
+    for name, value in attributes.items():
+        setattr(made, name, value)
+    return made
+
+
+def _settings(cls: type) -> tuple[str, ...]:
+    """Names of class attributes that are configuration beside the constructor's parameters, such as a loss's weight."""
+    return getattr(cls, "SETTINGS", ())
 
 
 def _require_kind(kind: str) -> None:
@@ -267,10 +282,16 @@ def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
             parts.add(parameter.name)
             continue
         fields.append((parameter.name, config_type, _default(parameter)))
+    allowing = typing.get_type_hints(constructor, include_extras=True)
+    if _settings(cls):
+        annotations = typing.get_type_hints(cls, include_extras=True)
+        for attribute in _settings(cls):
+            allowing[attribute] = annotations[attribute]
+            default = dataclasses.field(default=getattr(cls, attribute))
+            fields.append((attribute, get_args(annotations[attribute])[0], default))
     target = f"{cls.__module__}.{cls.__qualname__}"
     fields.append(("_target_", str, dataclasses.field(default=target)))
     config = dataclasses.make_dataclass(f"{cls.__name__}Config", fields, kw_only=True)
-    allowing = typing.get_type_hints(constructor, include_extras=True)
     return Plugin(kind, name, cls, config, allowing, frozenset(parts))
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Count, Natural
+from nerfro.allowed import Count
 from nerfro.boundaries.base import Boundary
-from nerfro.fields.encoding import positional_encoding
+from nerfro.fields.encoding import DIRECTION_DEGREE, positional_encoding
 from nerfro.fields.mlp import SkipMLP, glorot_linear, padded_sigmoid
 from nerfro.registry import register
 from nerfro.types import Exits
@@ -21,14 +21,12 @@ class Skybox(Boundary):
 
     Args:
         width, depth, skip: of the MLP.
-        direction_degree: octaves of the direction's encoding; 4 in the paper, which bounds how sharp a sky can be.
     """
 
-    def __init__(self, width: Count = 128, depth: Count = 4, skip: int = 3, direction_degree: Natural = 4) -> None:
+    def __init__(self, width: Count = 128, depth: Count = 4, skip: int = 3) -> None:
         super().__init__()
-        self.direction_degree = direction_degree
-        self.trunk = SkipMLP(3 * (1 + 2 * direction_degree), width, depth, skip)
+        self.trunk = SkipMLP(3 * (1 + 2 * DIRECTION_DEGREE), width, depth, skip)
         self.rgb = glorot_linear(self.trunk.num_outputs, 3)
 
     def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
-        return padded_sigmoid(self.rgb(self.trunk(positional_encoding(exits.directions, 0, self.direction_degree))))
+        return padded_sigmoid(self.rgb(self.trunk(positional_encoding(exits.directions, 0, DIRECTION_DEGREE))))

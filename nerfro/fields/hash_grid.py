@@ -26,6 +26,9 @@ _GEOMETRY_FEATURES = 16
 # Density may grow to e^15 times its start before the exponential is cut off, value and gradient.
 _MAX_EXPONENT = 15.0
 
+# Cells of the coarsest level along the box's longest side, as in Instant-NGP.
+_COARSEST_RESOLUTION = 16
+
 
 @register("field", "hash_grid")
 class HashGridField(Field):
@@ -40,7 +43,7 @@ class HashGridField(Field):
         radius: of a ball around the box's middle, world units, in which details are finest; beyond, they become coarser
             in proportion to the distance. None if there is nothing outside the box.
         num_levels: of the encoding, with 2 features each.
-        base_resolution, finest_resolution: cells along the box's longest side.
+        finest_resolution: cells of the finest level along the box's longest side.
         log2_table_size: logarithm of the largest number of entries of a level.
         width: of the hidden layers.
         direction_bands: bands of spherical harmonics that encode the direction; 1 makes colour independent of it.
@@ -60,7 +63,6 @@ class HashGridField(Field):
         box_max: list[float] = (1.0, 1.0, 1.0),  # type: ignore[assignment]
         radius: Positive | None = None,
         num_levels: Count = 12,
-        base_resolution: Count = 16,
         finest_resolution: Count = 256,
         log2_table_size: Annotated[int, Range(at_least=4, at_most=24)] = 15,
         width: Count = 64,
@@ -77,7 +79,7 @@ class HashGridField(Field):
         self.side = float((box[1] - box[0]).max())
         self.initial_density = initial_depth / self.side
         self.direction_bands, self.shortcut, self.precision = direction_bands, shortcut, precision
-        self.levels = hash_encoding.grid_levels(num_levels, base_resolution, finest_resolution, log2_table_size)
+        self.levels = hash_encoding.grid_levels(num_levels, _COARSEST_RESOLUTION, finest_resolution, log2_table_size)
         self.table = nn.Parameter(torch.empty(self.levels.num_entries, hash_encoding.NUM_FEATURES))
         nn.init.uniform_(self.table, -1e-4, 1e-4)
         num_harmonics = harmonics.spherical_harmonics(torch.zeros(1, 3), direction_bands).shape[-1]

@@ -12,14 +12,18 @@ from nerfro.geometry.mesh import TriangleMesh
 # Ratio of the largest to the smallest triangle around a vertex from which on the large one decides.
 _UNEVEN = 8.0
 
+# Edges with larger angles between their faces stay sharp. Facets of the meshes that we use differ by less than 12
+# degrees on curved sides, and by 45 and more at edges.
+CREASE_DEGREES = 30.0
 
-def corner_normals(mesh: TriangleMesh, crease_degrees: float = 30.0) -> Float[np.ndarray, "F 3 3"]:
+
+def corner_normals(mesh: TriangleMesh, crease_degrees: float = CREASE_DEGREES) -> Float[np.ndarray, "F 3 3"]:
     """Unit normal at each corner of each triangle, smooth over the vertex up to creases; see `smooth_normals`."""
     return smooth_normals(mesh, torch.from_numpy(mesh.triangles), crease_degrees).numpy()
 
 
 def smooth_normals(
-    mesh: TriangleMesh, triangles: Float[Tensor, "F 3 3"], crease_degrees: float
+    mesh: TriangleMesh, triangles: Float[Tensor, "F 3 3"], crease_degrees: float = CREASE_DEGREES
 ) -> Float[Tensor, "F 3 3"]:
     """Unit normal at each corner of each triangle, smooth over the vertex up to creases, with gradients by the corners.
 

@@ -23,7 +23,6 @@ def signed_distance_grid(
     box: Float[np.ndarray, "2 3"],
     resolution: int,
     band: float,
-    crease_degrees: float = 30.0,
     lid: Bool[np.ndarray, "F"] | None = None,
 ) -> Float[np.ndarray, "X Y Z"]:
     """Signed distance, world units, at the vertices (`resolution` a side) of a grid; negative inside.
@@ -36,7 +35,7 @@ def signed_distance_grid(
 
     which is exact to second order in the triangle's size for any curvature (a chord's tangents meet at twice its
     sagitta). So the facets of a finely tessellated curved surface do not show. Farther away the value is a lower bound
-    of the distance, at most sqrt(3) voxels short. Edges with angles above `crease_degrees` stay sharp. What is inside a
+    of the distance, at most sqrt(3) voxels short. Edges with angles above `CREASE_DEGREES` stay sharp. What is inside a
     mesh that is not closed is decided as in `occupancy_fraction`.
 
     Distances to triangles of a `lid` do not count, and what is nearer to it than to the others is inside: the inside
@@ -46,7 +45,7 @@ def signed_distance_grid(
     spacing = (np.asarray(box[1], np.float64) - origin) / (resolution - 1)
     reach = band * float(spacing.max())
     triangles = np.ascontiguousarray(mesh.triangles)
-    normals = corner_normals(mesh, crease_degrees)
+    normals = corner_normals(mesh)
     shown = np.ones(len(triangles), bool) if lid is None else ~lid
     distance, height = _distance_to(triangles[shown], normals[shown], origin, spacing, resolution, reach)
     inside = occupancy_fraction(mesh, box, resolution, subsamples=1) > 0.5

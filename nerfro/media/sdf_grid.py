@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import distance_transform_cdt
 from torch import Tensor
 
-from nerfro.allowed import NotNegative, Positive, Range, Resolution
+from nerfro.allowed import NotNegative, Positive, Resolution
 from nerfro.errors import NerfroError
 from nerfro.files.cache import cached_arrays, content_hash
 from nerfro.geometry.bodies import require_separate
-from nerfro.geometry.interpolation import quadratic_spline, smooth, spline_coefficients
+from nerfro.geometry.interpolation import quadratic_spline, spline_coefficients
 from nerfro.geometry.intersection import MeshIntersector, Triangles
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.signed_distance import signed_distance_grid
@@ -56,10 +56,6 @@ class SdfGrid(Solid):
         resolution: grid vertices a side.
         box_min, box_max: corners of the grid, world units; none for the mesh's bounds and a margin of air.
         shell_voxels: half width of the smooth interface that the Eikonal equation sees, voxels.
-        crease_degrees: edges with larger angles between their faces stay sharp.
-        smoothing_size, smoothing_sigma: Gaussian taps a side and standard deviation (voxels) that the distance is
-            smoothed with, for noisy silhouette hulls; size 0 for none. The kernel is of fourth order: it flattens
-            noise and keeps curvature.
         accept_open_mesh: take meshes with holes; the majority of three axes decides what is inside.
         absorption, learn_absorption, abbe: tint and dispersion, see `Solid`; for snell alone.
         cache: keep the distances in the cache folder.
@@ -85,9 +81,6 @@ class SdfGrid(Solid):
         box_min: list[float] | None = None,
         box_max: list[float] | None = None,
         shell_voxels: Positive = 0.1,
-        crease_degrees: NotNegative = 30.0,
-        smoothing_size: Annotated[int, Range(at_least=0, at_most=99)] = 0,
-        smoothing_sigma: Positive = 1.0,
         accept_open_mesh: bool = False,
         absorption: list[NotNegative] = [],  # noqa: B006
         learn_absorption: bool = False,
@@ -102,25 +95,18 @@ class SdfGrid(Solid):
             )
         require_bytes(BYTES_A_VERTEX * resolution**3, f"medium.resolution={resolution}")
         meshes = [load_mesh(resolve_path(path), accept_open_mesh) for path in (mesh, *inner_meshes)]
-        box = grid_box(box_min, box_max, meshes, resolution, AIR + smoothing_size // 2)
+        box = grid_box(box_min, box_max, meshes, resolution, AIR)
         spacing = (box[1] - box[0]) / (resolution - 1)
         shell = shell_voxels * float(spacing.min())
         super().__init__([ior, *inner_iors], shell, absorption, learn_absorption, abbe, learn_ior)
-        self.crease_degrees = crease_degrees
         self.meshes = meshes
-        band = BAND + smoothing_size
         distances = []
         for body in self.meshes:
             check_margin(body, box, resolution, 2)
             if body.is_closed:
                 require_separate(body)
-            distances.append(cached_distance(body, box, resolution, band, crease_degrees, cache))
-        values = torch.from_numpy(np.stack(distances))
-        if smoothing_size:
-            # 2 G - G * G: the curvature's share of the blur cancels.
-            values = torch.stack([smooth(2 * v - smooth(v, smoothing_size, smoothing_sigma), smoothing_size,
-                                         smoothing_sigma) for v in values])  # fmt: skip
-        self._set(values, torch.from_numpy(box).float())
+            distances.append(cached_distance(body, box, resolution, BAND, cache))
+        self._set(torch.from_numpy(np.stack(distances)), torch.from_numpy(box).float())
 
     @classmethod
     def from_distances(
@@ -186,7 +172,7 @@ class SdfGrid(Solid):
 
     def triangles(self) -> Triangles:
         """The triangles of all meshes where `vertices` are now, with gradients by them."""
-        return Triangles.of(self.meshes, self.crease_degrees, self.vertices)
+        return Triangles.of(self.meshes, self.vertices)
 
     @lazy_buffer
     def coarse_clearance(self) -> Float[Tensor, "x y z"]:
@@ -290,13 +276,12 @@ def cached_distance(
     box: Float[np.ndarray, "2 3"],
     resolution: int,
     band: float,
-    crease_degrees: float,
     cache: bool,
     lid: Bool[np.ndarray, "F"] | None = None,
 ) -> Float[np.ndarray, "X Y Z"]:
     """Signed distance to a mesh at a grid's vertices, see `signed_distance_grid`, from the cache folder if it may."""
     normals = "none" if mesh.normals is None else mesh.normals
-    settings = box, resolution, band, crease_degrees
+    settings = box, resolution, band
     left_out = () if lid is None else (lid,)
     key = "distance_" + content_hash(_VERSION, mesh.vertices, mesh.faces, normals, *settings, *left_out)
     arrays = cached_arrays(key, lambda: {"distance": signed_distance_grid(mesh, *settings, *left_out)}, cache)

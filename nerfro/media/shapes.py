@@ -14,6 +14,12 @@ from nerfro.registry import register
 
 # Air around a shape, as a share of its size: the shell lies outside its surface.
 _MARGIN = 0.05
+# Rounded box: distance from the centre to a face, and radius of the edges, world units. As the scenes of the paper, the
+# box fits into [-1, 1]^3, and its edges are a tenth of its size.
+_HALF_SIDE, _EDGE_RADIUS = 0.75, 0.08
+# Half side of the box of a slab along x and y, world units: no ray that crosses [-1, 1]^3 at less than 80 degrees meets
+# its end.
+_HALF_WIDTH = 10.0
 
 
 @register("medium", "ball")
@@ -50,15 +56,11 @@ class RoundedBox(Solid):
     """A cube around the origin with rounded edges and corners.
 
     Args:
-        half_side: from the centre to a face, world units.
-        edge_radius: of the rounding, world units.
         ior, shell, absorption, learn_absorption, abbe: see `Solid`.
     """
 
     def __init__(
         self,
-        half_side: Positive = 0.75,
-        edge_radius: NotNegative = 0.08,
         ior: Positive = 1.52,
         shell: Positive = 0.002,
         absorption: list[NotNegative] = (),  # type: ignore[assignment]
@@ -66,16 +68,15 @@ class RoundedBox(Solid):
         abbe: list[Positive] = (),  # type: ignore[assignment]
     ) -> None:
         super().__init__([ior], shell, absorption, learn_absorption, abbe)
-        self.half_side, self.edge_radius = half_side, edge_radius
-        side = half_side * (1 + _MARGIN) + shell
+        side = _HALF_SIDE * (1 + _MARGIN) + shell
         self.register_buffer("box", torch.tensor([[-side] * 3, [side] * 3]), persistent=False)
 
     def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
         """|max(q, 0)| + min(max q, 0) - r with q = |x| - (a - r): the distance to a smaller cube, less the radius."""
-        q = positions.abs() - (self.half_side - self.edge_radius)
+        q = positions.abs() - (_HALF_SIDE - _EDGE_RADIUS)
         outward = q.clamp(min=0)
         outside = torch.linalg.vector_norm(outward, dim=-1, keepdim=True)
-        distance = outside + q.amax(-1, keepdim=True).clamp(max=0) - self.edge_radius
+        distance = outside + q.amax(-1, keepdim=True).clamp(max=0) - _EDGE_RADIUS
         nearest_face = functional.one_hot(q.argmax(-1), 3).to(q)
         direction = torch.where(outside > 0, functional.normalize(outward, dim=-1), nearest_face)
         return distance, (direction * positions.sign())[..., None, :]
@@ -87,7 +88,6 @@ class Slab(Solid):
 
     Args:
         thickness: along z, world units.
-        half_width: half side of the box along x and y, world units.
         ior, shell, absorption, learn_absorption, abbe: see `Solid`.
     """
 
@@ -95,7 +95,6 @@ class Slab(Solid):
         self,
         thickness: Positive = 0.5,
         ior: Positive = 1.5,
-        half_width: Positive = 2.0,
         shell: Positive = 0.002,
         absorption: list[NotNegative] = (),  # type: ignore[assignment]
         learn_absorption: bool = False,
@@ -103,7 +102,7 @@ class Slab(Solid):
     ) -> None:
         super().__init__([ior], shell, absorption, learn_absorption, abbe)
         self.thickness = thickness
-        corner = torch.tensor([half_width, half_width, thickness * (0.5 + _MARGIN) + shell])
+        corner = torch.tensor([_HALF_WIDTH, _HALF_WIDTH, thickness * (0.5 + _MARGIN) + shell])
         self.register_buffer("box", torch.stack([-corner, corner]), persistent=False)
 
     def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:

@@ -43,7 +43,7 @@ class SdfVessel(SdfGrid):
         liquid_ior: refractive index of the liquid; 1 for an empty vessel.
         up: direction from the bottom to the top, world axes, of any length.
         height: the vessel's height, outside, in the unit in which lengths are given.
-        resolution, box_min, box_max, shell_voxels, crease_degrees, accept_open_mesh, cache: see `SdfGrid`.
+        resolution, box_min, box_max, shell_voxels, accept_open_mesh, cache: see `SdfGrid`.
         absorption, learn_absorption, abbe: of wall and liquid, see `Solid`.
 
     Attributes:
@@ -70,7 +70,6 @@ class SdfVessel(SdfGrid):
         box_min: list[float] | None = None,
         box_max: list[float] | None = None,
         shell_voxels: Positive = 0.1,
-        crease_degrees: NotNegative = 30.0,
         accept_open_mesh: bool = False,
         absorption: list[NotNegative] = [],  # noqa: B006
         learn_absorption: bool = False,
@@ -105,7 +104,7 @@ class SdfVessel(SdfGrid):
         self._require_lengths_within()
         # The wall's inner surface is made of these distances, and a refinement moves it.
         band = min(BAND + 2 * wall * self.unit / spacing, resolution)
-        settings = surface, box, resolution, band, crease_degrees, cache
+        settings = surface, box, resolution, band, cache
         outer = side = torch.from_numpy(cached_distance(*settings))
         if not closed:
             side = torch.from_numpy(cached_distance(*settings, find_lid(surface, upwards)))

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Count, Positive, Range, Resolution, check, corners_of_box
+from nerfro.allowed import Positive, Range, Resolution, check, corners_of_box
 from nerfro.errors import NerfroError
 from nerfro.files.cache import cached_arrays, content_hash, load_arrays, save_arrays
 from nerfro.geometry.bodies import require_separate
@@ -27,6 +27,8 @@ from nerfro.registry import register
 
 # Part of the cache's key: raise it when the same mesh and settings give other fractions than before.
 _VERSION = 1
+# Inside tests along each side around a vertex, as in the paper.
+_SUBSAMPLES = 4
 BYTES_A_VERTEX = 64  # of a grid while it is made
 
 
@@ -44,7 +46,6 @@ class VoxelGrid(Medium):
         box_min, box_max: corners of the grid, world units; the object needs a margin of air inside.
         smoothing_size: taps of the Gaussian kernel a side, odd; 0 for none.
         smoothing_sigma: standard deviation of the kernel, voxels.
-        subsamples: inside tests a side around each vertex.
         accept_open_mesh: take a mesh with holes; the majority of three axes decides what is inside.
         cache: keep the occupancy in the cache folder.
         grid: file written by `save`, used with the box, index and smoothing it holds instead of all the above.
@@ -62,7 +63,6 @@ class VoxelGrid(Medium):
         box_max: list[float] = [1.5, 1.5, 1.5],  # noqa: B006
         smoothing_size: Annotated[int, Range(at_least=0, at_most=99)] = 9,
         smoothing_sigma: Positive = 1.0,
-        subsamples: Count = 4,
         accept_open_mesh: bool = False,
         cache: bool = True,
         grid: str | None = None,
@@ -81,11 +81,11 @@ class VoxelGrid(Medium):
         check_margin(loaded, box, resolution, 2 + smoothing_size // 2)
         if loaded.is_closed:
             require_separate(loaded)
-        key = "occupancy_" + content_hash(_VERSION, loaded.vertices, loaded.faces, box, resolution, subsamples)
+        key = "occupancy_" + content_hash(_VERSION, loaded.vertices, loaded.faces, box, resolution, _SUBSAMPLES)
         occupancy = cached_arrays(
             key,
             # Multiples of 1/64 are exact in half precision.
-            lambda: {"occupancy": occupancy_fraction(loaded, box, resolution, subsamples).astype(np.float16)},
+            lambda: {"occupancy": occupancy_fraction(loaded, box, resolution, _SUBSAMPLES).astype(np.float16)},
             cache,
         )["occupancy"]
         require_inside(occupancy.max() > 0.25)  # more than what happens to lie on a flat mesh

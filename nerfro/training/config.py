@@ -18,7 +18,7 @@ from nerfro.losses.base import Loss
 from nerfro.media.analytic import Vacuum
 from nerfro.models.base import NerfModel, Parts
 from nerfro.models.optimizer import OptimizerConfig
-from nerfro.registry import build, configure, find
+from nerfro.registry import build, create, find
 from nerfro.training.backdrop import settle_backdrop
 from nerfro.training.content import ContentConfig, settle_content
 
@@ -182,7 +182,7 @@ def build_losses(nodes: DictConfig, known: bool = True) -> dict[str, Loss]:
         plugin = find("loss", name)
         if not known:
             node = {field: node[field] for field in node if not OmegaConf.is_interpolation(node, field)}
-        losses[name] = plugin.cls(**configure(plugin, node))
+        losses[name] = create(plugin, node)
     return losses
 
 

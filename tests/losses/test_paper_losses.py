@@ -19,6 +19,7 @@ from nerfro.media.analytic import Luneburg
 from nerfro.models.base import NerfModel, Parts
 from nerfro.models.optimizer import OptimizerConfig
 from nerfro.models.refractive import RefractiveModel
+from nerfro.registry import create, find
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.hierarchical import Hierarchical
 from nerfro.testing import NUM_RAYS, example_batch, example_rendering
@@ -127,7 +128,7 @@ def test_smoothness_teaches_the_boundary_only(model: NerfModel) -> None:
 
 
 def test_weight_is_zero_before_the_start_then_grows_linearly_to_its_value() -> None:
-    loss = Photometric(weight=2.0, start=10, ramp=4)
+    loss = create(find("loss", "photometric"), {"weight": 2.0, "start": 10, "ramp": 4})
     assert [loss.weight_at(step) for step in (0, 9)] == [0, 0]
     torch.testing.assert_close(
         torch.tensor([loss.weight_at(step) for step in range(10, 16)]), torch.tensor([0.4, 0.8, 1.2, 1.6, 2.0, 2.0])
@@ -141,8 +142,8 @@ def test_weight_without_a_ramp_steps_to_its_value() -> None:
 
 @pytest.mark.parametrize("option", ["weight", "start", "ramp"])
 def test_negative_schedules_are_refused(option: str) -> None:
-    with pytest.raises(NerfroError, match=f"{option}=-1 is not allowed; take at least 0"):
-        Photometric(**{option: -1})
+    with pytest.raises(NerfroError, match=f"{option}=-1.* is not allowed; take at least 0"):
+        create(find("loss", "photometric"), {option: -1})
 
 
 def test_tile_without_neighbours_is_refused() -> None:

@@ -109,7 +109,7 @@ def test_pictures_of_empty_glass_are_those_of_a_dielectric(what: str, tmp_path: 
         glass.save(tmp_path / "glass.ply")
         water.save(tmp_path / "water.ply")
         files = str(tmp_path / "glass.ply"), 1.5, [str(tmp_path / "water.ply")], [1.33]
-        medium = SdfGrid(*files, 48, BOX[0].tolist(), BOX[1].tolist(), crease_degrees=60, cache=False)
+        medium = SdfGrid(*files, 48, BOX[0].tolist(), BOX[1].tolist(), cache=False)
     else:
         medium = on_grid(what)
     expected, rays = path_traced(glass, 1.5, inner=inner), rays_of_picture()
