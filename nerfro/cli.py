@@ -45,6 +45,10 @@ EXIT_BROKEN_PIPE = 141  # as a shell tells of a program that SIGPIPE ended
 #                                                         YAML files, dropped from the configurations of old runs
 #   "medium[SdfGrid].smoothing_size": None                the same in old runs for one class, where others keep it
 RENAMED: dict[str, str | None] = {
+    "batches.hold_back": "batches.num_validation_views",
+    "batches.object": "batches.object_fraction",
+    "optimizer.boundary_first": "optimizer.boundary_steps",
+    "optimizer.tint_learning_rate": "optimizer.absorption_learning_rate",
     "medium.learn_surface": None,
     "optimizer.surface_learning_rate": None,
     "optimizer.surface_start": None,

@@ -46,15 +46,15 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     test = source.load(config.evaluation.split).checked()
     validation = source.load("val").checked() if config.evaluation.every > 0 and "val" in source.splits else None
     wanted, training = config.batches, source.load("train")
-    precrop = wanted.precrop_steps, wanted.precrop_fraction
-    batches = RayBatches(training, wanted.size, wanted.batching, config.seed, *precrop, wanted.jitter, wanted.object)
+    settings = wanted.precrop_steps, wanted.precrop_fraction, wanted.jitter, wanted.object_fraction
+    batches = RayBatches(training, wanted.size, wanted.batching, config.seed, *settings)
     subdivision = Subdivision.of(config.evaluation)
     lpips = find_lpips_networks(config.evaluation.lpips_backbone, config.evaluation.lpips_vgg_backbone)
     model = build_model(config, training)
     require_same_run(folder, checkpoint, config)
     throughput, interruption = Throughput(), StopOnSignal()
     # Cameras move by sky and outlines before the sky is learned.
-    cameras, boundary = CameraSteps(batches, training), BoundaryFirst(batches, config.optimizer.boundary_first)
+    cameras, boundary = CameraSteps(batches, training), BoundaryFirst(batches, config.optimizer.boundary_steps)
     trainer = make_trainer(config, folder, throughput, [interruption, cameras, boundary, Viewer(config, source, test)])
     batches = traced(batches.share(trainer.global_rank, trainer.world_size), model, config)
     few = batches.smaller(4096)

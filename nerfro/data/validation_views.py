@@ -33,8 +33,8 @@ class WithValidationViews(DataSource):
         num_training = len(views) - self._number
         if num_training < 1:
             raise NerfroError(
-                f"batches.hold_back={self._number} leaves no view to train on: there are {len(views)} training views; "
-                f"take at most {len(views) - 1}"
+                f"batches.num_validation_views={self._number} leaves no view to train on: there are "
+                f"{len(views)} training views; take at most {len(views) - 1}"
             )
         positions = views.cameras.camera_to_world[:, :, 3].double().cpu().numpy()
         # The smaller group is the spread one; the views that remain are then distributed as well.

@@ -67,7 +67,7 @@ class Medium(nn.Module, ABC):
         """Whether the index depends on the wavelength."""
         return False
 
-    def tinted(self, path: Path) -> Path:
+    def with_absorption(self, path: Path) -> Path:
         """The path with the absorption of the bodies that it crosses."""
         return path
 

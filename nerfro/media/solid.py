@@ -106,7 +106,7 @@ class Solid(Medium):
         per_unit = (wavelength**-2 - line_d) / (line_f - line_c) / self.iors.new_tensor(self.abbe)
         return variant(self, iors=self.iors + (self.iors - 1) * per_unit)
 
-    def tinted(self, path: Path) -> Path:
+    def with_absorption(self, path: Path) -> Path:
         of_bodies = self.absorption
         if of_bodies is None:
             return path

@@ -105,7 +105,7 @@ class NerfModel(LightningModule, ABC):
     def trace(self, rays: Rays, path: Path | None = None) -> Path:
         """Paths of rays, or the given ones, tinted by the medium; with gradients by what bends and learns."""
         path = self.path_sampler(rays, self.medium) if path is None else path
-        return self.medium.tinted(self.refined(path, rays) if self.paths_learn else path)
+        return self.medium.with_absorption(self.refined(path, rays) if self.paths_learn else path)
 
     def exit_directions(self, rays: Rays) -> Float[Tensor, "R 3"]:
         """Unit direction in which the main polyline of each ray leaves, without its branches and their cost."""
@@ -137,12 +137,12 @@ class NerfModel(LightningModule, ABC):
     def parameter_groups(self) -> dict[str, tuple[list[nn.Parameter], float]]:
         """All that learns: parameters and initial learning rate by name. A model that adds parameters adds a group."""
         config, bending = self.optimizer_config, self.medium.bending_parameters()
-        tint = [own for own in self.medium.parameters() if all(own is not other for other in bending)]
+        absorption = [own for own in self.medium.parameters() if all(own is not other for other in bending)]
         groups = {
             "fields": (list(self.fields.parameters()), config.learning_rate),
             "boundary": (list(self.boundary.parameters()), config.rate("boundary")),
             "medium": ([*bending, *self.path_sampler.parameters()], config.rate("medium")),
-            "tint": (tint, config.rate("tint")),
+            "absorption": (absorption, config.rate("absorption")),
             "camera": (self.camera.bending_parameters(), config.rate("camera")),
             "exposure": (self.camera.brightness_parameters(), config.rate("exposure")),
         }

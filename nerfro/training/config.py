@@ -40,9 +40,9 @@ class BatchesConfig:
     batching: Annotated[str, Literal["single_image", "all_images"]] = "single_image"
     jitter: bool = False  # draw each ray anywhere inside its pixel instead of through its centre
     # Share of the pixels of a step that is drawn of the object's alone, which masks tell; the others are of all pixels.
-    object: Annotated[float, Range(at_least=0, at_most=1)] = 0.0
+    object_fraction: Annotated[float, Range(at_least=0, at_most=1)] = 0.0
     # Training views, spread over the cameras' places, that are not trained on: they are the `val` split then.
-    hold_back: Natural = 0
+    num_validation_views: Natural = 0
     precrop_steps: Natural = 0  # number of first steps that see only the central window of the images
     precrop_fraction: Annotated[float, Range(more_than=0, at_most=1)] = 0.5  # side of that window
     # Rays in each direction of a pixel whose ray leaves `divergence` pixels or more away from the ray beside it;
@@ -161,7 +161,8 @@ class TrainConfig:
 
 def build_data(config: DictConfig) -> DataSource:
     """The data of a run; views that it holds back are their `val` split."""
-    source, number = build(config.data), OmegaConf.select(config, "batches.hold_back")  # which older checkpoints lack
+    source = build(config.data)
+    number = OmegaConf.select(config, "batches.num_validation_views")  # checkpoints of older releases lack it
     return WithValidationViews(source, number) if number else source
 
 

@@ -75,7 +75,7 @@ class RayBatches:
         self._object_share = object_share
         self._of_object: dict[Window, _Usable] | None = None
         if object_share > 0 and views.masks is None:
-            warn("batches.object: not every training photograph has a mask, so pixels are drawn of all alike")
+            warn("batches.object_fraction: not every training photograph has a mask, so pixels are drawn of all alike")
         elif object_share > 0:
             self._of_object = {window: _of_object(views, batching, window) for window in windows}
 
@@ -255,13 +255,15 @@ def _of_object(views: Views, batching: Batching, window: Window) -> _Usable:
     """The pixels of which the object fills more than a half."""
     assert views.masks is not None
     if batching == "single_image":
-        raise NerfroError("batches.object draws pixels of the object from all images; take batches.batching=all_images")
+        raise NerfroError("batches.object_fraction draws from all images; take batches.batching=all_images, or 0")
     filled = (view > 0.5 for view in views.masks)
     if views.usable is not None:
         filled = (mask & (view == 1) for mask, view in zip(filled, views.usable, strict=True))
     found = _Usable(filled, len(views), window)
     if found.starts[-1] == 0:
-        raise NerfroError("batches.object draws pixels of the object, and the masks have none; correct them, or take 0")
+        raise NerfroError(
+            "batches.object_fraction draws pixels of the object, and masks show none; correct them, or take 0"
+        )
     return found
 
 

@@ -72,7 +72,7 @@ def test_a_run_never_draws_what_it_holds_back(
 
     monkeypatch.setattr(RayBatches, "__init__", spied)
     run = [*tiny_default_run, f"hydra.run.dir={tmp_path / 'run'}", "trainer.max_steps=2", "evaluation.every=0"]
-    finished = train_here(*run, "batches.hold_back=1")
+    finished = train_here(*run, "batches.num_validation_views=1")
     assert finished.code == 0, finished.err
     val = nerfro.load(tmp_path / "run", device="cpu").views("val")
     assert [len(views) for views in drawn] == [2]
@@ -83,15 +83,17 @@ def test_a_run_never_draws_what_it_holds_back(
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ("3", "batches.hold_back=3 leaves no view to train on: there are 3 training views; take at most 2"),
-        ("-1", "batches.hold_back=-1 is not allowed; take at least 0"),
+        ("3", "batches.num_validation_views=3 leaves no view to train on: there are 3 training views; take at most 2"),
+        ("-1", "batches.num_validation_views=-1 is not allowed; take at least 0"),
         ("0.2", "Value '0.2' of type 'float' could not be converted to Integer"),
     ],
 )
 def test_numbers_that_cannot_be_held_back_are_refused_in_one_line(
     train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path, value: str, message: str
 ) -> None:
-    finished = train_here(*tiny_default_run, f"hydra.run.dir={tmp_path / 'run'}", f"batches.hold_back={value}")
+    finished = train_here(
+        *tiny_default_run, f"hydra.run.dir={tmp_path / 'run'}", f"batches.num_validation_views={value}"
+    )
     assert finished.code == 1
     assert message in finished.err
     assert finished.err.count("\n") == 1

@@ -133,7 +133,7 @@ def test_absorption_is_that_of_the_path_and_is_learned_from_a_picture(what: str)
     given, learner = on_grid(what, absorption=list(COLOURED)), on_grid(what, learn_absorption=True)
 
     def picture(medium: SdfGrid, path: Path) -> Tensor:
-        return seen(path, medium.tinted(path).transmitted(path.far[:, None])[:, 0])
+        return seen(path, medium.with_absorption(path).transmitted(path.far[:, None])[:, 0])
 
     assert agreement(picture(given, BRANCHES(rays_of_picture(), given)), expected) > 35
     few = BRANCHES(rays_of_picture(8), given)

@@ -35,7 +35,7 @@ def weights(
 
 
 def test_the_boundary_alone_has_learned_before_the_first_step(weights: Callable[..., dict[str, Tensor]]) -> None:
-    without, learned = weights("without", "optimizer.boundary_first=0"), weights("with", "optimizer.boundary_first=20")
+    without, learned = weights("without", "optimizer.boundary_steps=0"), weights("with", "optimizer.boundary_steps=20")
     changed = {name for name, value in learned.items() if not torch.equal(value, without[name])}
     assert changed == {"boundary.texels"}
 
@@ -43,13 +43,13 @@ def test_the_boundary_alone_has_learned_before_the_first_step(weights: Callable[
 def test_a_run_that_goes_on_does_not_learn_it_again(
     weights: Callable[..., dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    weights("run", "optimizer.boundary_first=5")
+    weights("run", "optimizer.boundary_steps=5")
 
     def never(*given: object) -> None:
         raise AssertionError("pixels beside the object were asked for")
 
     monkeypatch.setattr(RayBatches, "missing", never)
-    weights("run", "optimizer.boundary_first=5", "ckpt_path=last", "trainer.max_steps=2")
+    weights("run", "optimizer.boundary_steps=5", "ckpt_path=last", "trainer.max_steps=2")
 
 
 def test_rays_that_miss_a_box_have_their_own_colours(tiny_scene: Path) -> None:
