@@ -61,6 +61,7 @@ RENAMED: dict[str, str | None] = {
     "loss.total_variation.num_directions": None,
     "medium.crease_degrees": None,
     "medium.edge_radius": None,
+    "medium.grid": None,
     "medium.half_side": None,
     "medium.half_width": None,
     "medium.subsamples": None,

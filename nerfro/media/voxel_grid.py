@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated, get_type_hints
+from typing import Annotated
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Positive, Range, Resolution, check, corners_of_box
+from nerfro.allowed import Positive, Range, Resolution, corners_of_box
 from nerfro.errors import NerfroError
-from nerfro.files.cache import cached_arrays, content_hash, load_arrays, save_arrays
+from nerfro.files.cache import cached_arrays, content_hash
 from nerfro.geometry.bodies import require_separate
 from nerfro.geometry.interpolation import gradient, smooth, trilinear
 from nerfro.geometry.mesh import TriangleMesh, load_mesh, require_inside
@@ -48,7 +47,6 @@ class VoxelGrid(Medium):
         smoothing_sigma: standard deviation of the kernel, voxels.
         accept_open_mesh: take a mesh with holes; the majority of three axes decides what is inside.
         cache: keep the occupancy in the cache folder.
-        grid: file written by `save`, used with the box, index and smoothing it holds instead of all the above.
     """
 
     table: Float[Tensor, "X Y Z 4"]  # n and grad n (per world unit) at each vertex
@@ -56,7 +54,7 @@ class VoxelGrid(Medium):
 
     def __init__(
         self,
-        mesh: str | None = None,
+        mesh: str,
         ior: Positive = 1.5,
         resolution: Resolution = 128,
         box_min: list[float] = [-1.5, -1.5, -1.5],  # noqa: B006 (the registry reads and copies it)
@@ -65,18 +63,11 @@ class VoxelGrid(Medium):
         smoothing_sigma: Positive = 1.0,
         accept_open_mesh: bool = False,
         cache: bool = True,
-        grid: str | None = None,
     ) -> None:
         super().__init__()
-        if (mesh is None) == (grid is None):
-            raise NerfroError("medium=voxel_grid needs one source; set either medium.mesh or medium.grid")
-        if grid is not None:
-            stored = _load_grid(resolve_path(grid))
-            self._set(*stored)
-            return
         require_bytes(BYTES_A_VERTEX * resolution**3, f"medium.resolution={resolution}")
         box = corners_of_box(box_min, box_max)
-        loaded = load_mesh(resolve_path(str(mesh)), accept_open_mesh)
+        loaded = load_mesh(resolve_path(mesh), accept_open_mesh)
         # One voxel for the sub-samples, one for the gradient's difference, and what the smoothing spreads.
         check_margin(loaded, box, resolution, 2 + smoothing_size // 2)
         if loaded.is_closed:
@@ -173,18 +164,6 @@ class VoxelGrid(Medium):
         """Half a voxel."""
         return (0.5 * self.spacing.min()).expand(directions.shape[:-1])
 
-    def save(self, path: Path) -> None:
-        """Write occupancy, box, index and smoothing to a .npz that `medium.grid` loads."""
-        save_arrays(
-            path,
-            {
-                "occupancy": self.occupancy.cpu().numpy(),
-                "box": self.box.cpu().numpy(),
-                "ior": np.float64(self.ior),
-                "smoothing": np.array([self.smoothing_size, self.smoothing_sigma]),
-            },
-        )
-
 
 def grid_box(
     box_min: list[float] | None, box_max: list[float] | None, meshes: Sequence[TriangleMesh], resolution: int, air: int
@@ -230,20 +209,3 @@ def _rounded(corner: Float[np.ndarray, "3"], direction: int) -> str:
 
 def _faces(values: Tensor) -> list[Tensor]:
     return [values.select(axis, end) for axis in range(3) for end in (0, -1)]
-
-
-def _load_grid(path: Path) -> tuple[Tensor, Tensor, float, int, float]:
-    arrays = load_arrays(path)
-    missing = {"occupancy", "box", "ior", "smoothing"} - arrays.keys()
-    if missing:
-        raise NerfroError(f"{path} is no voxel grid, it lacks {', '.join(sorted(missing))}; make it again")
-    shapes = {"occupancy": (*arrays["occupancy"].shape, 0, 0, 0)[:3], "box": (2, 3), "ior": (), "smoothing": (2,)}
-    if any(arrays[name].shape != shape or arrays[name].dtype.kind not in "fiu" for name, shape in shapes.items()):
-        raise NerfroError(f"{path} is no voxel grid; make it again")
-    occupancy, (size, sigma), ior = arrays["occupancy"], arrays["smoothing"].tolist(), float(arrays["ior"])
-    values = {"ior": ior, "smoothing_size": int(size), "smoothing_sigma": sigma}
-    values["occupancy"] = [float(occupancy.min()), float(occupancy.max())]
-    hints = get_type_hints(VoxelGrid.__init__, include_extras=True)
-    check(f"{path}: ", hints | {"occupancy": list[Annotated[float, Range(at_least=0, at_most=1)]]}, values)
-    box = torch.from_numpy(corners_of_box(*arrays["box"].tolist())).float()
-    return torch.from_numpy(occupancy).float(), box, ior, int(size), sigma
