@@ -1,4 +1,4 @@
-"""The paper's skybox: a small MLP of the leaving direction."""
+"""The skybox of the paper: a small MLP of the exit direction."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from nerfro.types import Exits
 class Skybox(Boundary):
     """4x128 MLP of the encoded direction, after NeRFactor's normal field (paper, Eqn. volrendBd, F_psi).
 
-    Its sigmoid ends at 1, as the authors' does: no lamp is brighter.
+    The radiance is a sigmoid and at most 1, as in the authors' code. Bright lamps are therefore clipped.
 
     Args:
         width, depth, skip: of the MLP.

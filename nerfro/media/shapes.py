@@ -1,4 +1,4 @@
-"""Solids whose signed distance is known in closed form."""
+"""Solids with a signed distance in closed form."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from nerfro.media.base import Vectors
 from nerfro.media.solid import Solid
 from nerfro.registry import register
 
-# Air around a shape, as a share of its size: the shell lies outside its surface.
+# Air around a shape as a share of its size, because half of the shell lies outside the surface.
 _MARGIN = 0.05
 # Rounded box: distance from the centre to a face, and radius of the edges, world units. As the scenes of the paper, the
 # box fits into [-1, 1]^3, and its edges are a tenth of its size.
@@ -27,7 +27,7 @@ class Ball(Solid):
     """A ball around the origin.
 
     Args:
-        radius: world units.
+        radius: of the ball, world units.
         ior, shell, absorption, learn_absorption, abbe: see `Solid`.
     """
 
@@ -46,7 +46,7 @@ class Ball(Solid):
         self.register_buffer("box", torch.tensor([[-side] * 3, [side] * 3]), persistent=False)
 
     def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
-        """|x| - R and x / |x|."""
+        """Return |x| - R and x / |x|."""
         distance = torch.linalg.vector_norm(positions, dim=-1, keepdim=True)
         return distance - self.radius, functional.normalize(positions, dim=-1)[..., None, :]
 
@@ -72,7 +72,7 @@ class RoundedBox(Solid):
         self.register_buffer("box", torch.tensor([[-side] * 3, [side] * 3]), persistent=False)
 
     def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
-        """|max(q, 0)| + min(max q, 0) - r with q = |x| - (a - r): the distance to a smaller cube, less the radius."""
+        """Return |max(q, 0)| + min(max q, 0) - r with q = |x| - (a - r): the distance to a smaller cube, less r."""
         q = positions.abs() - (_HALF_SIDE - _EDGE_RADIUS)
         outward = q.clamp(min=0)
         outside = torch.linalg.vector_norm(outward, dim=-1, keepdim=True)
@@ -84,7 +84,7 @@ class RoundedBox(Solid):
 
 @register("medium", "slab")
 class Slab(Solid):
-    """A plate across the z axis, as wide as its box.
+    """A plate across the z axis that fills the medium's box along x and y.
 
     Args:
         thickness: along z, world units.
@@ -106,7 +106,7 @@ class Slab(Solid):
         self.register_buffer("box", torch.stack([-corner, corner]), persistent=False)
 
     def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
-        """|z| - h / 2 and the sign of z."""
+        """Return |z| - h / 2 and the sign of z."""
         z = positions[..., 2:]
         normal = torch.cat([torch.zeros_like(positions[..., :2]), z.sign()], -1)
         return z.abs() - 0.5 * self.thickness, normal[..., None, :]
