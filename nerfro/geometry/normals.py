@@ -12,8 +12,7 @@ from nerfro.geometry.mesh import TriangleMesh
 # Ratio of the largest to the smallest triangle around a vertex from which on the large one decides.
 _UNEVEN = 8.0
 
-# Edges with larger angles between their faces stay sharp. Facets of the meshes that we use differ by less than 12
-# degrees on curved sides, and by 45 and more at edges.
+# Edges with larger angles between their faces stay sharp, in degrees; 30 is a common default of modelling programs.
 CREASE_DEGREES = 30.0
 
 

@@ -14,7 +14,7 @@ from nerfro.losses.base import Loss, Model
 from nerfro.registry import register
 from nerfro.types import Batch, Exits, Rendering
 
-# Random pairs of directions for each step. Their lookups cost less than 1 % of a step of the default experiment's rays.
+# Random pairs of directions for each step.
 _NUM_PAIRS = 1024
 
 

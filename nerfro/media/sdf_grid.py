@@ -34,7 +34,7 @@ AIR = 4
 # spline and the step that brackets the surface.
 BAND = 3.0
 # Cells along each side of the blocks that store a lower bound of the distance, and of the blocks that store whether
-# they may contain a surface. Both were chosen by the tracing time of the torus and the ship at 128^3 voxels.
+# they may contain a surface. docs/benchmarks.md has times for 3 and 4 cells.
 BLOCK, SURFACE_BLOCK = 4, 3
 # A quadratic spline that is extrapolated by half a cell at a corner is a sum of coefficients whose positive weights add
 # up to 2.19 and whose negative weights to -1.19. It is positive if the largest coefficient is less than 1.84 times the
@@ -227,7 +227,7 @@ class SdfGrid(Solid):
         return torch.from_numpy(distance_transform_cdt(empty.numpy(), "chessboard").clip(0, 255).astype(np.uint8))
 
     def _coefficients_of_blocks(self) -> Float[Tensor, "K X Y Z"]:
-        """Return the coefficients of all blocks of `SURFACE_BLOCK`^3 cells with one neighbour on each side, on the CPU."""
+        """Return the coefficients of all blocks of `SURFACE_BLOCK`^3 cells and their neighbours, on the CPU."""
         values = self.coefficients.detach().cpu()
         for axis, count in enumerate(values.shape[1:], start=1):
             blocks = (count - 1) // SURFACE_BLOCK + 1

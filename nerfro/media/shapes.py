@@ -14,11 +14,9 @@ from nerfro.registry import register
 
 # Air around a shape as a share of its size, because half of the shell lies outside the surface.
 _MARGIN = 0.05
-# Rounded box: distance from the centre to a face, and radius of the edges, world units. As the scenes of the paper, the
-# box fits into [-1, 1]^3, and its edges are a tenth of its size.
+# Rounded box: distance from the centre to a face, and radius of the edges, world units. The box fits into [-1, 1]^3.
 _HALF_SIDE, _EDGE_RADIUS = 0.75, 0.08
-# Half side of the box of a slab along x and y, world units: no ray that crosses [-1, 1]^3 at less than 80 degrees meets
-# its end.
+# Slab: half side of the box along x and y, world units, larger than the scenes of the paper, which fit into [-1.5, 1.5]^3.
 _HALF_WIDTH = 10.0
 
 

@@ -137,7 +137,7 @@ class Solid(Medium):
         """
 
     def regions(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
-        """Evaluate `signed_distances` of the visible part of each body: in a `nested` medium its part inside all others."""
+        """Evaluate `signed_distances`; in a `nested` medium, of the part of each body inside all bodies before it."""
         phi, gradients = self.signed_distances(positions)
         if not self.nested:
             return phi, gradients
@@ -145,7 +145,7 @@ class Solid(Medium):
         return phi, gradients.gather(-2, body[..., None].expand_as(gradients))
 
     def innermost(self, inside: Bool[Tensor, "*batch K"]) -> Int[Tensor, "*batch"]:
-        """Return the number of the body that contains a point, from 1 on, given which surfaces enclose it; 0 for none."""
+        """Return the number of the body that contains a point, given which surfaces enclose it; 0 for none."""
         numbers = torch.arange(inside.shape[-1] + 1, device=inside.device)
         if self.nested:
             # Air in a vessel is the air outside: a ray passes between them without an event.
@@ -165,7 +165,7 @@ class Solid(Medium):
         within, rise = (
             torch.ones_like(n)[..., None],
             torch.zeros_like(positions),
-        )  # product of the steps and its gradient
+        )  # product of steps, its gradient
         for body, ior in enumerate(self.iors.unbind()):
             t = (0.5 - 0.5 * phi[..., body] / self.shell).clamp(0, 1)
             step = (t * t * (3 - 2 * t))[..., None]

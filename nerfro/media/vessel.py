@@ -132,12 +132,12 @@ class SdfVessel(SdfGrid):
         return values if values is None or len(values) == 2 else values * values.new_tensor([[1.0], [0.0], [1.0]])
 
     def grown(self, outwards: Float[Tensor, "X Y Z"]) -> SdfVessel:
-        """Return the vessel with a displaced outer surface; the cavity follows, because the wall keeps its thickness."""
+        """Return the vessel with a displaced outer surface. The cavity follows, as the wall keeps its thickness."""
         changed = variant(self, _outer=self._outer - outwards, _side=self._side - outwards)
         return changed._with_distances(changed._distances())
 
     def _distances(self) -> Float[Tensor, "K X Y Z"]:
-        """Compute the signed distances of the outer body, of the cavity and of the space below the level, world units."""
+        """Compute the signed distances of the outer body, the cavity and the space below the level, world units."""
         wall, foot, *level = (length * self.unit for length in self.lengths.values())
         cavity = torch.maximum(self._side + wall, foot - self._heights)
         return torch.stack([self._outer, cavity, *(self._heights - height for height in level)])

@@ -26,7 +26,7 @@ from nerfro.registry import register
 
 # Part of the cache key. Increase it when the same mesh and settings give different fractions.
 _VERSION = 1
-# Inside tests along each side around a vertex, as in the paper.
+# Inside tests along each side around a vertex.
 _SUBSAMPLES = 4
 BYTES_PER_VERTEX = 64  # peak memory while a grid is built
 
@@ -189,7 +189,7 @@ def grid_box(
         return corners_of_box(box_min, box_max)
     if box_min is not None or box_max is not None:
         raise NerfroError(
-            "only one of medium.box_min and medium.box_max is given; give both, or neither for the bounds of the mesh"
+            "medium.box_min and medium.box_max belong together; give both, or neither for the bounds of the mesh"
         )
     low, high = np.min([mesh.bounds[0] for mesh in meshes], 0), np.max([mesh.bounds[1] for mesh in meshes], 0)
     sides = np.maximum(high - low, 0.5 * (high - low).max())
@@ -207,7 +207,7 @@ def check_margin(mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], resolution: 
     share = 2 * voxels / (resolution - 1)
     if share >= 0.9:
         raise NerfroError(
-            f"medium.resolution={resolution} leaves no room for {voxels} voxels of air on each side; increase it"
+            f"medium.resolution={resolution} has no room for {voxels} voxels of air on each side; increase it"
         )
     margin = 0.5 * (high - low).max() * share / (1 - share)
     raise NerfroError(
