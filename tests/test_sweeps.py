@@ -289,7 +289,7 @@ def test_damaged_record_costs_its_own_cell_alone(sweep: Callable[..., Any], tmp_
 
 @pytest.mark.parametrize(
     ("override", "words"),
-    [("+batches.foo=1", "batches.foo is no setting"), ("batches.divergence=nan", "divergence=nan is not allowed")],
+    [("+batches.foo=1", "batches.foo is not a setting"), ("batches.divergence=nan", "divergence=nan is not allowed")],
 )
 def test_settings_of_cells_are_checked_before_any_is_run(
     override: str, words: str, sweep: Callable[..., Any], tmp_path: Path

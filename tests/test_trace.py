@@ -127,7 +127,7 @@ def test_bad_rays_are_one_clear_line(trace: Callable[..., str], tmp_path: Path, 
         (["far=inf"], "far=inf is not allowed"),
         (["medium.shell_voxels=nan"], "shell_voxels=nan is not allowed"),
         (["far=nan"], "far=nan is not allowed"),
-        (["medium.nothing=1"], "medium.nothing is no setting"),
+        (["medium.nothing=1"], "medium.nothing is not a setting"),
         (["medium=voxel_grid", "medium.smoothing_size=3"], "medium=sdf_grid"),
     ],
 )

@@ -1,8 +1,8 @@
 """An equi-angular cube map with several resolutions, in plain PyTorch.
 
 Face 2 a + b is the side of the cube at the positive (b = 0) or negative (b = 1) end of axis a. The first texture
-coordinate of a face is the angle towards axis a + 1 (modulo 3), and the second the angle towards axis a + 2. Texels have
-equal widths in angle, which keeps their solid angles within a factor of 1.4.
+coordinate of a face is the angle towards axis a + 1 (modulo 3), and the second the angle towards axis a + 2. All texels
+have the same width in angle, which keeps their solid angles within a factor of 1.4.
 
 `lookup` runs on GPUs, and is the reference implementation of the kernels in `nerfro.boundaries.cube_map_cpu`.
 """
@@ -116,9 +116,7 @@ def lookup(
     resolution, offset, padded_offset = (
         constant(values, texels.device) for values in (levels.resolutions, levels.offsets, padded_offsets)
     )
-    place = (coordinates[:, None] + 1) * (
-        0.5 * resolution[:, None]
-    ) + 0.5  # in padded texels, whose centres are integers
+    place = (coordinates[:, None] + 1) * (0.5 * resolution[:, None]) + 0.5  # in padded texels, with integer centres
     corner = torch.minimum(place.long().clamp(min=0), resolution[:, None])
     (u, v), (column, row) = (place - corner).unbind(-1), corner.unbind(-1)
     weights = torch.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], dim=-1)

@@ -27,8 +27,8 @@ _BLACK = 1e-3
 class EnvironmentMap(Boundary):
     """Squared softplus of a sum of cube maps of increasing resolution.
 
-    Coarse levels fill in directions that no ray has sampled. The map has no preferred axis. Its initial value is an even
-    grey or a given image.
+    Coarse levels fill in directions that no ray has sampled. The map has no preferred axis. It is initialized
+    to an even grey or to a given image.
 
     Args:
         resolutions: texels along each side of a face (90 degrees) of each level. The finest texel of the default is

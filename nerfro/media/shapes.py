@@ -16,7 +16,7 @@ from nerfro.registry import register
 _MARGIN = 0.05
 # Rounded box: distance from the centre to a face, and radius of the edges, world units. The box fits into [-1, 1]^3.
 _HALF_SIDE, _EDGE_RADIUS = 0.75, 0.08
-# Slab: half side of the box along x and y, world units, larger than the scenes of the paper, which fit into [-1.5, 1.5]^3.
+# Slab: half side of the box along x and y, world units, larger than the scenes of the paper.
 _HALF_WIDTH = 10.0
 
 
