@@ -211,7 +211,7 @@ def test_unknown_field_of_a_lightning_object_is_refused() -> None:
         ({"photometrc": {}}, "no loss is called 'photometrc'; known: backdrop, .*photometric, smoothness"),
         (
             {"photometric": {"weigth": 1}},
-            "loss=photometric: Key 'weigth' not in 'PhotometricConfig'; its fields: weight",
+            "loss=photometric: Key 'weigth' not in 'PhotometricConfig'; its fields: coarse",
         ),
         (
             {"photometric": 3},
@@ -241,7 +241,7 @@ def test_wrong_losses_are_refused(losses: dict[str, object], message: str) -> No
         (["+batches.foo=3"], ["batches.foo is not a setting; known: batching, contrast, contrast_start, divergence"]),
         (["+evaluation.foo=1"], ["evaluation.foo is not a setting; known: chunk_size"]),
         (["+sampler.point.num_samples=5"], ["sampler.point is not a setting; did you mean points?"]),
-        (["+optimizer.foo=1"], ["optimizer.foo is not a setting; known: adam_epsilon"]),
+        (["+optimizer.foo=1"], ["optimizer.foo is not a setting; known: absorption_learning_rate"]),
         (["+medium.foo=1"], ["medium.foo is not a setting; known: accept_open_mesh"]),
         (["+hydra.foo=1"], ["hydra.foo is not a setting; known: callbacks"]),
         (["+hydra.run.foo=1"], ["hydra.run.foo is not a setting; known: dir"]),

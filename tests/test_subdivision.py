@@ -25,7 +25,7 @@ from nerfro.types import Batch
 
 NUM_VIEWS, HEIGHT, WIDTH = 3, 8, 10
 SIDE, FOCAL = 33, 60.0
-CUBE = RoundedBox(ior=1.5)
+CUBE = RoundedBox(half_side=0.6, edge_radius=0.05, ior=1.5)
 
 
 @pytest.fixture

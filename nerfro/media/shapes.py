@@ -14,8 +14,6 @@ from nerfro.registry import register
 
 # Air around a shape as a share of its size, because half of the shell lies outside the surface.
 _MARGIN = 0.05
-# Rounded box: distance from the centre to a face, and radius of the edges, world units. The box fits into [-1, 1]^3.
-_HALF_SIDE, _EDGE_RADIUS = 0.75, 0.08
 # Slab: half side of the box along x and y, world units, larger than the scenes of the paper.
 _HALF_WIDTH = 10.0
 
@@ -54,11 +52,15 @@ class RoundedBox(Solid):
     """A cube around the origin with rounded edges and corners.
 
     Args:
+        half_side: distance from the centre to a face, world units.
+        edge_radius: radius of the rounded edges, world units.
         ior, shell, absorption, learn_absorption, abbe: see `Solid`.
     """
 
     def __init__(
         self,
+        half_side: Positive = 0.75,
+        edge_radius: NotNegative = 0.08,
         ior: Positive = 1.52,
         shell: Positive = 0.002,
         absorption: list[NotNegative] = (),  # type: ignore[assignment]
@@ -66,15 +68,16 @@ class RoundedBox(Solid):
         abbe: list[Positive] = (),  # type: ignore[assignment]
     ) -> None:
         super().__init__([ior], shell, absorption, learn_absorption, abbe)
-        side = _HALF_SIDE * (1 + _MARGIN) + shell
+        self.half_side, self.edge_radius = half_side, edge_radius
+        side = half_side * (1 + _MARGIN) + shell
         self.register_buffer("box", torch.tensor([[-side] * 3, [side] * 3]), persistent=False)
 
     def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
         """Return |max(q, 0)| + min(max q, 0) - r with q = |x| - (a - r): the distance to a smaller cube, less r."""
-        q = positions.abs() - (_HALF_SIDE - _EDGE_RADIUS)
+        q = positions.abs() - (self.half_side - self.edge_radius)
         outward = q.clamp(min=0)
         outside = torch.linalg.vector_norm(outward, dim=-1, keepdim=True)
-        distance = outside + q.amax(-1, keepdim=True).clamp(max=0) - _EDGE_RADIUS
+        distance = outside + q.amax(-1, keepdim=True).clamp(max=0) - self.edge_radius
         nearest_face = functional.one_hot(q.argmax(-1), 3).to(q)
         direction = torch.where(outside > 0, functional.normalize(outward, dim=-1), nearest_face)
         return distance, (direction * positions.sign())[..., None, :]

@@ -39,7 +39,7 @@ MEDIA = [
     Vacuum(),
     Luneburg(),
     Ball(shell=0.3),
-    RoundedBox(shell=0.05),
+    RoundedBox(shell=0.05, edge_radius=0.3),
     Slab(shell=0.1),
     _nested_balls(),
     _half_full_ball(),
