@@ -7,6 +7,7 @@ as rays where no ray splits; what is documented with R then has P rows.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
@@ -38,16 +39,16 @@ class Path:
     radii: Float[Tensor, "P"]  # pixel cone radius at unit distance, carried along from the rays
     # The ray that each polyline belongs to, non-decreasing, every ray with one polyline at least; by default each
     # ray has one.
-    ray: Int[Tensor, "P"] = None  # type: ignore[assignment]  # filled in below
+    ray: Int[Tensor, "P"] | Any = None  # filled in below
     # Linear factor of the light that the polyline brings; 1 by default. Those of a ray sum to at most 1.
-    throughput: Float[Tensor, "P 3"] = None  # type: ignore[assignment]
+    throughput: Float[Tensor, "P 3"] | Any = None
     # Innermost body of the medium in which each vertex is left, numbered from 1; 0 in air, or where the index
     # varies continuously.
-    body: Int[Tensor, "P S"] = None  # type: ignore[assignment]
+    body: Int[Tensor, "P S"] | Any = None
     # Absorption of air and of each body, for each colour channel, per world unit; 0 by default.
-    absorption: Float[Tensor, "K+1 3"] = None  # type: ignore[assignment]
+    absorption: Float[Tensor, "M 3"] | Any = None
     # Number of the wavelength at which the polyline is bent, where the index depends on it; 0 by default.
-    band: Int[Tensor, "P"] = None  # type: ignore[assignment]
+    band: Int[Tensor, "P"] | Any = None
     # Which of these were given. Known here, so that the ordinary path is neither summed up nor weighted, bit for bit.
     _given: frozenset[str] = field(init=False, repr=False)
 

@@ -69,12 +69,12 @@ def unproject(face: Int[Tensor, "P"], coordinates: Float[Tensor, "P 2"]) -> Floa
     return torch.nn.functional.normalize(components.gather(-1, order), dim=-1)
 
 
-def texel_directions(resolution: int) -> Float[Tensor, "6*n*n 3"]:
+def texel_directions(resolution: int) -> Float[Tensor, "T 3"]:
     """Directions of the texels' centres."""
     return _directions((torch.arange(resolution) + 0.5) / resolution * 2 - 1)
 
 
-def padded_texels(resolution: int) -> Int[Tensor, "6 n+2 n+2"]:
+def padded_texels(resolution: int) -> Int[Tensor, "6 m m"]:
     """The texel at each place of the faces, grown by one texel on every side with those of the neighbouring faces.
 
     At the faces' corners three faces meet and there is no fourth texel: these places are not to be used.
@@ -86,7 +86,7 @@ def padded_texels(resolution: int) -> Int[Tensor, "6 n+2 n+2"]:
     return ((face * n + row) * n + column).view(6, n + 2, n + 2).int()
 
 
-def _directions(centres: Float[Tensor, "n"]) -> Float[Tensor, "6*n*n 3"]:
+def _directions(centres: Float[Tensor, "n"]) -> Float[Tensor, "T 3"]:
     """Directions at all faces' places with the given coordinates, by face, row and column."""
     n = len(centres)
     face = torch.arange(6).repeat_interleave(n * n)

@@ -52,7 +52,7 @@ class EnvironmentMap(Boundary):
             self.set_lat_long(lat_long.load_lat_long(image))
 
     @classmethod
-    def of_texels(cls, radiance: Float[Tensor, "6*n*n 3"]) -> EnvironmentMap:
+    def of_texels(cls, radiance: Float[Tensor, "T 3"]) -> EnvironmentMap:
         """A sky that learns no more: the linear radiance of each texel, see `cube_map.texel_directions`."""
         sky = cls([math.isqrt(len(radiance) // 6)])
         sky.requires_grad_(False).texels.copy_(_raw(radiance))

@@ -75,7 +75,7 @@ class _Motions(PerView):
         """Turn and shift of each camera, without what is the world's; radians and world units."""
         return without_world(self.motion * self.units, self.of_world, self.weights)
 
-    def together(self) -> Float[Tensor, "3*V 3"]:
+    def together(self) -> Float[Tensor, "M 3"]:
         """Orthonormal turns by which all cameras turn alike, each about its own centre; pixels about its own axes."""
         own = self.moved()[..., :3].mT / self.units[:, :3, None]
         return torch.linalg.qr(own.flatten(0, 1))[0]

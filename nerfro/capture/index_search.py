@@ -66,8 +66,8 @@ class Estimate:
     values: Float[np.ndarray, "K"]
     standard_errors: Float[np.ndarray, "K"]
     curvature: Float[np.ndarray, "K"]
-    wide: Float[np.ndarray, "C K+1"]
-    close: Float[np.ndarray, "c K+1"]
+    wide: Float[np.ndarray, "C N"]
+    close: Float[np.ndarray, "c N"]
     unrelated: float
     doubts: list[str]
 

@@ -44,7 +44,7 @@ def contracted_box(box: Float[Tensor, "2 3"], radius: float) -> Float[Tensor, "2
 
 
 def contracted_length(
-    t: Float[Tensor, "*batch"], aside: Float[Tensor, "*batch"], radius: float
+    t: Float[Tensor, "*batch"], aside: Float[Tensor, "*#batch"], radius: float
 ) -> Float[Tensor, "*batch"]:
     """Integral of the shrinkage along a line, from the place nearest to the centre to arc length `t` from there.
 
@@ -64,7 +64,7 @@ def contracted_length(
 
 
 def world_length(
-    length: Float[Tensor, "*batch"], aside: Float[Tensor, "*batch"], radius: float
+    length: Float[Tensor, "*batch"], aside: Float[Tensor, "*#batch"], radius: float
 ) -> Float[Tensor, "*batch"]:
     """The inverse of `contracted_length`, for lengths that it returns for `FAR` or less."""
     a = aside.clamp(min=NEAREST * radius)

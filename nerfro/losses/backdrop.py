@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -36,7 +38,7 @@ class Backdrop(Loss):
     colour: Float[Tensor, "3"] | None
 
     def __init__(
-        self, colour: list[float] | None = None, weight: NotNegative = 0.1, start: Natural = 0, ramp: Natural = 0
+        self, colour: Sequence[float] | None = None, weight: NotNegative = 0.1, start: Natural = 0, ramp: Natural = 0
     ) -> None:
         super().__init__(weight, start, ramp)
         if colour is not None and (len(colour) != 3 or not all(0 <= value <= 1 for value in colour)):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -13,6 +13,7 @@ from nerfro.boundaries.base import Boundary
 from nerfro.types import Batch, Rendering
 
 
+@runtime_checkable
 class Model(Protocol):
     """What losses know of the model (`nerfro.models.base.NerfModel`)."""
 

@@ -58,8 +58,8 @@ class VoxelGrid(Medium):
         mesh: str | None = None,
         ior: Positive = 1.5,
         resolution: Resolution = 128,
-        box_min: list[float] = [-1.5, -1.5, -1.5],  # noqa: B006 (the registry reads and copies it)
-        box_max: list[float] = [1.5, 1.5, 1.5],  # noqa: B006
+        box_min: Sequence[float] = (-1.5, -1.5, -1.5),
+        box_max: Sequence[float] = (1.5, 1.5, 1.5),
         smoothing_size: Annotated[int, Range(at_least=0, at_most=99)] = 9,
         smoothing_sigma: Positive = 1.0,
         subsamples: Count = 4,
@@ -88,7 +88,7 @@ class VoxelGrid(Medium):
             lambda: {"occupancy": occupancy_fraction(loaded, box, resolution, subsamples).astype(np.float16)},
             cache,
         )["occupancy"]
-        require_inside(occupancy.max() > 0.25)  # more than what happens to lie on a flat mesh
+        require_inside(bool(occupancy.max() > 0.25))  # more than what happens to lie on a flat mesh
         fractions, corners = torch.from_numpy(occupancy).float(), torch.from_numpy(box).float()
         self._set(fractions, corners, ior, smoothing_size, smoothing_sigma)
 
@@ -150,7 +150,7 @@ class VoxelGrid(Medium):
         return n, torch.where(inside[..., None], values[..., 1:], 0.0)
 
     @lazy_buffer
-    def clearance_grid(self) -> Float[Tensor, "X-1 Y-1 Z-1"]:
+    def clearance_grid(self) -> Float[Tensor, "U V W"]:
         """Distance from any point of each cell within which grad n is zero, world units."""
         varies = (self.table[..., 1:] != 0).any(-1).cpu()
         for axis in range(3):
@@ -187,7 +187,11 @@ class VoxelGrid(Medium):
 
 
 def grid_box(
-    box_min: list[float] | None, box_max: list[float] | None, meshes: Sequence[TriangleMesh], resolution: int, air: int
+    box_min: Sequence[float] | None,
+    box_max: Sequence[float] | None,
+    meshes: Sequence[TriangleMesh],
+    resolution: int,
+    air: int,
 ) -> Float[np.ndarray, "2 3"]:
     """Corners of a medium's grid: the given ones, or the meshes' bounds and so many voxels of air on each side.
 

@@ -35,7 +35,7 @@ class Contracted:
     The first run is followed back, and the last one on, as far as is needed, whatever the path's own ends.
     """
 
-    marks: Float[Tensor, "P S+1"]  # measure at the beginning of each run, and in all
+    marks: Float[Tensor, "P M"]  # measure at the beginning of each run, and in all
     begin: Float[Tensor, "P S"]  # contracted length from the run's nearest place to the centre to its beginning
     passing: Float[Tensor, "P S"]  # arc length at that place
     aside: Float[Tensor, "P S"]  # distance from the centre there

@@ -82,7 +82,7 @@ def turning_normals(
     return functional.normalize(change, dim=-1, eps=torch.finfo(change.dtype).tiny)
 
 
-def indices_of(medium: Medium, like: Tensor) -> Float[Tensor, "K+1"]:
+def indices_of(medium: Medium, like: Tensor) -> Float[Tensor, "M"]:
     """Refractive index of air and of each body, with gradients."""
     bodies = [medium.iors] if isinstance(medium, Solid) else []
     return torch.cat([like.new_ones(1), *(iors.to(like) for iors in bodies)])

@@ -117,7 +117,7 @@ def bake_sky(boundary: Boundary, device: torch.device) -> Baked:
     return Baked({"size": size}, {"sky": upper, "sky_exponent": rest})
 
 
-def cube_directions(size: int) -> Float[Tensor, "6*size*size 3"]:
+def cube_directions(size: int) -> Float[Tensor, "T 3"]:
     """Unit directions of the texels by face, row and column.
 
     A face's place (1, a, b) in [-1, 1] stands for the direction (1, tan(a pi / 4), tan(b pi / 4)). Orientations:

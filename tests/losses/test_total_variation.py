@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
 
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.errors import NerfroError
+from nerfro.losses.base import Model
 from nerfro.losses.total_variation import TotalVariation, direction_pairs
 from nerfro.testing import example_batch, example_draws
 
@@ -27,8 +28,8 @@ def test_pairs_are_the_angle_apart_and_uniform() -> None:
     torch.testing.assert_close((first * second).sum(-1), torch.full((20_000,), math.cos(0.3)), rtol=0, atol=1e-5)
 
 
-def model(boundary) -> SimpleNamespace:
-    return SimpleNamespace(boundary=boundary, encode=lambda radiance: radiance)
+def model(boundary) -> Mock:
+    return Mock(spec=Model, boundary=boundary, encode=lambda radiance: radiance)
 
 
 def test_value_is_that_of_a_linear_sky() -> None:
