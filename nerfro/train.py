@@ -61,7 +61,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     first = few.batch(0)
     require_reach(model, first)
     share, device = few.batch_size / batches.batch_size, trainer.strategy.root_device
-    memory = require_memory(model, first.rays, device, share)
+    memory = require_memory(model, first.rays, device, share, batches.pixel_bytes)
     if trainer.is_global_zero:
         begin(folder, config, model)
         print(memory, flush=True)
