@@ -83,7 +83,8 @@ def with_told(
         told: what is known.
     """
     for each in told:
-        information = (variance * each.information).to(matrix)
+        # What a checkpoint brings is on the CPU.
+        information = variance * each.information.to(matrix)
         matrix = matrix + information
-        vector = vector + information @ (numbers - each.numbers).to(vector)
+        vector = vector + information @ (numbers - each.numbers.to(numbers)).to(vector)
     return matrix, vector
