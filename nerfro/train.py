@@ -54,7 +54,8 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     require_same_run(folder, checkpoint, config)
     throughput, interruption = Throughput(), StopOnSignal()
     # Cameras move by sky and outlines before the sky is learned.
-    cameras, boundary = CameraSteps(batches, training), BoundaryFirst(batches, config.optimizer.boundary_first)
+    cameras = CameraSteps(batches, training)
+    boundary = BoundaryFirst(batches, config.optimizer.boundary_first, interruption)
     trainer = make_trainer(config, folder, throughput, [interruption, cameras, boundary, Viewer(config, source, test)])
     batches = traced(batches.share(trainer.global_rank, trainer.world_size), model, config)
     few = batches.smaller(4096)

@@ -44,22 +44,25 @@ class CameraSteps(Callback):
     def __init__(self, batches: RayBatches, views: Views) -> None:
         self._batches, self._views = batches, views
         self._told: dict[str, Told] = {}  # by what
+        self._aligned = False  # by sky and outlines; a run that resumes at step 0 does not repeat it
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, NerfModel)
         model, camera, box = pl_module, pl_module.camera, occupied(pl_module)
-        if trainer.global_step > 0 or box is None or not isinstance(camera, RefinedCamera):
+        if trainer.global_step > 0 or self._aligned or box is None or not isinstance(camera, RefinedCamera):
             return
         batches = self._batches.to(model.device)
         panorama = align(camera, batches.cameras, batches.photographed, lambda rays: misses(box, rays))
         known = {"panorama": panorama, "outlines": meet_masks(camera, self._views, model.medium, panorama)}
         self._told = {name: told for name, told in known.items() if told is not None}
+        self._aligned = True
 
     def state_dict(self) -> dict[str, Any]:
-        return {name: dict(vars(told)) for name, told in self._told.items()}
+        return {"aligned": self._aligned, "told": {name: dict(vars(told)) for name, told in self._told.items()}}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._told = {name: Told(**told) for name, told in state_dict.items()}
+        self._aligned = state_dict["aligned"]
+        self._told = {name: Told(**told) for name, told in state_dict["told"].items()}
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
         assert isinstance(pl_module, NerfModel)

@@ -106,7 +106,8 @@ def test_a_resumed_step_on_a_gpu_uses_what_the_checkpoint_holds_on_the_cpu() -> 
     camera.begin(TRUE)
     size = camera.numbers().numel()
     steps = CameraSteps(Mock(spec=RayBatches), Mock(spec=Views))
-    steps.load_state_dict({"panorama": {"numbers": torch.zeros(size), "information": 1e12 * torch.eye(size).double()}})
+    prior = {"numbers": torch.zeros(size), "information": 1e12 * torch.eye(size).double()}
+    steps.load_state_dict({"aligned": True, "told": {"panorama": prior}})
     with PretendedGpu():
         camera, given = camera.to(GPU), TRUE.to(GPU)
         pixels, pictures = looked_at(0, 20).to(GPU), 1 - PHOTOGRAPHS.to(GPU)
