@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -171,7 +171,7 @@ class RefinedCamera(Camera):
         motion = self.motions.motion.flatten()
         return motion if self.lens is None else torch.cat([motion, self.lens])
 
-    def split(self, numbers: Float[Tensor, "N"]) -> tuple[Float[Tensor, "V 6"], Float[Tensor, "L"]]:
+    def split(self, numbers: Shaped[Tensor, "N"]) -> tuple[Shaped[Tensor, "V 6"], Shaped[Tensor, "L"]]:
         """The motions of the cameras and the lens, of such numbers."""
         num = self.motions.motion.numel()
         return numbers[:num].view(-1, 6), numbers[num:]

@@ -37,7 +37,7 @@ def fit(picture: Float[Tensor, "h w 3"] | None, width: int, height: int) -> Imag
 
 
 def sheet(
-    pictures: Sequence[Float[Tensor, "h w 3"]], captions: Sequence[str], width: int, columns: int, title: str
+    pictures: Sequence[Float[Tensor, "_ _ 3"]], captions: Sequence[str], width: int, columns: int, title: str
 ) -> Image.Image:
     """Pictures (sRGB) drawn `width` pixels wide in rows of at most `columns`, each over its caption, under a title."""
     columns, height = min(columns, len(pictures)), round(width * pictures[0].shape[0] / pictures[0].shape[1])

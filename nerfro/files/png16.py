@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -85,7 +86,7 @@ def _compiled_unfilter() -> Callable[[np.ndarray, int], None]:
     # Imported here: most data sets have 8 bits and need no compiler.
     import numba
 
-    return numba.njit(_unfilter, nogil=True, cache=True)
+    return numba.njit(inspect.unwrap(_unfilter), nogil=True, cache=True)
 
 
 def _unfilter(rows: np.ndarray, pixel_bytes: int) -> None:

@@ -172,6 +172,7 @@ def test_the_surface_is_that_of_the_ball_with_its_normals(scene: Scene) -> None:
         ({"glass": False, "ior": 1.4}, None),
     ],
 )
+@pytest.mark.usefixtures("unchecked")
 def test_what_a_scene_cannot_be_is_refused_in_one_line(scene: Scene, changes: dict, message: str | None) -> None:
     if message is None:
         assert len(scene.with_(**changes).ior) == 0
