@@ -1,4 +1,4 @@
-"""What a radiance field is."""
+"""Base class of radiance fields."""
 
 from __future__ import annotations
 
@@ -12,15 +12,18 @@ from nerfro.types import Radiance, Samples
 
 
 class Field(nn.Module, ABC):
-    """Density and colour of a volume."""
+    """Density and colour of a volume; subclasses implement `forward`.
+
+    Positions and densities are in world units, directions are unit vectors, and colours are sRGB.
+    """
 
     @property
     def bounds(self) -> Float[Tensor, "2 3"] | None:
-        """Opposite corners of the box outside of which it holds nothing, world units; None where it has none."""
+        """Opposite corners of the box outside of which the field is empty, world units; None for unbounded fields."""
         return None
 
     def density(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
-        """Density alone, per world unit, in single precision; it does not depend on the direction."""
+        """Evaluate only the density, per world unit, in single precision; density is independent of the direction."""
         directions = torch.zeros_like(positions)
         directions[:, 2] = -1
         s = torch.zeros(len(positions), 1, device=positions.device)
@@ -29,4 +32,11 @@ class Field(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, samples: Samples) -> Radiance:
-        """Density (per world unit) and colour (sRGB) at every sample."""
+        """Evaluate density (per world unit) and colour (sRGB) at samples.
+
+        Args:
+            samples: R rays with N samples each.
+
+        Returns:
+            Density [R, N] and colour [R, N, 3].
+        """

@@ -12,9 +12,12 @@ from torch import Tensor
 def positional_encoding(
     x: Float[Tensor, "*batch D"], min_degree: int, max_degree: int, identity: bool = True
 ) -> Float[Tensor, "*batch F"]:
-    """Sines and cosines of x at octaves 2^min .. 2^(max-1), all sines first, preceded by x itself (NeRF, Eqn. 4).
+    """Encode x by sines and cosines at octaves 2^min .. 2^(max-1) (NeRF, Eqn. 4).
 
-    The frequencies carry no factor pi and x is not normalised, as in mip-NeRF's code. F is D (2 octaves + identity).
+    As in mip-NeRF's code, frequencies have no factor pi and x is not normalized.
+
+    Returns:
+        x (if `identity`), all sines, and all cosines; F = D (2 octaves + identity).
     """
     scales = 2.0 ** torch.arange(min_degree, max_degree, device=x.device, dtype=x.dtype)
     angles = (x[..., None, :] * scales[:, None]).flatten(-2)
@@ -25,7 +28,7 @@ def positional_encoding(
 def integrated_positional_encoding(
     mean: Float[Tensor, "*batch 3"], variance: Float[Tensor, "*batch 3"], min_degree: int, max_degree: int
 ) -> Float[Tensor, "*batch F"]:
-    """Expected sines and cosines of a Gaussian with diagonal covariance (mip-NeRF, Eqn. 13)."""
+    """Return expected sines and cosines of a Gaussian with diagonal covariance (mip-NeRF, Eqn. 13)."""
     scales = 2.0 ** torch.arange(min_degree, max_degree, device=mean.device, dtype=mean.dtype)
     angles = (mean[..., None, :] * scales[:, None]).flatten(-2)
     damping = torch.exp(-0.5 * (variance[..., None, :] * scales[:, None] ** 2).flatten(-2))

@@ -1,4 +1,4 @@
-"""Multi-resolution hash encoding in plain PyTorch: the reference of the compiled kernels, and the path on a GPU.
+"""Multi-resolution hash encoding in plain PyTorch: reference of the compiled kernels, and the implementation for GPUs.
 
 Source: Mueller et al., Instant Neural Graphics Primitives, 2022, section 3.
 """
@@ -15,26 +15,26 @@ from torch import Tensor
 from nerfro.errors import NerfroError
 from nerfro.kernels.constants import constant
 
-# Features at a vertex. The compiled kernels are written for a pair, which one 64-bit load fetches.
+# Features per vertex. The compiled kernels assume two, which one 64-bit load fetches.
 NUM_FEATURES = 2
 
 # Corners of a cell, x fastest.
 _CORNERS = tuple((i, j, k) for k in (0, 1) for j in (0, 1) for i in (0, 1))
 
-# Factors of the spatial hash (Eqn. 4); the factor of x is 1, so that neighbours in x share a cache line.
+# Factors of the spatial hash (Eqn. 4). The factor of x is 1, so that neighbours in x share a cache line.
 HASH_Y, HASH_Z = 2654435761, 805459861
 
 
 @dataclass(frozen=True)
 class GridLevels:
-    """Where each level's vertices lie in one table, coarse to fine.
+    """Layout of the levels in one table, from coarse to fine.
 
-    A level whose (resolution + 1)^3 vertices fit into `size` entries is dense; a finer one is hashed.
+    A level is dense if (resolution + 1)^3 vertices fit into `size` entries, and hashed otherwise.
     """
 
-    resolutions: tuple[int, ...]  # cells along the unit cube's side
-    sizes: tuple[int, ...]  # entries of the table; a power of two where hashed
-    offsets: tuple[int, ...]  # first entry
+    resolutions: tuple[int, ...]  # cells along the side of the unit cube
+    sizes: tuple[int, ...]  # entries of each level; a power of two for hashed levels
+    offsets: tuple[int, ...]  # first entry of each level
 
     @property
     def num_entries(self) -> int:
@@ -49,16 +49,16 @@ class GridLevels:
 
 
 def grid_levels(num_levels: int, base_resolution: int, finest_resolution: int, log2_table_size: int) -> GridLevels:
-    """Levels in geometric progression of resolution (Eqns. 2 and 3)."""
+    """Return levels with resolutions in geometric progression (Eqns. 2 and 3)."""
     if num_levels < 1 or not 1 <= base_resolution <= finest_resolution:
         raise NerfroError(
-            f"hash grid of {num_levels} levels from {base_resolution} to {finest_resolution} cells: take 1 or more "
-            "levels and 1 <= base_resolution <= finest_resolution"
+            f"hash grid of {num_levels} levels from {base_resolution} to {finest_resolution} cells is not possible; "
+            "set num_levels >= 1 and 1 <= base_resolution <= finest_resolution"
         )
     if not 4 <= log2_table_size <= 24:
-        raise NerfroError(f"log2_table_size={log2_table_size} is not within 4 to 24; usual values are 14 to 19")
+        raise NerfroError(f"log2_table_size={log2_table_size} is outside 4 to 24; usual values are 14 to 19")
     growth = math.log(finest_resolution / base_resolution) / max(num_levels - 1, 1)
-    # The small addend keeps the last level from rounding down to one cell less than was asked for.
+    # The small addend prevents the last level from being rounded down to one cell less than requested.
     resolutions = [math.floor(base_resolution * math.exp(level * growth) + 1e-6) for level in range(num_levels)]
     sizes = [min((n + 1) ** 3, 2**log2_table_size) for n in resolutions]
     offsets = [sum(sizes[:level]) for level in range(num_levels)]
@@ -68,13 +68,15 @@ def grid_levels(num_levels: int, base_resolution: int, finest_resolution: int, l
 def hash_encode(
     positions: Float[Tensor, "P 3"], table: Float[Tensor, "T 2"], levels: GridLevels
 ) -> Float[Tensor, "P 2*L"]:
-    """Trilinearly interpolated features of every level, side by side.
+    """Interpolate the features of every level trilinearly and concatenate them.
 
-    Differentiable in the table and, within a cell, in the positions.
-    Positions are of the unit cube; what lies outside is clamped to it.
+    Args:
+        positions: positions in the unit cube; others are clamped to the cube. Differentiable within a cell.
+        table: entries of all levels. Differentiable.
+        levels: layout of the table.
     """
     index, weight = _vertices(positions.to(table.dtype), levels)
-    # index_select, because its gradient is one index_add: indexing with brackets would sort all indices first.
+    # The gradient of index_select is one index_add, whereas that of indexing with brackets sorts all indices.
     features = table.index_select(0, index.flatten()).view(*index.shape, NUM_FEATURES)
     return (features * weight[..., None]).sum(2).flatten(1)
 
@@ -82,7 +84,7 @@ def hash_encode(
 def _vertices(
     positions: Float[Tensor, "P 3"], levels: GridLevels
 ) -> tuple[Float[Tensor, "P L 8"], Float[Tensor, "P L 8"]]:
-    """Table entries and interpolation weights of the eight vertices around each position, on every level."""
+    """Return table entries and interpolation weights of the eight vertices around each position, for every level."""
     resolution, size, offset = (
         constant(values, positions.device) for values in (levels.resolutions, levels.sizes, levels.offsets)
     )
@@ -96,6 +98,6 @@ def _vertices(
     dense = x + stride * (y + stride * z)
     hashed = (x ^ (y * HASH_Y) ^ (z * HASH_Z)) % size[:, None]
     index = torch.where(is_dense[:, None], dense, hashed) + offset[:, None]
-    # Not prod, whose gradient waits for the device to count zeros.
+    # The gradient of prod would wait for the device to count zeros.
     along_x, along_y, along_z = torch.where(corner.bool(), fraction[:, :, None], 1 - fraction[:, :, None]).unbind(-1)
     return index, along_x * along_y * along_z

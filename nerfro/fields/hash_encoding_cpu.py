@@ -1,11 +1,11 @@
-"""Compiled CPU kernels of the hash encoding; `nerfro.fields.hash_encoding` is their reference.
+"""Compiled CPU kernels of the hash encoding; the reference is `nerfro.fields.hash_encoding`.
 
-Forward, threads share the points; each thread takes them block by block and level by level, so that a block's output
-stays in the first-level cache and a level's table in the second. Backward, threads share the levels: no two threads
-write to the same entry, so there are no atomics, and the sums do not depend on the number of threads. Gradients of
-positions are computed where they are asked for alone, with threads sharing the points again. What can be done
-for many points at once (cells, fractions, the part of the hash that y and z make) is done in loops of its own, because
-those become vector instructions, and the fetching of table entries does not.
+In the forward pass, threads share the points. Each thread processes block by block and level by level, so that the
+output of a block stays in the first-level cache and the table of a level in the second-level cache. In the backward
+pass, threads share the levels. Two threads never write to the same entry, so the kernel needs no atomic operations and
+sums do not depend on the number of threads. Gradients of positions are computed only on demand, with threads sharing
+the points. Cells, fractions and the hash of y and z are computed in separate loops, because the compiler turns these
+loops into vector instructions, in contrast to loops that fetch table entries.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from nerfro.kernels.threads import num_threads
 
 _BLOCK = 512
 _ONE = np.float32(1)
-# Hashes are of 32 bits.
+# Hashes have 32 bits.
 _UINT, _Y, _Z = np.uint32, np.uint32(HASH_Y), np.uint32(HASH_Z)
 
 
 def hash_encode(
     positions: Float[Tensor, "P 3"], table: Float[Tensor, "T 2"], levels: GridLevels
 ) -> Float[Tensor, "P 2*L"]:
-    """The same as `nerfro.fields.hash_encoding.hash_encode`, on the CPU."""
+    """Evaluate `nerfro.fields.hash_encoding.hash_encode` on the CPU."""
     return _HashEncode.apply(positions.float().t().contiguous(), table, levels)
 
 
@@ -71,18 +71,18 @@ def _layout(levels: GridLevels) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
 
 @compiled
 def _axis_cells(coordinates, resolution, cells, fractions):
-    """Cells that the unit cube's coordinates lie in along one axis, and where in them."""
+    """Compute cells and fractions within cells of coordinates along one axis of the unit cube."""
     scale, last = np.float32(resolution), _UINT(resolution - 1)
     for p in range(coordinates.shape[0]):
         scaled = min(max(coordinates[p], np.float32(0)), _ONE) * scale
-        # Bounded as an unsigned number, because a position that is not a number becomes the smallest signed integer.
+        # Clamped as an unsigned number, because nan becomes the smallest signed integer.
         cell = min(_UINT(np.int32(scaled)), last)
         cells[p], fractions[p] = cell, scaled - np.float32(cell)
 
 
 @compiled
 def _edges(j, k, resolution, dense, low_low, high_low, low_high, high_high):
-    """What y and z contribute to the entries of the cells' four edges along x; _vertex adds x."""
+    """Compute the contribution of y and z to the entries of the cells' four edges along x; `_vertices` adds x."""
     if dense:
         row, plane = _UINT(resolution + 1), _UINT((resolution + 1) * (resolution + 1))
         for p in range(j.shape[0]):
@@ -98,11 +98,11 @@ def _edges(j, k, resolution, dense, low_low, high_low, low_high, high_high):
 
 @compiled
 def _vertices(i, low_low, high_low, low_high, high_high, dense, mask):
-    """Entries of a cell's eight vertices in its level, x fastest.
+    """Return the entries of a cell's eight vertices in a level, x fastest.
 
-    Sizes of hashed levels are powers of two, so that the remainder is a mask.
+    Sizes of hashed levels are powers of two, so that the remainder is a bit mask.
     """
-    # Unsigned, because Numba counts signed ones from the end where they are negative, a test for each access.
+    # Unsigned, because Numba tests signed indices for negative values at each access.
     index, right = np.uintp, i + _UINT(1)
     if dense:
         a, b, c, d = index(low_low + i), index(high_low + i), index(low_high + i), index(high_high + i)
@@ -117,16 +117,16 @@ def _vertices(i, low_low, high_low, low_high, high_high, dense, mask):
 
 @compiled
 def _locate(positions, start, size, resolution, dense, cells, fractions, edges):
-    """Cells [3, B], fractions [3, B] and edges [4, B] of a block of the positions [3, P]."""
+    """Compute cells [3, B], fractions [3, B] and edges [4, B] of a block of positions [3, P]."""
     for axis in range(3):
-        # One row at a time: Numba takes a block of several for scattered in memory, and gives up vector instructions.
+        # One row at a time, because Numba treats a block of rows as scattered and emits no vector instructions.
         _axis_cells(positions[axis, start : start + size], resolution, cells[axis], fractions[axis])
     _edges(cells[1], cells[2], resolution, dense, edges[0], edges[1], edges[2], edges[3])
 
 
 @compiled
 def _interpolate(cells, fractions, edges, entries, dense, mask, features, first):
-    """A block's features of one level into two columns of `features`."""
+    """Write a block's features of one level into two columns of `features`."""
     for p in range(features.shape[0]):
         i, x, y, z = cells[0, p], fractions[0, p], fractions[1, p], fractions[2, p]
         w0, w1, w2, w3 = (_ONE - y) * (_ONE - z), y * (_ONE - z), (_ONE - y) * z, y * z
@@ -150,7 +150,7 @@ def _forward(positions, table, resolutions, sizes, offsets, dense, features):
             is_dense, mask = dense[level], _UINT(sizes[level] - 1)
             entries = table[offsets[level] : offsets[level] + sizes[level]]
             _locate(positions, start, size, resolutions[level], is_dense, cells, fractions, edges)
-            # Two calls, because a constant is compiled in: the loop over the points is left without a branch.
+            # Two calls with a constant each, so that the compiled loop over the points has no branch.
             if is_dense:
                 _interpolate(cells, fractions, edges, entries, True, mask, features[start : start + size], 2 * level)
             else:
@@ -158,14 +158,14 @@ def _forward(positions, table, resolutions, sizes, offsets, dense, features):
 
 
 @compiled
-def _gain(entries, vertex, first, second):
-    """What the loss would gain from a vertex if it alone had weight."""
+def _weight_gradient(entries, vertex, first, second):
+    """Return the derivative of the loss with respect to the weight of a vertex."""
     return first * entries[vertex, 0] + second * entries[vertex, 1]
 
 
 @compiled
 def _slope(x, y, low_low, high_low, low_high, high_high):
-    """Difference along an axis from a cell's edges along it, interpolated in the other two."""
+    """Interpolate the differences along a cell's four edges of one axis in the other two axes."""
     return (_ONE - y) * ((_ONE - x) * low_low + x * high_low) + y * ((_ONE - x) * low_high + x * high_high)
 
 
@@ -187,16 +187,16 @@ def _backward_to_positions(positions, table, gradient, resolutions, sizes, offse
                 x, y, z = fractions[0, p], fractions[1, p], fractions[2, p]
                 low_low, high_low, low_high, high_high = edges[0, p], edges[1, p], edges[2, p], edges[3, p]
                 a, b, c, d, e, f, g, h = _vertices(cells[0, p], low_low, high_low, low_high, high_high, is_dense, mask)
-                a, b = _gain(entries, a, first, second), _gain(entries, b, first, second)
-                c, d = _gain(entries, c, first, second), _gain(entries, d, first, second)
-                e, f = _gain(entries, e, first, second), _gain(entries, f, first, second)
-                g, h = _gain(entries, g, first, second), _gain(entries, h, first, second)
+                a, b = _weight_gradient(entries, a, first, second), _weight_gradient(entries, b, first, second)
+                c, d = _weight_gradient(entries, c, first, second), _weight_gradient(entries, d, first, second)
+                e, f = _weight_gradient(entries, e, first, second), _weight_gradient(entries, f, first, second)
+                g, h = _weight_gradient(entries, g, first, second), _weight_gradient(entries, h, first, second)
                 slopes[0, p] += _slope(y, z, b - a, d - c, f - e, h - g)
                 slopes[1, p] += _slope(x, z, c - a, d - b, g - e, h - f)
                 slopes[2, p] += _slope(x, y, e - a, f - b, g - c, h - d)
         for axis in range(3):
             for p in range(size):
-                # Positions outside are clamped: they may move without any change.
+                # Positions outside are clamped and therefore have no gradient.
                 moves = np.float32(0) <= positions[axis, start + p] <= _ONE
                 of_positions[axis, start + p] = slopes[axis, p] if moves else np.float32(0)
 
@@ -204,7 +204,7 @@ def _backward_to_positions(positions, table, gradient, resolutions, sizes, offse
 @compiled_parallel
 def _backward(positions, gradient, resolutions, sizes, offsets, dense, threads, table):
     num_points = positions.shape[1]
-    # Levels are dealt out in turn, because fine ones cost more than coarse ones.
+    # Levels are distributed in turn, because fine levels cost more than coarse levels.
     for thread in prange(threads):
         cells, fractions = np.empty((3, _BLOCK), _UINT), np.empty((3, _BLOCK), np.float32)
         edges = np.empty((4, _BLOCK), _UINT)
@@ -219,7 +219,7 @@ def _backward(positions, gradient, resolutions, sizes, offsets, dense, threads, 
                     w0, w1, w2, w3 = (_ONE - y) * (_ONE - z), y * (_ONE - z), (_ONE - y) * z, y * z
                     low_low, high_low, low_high, high_high = edges[0, p], edges[1, p], edges[2, p], edges[3, p]
                     a, b, c, d, e, f, g, h = _vertices(i, low_low, high_low, low_high, high_high, is_dense, mask)
-                    # Both are read before any entry is written, which might overlap for all the compiler knows.
+                    # Read before entries are written, because the compiler cannot exclude that the arrays overlap.
                     both = (gradient[start + p, 2 * level], gradient[start + p, 2 * level + 1])
                     for n in range(2):
                         left, right = (_ONE - x) * both[n], x * both[n]

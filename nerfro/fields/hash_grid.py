@@ -1,4 +1,4 @@
-"""The fast field: a multi-resolution hash grid with two small MLPs."""
+"""A multi-resolution hash grid with two small MLPs."""
 
 from __future__ import annotations
 
@@ -15,40 +15,41 @@ from nerfro.fields import spherical_harmonics as harmonics
 from nerfro.fields.base import Field
 from nerfro.fields.mlp import radiance
 from nerfro.fields.selection import evaluate_selected, inside_box
-from nerfro.geometry.contraction import contract, contracted_box, shrinkage
+from nerfro.geometry.contraction import contract, contracted_box, contraction_scale
 from nerfro.kernels.precision import fast_bfloat16
 from nerfro.registry import register
 from nerfro.types import Radiance, Samples
 
-# What the density network hands to the colour network.
+# Number of features that the density network passes to the colour network.
 _GEOMETRY_FEATURES = 16
 
-# Density may grow to e^15 times its start before the exponential is cut off, value and gradient.
+# The exponential is clamped at e^15 times the initial density, in value and gradient.
 _MAX_EXPONENT = 15.0
 
 
 @register("field", "hash_grid")
 class HashGridField(Field):
-    """Hash encoding, a density MLP and a colour MLP that sees the direction (Instant-NGP, sections 3 and 5.4).
+    """Hash encoding with a density MLP and a view-dependent colour MLP (Instant-NGP, sections 3 and 5.4).
 
-    Density is exponential: exp(raw) scaled so that at the start a ray across the box has an optical depth of about
-    `initial_depth`. Samples outside the box are not evaluated; nothing is there. With a `radius` the field covers all
-    of space, contracted beyond a ball (mip-NeRF 360, Eqn. 10), and the cube around contracted space is its box.
+    Density is exp(raw), scaled so that a ray across the box initially has an optical depth of about `initial_depth`.
+    The field is empty outside the box, and samples there are not evaluated. With a `radius`, the field covers all of
+    space, contracted outside a ball (mip-NeRF 360, Eqn. 10), and the box is the cube around contracted space.
 
     Args:
         box_min, box_max: opposite corners of the content's bounds, world units.
-        radius: of a ball around the box's middle, world units, in which details are finest; beyond, they become coarser
-            in proportion to the distance. None if there is nothing outside the box.
-        num_levels: of the encoding, with 2 features each.
-        base_resolution, finest_resolution: cells along the box's longest side.
-        log2_table_size: logarithm of the largest number of entries of a level.
-        width: of the hidden layers.
-        direction_bands: bands of spherical harmonics that encode the direction; 1 makes colour independent of it.
-        initial_depth: optical depth of the untrained field along the box's longest side.
-        shortcut: add three features of the density network to the colour before its sigmoid. A picture that is mostly
-            of one colour drives all units of the colour network below zero where another colour is needed; what is
-            there would stay grey, for no gradient comes through them.
-        precision: of the MLPs' matrix products. None: bfloat16 where the machine has units for it, else float32.
+        radius: radius of a ball around the centre of the box, world units, within which the resolution is finest.
+            Outside, cells grow with the distance. None if the scene is empty outside the box.
+        num_levels: number of levels of the encoding, with 2 features each.
+        base_resolution, finest_resolution: number of cells along the longest side of the box.
+        log2_table_size: base-2 logarithm of the largest number of entries of a level.
+        width: width of the hidden layers.
+        direction_bands: number of bands of spherical harmonics of the direction; 1 for view-independent colour.
+        initial_depth: optical depth of the untrained field along the longest side of the box.
+        shortcut: whether to add three features of the density network to the colour before the sigmoid. In images of
+            mostly one colour, all units of the colour network can become inactive where another colour is needed, and
+            without the shortcut no gradient would reach these places.
+        precision: number format of the MLPs' matrix products. None selects bfloat16 if the machine has units for
+            bfloat16, else float32.
     """
 
     box_min: Float[Tensor, "3"]
@@ -93,13 +94,13 @@ class HashGridField(Field):
             return evaluate_selected(self.decode, samples, inside_box(samples.positions, self.box_min, self.box_max))
         positions = samples.positions.flatten(0, 1)
         density, rgb = self.decode(contract(positions, self.centre, self.radius), samples.directions.flatten(0, 1))
-        density = density * shrinkage(positions, self.centre, self.radius)
+        density = density * contraction_scale(positions, self.centre, self.radius)
         return Radiance(density.view(samples.s.shape), rgb.view(samples.positions.shape))
 
     def decode(
         self, positions: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]
     ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P 3"]]:
-        """Density, per length there, and colour at positions within the box, which are contracted with a `radius`."""
+        """Evaluate density (per unit of contracted length) and colour at contracted positions."""
         geometry = self.apply_mlp(self.density_mlp, self.encode(positions))
         raw = self.apply_mlp(self.colour_mlp, geometry, self.encode_directions(directions))
         if self.shortcut:
@@ -112,7 +113,7 @@ class HashGridField(Field):
             return torch.where(inside_box(positions, self.box_min, self.box_max), density, 0.0)
         places = contract(positions, self.centre, self.radius)
         density = self._to_density(self.apply_mlp(self.density_mlp, self.encode(places)))
-        return density * shrinkage(positions, self.centre, self.radius)
+        return density * contraction_scale(positions, self.centre, self.radius)
 
     @property
     def centre(self) -> Float[Tensor, "3"]:
@@ -122,16 +123,16 @@ class HashGridField(Field):
         return self.initial_density * torch.exp(geometry[:, 0].float().clamp(max=_MAX_EXPONENT))
 
     def encode(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P F"]:
-        """Hash encoding in single precision, compiled on the CPU."""
+        """Encode positions in single precision, on the CPU by a compiled kernel."""
         unit = (positions - self.box_min) / self.side
         if unit.device.type == "cpu":
-            from nerfro.fields.hash_encoding_cpu import hash_encode  # compiled code, so only where it is used
+            from nerfro.fields.hash_encoding_cpu import hash_encode  # compiled, hence imported late
         else:
             hash_encode = hash_encoding.hash_encode
         return hash_encode(unit, self.table, self.levels)
 
     def encode_directions(self, directions: Float[Tensor, "P 3"]) -> Float[Tensor, "P K"]:
-        """Spherical harmonics, compiled on the CPU."""
+        """Encode directions by spherical harmonics, on the CPU by a compiled kernel."""
         if directions.device.type == "cpu":
             from nerfro.fields.spherical_harmonics_cpu import spherical_harmonics
         else:
@@ -139,7 +140,7 @@ class HashGridField(Field):
         return spherical_harmonics(directions, self.direction_bands)
 
     def apply_mlp(self, mlp: nn.Sequential, *inputs: Float[Tensor, "P _"]) -> Float[Tensor, "P O"]:
-        """An MLP of inputs side by side in the field's precision, with a gradient of our own on the CPU."""
+        """Apply an MLP to concatenated inputs in the precision of the field, on the CPU by `relu_mlp`."""
         device = inputs[0].device.type
         rounds = fast_bfloat16(device) if self.precision is None else self.precision == "bfloat16"
         if device == "cpu":
@@ -152,7 +153,7 @@ class HashGridField(Field):
 
 
 def _mlp(num_inputs: int, width: int, num_hidden: int, num_outputs: int) -> nn.Sequential:
-    """ReLU layers without biases, Glorot-uniform."""
+    """Create ReLU layers without biases and with Glorot-uniform weights."""
     widths = [num_inputs, *[width] * num_hidden, num_outputs]
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):

@@ -1,4 +1,4 @@
-"""The mip-NeRF field: integrated positional encoding of conical frustums and an MLP."""
+"""The field of mip-NeRF: an MLP on the integrated positional encoding of conical frustums."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from nerfro.types import Radiance, Samples
 
 @register("field", "mip_nerf")
 class MipNerfField(Field):
-    """8x256 MLP on the expected encoding of each sample's frustum (mip-NeRF, section 3); wants `cast=cones`.
+    """8x256 MLP on the expected encoding of each sample's frustum (mip-NeRF, section 3); needs `cast=cones`.
 
     Args:
-        width, depth, skip, view_width: of the MLP, see `RadianceMLP`.
-        position_degree: octaves of the integrated encoding, which damps those finer than the frustum.
-        direction_degree: octaves of the direction's encoding.
+        width, depth, skip, view_width: shape of the MLP, see `RadianceMLP`.
+        position_degree: number of octaves of the integrated encoding, which damps octaves finer than the frustum.
+        direction_degree: number of octaves of the encoding of directions.
     """
 
     def __init__(
@@ -45,9 +45,9 @@ class MipNerfField(Field):
 
 
 def frustum_gaussians(samples: Samples) -> tuple[Float[Tensor, "R N 3"], Float[Tensor, "R N 3"]]:
-    """Mean and diagonal covariance of the frustum that each sample's interval cuts out of its pixel's cone.
+    """Return mean and diagonal covariance of each sample's conical frustum.
 
-    mip-NeRF's Eqn. 7 and 16 in their numerically stable form. On a bent path the cone follows the local direction and
+    mip-NeRF, Eqns. 7 and 16, in numerically stable form. On a bent path the cone follows the local direction and
     widens with arc length, which neglects the focusing by the medium.
     """
     near, far = samples.edges[:, :-1], samples.edges[:, 1:]

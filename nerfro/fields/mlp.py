@@ -12,17 +12,17 @@ from torch import Tensor, nn
 from nerfro.allowed import Count, checked
 from nerfro.errors import NerfroError
 
-# Colours reach a little beyond [0, 1], so that black and white need no infinite activation (mip-NeRF's code).
+# Colours extend slightly beyond [0, 1], so that black and white need no infinite activation (mip-NeRF's code).
 RGB_PADDING = 1e-3
-# The squared sigmoid of this is 1 / 240 in sRGB.
+# Activation whose squared sigmoid is 1 / 240 in sRGB.
 _BLACK = -4.0
 
 
 @checked("MLP")
 class SkipMLP(nn.Module):
-    """ReLU layers; the input is concatenated again to the output of layer `skip` (counted from 1).
+    """ReLU layers with a skip connection: the input is concatenated to the output of layer `skip` (counted from 1).
 
-    Weights are Glorot-uniform and biases zero, as in the authors' code.
+    Weights are Glorot-uniform and biases are zero, as in the authors' code.
     """
 
     def __init__(self, num_inputs: int, width: Count, depth: Count, skip: int) -> None:
@@ -42,12 +42,12 @@ class SkipMLP(nn.Module):
 
 
 class RadianceMLP(nn.Module):
-    """Encoded position and direction -> density (softplus of raw - 1) and colour (padded sigmoid).
+    """Map encoded positions and directions to density (softplus of raw - 1) and colour (padded sigmoid).
 
     Args:
         num_position, num_direction: widths of the encodings.
-        width, depth, skip: of the trunk; NeRF's are 256, 8 and 5.
-        view_width: of the layer that mixes in the direction.
+        width, depth, skip: shape of the trunk; NeRF uses 256, 8 and 5.
+        view_width: width of the layer that takes the direction.
     """
 
     def __init__(
@@ -70,17 +70,17 @@ class RadianceMLP(nn.Module):
 
 
 def compile_networks(model: nn.Module, backend: str) -> None:
-    """Have torch.compile compile a model's networks in place, for any number of points."""
+    """Compile a model's networks in place with torch.compile, for any number of points."""
     known = torch.compiler.list_backends(exclude_tags=())
     if backend not in known:
-        raise NerfroError(f"compile={backend} is no backend of torch.compile here; there are {', '.join(known)}")
+        raise NerfroError(f"compile={backend} is not a backend of torch.compile; set one of {', '.join(known)}")
     for module in model.modules():
         if isinstance(module, (RadianceMLP, nn.Sequential)):
             module.compile(backend=backend, dynamic=True)
 
 
 def glorot_linear(num_inputs: int, num_outputs: int) -> nn.Linear:
-    """Linear layer with Glorot-uniform weights and zero bias."""
+    """Create a linear layer with Glorot-uniform weights and zero bias."""
     layer = nn.Linear(num_inputs, num_outputs)
     nn.init.xavier_uniform_(layer.weight)
     nn.init.zeros_(layer.bias)
@@ -88,21 +88,22 @@ def glorot_linear(num_inputs: int, num_outputs: int) -> nn.Linear:
 
 
 def padded_sigmoid(raw: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Sigmoid stretched to [-0.001, 1.001], in single precision."""
+    """Evaluate a sigmoid with range [-0.001, 1.001] in single precision."""
     return torch.sigmoid(raw.float()) * (1 + 2 * RGB_PADDING) - RGB_PADDING
 
 
 def radiance(raw: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Linear radiance in [0, 1]: a squared sigmoid, for pictures store about the root of radiance.
+    """Convert raw outputs to linear radiance in [0, 1] by a squared sigmoid.
 
-    Thin fog before a bright sky is soonest explained by black, and a sigmoid that was driven far down would never come
-    back: below `_BLACK`, a pixel's last level above 0, nothing drives it on.
+    The square approximates sRGB, which stores about the root of radiance. Early in training, black explains thin fog in
+    front of a bright sky best, and the gradient of a saturated sigmoid would vanish. Therefore gradients that would
+    decrease values below `_BLACK`, the smallest pixel value above 0, are blocked.
     """
-    return torch.sigmoid(_HeldBack.apply(raw.float())).square()
+    return torch.sigmoid(_ClampBlack.apply(raw.float())).square()
 
 
-class _HeldBack(torch.autograd.Function):
-    """The identity, cut off at `_BLACK`; there it passes the gradients alone that lead back."""
+class _ClampBlack(torch.autograd.Function):
+    """Clamp values at `_BLACK`; below, pass only gradients that increase the values."""
 
     @staticmethod
     def forward(ctx: Any, raw: Tensor) -> Tensor:

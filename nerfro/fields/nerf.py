@@ -1,4 +1,4 @@
-"""The NeRF field: positional encoding and an MLP, asked at points."""
+"""The field of NeRF: an MLP on positional encodings of points."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class NerfField(Field):
     """8x256 MLP on positional encodings of position and local direction (paper, section 2; NeRF, section 5).
 
     Args:
-        width, depth, skip, view_width: of the MLP, see `RadianceMLP`.
-        position_degree: octaves of the position's encoding; positions are raw world coordinates.
-        direction_degree: octaves of the direction's encoding.
-        normalise: length in world units that counts as one before encoding; 1 leaves positions as they are.
-        box_min, box_max: opposite corners of the content's bounds, world units. Samples outside are not evaluated;
-            nothing is there. Infinite ones have every sample evaluated, as the authors do.
+        width, depth, skip, view_width: shape of the MLP, see `RadianceMLP`.
+        position_degree: number of octaves of the encoding of positions.
+        direction_degree: number of octaves of the encoding of directions.
+        normalise: divisor of positions before the encoding, world units.
+        box_min, box_max: opposite corners of the bounds of the scene, world units. The field is empty outside, and
+            samples there are not evaluated. With infinite corners, all samples are evaluated, as in the authors' code.
     """
 
     box: Float[Tensor, "2 3"]
@@ -64,7 +64,7 @@ class NerfField(Field):
     def decode(
         self, positions: Float[Tensor, "*batch 3"], directions: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-        """Density and colour at positions, seen along unit directions."""
+        """Evaluate density and colour at positions for unit directions."""
         position = positional_encoding(positions / self.normalise, 0, self.position_degree)
         direction = positional_encoding(directions, 0, self.direction_degree)
         return self.mlp(position, direction)

@@ -1,7 +1,7 @@
-"""A narrow ReLU MLP on the CPU with its gradient written out; a `torch.nn.Sequential` is its reference.
+"""A narrow ReLU MLP on the CPU with a hand-written gradient; the reference is a `torch.nn.Sequential`.
 
-A layer of 64 units computes little for each number that it moves, so that memory decides its speed. Here no gradient
-and no activation is copied: ReLU and its gradient are taken in place, and only the inputs that learn get a gradient.
+A layer of 64 units performs few operations per number, so that memory bandwidth limits the speed. Therefore neither
+gradients nor activations are copied: ReLU and its gradient work in place, and only inputs that learn get gradients.
 """
 
 from __future__ import annotations
@@ -14,17 +14,20 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-# Rows of a product. oneDNN makes a program for each shape and keeps a thousand of them; every batch has another number
-# of points, so each step left 5 MB of programs behind, scattered over the memory. Rows of zeros fill up a step.
+# Rows of a product. oneDNN compiles and caches a program for each shape. Batches differ in the number of points, so
+# each step would add 5 MB of programs. Rows of zeros therefore pad the number of points to a multiple of _STEP.
 _BLOCK, _STEP = 16384, 2048
 
 
 def relu_mlp(
     inputs: Float[Tensor, "P I"] | list[Float[Tensor, "P _"]], weights: list[Tensor], dtype: torch.dtype
 ) -> Float[Tensor, "P O"]:
-    """Linear layers without biases, with ReLU between them.
+    """Apply linear layers without biases, with ReLU between the layers.
 
-    Several inputs are taken side by side; weights are [outputs, inputs], and `dtype` is that of the products.
+    Args:
+        inputs: one or several inputs, which are concatenated.
+        weights: matrix [outputs, inputs] of each layer.
+        dtype: number format of the matrix products.
     """
     parts = [inputs] if isinstance(inputs, Tensor) else inputs
     with torch.autocast("cpu", enabled=False):
@@ -38,7 +41,7 @@ class _ReluMLP(torch.autograd.Function):
         layers = [weight.to(dtype) for weight in weights]
         num_points, learns = len(parts[0]), any(ctx.needs_input_grad)
         num_rows = -(-num_points // _STEP) * _STEP
-        # Nothing is kept of a block where nothing learns, so that the next one finds its memory in the cache.
+        # Without gradients, all blocks share the memory of one block, which stays in the CPU's cache.
         kept = num_rows if learns else min(num_rows, _BLOCK)
         activations = [parts[0].new_zeros(kept, sum(part.shape[1] for part in parts), dtype=dtype)]
         activations += [parts[0].new_empty(kept, len(layer), dtype=dtype) for layer in layers[:-1]]
@@ -85,15 +88,15 @@ class _ReluMLP(torch.autograd.Function):
 
 
 def _comparable(values: Tensor) -> Tensor:
-    """The same memory as numbers with the same signs that the CPU compares fast.
+    """View values as numbers of the same sign that the CPU compares fast.
 
-    PyTorch widens bfloat16 to compare it, at six times the cost. As an integer it is positive where the number is.
+    PyTorch widens bfloat16 for comparisons, at six times the cost. The bits as an integer have the same sign.
     """
     return values.view(torch.int16) if values.dtype == torch.bfloat16 else values
 
 
 def _product(rows: Float[Tensor, "Q I"], matrix: Float[Tensor, "I O"]) -> Float[Tensor, "Q O"]:
-    """rows matrix, in blocks."""
+    """Return rows @ matrix, computed in blocks."""
     product = rows.new_empty(len(rows), matrix.shape[1])
     for block, of_block in zip(rows.split(_BLOCK), product.split(_BLOCK), strict=True):
         torch.mm(block, matrix, out=of_block)
@@ -101,7 +104,7 @@ def _product(rows: Float[Tensor, "Q I"], matrix: Float[Tensor, "I O"]) -> Float[
 
 
 def _product_of_columns(left: Float[Tensor, "Q O"], right: Float[Tensor, "Q I"]) -> Float[Tensor, "O I"]:
-    """left^T right, in blocks, with the narrower one on the left: so the matrix library is faster."""
+    """Return left^T @ right, computed in blocks with the narrower matrix on the left, which is faster."""
     if left.shape[1] > right.shape[1]:
         return _product_of_columns(right, left).t()
     total = left.new_zeros(left.shape[1], right.shape[1], dtype=torch.promote_types(left.dtype, torch.float32))

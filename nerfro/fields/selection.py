@@ -1,4 +1,4 @@
-"""Asking a field only where it can hold something."""
+"""Evaluation of a field at selected samples."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ Decoder = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 def evaluate_selected(decoder: Decoder, samples: Samples, selected: Bool[Tensor, "R N"]) -> Radiance:
-    """Evaluate `decoder` at the selected samples that may be occupied; elsewhere density and colour are zero.
+    """Evaluate a decoder at selected samples that may be occupied; elsewhere, density and colour are zero.
 
-    On a GPU the number of selected samples is waited for, one synchronisation with the host.
+    On a GPU, counting the selected samples costs one synchronization with the host.
     """
     if samples.occupied is not None:
         selected = selected & samples.occupied
@@ -24,7 +24,7 @@ def evaluate_selected(decoder: Decoder, samples: Samples, selected: Bool[Tensor,
     positions = samples.positions.flatten(0, 1).index_select(0, index)
     directions = samples.directions.flatten(0, 1).index_select(0, index)
     density, rgb = decoder(positions, directions)
-    # Written out of place into zeros, so that gradients flow from the full tensors back to the selected samples.
+    # Out of place, so that gradients flow from the full tensors back to the selected samples.
     all_density = density.new_zeros(selected.numel()).index_copy(0, index, density)
     all_rgb = rgb.new_zeros(selected.numel(), 3).index_copy(0, index, rgb)
     return Radiance(all_density.view(selected.shape), all_rgb.view(*selected.shape, 3))
@@ -33,5 +33,5 @@ def evaluate_selected(decoder: Decoder, samples: Samples, selected: Bool[Tensor,
 def inside_box(
     positions: Float[Tensor, "*batch 3"], box_min: Float[Tensor, "3"], box_max: Float[Tensor, "3"]
 ) -> Bool[Tensor, "*batch"]:
-    """Whether positions lie in an axis-aligned box, faces included."""
+    """Return whether positions lie in an axis-aligned box, including the faces."""
     return ((positions >= box_min) & (positions <= box_max)).all(-1)

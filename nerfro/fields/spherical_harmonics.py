@@ -12,7 +12,7 @@ MAX_BANDS = 4
 
 
 def spherical_harmonics(directions: Float[Tensor, "*batch 3"], num_bands: int) -> Float[Tensor, "*batch K"]:
-    """The K = num_bands^2 orthonormal real harmonics of degree 0 to num_bands - 1, order -l to l within a degree."""
+    """Evaluate the K = num_bands^2 orthonormal real harmonics of degrees l < num_bands, by degree and order."""
     check_bands(num_bands)
     x, y, z = directions.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
@@ -41,6 +41,6 @@ def spherical_harmonics(directions: Float[Tensor, "*batch 3"], num_bands: int) -
 
 
 def check_bands(num_bands: int) -> None:
-    """Refuse a number of bands that is not implemented."""
+    """Raise an error if a number of bands is not implemented."""
     if not 1 <= num_bands <= MAX_BANDS:
-        raise NerfroError(f"{num_bands} bands of spherical harmonics: allowed are 1 to {MAX_BANDS}")
+        raise NerfroError(f"{num_bands} bands of spherical harmonics are not supported; set 1 to {MAX_BANDS}")

@@ -1,4 +1,4 @@
-"""Compiled CPU kernels of spherical harmonics; `nerfro.fields.spherical_harmonics` is its reference."""
+"""Compiled CPU kernels of spherical harmonics; the reference is `nerfro.fields.spherical_harmonics`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TEN, _FIFTEEN = np.float32(10), np.float32(15)
 
 
 def spherical_harmonics(directions: Float[Tensor, "P 3"], num_bands: int) -> Float[Tensor, "P K"]:
-    """The same as `nerfro.fields.spherical_harmonics.spherical_harmonics`, on the CPU."""
+    """Evaluate `nerfro.fields.spherical_harmonics.spherical_harmonics` on the CPU."""
     check_bands(num_bands)
     return _Harmonics.apply(directions.float().contiguous(), num_bands)
 
@@ -70,7 +70,7 @@ def _harmonics(directions, num_bands, values):
 
 @compiled_parallel
 def _backward(directions, gradient, num_bands, of_directions):
-    """Derivatives of the polynomials above, each times its upstream gradient."""
+    """Add the derivatives of the polynomials in `_harmonics`, multiplied by the upstream gradients."""
     for p in prange(directions.shape[0]):
         x, y, z, g = directions[p, 0], directions[p, 1], directions[p, 2], gradient[p]
         xx, yy, zz = x * x, y * y, z * z

@@ -1,4 +1,4 @@
-"""The separate closed surfaces of one mesh: a point inside two of them that cross would count as outside."""
+"""Connected closed surfaces of one mesh, and the check that they do not cross."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from nerfro.errors import NerfroError
 from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh
 
-_MARGIN = 1e-3  # of an edge: surfaces that touch at its ends, or along it, do not cross
-_TOUCHING = 1e-5  # of the mesh's extent: what is nearer to a surface along a line lies on it
-_FEWEST, _MOST = 2**9, 2**16  # points of a body that are looked for inside others
-_NUM_LINES = 3  # through each of them, both ways
+_MARGIN = 1e-3  # fraction of an edge; surfaces that touch at the ends of an edge do not cross
+_TOUCHING = 1e-5  # fraction of the mesh's extent; points closer to a surface along a line lie on the surface
+_FEWEST, _MOST = 2**9, 2**16  # numbers of points of a body that are tested against other bodies
+_NUM_LINES = 3  # lines through each point, in both directions
 
 
 def bodies_of(mesh: TriangleMesh) -> Int[np.ndarray, "F"]:
-    """Number of the connected surface that each triangle belongs to."""
+    """Return the number of the connected surface of each triangle."""
     start, end = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2).T
     size = len(mesh.vertices)
     _, body = connected_components(coo_array((np.ones(len(start), bool), (start, end)), (size, size)), directed=False)
@@ -28,9 +28,12 @@ def bodies_of(mesh: TriangleMesh) -> Int[np.ndarray, "F"]:
 
 
 def require_separate(mesh: TriangleMesh) -> None:
-    """Refuse a closed mesh of which one surface goes through another, or covers it; one may lie inside another."""
+    """Raise an error if closed surfaces of a mesh cross or coincide; nested surfaces are allowed.
+
+    A point inside two crossing surfaces would count as outside, because inside and outside are decided by parity.
+    """
     body = bodies_of(mesh)
-    # Of extent one around the origin: Embree counts in single precision.
+    # Scaled to extent one around the origin, because Embree computes in single precision.
     triangles = (mesh.triangles - mesh.bounds.mean(0)) / np.ptp(mesh.bounds, axis=0).max()
     corners = [triangles[body == number] for number in range(body.max() + 1)]
     low, high = (np.stack([end(c.reshape(-1, 3), axis=0) for c in corners]) for end in (np.min, np.max))
@@ -42,26 +45,26 @@ def require_separate(mesh: TriangleMesh) -> None:
         others = _Others(np.concatenate([corners[other] for other in near.nonzero()[0]]))
         if others.are_crossed(own) or not others.leave_on_one_side(own):
             raise NerfroError(
-                "closed surfaces of the mesh go through each other, and where they do there is no inside; unite them "
-                "(boolean union), or give bodies inside others as medium.inner_meshes"
+                "closed surfaces of the mesh cross, so their inside is not defined; unite them (boolean union), "
+                "or give bodies inside others as medium.inner_meshes"
             )
 
 
 class _Others:
-    """Closed surfaces that another one of triangles [F, 3, 3] must not go through."""
+    """Closed surfaces that another surface, given by triangles [F, 3, 3], must not cross."""
 
     def __init__(self, triangles: Float[np.ndarray, "G 3 3"]) -> None:
         self._triangles, self._intersector = torch.from_numpy(triangles), MeshIntersector(triangles)
 
     def are_crossed(self, own: Float[np.ndarray, "F 3 3"]) -> bool:
-        """Whether an edge goes through a triangle: so the thinnest needle is found."""
+        """Return whether an edge crosses a triangle; this test finds crossings of any thickness."""
         start, end = (torch.from_numpy(own[:, corners].reshape(-1, 3)) for corners in ([0, 1, 2], [1, 2, 0]))
         along = end - start
         met, triangle, normal = self._first_hits(start, along)
         start, along = start[met], along[met]
         steep = (along * normal).sum(-1)
         share = ((triangle[:, 0] - start) * normal).sum(-1) / steep
-        # An edge that lies in a triangle's plane does not go through it, nor does one that touches its border.
+        # Edges in the plane of a triangle, and edges that touch the border of a triangle, do not cross the triangle.
         through = steep.abs() > _MARGIN * along.norm(dim=-1) * normal.norm(dim=-1)
         to_corners = triangle - (start + share[:, None] * along)[:, None]
         parts = (torch.linalg.cross(to_corners, to_corners.roll(-1, 1)) * normal[:, None]).sum(-1)
@@ -69,21 +72,21 @@ class _Others:
         return bool((through & within & (share > _MARGIN) & (share < 1 - _MARGIN)).any())
 
     def leave_on_one_side(self, own: Float[np.ndarray, "F 3 3"]) -> bool:
-        """Whether its points lie all inside or all outside: so bodies are found whose edges meet edges alone.
+        """Return whether all points of a surface lie inside, or all outside; finds crossings where only edges meet.
 
-        A surface that has no point clear of the others lies on them, and has no side.
+        A surface without points clear of the others coincides with the others and has no side.
         """
         generator = np.random.default_rng(0)
         some = own[:: -(-len(own) // _MOST)]
         weights = generator.dirichlet(np.ones(3), (-(-_FEWEST // len(some)), len(some)))
         points = torch.from_numpy(np.einsum("nfc,fcx->nfx", weights, some).reshape(-1, 3))
         lines = torch.nn.functional.normalize(torch.from_numpy(generator.normal(size=(_NUM_LINES, 3))), dim=-1)
-        # Lines from a point that lies on a surface disagree: it is between the two ways.
-        odd = torch.stack([self._are_met_oddly(points, way * line) for line in lines for way in (1, -1)])
+        # For points on a surface, the parities of the two directions differ.
+        odd = torch.stack([self._are_met_oddly(points, sign * line) for line in lines for sign in (1, -1)])
         return bool(odd.all(0).any() != (~odd).all(0).any())
 
     def _are_met_oddly(self, points: Float[Tensor, "P 3"], along: Float[Tensor, "3"]) -> Bool[Tensor, "P"]:
-        """Whether the line from each point crosses an odd number of triangles."""
+        """Return whether the line from each point crosses an odd number of triangles."""
         odd, left = torch.zeros(len(points), dtype=torch.bool), torch.arange(len(points))
         origin = points + _TOUCHING * along
         while len(left):
@@ -97,7 +100,7 @@ class _Others:
     def _first_hits(
         self, start: Float[Tensor, "R 3"], along: Float[Tensor, "R 3"]
     ) -> tuple[Bool[Tensor, "R"], Float[Tensor, "M 3 3"], Float[Tensor, "M 3"]]:
-        """Which rays meet a triangle, the first one of each, and its normal."""
+        """Return which rays hit a triangle, and the first triangle of each of these rays with its normal."""
         hit = self._intersector.first_hits(start, along.contiguous())
         triangle = self._triangles[hit[hit >= 0]]
         return hit >= 0, triangle, torch.linalg.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])

@@ -1,4 +1,4 @@
-"""Interpolation, smoothing and differences on regular grids whose vertices include both ends of the box."""
+"""Interpolation, smoothing and finite differences on regular grids whose outer vertices lie on the box."""
 
 from __future__ import annotations
 
@@ -15,9 +15,12 @@ from nerfro.rays import Rays
 def trilinear(
     table: Float[Tensor, "X Y Z C"], box: Float[Tensor, "2 3"], positions: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch C"]:
-    """Interpolate all channels of a grid linearly along each axis; positions outside take the border's values.
+    """Interpolate all channels of a grid trilinearly; positions outside get the values at the border.
 
-    Box and positions are in world units, the box as its lower and upper corner, here and below.
+    Args:
+        table: values at the vertices.
+        box: lower and upper corner of the grid, world units.
+        positions: world units.
     """
     shape = constant(table.shape[:3], table.device)
     scale = (shape - 1) / (box[1] - box[0])
@@ -43,8 +46,8 @@ def trilinear(
 def intersect_box(
     box: Float[Tensor, "2 3"], origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]
 ) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
-    """Distances at which lines enter and leave a box, with gradients; the first exceeds the second where they miss."""
-    # A line along a slab is in it for ever or never. Dividing by its zero would make gradients nan.
+    """Return the distances at which lines enter and leave a box, differentiable; enter > leave for lines that miss."""
+    # A line parallel to a slab is inside or outside everywhere. Division by zero would make the gradients nan.
     parallel = directions == 0
     inverse = 1.0 / torch.where(parallel, 1.0, directions)
     below, above = box[0] - origins, box[1] - origins
@@ -56,16 +59,16 @@ def intersect_box(
 
 
 def misses(box: Float[Tensor, "2 3"], rays: Rays) -> Bool[Tensor, "R"]:
-    """Which rays pass by a box of these corners."""
+    """Return which rays miss a box."""
     enter, leave = intersect_box(box, rays.origins, rays.directions)
     return (enter >= leave) | (leave <= 0)
 
 
 def spline_coefficients(values: Float[Tensor, "X Y Z"]) -> Float[Tensor, "X Y Z"]:
-    """Coefficients of the quadratic B-spline that passes through smooth values up to fourth order in the spacing.
+    """Return coefficients of a quadratic B-spline that interpolates smooth values to fourth order in the spacing.
 
-    c = f - f'' / 8 along each axis, with f'' the second difference. The exact inverse has infinite support and rings at
-    creases; this has three taps.
+    c = f - f'' / 8 along each axis, with the second difference f''. The exact inverse has infinite support and rings
+    at creases, whereas this approximation has three taps.
     """
     for axis in range(3):
         before, values, after = _shifted(values, axis, 1)
@@ -76,9 +79,12 @@ def spline_coefficients(values: Float[Tensor, "X Y Z"]) -> Float[Tensor, "X Y Z"
 def quadratic_spline(
     coefficients: Float[Tensor, "X Y Z"], box: Float[Tensor, "2 3"], positions: Float[Tensor, "*batch 3"]
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-    """Quadratic B-spline on a grid and its exact, continuous gradient; cut off near and beyond the border.
+    """Evaluate a quadratic B-spline on a grid and its exact, continuous gradient; clamped near the border.
 
-    The coefficients are those at the grid's vertices, see `spline_coefficients`.
+    Args:
+        coefficients: at the vertices of the grid, see `spline_coefficients`.
+        box: lower and upper corner of the grid, world units.
+        positions: world units.
     """
     shape = constant(coefficients.shape, coefficients.device)
     scale = (shape - 1) / (box[1] - box[0])
@@ -101,19 +107,19 @@ def quadratic_spline(
 
 
 def bspline_basis(num_control: int, num_places: int) -> Float[Tensor, "num_places num_control"]:
-    """Cubic B-splines of evenly spaced control points, at evenly spaced places from the second to the last but one."""
+    """Return cubic B-splines of evenly spaced control points, evaluated from the second to the last but one."""
     place = torch.linspace(1, num_control - 2, num_places)
     return cubic_bspline(place[:, None] - torch.arange(num_control))
 
 
 def cubic_bspline(t: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """The cubic B-spline of unit spacing around 0."""
+    """Evaluate the cubic B-spline of unit spacing around 0."""
     t = t.abs()
     return torch.where(t < 1, 2 / 3 - t**2 + t**3 / 2, (2 - t).clamp(min=0) ** 3 / 6)
 
 
 def smooth(values: Float[Tensor, "X Y Z"], size: int, sigma: float) -> Float[Tensor, "X Y Z"]:
-    """Convolve with a normalised Gaussian of size^3 taps; the border repeats outwards. Size 0 changes nothing.
+    """Convolve a grid with a normalized Gaussian of size^3 taps and replicated borders; size 0 changes nothing.
 
     Raises:
         NerfroError: the size is even or negative, or sigma is not positive.
@@ -122,13 +128,13 @@ def smooth(values: Float[Tensor, "X Y Z"], size: int, sigma: float) -> Float[Ten
         return values
     if size < 0 or size % 2 == 0 or not sigma > 0:
         raise NerfroError(
-            f"smoothing_size={size}, smoothing_sigma={sigma} is no kernel; "
-            "the size must be odd (or 0 for none) and sigma positive"
+            f"smoothing_size={size}, smoothing_sigma={sigma} is not a valid kernel; "
+            "the size must be odd (or 0 for no smoothing) and sigma positive"
         )
     taps = torch.exp(-0.5 * ((torch.arange(size, dtype=torch.float64) - size // 2) / sigma) ** 2)
     weights = (taps / taps.sum()).tolist()
     for axis in track("smoothing", range(3)):
-        # Shifted sums of whole grids: much faster than a convolution with a single channel.
+        # Sums of shifted grids are much faster than a convolution with a single channel.
         first, *others = _shifted(values, axis, size // 2)
         values = weights[0] * first
         for weight, other in zip(weights[1:], others, strict=True):
@@ -137,7 +143,7 @@ def smooth(values: Float[Tensor, "X Y Z"], size: int, sigma: float) -> Float[Ten
 
 
 def gradient(values: Float[Tensor, "X Y Z"], spacing: Float[Tensor, "3"]) -> Float[Tensor, "X Y Z 3"]:
-    """Central differences, (next - previous) / 2h; the border repeats outwards, so its gradient is half."""
+    """Return central differences, (next - previous) / 2h; replicated borders halve the gradient at the border."""
     parts = []
     for axis in range(3):
         before, _, after = _shifted(values, axis, 1)
@@ -146,7 +152,7 @@ def gradient(values: Float[Tensor, "X Y Z"], spacing: Float[Tensor, "3"]) -> Flo
 
 
 def _shifted(values: Float[Tensor, "X Y Z"], axis: int, reach: int) -> list[Float[Tensor, "X Y Z"]]:
-    """The neighbours of all vertices at -reach, ..., reach along an axis; the border repeats outwards."""
+    """Return the grid shifted by -reach, ..., reach along an axis, with replicated borders."""
     length = values.shape[axis]
     first, last = values.narrow(axis, 0, 1), values.narrow(axis, length - 1, 1)
     padded = torch.cat([*[first] * reach, values, *[last] * reach], axis)

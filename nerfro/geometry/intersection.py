@@ -1,4 +1,4 @@
-"""Rays against triangles, by Embree's bounding volume hierarchy."""
+"""Intersection of rays and triangles with Embree's bounding volume hierarchy."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from nerfro.geometry.normals import smooth_normals
 
 @dataclass(frozen=True)
 class Triangles:
-    """The triangles of several bodies in double precision, with gradients by their vertices where these have them.
+    """Triangles of several bodies in double precision, differentiable with respect to the vertices.
 
     Attributes:
-        corners: of each triangle, world units.
+        corners: corners of each triangle, world units.
         normals: unit normal at each corner, split at creases.
-        body: which body each triangle belongs to.
+        body: number of the body of each triangle.
     """
 
     corners: Float[Tensor, "F 3 3"]
@@ -32,7 +32,13 @@ class Triangles:
     def of(
         cls, meshes: list[TriangleMesh], crease_degrees: float, vertices: Float[Tensor, "V 3"] | None = None
     ) -> Triangles:
-        """Those of meshes, smooth up to the crease angle; `vertices` of all meshes replace those that they have."""
+        """Collect the triangles of meshes, with smooth normals up to the crease angle.
+
+        Args:
+            meshes: one mesh per body.
+            crease_degrees: largest angle between faces whose normals are averaged, degrees.
+            vertices: vertices of all meshes together that replace the vertices of the meshes, world units.
+        """
         counts = [len(mesh.vertices) for mesh in meshes]
         if vertices is None:
             vertices = torch.from_numpy(np.concatenate([mesh.vertices for mesh in meshes]))
@@ -43,17 +49,17 @@ class Triangles:
         return cls(torch.cat(corners), torch.cat(normals), torch.from_numpy(body))
 
     def areas(self, face: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
-        """Normals of triangles by the right-hand rule, twice as long as their areas."""
+        """Return normals by the right-hand rule, with a length of twice the area of the triangle."""
         a, b, c = self.corners[face].unbind(1)
         return torch.linalg.cross(b - a, c - a)
 
     def distance(self, x: Float[Tensor, "R 3"], d: Float[Tensor, "R 3"], face: Int[Tensor, "R"]) -> Float[Tensor, "R"]:
-        """Distance to a triangle's plane along a ray."""
+        """Return the distance to a triangle's plane along each ray."""
         normal = self.areas(face)
         return ((self.corners[face, 0] - x) * normal).sum(-1) / (d * normal).sum(-1)
 
     def normal(self, x: Float[Tensor, "R 3"], face: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
-        """Unit normal at points of triangles: the corners' normals, weighted with the barycentric coordinates."""
+        """Interpolate unit normals at points of triangles with barycentric coordinates."""
         corners, normal = self.corners[face], self.areas(face)
         areas = [torch.linalg.cross(corners[:, (i + 1) % 3] - x, corners[:, (i + 2) % 3] - x) for i in range(3)]
         weights = torch.stack([(area * normal).sum(-1) for area in areas], -1)
@@ -62,7 +68,7 @@ class Triangles:
 
 
 class MeshIntersector:
-    """First hits of rays with triangles, given by their corners."""
+    """First hits of rays with triangles, which are given by the corners."""
 
     def __init__(self, corners: Float[Tensor, "F 3 3"] | Float[np.ndarray, "F 3 3"]) -> None:
         try:
@@ -74,10 +80,10 @@ class MeshIntersector:
                 "ARM), or set sampler.path.interface=sdf"
             ) from error
         self._scene = EmbreeScene()
-        # The scene keeps a pointer to the mesh, not the mesh.
+        # The scene does not keep the mesh alive.
         self._mesh = EmbreeMesh(self._scene, np.asarray(corners, np.float32))
 
     def first_hits(self, x: Float[Tensor, "R 3"], d: Float[Tensor, "R 3"]) -> Int[Tensor, "R"]:
-        """Triangle that each ray hits first, -1 for none."""
+        """Return the first triangle that each ray hits, -1 for none."""
         hits = self._scene.run(x.float().numpy(), d.float().numpy())
         return torch.from_numpy(np.asarray(hits)).long()

@@ -1,4 +1,4 @@
-"""The part of a vessel's outer surface that closes its opening, where silhouettes show no hole."""
+"""The part of a vessel's outer surface that closes the opening, which silhouettes do not show."""
 
 from __future__ import annotations
 
@@ -8,22 +8,27 @@ from jaxtyping import Bool, Float
 from nerfro.geometry.bodies import bodies_of
 from nerfro.geometry.mesh import TriangleMesh
 
-# Triangles count as level whose normals are within 45 degrees of up.
+# Triangles count as level if their normals are within 45 degrees of up.
 _LEVEL = np.cos(np.pi / 4)
 
 
 def find_lid(mesh: TriangleMesh, up: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "F"]:
-    """Which triangles belong to the lid: those around the highest one that face up, as far as they hang together.
+    """Find the lid of a mesh: the connected level triangles around the highest level triangle.
 
-    `up` is a unit vector. No triangle is chosen where the highest ones do not face up.
+    Args:
+        mesh: outer surface of the vessel.
+        up: unit vector.
+
+    Returns:
+        Whether each triangle belongs to the lid; false everywhere if no triangle is level.
     """
     triangles = mesh.triangles
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     level = normals @ up > _LEVEL * np.linalg.norm(normals, axis=-1)
     if not level.any():
         return level
-    part = bodies_of(TriangleMesh(mesh.vertices, mesh.faces[level]))
+    component = bodies_of(TriangleMesh(mesh.vertices, mesh.faces[level]))
     highest = (triangles[level].mean(1) @ up).argmax()
     lid = np.zeros_like(level)
-    lid[level] = part == part[highest]
+    lid[level] = component == component[highest]
     return lid

@@ -1,4 +1,4 @@
-"""Where lines meet."""
+"""Intersection of lines in the least-squares sense."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ from jaxtyping import Float
 
 
 def nearest_point(origins: Float[np.ndarray, "V 3"], directions: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "3"]:
-    """The point of the least sum of distances to lines, by reweighted least squares: a few stray lines do not count."""
+    """Return the point with the least sum of distances to lines, which is robust to outliers.
+
+    Solved by iteratively reweighted least squares.
+    """
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     weights = np.ones(len(origins))
     point = origins.mean(0)
     for _ in range(20):
-        # Where all lines are parallel, any depth will do: the one nearest the cameras' centres.
+        # If all lines are parallel, the small second term selects the point nearest to the mean of the origins.
         system = (weights[:, None, None] * across).sum(0) + 1e-9 * weights.sum() * np.eye(3)
         point = np.linalg.solve(
             system,

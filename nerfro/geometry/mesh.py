@@ -1,4 +1,4 @@
-"""Triangle meshes as two arrays, read from any format trimesh knows."""
+"""Triangle meshes as two arrays, read from any format that trimesh supports."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class TriangleMesh:
     Attributes:
         vertices: corner positions.
         faces: vertex indices of each triangle.
-        normals: unit normals at the corners of the triangles, where the file has normals of its own.
+        normals: unit normals at the corners of the triangles if the file has normals, else None.
     """
 
     vertices: Float[np.ndarray, "V 3"]
@@ -38,7 +38,7 @@ class TriangleMesh:
 
     @property
     def is_closed(self) -> bool:
-        """Whether every edge belongs to an even number of triangles, so that inside and outside are defined."""
+        """Whether every edge belongs to an even number of triangles, so that the inside is defined."""
         edges = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         _, uses = np.unique(edges, axis=0, return_counts=True)
         return bool((uses % 2 == 0).all())
@@ -51,11 +51,15 @@ class TriangleMesh:
         write_atomically(path, content)
 
 
-_THINNEST = 1e-4  # world units; boxes are kept to six decimals
+_THINNEST = 1e-4  # world units; boxes are stored with six decimals
 
 
 def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
-    """Read a triangle mesh of any format trimesh reads (ply, obj, stl, glb, ...) and merge its duplicate vertices.
+    """Read a triangle mesh of any format that trimesh supports (ply, obj, stl, glb, ...) and merge duplicate vertices.
+
+    Args:
+        path: mesh file.
+        accept_open_mesh: whether a mesh with holes is accepted.
 
     Raises:
         NerfroError: the file is missing, unreadable, empty, not finite, or has holes that are not accepted.
@@ -68,16 +72,16 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
         loaded: Any = trimesh.load(path, process=False)
         if isinstance(loaded, trimesh.Scene):  # several bodies, or one in a format for scenes
             loaded = loaded.to_mesh()
-    except Exception as error:  # trimesh's readers raise whatever their parsers do
+    except Exception as error:  # trimesh passes on any exception of the parsers
         raise NerfroError(f"mesh {path} cannot be read ({error}); export it as ply, obj, stl or glb") from error
     vertices = np.asarray(getattr(loaded, "vertices", ()), np.float64)
     faces = np.asarray(getattr(loaded, "faces", ()), np.int64)
     if len(vertices) == 0 or len(faces) == 0:
-        raise NerfroError(f"mesh {path} has no triangles; export a surface, not a point cloud or a scene without one")
+        raise NerfroError(f"mesh {path} has no triangles; export a surface instead of a point cloud or an empty scene")
     if not np.isfinite(vertices).all():
         raise NerfroError(f"mesh {path} has vertices that are not finite; export it again")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise NerfroError(f"mesh {path} has triangles of vertices that it lacks; export it again")
+        raise NerfroError(f"mesh {path} has triangles with indices of missing vertices; export it again")
     check(f"mesh {path} reaches too far; scale it to about one unit: ", {"coordinate": Coordinate},
           {"coordinate": float(vertices.flat[np.abs(vertices).argmax()])})  # fmt: skip
     extent = float(np.ptp(vertices, axis=0).min())
@@ -86,7 +90,7 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
             f"mesh {path} is {extent:g} world units thin, so it has no inside; "
             "export a solid, and scale cameras and mesh so that it is about one unit wide"
         )
-    # trimesh computes normals on demand; in its cache before anybody asked are only those that were read.
+    # trimesh computes normals on demand; before the first access, the cache holds only normals from the file.
     read = np.asarray(loaded.vertex_normals, np.float64) if "vertex_normals" in loaded._cache else None
     if read is not None:
         length = np.linalg.norm(read, axis=-1, keepdims=True)
@@ -101,16 +105,18 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
 
 
 def load_points(path: Path) -> Float[np.ndarray, "P 3"]:
-    """The points of a cloud, of any format trimesh reads."""
+    """Read the points of a point cloud of any format that trimesh supports.
+
+    Raises:
+        NerfroError: the file cannot be read.
+    """
     import trimesh
 
     try:
         loaded: Any = trimesh.load(path, process=False)
         return np.asarray(loaded.vertices, np.float64).reshape(-1, 3)
-    except Exception as error:  # trimesh's readers raise whatever their parsers do
-        raise NerfroError(
-            f"{path} holds no points that can be read ({error}); export it again, or take it out"
-        ) from error
+    except Exception as error:  # trimesh passes on any exception of the parsers
+        raise NerfroError(f"{path} has no readable points ({error}); export it again, or remove it") from error
 
 
 def merge_vertices(
@@ -118,25 +124,26 @@ def merge_vertices(
     faces: Int[np.ndarray, "F 3"],
     normals: Float[np.ndarray, "F 3 3"] | None = None,
 ) -> TriangleMesh:
-    """Unite vertices at equal positions (texture seams and STL files repeat them); drop collapsed triangles and copies.
+    """Merge vertices at equal positions, and remove degenerate and duplicate triangles.
 
-    A triangle and its copy, which looks the same way, would together bound nothing.
+    Texture seams and STL files repeat vertices. A triangle and a duplicate of the same orientation would cancel,
+    because inside and outside are decided by parity.
     """
     unique, inverse = np.unique(vertices, axis=0, return_inverse=True)
     merged = inverse.reshape(-1)[faces]
     kept = (merged[:, 0] != merged[:, 1]) & (merged[:, 1] != merged[:, 2]) & (merged[:, 2] != merged[:, 0])
-    # Turned so that the smallest index comes first, which keeps the way that a triangle looks.
-    turned = np.take_along_axis(merged, (merged.argmin(1)[:, None] + np.arange(3)) % 3, 1)
+    # Rotated so that the smallest index comes first, which keeps the orientation of a triangle.
+    rotated = np.take_along_axis(merged, (merged.argmin(1)[:, None] + np.arange(3)) % 3, 1)
     first = np.zeros(len(merged), bool)
-    first[np.unique(turned, axis=0, return_index=True)[1]] = True
+    first[np.unique(rotated, axis=0, return_index=True)[1]] = True
     kept &= first
     return TriangleMesh(unique, merged[kept], None if normals is None else normals[kept])
 
 
-def require_inside(some: bool) -> None:
-    """Refuse a mesh in which no vertex of a grid lies: there would be no object."""
-    if not some:
+def require_inside(any_inside: bool) -> None:
+    """Raise an error if no vertex of a grid lies inside a mesh, because there would be no object."""
+    if not any_inside:
         raise NerfroError(
             "no vertex of the grid lies inside the mesh: it is flat, thinner than a voxel (raise medium.resolution), "
-            "or every triangle is there twice, facing both ways"
+            "or every triangle has a duplicate of opposite orientation"
         )

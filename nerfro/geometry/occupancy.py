@@ -1,4 +1,4 @@
-"""Which fraction of each grid cell lies inside a mesh, by ray parity along whole columns of the grid."""
+"""Fraction of each grid cell that lies inside a mesh, by ray parity along columns of the grid."""
 
 from __future__ import annotations
 
@@ -12,21 +12,23 @@ from nerfro.geometry.mesh import TriangleMesh
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.progress import track
 
-PLANES = 16  # of a grid, between two looks of the progress bar
+PLANES = 16  # planes of a grid per update of the progress bar
 
 
 def occupancy_fraction(
     mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], resolution: int, subsamples: int = 4
 ) -> Float[np.ndarray, "X Y Z"]:
-    """Fraction of sub-samples around every grid vertex that lie inside a mesh, A / (A + B).
+    """Compute the fraction of sub-samples around every grid vertex that lie inside a mesh, A / (A + B).
 
-    The grid has `resolution` vertices a side, both ends of the box included; the subsamples^3 points around a vertex
-    spread evenly from -h to h on each axis (h the spacing), ends included, as in the authors' code. A point is inside
-    when a line from it crosses the mesh an odd number of times. One line serves a whole column of points, so the cost
-    is that of rasterising the mesh, not of asking for each point.
+    The subsamples^3 points around a vertex are spaced evenly from -h to h on each axis with the spacing h, as in the
+    authors' code. A point is inside if a line from the point crosses the mesh an odd number of times. One line serves
+    a column of points, so the cost is that of rasterizing the mesh.
 
-    Mesh and box (lower and upper corner) are in world units. Where the mesh is not closed, the majority of the lines
-    along x, y and z decides.
+    Args:
+        mesh: world units. If the mesh is not closed, the majority of lines along x, y and z decides.
+        box: lower and upper corner of the grid, world units.
+        resolution: number of vertices per side, with vertices on both ends of the box.
+        subsamples: number of sub-samples per axis.
     """
     offsets = np.linspace(-1.0, 1.0, subsamples) if subsamples > 1 else np.zeros(1)
     votes = []
@@ -46,7 +48,7 @@ def occupancy_fraction(
 def triangles_by_plane(
     triangles: Float[np.ndarray, "F 3 3"], origin: float, spacing: float, num_planes: int, reach: float
 ) -> tuple[Int[np.ndarray, "U"], Int[np.ndarray, "P+1"]]:
-    """The triangles within `reach` of the planes x = origin + i spacing, plane by plane, and where each begins."""
+    """Return triangles within `reach` of the planes x = origin + i spacing, sorted by plane, and each plane's start."""
     low = np.ceil((triangles[:, :, 0].min(1) - reach - origin) / spacing).astype(np.int64).clip(0, num_planes)
     high = np.floor((triangles[:, :, 0].max(1) + reach - origin) / spacing).astype(np.int64).clip(-1, num_planes - 1)
     uses = (high - low + 1).clip(0)
@@ -58,7 +60,7 @@ def triangles_by_plane(
 
 @compiled
 def _edge_side(ax: float, ay: float, bx: float, by: float, px: float, py: float) -> float:
-    """Twice the signed area of (a, b, p), computed so that it is exactly negated when a and b are swapped."""
+    """Return twice the signed area of (a, b, p), with a result that changes only its sign if a and b are swapped."""
     if ax < bx or (ax == bx and ay < by):
         return (bx - ax) * (py - ay) - (by - ay) * (px - ax)
     return -((ax - bx) * (py - by) - (ay - by) * (px - bx))
@@ -66,7 +68,7 @@ def _edge_side(ax: float, ay: float, bx: float, by: float, px: float, py: float)
 
 @compiled
 def _is_left(side: float, ax: float, ay: float, bx: float, by: float) -> bool:
-    """Sign of `_edge_side`; a point on the line counts as moved by (e, e^2), so that no line is hit twice or missed."""
+    """Return the sign of `_edge_side`; points on a line are moved by (e, e^2), so that it is hit exactly once."""
     if side != 0.0:
         return side > 0.0
     if ay != by:
@@ -76,7 +78,7 @@ def _is_left(side: float, ax: float, ay: float, bx: float, by: float) -> bool:
 
 @compiled_parallel
 def _count_inside(triangles, order, starts, origin, spacing, offsets, first_plane, counts):
-    """Add the sub-samples inside to zeros; the planes of the grid are those from number `first_plane` on."""
+    """Count the sub-samples inside for planes of the grid, which begin with number `first_plane`."""
     num, resolution = len(offsets), counts.shape[1]
     for i in prange(len(counts)):
         crossings = np.zeros((resolution, num, num, resolution + 1), np.uint8)

@@ -15,7 +15,7 @@ from nerfro.geometry.occupancy import PLANES, occupancy_fraction, triangles_by_p
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.progress import track
 
-_LEAST_DEPTH = 0.01  # of a vertex in the mesh, voxels
+_LEAST_DEPTH = 0.01  # of a vertex inside the mesh, voxels
 
 
 def signed_distance_grid(
@@ -26,21 +26,29 @@ def signed_distance_grid(
     crease_degrees: float = 30.0,
     lid: Bool[np.ndarray, "F"] | None = None,
 ) -> Float[np.ndarray, "X Y Z"]:
-    """Signed distance, world units, at the vertices (`resolution` a side) of a grid; negative inside.
+    """Compute the signed distance to a mesh at the vertices of a grid, world units; negative inside.
 
-    Within `band` voxels of the surface it is the distance to the nearest triangle, less the height of the smooth
-    surface over that triangle, half the mean of the three corners' tangent planes: with p the nearest point, b its
-    barycentric coordinates, v and N the corners and their normals,
+    Within `band` voxels of the surface, the value is the distance to the nearest triangle minus the height of the
+    smooth surface over that triangle. With the nearest point p, the barycentric coordinates b_i of p, the corners v_i
+    and the normals N_i,
 
         height = 1/2 sum_i b_i (v_i - p) . N_i,
 
-    which is exact to second order in the triangle's size for any curvature (a chord's tangents meet at twice its
-    sagitta). So the facets of a finely tessellated curved surface do not show. Farther away the value is a lower bound
-    of the distance, at most sqrt(3) voxels short. Edges with angles above `crease_degrees` stay sharp. What is inside a
-    mesh that is not closed is decided as in `occupancy_fraction`.
+    which is exact to second order in the size of the triangle for any curvature. Facets of a finely tessellated curved
+    surface are therefore invisible. Farther away, the value is a lower bound of the distance that is at most sqrt(3)
+    voxels too small.
 
-    Distances to triangles of a `lid` do not count, and what is nearer to it than to the others is inside: the inside
-    goes on through it for ever.
+    Args:
+        mesh: world units. The inside of an open mesh is decided as in `occupancy_fraction`.
+        box: lower and upper corner of the grid, world units.
+        resolution: number of vertices per side.
+        band: width of the band of exact distances, voxels.
+        crease_degrees: edges with larger angles stay sharp.
+        lid: triangles whose distances do not count. Points that are nearer to the lid than to other triangles are
+            inside, so that the inside extends through the lid to infinity.
+
+    Raises:
+        NerfroError: no vertex of the grid lies inside the mesh.
     """
     origin = np.asarray(box[0], np.float64)
     spacing = (np.asarray(box[1], np.float64) - origin) / (resolution - 1)
@@ -50,7 +58,7 @@ def signed_distance_grid(
     shown = np.ones(len(triangles), bool) if lid is None else ~lid
     distance, height = _distance_to(triangles[shown], normals[shown], origin, spacing, resolution, reach)
     inside = occupancy_fraction(mesh, box, resolution, subsamples=1) > 0.5
-    # In a flat mesh those count as inside that happen to lie on it.
+    # Vertices on a flat mesh can count as inside.
     require_inside(bool((inside & (distance > _LEAST_DEPTH * spacing.min())).any()))
     if lid is not None:
         inside |= _distance_to(triangles[lid], normals[lid], origin, spacing, resolution, reach)[0] < distance
@@ -65,24 +73,24 @@ def _distance_to(
     resolution: int,
     reach: float,
 ) -> tuple[Float[np.ndarray, "X Y Z"], Float[np.ndarray, "X Y Z"]]:
-    """Distance to the nearest triangle, a lower bound beyond `reach`, and the smooth surface's height over it."""
+    """Return distance to the nearest triangle (a lower bound beyond `reach`) and height of the smooth surface."""
     order, starts = triangles_by_plane(triangles, origin[0], spacing[0], resolution, reach)
     distance, height = (np.full((resolution,) * 3, value, np.float32) for value in (np.inf, 0.0))
     for first in track("distances", range(0, resolution, PLANES)):
         planes = slice(first, first + PLANES)
         found = distance[planes], height[planes]
         _narrow_band(triangles, normals, order, starts[first:], origin, spacing, first, reach, *found)
-    # A point's nearest surface point has a near voxel within half a voxel's diagonal, wherever that is in the band.
+    # The surface point nearest to a vertex lies within half a voxel diagonal of a vertex in the band.
     half_diagonal = 0.5 * float(np.linalg.norm(spacing))
     far = distance_to_set(distance <= half_diagonal, spacing) - half_diagonal
     return np.where(distance <= reach, distance, np.maximum(far, reach)), height
 
 
 def distance_to_set(members: Bool[np.ndarray, "X Y Z"], spacing: Float[np.ndarray, "3"]) -> Float[np.ndarray, "X Y Z"]:
-    """Euclidean distance of each grid vertex to the nearest member; infinite where there is none."""
+    """Return the Euclidean distance of each grid vertex to the nearest member; infinite without members."""
     if not members.any():
         return np.full(members.shape, np.inf, np.float32)
-    # SciPy's own distances want 48 bytes a vertex, its indices of the nearest member 12.
+    # SciPy's distances need 48 bytes per vertex, the indices of the nearest member only 12.
     nearest = distance_transform_edt(~members, sampling=spacing, return_distances=False, return_indices=True)
     squared = np.zeros(members.shape, np.float32)
     for axis, index in enumerate(np.ogrid[tuple(map(slice, members.shape))]):
@@ -92,7 +100,7 @@ def distance_to_set(members: Bool[np.ndarray, "X Y Z"], spacing: Float[np.ndarra
 
 @compiled
 def _closest_barycentric(t, x, y, z):
-    """Barycentric coordinates of the point of a triangle closest to (x, y, z), by the Voronoi regions of its features.
+    """Return the barycentric coordinates of the point of a triangle that is closest to (x, y, z).
 
     Source:
         C. Ericson, Real-Time Collision Detection, 2005, section 5.1.5.
@@ -132,9 +140,9 @@ def _closest_barycentric(t, x, y, z):
 
 @compiled_parallel
 def _narrow_band(triangles, normals, order, starts, origin, spacing, first, reach, distance, height):
-    """Put the distance to the nearest triangle, and the smooth surface's signed height over it, where it is in reach.
+    """Write distance to the nearest triangle and signed height of the smooth surface, where a triangle is in reach.
 
-    The planes of the grid are those from number `first` on.
+    The planes of the grid begin with number `first`.
     """
     resolution = distance.shape[1]
     for i in prange(len(distance)):
@@ -157,10 +165,10 @@ def _narrow_band(triangles, normals, order, starts, origin, spacing, first, reac
                 y = origin[1] + j * spacing[1]
                 for k in range(first_k, last_k + 1):
                     z = origin[2] + k * spacing[2]
-                    # The distances to the triangle's middle and to its plane rule most of the box out.
+                    # Distances to the centre and to the plane of the triangle exclude most of the box.
                     nearest = min(reach, distance[i, j, k])
-                    to_middle = (x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2
-                    if to_middle > (nearest + radius) ** 2:
+                    to_centre = (x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2
+                    if to_centre > (nearest + radius) ** 2:
                         continue
                     to_plane = (nx * (x - t[0, 0]) + ny * (y - t[0, 1]) + nz * (z - t[0, 2])) / norm
                     if abs(to_plane) > nearest:

@@ -10,12 +10,15 @@ _NEVER = 2**31 - 1
 
 
 def keep_freed_memory() -> bool:
-    """Let the process keep the memory that it frees, for the next step's tensors.
+    """Let the process keep freed memory for the tensors of the next step.
 
-    By default glibc gives large blocks back to the system when a tensor dies. Every step then gets the same memory
-    anew, one page fault and 4 KiB of zeros at a time, which can cost more than the arithmetic. The price is that memory
-    once used stays with the process until it ends. Little may be left for long among tensors of ever different sizes:
-    no gap would fit the next one, and the process would grow.
+    By default, glibc returns large blocks to the system when a tensor is freed. Every step then allocates the same
+    memory again, one page fault and 4 KiB of zeros at a time, which can cost more than the arithmetic. The price is
+    that the process keeps the memory until the process ends. Long-lived tensors must not be allocated among tensors of
+    varying sizes, because freed gaps would not fit later tensors and the process would grow.
+
+    Returns:
+        Whether the C library supports the setting.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt

@@ -1,4 +1,4 @@
-"""Tensors as compiled kernels take them."""
+"""Conversion of tensors to the arrays that compiled kernels take."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ from torch import Tensor
 
 
 def arrays(*tensors: Tensor) -> list[np.ndarray]:
-    """The memory of tensors on the CPU, gradients aside; that of a copy where they are not contiguous."""
+    """Return CPU tensors as NumPy arrays without gradients, sharing memory if the tensors are contiguous."""
     return [tensor.detach().contiguous().numpy() for tensor in tensors]

@@ -1,4 +1,4 @@
-"""The memory that there is, and what does not fit into it."""
+"""Memory that is available to this process."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from pathlib import Path
 from nerfro.errors import NerfroError
 
 
-def require_bytes(num_bytes: float, what: str) -> None:
-    """Refuse something that needs more memory than there is, before it is begun."""
-    there = available_bytes()
-    if num_bytes > there:
+def require_bytes(num_bytes: float, purpose: str) -> None:
+    """Raise an error if an allocation needs more memory than is available."""
+    free = available_bytes()
+    if num_bytes > free:
         raise NerfroError(
-            f"{what} needs about {num_bytes / 1e9:.1f} GB of memory and {there / 1e9:.1f} GB are free; make it smaller"
+            f"{purpose} needs about {num_bytes / 1e9:.1f} GB of memory, but {free / 1e9:.1f} GB are free; reduce it"
         )
 
 
 def available_bytes() -> float:
-    """Memory that this process may still take: what the system has, within its control groups' limits.
+    """Return the memory that this process can still allocate, within the limits of the system and of control groups.
 
-    Infinite where nobody tells (other systems than Linux).
+    Infinite on systems other than Linux, which do not provide the number.
     """
     free = [number_in(Path("/proc/meminfo"), r"MemAvailable:\s+(\d+)", 1024, math.inf)]
     for folder, limit, usage in _control_groups():
-        # Cached files count as used there, but are dropped when somebody needs the room.
+        # Control groups count cached files as used memory, although the kernel drops cached files on demand.
         cache = number_in(folder / "memory.stat", r"^(?:total_)?inactive_file (\d+)")
         free.append(number_in(folder / limit, r"(\d+)", 1, math.inf) - number_in(folder / usage, r"(\d+)") + cache)
     return min(free)
 
 
 def _control_groups() -> Iterator[tuple[Path, str, str]]:
-    """Folders of this process's memory groups and those around them, with their files of limit and usage."""
+    """Yield the folders of this process's memory groups and of their parents, with the files of limit and usage."""
     try:
         lines = Path("/proc/self/cgroup").read_text().splitlines()
     except OSError:
@@ -53,7 +53,7 @@ def _control_groups() -> Iterator[tuple[Path, str, str]]:
 
 
 def number_in(file: Path, pattern: str, unit: int = 1, default: float = 0) -> float:
-    """The first number of a pattern in a file of the system; the default without either."""
+    """Return the first match of a pattern in a system file as a number, or the default if there is none."""
     try:
         found = re.search(pattern, file.read_text(), re.MULTILINE)
     except OSError:

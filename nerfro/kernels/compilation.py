@@ -1,4 +1,4 @@
-"""How kernels are compiled, and where the machine code is kept."""
+"""Compilation of kernels and the cache of machine code."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ Function = TypeVar("Function", bound=Callable)
 
 
 def compiled(function: Function) -> Function:
-    """Compile for one thread on the first call, and keep the machine code on disk; Python goes on meanwhile.
+    """Compile a function for one thread at the first call, cache the machine code on disk, and release Python's lock.
 
-    What is compiled so makes no arrays. Then it need not count who uses those that it is given, which took 30 %
-    of the time of tracing.
+    The function must not create arrays. Numba then omits reference counts of arrays, which took 30 % of the time of
+    tracing.
     """
     return _compile(function, parallel=False, allocates=False)
 
 
 def inlined(function: Function) -> Function:
-    """Compile into the kernels that call it: for what is done at every step along a ray."""
+    """Compile a function into the kernels that call the function, for code that runs at every step along a ray."""
     return cast(Function, numba.njit(inline="always")(function))
 
 
 def compiled_parallel(function: Function) -> Function:
-    """Compile with `prange` loops spread over the cores that PyTorch uses, and keep the machine code on disk.
+    """Compile a function with `prange` loops over the cores that PyTorch uses, and cache the machine code on disk.
 
     If PyTorch uses one core in the calling thread, the loops run in that thread. Several threads may then run kernels
     at the same time; parallel kernels wait for each other.
@@ -52,10 +52,10 @@ def compiled_parallel(function: Function) -> Function:
 
 
 def _compile(function: Function, parallel: bool, allocates: bool = True) -> Function:
-    # Fused multiply-add is the only liberty taken with floating point: infinities and exact comparisons stay.
+    # Fused multiply-add is the only relaxation of floating-point arithmetic: infinities and exact comparisons stay.
     options: dict[str, Any] = {"parallel": parallel, "nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
     if not allocates:
-        options["_nrt"] = False  # Numba's run time, which makes arrays and counts their users
+        options["_nrt"] = False  # Numba's run time, which allocates and counts references
     chosen = numba.config.CACHE_DIR  # type: ignore[attr-defined]
     # The installed package may be read-only, and Numba does not tell the two forms of a function apart.
     base = Path(chosen) if chosen else cache_dir() / "kernels"

@@ -1,6 +1,6 @@
-"""Refractive index at a point, for kernels: from a voxel grid, or from signed distances on grids.
+"""Refractive index at a point for kernels, from a voxel grid or from grids of signed distances.
 
-The same mathematics as `geometry.interpolation` and `media.solid`, for one point at a time.
+The mathematics is that of `geometry.interpolation` and `media.solid`, for one point at a time.
 """
 
 from __future__ import annotations
@@ -14,28 +14,28 @@ from jaxtyping import Float, UInt8
 from nerfro.kernels.compilation import compiled
 from nerfro.kernels.tolerances import BEYOND_BOX, SAFE_SHARE
 
-# Unsigned, because Numba counts signed indices from the end where they are negative, a test for each access.
+# Unsigned, because Numba tests signed indices for negative values at each access.
 _UINT = np.uintp
 
 
 class MediumGrid(NamedTuple):
-    """A medium on a grid, as kernels see it. What is None has another type, for which kernels are compiled anew."""
+    """A medium on a grid, as kernels take it. Numba compiles a kernel separately for fields that are None."""
 
-    # Index and gradient at the grid's vertices [X, Y, Z, 4] (`media.voxel_grid`); or coefficients of the bodies'
+    # Index and its gradient at the grid's vertices [X, Y, Z, 4] (`media.voxel_grid`); or coefficients of the bodies'
     # splines [K, X, Y, Z] (`media.sdf_grid`).
     values: Float[np.ndarray, "..."]
-    clearance: Float[np.ndarray, "x y z"]  # of blocks of cells
-    iors: Float[np.ndarray, "K"] | None  # index of each body; None where the values are the index itself
-    nested: bool  # whether a body is only where all before it are too (`media.solid`)
+    clearance: Float[np.ndarray, "x y z"]  # distance within which the index is constant, of blocks of cells
+    iors: Float[np.ndarray, "K"] | None  # index of each body; None if the values are the index
+    nested: bool  # whether each body is bounded by all previous bodies (`media.solid`)
     shell: float  # half width of the bodies' smooth interface, world units
     # Corners of the grid, world units.
     low: Float[np.ndarray, "3"]
     high: Float[np.ndarray, "3"]
-    # Cells and blocks a world unit.
+    # Cells and blocks per world unit.
     inverse_spacing: Float[np.ndarray, "3"]
     inverse_block: Float[np.ndarray, "3"]
-    # Of the smaller blocks in which surfaces are looked for; None where there are no bodies: lowest and highest
-    # derivatives of the bodies' splines, how many blocks away a surface may be, and blocks a world unit.
+    # Smaller blocks for the search of surfaces; None without bodies. Lowest and highest derivatives of the bodies'
+    # splines, number of empty blocks around each block, and blocks per world unit.
     slopes: Float[np.ndarray, "K x y z 3 2"] | None
     empty: UInt8[np.ndarray, "x y z"] | None
     inverse_small: Float[np.ndarray, "3"] | None
@@ -43,7 +43,7 @@ class MediumGrid(NamedTuple):
 
 @compiled
 def _stencil(place, count):
-    """The first of three vertices that a spline reads along an axis, and how far from the middle one it is asked."""
+    """Return the first of the three vertices of a spline along an axis, and the offset from the middle vertex."""
     middle = min(max(math.floor(place + 0.5), 1), count - 2)
     return _UINT(middle - 1), min(max(place - middle, -1.5), 1.5)
 
@@ -60,7 +60,7 @@ def _slopes(t):
 
 @compiled
 def spline_value(coefficients, low, inverse_spacing, x, y, z):
-    """Quadratic B-spline on a grid."""
+    """Evaluate a quadratic B-spline on a grid."""
     i, tx = _stencil((x - low[0]) * inverse_spacing[0], coefficients.shape[0])
     j, ty = _stencil((y - low[1]) * inverse_spacing[1], coefficients.shape[1])
     k, tz = _stencil((z - low[2]) * inverse_spacing[2], coefficients.shape[2])
@@ -79,7 +79,7 @@ def spline_value(coefficients, low, inverse_spacing, x, y, z):
 
 @compiled
 def spline_value_gradient(coefficients, low, inverse_spacing, x, y, z):
-    """Quadratic B-spline on a grid, and its exact gradient."""
+    """Evaluate a quadratic B-spline on a grid and its exact gradient."""
     i, tx = _stencil((x - low[0]) * inverse_spacing[0], coefficients.shape[0])
     j, ty = _stencil((y - low[1]) * inverse_spacing[1], coefficients.shape[1])
     k, tz = _stencil((z - low[2]) * inverse_spacing[2], coefficients.shape[2])
@@ -106,7 +106,7 @@ def spline_value_gradient(coefficients, low, inverse_spacing, x, y, z):
 
 @compiled
 def solid_clearance(coefficients, shell, low, inverse_spacing, x, y, z):
-    """Most of the distance to the nearest shell of nested bodies (`media.solid`)."""
+    """Return a lower bound of the distance to the nearest shell of nested bodies (`media.solid`)."""
     clearance = math.inf
     for body in range(coefficients.shape[0]):
         phi = spline_value(coefficients[body], low, inverse_spacing, x, y, z)
@@ -116,7 +116,7 @@ def solid_clearance(coefficients, shell, low, inverse_spacing, x, y, z):
 
 @compiled
 def solid_index(coefficients, iors, nested, shell, low, inverse_spacing, x, y, z):
-    """Index, its gradient and the clearance of bodies with smooth shells (`media.solid`)."""
+    """Return index, gradient of the index and clearance of bodies with smooth shells (`media.solid`)."""
     n, gx, gy, gz, clearance = 1.0, 0.0, 0.0, 0.0, math.inf
     within, rx, ry, rz = 1.0, 0.0, 0.0, 0.0
     for body in range(coefficients.shape[0]):
@@ -148,7 +148,7 @@ def solid_index(coefficients, iors, nested, shell, low, inverse_spacing, x, y, z
 
 @compiled
 def voxel_index(table, low, inverse_spacing, x, y, z):
-    """Index and gradient from a grid, trilinear; n = 1 and no gradient outside."""
+    """Interpolate index and gradient on a grid trilinearly; outside, n = 1 and the gradient is zero."""
     fx = (x - low[0]) * inverse_spacing[0]
     fy = (y - low[1]) * inverse_spacing[1]
     fz = (z - low[2]) * inverse_spacing[2]
@@ -174,7 +174,7 @@ def voxel_index(table, low, inverse_spacing, x, y, z):
 
 @compiled
 def block_at(counts, bx, by, bz):
-    """Numbers of the block that a place lies in, or of the nearest one, of so many along each axis."""
+    """Return the indices of the block that contains a point, or of the nearest block."""
     i = min(max(int(bx), 0), counts[0] - 1)
     j = min(max(int(by), 0), counts[1] - 1)
     k = min(max(int(bz), 0), counts[2] - 1)
@@ -183,20 +183,20 @@ def block_at(counts, bx, by, bz):
 
 @compiled
 def blocks_from(low, inverse_size, x, y, z):
-    """How many blocks (of any size) from the grid's corner a place lies, along each axis."""
+    """Return a point's coordinates in blocks from the grid's corner."""
     return (x - low[0]) * inverse_size[0], (y - low[1]) * inverse_size[1], (z - low[2]) * inverse_size[2]
 
 
 @compiled
 def block_clearance(clearance, low, inverse_size, x, y, z):
-    """Distance within which the index surely does not vary, from the cell (of any size) that holds the point."""
+    """Return the distance around a point's block within which the index is constant."""
     bx, by, bz = blocks_from(low, inverse_size, x, y, z)
     return clearance[block_at(clearance.shape, bx, by, bz)]
 
 
 @compiled
 def lengths_of_block(rx, ry, rz):
-    """How far a line goes for one block along each axis, of which it crosses so many in a unit of length."""
+    """Return the length of a line per block along each axis, given the blocks per unit length."""
     qx, qy, qz = math.inf, math.inf, math.inf
     if rx != 0.0:
         qx = 1.0 / rx
@@ -209,7 +209,7 @@ def lengths_of_block(rx, ry, rz):
 
 @compiled
 def _end_along(i, reach, b, q):
-    """Distance at which a line leaves along one axis; never where it runs parallel, even on the last block's face."""
+    """Return the distance at which a line leaves along one axis; infinite for parallel lines, even on a face."""
     if math.isinf(q):
         return math.inf
     return ((i + reach if q > 0.0 else i + 1.0 - reach) - b) * q
@@ -217,7 +217,7 @@ def _end_along(i, reach, b, q):
 
 @compiled
 def end_of_blocks(i, j, k, reach, bx, by, bz, qx, qy, qz):
-    """Distance at which a line from a place in blocks leaves those less than `reach` away from one of them."""
+    """Return the distance at which a line leaves the blocks that are less than `reach` away from block (i, j, k)."""
     i, j, k, reach = float(i), float(j), float(k), float(reach)
     end_y, end_z = _end_along(j, reach, by, qy), _end_along(k, reach, bz, qz)
     return min(_end_along(i, reach, bx, qx), min(end_y, end_z))
@@ -225,7 +225,7 @@ def end_of_blocks(i, j, k, reach, bx, by, bz, qx, qy, qz):
 
 @compiled
 def slopes_along(slopes, i, j, k, dx, dy, dz, lowest, highest):
-    """Bounds of each body's slope along a line in a block; returns whether every spline only grows or only falls."""
+    """Bound each body's slope along a line in a block; return whether every spline is monotone."""
     monotone, direction = True, (dx, dy, dz)
     for body in range(slopes.shape[0]):
         least, most = 0.0, 0.0
@@ -241,7 +241,7 @@ def slopes_along(slopes, i, j, k, dx, dy, dz, lowest, highest):
 
 @compiled
 def box_span(low, high, x, y, z, dx, dy, dz):
-    """Distances at which a line enters and leaves a box; the first exceeds the second where it misses."""
+    """Return the distances at which a line enters and leaves a box; enter > leave if the line misses the box."""
     enter, leave = -math.inf, math.inf
     for axis in range(3):
         position = x if axis == 0 else (y if axis == 1 else z)
@@ -259,14 +259,14 @@ def box_span(low, high, x, y, z, dx, dy, dz):
 
 @compiled
 def distance_out(low, high, x, y, z, dx, dy, dz):
-    """Distance after which a ray from inside a box, or from just outside it, is surely out of it."""
+    """Return a distance after which a ray from inside a box, or from near the box, is outside."""
     shortest = min(high[0] - low[0], high[1] - low[1], high[2] - low[2])
     return max(box_span(low, high, x, y, z, dx, dy, dz)[1], 0.0) + BEYOND_BOX * shortest
 
 
 @compiled
 def put_vertex(positions, directions, s, count, x, y, z, dx, dy, dz, length):
-    """Append a vertex to a row of polylines; beyond their capacity vertices are counted, not kept."""
+    """Append a vertex to a polyline; vertices beyond the capacity are only counted."""
     if count < s.shape[0]:
         positions[count, 0], positions[count, 1], positions[count, 2] = x, y, z
         directions[count, 0], directions[count, 1], directions[count, 2] = dx, dy, dz
@@ -276,7 +276,7 @@ def put_vertex(positions, directions, s, count, x, y, z, dx, dy, dz, length):
 
 @compiled
 def put_end(positions, directions, s, count, low, high, bent, x, y, z, dx, dy, dz, length, far):
-    """Append the last vertex, at far; a bent path has left the box by then, if need be later."""
+    """Append the last vertex at `far`, or farther if a bent path has not left the box by then."""
     ahead = far - length
     if bent:
         ahead = max(ahead, distance_out(low, high, x, y, z, dx, dy, dz))
@@ -287,7 +287,7 @@ def put_end(positions, directions, s, count, low, high, bent, x, y, z, dx, dy, d
 
 @compiled
 def repeat_last(positions, directions, s, count):
-    """Fill a row with its last vertex."""
+    """Fill the rest of a polyline with the last vertex."""
     last = min(count, s.shape[0]) - 1
     for i in range(last + 1, s.shape[0]):
         for axis in range(3):

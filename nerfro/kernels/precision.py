@@ -1,4 +1,4 @@
-"""Which kind of number a machine multiplies fast."""
+"""Number formats in which a machine multiplies fast."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import torch
 
 
 def fast_bfloat16(device: str) -> bool:
-    """Whether products in bfloat16 are faster than in float32 on a device: `cpu`, `cuda`, ...
+    """Return whether matrix products in bfloat16 are faster than in float32 on a device: `cpu`, `cuda`, ...
 
-    A processor without units for it computes each number on its own: with AVX2 alone a product of 16384x64 and 64x64
-    takes 40 times as long as in float32. Units that PyTorch does not tell of (ARM's) are not used.
+    Processors without bfloat16 units compute each number separately: with AVX2, a product of 16384x64 and 64x64
+    takes 40 times as long as in float32. ARM's units are not used, because PyTorch does not report them.
     """
     if device == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)

@@ -14,7 +14,7 @@ from torch import Tensor
 from nerfro.allowed import Count, NotNegative, Positive, Range, Share, corners_of_box
 from nerfro.draws import Draws
 from nerfro.fields.base import Field
-from nerfro.geometry.contraction import contract, contracted_box, expand, shrinkage
+from nerfro.geometry.contraction import contract, contracted_box, contraction_scale, expand
 from nerfro.kernels.arrays import arrays
 from nerfro.registry import register
 from nerfro.rendering import volume_weights
@@ -147,7 +147,7 @@ class DensityGridSampler(PointSampler):
             samples = cone_samples(path, edges)
         else:
             samples = Samples.along(path, measure.arc_length(midpoints(places)).to(path.s.dtype), edges)
-            smaller = shrinkage(samples.positions, self.centre, self.radius)
+            smaller = contraction_scale(samples.positions, self.centre, self.radius)
             lengths = (places.diff(dim=1) / smaller).to(path.s.dtype)
             samples = replace(samples, lengths=lengths, measure=places.to(path.s.dtype))
         depth = self.lookup(self.contracted(samples.positions)) * places.diff(dim=1)
@@ -221,7 +221,7 @@ class DensityGridSampler(PointSampler):
             return field.density(places)
         positions = expand(places, self.centre, self.radius)
         outside = (places - self.centre).norm(dim=-1) >= 2 * self.radius  # where no place of the world lies
-        density = field.density(positions) / shrinkage(positions, self.centre, self.radius)
+        density = field.density(positions) / contraction_scale(positions, self.centre, self.radius)
         return torch.where(outside, 0.0, density)
 
 

@@ -104,8 +104,8 @@ def _arc_length(place, run, marks, begin, passing, aside, radius):
 
 
 @compiled
-def _shrinkage(x, y, z, centre, radius):
-    """`geometry.contraction.shrinkage` of one place; 1 where nothing is contracted."""
+def _contraction_scale(x, y, z, centre, radius):
+    """`geometry.contraction.contraction_scale` of one place; 1 where nothing is contracted."""
     if radius == 0.0:
         return 1.0
     square = (x - centre[0]) ** 2 + (y - centre[1]) ** 2 + (z - centre[2]) ** 2
@@ -127,7 +127,7 @@ def _cell(x, y, z, per_unit, cells):
 
 @compiled
 def _cell_of(x, y, z, smaller, centre, low, per_unit, cells):
-    """The same of a place of the world, which is contracted where its shrinkage is below 1."""
+    """The same of a place of the world, which is contracted where its contraction scale is below 1."""
     if smaller < 1.0:
         share = (2.0 - np.sqrt(smaller)) * np.sqrt(smaller)
         x = centre[0] + share * (x - centre[0])
@@ -316,7 +316,7 @@ def draw(
                     z = positions[ray, run, 2] + ahead * dz
                     points[ray, edge - 1, 0], points[ray, edge - 1, 1], points[ray, edge - 1, 2] = x, y, z
                     headings[ray, edge - 1, 0], headings[ray, edge - 1, 1], headings[ray, edge - 1, 2] = dx, dy, dz
-                    smaller = _shrinkage(x, y, z, centre, radius)
+                    smaller = _contraction_scale(x, y, z, centre, radius)
                     lengths[ray, edge - 1] = (place - before) / smaller
                     depth = flat[_cell_of(x, y, z, smaller, centre, low, per_unit, cells)] * (place - before)
                     occupied[ray, edge - 1] = depth >= empty

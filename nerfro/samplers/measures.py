@@ -30,7 +30,7 @@ class WithinBox:
 
 @dataclass(frozen=True)
 class Contracted:
-    """Arc length times the shrinkage of contracted space, added up over all runs; from near to practical infinity.
+    """Arc length times the contraction scale, added up over all runs; from near to practical infinity.
 
     The first run is followed back, and the last one on, as far as is needed, whatever the path's own ends.
     """

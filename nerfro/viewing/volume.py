@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
-from nerfro.geometry.contraction import expand, shrinkage
+from nerfro.geometry.contraction import contraction_scale, expand
 from nerfro.geometry.interpolation import trilinear
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.types import Samples
@@ -63,7 +63,7 @@ def bake(
     smaller = torch.ones(())
     if radius is not None:
         positions = expand(positions, box.mean(0), radius)
-        smaller = shrinkage(positions, box.mean(0), radius)
+        smaller = contraction_scale(positions, box.mean(0), radius)
     above = torch.tensor([0.0, 0.0, -1.0])
     blocks = positions.split(_POINTS_AT_ONCE)
     blocks = tqdm(blocks, unit="block", desc="bake", dynamic_ncols=True, disable=not progress)

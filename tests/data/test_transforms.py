@@ -364,7 +364,7 @@ def test_bounds_enclose_the_sparse_points(tmp_path: Path) -> None:
     assert cameras.near == pytest.approx(0.9 * 2.8, rel=0.03)
     assert cameras.far == pytest.approx(1.1 * 3.2, rel=0.03)
     (root / "sparse_pc.ply").write_bytes(b"ply?")
-    with pytest.raises(NerfroError, match=r"sparse_pc\.ply holds no points"):
+    with pytest.raises(NerfroError, match=r"sparse_pc\.ply has no readable points"):
         NerfstudioData(str(root)).load("train")
 
 

@@ -148,7 +148,7 @@ def test_compiled_networks_equal_plain_ones_and_keep_their_weights_names() -> No
 
 
 def test_unknown_backend_of_the_compiler_is_refused() -> None:
-    with pytest.raises(NerfroError, match=r"compile=cuda is no backend of torch.compile here; there are .*inductor"):
+    with pytest.raises(NerfroError, match=r"compile=cuda is not a backend of torch.compile; set one of .*inductor"):
         compile_networks(NerfField(width=4, depth=1, skip=1, view_width=4), "cuda")
 
 

@@ -1,4 +1,4 @@
-"""Closed surfaces in one mesh: those that go through each other are found, others pass."""
+"""Closed surfaces of one mesh: crossing surfaces are refused, others are accepted."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_surfaces_apart_inside_each_other_or_touching_pass(parts: list[trimesh.T
 def test_surfaces_that_go_through_each_other_are_refused(parts: list[trimesh.Trimesh]) -> None:
     mesh = mesh_of(*parts)
     assert bodies_of(mesh).max() == len(parts) - 1
-    with pytest.raises(NerfroError, match="go through each other"):
+    with pytest.raises(NerfroError, match="closed surfaces of the mesh cross"):
         require_separate(mesh)
 
 
@@ -111,7 +111,7 @@ def test_triangle_of_a_vertex_that_is_not_there_is_refused(index: int, encoding:
     else:
         content = file.read_bytes()
         file.write_bytes(content[:-12] + index.to_bytes(4, "little", signed=True) + content[-8:])
-    with pytest.raises(NerfroError, match="triangles of vertices that it lacks"):
+    with pytest.raises(NerfroError, match="triangles with indices of missing vertices"):
         load_mesh(file)
 
 

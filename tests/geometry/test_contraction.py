@@ -12,14 +12,14 @@ from nerfro.geometry.contraction import (
     contract,
     contracted_box,
     contracted_length,
+    contraction_scale,
     expand,
-    shrinkage,
     world_length,
 )
 
 CENTRE = torch.tensor([0.5, -1.0, 2.0], dtype=torch.float64)
 RADIUS = 1.5
-ASIDE = torch.tensor([0.0, 1e-4, 0.7, 1.4999, 1.5, 2.0, 30.0], dtype=torch.float64)
+IMPACT_PARAMETERS = torch.tensor([0.0, 1e-4, 0.7, 1.4999, 1.5, 2.0, 30.0], dtype=torch.float64)
 
 
 def test_contraction_keeps_the_ball_and_brings_infinity_to_twice_its_radius() -> None:
@@ -42,35 +42,37 @@ def test_shrinkage_is_that_of_lengths_on_lines_from_the_centre() -> None:
     ends = [contract(CENTRE + (distance + h)[:, None] * directions, CENTRE, RADIUS) for h in (-1e-5, 1e-5)]
     found = (ends[1] - ends[0]).norm(dim=-1) / 2e-5
     torch.testing.assert_close(
-        shrinkage(CENTRE + distance[:, None] * directions, CENTRE, RADIUS), found, rtol=1e-5, atol=0
+        contraction_scale(CENTRE + distance[:, None] * directions, CENTRE, RADIUS), found, rtol=1e-5, atol=0
     )
 
 
-@pytest.mark.parametrize("aside", ASIDE.tolist())
-def test_contracted_length_is_the_sum_of_the_shrinkage(aside: float) -> None:
+@pytest.mark.parametrize("impact_parameter", IMPACT_PARAMETERS.tolist())
+def test_contracted_length_is_the_sum_of_the_shrinkage(impact_parameter: float) -> None:
     t = torch.linspace(-40, 60, 400_001, dtype=torch.float64)
     middles = 0.5 * (t[1:] + t[:-1])
-    places = torch.stack([middles, torch.full_like(middles, aside), torch.zeros_like(middles)], -1)
-    added_up = (shrinkage(places, torch.zeros(3, dtype=torch.float64), RADIUS) * t.diff()).sum()
-    of_a_line = torch.tensor(aside, dtype=torch.float64)
+    places = torch.stack([middles, torch.full_like(middles, impact_parameter), torch.zeros_like(middles)], -1)
+    added_up = (contraction_scale(places, torch.zeros(3, dtype=torch.float64), RADIUS) * t.diff()).sum()
+    of_a_line = torch.tensor(impact_parameter, dtype=torch.float64)
     first, last = contracted_length(t[[0, -1]], of_a_line, RADIUS)
     torch.testing.assert_close(last - first, added_up, rtol=1e-6, atol=1e-6)
 
 
 def test_lengths_to_infinity() -> None:
-    through = contracted_length(torch.tensor([math.inf], dtype=torch.float64).clamp(max=1e12), ASIDE[:1], RADIUS)
+    through = contracted_length(
+        torch.tensor([math.inf], dtype=torch.float64).clamp(max=1e12), IMPACT_PARAMETERS[:1], RADIUS
+    )
     torch.testing.assert_close(through, torch.tensor([2 * RADIUS], dtype=torch.float64))
-    past = contracted_length(torch.tensor([1e12], dtype=torch.float64), ASIDE[-1:], RADIUS)
-    torch.testing.assert_close(past, math.pi / 2 * RADIUS**2 / ASIDE[-1:])
+    past = contracted_length(torch.tensor([1e12], dtype=torch.float64), IMPACT_PARAMETERS[-1:], RADIUS)
+    torch.testing.assert_close(past, math.pi / 2 * RADIUS**2 / IMPACT_PARAMETERS[-1:])
 
 
 def test_world_length_is_its_inverse() -> None:
     t = torch.cat([-torch.logspace(-3, math.log10(FAR), 60), torch.logspace(-3, math.log10(FAR), 60)]).double()
-    for aside in ASIDE:
-        length = contracted_length(t, aside, RADIUS)
-        torch.testing.assert_close(world_length(length, aside, RADIUS), t, rtol=1e-6, atol=1e-9)
+    for impact_parameter in IMPACT_PARAMETERS:
+        length = contracted_length(t, impact_parameter, RADIUS)
+        torch.testing.assert_close(world_length(length, impact_parameter, RADIUS), t, rtol=1e-6, atol=1e-9)
 
 
 def test_places_pass_gradients() -> None:
     x = (CENTRE + torch.tensor([[0.3, 0.2, -0.4], [3.0, -1.0, 2.0], [0.0, 0.0, -90.0]])).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: (contract(x, CENTRE, RADIUS), shrinkage(x, CENTRE, RADIUS)), x)
+    assert torch.autograd.gradcheck(lambda x: (contract(x, CENTRE, RADIUS), contraction_scale(x, CENTRE, RADIUS)), x)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nerfro.fields.base import Field
-from nerfro.geometry.contraction import contracted_length, shrinkage
+from nerfro.geometry.contraction import contracted_length, contraction_scale
 from nerfro.samplers.density_grid import DensityGridSampler
 from nerfro.testing import example_draws, example_path
 from nerfro.types import Path, Radiance, Samples
@@ -81,7 +81,7 @@ def test_samples_of_all_space_hold_all_contracted_length(aside: float) -> None:
     sampler = trained_sampler(**ALL_OF_SPACE)
     path = straight(torch.tensor([2.0, 3.0, 3.5, 6.0]), aside)
     samples = sampler(path, None)
-    shorter = shrinkage(samples.positions, torch.zeros(3), 0.7)
+    shorter = contraction_scale(samples.positions, torch.zeros(3), 0.7)
     ends = contracted_length(torch.tensor([0.3 - 4, 1e6]), torch.tensor(aside), 0.7)
     torch.testing.assert_close((samples.deltas * shorter).sum(), ends[1] - ends[0], rtol=1e-3, atol=0)
     assert samples.edges[0, 0] == pytest.approx(0.3, abs=1e-3)  # though the path begins at 2
