@@ -1,8 +1,8 @@
-"""How far disturbed poses, and a disturbed lens, come back: `python benchmarks/cameras.py`.
+"""Measure how well training recovers disturbed poses and a disturbed lens: `python benchmarks/cameras.py`.
 
-Every training camera of a scene is turned about a random axis and shifted in a random direction; what all share is
-taken out, because it is the world's. The poses of test cameras stay as they are; the lens is wrong for all. Each run is
-`nerfro.train` with the given options; errors are of the cameras that it believes in, left as they are.
+Every training camera of a scene is rotated about a random axis and shifted in a random direction, without the motion
+common to all cameras, because that motion is not observable. Poses of test cameras stay exact, and the lens is
+disturbed for all cameras. Each row is a run of `nerfro.train`, with the errors of the estimated cameras.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def main() -> None:
     with TemporaryDirectory() as folder:
         out = Path(given.out or folder).resolve()
         true = BlenderData(given.root).load("train").cameras
-        believed = replace(
+        initial = replace(
             true,
             camera_to_world=disturbed(true, math.radians(given.degrees), given.percent / 100, given.seed),
             fx=true.fx * (1 + given.focal / 100),
@@ -54,8 +54,8 @@ def main() -> None:
             cx=true.cx + given.principal,
             cy=true.cy - given.principal,
         )
-        data = write_disturbed(resolve_path(given.root), believed, out / "data")
-        spoilt = [f"data.root={data}", "data=nerfstudio", f"data.near={true.near:g}", f"data.far={true.far:g}"]
+        data = write_disturbed(resolve_path(given.root), initial, out / "data")
+        disturbed_data = [f"data.root={data}", "data=nerfstudio", f"data.near={true.near:g}", f"data.far={true.far:g}"]
         lens = "true" if given.focal or given.principal else "false"
         print(
             "poses          PSNR   on the object   aligned   rotation, degrees    position, % of the distance   "
@@ -65,15 +65,15 @@ def main() -> None:
         )
         for row in given.rows:
             run = out / row
-            source = [f"data.root={given.root}"] if row == "true" else spoilt
+            source = [f"data.root={given.root}"] if row == "true" else disturbed_data
             camera = ["camera=refined", f"camera.lens={lens}"] if row.startswith("refined") else []
             options = [*source, *camera, *given.options, f"hydra.run.dir={run}", "logger=none"]
             subprocess.run([sys.executable, "-m", "nerfro.train", *options], check=True, stdout=subprocess.DEVNULL)
-            print(line(row, run, true, true if row == "true" else believed), flush=True)
+            print(line(row, run, true, true if row == "true" else initial), flush=True)
 
 
 def disturbed(cameras: Cameras, angle: float, share: float, seed: int) -> Float[Tensor, "V 3 4"]:
-    """Poses turned by an angle (radians) and shifted by a share of the distance, none of it common to all."""
+    """Rotate poses by an angle (radians) and shift them by a fraction of the distance, without common motion."""
     generator = torch.Generator().manual_seed(seed)
     poses, distances = cameras.camera_to_world.double(), object_distances(cameras)
     units = torch.stack([torch.full_like(distances, angle), share * distances], -1).repeat_interleave(3, -1)
@@ -86,9 +86,9 @@ def disturbed(cameras: Cameras, angle: float, share: float, seed: int) -> Float[
 
 
 def write_disturbed(root: Path, cameras: Cameras, folder: Path) -> Path:
-    """A folder in nerfstudio's format with everything that the data set has, but these training cameras.
+    """Write a copy of a data set in nerfstudio's format with other training cameras.
 
-    The lens of the first is that of all splits.
+    The lens of the first camera replaces the lens of all splits.
     """
     folder.mkdir(parents=True, exist_ok=True)
     lens = {"fl_x": cameras.fx, "fl_y": cameras.fy, "cx": cameras.cx, "cy": cameras.cy}
@@ -108,10 +108,10 @@ def write_disturbed(root: Path, cameras: Cameras, folder: Path) -> Path:
     return folder
 
 
-def line(row: str, run: Path, true: Cameras, believed: Cameras) -> str:
-    """A row of the table; where cameras were refined, they are those of the run instead of those believed at first."""
-    poses = believed.camera_to_world.double()
-    true_lens, lens = ([float(values[0]) for values in (each.fx, each.cx, each.cy)] for each in (true, believed))
+def line(row: str, run: Path, true: Cameras, initial: Cameras) -> str:
+    """Format a row of the table, with the cameras of the run if the run refined them, else the initial ones."""
+    poses = initial.camera_to_world.double()
+    true_lens, lens = ([float(values[0]) for values in (each.fx, each.cx, each.cy)] for each in (true, initial))
     if row.startswith("refined"):
         frames = json.loads((run / "cameras.json").read_text("utf-8"))["frames"]
         poses = torch.tensor([frame["transform_matrix"][:3] for frame in frames], dtype=torch.float64)
@@ -128,7 +128,7 @@ def line(row: str, run: Path, true: Cameras, believed: Cameras) -> str:
 
 
 def errors(poses: Float[Tensor, "V 3 4"], true: Cameras) -> tuple[Float[Tensor, "V"], Float[Tensor, "V"]]:
-    """By how many degrees, and percent of its distance, each camera is off."""
+    """Return each camera's rotation error in degrees and position error in percent of the distance."""
     turn, shift = motion_between(true.camera_to_world, poses)
     return turn, 100 * shift / object_distances(true)
 

@@ -1,9 +1,9 @@
-"""Where the squared error of a trained run lies: which pixels hold it, and what the picture would gain without them.
+"""Break down the squared error of a trained run by classes of pixels, with the PSNR without the error of each class.
 
     python benchmarks/error_budget.py RUN [--views 5] [--divergence 0]
 
-RUN is a run folder. Its first test views are rendered again, as they were evaluated or with other numbers of rays, and
-every pixel is put into the first class that it fits.
+RUN is a run folder. The first test views are rendered again, as in the evaluation or with other numbers of rays, and
+every pixel is assigned to the first class that matches.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ CLASSES = ("past the glass", "things inside", "edges", "sky through the glass")
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("run", type=Path)
-    parser.add_argument("--views", type=int, help="test views that are looked at; all by default")
+    parser.add_argument("--views", type=int, help="number of test views; all by default")
     for option, kind in (("supersample", int), ("divergence", float), ("contrast", float)):
         parser.add_argument(f"--{option}", type=kind, help=f"evaluation.{option}; as trained by default")
     parser.add_argument("--edge", type=float, default=8.0, help="pixel angles from which neighbours part")
@@ -53,7 +53,7 @@ def main() -> None:
 
 @torch.inference_mode()
 def classify(model: NerfModel, cameras: Cameras, view: int, opacity: Tensor, edge: float) -> Tensor:
-    """Row of CLASSES for each pixel of a view."""
+    """Return the index in CLASSES of each pixel of a view."""
     size = cameras.height * cameras.width
     parted, refracted = [], []
     for pixels in torch.arange(view * size, (view + 1) * size).split(model.chunk_size):
@@ -69,7 +69,7 @@ def classify(model: NerfModel, cameras: Cameras, view: int, opacity: Tensor, edg
 
 
 def budget(errors: Tensor, classes: Tensor) -> Iterator[str]:
-    """A row of the table for each class, and one for all pixels."""
+    """Yield a row of the table for each class, and a row for all pixels."""
     total = errors.double().sum()
     for index, name in enumerate((*CLASSES, "all")):
         chosen = classes == index if index < len(CLASSES) else torch.ones_like(classes, dtype=torch.bool)
@@ -80,7 +80,7 @@ def budget(errors: Tensor, classes: Tensor) -> Iterator[str]:
 
 
 def decibels(mean_square: Tensor) -> float:
-    """Peak signal-to-noise ratio of a mean squared error of values in [0, 1]."""
+    """Return the peak signal-to-noise ratio of a mean squared error of values in [0, 1]."""
     return -10 * math.log10(max(float(mean_square), 1e-12))
 
 

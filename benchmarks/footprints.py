@@ -1,11 +1,11 @@
-"""What a pixel of glass needs: rays, or a sky that answers with the level that fits a ray's footprint.
+"""Compare more rays per pixel of glass with lookups of the sky at the level of a ray's footprint.
 
     python benchmarks/footprints.py [--sky torus] [--views 2]
     python benchmarks/footprints.py --run RUN [--views 3]
 
-The first: an empty rounded cube under a sky that is known exactly, without partial reflection; the truth has 256 rays
-a pixel. Rows differ in the number of rays alone, columns in what the sky is asked. Scores are of the glass's pixels.
-The second: test views of a trained run, whose learned sky answers by footprint in the rays of divided pixels.
+The first form renders an empty rounded cube under a known sky without partial reflection. The reference has 256 rays
+per pixel. Rows differ in the number of rays, columns in the level of the sky. Scores are of pixels of glass.
+The second form renders test views of a trained run, with lookups of the learned sky by footprint in subdivided pixels.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ CHUNK = 200_000
 
 
 class Pyramid:
-    """A sky as averages over ever larger texels; every level is looked up bilinearly."""
+    """Mip levels of a sky as cube maps with bilinear lookup."""
 
     def __init__(self, texels: Float[Tensor, "6*n*n 3"]) -> None:
         n = math.isqrt(len(texels) // 6)

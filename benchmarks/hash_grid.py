@@ -1,9 +1,9 @@
-"""Hash-grid field, environment map and density grid: compiled CPU kernels against their plain-PyTorch twins.
+"""Hash-grid field, environment map and density grid: compiled CPU kernels against reference implementations.
 
     python benchmarks/hash_grid.py [--rays 1024] [--samples 64] [--threads 2] [--rounds 9] [--cpu-time]
 
-Prints a Markdown table. The two sides of a ratio take turns within one run, and the fastest turn of each counts. On a
-machine with other load even the fastest turn is mostly waiting: `--threads 1 --cpu-time` counts processor time instead.
+Prints a Markdown table. Both implementations alternate within one run, and the fastest round of each counts. On a busy
+machine, use `--threads 1 --cpu-time` to measure processor time instead of elapsed time.
 """
 
 from __future__ import annotations
@@ -54,14 +54,14 @@ def main() -> None:
     )
     clock = time.process_time if arguments.cpu_time else time.perf_counter
     print("processor time\n" if arguments.cpu_time else "elapsed time\n")
-    print("| task | twin, ms | compiled, ms | ratio |\n|---|---|---|---|")
+    print("| task | reference, ms | compiled, ms | ratio |\n|---|---|---|---|")
     samples = random_samples(arguments.rays, arguments.samples)
     for num_levels, log2_table_size in ((12, 15), (16, 15), (16, 17)):
         name = f"{num_levels} levels, 2^{log2_table_size} entries"
-        for label, twin, compiled in hash_grid_tasks(samples, num_levels, log2_table_size):
-            report(f"{label}; {name}", twin, compiled, arguments.rounds, clock)
-    for label, twin, compiled in [*environment_map_tasks(arguments.rays), *drawing_tasks(arguments.rays)]:
-        report(label, twin, compiled, arguments.rounds, clock)
+        for label, reference, compiled in hash_grid_tasks(samples, num_levels, log2_table_size):
+            report(f"{label}; {name}", reference, compiled, arguments.rounds, clock)
+    for label, reference, compiled in [*environment_map_tasks(arguments.rays), *drawing_tasks(arguments.rays)]:
+        report(label, reference, compiled, arguments.rounds, clock)
 
 
 def random_samples(num_rays: int, num_samples: int) -> Samples:
@@ -89,7 +89,7 @@ def hash_grid_tasks(samples: Samples, num_levels: int, log2_table_size: int) -> 
     """Encoding alone, and a whole training pass through the field (forward, backward, Adam)."""
     settings = {"num_levels": num_levels, "finest_resolution": 512, "log2_table_size": log2_table_size}
     compiled = HashGridField(**settings, precision="bfloat16")
-    twin = TwinField(**settings, precision="float32")
+    reference = TwinField(**settings, precision="float32")
     upstream = torch.randn(samples.positions.shape[0] * samples.positions.shape[1], 2 * num_levels)
     positions = samples.positions.flatten(0, 1)
 
@@ -116,11 +116,11 @@ def hash_grid_tasks(samples: Samples, num_levels: int, log2_table_size: int) -> 
 
     same = HashGridField(**settings, precision="float32")
     return [
-        ("encode, forward", encode(twin), encode(compiled)),
-        ("encode, forward and backward", encode_and_back(twin), encode_and_back(compiled)),
-        ("encode + decode in float32, forward and backward", decode(twin), decode(same)),
-        ("encode + decode in bfloat16, forward and backward", decode(twin), decode(compiled)),
-        ("Adam (plain, fused)", adam(twin, fused=False), adam(compiled, fused=True)),
+        ("encode, forward", encode(reference), encode(compiled)),
+        ("encode, forward and backward", encode_and_back(reference), encode_and_back(compiled)),
+        ("encode + decode in float32, forward and backward", decode(reference), decode(same)),
+        ("encode + decode in bfloat16, forward and backward", decode(reference), decode(compiled)),
+        ("Adam (plain, fused)", adam(reference, fused=False), adam(compiled, fused=True)),
     ]
 
 
@@ -129,14 +129,14 @@ def environment_map_tasks(num_rays: int) -> list[tuple[str, Task, Task]]:
     boundary = EnvironmentMap()
     directions = torch.nn.functional.normalize(torch.randn(num_rays, 3), dim=-1)
 
-    def twin() -> None:
+    def reference() -> None:
         raw = cube_map.lookup(*cube_map.project(directions), boundary.texels, boundary.padded, boundary.levels)
         torch.autograd.grad(torch.sigmoid(raw).square().sum(), boundary.texels)
 
     def compiled() -> None:
         torch.autograd.grad(boundary(Exits(directions)).square().sum(), boundary.texels)
 
-    return [("environment map, one direction a ray, forward and backward", twin, compiled)]
+    return [("environment map, one direction a ray, forward and backward", reference, compiled)]
 
 
 def drawing_tasks(num_rays: int) -> list[tuple[str, Task, Task]]:
@@ -153,16 +153,16 @@ def drawing_tasks(num_rays: int) -> list[tuple[str, Task, Task]]:
         sampler = DensityGridSampler(**options)
         sampler.density = 20 * torch.rand(sampler.density.shape) ** 8
         draws = Draws(0, 0, torch.arange(num_rays))
-        twin, compiled = partial(sampler.draw, path, draws), partial(sampler.draw_compiled, path, draws)
-        tasks.append((f"drawing in {label}", twin, compiled))
+        reference, compiled = partial(sampler.draw, path, draws), partial(sampler.draw_compiled, path, draws)
+        tasks.append((f"drawing in {label}", reference, compiled))
     return tasks
 
 
-def report(label: str, twin: Task, compiled: Task, rounds: int, clock: Callable[[], float]) -> None:
+def report(label: str, reference: Task, compiled: Task, rounds: int, clock: Callable[[], float]) -> None:
     """Print a table row; both tasks run once before they are timed."""
     fastest = [float("inf"), float("inf")]
     for turn in range(rounds + 1):
-        for side, task in enumerate((twin, compiled)):
+        for side, task in enumerate((reference, compiled)):
             start = clock()
             task()
             if turn > 0:

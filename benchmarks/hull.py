@@ -1,4 +1,4 @@
-"""How well a hull stands for the true surface: `python benchmarks/hull.py DATA MESH`, a minute on one core."""
+"""Compare a visual hull with the true surface: `python benchmarks/hull.py DATA MESH`, one minute on one core."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MAX_PIXELS = 160
 def main() -> None:
     """Print the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("data", help="folder of posed images; its test split is looked at")
+    parser.add_argument("data", help="folder of posed images; the test split is used")
     parser.add_argument("mesh", type=Path, help="written by nerfro.preprocess")
     parser.add_argument("--truth", type=Path, help="true surface; DATA/truth/mesh.ply, or DATA/mesh.ply, if not given")
     parser.add_argument("--format", default="blender", help="of the data, as in data=")
@@ -42,7 +42,7 @@ def main() -> None:
 
 
 def true_surface(root: Path) -> TriangleMesh:
-    """The true surface in the frame of a data set's cameras, which for a capture are not the true ones."""
+    """Return the true surface in the frame of the data set's cameras; for captures, cameras are estimated."""
     if not (root / "truth").is_dir():
         return load_mesh(root / "mesh.ply")
     true_poses, poses = (read_cameras(folder)[1] for folder in (root / "truth", root))

@@ -1,7 +1,7 @@
-"""How well the index is found, and from where: `python benchmarks/index.py DATA MESH --ior 1.5`.
+"""Measure the accuracy of the index search on inexact surfaces: `python benchmarks/index.py DATA MESH --ior 1.5`.
 
-The surface is spoiled more and more, by a coat of even thickness (or its lack) and by bumps, in shares of its size. For
-each, what the search finds, and the basin: the starts from which the error only falls on the way to it.
+The surface is enlarged or shrunk by a constant offset, or disturbed by bumps, in percent of the size. Printed are the
+index that the search finds, and the basin of attraction: initial values from which the error decreases monotonically.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from nerfro.paths import resolve_path
 from nerfro.registry import discover, find
 
 _BAND, _MARGIN_SHARE = 3.0, 0.2
-# Bumps are sums of so many waves, of lengths from a third of the object's size to its size.
+# Number of sine waves that make up the bumps, with wavelengths from a third of the object's size to its size.
 _WAVES = 12
 
 
 def main() -> None:
     """Print a line for each spoiled surface."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("data", help="folder of posed images; its training split is looked at")
+    parser.add_argument("data", help="folder of posed images; the training split is used")
     parser.add_argument("mesh", help="closed surface")
     parser.add_argument("--format", default="blender", help="of the data, as in data=")
     parser.add_argument("--ior", type=float, default=1.5, help="the true one")
@@ -55,7 +55,7 @@ def main() -> None:
 
 
 def spoiled(mesh: TriangleMesh, kind: str, share: float) -> TriangleMesh:
-    """A mesh moved along its normals by a share of its size, evenly or in bumps of that standard deviation."""
+    """Offset a mesh along the normals by a fraction of the size, evenly or in bumps of that standard deviation."""
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     size = float(np.ptp(mesh.bounds, axis=0).max())
     height = np.full(len(mesh.vertices), {"coat": 1.0, "lack": -1.0}.get(kind, 0.0))
@@ -69,7 +69,7 @@ def spoiled(mesh: TriangleMesh, kind: str, share: float) -> TriangleMesh:
 
 
 def basin(found: Estimate) -> tuple[float, float]:
-    """Between which starts the error of a single body falls all the way to the lowest candidate."""
+    """Return the interval of initial values from which the error of a single body decreases to the minimum."""
     values, errors = found.wide.T
     low = high = int(errors.argmin())
     while low > 0 and errors[low - 1] > errors[low]:

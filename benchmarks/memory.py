@@ -1,9 +1,9 @@
-"""Memory of whole runs: training with the default preset and the evaluation after it, each in a process of its own.
+"""Measure the memory of training and evaluation with the default preset, with a separate process for each row.
 
     python benchmarks/memory.py [--steps 300] [ROW ...]
 
-Makes folders of noise in the sizes of the table, trains on them, scores one view, and prints a Markdown table. Load on
-the machine changes the seconds, not the memory.
+Writes folders of noise images, trains on them, evaluates one view, and prints a Markdown table. ROW is `embedded` or
+COUNTxWIDTHxHEIGHT of the training images. Load on the machine changes the times but not the memory.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def main() -> None:
 
 
 def make_noise(folder: Path, count: int, width: int, height: int) -> None:
-    """Write pictures of noise, whose cameras look at the origin from a circle; one of them is for testing."""
+    """Write noise images with cameras on a circle around the origin; the last image is the test view."""
     generator = np.random.default_rng(0)
     frames = []
     for number in range(count + 1):
@@ -73,7 +73,7 @@ def make_noise(folder: Path, count: int, width: int, height: int) -> None:
 
 
 def measure(options: list[str]) -> list[str]:
-    """Seconds to the first step; MiB after it, a minute later and at the last step; most MiB of the process."""
+    """Measure seconds to the first step, MiB after that step, a minute later and at the last step, and peak MiB."""
     begun = time.perf_counter()
     process = subprocess.Popen(
         [sys.executable, "-m", "nerfro.train", *options], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
@@ -103,7 +103,7 @@ def measure(options: list[str]) -> list[str]:
 
 
 def _resident(pid: int) -> Iterator[float]:
-    """MiB of a process, again and again until it ends."""
+    """Yield the resident memory of a process in MiB until the process ends."""
     while True:
         try:
             found = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())

@@ -1,8 +1,9 @@
-"""Train with a time limit of processor time, so that a run on a busy machine is worth one on a quiet core.
+"""Train with a limit of processor time, so that results do not depend on other work on the machine.
 
     python benchmarks/processor_time.py +experiment=straight data.root=DIR trainer.max_time=00:00:05:00
 
-takes what `python -m nerfro.train` takes. On a quiet core, and with one thread, both are the same.
+The arguments are those of `python -m nerfro.train`. Processor time is that of all threads of the process. With one
+thread on an idle core, both limits are the same.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""An independent tracer of rounded glass cubes: double precision, one ray at a time, none of nerfro's code."""
+"""An independent tracer of rounded glass cubes in double precision, for one ray at a time, without code of nerfro."""
 
 from __future__ import annotations
 

@@ -1,9 +1,7 @@
-"""How exact and how fast rays are traced: `python benchmarks/tracing.py`, about five minutes on two cores.
+"""Measure accuracy and speed of tracing: `python benchmarks/tracing.py`, about five minutes on two cores.
 
-`--branches` prints the last table alone.
-
-Prints the tables of docs/benchmarks.md as Markdown. Every error is against a closed form or an independent tracer,
-every speed is the best of several passes that alternate between the samplers, in one process.
+Prints the tables of docs/benchmarks.md as Markdown; `--branches` prints only the last table. Errors are measured
+against closed forms or an independent tracer. Speeds are the best of several passes that alternate between samplers.
 """
 
 from __future__ import annotations
@@ -45,7 +43,7 @@ def main() -> None:
     """Print all tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--resolution", type=int, default=256, help="of the signed-distance grids")
-    parser.add_argument("--branches", action="store_true", help="only what light that splits costs")
+    parser.add_argument("--branches", action="store_true", help="only the cost of light that splits")
     parser.add_argument("--euler-resolution", type=int, default=512, help="of the paper's voxel grid (authors: 512)")
     parser.add_argument("--side", type=int, default=400, help="pixels of the view whose rays are timed")
     parser.add_argument("--rays", type=int, default=4000, help="rays through the ball; 3/8 of them through the cube")

@@ -1,14 +1,15 @@
-"""How fast training and rendering are, and what a time budget buys. Each part prints Markdown; see docs/benchmarks.md.
+"""Measure the speed of training and rendering, and scores by time budget. Each part prints Markdown.
 
     python benchmarks/training.py step                        # a step of the paper's recipe, plain and fast
     python benchmarks/training.py curve                       # their losses over 200 steps
-    python benchmarks/training.py profile refractive          # where a step's milliseconds go
-    python benchmarks/training.py paths                       # what live tracing costs of a step; see docs for one core
-    python benchmarks/training.py branches                    # what light that splits costs of a step
+    python benchmarks/training.py profile refractive          # time of a step by component
+    python benchmarks/training.py paths                       # cost of live tracing per step
+    python benchmarks/training.py branches                    # cost of light that splits per step
     python benchmarks/training.py budget 00:00:05:00          # default preset and paper's recipe, given the same time
     python benchmarks/training.py view RUN/checkpoints/last.ckpt   # rendering a 400x400 view
 
-The embedded scene, all cores unless OMP_NUM_THREADS and NUMBA_NUM_THREADS say otherwise.
+All parts use the embedded scene, and all cores unless OMP_NUM_THREADS and NUMBA_NUM_THREADS are set. docs/benchmarks.md
+explains the results.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ def main() -> None:
 
 
 class Steps(pl.Callback):
-    """Seconds by the clock and of the processor and total loss of every training step, from one's end to the next's."""
+    """Record elapsed time, processor time and total loss of every training step."""
 
     def __init__(self) -> None:
         self.seconds: list[float] = []
@@ -113,7 +114,7 @@ class Steps(pl.Callback):
 
 
 class Training:
-    """An experiment on the embedded scene that can be trained for a few steps at a time, as nerfro.train does it.
+    """An experiment on the embedded scene that trains for a few steps at a time, as nerfro.train does.
 
     Args:
         overrides: Hydra overrides of conf/train.yaml.
@@ -132,7 +133,7 @@ class Training:
         self.num_rays = wanted.size
 
     def run(self, num_steps: int, data: RayDataModule | None = None) -> Steps:
-        """Train for some steps with a new optimiser."""
+        """Train for some steps with a new optimizer."""
         steps = Steps()
         trainer = pl.Trainer(
             max_steps=num_steps,
@@ -156,7 +157,7 @@ def paper_recipe(experiment: str, *overrides: str) -> Training:
 
 
 def report_step(turns: int, options: list[str]) -> None:
-    """A step of 1024 rays in single precision with every sample evaluated, and what makes it faster."""
+    """Time a step of 1024 rays in single precision with all samples evaluated, and two faster variants."""
     variants = {
         "plain: float32, every sample evaluated (`paper_refractive`)": paper_recipe(PLAIN, *options),
         "bfloat16 products (`trainer.precision=bf16-mixed`)": paper_recipe(
@@ -240,7 +241,7 @@ def report_profile(experiment: str, steps: int, options: list[str]) -> None:
 
 
 class ReadyBatches(RayDataModule):
-    """The batches of the first steps again and again, traced before training starts."""
+    """Batches of the first steps, traced before training starts."""
 
     def __init__(self, batches: RayBatches, num_steps: int) -> None:
         super().__init__(batches, None, 0)
@@ -252,7 +253,7 @@ class ReadyBatches(RayDataModule):
 
 
 class TracedInStep(RayDataModule):
-    """Paths are traced when a step asks for them, as where the medium learns."""
+    """Batches whose paths are traced within the step, as for media that learn."""
 
     def transfer_batch_to_device(self, batch: int, device: torch.device, dataloader_idx: int) -> Batch:
         with torch.no_grad():
@@ -260,9 +261,9 @@ class TracedInStep(RayDataModule):
 
 
 def report_paths(turns: int, steps: int, options: list[str]) -> None:
-    """What live tracing costs of a step of the default preset, against the same batches made before.
+    """Compare the time of a step with live tracing to a step with the same batches traced beforehand.
 
-    Ways take turns, and the median of each way's turns counts. Processor time is of all threads.
+    Variants alternate, and the median of each variant counts. Processor time is that of all threads.
     """
     training = Training("+experiment=refractive", *options)
     batches = training.batches

@@ -1,7 +1,7 @@
-"""What `viewer=true` costs a training: `python benchmarks/viewer.py`.
+"""Measure how much `viewer=true` slows down training: `python benchmarks/viewer.py`.
 
-One run trains on the embedded scene while a browser's requests come and go. Steps are timed in windows with and without
-them, one after the other, so that both see the same phases of the training and the same other work on the machine.
+One run trains on the embedded scene. Windows with and without requests of a browser alternate, so that both kinds of
+windows see the same phases of the training and the same load of the machine.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from nerfro.viewing import server
 
 
 class TimedViewer(Viewer):
-    """Notes when each step ended, and whether somebody looked."""
+    """Record the end of each step, and whether a browser was connected."""
 
     steps: list[tuple[float, bool]] = []  # noqa: RUF012 (of the one run)
     baking: list[float] = []  # noqa: RUF012
@@ -38,7 +38,7 @@ class TimedViewer(Viewer):
 
 
 def browse(window: float) -> None:
-    """Ask for news every two seconds in every second window, as the page does."""
+    """Poll the server every two seconds in every second window, as the page does."""
     begun = time.monotonic()
     while True:
         time.sleep(2)
