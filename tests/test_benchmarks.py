@@ -164,6 +164,7 @@ def test_cameras_come_back(run: Run, tiny_default_run: list[str], tiny_scene: Pa
     assert len(list(tmp_path.glob("*/metrics.json"))) == 2
 
 
+@pytest.mark.slow
 def test_memory_of_a_training_is_measured(run: Run, tiny_default_run: list[str]) -> None:
     options = [option for option in tiny_default_run if not option.startswith("data.root")]
     assert len(run("memory", "2x8x8", "--steps", 2, "--options", *options)) == 2
