@@ -9,7 +9,7 @@ from nerfro.files.cache import file_hash
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.paths import CONF_DIR, user_path
 from nerfro.training.load import checkpoint_of, load
-from nerfro.viewing.film import write_film
+from nerfro.viewing.film import find_ffmpeg, write_film
 from nerfro.viewing.frames import Rendering, render_frames
 from nerfro.viewing.layers import LAYERS
 from nerfro.viewing.render_request import RenderConfig, check_request, checkpoints, find_shots, labels, prepared
@@ -29,9 +29,12 @@ def main(config: DictConfig) -> None:
     read = [*map(checkpoint_of, runs), *([config.sky] if config.sky else []), *(sweep.files if sweep else [])]
     request = (config.what, config.sweep, rendering.labels, scenes[0].subdivision, *map(file_hash, read))
     folder = user_path(config.out)
+    films = config.film if shots.film and config.format == "png" else []
+    if "mp4" in films:
+        find_ffmpeg()  # a missing ffmpeg is reported before the frames are rendered
     files = render_frames(rendering, shots, folder, f".{config.format}", request, config.overwrite)
     print(f"{len(files)} frames: {files[0]}")
-    for kind in config.film if shots.film and config.format == "png" else ():
+    for kind in films:
         film = folder / f"film.{kind}"
         write_film(film, files, config.seconds)
         print(f"film: {film}")

@@ -294,7 +294,7 @@ class Rendering:
     """One sampling level of rendered rays (paper, Eqn. volrendBd)."""
 
     # Radiance of each ray, boundary term included, of all its polylines together. Linear, and unbounded above;
-    # sRGB where the model adds up sRGB (`NerfModel.colour`).
+    # sRGB where the model adds up sRGB (`Scene.colour_space`).
     rgb: Float[Tensor, "R 3"]
     weights: Float[Tensor, "P N"]  # contribution of each sample to its polyline
     transmittance: Float[Tensor, "P"]  # what is left at the end of the polyline, T_{N+1}

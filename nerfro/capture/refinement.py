@@ -31,7 +31,7 @@ from nerfro.capture.displacement import Displacement
 from nerfro.capture.record import Record
 from nerfro.capture.rims import RimFinder
 from nerfro.capture.room_picture import RoomPicture, picture_of
-from nerfro.capture.surroundings import VALIDATION_EVERY, Pixels, Room, Surroundings, robust
+from nerfro.capture.surroundings import Pixels, Room, Surroundings, robust
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import NerfroError
 from nerfro.files.cache import content_hash
@@ -221,9 +221,8 @@ class _Descent:
         self.sampler = Snell(max_events=2 * len(medium.iors))
         self.size = float(np.ptp(mesh.bounds, axis=0).max())
         self.offsets = Displacement(tuple(medium.distances.shape[1:]), self.size, settings.levels)
-        held_back = through.view % VALIDATION_EVERY == VALIDATION_EVERY - 1
-        self.teachers = through[~held_back]
-        self.judges = (through[held_back] if held_back.any() else through).some(_JUDGED)
+        self.teachers, validation = through.split()
+        self.judges = validation.some(_JUDGED)
         self.first_errors: Tensor | None = None
         self.rims = RimFinder(mesh, silhouettes).points().points
         cameras = silhouettes.cameras

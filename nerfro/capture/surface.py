@@ -10,15 +10,7 @@ from nerfro.capture.pose_conventions import overlap
 from nerfro.capture.revolution import Symmetry, fit_revolution
 from nerfro.capture.silhouette_fit import fit_surface
 from nerfro.capture.silhouettes import frame_pixels
-from nerfro.capture.visual_hull import (
-    NUM_LEVELS,
-    Silhouettes,
-    carve_grid,
-    extract_surface,
-    find_box,
-    reaches_border,
-    remove_strays,
-)
+from nerfro.capture.visual_hull import Silhouettes, carve_grid, extract_surface, find_box, reaches_border, remove_strays
 from nerfro.cli import warn
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError, first_of
@@ -110,9 +102,7 @@ def make_mesh(
     """
     box = object_box(silhouettes, wrong_masks) if corners is None else corners
     with bar("carving") as progress:
-        distances, corner, spacing = carve_grid(
-            silhouettes, box, resolution, wrong_masks, lambda level: progress(level / NUM_LEVELS)
-        )
+        distances, corner, spacing = carve_grid(silhouettes, box, resolution, wrong_masks, progress)
     num_parts, num_kept = remove_strays(distances, keep)
     mesh = extract_surface(distances, corner, spacing)
     if smoothing > 0:

@@ -79,6 +79,11 @@ class Pixels:
         """Rays through the centres of the pixels."""
         return pixel_rays(self.cameras, self.index)
 
+    def split(self) -> tuple[Pixels, Pixels]:
+        """Split the pixels into those of training and of validation views; without the latter, all pixels validate."""
+        validates = self.view % VALIDATION_EVERY == VALIDATION_EVERY - 1
+        return self[~validates], self[validates] if validates.any() else self
+
     def some(self, count: int) -> Pixels:
         """Select at most `count` random pixels with a fixed seed."""
         chosen = torch.randperm(len(self), generator=torch.Generator().manual_seed(0))[:count]
@@ -168,8 +173,7 @@ def learn_surroundings(
             views.
         progress: called with the completed fraction.
     """
-    validates = beside.view % VALIDATION_EVERY == VALIDATION_EVERY - 1
-    training, validation = beside[~validates], beside[validates] if validates.any() else beside
+    training, validation = beside.split()
     validation = validation.some(_SKY_PIXELS)
     found = None
     if not near:

@@ -21,7 +21,6 @@ from nerfro.geometry.mesh import TriangleMesh, merge_vertices
 
 # Number of refinements. Each halves the voxels and evaluates only voxels near the surface of the coarser level.
 _LEVELS = 2
-NUM_LEVELS = _LEVELS + 1
 # Width of the neighbourhood in voxels of the coarser level, more than a voxel's diagonal.
 _BAND = 2.0
 # Components below this fraction of the volume of the largest component are removed.
@@ -145,7 +144,7 @@ def carve_grid(
         box: corners of the grid; the upper corner moves outwards to an integer number of voxels.
         resolution: number of voxels along the longest side.
         wrong_masks: number of views that may be wrong about any point.
-        progress: called with the number of completed levels, a fraction included.
+        progress: called with the completed fraction.
 
     Returns:
         Signed distances at the corners of the voxels (see `Silhouettes.carve`), the lower corner, and the voxel size.
@@ -168,7 +167,7 @@ def carve_grid(
         carved = torch.empty(len(wanted))
         for start in range(0, len(wanted), _CHUNK):
             carved[start : start + _CHUNK] = silhouettes.carve(wanted[start : start + _CHUNK], wrong_masks)
-            progress(level + min(start + _CHUNK, len(wanted)) / len(wanted))
+            progress((level + min(start + _CHUNK, len(wanted)) / len(wanted)) / (_LEVELS + 1))
         values[near] = carved
     return values.numpy(), np.asarray(box[0], np.float64), spacing
 

@@ -167,7 +167,7 @@ class Renderer(nn.Module, ABC):
         return self._in_chunks(lambda chunk: self._render_traced(chunk, self.trace(chunk)), rays)[0]
 
     def _refined(self, path: Path, rays: Rays) -> Path:
-        """Paths with gradients, but for those whose derivatives are too large, or not yet to be learned from."""
+        """Replay paths with gradients, except for paths whose derivatives are too large."""
         medium = self.scene.medium
         steady = self.path_sampler.steady(path, medium)
         if steady.all():
@@ -175,7 +175,7 @@ class Renderer(nn.Module, ABC):
         rows = steady.nonzero()[:, 0]
         if not len(rows):
             return path
-        # The others are not replayed at all: they have many events, and take most of the time.
+        # Unsteady paths have many events, and their replay would take most of the time.
         refined = self.path_sampler.refine(path[rows], rays[path.ray[rows]], medium)
         names = ["positions", "directions", "s", *(["throughput"] if path.splits else [])]
         columns = {name: getattr(path, name).index_copy(0, rows, getattr(refined, name)) for name in names}

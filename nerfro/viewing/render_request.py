@@ -20,7 +20,6 @@ from nerfro.subdivision import SubdivisionChanges
 from nerfro.variants import variant
 from nerfro.viewing.camera_files import read_cameras
 from nerfro.viewing.camera_paths import PATHS, Flight, Surroundings, fly
-from nerfro.viewing.film import find_ffmpeg
 from nerfro.viewing.layers import LAYERS
 from nerfro.viewing.trained_scene import TrainedScene
 
@@ -93,8 +92,6 @@ def check_request(config: DictConfig) -> None:
     unknown = [name for name in config.film if name not in FILMS]
     if unknown:
         raise NerfroError(f"film={list(config.film)} is not allowed; give some of {', '.join(FILMS)}, or []")
-    if "mp4" in config.film and config.path is not None and config.format == "png":
-        find_ffmpeg()  # reported before the frames are rendered
     for name in ("position", "target"):
         point = config[name]
         if point is not None and (len(point) != 3 or not all(map(math.isfinite, point))):

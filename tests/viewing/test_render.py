@@ -191,12 +191,13 @@ def test_what_cannot_be_rendered_is_refused_in_one_line(
     assert not Path("O").exists()
 
 
+@pytest.mark.parametrize("view", [["path=orbit"], ["views=test:0", "sweep=medium.ior:1.0:1.6"]])
 def test_a_missing_ffmpeg_is_reported_before_frames_are_rendered(
-    render: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch
+    view: list[str], render: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shutil.which", lambda name: None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    code, out = render("path=orbit", "frames=2", "resolution=16")
+    code, out = render(*view, "frames=2", "resolution=16")
     assert code == 1
     assert "needs ffmpeg, which is not installed; install ffmpeg, or pip install 'nerfro[video]'" in out
     assert not Path("O").exists()
