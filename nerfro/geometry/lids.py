@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 
 from nerfro.geometry.bodies import bodies_of
 from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.orientation import area_vectors
 
 # Triangles count as level if their normals are within 45 degrees of up.
 _LEVEL = np.cos(np.pi / 4)
@@ -23,7 +24,7 @@ def find_lid(mesh: TriangleMesh, up: Float[np.ndarray, "3"]) -> Bool[np.ndarray,
         Whether each triangle belongs to the lid; false everywhere if no triangle is level.
     """
     triangles = mesh.triangles
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals = area_vectors(triangles)
     level = normals @ up > _LEVEL * np.linalg.norm(normals, axis=-1)
     if not level.any():
         return level

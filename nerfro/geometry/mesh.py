@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from nerfro.allowed import Coordinate, check
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
+from nerfro.geometry.orientation import area_vectors, inward_faces
 
 
 @dataclass(frozen=True)
@@ -95,13 +96,26 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
     if read is not None:
         length = np.linalg.norm(read, axis=-1, keepdims=True)
         read = np.divide(read, length, out=np.zeros(read.shape), where=np.isfinite(length) & (length > 0))[faces]
-    mesh = merge_vertices(vertices, faces, read)
+    mesh = _facing_outwards(merge_vertices(vertices, faces, read))
     if not accept_open_mesh and not mesh.is_closed:
         raise NerfroError(
             f"mesh {path} is not watertight, so its inside is not defined; close its holes, "
             "or set medium.accept_open_mesh=true to decide by majority along the three axes"
         )
     return mesh
+
+
+def _facing_outwards(mesh: TriangleMesh) -> TriangleMesh:
+    """Reverse triangles and normals that face the inside; see `inward_faces`."""
+    if not len(mesh.faces):
+        return mesh
+    inwards = inward_faces(mesh.vertices, mesh.faces)[:, None]
+    faces, normals = np.where(inwards, mesh.faces[:, ::-1], mesh.faces), mesh.normals
+    if normals is not None:
+        normals = np.where(inwards[..., None], normals[:, ::-1], normals)
+        outward = np.einsum("fcx,fx->fc", normals, area_vectors(mesh.vertices[faces])) >= 0
+        normals = np.where(outward[..., None], normals, -normals)
+    return TriangleMesh(mesh.vertices, faces, normals)
 
 
 def load_points(path: Path) -> Float[np.ndarray, "P 3"]:

@@ -251,13 +251,13 @@ def test_grid_of_distances_refracts_as_the_ball() -> None:
     assert angle(path.exit_directions, _ball_exit(heights, 0.8, 1.5)).max() < 0.05
 
 
-@pytest.mark.parametrize("inner_ior", [1.0, 1.33, 1.8])
-def test_ball_in_a_ball_deviates_as_its_conserved_moment(inner_ior: float) -> None:
-    outer, inner, n = 1.2, 0.6, 1.5
-    heights = torch.linspace(0.02, 1.1, 60, dtype=torch.float64)
-    radius = _points(96).norm(dim=-1)
-    trace = Snell().trace(beam(heights), _grid(torch.stack([radius - outer, radius - inner]), [n, inner_ior]))
-    # n r sin(phi) = b everywhere.
+def _nested_exit(
+    heights: Tensor, outer: float, n: float, inner: float, inner_ior: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Exit directions of the beam behind a ball in a ball, and which rays meet the inner ball or are reflected at it.
+
+    n r sin(phi) = b everywhere.
+    """
     deviation = 2 * (torch.asin(heights / outer) - torch.asin(heights / (n * outer)))
     meets = heights < n * inner
     reflected = meets & (heights > inner_ior * inner)
@@ -265,7 +265,16 @@ def test_ball_in_a_ball_deviates_as_its_conserved_moment(inner_ior: float) -> No
     t = torch.asin((heights / (inner_ior * inner)).clamp(max=1))
     bent = torch.where(reflected, 2 * i - math.pi, 2 * (i - t))
     deviation = deviation + torch.where(meets, bent, 0.0)
-    exact = torch.stack([deviation.cos(), -deviation.sin(), 0 * heights], -1)
+    return torch.stack([deviation.cos(), -deviation.sin(), 0 * heights], -1), meets, reflected
+
+
+@pytest.mark.parametrize("inner_ior", [1.0, 1.33, 1.8])
+def test_ball_in_a_ball_deviates_as_its_conserved_moment(inner_ior: float) -> None:
+    outer, inner, n = 1.2, 0.6, 1.5
+    heights = torch.linspace(0.02, 1.1, 60, dtype=torch.float64)
+    radius = _points(96).norm(dim=-1)
+    trace = Snell().trace(beam(heights), _grid(torch.stack([radius - outer, radius - inner]), [n, inner_ior]))
+    exact, meets, reflected = _nested_exit(heights, outer, n, inner, inner_ior)
     error = angle(trace.path.exit_directions, exact)
     events = torch.where(meets, torch.where(reflected, 3, 4), 2)
     # Just at grazing the grid decides otherwise than the ball.
@@ -275,6 +284,16 @@ def test_ball_in_a_ball_deviates_as_its_conserved_moment(inner_ior: float) -> No
     assert error[clear].median() < 0.02
     if inner_ior == 1.0:
         assert reflected.any()
+
+
+def test_paths_through_a_cavity_do_not_depend_on_the_winding_of_triangles(tmp_path: FilePath) -> None:
+    heights = torch.linspace(0.02, 0.6, 30, dtype=torch.float64)
+    shape = trimesh.util.concatenate([trimesh.creation.icosphere(4, radius) for radius in (0.9, 0.45)])
+    exact, *_ = _nested_exit(heights, 0.9, 1.5, 0.45, 1.0)
+    reversed_ = np.random.default_rng(0).random(len(shape.faces)) < 0.5
+    shape = trimesh.Trimesh(shape.vertices, np.where(reversed_[:, None], shape.faces[:, ::-1], shape.faces))
+    path = Snell()(beam(heights), _mesh_medium(shape, tmp_path, resolution=96))
+    assert angle(path.exit_directions, exact)[(heights - 0.45).abs() > 0.02].median() < 0.03
 
 
 def test_bodies_of_equal_index_are_one() -> None:
