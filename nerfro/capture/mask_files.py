@@ -19,12 +19,12 @@ from nerfro.capture.masking import Segmentation
 from nerfro.capture.outline_hull import FEWEST_VIEWS
 from nerfro.capture.targets import opencv
 from nerfro.data.base import DataSource, Frame
-from nerfro.data.image_files import read_mask, to_unit
+from nerfro.data.image_files import read_mask, read_size, to_unit
 from nerfro.data.masks import without_masks
-from nerfro.data.transforms import read_json
 from nerfro.errors import NerfroError
 from nerfro.files.drawing import sheet
 from nerfro.files.images import save_picture
+from nerfro.files.reading import read_json
 from nerfro.paths import user_path
 
 _TILE, _COLUMNS, _NAME_LENGTH = 220, 6, 20  # width of a tile in pixels, tiles per row, characters of a name
@@ -151,8 +151,7 @@ def mask_file(frame: Frame) -> Path:
 
 def stored_size(frame: Frame) -> tuple[int, int]:
     """Return width and height of the image file of a frame."""
-    with Image.open(frame.image) as image:
-        return image.size
+    return read_size(frame.image)[:2]
 
 
 def read_resized(mask: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:

@@ -12,8 +12,8 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from nerfro.allowed import Count
 from nerfro.capture.preprocess_options import is_given
 from nerfro.cli import warn
-from nerfro.data.transforms import read_json
 from nerfro.errors import NerfroError
+from nerfro.files.reading import read_json
 
 
 @dataclass

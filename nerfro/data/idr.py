@@ -15,7 +15,7 @@ from nerfro.data.frames import Every, FrameSet, Lens, PosedImages, list_images
 from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha
 from nerfro.data.transforms import parse_matrix
 from nerfro.errors import NerfroError
-from nerfro.files.cache import load_arrays
+from nerfro.files.reading import load_arrays
 from nerfro.registry import register
 
 _MAX_SKEW = 1e-3

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
-from PIL import ExifTags, Image, TiffImagePlugin, UnidentifiedImageError
+from PIL import ExifTags, Image
 from scipy.sparse import csr_array
 
-from nerfro.errors import NerfroError
 from nerfro.files.deep_images import read_16bit
+from nerfro.files.reading import open_image
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 Alpha = Literal["drop", "white", "black"]
@@ -32,60 +30,19 @@ def to_levels(values: Float[np.ndarray, "H W *C"]) -> UInt16[np.ndarray, "H W *C
 
 def read_levels(path: Path) -> Levels:
     """Read the 8- or 16-bit levels [H, W, C] of a file; C is 1 (grey), 2 (grey, alpha), 3 (RGB) or 4 (RGBA)."""
-    with _open(path) as (image, bits):
-        return read_16bit(path) if bits > 8 else _read_8bit(image)
+    with open_image(path) as (image, bits):
+        return _read_16bit(path, image) if bits > 8 else _read_8bit(image, bits)
 
 
 def read_size(path: Path) -> tuple[int, int, int]:
     """Read width, height and bits per channel from the header of an image file."""
-    with _open(path) as (image, bits):
+    with open_image(path, whole=False) as (image, bits):
         return *image.size, bits
-
-
-@contextlib.contextmanager
-def _open(path: Path) -> Iterator[tuple[Image.Image, int]]:
-    """Open an image file with Pillow; yield it with its bits per channel, of which Pillow silently keeps 8."""
-    with _naming(path), path.open("rb") as file:
-        header = file.read(25)
-        file.seek(0)
-        with Image.open(file) as image:
-            _require_upright(image, path)
-            bits = 8
-            if image.format == "PNG":
-                bits = max(bits, header[24])
-            elif isinstance(image, TiffImagePlugin.TiffImageFile):
-                bits = max(bits, *image.tag_v2.get(TiffImagePlugin.BITSPERSAMPLE, (8,)))
-            yield image, bits
-
-
-@contextlib.contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Convert errors about an unreadable file to a message that names the file."""
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise NerfroError(f"image {path} does not exist; restore it or remove its frame") from error
-    except UnidentifiedImageError as error:
-        raise NerfroError(f"image {path} cannot be read (it is not an image); copy or export it again") from error
-    # Pillow reports a corrupt PNG as SyntaxError or ValueError.
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise NerfroError(f"image {path} cannot be read ({error}); copy or export it again") from error
-
-
-def _require_upright(image: Image.Image, path: Path) -> None:
-    """Refuse an EXIF orientation, because it is unknown whether poses and masks refer to the rotated pixels."""
-    # Pillow applies the orientation of TIFF files itself.
-    orientation = image.getexif().get(ExifTags.Base.Orientation, 1) if "exif" in image.info else 1
-    if orientation != 1:
-        raise NerfroError(
-            f"image {path} has EXIF orientation {orientation}; rotate its pixels (magick mogrify -auto-orient), or "
-            "remove the entry (exiftool -Orientation=) if the poses belong to the pixels as stored"
-        )
 
 
 def read_exposure(path: Path) -> tuple[float | None, float | None, float | None]:
     """Read exposure time in seconds, f-number and ISO sensitivity from EXIF data; None for a missing value."""
-    with _naming(path), Image.open(path) as image:
+    with open_image(path, whole=False) as (image, _):
         tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
     named = ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings
     time, number, sensitivity = (_positive(tags.get(tag)) for tag in named)
@@ -101,11 +58,25 @@ def _positive(value: object) -> float | None:
     return number if 0 < number < float("inf") else None
 
 
-def _read_8bit(image: Image.Image) -> UInt8[np.ndarray, "H W C"]:
-    if image.mode not in ("L", "LA", "RGB", "RGBA"):
-        image = image.convert("RGBA" if image.has_transparency_data else "L" if image.mode == "1" else "RGB")
+def _read_8bit(image: Image.Image, bits: int) -> UInt8[np.ndarray, "H W C"]:
+    if image.mode == "P" and image.palette is None:
+        raise OSError("it has no palette")
+    # PNG files may state one colour that is transparent. Pillow scales levels of 2 and 4 bits, but not this colour.
+    if image.mode == "L" and "transparency" in image.info and bits in (2, 4):
+        image.info["transparency"] *= 255 // (2**bits - 1)
+    if image.mode not in ("L", "LA", "RGB", "RGBA") or "transparency" in image.info:
+        grey, transparent = image.mode in ("1", "L"), image.has_transparency_data
+        image = image.convert(("LA" if transparent else "L") if grey else "RGBA" if transparent else "RGB")
     levels = np.asarray(image)
     return levels.reshape(*levels.shape[:2], -1)
+
+
+def _read_16bit(path: Path, image: Image.Image) -> UInt16[np.ndarray, "H W C"]:
+    levels, transparent = read_16bit(path), image.info.get("transparency")
+    if isinstance(transparent, int):  # OpenImageIO takes no grey level for transparent
+        grey = levels[..., 0]
+        return np.stack([grey, np.where(grey == transparent, 0, 65535).astype(np.uint16)], -1)
+    return levels
 
 
 def read_rgb(path: Path, alpha: Alpha) -> Levels:

@@ -15,7 +15,7 @@ from nerfro.data.frames import Every, FrameSet, Lens, PosedImages, check_pose, l
 from nerfro.data.image_files import Alpha, read_size
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
-from nerfro.files.cache import load_array
+from nerfro.files.reading import load_array
 from nerfro.registry import register
 
 # LLFF scales the nearest depth to 1 / 0.75, which leaves a margin in front of the scene.

@@ -9,13 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from nerfro.cli import warn
 from nerfro.data.base import Views
 from nerfro.data.image_files import Levels, read_levels, read_mask, read_size
 from nerfro.data.lazy_images import LazyImages
 from nerfro.errors import NerfroError, first_of
+from nerfro.files.reading import open_image
 
 _SPLIT_FOLDERS = ("train", "val", "test")
 # Lossless format first. Cameras and networks write suffixes in lower or upper case.
@@ -168,12 +168,9 @@ def _read_usable(mask: Path) -> Levels:
 
 def _is_transparent(image: Path) -> bool:
     """Return whether an image has pixels that are not opaque."""
-    try:
-        with Image.open(image) as opened:
-            if not opened.has_transparency_data:  # known without decoding
-                return False
-    except OSError:
-        return False  # the error is reported when the colours are read
+    with open_image(image, whole=False) as (opened, _):
+        if not opened.has_transparency_data:  # known without decoding
+            return False
     levels = _read_alpha(image)
     return bool((levels < np.iinfo(levels.dtype).max).any())
 

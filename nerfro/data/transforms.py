@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeGuard
+from typing import TypeGuard
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +18,7 @@ from nerfro.data.frames import SPLITS, check_pose, require_root
 from nerfro.data.image_files import IMAGE_SUFFIXES
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError, first_of
+from nerfro.files.reading import read_json
 
 
 @dataclass(frozen=True)
@@ -100,18 +100,6 @@ def parse_manifest(path: Path, mask_key: str = "mask_path", skip_missing: bool =
     if repeated:
         raise NerfroError(f"{path}: {first_of(repeated)} occurs in several frames; keep one frame per image")
     return Manifest(path, document, read)
-
-
-def read_json(path: Path, unreadable: str) -> Any:
-    """Read a JSON file; `unreadable` is the advice in the error message for a file that cannot be opened."""
-    try:
-        # Python refuses very long integers. Infinity takes their place and is refused where the value is used.
-        parse_int = lambda text: int(text) if len(text) < 300 else math.inf  # noqa: E731
-        return json.loads(path.read_text("utf-8"), parse_int=parse_int)
-    except OSError as error:
-        raise NerfroError(f"{path} cannot be read ({error.strerror}); {unreadable}") from error
-    except (ValueError, RecursionError) as error:
-        raise NerfroError(f"{path} is not valid JSON ({error}); copy or export it again") from error
 
 
 def parse_matrix(value: object, shapes: tuple[tuple[int, int], ...], where: str) -> Float[np.ndarray, "rows columns"]:

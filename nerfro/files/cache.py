@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import atomic_file
+from nerfro.files.reading import load_arrays
 from nerfro.paths import user_path
 
 # Maximum size of all entries in bytes; the least recently used entries are removed first.
@@ -50,33 +52,6 @@ def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 
-def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read a .npz of plain arrays without executing pickled code."""
-    with _reading(path, "is not a readable .npz of plain arrays", "make it again"), np.load(path) as file:
-        return {name: file[name] for name in file.files}
-
-
-def load_array(path: Path) -> np.ndarray:
-    """Read the numbers of a .npy without executing pickled code, in double precision."""
-    with _reading(path, "cannot be read", "copy or export it again"):
-        array = np.load(path)
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
-        raise NerfroError(f"{path} is not a .npy of numbers; copy or export it again")
-    return array.astype(np.float64)
-
-
-@contextlib.contextmanager
-def _reading(path: Path, trouble: str, advice: str) -> Iterator[None]:
-    """Convert errors about a missing or damaged file to a message that names the file."""
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise NerfroError(f"{path} does not exist; check the path") from error
-    except Exception as error:  # NumPy and zipfile raise nearly anything on a damaged file
-        reason = str(error).strip().split("\n", 1)[0] or type(error).__name__
-        raise NerfroError(f"{path} {trouble} ({reason}); {advice}") from error
-
-
 def cached_arrays(
     key: str, compute: Callable[[], dict[str, np.ndarray]], enabled: bool = True
 ) -> dict[str, np.ndarray]:
@@ -91,7 +66,7 @@ def cached_arrays(
         return compute()
     path = cache_dir() / f"{key}.npz"
     with contextlib.suppress(NerfroError, OSError):
-        arrays = load_arrays(path)
+        arrays = load_arrays(path, most_bytes=math.inf)
         if str(arrays.pop(_CHECKSUM, "")) == _checksum(arrays):
             os.utime(path)
             return arrays

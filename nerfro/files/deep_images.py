@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt16
 
 from nerfro.files.atomic import write_atomically
+from nerfro.files.reading import MAX_PIXELS
 
 
 def read_16bit(path: Path) -> UInt16[np.ndarray, "H W C"]:
@@ -73,6 +74,8 @@ def _read(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     image = OpenImageIO.ImageInput.open(str(path), configuration)
     if image is None:
         raise OSError(OpenImageIO.geterror().partition("\n")[0])
+    if image.spec().width * image.spec().height > MAX_PIXELS:
+        raise OSError(f"it has more than {MAX_PIXELS / 1e6:.0f} million pixels")
     pixels, error = image.read_image(format=image.spec().format), image.geterror()
     image.close()
     if pixels is None:

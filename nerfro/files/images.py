@@ -12,6 +12,7 @@ from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import atomic_file
+from nerfro.files.reading import open_image
 
 
 def to_8bit(rgb: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
@@ -50,16 +51,11 @@ def save_picture(path: Path | str, picture: Image.Image, optimize: bool = False)
 
 def load_png(path: Path | str) -> Float[Tensor, "H W 3"]:
     """Read an 8-bit grey or RGB picture without transparency as float32 sRGB values, multiples of 1/255."""
-    try:
-        with Image.open(path) as image:
-            if image.mode not in ("RGB", "L"):
-                raise NerfroError(
-                    f"{path} has pixels of mode {image.mode}; "
-                    "allowed are 8-bit RGB and grey: convert it, with transparency composited first"
-                )
-            levels = np.array(image.convert("RGB"))
-    except FileNotFoundError as error:
-        raise NerfroError(f"the picture {path} does not exist; check the folder and the file's name") from error
-    except (OSError, SyntaxError) as error:  # Pillow's PNG reader raises both
-        raise NerfroError(f"the picture {path} cannot be read ({error}); write or copy it again") from error
+    with open_image(Path(path)) as (image, bits):
+        if image.mode not in ("RGB", "L") or image.has_transparency_data or bits > 8:
+            raise NerfroError(
+                f"{path} has pixels of mode {image.mode} with {bits} bits; "
+                "allowed are 8-bit RGB and grey: convert it, with transparency composited first"
+            )
+        levels = np.array(image.convert("RGB"))
     return torch.from_numpy(levels).float() / 255

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
 from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.files.deep_images import read_radiance, write_radiance
 from nerfro.files.images import save_png
+from nerfro.files.reading import open_image, reading
 from nerfro.light import to_linear, to_srgb
 
 _FORMATS = (".png", ".jpg", ".jpeg", ".hdr", ".exr")
@@ -50,16 +50,12 @@ def load_lat_long(path: Path | str) -> Float[Tensor, "H 2*H 3"]:
     """Read a lat-long picture as linear radiance; lamps of a .hdr or .exr are as bright as they are."""
     path = Path(path)
     suffix = _format(path)
-    if not path.is_file():
-        raise NerfroError(f"the sky {path} does not exist; correct boundary.image")
-    try:
+    with reading(path, "the sky ", advice="write or copy it again", missing="correct boundary.image"):
         if suffix in (".hdr", ".exr"):
             rgb = read_radiance(path)
         else:
-            with Image.open(path) as image:
+            with open_image(path) as (image, _):
                 rgb = to_linear(np.array(image.convert("RGB")) / 255)
-    except (OSError, ValueError, RuntimeError, SyntaxError) as error:
-        raise NerfroError(f"the sky {path} cannot be read ({error}); write or copy it again") from error
     height, width = rgb.shape[:2]
     if width != 2 * height:
         raise NerfroError(f"the sky {path} has {width}x{height} pixels; a lat-long picture is twice as wide as high")

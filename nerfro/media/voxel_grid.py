@@ -13,7 +13,8 @@ from torch import Tensor
 
 from nerfro.allowed import Count, Positive, Range, Resolution, check, corners_of_box
 from nerfro.errors import NerfroError
-from nerfro.files.cache import cached_arrays, content_hash, load_arrays, save_arrays
+from nerfro.files.cache import cached_arrays, content_hash, save_arrays
+from nerfro.files.reading import load_arrays
 from nerfro.geometry.bodies import require_separate
 from nerfro.geometry.interpolation import gradient, smooth, trilinear
 from nerfro.geometry.mesh import TriangleMesh, load_mesh, require_inside

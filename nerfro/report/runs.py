@@ -13,12 +13,11 @@ from typing import Any
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from PIL import Image
 
-from nerfro.data.transforms import read_json
 from nerfro.errors import NerfroError, first_of
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
 from nerfro.files.foreign_config import foreign_config
+from nerfro.files.reading import open_image, read_json
 from nerfro.paths import EMBEDDED_PREFIX, user_path
 from nerfro.training.run_folder import CELL_FILE
 from nerfro.training.sweeps import scene_name
@@ -165,7 +164,7 @@ def read_run(folder: Path) -> Run:
             raise NerfroError(f"{folder / 'run.json'} lacks {first_of(sorted(absent))}; omit the run")
         data, trainer, root = config["data"], config["trainer"], str(config["data"]["root"])
         view = metrics.result.views[0].name
-        with Image.open(folder / "images" / f"{view}.png") as image:
+        with open_image(folder / "images" / f"{view}.png") as (image, _):
             width, height = image.size
         options = sorted((key, str(value)) for key, value in data.items() if key not in ("root", "near", "far"))
         return Run(

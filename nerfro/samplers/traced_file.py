@@ -15,7 +15,7 @@ from torch import Tensor
 
 from nerfro.allowed import Coordinate, Distance, check
 from nerfro.errors import NerfroError
-from nerfro.files.cache import load_arrays
+from nerfro.files.reading import load_arrays
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
 from nerfro.types import Path, Rays

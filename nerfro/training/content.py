@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from nerfro.allowed import Count, NotNegative, Positive
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
-from nerfro.files.cache import load_array
+from nerfro.files.reading import load_array
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium

@@ -19,9 +19,10 @@ from nerfro.capture.calibrated_data import relative
 from nerfro.data.base import Views
 from nerfro.data.frames import Lens, check_pose
 from nerfro.data.nerfstudio import read_lens
-from nerfro.data.transforms import is_number, parse_matrix, read_json
+from nerfro.data.transforms import is_number, parse_matrix
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
+from nerfro.files.reading import read_json
 from nerfro.viewing.camera_paths import Surroundings
 
 # Names of the nine coefficients (`nerfro.lens`); other programs know the first six.

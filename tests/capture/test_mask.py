@@ -158,7 +158,7 @@ def test_mistakes_are_reported_in_one_line(capture: Path, command: Callable[...,
         "mask", root, "outlines={q_1:[1,1,9,9]}"
     )
     assert "give a box [left,top,right,bottom]" in command("mask", root, "outlines={p_1:[9,9,1,1]}")
-    assert "cannot be read" in command("mask", root, "outlines=nothing.json")
+    assert "nothing.json does not exist" in command("mask", root, "outlines=nothing.json")
     assert "is part of nerfro" in command("mask", "data=blender", "data.root=embedded:torus")
     assert not list((capture / "photos").glob("mask_*"))
 

@@ -11,7 +11,8 @@ import pytest
 
 from nerfro.errors import NerfroError
 from nerfro.files import cache
-from nerfro.files.cache import cached_arrays, content_hash, load_arrays, save_arrays
+from nerfro.files.cache import cached_arrays, content_hash, save_arrays
+from nerfro.files.reading import load_arrays
 
 
 class _Counter:

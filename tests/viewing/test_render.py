@@ -165,7 +165,7 @@ def test_runs_stand_side_by_side_under_their_names(render: Callable[..., tuple[i
         ([], "from where is it seen? give one of path=orbit"),
         (["path=orbit", "views=test"], "from where is it seen?"),
         (["path=loop"], "path=loop is not known; give orbit, spiral, arc, dolly"),
-        (["path=nowhere.json"], "nowhere.json cannot be read"),
+        (["path=nowhere.json"], "nowhere.json does not exist"),
         (["views=test:9"], "test has views 0 to 2"),
         (["position=[1,2]"], "position=[1.0, 2.0] is no point"),
         (["target=[0,0,0]", "views=test"], "is for a still"),

@@ -1,0 +1,169 @@
+"""Readers of files that strangers may have written: images, JSON documents and arrays.
+
+Decoders raise nearly any exception on a damaged file, allocate what a header asks for, and wait at a pipe. Therefore
+these readers accept regular files of bounded size, and convert any error to one line.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import stat
+import struct
+import threading
+import warnings
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from PIL import ExifTags, Image, TiffImagePlugin, UnidentifiedImageError
+
+from nerfro.errors import NerfroError
+
+# Pixels of the largest image, 134 million; bytes of the largest JSON document, and of all arrays of a file in memory.
+MAX_PIXELS, MAX_JSON_BYTES, MAX_ARRAY_BYTES = 2**27, 2**27, 2**31
+
+_AGAIN = "copy or export it again"
+# Python's warning filters belong to all threads.
+_filters = threading.Lock()
+
+
+@contextlib.contextmanager
+def reading(
+    path: Path, what: str = "", trouble: str = "cannot be read", advice: str = _AGAIN, missing: str = "check the path"
+) -> Iterator[None]:
+    """Require a regular file, and convert any error about its content to one line.
+
+    Args:
+        path: the file.
+        what: word before the path in the message, with a space.
+        trouble, advice: middle and end of the message, around the reason.
+        missing: advice for a file that does not exist.
+
+    Raises:
+        NerfroError: the file does not exist, is a pipe, a device or a folder, or reading it raised an exception.
+    """
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise NerfroError(f"{what}{path} is not a regular file; give a file on a disk")
+        yield
+    except NerfroError:
+        raise
+    except FileNotFoundError as error:
+        raise NerfroError(f"{what}{path} does not exist; {missing}") from error
+    except Exception as error:
+        strerror = error.strerror if isinstance(error, OSError) else None
+        reason = strerror or str(error).strip().split("\n", 1)[0] or type(error).__name__
+        raise NerfroError(f"{what}{path} {trouble} ({reason}); {advice}") from error
+
+
+@contextlib.contextmanager
+def open_image(path: Path, whole: bool = True) -> Iterator[tuple[Image.Image, int]]:
+    """Open an image file, and yield it with the bits per channel of the file, of which Pillow silently keeps 8.
+
+    Args:
+        path: the file.
+        whole: whether the end of a PNG file must be there; Pillow decodes the file without it.
+
+    Raises:
+        NerfroError: the file is missing or damaged, has more than `MAX_PIXELS` pixels, or has an EXIF orientation.
+    """
+    with reading(path, "image ", missing="restore it or remove its frame"), path.open("rb") as file:
+        with _filters, warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # `MAX_PIXELS` is stricter
+            try:
+                image = Image.open(file)
+                too_large = math.prod(image.size) > MAX_PIXELS
+            except UnidentifiedImageError as error:
+                raise OSError("it is not an image") from error
+            except Image.DecompressionBombError:
+                too_large = True
+        if too_large:
+            raise NerfroError(f"image {path} has more than {MAX_PIXELS / 1e6:.0f} million pixels; downscale the image")
+        with image:
+            _require_upright(image, path)
+            if image.format == "PNG" and whole:
+                _require_end(file)
+            yield image, _bits(image, file)
+
+
+def _bits(image: Image.Image, file: BinaryIO) -> int:
+    if image.format == "PNG":
+        place = file.tell()
+        file.seek(24)
+        (bits,) = file.read(1)
+        file.seek(place)
+        return bits
+    if isinstance(image, TiffImagePlugin.TiffImageFile):
+        return max(8, *image.tag_v2.get(TiffImagePlugin.BITSPERSAMPLE, (8,)))
+    return 8
+
+
+def _require_end(file: BinaryIO) -> None:
+    """Require all chunks of a PNG file up to its last one, IEND."""
+    place, kind = file.tell(), b""
+    file.seek(8)
+    while kind != b"IEND":
+        head = file.read(8)
+        if len(head) < 8:
+            raise OSError("the file is truncated")
+        length, kind = struct.unpack(">I4s", head)
+        file.seek(length, 1)
+        if len(file.read(4)) < 4:  # checksum
+            raise OSError("the file is truncated")
+    file.seek(place)
+
+
+def _require_upright(image: Image.Image, path: Path) -> None:
+    """Refuse an EXIF orientation, because it is unknown whether poses and masks refer to the rotated pixels."""
+    tags = image.tag_v2 if isinstance(image, TiffImagePlugin.TiffImageFile) else {}
+    tags = image.getexif() if "exif" in image.info else tags
+    orientation = tags.get(ExifTags.Base.Orientation, 1)
+    if orientation in range(2, 9):
+        raise NerfroError(
+            f"image {path} has EXIF orientation {orientation}; rotate its pixels (magick mogrify -auto-orient), or "
+            "remove the entry (exiftool -Orientation=) if the poses belong to the pixels as stored"
+        )
+
+
+def read_json(path: Path, unreadable: str) -> Any:
+    """Read a JSON file in UTF-8, UTF-16 or UTF-32; `unreadable` is the advice for a file that cannot be opened."""
+    # Python refuses very long integers. Infinity takes their place and is refused where the value is used.
+    parse_int = lambda text: int(text) if len(text) < 300 else math.inf  # noqa: E731
+    with reading(path, advice=unreadable, missing=unreadable):
+        if path.stat().st_size > MAX_JSON_BYTES:
+            raise NerfroError(f"{path} is larger than {MAX_JSON_BYTES >> 20} MiB, the most for JSON; split it")
+        content = path.read_bytes()
+    with reading(path, trouble="is not valid JSON"):
+        return json.loads(content, parse_int=parse_int)
+
+
+def load_arrays(path: Path, most_bytes: float = MAX_ARRAY_BYTES) -> dict[str, np.ndarray]:
+    """Read a .npz of plain arrays without executing pickled code.
+
+    Args:
+        path: the file.
+        most_bytes: size of all arrays in memory, which is checked before anything is unpacked.
+    """
+    with reading(path, trouble="is not a readable .npz of plain arrays", advice="make it again"):
+        with zipfile.ZipFile(path) as archive:
+            needed = sum(entry.file_size for entry in archive.infolist())
+        if needed > most_bytes:
+            limit = f"at most {most_bytes / 2**30:g} GiB are read"
+            raise NerfroError(f"{path} holds {needed / 2**30:.1f} GiB of arrays, but {limit}; split the file")
+        with np.load(path) as file:
+            return {name: file[name] for name in file.files}
+
+
+def load_array(path: Path) -> np.ndarray:
+    """Read the numbers of a .npy without executing pickled code, in double precision."""
+    with reading(path):
+        if path.stat().st_size > MAX_ARRAY_BYTES:
+            raise OSError(f"it is larger than {MAX_ARRAY_BYTES >> 30} GiB")
+        array = np.load(path)
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+            raise NerfroError(f"{path} is not a .npy of numbers; {_AGAIN}")
+        return array.astype(np.float64)

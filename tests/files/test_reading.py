@@ -1,0 +1,116 @@
+"""Files of strangers: what is damaged, without end or too large is refused in one line, and quickly."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from nerfro.data.image_files import read_levels, read_rgb, read_size
+from nerfro.errors import NerfroError
+from nerfro.files.images import load_png
+from nerfro.files.reading import load_array, load_arrays, read_json
+
+
+def chunk(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+def png(width: int, height: int, bits: int, colour: int, rows: bytes, *chunks: bytes) -> bytes:
+    """A PNG file by its specification; colour is 0 (grey), 2 (RGB) or 3 (palette)."""
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0))
+    parts = (header, *chunks, chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+def test_png_that_is_cut_off_anywhere_is_no_image(tmp_path: Path) -> None:
+    path = tmp_path / "image.png"
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (5, 4, 3), dtype=np.uint8)).save(path)
+    content = path.read_bytes()
+    for length in range(len(content)):
+        path.write_bytes(content[:length])
+        for read in (read_levels, load_png):
+            with pytest.raises(NerfroError, match=r"image\.png cannot be read \(.+\); copy or export it again"):
+                read(path)
+    path.write_bytes(content + b"bytes behind the last chunk, as some programs write them")
+    assert read_levels(path).shape == (5, 4, 3)
+
+
+TOO_LARGE = "has more than 134 million pixels; downscale the image"
+IMAGES = {
+    "no palette": (png(4, 3, 8, 3, (b"\0" + b"\1" * 4) * 3), r"cannot be read \(it has no palette\); copy or export"),
+    "16 bits": (png(60_000, 60_000, 16, 2, b"\0"), TOO_LARGE),
+    "as large as the format allows": (png(2**31 - 1, 2**31 - 1, 16, 0, b"\0"), TOO_LARGE),
+    "zeros": (png(12_000, 12_000, 8, 0, bytes(1000)), TOO_LARGE),
+}
+
+
+@pytest.mark.parametrize("image", IMAGES)
+def test_images_without_palette_and_of_enormous_size_are_refused(
+    tmp_path: Path, image: str, recwarn: pytest.WarningsRecorder
+) -> None:
+    content, message = IMAGES[image]
+    (tmp_path / "image.png").write_bytes(content)
+    with pytest.raises(NerfroError, match=message):
+        read_levels(tmp_path / "image.png")
+    assert len(recwarn) == 0
+
+
+READERS = [read_levels, read_size, load_png, load_array, load_arrays, lambda path: read_json(path, "")]
+
+
+@pytest.mark.parametrize("read", READERS)
+def test_pipes_are_refused_instead_of_waited_for(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    os.mkfifo(tmp_path / "pipe.png")
+    with pytest.raises(NerfroError, match=r"pipe\.png is not a regular file; give a file on a disk"):
+        read(tmp_path / "pipe.png")
+
+
+def test_arrays_that_unpack_to_more_than_the_limit_are_refused(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "rays.npz", origins=np.zeros((1000, 3)))
+    assert load_arrays(tmp_path / "rays.npz", most_bytes=25_000)["origins"].shape == (1000, 3)
+    with pytest.raises(NerfroError, match=r"rays\.npz holds 0\.0 GiB of arrays, but at most .* split the file"):
+        load_arrays(tmp_path / "rays.npz", most_bytes=24_000)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-32"])
+def test_json_is_read_with_and_without_a_byte_order_mark(tmp_path: Path, encoding: str) -> None:
+    (tmp_path / "a.json").write_text(json.dumps({"é": 1}, ensure_ascii=False), encoding=encoding)
+    assert read_json(tmp_path / "a.json", "") == {"é": 1}
+
+
+def grey(levels: list[int], bits: int) -> bytes:
+    """One row of grey levels, padded to whole bytes."""
+    row = "".join(format(level, f"0{bits}b") for level in levels)
+    return b"\0" + int(row.ljust(-(-len(row) // 8) * 8, "0"), 2).to_bytes(-(-len(row) // 8), "big")
+
+
+@pytest.mark.parametrize("bits", [1, 2, 4, 8, 16])
+def test_one_transparent_grey_level_is_transparency(tmp_path: Path, bits: int) -> None:
+    levels = [0, 1, 2**bits - 1, 1, 0]
+    content = png(5, 1, bits, 0, grey(levels, bits), chunk(b"tRNS", struct.pack(">H", 1)))
+    (tmp_path / "image.png").write_bytes(content)
+    read = read_levels(tmp_path / "image.png")
+    assert read.shape == (1, 5, 2)
+    full = np.iinfo(read.dtype).max
+    assert read[0, :, 0].tolist() == [level * full // (2**bits - 1) for level in levels]
+    assert read[0, :, 1].tolist() == [0 if level == 1 else full for level in levels]
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_one_transparent_colour_is_composited(tmp_path: Path, bits: int) -> None:
+    rows = np.zeros((2, 3), ">u1" if bits == 8 else ">u2")
+    rows[1] = 2**bits - 1, 0, 0
+    transparency = chunk(b"tRNS", struct.pack(">3H", 0, 0, 0))
+    (tmp_path / "image.png").write_bytes(png(2, 1, bits, 2, b"\0" + rows.tobytes(), transparency))
+    read = {alpha: read_rgb(tmp_path / "image.png", alpha)[0].tolist() for alpha in ("white", "black")}
+    assert read == {"white": [[65535] * 3, [65535, 0, 0]], "black": [[0] * 3, [65535, 0, 0]]}
+    with pytest.raises(NerfroError, match="convert it, with transparency composited first"):
+        load_png(tmp_path / "image.png")
