@@ -33,12 +33,12 @@ class Crop:
         """Return whether the crop lies inside an image of the given size."""
         return min(self.top, self.left) >= 0 and self.top + self.size <= height and self.left + self.size <= width
 
-    def of(self, picture: Float[Tensor, "H W C"]) -> Float[Tensor, "size size C"]:
+    def of(self, image: Float[Tensor, "H W C"]) -> Float[Tensor, "size size C"]:
         """Crop an image; raises an error if the crop exceeds it."""
-        height, width = picture.shape[:2]
+        height, width = image.shape[:2]
         if not self.inside(height, width):
             raise NerfroError(f"{self} exceeds an image of {height} x {width} pixels; choose another crop")
-        return picture[self.top : self.top + self.size, self.left : self.left + self.size]
+        return image[self.top : self.top + self.size, self.left : self.left + self.size]
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,12 @@ class ImageRow:
     Attributes:
         reference: ground truth, sRGB in [0, 1].
         predictions: the view rendered by each method, or None for a missing image.
-        label: vertical text at the left; may be empty.
         captions: text below each prediction, such as its PSNR; may be empty.
         crops: insets, which are shown enlarged below the images.
     """
 
     reference: Float[Tensor, "H W 3"]
     predictions: Sequence[Float[Tensor, "H W 3"] | None]
-    label: str = ""
     captions: Sequence[str] = ()
     crops: Sequence[Crop] = ()
 
@@ -64,7 +62,7 @@ def image_grid(
     rows: Sequence[ImageRow],
     titles: Sequence[str],
     width: int = 256,
-    error_limit: float | None = SQUARED_ERROR_LIMIT,
+    error_limit: float = SQUARED_ERROR_LIMIT,
 ) -> Float[Tensor, "H W 3"]:
     """Draw views as rows and methods as columns.
 
@@ -75,22 +73,21 @@ def image_grid(
         rows: at least one view.
         titles: headings of the columns, including the reference.
         width: width of each column in pixels.
-        error_limit: squared error at the end of the colour scale, or None for no error maps.
+        error_limit: squared error at the end of the colour scale.
 
     Raises:
         NerfroError: there is no row, the number of titles or captions is wrong, or sizes differ within a row.
     """
     _check(rows, titles)
-    margin = LINE_HEIGHT if any(row.label for row in rows) else 0
-    across = margin + len(titles) * (width + GAP) - GAP
+    across = len(titles) * (width + GAP) - GAP
     heading = paper(across, LINE_HEIGHT)
     for column, title in enumerate(titles):
-        write(heading, title, margin + column * (width + GAP) + width // 2, LINE_HEIGHT // 2)
+        write(heading, title, column * (width + GAP) + width // 2, LINE_HEIGHT // 2)
     bands = [np.asarray(heading)]
     for index, row in enumerate(rows):
         if index > 0:
             bands.append(np.asarray(paper(across, ROW_GAP)))
-        bands.append(_row_band(row, margin, width, across, error_limit))
+        bands.append(_row_band(row, width, across, error_limit))
     return torch.from_numpy(np.concatenate(bands)).float() / 255
 
 
@@ -156,38 +153,32 @@ def _check(rows: Sequence[ImageRow], titles: Sequence[str]) -> None:
                 )
 
 
-def _row_band(row: ImageRow, margin: int, width: int, across: int, error_limit: float | None) -> np.ndarray:
-    """Draw one row of the grid: a column of cells for each image, and the label."""
+def _row_band(row: ImageRow, width: int, across: int, error_limit: float) -> np.ndarray:
+    """Draw one row of the grid: a column of cells for each image."""
     captions = ["", *row.captions] if row.captions else [None] * (1 + len(row.predictions))  # None reserves no space
     columns = [
-        _column(row, picture, caption, width, error_limit)
-        for picture, caption in zip([row.reference, *row.predictions], captions, strict=True)
+        _column(row, image, caption, width, error_limit)
+        for image, caption in zip([row.reference, *row.predictions], captions, strict=True)
     ]
     band = paper(across, columns[0].height)
     for index, column in enumerate(columns):
-        band.paste(column, (margin + index * (width + GAP), 0))
-    if row.label:
-        label = paper(band.height, margin)
-        write(label, row.label, band.height // 2, margin // 2)
-        band.paste(label.rotate(90, expand=True), (0, 0))
+        band.paste(column, (index * (width + GAP), 0))
     return np.asarray(band)
 
 
-def _column(
-    row: ImageRow, picture: Tensor | None, caption: str | None, width: int, error_limit: float | None
-) -> Image.Image:
+def _column(row: ImageRow, image: Tensor | None, caption: str | None, width: int, error_limit: float) -> Image.Image:
     """Stack an image, its caption, its insets and its error map."""
     height = round(width * row.reference.shape[0] / row.reference.shape[1])
-    cells = [_picture_cell(row, picture, width, height)]
+    cells = [_image_cell(row, image, width, height)]
     if caption is not None:
         cells.append(paper(width, LINE_HEIGHT))
         write(cells[-1], caption, width // 2, LINE_HEIGHT // 2)
     if row.crops:
-        cells.append(_insets_cell(row.crops, picture, width))
-    if error_limit is not None and picture is row.reference:
+        cells.append(_insets_cell(row.crops, image, width))
+    if image is row.reference:
         cells.append(colour_scale(width, height, "squared error", error_limit))
-    elif error_limit is not None:
-        error = None if picture is None else magma(squared_error_map(picture.cpu(), row.reference.cpu()), error_limit)
+    else:
+        error = None if image is None else magma(squared_error_map(image.cpu(), row.reference.cpu()), error_limit)
         cells.append(fit(error, width, height))
     column = paper(width, sum(cell.height + GAP for cell in cells))
     top = 0
@@ -197,22 +188,22 @@ def _column(
     return column
 
 
-def _picture_cell(row: ImageRow, picture: Tensor | None, width: int, height: int) -> Image.Image:
-    cell = fit(picture, width, height)
+def _image_cell(row: ImageRow, image: Tensor | None, width: int, height: int) -> Image.Image:
+    cell = fit(image, width, height)
     zoom = width / row.reference.shape[1]
-    for crop, colour in zip(row.crops if picture is not None else (), cycle(CROP_COLOURS), strict=False):
+    for crop, colour in zip(row.crops if image is not None else (), cycle(CROP_COLOURS), strict=False):
         left, top = round(zoom * crop.left), round(zoom * crop.top)
         right, bottom = round(zoom * (crop.left + crop.size)), round(zoom * (crop.top + crop.size))
         ImageDraw.Draw(cell).rectangle([left, top, right - 1, bottom - 1], outline=colour, width=2)
     return cell
 
 
-def _insets_cell(crops: Sequence[Crop], picture: Tensor | None, width: int) -> Image.Image:
+def _insets_cell(crops: Sequence[Crop], image: Tensor | None, width: int) -> Image.Image:
     """Draw the insets side by side over the width of the column, with coloured frames."""
     side = (width - (len(crops) - 1) * GAP) // len(crops)
     cell = paper(width, side)
     for index, (crop, colour) in enumerate(zip(crops, cycle(CROP_COLOURS), strict=False)):
-        inset = fit(None if picture is None else crop.of(picture), side, side)
+        inset = fit(None if image is None else crop.of(image), side, side)
         ImageDraw.Draw(inset).rectangle([0, 0, side - 1, side - 1], outline=colour, width=3)
         cell.paste(inset, (index * (side + GAP), 0))
     return cell

@@ -15,10 +15,11 @@ from nerfro.rays import Rays
 from nerfro.rendering import Renderer
 
 # Pixels per view and step, and candidates drawn per pixel; the candidates with the most contrast are used.
-_NUM_PIXELS, _DRAWN = 600, 3
+_NUM_PIXELS, _NUM_CANDIDATES = 600, 3
 # Distance of finite differences in pixels, in the first and in the last step.
-_REACH = 2.0, 0.5
-_SCALE, _LONGEST = 0.3, 3.0
+_FIRST_DIFFERENCE, _LAST_DIFFERENCE = 2.0, 0.5
+# Scale of the robust error in sRGB, and maximum motion of a camera in one step in pixels.
+_ERROR_SCALE, _MAX_PIXELS = 0.3, 3.0
 
 
 @torch.no_grad()
@@ -32,10 +33,10 @@ def refine_on_left(renderer: Renderer, views: Views, gains: Float[Tensor, "V 3"]
         steps: number of Gauss-Newton steps.
     """
     cameras, device = views.cameras.to(renderer.scene.device), renderer.scene.device
-    part = RefinedCamera(fix_gauge=False).to(device)
-    part.begin(cameras)
+    camera = RefinedCamera(fix_gauge=False).to(device)
+    camera.begin(cameras)
     photographs, gains = PixelStore(views.images).to(device), gains.to(device)
-    generator, shape = torch.Generator().manual_seed(0), (len(views), _DRAWN * _NUM_PIXELS)
+    generator, shape = torch.Generator().manual_seed(0), (len(views), _NUM_CANDIDATES * _NUM_PIXELS)
 
     def photographed(pixels: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
         return photographs[pixels]
@@ -46,8 +47,10 @@ def refine_on_left(renderer: Renderer, views: Views, gains: Float[Tensor, "V 3"]
     for step in range(steps):
         row = torch.randint(cameras.height, shape, generator=generator)
         column = torch.randint(cameras.width // 2, shape, generator=generator)
-        drawn = (torch.arange(len(views))[:, None] * cameras.height + row) * cameras.width + column
-        pixels = informative_pixels(drawn.to(device), _NUM_PIXELS, photographed, cameras)
-        reach = _REACH[0] * (_REACH[1] / _REACH[0]) ** (step / max(steps - 1, 1))
-        gauss_newton_step(part, cameras, pixels, photographed, shown, Step(reach, _SCALE, _LONGEST))
-    return part.estimated(cameras).to(views.cameras.device)
+        candidates = (torch.arange(len(views))[:, None] * cameras.height + row) * cameras.width + column
+        pixels = informative_pixels(candidates.to(device), _NUM_PIXELS, photographed, cameras)
+        progress = step / max(steps - 1, 1)
+        difference = _FIRST_DIFFERENCE * (_LAST_DIFFERENCE / _FIRST_DIFFERENCE) ** progress
+        settings = Step(difference, _ERROR_SCALE, _MAX_PIXELS)
+        gauss_newton_step(camera, cameras, pixels, photographed, shown, settings)
+    return camera.estimated(cameras).to(views.cameras.device)

@@ -1,4 +1,4 @@
-"""PSNR, the mean of a metric over images, and a metric that collects all scores of all views and regions."""
+"""PSNR, and a metric that collects the scores of all views and regions."""
 
 from __future__ import annotations
 
@@ -46,39 +46,6 @@ def psnr(
     """
     errors = squared_error_map(prediction.double(), target.double())
     return (-10 * torch.log10(mean_over(errors, inside))).clamp(max=MAX_PSNR)
-
-
-class MeanOverImages(torchmetrics.Metric):
-    """Mean of a metric over images.
-
-    Args:
-        metric: `psnr`, `ssim`, `ms_ssim`, `flip` or an `LpipsNetwork`.
-    """
-
-    full_state_update = False
-    total: Tensor
-    count: Tensor
-
-    def __init__(self, metric: ImageMetric) -> None:
-        super().__init__()
-        self.metric = metric
-        self.add_state("total", default=torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("count", default=torch.zeros((), dtype=torch.long), dist_reduce_fx="sum")
-
-    @torch.no_grad()
-    def update(
-        self,
-        prediction: Float[Tensor, "H W 3"],
-        target: Float[Tensor, "H W 3"],
-        inside: Bool[Tensor, "H W"] | None = None,
-    ) -> None:
-        """Add one image, sRGB in [0, 1], or its pixels inside a mask."""
-        self.total += self.metric(prediction, target, inside).double()
-        self.count += 1
-
-    def compute(self) -> Float[Tensor, ""]:
-        """Return the mean over the images so far."""
-        return self.total / self.count
 
 
 class ImageMetrics(torchmetrics.Metric):

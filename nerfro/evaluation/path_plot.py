@@ -61,7 +61,7 @@ def plot_paths(axes: Axes, path: Path, medium: Medium, colour: str = "tab:red") 
     axes.imshow(n, cmap="Blues", vmin=1, vmax=2 * float(n.max()) - 1, extent=extent, origin="lower")
     for positions, share in zip(vertices, path.throughput.cpu(), strict=True):
         flat = positions - centre
-        # Weak branches remain visible. Branches of separated colours (dispersion) are drawn in these colours.
+        # Weak branches remain visible. With dispersion, the branch of each wavelength is drawn in its own colour.
         strength = float(share.max())
         drawn = colour if float(share.min()) == strength else tuple((share / strength).tolist())
         axes.plot(flat @ across, flat @ up, color=drawn, linewidth=0.8, alpha=0.15 + 0.85 * strength**0.5)

@@ -1,4 +1,4 @@
-"""Rendering one view, with more than one ray where a pixel's centre does not stand for the pixel."""
+"""Rendering of one view, with several rays in pixels whose central ray is not representative."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ class EvaluateConfig:
 
 
 def require_one_task(config: DictConfig) -> None:
-    """Raise an error for options that contradict each other or have no effect."""
+    """Refuse options without effect, and options with contradictory values."""
     if (config.checkpoint is None) == (config.predictions is None):
         raise NerfroError(
             "give either checkpoint=RUN/checkpoints/last.ckpt, or predictions=DIR and references=DIR, to score"
@@ -73,7 +73,7 @@ def require_one_task(config: DictConfig) -> None:
 
 @contextmanager
 def own_folder(config: DictConfig, default: Path) -> Iterator[Path]:
-    """Lock the output folder; raises an error if it holds anything but an evaluation that may be replaced."""
+    """Lock the output folder; raises an error unless the folder is empty or holds a replaceable evaluation."""
     folder = default if config.out is None else user_path(config.out)
     if not (folder / REQUEST_FILE).is_file():
         require_own(folder, (), "it is not the folder of an evaluation; give another out=...")
@@ -87,7 +87,7 @@ def own_folder(config: DictConfig, default: Path) -> Iterator[Path]:
 
 
 def record(folder: Path, config: DictConfig) -> None:
-    """Write the configuration first, which marks the folder as that of an evaluation."""
+    """Write the configuration, which marks the folder as that of an evaluation, before any other file."""
     write_atomically(folder / REQUEST_FILE, OmegaConf.to_yaml(config, resolve=True))
 
 

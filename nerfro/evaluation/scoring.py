@@ -6,8 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 from tqdm import tqdm
 
+from nerfro.camera.exposure import fit_gain
 from nerfro.data.base import Views
 from nerfro.data.image_files import Alpha
 from nerfro.evaluation.error_maps import write_error_sheet
@@ -28,23 +31,44 @@ def score_views(
     folder: Path,
     subdivision: Subdivision,
     subfolder: str = "images",
-) -> EvaluationResult:
+    right_halves: bool = False,
+) -> tuple[EvaluationResult, Float[Tensor, "V 3"]]:
     """Render all views, write these as 8-bit sRGB to `folder/<subfolder>/<prefix>_NNN.png`, and compute the scores.
 
     The memory holds the rays and images of one view and the samples of `renderer.chunk_size` rays.
+
+    Args:
+        renderer: trained model.
+        views: views to score.
+        metrics: scores of earlier views are removed.
+        folder: folder of the evaluation.
+        subdivision: which pixels get several rays.
+        subfolder: name of the folder of images.
+        right_halves: score only the right half of each view. If the model estimates exposures, the gain of each view
+            is fitted on the left half of the photograph.
+
+    Returns:
+        Scores, and the gain of each view and channel, which is 1 if no gains are fitted.
     """
-    height, width = views.cameras.height, views.cameras.width
-    cameras = views.cameras.to(renderer.scene.device)
+    metrics.reset()
+    scene, height, width = renderer.scene, views.cameras.height, views.cameras.width
+    cameras, left = views.cameras.to(scene.device), slice(width // 2)
+    scored = slice(width // 2, None) if right_halves else slice(None)
+    gains = torch.ones(len(views), 3)
     progress = tqdm(total=len(views) * height * width, unit="ray", unit_scale=True, desc="evaluate", dynamic_ncols=True)
     with progress:
         for view in range(len(views)):
-            rendered = render_view(renderer, cameras, view, subdivision)
-            rgb = renderer.scene.colour_space.to_display(rendered.radiance).reshape(height, width, 3).cpu()
+            radiance = render_view(renderer, cameras, view, subdivision).radiance.view(height, width, 3).cpu()
+            target, mask = views.images[view], None if views.masks is None else views.masks[view]
+            if right_halves and scene.camera.exposure is not None:
+                to_srgb, shown = scene.colour_space.to_srgb, radiance[:, left].flatten(0, 1)
+                gains[view] = fit_gain(to_srgb, shown, target[:, left].flatten(0, 1))
+            rgb = scene.colour_space.to_display(radiance, gains[view])
             save_png(folder / subfolder / f"{metrics.prefix}_{view:03d}.png", rgb)
-            coverage = None if views.masks is None else views.masks[view]
-            metrics.update(rgb, views.images[view], view, coverage)
+            prediction, target = (image[:, scored].contiguous() for image in (rgb, target))
+            metrics.update(prediction, target, view, None if mask is None else mask[:, scored].contiguous())
             progress.update(height * width)
-    return metrics.result()
+    return metrics.result(), gains
 
 
 def score_folders(
