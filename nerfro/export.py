@@ -13,7 +13,7 @@ from nerfro.viewing.exports import ExportConfig, find_export
 
 @entry_point("export", ExportConfig)
 def main(config: DictConfig) -> None:
-    """Refuse what cannot be written, load the scene, write, print."""
+    """Check the request, load the scene, and write the file."""
     out = user_path(config.out)
     export = find_export(config.what, out)
     refuse_existing(export.files(out), config.overwrite)

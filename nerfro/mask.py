@@ -27,7 +27,7 @@ from nerfro.capture.targets import opencv
 from nerfro.cli import entry_point, warn
 from nerfro.data.base import Frame
 from nerfro.errors import NerfroError, first_of
-from nerfro.files.images import save_picture
+from nerfro.files.images import save_image
 from nerfro.paths import EMBEDDED_PREFIX
 from nerfro.registry import build
 
@@ -62,7 +62,7 @@ def main(config: DictConfig) -> None:
     made = [view for view in range(len(frames)) if view not in kept]
     for view in made:
         save_mask(frames[view], found.masks[view])
-    save_picture(source.root / _SHEET, mask_sheet(images, frames, found))
+    save_image(source.root / _SHEET, mask_sheet(images, frames, found))
     _report(frames, found)
     print(f"wrote {len(made)} masks beside their images (mask_*.png); check them in {source.root / _SHEET}")
     print("correct wrong masks in a paint program; or delete them, outline one of these views, and repeat the command")

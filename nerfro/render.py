@@ -1,4 +1,4 @@
-"""`python -m nerfro.render checkpoint=... path=orbit out=DIR`: pictures and films of a trained scene, from anywhere."""
+"""`python -m nerfro.render checkpoint=... path=orbit out=DIR`: render images and films of a trained scene."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.paths import CONF_DIR, user_path
 from nerfro.training.load import checkpoint_of, load
 from nerfro.viewing.film import find_ffmpeg, write_film
-from nerfro.viewing.frames import Rendering, render_frames
+from nerfro.viewing.frames import FrameRenderer, render_frames
 from nerfro.viewing.layers import LAYERS
 from nerfro.viewing.render_request import RenderConfig, check_request, checkpoints, find_shots, labels, prepared
 from nerfro.viewing.sweep import read_sweep
@@ -18,24 +18,24 @@ from nerfro.viewing.sweep import read_sweep
 
 @entry_point("render", RenderConfig, CONF_DIR / "render", verbatim=("sweep",))
 def main(config: DictConfig) -> None:
-    """Refuse what cannot be rendered, load the scenes, render the frames that are missing, make films of them."""
+    """Check the request, load the scenes, render the missing frames, and encode films."""
     check_request(config)
     keep_freed_memory()
     sweep = None if config.sweep is None else read_sweep(config.sweep)
     runs = checkpoints(config)
     scenes = [prepared(config, load(run, config.device, config.root)) for run in runs]
     shots = find_shots(config, scenes[0])
-    rendering = Rendering(scenes, labels(config), LAYERS[config.what], sweep)
-    read = [*map(checkpoint_of, runs), *([config.sky] if config.sky else []), *(sweep.files if sweep else [])]
-    request = (config.what, config.sweep, rendering.labels, scenes[0].subdivision, *map(file_hash, read))
+    renderer = FrameRenderer(scenes, labels(config), LAYERS[config.what], sweep)
+    inputs = [*map(checkpoint_of, runs), *([config.sky] if config.sky else []), *(sweep.files if sweep else [])]
+    request = (config.what, config.sweep, renderer.labels, scenes[0].subdivision, *map(file_hash, inputs))
     folder = user_path(config.out)
     films = config.film if shots.film and config.format == "png" else []
     if "mp4" in films:
         find_ffmpeg()  # a missing ffmpeg is reported before the frames are rendered
-    files = render_frames(rendering, shots, folder, f".{config.format}", request, config.overwrite)
+    files = render_frames(renderer, shots, folder, f".{config.format}", request, config.overwrite)
     print(f"{len(files)} frames: {files[0]}")
-    for kind in films:
-        film = folder / f"film.{kind}"
+    for form in films:
+        film = folder / f"film.{form}"
         write_film(film, files, config.seconds)
         print(f"film: {film}")
 

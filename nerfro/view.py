@@ -11,18 +11,18 @@ from omegaconf import DictConfig
 from nerfro.cli import entry_point
 from nerfro.report.curves import CURVES_FILE, read_curves
 from nerfro.training.load import checkpoint_of, load
-from nerfro.viewing.live import LOOK_AGAIN, LivePage, ViewConfig
+from nerfro.viewing.live import POLL_SECONDS, LivePage, ViewConfig
 from nerfro.viewing.page import page_split
 from nerfro.viewing.server import PageServer
 
 
 @entry_point("view", ViewConfig)
 def main(config: DictConfig) -> None:
-    """Serve until Ctrl-C; whenever the checkpoint or the curve of the loss is another, show that."""
+    """Serve the page until Ctrl-C, and update the page when the checkpoint or the training curve changes."""
     checkpoint = checkpoint_of(config.checkpoint)
     run = checkpoint.parent.parent
     scene = load(checkpoint, config.device, config.root)
-    shown, told = _written(checkpoint), _written(run / CURVES_FILE)
+    scene_time, curve_time = _modified(checkpoint), _modified(run / CURVES_FILE)
     server = PageServer(config.host, config.port)
     split = page_split(scene.source)
     page = LivePage(server, scene, scene.views(split), split, config.resolution)
@@ -31,22 +31,23 @@ def main(config: DictConfig) -> None:
     if config.open:
         webbrowser.open(server.url)
     while True:
-        time.sleep(LOOK_AGAIN)
-        if _written(checkpoint) != shown:
-            shown = _written(checkpoint)
+        time.sleep(POLL_SECONDS)
+        if _modified(checkpoint) != scene_time:
+            scene_time = _modified(checkpoint)
             page.show(load(checkpoint, config.device, config.root))
-        if _written(run / CURVES_FILE) != told:
-            told = _written(run / CURVES_FILE)
+        if _modified(run / CURVES_FILE) != curve_time:
+            curve_time = _modified(run / CURVES_FILE)
             show_losses(server, run)
 
 
 def show_losses(server: PageServer, run: Path) -> None:
-    """Show the losses that a run has logged; a run without a CSV log has none to show."""
+    """Show the training curve of a run; the curve is empty without a CSV log."""
     steps, losses = read_curves(run).get("loss/total", ((), ()))
-    server.show_losses([(int(step), float(loss)) for step, loss in zip(steps, losses, strict=True)])
+    server.set_losses([(int(step), float(loss)) for step, loss in zip(steps, losses, strict=True)])
 
 
-def _written(file: Path) -> float:
+def _modified(file: Path) -> float:
+    """Return the modification time of a file, or 0 if the file does not exist."""
     return file.stat().st_mtime if file.exists() else 0.0
 
 

@@ -23,7 +23,7 @@ from nerfro.data.image_files import read_mask, read_size, to_unit
 from nerfro.data.masks import without_masks
 from nerfro.errors import NerfroError
 from nerfro.files.drawing import sheet
-from nerfro.files.images import save_picture
+from nerfro.files.images import save_image
 from nerfro.files.reading import read_json
 from nerfro.paths import user_path
 
@@ -170,7 +170,7 @@ def save_mask(frame: Frame, mask: Bool[np.ndarray, "H W"]) -> None:
     picture, size = Image.fromarray(np.uint8(255 * mask)), stored_size(frame)
     if picture.size != size:
         picture = picture.resize(size, Image.Resampling.BICUBIC).point(lambda level: 255 * (level > 127))
-    save_picture(mask_file(frame), picture)
+    save_image(mask_file(frame), picture)
 
 
 def mask_sheet(

@@ -15,7 +15,7 @@ from nerfro.cli import warn
 from nerfro.data.base import Views
 from nerfro.errors import first_of
 from nerfro.files.atomic import write_atomically
-from nerfro.files.images import save_picture
+from nerfro.files.images import save_image
 from nerfro.geometry.mesh import TriangleMesh
 
 SHEET, REPORT = "overlays.png", "overlaps.json"
@@ -71,7 +71,7 @@ def draw_overlays(
     views: Views, mesh: TriangleMesh, overlaps: Float[np.ndarray, "V"], inside: list[TriangleMesh], folder: Path
 ) -> None:
     """Write the contact sheet of the overlaps, with the outlines of inner bodies (see `contact_sheet`)."""
-    save_picture(folder / SHEET, contact_sheet(views, mesh, overlaps, _MAX_PIXELS, inside))
+    save_image(folder / SHEET, contact_sheet(views, mesh, overlaps, _MAX_PIXELS, inside))
 
 
 def _warn_of_bad(

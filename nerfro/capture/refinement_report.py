@@ -15,7 +15,7 @@ from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import Interrupted
 from nerfro.files.atomic import write_atomically
 from nerfro.files.drawing import sheet
-from nerfro.files.images import save_picture
+from nerfro.files.images import save_image
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
@@ -73,7 +73,7 @@ def _draw(around: Around, before: SdfGrid, after: SdfGrid, file: Path) -> None:
             radiance = _seen_through(around.surroundings, medium, rays)
             pictures.append(to_srgb(radiance.view(cameras.height, cameras.width, 3)).clamp(0, 1))
             captions.append(f"{state}, nothing inside")
-    save_picture(file, sheet(pictures, captions, _WIDTH, 3, "surroundings as refracted by the surface"))
+    save_image(file, sheet(pictures, captions, _WIDTH, 3, "surroundings as refracted by the surface"))
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""What drawn pictures are made of: cells of one size, text, and colour scales."""
+"""Elements of drawn images: cells of equal size, text, and colour scales."""
 
 from __future__ import annotations
 
@@ -14,46 +14,45 @@ from torch import Tensor
 from nerfro.errors import NerfroError
 from nerfro.files.images import to_8bit
 
-GAP = 6  # pixels between pictures
+GAP = 6  # pixels between images
 TEXT_SIZE = 14  # pixels
 LINE_HEIGHT = 22  # pixels
-PAPER, INK, EMPTY = (255, 255, 255), (25, 25, 25), (225, 225, 225)  # EMPTY: grey of what is not known
+PAPER, INK, EMPTY = (255, 255, 255), (25, 25, 25), (225, 225, 225)  # EMPTY: grey of missing values
 
 
 def paper(width: int, height: int) -> Image.Image:
-    """A white picture."""
+    """Make a white image."""
     return Image.new("RGB", (width, height), PAPER)
 
 
-def fit(picture: Float[Tensor, "h w 3"] | None, width: int, height: int) -> Image.Image:
-    """A picture at a size: enlarged by repeating pixels, reduced by averaging; grey where there is none."""
-    if picture is None:
+def fit(image: Float[Tensor, "h w 3"] | None, width: int, height: int) -> Image.Image:
+    """Resize an image by repeating or averaging pixels; a missing image becomes a grey cell."""
+    if image is None:
         cell = Image.new("RGB", (width, height), EMPTY)
         write(cell, "n/a", width // 2, height // 2)
         return cell
-    image = Image.fromarray(to_8bit(picture).cpu().numpy())
-    method = Image.Resampling.NEAREST if width >= image.width else Image.Resampling.BOX
-    return image.resize((width, height), method)
+    pixels = Image.fromarray(to_8bit(image).cpu().numpy())
+    return pixels.resize((width, height), Image.Resampling.NEAREST if width >= pixels.width else Image.Resampling.BOX)
 
 
 def sheet(
-    pictures: Sequence[Float[Tensor, "h w 3"]], captions: Sequence[str], width: int, columns: int, title: str
+    images: Sequence[Float[Tensor, "h w 3"]], captions: Sequence[str], width: int, columns: int, title: str = ""
 ) -> Image.Image:
-    """Pictures (sRGB) drawn `width` pixels wide in rows of at most `columns`, each over its caption, under a title."""
-    columns, height = min(columns, len(pictures)), round(width * pictures[0].shape[0] / pictures[0].shape[1])
-    pitch = height + LINE_HEIGHT + GAP
-    whole = paper(columns * (width + GAP) - GAP, LINE_HEIGHT + -(-len(pictures) // columns) * pitch)
+    """Draw sRGB images `width` pixels wide in rows of at most `columns`, with captions below and a title on top."""
+    columns, height = min(columns, len(images)), round(width * images[0].shape[0] / images[0].shape[1])
+    pitch, start = height + LINE_HEIGHT + GAP, LINE_HEIGHT if title else 0
+    whole = paper(columns * (width + GAP) - GAP, start + -(-len(images) // columns) * pitch - GAP)
     write(whole, title, whole.width // 2, LINE_HEIGHT // 2)
-    for place, (picture, caption) in enumerate(zip(pictures, captions, strict=True)):
-        left, top = place % columns * (width + GAP), LINE_HEIGHT + place // columns * pitch
-        whole.paste(fit(picture, width, height), (left, top))
+    for number, (image, caption) in enumerate(zip(images, captions, strict=True)):
+        left, top = number % columns * (width + GAP), start + number // columns * pitch
+        whole.paste(fit(image, width, height), (left, top))
         write(whole, caption, left + width // 2, top + height + LINE_HEIGHT // 2)
     return whole
 
 
 def write(image: Image.Image, text: str, x: int, y: int) -> None:
-    """Write a text around a centre, moved inwards where it would leave the picture."""
-    # Pillow's own font lacks signs such as ≥ and ↑; the one that matplotlib brings along has them.
+    """Write a text around a centre; a text that would leave the image is moved inwards."""
+    # Pillow's own font lacks signs such as ≥ and ↑, which the font of matplotlib has.
     font = ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", TEXT_SIZE)
     draw = ImageDraw.Draw(image)
     half = draw.textlength(text, font=font) / 2
@@ -61,7 +60,7 @@ def write(image: Image.Image, text: str, x: int, y: int) -> None:
 
 
 def colour_scale(width: int, height: int, title: str, limit: float) -> Image.Image:
-    """A colour scale of error maps with its ends: without it the maps mean nothing."""
+    """Draw the colour scale of error maps, labelled with its limits."""
     cell = paper(width, height)
     length, thickness = round(0.8 * width), max(height // 12, 4)
     left, top = (width - length) // 2, (height - thickness) // 2
@@ -75,14 +74,19 @@ def colour_scale(width: int, height: int, title: str, limit: float) -> Image.Ima
 
 
 def magma(values: Float[Tensor, "H W"], limit: float) -> Float[Tensor, "H W 3"]:
-    """Colours of matplotlib's magma: black at 0, through purple and orange, to pale yellow at `limit` and above.
+    """Map values to the colours of matplotlib's magma: from black at 0 to pale yellow at `limit` and above.
 
-    The scale is given and never fitted to the values, so that pictures can be compared.
+    The limit is fixed and not fitted to the values, so that images can be compared.
 
-    Values are non-negative; those that are NaN become grey. Colours are sRGB, float32.
+    Args:
+        values: non-negative values; NaN becomes grey.
+        limit: value at the end of the scale.
+
+    Returns:
+        sRGB, float32.
     """
     if not limit > 0:
-        raise NerfroError(f"the limit of a colour scale must be positive, got {limit}")
+        raise NerfroError(f"limit={limit} of a colour scale is not allowed; give a positive number")
     num_colours = 256
     table = torch.from_numpy(matplotlib.colormaps["magma"](range(num_colours))[:, :3]).float()
     values = values.detach().cpu().float()

@@ -1,8 +1,11 @@
-"""8-bit sRGB pictures: the form in which predictions are written, and scored."""
+"""Images of 8-bit sRGB, the format in which predictions are written and scored."""
 
 from __future__ import annotations
 
+import base64
+import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,39 +21,46 @@ from nerfro.files.reading import open_image
 def to_8bit(rgb: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
     """Clip finite sRGB values to [0, 1] and round to the nearest of 256 levels.
 
-    Truncation instead of rounding would darken every picture by half a level.
+    Truncation instead of rounding would darken every image by half a level.
     """
     if not rgb.is_floating_point():
         raise NerfroError(f"expected sRGB values of floating point in [0, 1], got {rgb.dtype}; divide levels by 255")
     num_bad = int((~torch.isfinite(rgb)).sum())
     if num_bad:
         raise NerfroError(
-            f"{num_bad} of the picture's {rgb.numel()} values are NaN or infinite: the model has diverged; "
+            f"{num_bad} of the image's {rgb.numel()} values are NaN or infinite: the model has diverged; "
             "train with a lower learning rate or with gradient clipping"
         )
     return (rgb.detach().clamp(0, 1) * 255).round().to(torch.uint8)
 
 
 def round_to_8bit(rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
-    """The values that a viewer of the saved PNG sees: multiples of 1/255 in [0, 1], of the input's type."""
+    """Round to the values of a saved PNG: multiples of 1/255 in [0, 1], in the type of the input."""
     return to_8bit(rgb).to(rgb.dtype) / 255
 
 
 def save_png(path: Path | str, rgb: Float[Tensor, "H W 3"]) -> None:
-    """Write sRGB values, clipped to [0, 1] and rounded, as 8-bit PNG, whole or not at all."""
+    """Clip sRGB values to [0, 1], round them, and write an 8-bit PNG atomically."""
     if rgb.ndim != 3 or rgb.shape[-1] != 3:
-        raise NerfroError(f"cannot write {path}: expected a picture [H, W, 3], got {list(rgb.shape)}")
-    save_picture(path, Image.fromarray(to_8bit(rgb).cpu().numpy()))
+        raise NerfroError(f"cannot write {path}: expected an image [H, W, 3], got {list(rgb.shape)}")
+    save_image(path, Image.fromarray(to_8bit(rgb).cpu().numpy()))
 
 
-def save_picture(path: Path | str, picture: Image.Image, optimize: bool = False) -> None:
-    """Write any picture as PNG, whole or not at all."""
+def save_image(path: Path | str, image: Image.Image, optimize: bool = False) -> None:
+    """Write an image as PNG atomically."""
     with atomic_file(path) as file:
-        picture.save(file, "PNG", optimize=optimize)
+        image.save(file, "PNG", optimize=optimize)
+
+
+def data_uri(pixels: UInt8[np.ndarray, "H W 3"], form: str, **options: Any) -> str:
+    """Encode an image as a data URI; `form` is PNG or JPEG, and `options` are those of Pillow's writer."""
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, form, **options)
+    return f"data:image/{form.lower()};base64,{base64.b64encode(file.getvalue()).decode()}"
 
 
 def load_png(path: Path | str) -> Float[Tensor, "H W 3"]:
-    """Read an 8-bit grey or RGB picture without transparency as float32 sRGB values, multiples of 1/255."""
+    """Read an 8-bit grey or RGB image without transparency as float32 sRGB values, multiples of 1/255."""
     with open_image(Path(path)) as (image, bits):
         if image.mode not in ("RGB", "L") or image.has_transparency_data or bits > 8:
             raise NerfroError(

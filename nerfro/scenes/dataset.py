@@ -19,7 +19,7 @@ from PIL import Image
 
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
-from nerfro.files.images import save_picture
+from nerfro.files.images import save_image
 from nerfro.files.lat_long import save_lat_long
 from nerfro.light import to_srgb
 from nerfro.scenes.baking import bake
@@ -266,7 +266,7 @@ def fingerprint(scene: Scene) -> str:
 def _write_image(path: Path, image: np.ndarray) -> None:
     """Write sRGB [H, W, 3] or shares [H, W], clipped to [0, 1], as an 8-bit PNG, or bool [H, W] as a 1-bit PNG."""
     levels = image if image.dtype == bool else np.rint(np.clip(image, 0.0, 1.0) * 255).astype(np.uint8)
-    save_picture(path, Image.fromarray(levels), optimize=True)
+    save_image(path, Image.fromarray(levels), optimize=True)
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:

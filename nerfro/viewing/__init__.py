@@ -1,1 +1,1 @@
-"""Trained scenes to look at and to hand on: pictures, films, pages and files for other programs."""
+"""Trained scenes: rendering, films, interactive pages and export to other programs."""

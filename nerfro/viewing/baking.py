@@ -1,4 +1,4 @@
-"""A model as the arrays that a browser traces: signed distances, the sky as a cube, and what is inside as a volume."""
+"""Conversion of a model to arrays that a browser traces: signed distances, a cube map of the sky, and a volume."""
 
 from __future__ import annotations
 
@@ -25,32 +25,33 @@ from nerfro.media.solid import Solid
 from nerfro.rendering import ColourSpace, Renderer
 from nerfro.types import Exits
 from nerfro.viewing import packing
-from nerfro.viewing.volume import UNSEEN, Volume
+from nerfro.viewing.changes import absorption_of
+from nerfro.viewing.volume import MIN_OPTICAL_DEPTH, Volume
 
-# Distances are kept up to this many cells from the surface, where the spline that is its zero level reads them; beyond,
-# rays jump by the blocks' clearance.
+# Distances are stored up to this many cells from the surface, where the B-spline of the surface reads them. Farther
+# away, rays advance by the clearance of the blocks.
 _BAND = 3.5
-_GRID_OF_ANALYTIC = 128  # vertices a side, where a medium has no grid of its own
-_SKY_SIZE = 256  # texels along a cube's side, where the boundary is no texture
-_SOLID = 30.0  # optical depth of a cell, at most
-_BRICK = 8  # voxels a side of what is skipped where it is empty
-_CHUNK = 2**16  # texels asked for at once
+_ANALYTIC_RESOLUTION = 128  # vertices per side of the grid of a medium in closed form
+_SKY_SIZE = 256  # texels per side of the cube map, unless the background is a texture
+_MAX_OPTICAL_DEPTH = 30.0  # of one cell
+_BRICK = 8  # voxels per side of the bricks that are skipped if they are empty
+_CHUNK = 2**16  # texels that are evaluated at once
 
 
 @dataclass(frozen=True)
 class Baked:
-    """Some of a page's arrays, as pictures by name, and the numbers that belong to them."""
+    """Arrays of a page as images by name, and the numbers that describe them."""
 
     facts: dict[str, Any]
     voxels: dict[str, UInt8[np.ndarray, "Z Y X C"]] = field(default_factory=dict)
 
     def packed(self, compression: int = 9) -> dict[str, str]:
-        """The arrays as `data:` addresses."""
+        """Encode the arrays as data URIs."""
         return {name: packing.pack(voxels, compression) for name, voxels in self.voxels.items()}
 
 
 def bake_surface(renderer: Renderer) -> Baked:
-    """The bodies on which rays bend, as the grid whose splines `samplers/snell_cpu.py` follows.
+    """Convert the refractive bodies to the grid of splines that `samplers/snell_cpu.py` traces.
 
     Raises:
         NerfroError: the medium has no surface.
@@ -74,15 +75,13 @@ def bake_surface(renderer: Renderer) -> Baked:
     steps = np.clip(np.round(coefficients / step), -32767, 32767).astype(np.int64)
     clearance = grid.coarse_clearance.cpu().double().numpy()
     unit = max(float(clearance.max()), 1e-9) / 255
-    absorbed = getattr(medium, "absorption", None)
-    absorption = absorbed.detach() if isinstance(absorbed, Tensor) else torch.zeros(len(medium.indices), 3)
     slices = np.concatenate([body.transpose(2, 1, 0) for body in steps])
     blocks = np.floor(clearance / unit + 1e-9).astype(np.uint8).transpose(2, 1, 0)
     return Baked(
         {
             "iors": [float(ior) for ior in medium.indices],
             "nested": medium.nested,
-            "absorption": absorption.tolist(),
+            "absorption": absorption_of(renderer.scene).tolist(),
             "vertices": vertices.tolist(),
             "size": list(slices.shape[::-1]),
             "blocks": list(blocks.shape[::-1]),
@@ -99,29 +98,29 @@ def bake_surface(renderer: Renderer) -> Baked:
 
 
 def _on_grid(medium: Solid) -> SdfGrid:
-    """A closed-form medium as one of distances on a grid."""
-    axes = (torch.linspace(float(low), float(high), _GRID_OF_ANALYTIC) for low, high in medium.box.T)
-    places = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).to(medium.box)
+    """Sample the signed distances of a medium in closed form on a grid."""
+    axes = (torch.linspace(float(low), float(high), _ANALYTIC_RESOLUTION) for low, high in medium.box.T)
+    positions = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).to(medium.box)
     with torch.no_grad():
-        distances = torch.stack([medium.signed_distances(plane)[0] for plane in places]).movedim(-1, 0)
+        distances = torch.stack([medium.signed_distances(plane)[0] for plane in positions]).movedim(-1, 0)
     return SdfGrid.from_distances(distances.contiguous(), medium.box, medium.indices.tolist(), medium.shell)
 
 
 @torch.inference_mode()
 def bake_sky(boundary: Boundary, device: torch.device) -> Baked:
-    """Radiance at the texels of a cube in OpenGL's order, equally wide in angle; seen from the middle of all."""
+    """Evaluate the background radiance at the texels of a cube map, seen from the centre of the scene."""
     size = boundary.levels.resolutions[-1] if isinstance(boundary, EnvironmentMap) else _SKY_SIZE
     directions = cube_directions(size).to(device)
-    radiance = torch.cat([boundary(Exits(some)).float().cpu() for some in directions.split(_CHUNK)])
+    radiance = torch.cat([boundary(Exits(chunk)).float().cpu() for chunk in directions.split(_CHUNK)])
     upper, rest = packing.shared_exponent(radiance.view(6, size, size, 3).double().numpy())
     return Baked({"size": size}, {"sky": upper, "sky_exponent": rest})
 
 
 def cube_directions(size: int) -> Float[Tensor, "6*size*size 3"]:
-    """Unit directions of the texels by face, row and column.
+    """Compute the unit directions of the texels of a cube map by face, row and column.
 
-    A face's place (1, a, b) in [-1, 1] stands for the direction (1, tan(a pi / 4), tan(b pi / 4)). Orientations:
-    OpenGL ES 3.0, table 3.21.
+    The texels of a face are equally wide in angle: position (1, a, b) in [-1, 1] stands for the direction
+    (1, tan(a pi / 4), tan(b pi / 4)). The orientations of the faces are those of OpenGL ES 3.0, table 3.21.
     """
     centres = ((torch.arange(size) + 0.5) / size * 2 - 1) * (math.pi / 4)
     t, s = torch.meshgrid(centres.tan(), centres.tan(), indexing="ij")
@@ -130,22 +129,22 @@ def cube_directions(size: int) -> Float[Tensor, "6*size*size 3"]:
     return F.normalize(torch.stack([torch.stack(face, -1) for face in faces]), dim=-1).view(-1, 3)
 
 
-def volume_arrays(volume: Volume, colour_space: ColourSpace) -> Baked:
-    """What is inside, as the logarithm of its density and the root of its colour.
+def bake_volume(volume: Volume, colour_space: ColourSpace) -> Baked:
+    """Convert a volume to bytes: the logarithm of the density, and the square root of the colour.
 
     Args:
-        volume: with linear radiance.
-        colour_space: in which rays add up radiance.
+        volume: samples of the radiance field, with linear radiance.
+        colour_space: space in which the model adds up the radiance of a ray.
     """
     sides = volume.box[1] - volume.box[0]
     cell = float((sides / (torch.tensor(volume.density.shape) - 1)).min())
-    thinnest, span = UNSEEN / cell, math.log(_SOLID / UNSEEN)
+    thinnest, span = MIN_OPTICAL_DEPTH / cell, math.log(_MAX_OPTICAL_DEPTH / MIN_OPTICAL_DEPTH)
     levels = (volume.density.clamp(min=thinnest) / thinnest).log().div(span).clamp(max=1)
     rgb = (to_srgb(volume.rgb) if colour_space is ColourSpace.SRGB else volume.rgb).clamp(min=0)
     brightest = max(float(rgb.max()), 1e-6)
     content = torch.cat([(rgb / brightest).sqrt(), levels[..., None]], -1).mul(255).round().byte()
     slices = content.permute(2, 1, 0, 3).numpy()
-    occupied = _bricks(slices[..., 3])
+    occupied = _occupied_bricks(slices[..., 3])
     return Baked(
         {
             "low": volume.box[0].tolist(),
@@ -161,13 +160,13 @@ def volume_arrays(volume: Volume, colour_space: ColourSpace) -> Baked:
     )
 
 
-def _bricks(levels: UInt8[np.ndarray, "Z Y X"]) -> UInt8[np.ndarray, "z y x"]:
-    """Whether anything is in equal parts of the grid, or at a vertex beside them that interpolation reads."""
-    held = levels > 0
+def _occupied_bricks(levels: UInt8[np.ndarray, "Z Y X"]) -> UInt8[np.ndarray, "z y x"]:
+    """Mark the bricks of a grid that have a nonzero vertex, inside or among the neighbours used for interpolation."""
+    occupied = levels > 0
     for axis, count in enumerate(levels.shape):
         bounds = np.linspace(0, count - 1, math.ceil((count - 1) / _BRICK) + 1)
-        parts = [
-            held.take(range(math.floor(low), math.ceil(high) + 1), axis).any(axis) for low, high in pairwise(bounds)
+        bricks = [
+            occupied.take(range(math.floor(low), math.ceil(high) + 1), axis).any(axis) for low, high in pairwise(bounds)
         ]
-        held = np.stack(parts, axis)
-    return held.astype(np.uint8)
+        occupied = np.stack(bricks, axis)
+    return occupied.astype(np.uint8)

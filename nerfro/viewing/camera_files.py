@@ -1,4 +1,4 @@
-"""Files of cameras: nerfstudio's camera paths and transforms.json are read, refined cameras written."""
+"""Camera files: reader of nerfstudio's camera paths and transforms.json, and writer of refined cameras."""
 
 from __future__ import annotations
 
@@ -23,72 +23,75 @@ from nerfro.data.transforms import is_number, parse_matrix
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import read_json
-from nerfro.viewing.camera_paths import Surroundings
+from nerfro.viewing.camera_paths import CaptureGeometry
 
 # Names of the nine coefficients (`nerfro.lens`); other programs know the first six.
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2", "k5", "k6", "k7")
 
 
-def read_cameras(file: Path, around: Surroundings) -> Cameras:
-    """Cameras of a file, in the world of the training data; where it tells no resolution they have that of the data.
+def read_cameras(file: Path, geometry: CaptureGeometry) -> Cameras:
+    """Read the cameras of a file, with poses in the world of the training data.
 
-    Read are nerfstudio's camera paths (`camera_path`, with a pose and a vertical field of view in each place) and files
-    as `transforms.json` (`frames`, with poses and intrinsics, of which no picture is needed).
+    The file is a camera path of nerfstudio (`camera_path`: poses and vertical fields of view) or a `transforms.json`
+    (`frames`: poses and intrinsics; the images are not needed).
+
+    Args:
+        file: JSON file.
+        geometry: geometry of the training data; its resolution is the default.
 
     Raises:
-        NerfroError: the file is neither, or anything in it is missing or no number.
+        NerfroError: the file has another format, or a value is missing or invalid.
     """
     document = read_json(file, "check the path")
     lens_of: Callable[[Mapping[str, Any], int, int, str], Lens] = read_lens
     if isinstance(document, dict) and isinstance(document.get("camera_path"), list):
         size = ("render_width", "render_height")
-        places, pose_key, lens_of = document["camera_path"], "camera_to_world", _lens_of_path
+        entries, pose_key, lens_of = document["camera_path"], "camera_to_world", _lens_of_path
     elif isinstance(document, dict) and isinstance(document.get("frames"), list):
-        size, places, pose_key = ("w", "h"), document["frames"], "transform_matrix"
+        size, entries, pose_key = ("w", "h"), document["frames"], "transform_matrix"
     else:
         raise NerfroError(
             f"{file} has neither 'camera_path' nor 'frames'; give nerfstudio's camera path, or transforms"
         )
-    if not places:
+    if not entries:
         raise NerfroError(f"{file} has no cameras; give one or more")
     width, height = (_pixels(document, key, default, file) for key, default in
-                     zip(size, (around.camera.width, around.camera.height), strict=True))  # fmt: skip
+                     zip(size, (geometry.camera.width, geometry.camera.height), strict=True))  # fmt: skip
     poses, lenses = [], []
-    for number, place in enumerate(places):
+    for number, entry in enumerate(entries):
         where = f"{file}: camera {number}"
-        if not isinstance(place, dict) or pose_key not in place:
+        if not isinstance(entry, dict) or pose_key not in entry:
             raise NerfroError(f"{where} has no '{pose_key}'; add it")
-        flat = np.asarray(place[pose_key], dtype=object)
-        matrix = flat.reshape(-1, 4).tolist() if flat.size in (12, 16) else place[pose_key]
+        flat = np.asarray(entry[pose_key], dtype=object)
+        matrix = flat.reshape(-1, 4).tolist() if flat.size in (12, 16) else entry[pose_key]
         poses.append(check_pose(parse_matrix(matrix, ((3, 4), (4, 4)), where), where, pose_key))
-        lenses.append(lens_of({**document, **place}, width, height, where))
+        lenses.append(lens_of({**document, **entry}, width, height, where))
     fx, fy, cx, cy = torch.tensor([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in lenses]).unbind(-1)
     distorted = any(lens.distortion is not None for lens in lenses)
     distortion = torch.tensor([lens.distortion or (0.0,) * 9 for lens in lenses]) if distorted else None
     pose = torch.from_numpy(np.stack(poses)).float()
-    near, far = around.camera.near, around.camera.far
-    return around.bounded(Cameras(pose, fx, fy, cx, cy, width, height, near, far, distortion))
+    near, far = geometry.camera.near, geometry.camera.far
+    return geometry.with_ray_bounds(Cameras(pose, fx, fy, cx, cy, width, height, near, far, distortion))
 
 
 def write_cameras(file: Path, camera: Camera, views: Views) -> None:
-    """Write the training cameras as they are believed to be, where anything of them learns, for `data=nerfstudio`.
+    """Write the estimated training cameras as a `transforms.json` for `data=nerfstudio`, if cameras are optimized.
 
-    It is a `transforms.json`. Each frame also tells how far its camera was moved (`turned_degrees`, `shifted` in world
-    units), and its `gain`.
+    Each frame also has the motion of its camera (`turned_degrees`, and `shifted` in world units) and its `gain`.
     """
     if not camera.moves and camera.exposure is None:
         return
-    given, believed = views.cameras, camera.estimated(views.cameras).to("cpu")
-    turned, shifted = (values.tolist() for values in motion_between(given.camera_to_world, believed.camera_to_world))
+    given, estimated = views.cameras, camera.estimated(views.cameras).to("cpu")
+    turned, shifted = (values.tolist() for values in motion_between(given.camera_to_world, estimated.camera_to_world))
     gains = None if camera.exposure is None else camera.exposure.gains().tolist()
     frames = []
     for view, frame in enumerate(views.frames):
-        lens = {"fl_x": believed.fx, "fl_y": believed.fy, "cx": believed.cx, "cy": believed.cy}
+        lens = {"fl_x": estimated.fx, "fl_y": estimated.fy, "cx": estimated.cx, "cy": estimated.cy}
         entry: dict[str, Any] = {"file_path": relative(frame.image, file.parent)}
         entry |= {name: float(values[view]) for name, values in lens.items()}
-        if believed.distortion is not None:
-            entry |= dict(zip(_DISTORTION, believed.distortion[view].tolist(), strict=True))
-        entry["transform_matrix"] = [*believed.camera_to_world[view].tolist(), [0.0, 0.0, 0.0, 1.0]]
+        if estimated.distortion is not None:
+            entry |= dict(zip(_DISTORTION, estimated.distortion[view].tolist(), strict=True))
+        entry["transform_matrix"] = [*estimated.camera_to_world[view].tolist(), [0.0, 0.0, 0.0, 1.0]]
         entry |= {"turned_degrees": turned[view], "shifted": shifted[view]}
         if gains is not None:
             entry["gain"] = gains[view]
@@ -97,18 +100,17 @@ def write_cameras(file: Path, camera: Camera, views: Views) -> None:
     write_atomically(file, json.dumps(document, indent=1) + "\n")
 
 
-def _lens_of_path(place: Mapping[str, Any], width: int, height: int, where: str) -> Lens:
-    angle = place.get("fov")
-    if place.get("camera_type", "perspective") != "perspective":
-        raise NerfroError(f"{where}: camera_type={place['camera_type']!r} is not supported; take perspective")
+def _lens_of_path(entry: Mapping[str, Any], width: int, height: int, where: str) -> Lens:
+    angle = entry.get("fov")
+    if entry.get("camera_type", "perspective") != "perspective":
+        raise NerfroError(f"{where}: camera_type={entry['camera_type']!r} is not supported; take perspective")
     if not is_number(angle) or not 0 < angle < 180:
         raise NerfroError(f"{where}: fov={angle!r} must be the vertical field of view, between 0 and 180 degrees")
-    lens = Lens.of_angle(math.radians(angle), height, height)
-    return replace(lens, cx=0.5 * width)
+    return replace(Lens.of_angle(math.radians(angle), height, height), cx=0.5 * width)
 
 
 def _pixels(document: Mapping[str, Any], key: str, default: int, file: Path) -> int:
     value = document.get(key, default)
     if not is_number(value) or value < 1:
-        raise NerfroError(f"{file}: {key}={value!r} must be a number of pixels")
+        raise NerfroError(f"{file}: {key}={value!r} is not a number of pixels; give 1 or more")
     return int(value)

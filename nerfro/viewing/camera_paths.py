@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,19 +13,38 @@ from torch.nn import functional
 
 from nerfro.cameras import Cameras
 
-# The world's own axis is up where the photographs' mean is nearer to it than this.
-_NEARLY = math.cos(math.radians(15))
+# The up direction is an axis of the world if the mean up direction of the photographs is closer than this to the axis.
+_MIN_AXIS_COSINE = math.cos(math.radians(15))
+
+
+def up_direction(cameras: Cameras) -> Float[Tensor, "3"]:
+    """Estimate the up direction of the world: the mean over the cameras, or a world axis close to the mean."""
+    mean = cameras.camera_to_world[:, :, 1].mean(0).cpu()
+    if float(mean.norm()) < 0.1:  # the cameras have no common up direction
+        return torch.tensor([0.0, 0.0, 1.0])
+    up = functional.normalize(mean, dim=0)
+    axis = torch.eye(3)[up.abs().argmax()] * up[up.abs().argmax()].sign()
+    return axis if float(up @ axis) > _MIN_AXIS_COSINE else up
 
 
 @dataclass(frozen=True)
-class Surroundings:
-    """How an object was photographed: what a path around it goes by.
+class OrbitPosition:
+    """Position of a camera around the object: angles in degrees, distance in world units."""
+
+    azimuth: float
+    elevation: float
+    distance: float
+
+
+@dataclass(frozen=True)
+class CaptureGeometry:
+    """Position of an object relative to the cameras of its photographs.
 
     Attributes:
-        centre: of the object, world units.
-        up: unit direction that is up in the photographs.
-        distance: median of the cameras' from the centre, world units.
-        camera: one of the cameras, for its lens and resolution.
+        centre: centre of the object, world units.
+        up: unit up direction, see `up_direction`.
+        distance: median distance of the cameras from the centre, world units.
+        camera: one of the cameras, without distortion; its lens and resolution are the defaults of new cameras.
     """
 
     centre: Float[Tensor, "3"]
@@ -34,76 +53,59 @@ class Surroundings:
     camera: Cameras
 
     @classmethod
-    def of(cls, cameras: Cameras, bounds: Float[Tensor, "2 3"]) -> Surroundings:
-        """Those of photographs of an object within bounds."""
-        cameras = cameras.to("cpu")
-        centre = bounds.mean(0)
-        mean = functional.normalize(cameras.camera_to_world[:, :, 1].mean(0), dim=0)
-        axis = torch.zeros(3)
-        axis[mean.abs().argmax()] = mean[mean.abs().argmax()].sign()
+    def of(cls, cameras: Cameras, bounds: Float[Tensor, "2 3"]) -> CaptureGeometry:
+        """Measure the geometry of photographs of an object in the given bounds."""
+        cameras, centre = cameras.to("cpu"), bounds.mean(0)
         distance = torch.linalg.vector_norm(cameras.camera_to_world[:, :, 3] - centre, dim=-1).median()
-        up = axis if float(mean @ axis) > _NEARLY else mean
-        return cls(centre, up, float(distance), replace(cameras.select([0]), distortion=None))
+        return cls(centre, up_direction(cameras), float(distance), replace(cameras.select([0]), distortion=None))
 
-    def place(self, azimuth: float, elevation: float, distance: float) -> Float[Tensor, "3"]:
-        """The point at angles in degrees around the centre; azimuth 0 is on the side of the world's x axis, or y's."""
+    def position_at(self, position: OrbitPosition) -> Float[Tensor, "3"]:
+        """Convert angles and a distance to a point; azimuth 0 is along the x axis of the world, or y if x is up."""
         x = torch.eye(3)[int(self.up[0].abs() > 0.9)]
         x = functional.normalize(x - (x @ self.up) * self.up, dim=0)
         y = torch.linalg.cross(self.up, x)
-        around, above = math.radians(azimuth), math.radians(elevation)
-        level = math.cos(around) * x + math.sin(around) * y
-        return self.centre + distance * (math.cos(above) * level + math.sin(above) * self.up)
+        azimuth, elevation = math.radians(position.azimuth), math.radians(position.elevation)
+        horizontal = math.cos(azimuth) * x + math.sin(azimuth) * y
+        return self.centre + position.distance * (math.cos(elevation) * horizontal + math.sin(elevation) * self.up)
 
-    def looking(self, positions: Float[Tensor, "V 3"], target: Float[Tensor, "3"]) -> Cameras:
-        """Cameras at positions that look at a target, with the photographs' lens, upright.
-
-        Bounds of their rays move with the camera, so that these enclose the object as those of the photographs do.
-        """
+    def look_at(self, positions: Float[Tensor, "V 3"], target: Float[Tensor, "3"]) -> Cameras:
+        """Make upright cameras at positions that look at a target, with the lens of the photographs."""
         back = functional.normalize(positions - target, dim=-1)
-        # Straight from above there is no upright: any axis across will do.
+        # A camera directly above has no upright orientation; any horizontal axis is as good as another.
         up = torch.where((back @ self.up).abs()[:, None] > 0.9999, self.up.roll(1), self.up)
         right = functional.normalize(torch.linalg.cross(up, back), dim=-1)
         pose = torch.stack([right, torch.linalg.cross(back, right), back, positions], -1)
-        return self.bounded(replace(self.camera.select([0] * len(positions)), camera_to_world=pose))
+        return self.with_ray_bounds(replace(self.camera.select([0] * len(positions)), camera_to_world=pose))
 
-    def bounded(self, cameras: Cameras) -> Cameras:
-        """Cameras whose rays begin and end as far before and behind the object as those of the photographs do."""
-        away = torch.linalg.vector_norm(cameras.camera_to_world[:, :, 3] - self.centre, dim=-1) - self.distance
-        near, far = self.camera.near + float(away.min()), self.camera.far + float(away.max())
+    def with_ray_bounds(self, cameras: Cameras) -> Cameras:
+        """Set near and far so that rays enclose the object by the same margins as the rays of the photographs."""
+        offset = torch.linalg.vector_norm(cameras.camera_to_world[:, :, 3] - self.centre, dim=-1) - self.distance
+        near, far = self.camera.near + float(offset.min()), self.camera.far + float(offset.max())
         return replace(cameras, near=max(near, 0.0), far=max(far, self.camera.far))
 
 
-@dataclass(frozen=True)
-class Flight:
-    """Where a path goes, in numbers: angles in degrees, the distance in world units."""
-
-    azimuth: float
-    elevation: float
-    distance: float
+def orbit(start: OrbitPosition, fraction: float) -> OrbitPosition:
+    """Circle the object once at constant elevation."""
+    return replace(start, azimuth=start.azimuth + 360 * fraction)
 
 
-def orbit(start: Flight, share: float) -> Flight:
-    """Once around at one height."""
-    return replace(start, azimuth=start.azimuth + 360 * share)
+def spiral(start: OrbitPosition, fraction: float) -> OrbitPosition:
+    """Circle the object twice, rising from the negative of the elevation to the elevation."""
+    return replace(start, azimuth=start.azimuth + 720 * fraction, elevation=start.elevation * (2 * fraction - 1))
 
 
-def spiral(start: Flight, share: float) -> Flight:
-    """Twice around, rising from as far below the object as it ends above."""
-    return replace(start, azimuth=start.azimuth + 720 * share, elevation=start.elevation * (2 * share - 1))
+def arc(start: OrbitPosition, fraction: float) -> OrbitPosition:
+    """Swing to and fro over 60 degrees, without a stop at the turning points."""
+    return replace(start, azimuth=start.azimuth + 30 * math.sin(2 * math.pi * fraction))
 
 
-def arc(start: Flight, share: float) -> Flight:
-    """To and fro over 60 degrees, without a stop where it turns."""
-    return replace(start, azimuth=start.azimuth + 30 * math.sin(2 * math.pi * share))
+def dolly(start: OrbitPosition, fraction: float) -> OrbitPosition:
+    """Approach the object from one and a half times the distance to three quarters of the distance."""
+    return replace(start, distance=start.distance * 1.5 * 0.5**fraction)
 
 
-def dolly(start: Flight, share: float) -> Flight:
-    """Towards the object: from one and a half times the distance to three quarters of it."""
-    return replace(start, distance=start.distance * 1.5 * 0.5**share)
-
-
-# Paths that end where they began leave their last place to the first frame of the next round.
-PATHS: dict[str, tuple[Callable[[Flight, float], Flight], bool]] = {
+# Function of each path, and whether the path is closed: a closed path does not repeat its first position at the end.
+PATHS: dict[str, tuple[Callable[[OrbitPosition, float], OrbitPosition], bool]] = {
     "orbit": (orbit, True),
     "spiral": (spiral, False),
     "arc": (arc, True),
@@ -111,15 +113,9 @@ PATHS: dict[str, tuple[Callable[[Flight, float], Flight], bool]] = {
 }
 
 
-def fly(around: Surroundings, name: str, start: Flight, num_frames: int) -> Cameras:
-    """The cameras of a path by its name in `PATHS`, all of which look at the object's centre."""
+def path_cameras(geometry: CaptureGeometry, name: str, start: OrbitPosition, num_frames: int) -> Cameras:
+    """Make the cameras of a path in `PATHS`, which look at the centre of the object."""
     path, closed = PATHS[name]
-    flights: Sequence[Flight] = [path(start, share) for share in shares(num_frames, closed)]
-    positions = [around.place(flight.azimuth, flight.elevation, flight.distance) for flight in flights]
-    return around.looking(torch.stack(positions), around.centre)
-
-
-def shares(num_frames: int, closed: bool) -> list[float]:
-    """Where frames lie on a path, from 0 to 1, which a closed path does not repeat."""
     last = num_frames if closed else max(num_frames - 1, 1)
-    return [frame / last for frame in range(num_frames)]
+    positions = [geometry.position_at(path(start, frame / last)) for frame in range(num_frames)]
+    return geometry.look_at(torch.stack(positions), geometry.centre)

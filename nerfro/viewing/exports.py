@@ -1,4 +1,4 @@
-"""What a trained scene can be written as, and what is asked about it."""
+"""Export of a trained scene: options of the command, and a writer for each kind of file."""
 
 # ruff: noqa: UP045 - OmegaConf on Python 3.10 wants Optional
 
@@ -17,90 +17,91 @@ from nerfro.files.atomic import write_atomically
 from nerfro.files.cache import save_arrays
 from nerfro.files.lat_long import save_lat_long
 from nerfro.viewing.meshes import write_mesh
-from nerfro.viewing.mitsuba_scene import files_beside, write_mitsuba
-from nerfro.viewing.page import page_of
+from nerfro.viewing.mitsuba_scene import MITSUBA_FILES, write_mitsuba
+from nerfro.viewing.page import make_page
 from nerfro.viewing.points import write_points
 from nerfro.viewing.trained_scene import SKY_HEIGHT, TrainedScene
-from nerfro.viewing.volume import RESOLUTION, bake, find_half_depth
+from nerfro.viewing.volume import RESOLUTION, sample_field
 
 
 @dataclass
 class ExportConfig:
-    """What `python -m nerfro.export` is asked."""
+    """Options of `python -m nerfro.export`."""
 
     checkpoint: str = MISSING  # run folder, or a checkpoint in it
     what: str = MISSING  # page, mesh, points, sky, volume or mitsuba
-    out: str = MISSING  # file that is written; its ending says in which format
-    # Grid vertices along the longest side of the inside, or rows of the sky.
+    out: str = MISSING  # output file; its ending selects the format
+    # Grid vertices along the longest side of the volume (default 128), or rows of the sky (default 512).
     resolution: Optional[Count] = None
-    # Inside is solid where half the light is lost within this length, world units; by default a hundredth of the
-    # object's longest side.
+    # Length, world units, within which dense content absorbs half the light; the surface is extracted at this density.
+    # By default a hundredth of the object's longest side.
     half_depth: Optional[Positive] = None
-    count: Count = 200_000  # of points
-    sky: Optional[str] = None  # lat-long picture that replaces the sky (.hdr, .exr, .png, .jpg)
+    count: Count = 200_000  # number of points
+    sky: Optional[str] = None  # lat-long image that replaces the sky (.hdr, .exr, .png, .jpg)
     root: Optional[str] = None  # folder of the data, if it has moved since training
     device: str = "auto"  # `cpu`, `cuda`, or `auto` for a GPU if there is one
-    overwrite: bool = False  # whether `out`, and what lies beside it, may be replaced
+    overwrite: bool = False  # whether existing output files may be replaced
 
 
 @dataclass(frozen=True)
 class Export:
-    """One kind of file."""
+    """A kind of output file.
 
-    suffixes: tuple[str, ...]  # of the file's name
-    write: Callable[[TrainedScene, Path, DictConfig], str]  # writes the file and says in a few words what it holds
-    files: Callable[[Path], list[Path]] = lambda out: [out]  # all that it writes
+    Attributes:
+        suffixes: allowed endings of the file.
+        write: writes the file and returns a short description of the content.
+        companions: endings of further files; `_sky.hdr` stands for `scene_sky.hdr` beside `scene.xml`.
+    """
+
+    suffixes: tuple[str, ...]
+    write: Callable[[TrainedScene, Path, DictConfig], str]
+    companions: tuple[str, ...] = ()
+
+    def files(self, out: Path) -> list[Path]:
+        """Return all files that `write` may write."""
+        return [out, *(out.with_name(out.stem + ending) for ending in self.companions)]
 
 
 def find_export(what: str, out: Path) -> Export:
-    """The writer of what is asked for.
+    """Return the export of a name, and check the ending of the output file.
 
     Raises:
-        NerfroError: it is unknown, or the file's name does not end as such files do.
+        NerfroError: the name is unknown, or the file has another ending.
     """
     if what not in EXPORTS:
         raise NerfroError(f"what={what} is not known; choose {', '.join(EXPORTS)}")
     export = EXPORTS[what]
     if out.suffix.lower() not in export.suffixes:
-        raise NerfroError(f"out={out} must end in {' or '.join(export.suffixes)}, for that is what is written")
+        raise NerfroError(f"out={out} has another ending than the exported file; it must end in "
+                          f"{' or '.join(export.suffixes)}")  # fmt: skip
     return export
 
 
-def _mesh(scene: TrainedScene, out: Path, config: DictConfig) -> str:
-    return write_mesh(scene, out, config.resolution or RESOLUTION, find_half_depth(scene, config.half_depth))
-
-
-def _points(scene: TrainedScene, out: Path, config: DictConfig) -> str:
-    return write_points(scene, out, config.count)
-
-
-def _sky(scene: TrainedScene, out: Path, config: DictConfig) -> str:
+def _write_sky(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     sky = scene.sky_of_height(config.resolution or SKY_HEIGHT)
     save_lat_long(out, sky)
     return f"the sky: {sky.shape[1]}x{sky.shape[0]} pixels, lat-long, z up"
 
 
-def _volume(scene: TrainedScene, out: Path, config: DictConfig) -> str:
-    volume = bake(scene, config.resolution or RESOLUTION)
+def _write_volume(scene: TrainedScene, out: Path, config: DictConfig) -> str:
+    volume = sample_field(scene, config.resolution or RESOLUTION)
     save_arrays(out, {name: getattr(volume, name).numpy() for name in ("density", "rgb", "box")})
     return f"the inside: {'x'.join(map(str, volume.density.shape))} vertices with density and linear rgb"
 
 
-def _mitsuba(scene: TrainedScene, out: Path, config: DictConfig) -> str:
-    return write_mitsuba(scene, out, config.resolution or RESOLUTION, find_half_depth(scene, config.half_depth))
-
-
-def _page(scene: TrainedScene, out: Path, config: DictConfig) -> str:
-    page = page_of(scene, config.resolution or RESOLUTION)
+def _write_page(scene: TrainedScene, out: Path, config: DictConfig) -> str:
+    page = make_page(scene, config.resolution or RESOLUTION)
     write_atomically(out, page)
     return f"an interactive page of {len(page) / 1e6:.1f} MB"
 
 
 EXPORTS = {
-    "page": Export((".html",), _page),
-    "mesh": Export((".glb", ".ply"), _mesh),
-    "points": Export((".ply",), _points),
-    "sky": Export((".hdr", ".exr", ".png"), _sky),
-    "volume": Export((".npz",), _volume),
-    "mitsuba": Export((".xml",), _mitsuba, files_beside),
+    "page": Export((".html",), _write_page),
+    "mesh": Export((".glb", ".ply"), lambda scene, out, c: write_mesh(scene, out, c.resolution, c.half_depth)),
+    "points": Export((".ply",), lambda scene, out, c: write_points(scene, out, c.count)),
+    "sky": Export((".hdr", ".exr", ".png"), _write_sky),
+    "volume": Export((".npz",), _write_volume),
+    "mitsuba": Export(
+        (".xml",), lambda scene, out, c: write_mitsuba(scene, out, c.resolution, c.half_depth), MITSUBA_FILES
+    ),
 }

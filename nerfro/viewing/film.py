@@ -55,7 +55,7 @@ def find_ffmpeg() -> str:
 
 
 def _write_mp4(file: Path, frames: Sequence[Path], rate: float) -> None:
-    height, width = _even(_pixels(frames[0])).shape[:2]
+    height, width = _read_even(frames[0]).shape[:2]
     with tempfile.TemporaryDirectory() as folder:
         encoded = Path(folder, file.name)
         pixels = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(rate), "-i", "-"]
@@ -65,7 +65,7 @@ def _write_mp4(file: Path, frames: Sequence[Path], rate: float) -> None:
             assert process.stdin is not None
             with contextlib.suppress(BrokenPipeError):  # ffmpeg has failed, and its message says why
                 for frame in frames:
-                    process.stdin.write(_even(_pixels(frame)).tobytes())
+                    process.stdin.write(_read_even(frame).tobytes())
             messages = process.communicate()[1].decode(errors="replace").strip().splitlines()
         if process.returncode:
             reason = messages[-1:] or ["no message"]
@@ -74,25 +74,22 @@ def _write_mp4(file: Path, frames: Sequence[Path], rate: float) -> None:
 
 
 def _write_gif(file: Path, frames: Sequence[Path], rate: float) -> None:
-    pictures = _palettes(frames)
-    # The format counts in hundredths of a second, and viewers do not go below two.
+    images = _quantized(frames)
+    # The unit of the format is a hundredth of a second, and viewers replace durations below two units.
     duration = max(20, 10 * round(100 / rate))
     with atomic_file(file) as stream:
-        next(pictures).save(stream, "GIF", save_all=True, append_images=pictures, duration=duration, loop=0)
+        next(images).save(stream, "GIF", save_all=True, append_images=images, duration=duration, loop=0)
 
 
-def _palettes(frames: Sequence[Path]) -> Iterator[Image.Image]:
-    """Frames with 256 colours each: those of the first alone would be wrong where a film changes."""
+def _quantized(frames: Sequence[Path]) -> Iterator[Image.Image]:
+    """Reduce each frame to a palette of 256 colours of its own, because the colours of a film change."""
     for frame in frames:
-        with Image.open(frame) as picture:
-            yield picture.convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.FLOYDSTEINBERG)
+        with Image.open(frame) as image:
+            yield image.convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.FLOYDSTEINBERG)
 
 
-def _pixels(frame: Path) -> UInt8[np.ndarray, "H W 3"]:
-    with Image.open(frame) as picture:
-        return np.array(picture.convert("RGB"))
-
-
-def _even(pixels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    """With the last row and column twice where there is an odd number: colours of .mp4 are of two by two pixels."""
+def _read_even(frame: Path) -> UInt8[np.ndarray, "H W 3"]:
+    """Read a frame and repeat the last row and column if their number is odd, because H.264 needs even sizes."""
+    with Image.open(frame) as image:
+        pixels = np.array(image.convert("RGB"))
     return np.pad(pixels, ((0, pixels.shape[0] % 2), (0, pixels.shape[1] % 2), (0, 0)), mode="edge")

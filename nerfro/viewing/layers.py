@@ -1,4 +1,4 @@
-"""What can be shown of a scene: the whole of it, its parts alone, and what is known beside colour."""
+"""Layers of a rendering: colours of the scene or of some components, depth, normals, opacity and exit directions."""
 
 from __future__ import annotations
 
@@ -12,36 +12,41 @@ from torch import Tensor
 from nerfro.cameras import Cameras
 from nerfro.viewing.trained_scene import RenderedViews, TrainedScene
 
-Pictures = Float[Tensor, "V H W C"]
+Images = Float[Tensor, "V H W C"]
 
 
 @dataclass(frozen=True)
 class Layer:
-    """One thing that is shown."""
+    """A quantity that is rendered.
 
-    # Of which scene, where some of its parts are taken away.
+    Attributes:
+        glass, inside: whether the rendered scene contains the glass, and the content of the glass.
+        values: values in their units: linear radiance, world units or unit vectors.
+        shown: values as sRGB in [0, 1]; depth is scaled to the bounds of the camera's rays.
+    """
+
     glass: bool
     inside: bool
-    values: Callable[[RenderedViews], Pictures]  # as they are: linear radiance, world units, unit vectors
-    # The values as sRGB in [0, 1]; depth is drawn between the bounds of the camera's rays.
-    shown: Callable[[RenderedViews, Cameras], Pictures]
+    values: Callable[[RenderedViews], Images]
+    shown: Callable[[RenderedViews, Cameras], Images]
 
     def of(self, scene: TrainedScene) -> TrainedScene:
-        """The scene of which it is rendered."""
+        """Return the scene with the components of this layer."""
         return scene if self.glass and self.inside else scene.with_(glass=self.glass, inside=self.inside)
 
 
-def _grey(values: Float[Tensor, "V H W"]) -> Pictures:
+def _grey(values: Float[Tensor, "V H W"]) -> Images:
     return values[..., None].clamp(0, 1).expand(*values.shape, 3)
 
 
-def _near_is_bright(rendered: RenderedViews, cameras: Cameras) -> Pictures:
-    share = (cameras.far - rendered.depth) / (cameras.far - cameras.near)
-    return _grey(torch.where(rendered.opacity < 0.5, 0.0, share))
+def _depth_image(rendered: RenderedViews, cameras: Cameras) -> Images:
+    """Map depth to grey: near is bright, and pixels of low opacity are black."""
+    fraction = (cameras.far - rendered.depth) / (cameras.far - cameras.near)
+    return _grey(torch.where(rendered.opacity < 0.5, 0.0, fraction))
 
 
-def _vectors(values: Pictures) -> Pictures:
-    """Unit vectors as colours: (x, y, z) from -1 to 1 are red, green and blue from 0 to 1; none is black."""
+def _vector_image(values: Images) -> Images:
+    """Map x, y and z of unit vectors from [-1, 1] to red, green and blue in [0, 1]; zero vectors are black."""
     return torch.where((values == 0).all(-1, keepdim=True), 0.0, 0.5 + 0.5 * values).clamp(0, 1)
 
 
@@ -51,10 +56,10 @@ def _colours(glass: bool = True, inside: bool = True) -> Layer:
 
 LAYERS = {
     "rgb": _colours(),
-    "depth": Layer(True, True, lambda rendered: rendered.depth[..., None], _near_is_bright),
-    "normals": Layer(True, True, lambda r: r.normals, lambda r, _: _vectors(r.normals)),
+    "depth": Layer(True, True, lambda rendered: rendered.depth[..., None], _depth_image),
+    "normals": Layer(True, True, lambda r: r.normals, lambda r, _: _vector_image(r.normals)),
     "opacity": Layer(True, True, lambda r: r.opacity[..., None], lambda r, _: _grey(r.opacity)),
-    "exits": Layer(True, True, lambda r: r.exit_directions, lambda r, _: _vectors(r.exit_directions)),
+    "exits": Layer(True, True, lambda r: r.exit_directions, lambda r, _: _vector_image(r.exit_directions)),
     "glass": _colours(inside=False),
     "inside": _colours(glass=False),
     "sky": _colours(glass=False, inside=False),

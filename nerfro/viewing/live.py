@@ -1,4 +1,4 @@
-"""A model that still learns, on a page: baked again and again within a share of the time."""
+"""Interactive page of a model during training, updated within a fixed fraction of the training time."""
 
 # ruff: noqa: UP045 - OmegaConf on Python 3.10 wants Optional
 
@@ -13,77 +13,77 @@ from omegaconf import MISSING
 from nerfro.allowed import Range
 from nerfro.data.base import Views
 from nerfro.viewing.baking import Baked
-from nerfro.viewing.page import document, frame_of, parts_of
+from nerfro.viewing.page import assemble_page, bake_parts, static_parts
 from nerfro.viewing.server import PageServer
 from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import RESOLUTION
 
-LOOK_AGAIN = 3.0  # seconds between two looks at a checkpoint that may be replaced
+POLL_SECONDS = 3.0  # interval at which the command checks for a new checkpoint
 
-_SHARE = 0.02  # of the time that goes into baking
-_SECONDS = 5.0  # between two bakes; the inside's resolution follows
-_RESOLUTIONS = 24, 128  # vertices of the inside's grid along its longest side
-_FASTEST = 1  # zlib's level: what crosses the loopback need not be small
+_TIME_FRACTION = 0.02  # maximum share of the training time that updates take
+_UPDATE_SECONDS = 5.0  # target interval between updates; the resolution of the volume is adapted
+_RESOLUTIONS = 24, 128  # bounds of the adapted resolution
+_COMPRESSION = 1  # fastest level of zlib, because local connections are fast
 
 
 @dataclass
 class ViewConfig:
-    """What `python -m nerfro.view` is asked."""
+    """Options of `python -m nerfro.view`."""
 
     checkpoint: str = MISSING  # run folder, or a checkpoint in it
-    host: str = "localhost"  # address to listen at; 0.0.0.0 lets other machines see the page
-    port: Annotated[int, Range(at_least=0, at_most=65535)] = 8008  # 0 for any that is free
+    host: str = "localhost"  # address of the server; 0.0.0.0 accepts connections from other machines
+    port: Annotated[int, Range(at_least=0, at_most=65535)] = 8008  # 0 for any free port
     open: bool = True  # whether to open a browser
-    resolution: Annotated[int, Range(at_least=2)] = RESOLUTION  # grid vertices of the inside along its longest side
+    resolution: Annotated[int, Range(at_least=2)] = RESOLUTION  # grid vertices along the longest side of the volume
     root: Optional[str] = None  # folder of the data, if it has moved since training
     device: str = "auto"  # `cpu`, `cuda`, or `auto` for a GPU if there is one
 
 
 class LivePage:
-    """Keeps a server's page up to date with a scene, in the thread that asks for it.
+    """Keeps the page of a server up to date with a scene. Updates run in the thread of the caller.
 
-    A bake takes as long as it takes: the next comes so much later that the share of time stays, and its grid is
-    coarser if that is later than every few seconds.
+    The interval between updates is proportional to the duration of an update, so that updates take a fixed share of the
+    time. If the interval exceeds a few seconds, the resolution of the volume decreases.
 
     Args:
-        server: shows the page.
-        scene: what is shown, as its model is at each time.
-        views: cameras and photographs of the page.
-        split: which views these are.
-        resolution: vertices of the inside's grid along its longest side, at first.
+        server: server of the page.
+        scene: scene whose model changes during training.
+        views: cameras and photographs on the page.
+        split: name of the split of these views.
+        resolution: initial number of vertices along the longest side of the volume.
     """
 
     def __init__(self, server: PageServer, scene: TrainedScene, views: Views, split: str, resolution: int = 48) -> None:
         self._server, self._scene, self._cameras = server, scene, views.cameras
         self._resolution = resolution
-        frame = {**frame_of(scene, views, split), "version": 0}
-        server.open(document(scene.name, frame, self._parts(surface=True), live=True))
+        static = {**static_parts(scene, views, split), "version": 0}
+        server.open(assemble_page(scene.name, static, self._bake(surface=True), live=True))
         self._next = time.monotonic()
 
     def update(self) -> None:
-        """Show the model as it is now, if it is time and somebody looks."""
-        begun = time.monotonic()
-        if begun < self._next or not self._server.watched:
+        """Publish the current model, if an update is due and a browser shows the page."""
+        start = time.monotonic()
+        if start < self._next or not self._server.watched:
             return
         self.show(self._scene)
-        took = time.monotonic() - begun
-        self._next = begun + max(took / _SHARE, _SECONDS)
-        finer = (_SHARE * _SECONDS / took) ** (1 / 3)
+        duration = time.monotonic() - start
+        self._next = start + max(duration / _TIME_FRACTION, _UPDATE_SECONDS)
+        scale = (_TIME_FRACTION * _UPDATE_SECONDS / duration) ** (1 / 3)
         low, high = _RESOLUTIONS
-        self._resolution = round(min(max(self._resolution * min(max(finer, 0.7), 1.3), low), high))
+        self._resolution = round(min(max(self._resolution * min(max(scale, 0.7), 1.3), low), high))
 
     def show(self, scene: TrainedScene) -> None:
-        """Show another state of the scene."""
-        moves = any(parameter.requires_grad for parameter in scene.renderer.scene.medium.parameters())
+        """Publish another state of the scene."""
+        surface_changes = any(parameter.requires_grad for parameter in scene.renderer.scene.medium.parameters())
         self._scene = scene
-        parts = self._parts(surface=moves)
-        arrays = {name: uri for part in parts.values() for name, uri in part.packed(_FASTEST).items()}
+        parts = self._bake(surface=surface_changes)
+        arrays = {name: uri for part in parts.values() for name, uri in part.packed(_COMPRESSION).items()}
         self._server.publish({name: part.facts for name, part in parts.items()}, arrays)
 
-    def _parts(self, surface: bool) -> dict[str, Baked]:
+    def _bake(self, surface: bool) -> dict[str, Baked]:
         renderer = self._scene.renderer
         was_training = renderer.training
         renderer.eval()
-        parts = parts_of(self._scene, self._cameras, self._resolution, surface)
+        parts = bake_parts(self._scene, self._cameras, self._resolution, surface)
         renderer.train(was_training)
         return parts

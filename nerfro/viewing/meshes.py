@@ -1,87 +1,136 @@
-"""Glass and what is inside it as meshes for other programs."""
+"""Export of glass and dense content as meshes: .glb with glass materials, or .ply with vertex colours."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+import torch
+import trimesh
+from torch.nn import functional
+from trimesh.exchange.gltf import export_glb
+from trimesh.exchange.ply import export_ply
 
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
-from nerfro.files.gltf import GltfMesh, encode_glb
 from nerfro.files.images import to_8bit
-from nerfro.files.ply import write_ply
+from nerfro.geometry.interpolation import trilinear
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.light import to_srgb
 from nerfro.media.solid import Solid
 from nerfro.viewing.changes import absorption_of
+from nerfro.viewing.surface import largest_components, level_set
 from nerfro.viewing.trained_scene import TrainedScene
-from nerfro.viewing.volume import ColouredMesh, bake, solid_surface
+from nerfro.viewing.volume import POINTS_AT_ONCE, RESOLUTION, query_field, sample_field
 
-# Opacity of glass in a .ply, which knows no glass.
-_GLASS_RGBA = (255, 255, 255, 60)
-
-
-def write_mesh(scene: TrainedScene, out: Path, resolution: int, half_depth: float) -> str:
-    """Write the surfaces of glass, and of what is solid inside: .glb with glass as a material, or .ply with colours."""
-    glass = scene.surface if isinstance(scene.renderer.scene.medium, Solid) else []
-    solid = find_solid(scene, resolution, half_depth)
-    if not glass and solid is None:
-        raise NerfroError("there is nothing to write: no glass, and nothing inside is solid; raise half_depth")
-    if out.suffix.lower() == ".glb":
-        write_atomically(out, encode_glb(_gltf_meshes(scene, glass, solid)))
-    else:
-        _write_ply(out, glass, solid)
-    inside = "nothing solid inside" if solid is None else f"{len(solid.mesh.faces)} triangles inside"
-    return f"{sum(len(mesh.faces) for mesh in glass)} triangles of glass, {inside}"
+_GLASS_RGBA = (255, 255, 255, 60)  # translucent white, because .ply has no glass materials
+_HALF_DEPTH = 0.01  # default of half_depth, relative to the longest side of the object
+# The y axis is up in glTF, and the z axis in nerfro.
+_Z_UP_TO_Y_UP = trimesh.transformations.rotation_matrix(-math.pi / 2, [1, 0, 0])
 
 
-def find_solid(scene: TrainedScene, resolution: int, half_depth: float) -> ColouredMesh | None:
-    """What is solid inside; None where nothing is."""
-    try:
-        return solid_surface(scene, bake(scene, resolution), half_depth)
-    except NerfroError:
-        return None
+def write_mesh(scene: TrainedScene, out: Path, resolution: int | None, half_depth: float | None) -> str:
+    """Write the surfaces of the glass and of the dense content as .glb or .ply; see `inside_mesh` for the options."""
+    glass, inside = glass_meshes(scene), inside_mesh(scene, resolution, half_depth)
+    if not glass and inside is None:
+        raise NerfroError("the scene has neither glass nor dense content to write; raise half_depth")
+    encode = _encode_glb if out.suffix.lower() == ".glb" else _encode_ply
+    write_atomically(out, encode(scene, glass, inside))
+    content = "nothing solid inside" if inside is None else f"{len(inside.faces)} triangles inside"
+    return f"{sum(len(mesh.faces) for mesh in glass)} triangles of glass, {content}"
 
 
-def with_normals(
-    mesh: TriangleMesh,
-) -> tuple[Float[np.ndarray, "W 3"], Int[np.ndarray, "F 3"], Float[np.ndarray, "W 3"]]:
-    """Vertices, faces and normals of vertices: where the triangles' normals differ, vertices are there twice."""
+def glass_meshes(scene: TrainedScene) -> list[trimesh.Trimesh]:
+    """Triangulate the surface of each body, with vertex normals; returns an empty list without bodies."""
+    if not isinstance(scene.renderer.scene.medium, Solid):
+        return []
+    return [_with_vertex_normals(mesh) for mesh in scene.surface]
+
+
+def _with_vertex_normals(mesh: TriangleMesh) -> trimesh.Trimesh:
+    """Convert normals of triangle corners to normals of vertices; vertices on creases are duplicated."""
     assert mesh.normals is not None
     corners = np.concatenate([mesh.triangles, mesh.normals], -1).reshape(-1, 6).astype(np.float32)
     unique, index = np.unique(corners, axis=0, return_inverse=True)
-    return unique[:, :3], index.reshape(-1, 3), unique[:, 3:]
+    return trimesh.Trimesh(unique[:, :3], index.reshape(-1, 3), vertex_normals=unique[:, 3:], process=False)
 
 
-def _gltf_meshes(scene: TrainedScene, glass: list[TriangleMesh], solid: ColouredMesh | None) -> list[GltfMesh]:
-    meshes = []
-    for number, (mesh, ior, absorption) in enumerate(
-        zip(glass, scene.ior, absorption_of(scene.renderer.scene), strict=True)
-    ):
-        thickness = float((mesh.bounds[1] - mesh.bounds[0]).min())
-        material = _glass(f"glass {number}", float(ior), absorption.numpy(), thickness)
-        vertices, faces, normals = with_normals(mesh)
-        meshes.append(GltfMesh(f"glass_{number}", vertices, faces, normals, material))
-    if solid is not None:
-        # The colours are light that is seen, not albedo: no lamp of the program may shade them again.
-        material = {"name": "inside", "extensions": {"KHR_materials_unlit": {}}}
-        radiance = solid.radiance.clamp(0, 1).numpy()
-        meshes.append(
-            GltfMesh("inside", solid.mesh.vertices, solid.mesh.faces, solid.normals.numpy(), material, radiance)
+@torch.inference_mode()
+def inside_mesh(scene: TrainedScene, resolution: int | None, half_depth: float | None) -> trimesh.Trimesh | None:
+    """Extract the surface of the dense content with marching cubes, with the radiance seen from outside.
+
+    Small separate components are omitted.
+
+    Args:
+        scene: scene whose radiance field is sampled.
+        resolution: grid vertices along the longest side, `RESOLUTION` by default.
+        half_depth: length within which the density of the surface absorbs half the light, world units; by default a
+            hundredth of the object's longest side.
+
+    Returns:
+        Mesh with vertex normals and the vertex attribute `radiance` (linear), or None if no content is dense enough.
+    """
+    volume = sample_field(scene, resolution or RESOLUTION)
+    level = math.log(2) / (half_depth or _HALF_DEPTH * float((scene.bounds[1] - scene.bounds[0]).max()))
+    # The padding closes surfaces at the faces of the box. A logarithm of the density is closer to linear across a
+    # surface than the density.
+    values = functional.pad(volume.density, (1,) * 6).clamp(min=1e-3 * level).log()
+    spacing = (volume.box[1] - volume.box[0]) / (torch.tensor(volume.density.shape) - 1)
+    box = volume.box + torch.stack([-spacing, spacing])
+    if not values.max() > math.log(level):
+        return None
+    mesh = largest_components(level_set(values, box, math.log(level)))
+    vertices = torch.from_numpy(mesh.vertices).float()
+    gradients = torch.stack(torch.gradient(values), -1) / spacing
+    normals = -functional.normalize(trilinear(gradients, box, vertices), dim=-1)
+    network = scene.renderer.scene
+    radiance = [
+        query_field(scene.field, positions.to(network.device), directions)[1].cpu()
+        for positions, directions in zip(vertices.split(POINTS_AT_ONCE), (-normals).split(POINTS_AT_ONCE), strict=True)
+    ]
+    linear = network.colour_space.to_linear(torch.cat(radiance)).numpy()
+    return trimesh.Trimesh(
+        mesh.vertices, mesh.faces, vertex_normals=normals.numpy(), vertex_attributes={"radiance": linear}, process=False
+    )
+
+
+def _encode_glb(scene: TrainedScene, glass: list[trimesh.Trimesh], inside: trimesh.Trimesh | None) -> bytes:
+    meshes, materials = {}, {}
+    for number, (mesh, absorption) in enumerate(zip(glass, absorption_of(scene.renderer.scene), strict=True)):
+        meshes[f"glass_{number}"] = mesh
+        materials[f"glass_{number}"] = _glass_material(mesh, float(scene.ior[number]), absorption.numpy())
+    if inside is not None:
+        meshes["inside"] = inside
+        inside.vertex_attributes["radiance"] = np.clip(inside.vertex_attributes["radiance"], 0, 1)
+        # The colours are radiance and not albedo, so lights of the other program must not shade them again.
+        materials["inside"] = {"extensions": {"KHR_materials_unlit": {}}}
+
+    def add_materials(document: dict[str, Any]) -> None:
+        """Add what trimesh does not write: extensions of materials, and colours in floating point."""
+        document["materials"] = [{"name": name, **material} for name, material in materials.items()]
+        document["extensionsUsed"] = sorted(
+            {name for material in materials.values() for name in material["extensions"]}
         )
-    return meshes
+        for mesh in document["meshes"]:
+            (primitive,) = mesh["primitives"]
+            primitive["material"] = list(materials).index(mesh["name"])
+            if "_radiance" in primitive["attributes"]:
+                primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_radiance")
+
+    document = trimesh.Scene()
+    for name, mesh in meshes.items():
+        document.add_geometry(mesh, geom_name=name, node_name=name, transform=_Z_UP_TO_Y_UP)
+    return export_glb(document, include_normals=True, tree_postprocessor=add_materials)
 
 
-def _glass(name: str, ior: float, absorption: Float[np.ndarray, "3"], thickness: float) -> dict[str, Any]:
-    """Khronos' KHR_materials_transmission, _ior and _volume; light that is absorbed is told at a distance of one."""
-    volume: dict[str, Any] = {"thicknessFactor": thickness}
+def _glass_material(mesh: trimesh.Trimesh, ior: float, absorption: np.ndarray) -> dict[str, Any]:
+    """Describe glass by KHR_materials_transmission, KHR_materials_ior and KHR_materials_volume (Khronos)."""
+    volume: dict[str, Any] = {"thicknessFactor": float(mesh.extents.min())}
     if absorption.any():
         volume |= {"attenuationDistance": 1.0, "attenuationColor": np.exp(-absorption).tolist()}
     return {
-        "name": name,
         "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.0},
         "extensions": {
             "KHR_materials_transmission": {"transmissionFactor": 1.0},
@@ -91,15 +140,15 @@ def _glass(name: str, ior: float, absorption: Float[np.ndarray, "3"], thickness:
     }
 
 
-def _write_ply(out: Path, glass: list[TriangleMesh], solid: ColouredMesh | None) -> None:
-    parts = [with_normals(mesh) for mesh in glass]
-    rgba = [np.tile(np.array(_GLASS_RGBA, np.uint8), (len(vertices), 1)) for vertices, _, _ in parts]
-    if solid is not None:
-        parts.append((solid.mesh.vertices, solid.mesh.faces, solid.normals.numpy()))
-        colours = to_8bit(to_srgb(solid.radiance)).numpy()
-        rgba.append(np.pad(colours, ((0, 0), (0, 1)), constant_values=255))
-    offsets = np.cumsum([0, *(len(vertices) for vertices, _, _ in parts)])
-    faces = np.concatenate([faces + offset for (_, faces, _), offset in zip(parts, offsets, strict=False)])
-    columns = dict(zip(("nx", "ny", "nz"), np.concatenate([normals for _, _, normals in parts]).T, strict=True))
-    columns |= zip(("red", "green", "blue", "alpha"), np.concatenate(rgba).T, strict=True)
-    write_ply(out, np.concatenate([vertices for vertices, _, _ in parts]), faces, columns)
+def _encode_ply(scene: TrainedScene, glass: list[trimesh.Trimesh], inside: trimesh.Trimesh | None) -> bytes:
+    coloured = [_with_colours(mesh, np.tile(_GLASS_RGBA, (len(mesh.vertices), 1))) for mesh in glass]
+    if inside is not None:
+        radiance = torch.from_numpy(np.asarray(inside.vertex_attributes["radiance"]))
+        coloured.append(_with_colours(inside, to_8bit(to_srgb(radiance)).numpy()))
+    return export_ply(trimesh.util.concatenate(coloured), vertex_normal=True)
+
+
+def _with_colours(mesh: trimesh.Trimesh, colours: np.ndarray) -> trimesh.Trimesh:
+    return trimesh.Trimesh(
+        mesh.vertices, mesh.faces, vertex_normals=mesh.vertex_normals, vertex_colors=np.uint8(colours), process=False
+    )

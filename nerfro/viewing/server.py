@@ -1,4 +1,4 @@
-"""A page on one port of this machine, and what has changed since it was opened; no file is read for an answer."""
+"""HTTP server for an interactive page and its updates; the server reads no files."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from urllib.parse import parse_qs, urlsplit
 
 from nerfro.errors import NerfroError
 
-_WATCHED = 10.0  # seconds for which a browser that has asked is thought to look
-_LOSSES = 500  # points of the curve, at most; twice as many are thinned out
-# What a browser sees that comes before the page is made; it asks again by itself.
-_SOON = b'<!DOCTYPE html><meta http-equiv="refresh" content="2"><title>nerfro</title><p>The page is being made.'
+_WATCHED_SECONDS = 10.0  # a page counts as watched for so long after a request
+_MAX_LOSSES = 500  # maximum number of points of the curve
+# Placeholder until the page is complete; browsers reload the placeholder every two seconds.
+_PLACEHOLDER = b'<!DOCTYPE html><meta http-equiv="refresh" content="2"><title>nerfro</title><p>The page is being made.'
 
 
 class PageServer:
-    """Serves a page at `/` and its news at `/state`, in a thread of its own.
+    """Serves a page at `/` and its updates at `/state`, in a background thread.
 
-    A browser's requests are answered if they come from the page itself: by an address or a name of this machine
-    (`Host`), and from no page of another origin (`Origin`).
+    The server answers requests of the page only: the header `Host` must name this machine, and the header `Origin` must
+    be absent or name the page.
 
     Args:
-        host: address to listen at; `localhost` for this machine alone.
-        port: to listen at; 0 for any that is free.
+        host: address of the server; `localhost` accepts connections from this machine only.
+        port: port of the server; 0 for any free port.
 
     Raises:
-        NerfroError: nobody can listen there.
+        NerfroError: the address is not available.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -40,59 +40,57 @@ class PageServer:
             self._server = ThreadingHTTPServer((host, port), _Handler)
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
-            raise NerfroError(f"{host}:{port} cannot be served on ({reason}); give another port, or port 0") from error
+            raise NerfroError(f"{host}:{port} is not available ({reason}); give another port, or port 0") from error
         self._server.daemon_threads = True
         self._server.page = self  # type: ignore[attr-defined]
         self.url = f"http://{host}:{self._server.server_address[1]}"
         self._lock = threading.Lock()
-        self._page, self._news, self._version = _SOON, b"null", 0
+        self._page, self._update, self._version = _PLACEHOLDER, b"null", 0
         self._losses: list[tuple[int, float]] = []
-        self._asked = -_WATCHED
+        self._last_request = -_WATCHED_SECONDS
         threading.Thread(target=self._server.serve_forever, daemon=True, name="page server").start()
 
     @property
     def watched(self) -> bool:
-        """Whether a browser has asked within the last seconds."""
-        return time.monotonic() - self._asked < _WATCHED
+        """Whether a browser has sent a request recently."""
+        return time.monotonic() - self._last_request < _WATCHED_SECONDS
 
     def open(self, page: str) -> None:
-        """Show a page to browsers that come."""
+        """Replace the placeholder by the page."""
         with self._lock:
             self._page = page.encode()
 
     def publish(self, scene: dict[str, Any], arrays: dict[str, str]) -> None:
-        """Tell the browsers that are there: facts and arrays of the page that are others now."""
+        """Send changed numbers and arrays to the browsers that show the page."""
         with self._lock:
             self._version += 1
-            self._news = json.dumps({"scene": {**scene, "version": self._version}, "arrays": arrays}).encode()
+            self._update = json.dumps({"scene": {**scene, "version": self._version}, "arrays": arrays}).encode()
 
     def add_loss(self, step: int, loss: float) -> None:
-        """One more point of the curve."""
+        """Append a point to the training curve."""
         with self._lock:
             self._losses.append((step, loss))
-            if len(self._losses) > 2 * _LOSSES:
-                self._losses = self._losses[::2]
 
-    def show_losses(self, losses: Sequence[tuple[int, float]]) -> None:
-        """The curve so far: optimisation steps and losses."""
-        every = -(-len(losses) // _LOSSES) or 1
+    def set_losses(self, losses: Sequence[tuple[int, float]]) -> None:
+        """Replace the training curve by pairs of optimization step and loss."""
         with self._lock:
-            # Counted from the end, which is told in words.
-            self._losses = list(losses)[::-every][::-1]
+            self._losses = list(losses)
 
     def page(self) -> bytes:
         return self._page
 
     def state(self, after: int) -> bytes:
-        """What a page of version `after` does not know, as JSON."""
-        self._asked = time.monotonic()
+        """Return the training curve, and the update for a page of version `after`, as JSON."""
+        self._last_request = time.monotonic()
         with self._lock:
-            losses = json.dumps(self._losses).encode()
-            news = self._news if self._version > after else b"null"
-        return b'{"losses": ' + losses + b', "news": ' + news + b"}"
+            every = -(-len(self._losses) // _MAX_LOSSES) or 1
+            # Counted from the end, because the page states the last loss.
+            losses = json.dumps(self._losses[::-every][::-1]).encode()
+            update = self._update if self._version > after else b"null"
+        return b'{"losses": ' + losses + b', "news": ' + update + b"}"
 
     def close(self) -> None:
-        """Answer nobody any more."""
+        """Stop the server."""
         self._server.shutdown()
         self._server.server_close()
 
@@ -101,31 +99,33 @@ class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "nerfro", ""
 
     def do_GET(self) -> None:
-        shown: PageServer = self.server.page  # type: ignore[attr-defined]
+        page: PageServer = self.server.page  # type: ignore[attr-defined]
         address = urlsplit(self.path)
-        if not self._of_this_page():
-            self._answer(HTTPStatus.FORBIDDEN, b"this page is for browsers that were given its address", "text/plain")
+        if not self._is_same_origin():
+            self._answer(HTTPStatus.FORBIDDEN, b"open the page by the address that nerfro has printed", "text/plain")
         elif address.path == "/":
-            self._answer(HTTPStatus.OK, shown.page(), "text/html; charset=utf-8")
+            self._answer(HTTPStatus.OK, page.page(), "text/html; charset=utf-8")
         elif address.path == "/state":
             after = parse_qs(address.query).get("after", ["0"])[0]
-            known = int(after) if after.isascii() and after.isdigit() else 0
-            self._answer(HTTPStatus.OK, shown.state(known), "application/json")
+            version = int(after) if after.isascii() and after.isdigit() else 0
+            self._answer(HTTPStatus.OK, page.state(version), "application/json")
         else:
-            self._answer(HTTPStatus.NOT_FOUND, b"there is nothing here but the page", "text/plain")
+            self._answer(HTTPStatus.NOT_FOUND, b"this server has only the page at /", "text/plain")
 
-    def _of_this_page(self) -> bool:
-        """A name that leads here from elsewhere (DNS rebinding) and pages of other origins are refused."""
+    def _is_same_origin(self) -> bool:
+        """Check the headers of the request, to refuse pages of other origins and DNS rebinding."""
         host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
         try:
-            name = urlsplit(f"//{host}").hostname
-        except ValueError:  # no address at all
+            name = urlsplit(f"//{host}").hostname or ""
+            if name not in ("localhost", socket.gethostname().lower()):
+                ipaddress.ip_address(name)
+        except ValueError:  # neither a name of this machine nor an address
             return False
-        return _names_this_machine(name) and origin in (None, f"http://{host}")
+        return origin in (None, f"http://{host}")
 
-    def _answer(self, status: HTTPStatus, body: bytes, kind: str) -> None:
+    def _answer(self, status: HTTPStatus, body: bytes, content_type: str) -> None:
         self.send_response(status)
-        self.send_header("Content-Type", kind)
+        self.send_header("Content-Type", content_type)
         self.send_header("Content-Length", str(len(body)))
         self.send_header("Cache-Control", "no-store")
         self.send_header("Cross-Origin-Resource-Policy", "same-origin")
@@ -134,14 +134,4 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *arguments: object) -> None:
-        """Say nothing: the terminal belongs to the training."""
-
-
-def _names_this_machine(name: str | None) -> bool:
-    if name in ("localhost", socket.gethostname().lower()):
-        return True
-    try:
-        ipaddress.ip_address(name or "")
-    except ValueError:
-        return False
-    return True
+        """Suppress the log, because the terminal shows the progress of the training."""

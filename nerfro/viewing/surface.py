@@ -1,4 +1,4 @@
-"""The surfaces of a medium as triangles."""
+"""Triangulation of the surfaces of a medium and of level sets on grids."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
 
-# Vertices a side of the grid on which the distance of a body that has no mesh is asked.
-_RESOLUTION = 128
-# Triangles of a separate part that is left out, as a share of those of the largest.
-_CRUMB = 0.02
+_ANALYTIC_RESOLUTION = 128  # vertices per side of the grid on which distances in closed form are sampled
+_MIN_COMPONENT = 0.02  # triangles of the smallest component that is kept, relative to the largest component
 
 
 @torch.no_grad()
 def surface_of(medium: Medium, triangles: bool) -> list[TriangleMesh]:
-    """The surface of each body with the normals that rays bend at, world units.
+    """Triangulate the surface of each body, with the normals at which rays bend; world units.
 
     Args:
-        medium: of solid bodies.
-        triangles: whether rays meet the triangles of its meshes, and not the zero levels of its signed distances.
+        medium: medium of solid bodies.
+        triangles: whether rays intersect the triangles of the medium instead of the zero levels of its distances.
     """
     if not isinstance(medium, Solid):
-        raise NerfroError(f"{type(medium).__name__} has no surface: its index varies continuously, or it is none")
+        raise NerfroError(
+            f"{type(medium).__name__} has no surface, because its index varies continuously or is 1; "
+            "train with medium=sdf_grid"
+        )
     if triangles and isinstance(medium, SdfGrid):
         return _meshes(medium.triangles())
     return [_zero_level(medium, body, values) for body, values in enumerate(_distances(medium))]
@@ -46,17 +47,20 @@ def _meshes(triangles: Triangles) -> list[TriangleMesh]:
 
 
 def _zero_level(medium: Solid, body: int, values: Float[Tensor, "X Y Z"]) -> TriangleMesh:
-    """Marching cubes, and a step of Newton's method for each vertex: the grid's own interpolation is not linear."""
+    """Triangulate with marching cubes, then improve each vertex by a Newton step on the distance of the medium.
+
+    The step is needed because marching cubes interpolates linearly, and the medium does not.
+    """
     mesh = level_set(-values, medium.box.cpu(), 0.0)
     vertices = torch.from_numpy(mesh.vertices).to(medium.box)
-    phi, gradient = (found[:, body] for found in medium.regions(vertices))
+    phi, gradient = (value[:, body] for value in medium.regions(vertices))
     vertices = vertices - phi[:, None] * gradient / gradient.square().sum(-1, keepdim=True).clamp(min=1e-6)
     normals = torch.nn.functional.normalize(medium.regions(vertices)[1][:, body], dim=-1).cpu().numpy()
     return TriangleMesh(vertices.double().cpu().numpy(), mesh.faces, normals[mesh.faces])
 
 
 def _distances(medium: Solid) -> Float[Tensor, "K X Y Z"]:
-    counts = medium.coefficients.shape[1:] if isinstance(medium, SdfGrid) else [_RESOLUTION] * 3
+    counts = medium.coefficients.shape[1:] if isinstance(medium, SdfGrid) else [_ANALYTIC_RESOLUTION] * 3
     box = medium.box.cpu()
     axes = [torch.linspace(float(low), float(high), n) for low, high, n in zip(*box, counts, strict=True)]
     slabs = [medium.regions(torch.cartesian_prod(x[None], *axes[1:]).to(medium.box))[0].cpu() for x in axes[0]]
@@ -64,31 +68,34 @@ def _distances(medium: Solid) -> Float[Tensor, "K X Y Z"]:
 
 
 def level_set(values: Float[Tensor, "X Y Z"], box: Float[Tensor, "2 3"], level: float) -> TriangleMesh:
-    """Where values at the vertices of a grid over a box cross a level, by marching cubes; faces look to lower values.
+    """Extract a level set of values at the vertices of a grid over a box; faces point towards lower values.
 
     Raises:
-        NerfroError: they cross it nowhere.
+        NerfroError: the level is outside the range of the values.
     """
     from skimage.measure import marching_cubes
 
     volume = values.numpy()
     if not volume.min() < level < volume.max():
-        raise NerfroError(f"nothing crosses {level:g}: values lie between {volume.min():g} and {volume.max():g}")
+        raise NerfroError(
+            f"the level {level:g} is outside the range of the values, {volume.min():g} to {volume.max():g}; "
+            "choose a level inside"
+        )
     spacing = (box[1] - box[0]).double().numpy() / (np.array(volume.shape) - 1)
     vertices, faces, _, _ = marching_cubes(volume, level, gradient_direction="ascent")
     return TriangleMesh(vertices * spacing + box[0].double().numpy(), faces.astype(np.int64))
 
 
-def without_crumbs(mesh: TriangleMesh) -> TriangleMesh:
-    """The mesh without its small separate parts: what a field invents to explain edges and reflections of glass."""
+def largest_components(mesh: TriangleMesh) -> TriangleMesh:
+    """Remove small separate components, which are artefacts that explain edges and reflections of the glass."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     size = len(mesh.vertices)
     first, second = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
-    joined = coo_array((np.ones(len(first), np.int8), (first, second)), (size, size))
-    _, part = connected_components(joined, directed=False)
-    counts = np.bincount(part[mesh.faces[:, 0]], minlength=part.max() + 1)
-    faces = mesh.faces[counts[part[mesh.faces[:, 0]]] >= _CRUMB * counts.max()]
-    used, index = np.unique(faces, return_inverse=True)
+    adjacency = coo_array((np.ones(len(first), np.int8), (first, second)), (size, size))
+    _, component = connected_components(adjacency, directed=False)
+    component = component[mesh.faces[:, 0]]
+    counts = np.bincount(component)
+    used, index = np.unique(mesh.faces[counts[component] >= _MIN_COMPONENT * counts.max()], return_inverse=True)
     return TriangleMesh(mesh.vertices[used], index.reshape(-1, 3))

@@ -1,4 +1,4 @@
-"""A trained scene: render it from anywhere, look at its parts, and change them."""
+"""A trained scene: rendering from any camera, access to its components, and modified copies."""
 
 from __future__ import annotations
 
@@ -27,32 +27,40 @@ from nerfro.variants import variant
 from nerfro.viewing.changes import with_absorption, with_indices, with_sky, without_glass, without_inside
 from nerfro.viewing.surface import surface_of
 
-# Rows of the sky that `TrainedScene.sky` is drawn with: the default environment map's finest texels.
-SKY_HEIGHT = 512
+SKY_HEIGHT = 512  # rows of `TrainedScene.sky`: the finest level of the default environment map
 
 
 class RenderedViews(NamedTuple):
-    """Pictures of V cameras, on the CPU. It unpacks in this order: `rgb, depth, opacity, normals, exits, radiance`."""
+    """Images of V cameras, on the CPU, in the order `rgb, depth, opacity, normals, exits, radiance`.
 
-    rgb: Float[Tensor, "V H W 3"]  # sRGB in [0, 1]
-    # Expected arc length along the bent ray of what is inside, world units; the path's end where nothing is.
+    Attributes:
+        rgb: sRGB in [0, 1].
+        depth: expected arc length of the content along the bent ray, world units; the end of the path in empty pixels.
+        opacity: opacity of the content, from 0 to 1.
+        normals: unit normals at the first intersection with the glass, towards the camera; zero where rays miss the
+            glass.
+        exit_directions: unit directions in which the rays leave the scene.
+        radiance: linear radiance, not bounded above.
+    """
+
+    rgb: Float[Tensor, "V H W 3"]
     depth: Float[Tensor, "V H W"]
-    opacity: Float[Tensor, "V H W"]  # of what is inside, 0 to 1
-    normals: Float[Tensor, "V H W 3"]  # of the surface where it is first met, towards the camera; zero beside the glass
-    exit_directions: Float[Tensor, "V H W 3"]  # unit directions in which rays leave for the sky
-    radiance: Float[Tensor, "V H W 3"]  # linear, unbounded above
+    opacity: Float[Tensor, "V H W"]
+    normals: Float[Tensor, "V H W 3"]
+    exit_directions: Float[Tensor, "V H W 3"]
+    radiance: Float[Tensor, "V H W 3"]
 
 
 @dataclass(frozen=True)
 class TrainedScene:
-    """A trained model with the data that it was trained on; `nerfro.load` makes one of a run.
+    """A trained model with its training data; `nerfro.load` reads the scene of a run.
 
     Attributes:
-        model: the radiance field, glass and sky, in evaluation.
-        source: the data set.
-        subdivision: rays a pixel, as the run was evaluated.
-        name: of the experiment.
-        content: corners of the box outside of which the field holds nothing, world units, where it has one.
+        renderer: renderer of the learned scene, in evaluation mode.
+        source: data set.
+        subdivision: rays per pixel; the default is the subdivision of the run's evaluation.
+        name: name of the experiment.
+        content: corners of the box outside of which the field is empty, world units; None if the box is unknown.
     """
 
     renderer: Renderer
@@ -62,11 +70,11 @@ class TrainedScene:
     content: Float[Tensor, "2 3"] | None = None
 
     def views(self, split: str = "test") -> Views:
-        """Cameras, photographs and masks of a split of the data."""
+        """Load the cameras, photographs and masks of a split of the data."""
         return self.source.load(split)
 
     def cameras(self, split: str = "test") -> Cameras:
-        """The cameras of a split of the data, on the scene's device."""
+        """Load the cameras of a split of the data, on the device of the scene."""
         return self.views(split).cameras.to(self.renderer.scene.device)
 
     def render(
@@ -76,18 +84,18 @@ class TrainedScene:
         chunk_size: int | None = None,
         progress: bool = False,
     ) -> RenderedViews:
-        """Render each camera, in chunks that bound the memory.
+        """Render images of cameras, in chunks that limit the memory.
 
         Args:
-            cameras: on any device; see `nerfro.cameras.Cameras` for their axes.
-            subdivision: rays a pixel, as the run was evaluated by default; `Subdivision()` gives each pixel one.
-            chunk_size: rays rendered at once, as the run was evaluated by default.
-            progress: whether to show a bar with the time that is left.
+            cameras: cameras on any device; see `nerfro.cameras.Cameras` for their axes.
+            subdivision: rays per pixel, by default those of the run's evaluation; `Subdivision()` means one ray.
+            chunk_size: rays rendered at once, by default those of the run's evaluation.
+            progress: whether to show a progress bar.
         """
         scene = self if chunk_size is None else replace(self, renderer=variant(self.renderer, chunk_size=chunk_size))
         views = tqdm(range(len(cameras)), unit="view", desc="render", disable=not progress, dynamic_ncols=True)
         rendered = [scene._render_view(cameras, view, subdivision or self.subdivision) for view in views]
-        return RenderedViews(*(torch.stack(parts) for parts in zip(*rendered, strict=True)))
+        return RenderedViews(*(torch.stack(images) for images in zip(*rendered, strict=True)))
 
     def _render_view(self, cameras: Cameras, view: int, subdivision: Subdivision) -> tuple[Tensor, ...]:
         found = render_view(self.renderer, cameras.to(self.renderer.scene.device), view, subdivision)
@@ -98,45 +106,48 @@ class TrainedScene:
 
     @property
     def sky(self) -> Float[Tensor, "512 1024 3"]:
-        """What is seen beyond the volume, from its middle: linear radiance, lat-long, z up (see `files.lat_long`)."""
+        """Background as a lat-long image of linear radiance, z up (see `files.lat_long`)."""
         return self.sky_of_height(SKY_HEIGHT)
 
     def sky_of_height(self, height: int) -> Float[Tensor, "H 2*H 3"]:
-        """`sky` with another number of rows."""
-        return self.seen_beyond(lat_long.directions(height).view(-1, 3)).view(height, 2 * height, 3)
+        """Evaluate the background as a lat-long image with a given number of rows."""
+        return self.background(lat_long.directions(height).view(-1, 3)).view(height, 2 * height, 3)
 
     @torch.inference_mode()
-    def seen_beyond(self, directions: Float[Tensor, "D 3"]) -> Float[Tensor, "D 3"]:
-        """Linear radiance from beyond the volume in unit directions, as seen from its middle; on the CPU."""
+    def background(self, directions: Float[Tensor, "D 3"]) -> Float[Tensor, "D 3"]:
+        """Evaluate the linear background radiance in unit directions, seen from the centre of the scene."""
         scene = self.renderer.scene
-        parts = directions.to(scene.device).split(self.renderer.chunk_size)
-        radiance = torch.cat([scene.boundary(Exits(part)) for part in parts])
+        chunks = directions.to(scene.device).split(self.renderer.chunk_size)
+        radiance = torch.cat([scene.boundary(Exits(chunk)) for chunk in chunks])
         return scene.colour_space.to_linear(radiance.float()).cpu()
 
     @property
     def surface(self) -> list[TriangleMesh]:
-        """The surfaces on which rays bend, the outer body's first; world units."""
+        """Surfaces on which rays bend, starting with the outer body; world units."""
         return surface_of(self.renderer.scene.medium, getattr(self.renderer.path_sampler, "interface", "sdf") == "mesh")
 
     @property
     def field(self) -> Field:
-        """The radiance field that the finest sampling level asks."""
+        """Radiance field of the finest sampling level."""
         finest: Field = self.renderer.scene.fields[-1]  # type: ignore[assignment]
         return finest
 
     @property
     def ior(self) -> Float[Tensor, "K"]:
-        """Refractive index of each body, the outer one's first; none without bodies."""
+        """Refractive index of each body, starting with the outer body; empty without bodies."""
         return self.renderer.scene.medium.indices.cpu()
 
     @property
     def bounds(self) -> Float[Tensor, "2 3"]:
-        """Corners of the box around the glass, or around all that the field holds where there is no glass."""
+        """Corners of the box around the glass, or without glass around the content; world units."""
         box = self.renderer.scene.medium.content_box.float().cpu()
         if (box[1] > box[0]).all():
             return box
         if self.content is None:
-            raise NerfroError("it is not known where the object is: the run has neither glass nor content.box_min")
+            raise NerfroError(
+                "the position of the object is unknown, because the run has neither glass nor content.box_min; "
+                "train with content.box_min and content.box_max"
+            )
         return self.content
 
     def with_(
@@ -147,22 +158,22 @@ class TrainedScene:
         glass: bool = True,
         inside: bool = True,
     ) -> TrainedScene:
-        """The scene with some parts changed; it shares all others with this one, which stays as it is.
+        """Return a copy with some components replaced; the copy shares all other components.
 
         Args:
-            sky: lat-long picture of linear radiance, or its file (.hdr, .exr, .png, .jpg), instead of the sky.
-            ior: index of the outer body, or of each.
-            absorption: of red, green and blue in the outer body, or in each [K, 3], per world unit.
-            glass: False takes the glass away: all rays are straight.
-            inside: False takes away what is inside.
+            sky: lat-long image of linear radiance, or a file (.hdr, .exr, .png, .jpg), that replaces the background.
+            ior: refractive index of the outer body, or of each body.
+            absorption: absorption of red, green and blue in the outer body [3], or in each body [K, 3], per world unit.
+            glass: False removes the glass, so that all rays are straight.
+            inside: False removes the content of the glass.
 
         Raises:
-            NerfroError: the model has no such part.
+            NerfroError: the model lacks the component, or a value is invalid.
         """
         renderer = self.renderer
         if sky is not None:
-            picture = sky if isinstance(sky, Tensor) else lat_long.load_lat_long(user_path(sky))
-            renderer = with_sky(renderer, picture)
+            image = sky if isinstance(sky, Tensor) else lat_long.load_lat_long(user_path(sky))
+            renderer = with_sky(renderer, image)
         if ior is not None:
             renderer = with_indices(renderer, torch.as_tensor(ior))
         if absorption is not None:

@@ -35,7 +35,7 @@ def test_scale_is_fixed_and_not_fitted_to_the_values() -> None:
 
 
 def test_impossible_maps_are_refused() -> None:
-    with pytest.raises(NerfroError, match="positive, got 0"):
+    with pytest.raises(NerfroError, match="limit=0 of a colour scale"):
         magma(torch.zeros(2, 2), 0)
     with pytest.raises(NerfroError, match="must have the same size"):
         squared_error_map(torch.zeros(2, 2, 3), torch.zeros(2, 1, 3))

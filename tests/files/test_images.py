@@ -39,7 +39,7 @@ def test_diverged_picture_is_refused_and_overwrites_nothing(tmp_path: Path, bad:
     save_png(tmp_path / "picture.png", torch.zeros(4, 4, 3))
     diverged = torch.ones(4, 4, 3)
     diverged[1, 2, 0] = bad
-    with pytest.raises(NerfroError, match="1 of the picture's 48 values"):
+    with pytest.raises(NerfroError, match="1 of the image's 48 values"):
         save_png(tmp_path / "picture.png", diverged)
     assert load_png(tmp_path / "picture.png").max() == 0
 

@@ -11,20 +11,20 @@ import torch
 
 from nerfro.errors import NerfroError
 from nerfro.viewing.camera_files import read_cameras
-from nerfro.viewing.camera_paths import PATHS, Flight, Surroundings, fly
+from nerfro.viewing.camera_paths import PATHS, CaptureGeometry, OrbitPosition, path_cameras
 from nerfro.viewing.trained_scene import TrainedScene
 
 CENTRE = torch.tensor([0.5, -0.2, 0.1])
 
 
 @pytest.fixture
-def around(scene: TrainedScene) -> Surroundings:
-    return Surroundings.of(scene.cameras("train"), torch.stack([CENTRE - 1, CENTRE + 1]))
+def around(scene: TrainedScene) -> CaptureGeometry:
+    return CaptureGeometry.of(scene.cameras("train"), torch.stack([CENTRE - 1, CENTRE + 1]))
 
 
 @pytest.mark.parametrize("name", sorted(PATHS))
-def test_all_cameras_look_at_the_middle_upright(name: str, around: Surroundings) -> None:
-    cameras = fly(around, name, Flight(30, 20, 5.0), 16)
+def test_all_cameras_look_at_the_middle_upright(name: str, around: CaptureGeometry) -> None:
+    cameras = path_cameras(around, name, OrbitPosition(30, 20, 5.0), 16)
     pixels, depth = cameras.project(CENTRE[None])
     torch.testing.assert_close(pixels[:, 0], torch.full((16, 2), 16.0), atol=1e-3, rtol=0)
     assert (depth > 0).all()
@@ -39,8 +39,8 @@ def test_all_cameras_look_at_the_middle_upright(name: str, around: Surroundings)
     assert cameras.far >= distances.max() - around.distance + around.camera.far - 1e-4
 
 
-def test_an_orbit_is_a_circle_that_does_not_repeat_its_beginning(around: Surroundings) -> None:
-    cameras = fly(around, "orbit", Flight(0, 30, 5.0), 8)
+def test_an_orbit_is_a_circle_that_does_not_repeat_its_beginning(around: CaptureGeometry) -> None:
+    cameras = path_cameras(around, "orbit", OrbitPosition(0, 30, 5.0), 8)
     offsets = cameras.camera_to_world[:, :, 3] - CENTRE
     torch.testing.assert_close(offsets.norm(dim=-1), torch.full((8,), 5.0))
     torch.testing.assert_close(offsets[:, 2], torch.full((8,), 5 * math.sin(math.radians(30))))
@@ -49,10 +49,10 @@ def test_an_orbit_is_a_circle_that_does_not_repeat_its_beginning(around: Surroun
     torch.testing.assert_close(steps, steps[:1].expand(8), atol=1e-5, rtol=0)
 
 
-def test_a_dolly_comes_nearer_and_a_spiral_rises(around: Surroundings) -> None:
-    near = fly(around, "dolly", Flight(0, 0, 4.0), 5).camera_to_world[:, :, 3] - CENTRE
+def test_a_dolly_comes_nearer_and_a_spiral_rises(around: CaptureGeometry) -> None:
+    near = path_cameras(around, "dolly", OrbitPosition(0, 0, 4.0), 5).camera_to_world[:, :, 3] - CENTRE
     torch.testing.assert_close(near.norm(dim=-1)[[0, -1]], torch.tensor([6.0, 3.0]))
-    heights = (fly(around, "spiral", Flight(0, 40, 4.0), 9).camera_to_world[:, :, 3] - CENTRE)[:, 2]
+    heights = (path_cameras(around, "spiral", OrbitPosition(0, 40, 4.0), 9).camera_to_world[:, :, 3] - CENTRE)[:, 2]
     assert (heights.diff() > 0).all()
     torch.testing.assert_close(heights[0], -heights[-1])
 
@@ -61,11 +61,11 @@ def test_up_is_what_is_up_in_the_photographs(scene: TrainedScene) -> None:
     cameras = scene.cameras("train")
     turn = torch.tensor([[1.0, 0, 0], [0, 0.0, 1], [0, -1, 0]])  # z to y
     turned = cameras._each(lambda values: turn @ values if values.ndim == 3 else values)
-    found = Surroundings.of(turned, torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    found = CaptureGeometry.of(turned, torch.tensor([[-1.0] * 3, [1.0] * 3]))
     torch.testing.assert_close(found.up, torch.tensor([0.0, 1.0, 0.0]))
 
 
-def test_nerfstudios_camera_path_is_read(around: Surroundings, tmp_path: Path) -> None:
+def test_nerfstudios_camera_path_is_read(around: CaptureGeometry, tmp_path: Path) -> None:
     pose = torch.eye(4)
     pose[:3, 3] = torch.tensor([0.0, 0.0, 4.0])
     places = [{"camera_to_world": pose.flatten().tolist(), "fov": fov, "aspect": 2} for fov in (40, 60)]
@@ -80,7 +80,7 @@ def test_nerfstudios_camera_path_is_read(around: Surroundings, tmp_path: Path) -
         torch.testing.assert_close(pixels[0, 0], torch.tensor([50.0, 0.0]), atol=1e-3, rtol=0)
 
 
-def test_transforms_are_read_without_their_pictures(around: Surroundings, tmp_path: Path) -> None:
+def test_transforms_are_read_without_their_pictures(around: CaptureGeometry, tmp_path: Path) -> None:
     pose = torch.eye(4)
     pose[2, 3] = 3.0
     frames = [{"file_path": "gone.png", "transform_matrix": pose.tolist()}]
@@ -104,7 +104,7 @@ def test_transforms_are_read_without_their_pictures(around: Surroundings, tmp_pa
         ({"frames": [{"transform_matrix": torch.eye(4).tolist()}]}, "has neither 'fl_x'"),
     ],
 )
-def test_damaged_cameras_are_refused(document: dict, message: str, around: Surroundings, tmp_path: Path) -> None:
+def test_damaged_cameras_are_refused(document: dict, message: str, around: CaptureGeometry, tmp_path: Path) -> None:
     (tmp_path / "path.json").write_text(json.dumps(document))
     with pytest.raises(NerfroError, match=message) as refused:
         read_cameras(tmp_path / "path.json", around)

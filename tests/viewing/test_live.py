@@ -13,7 +13,7 @@ from nerfro.viewing import live
 from nerfro.viewing.live import LivePage
 from nerfro.viewing.server import PageServer
 from nerfro.viewing.trained_scene import TrainedScene
-from tests.viewing.chromium import needs_chromium, open_page
+from tests.viewing.browser import Browser, needs_chromium
 
 
 @pytest.fixture
@@ -28,13 +28,13 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """A clock that the test sets; a bake takes three of its seconds."""
     now = [100.0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])
-    bake = live.parts_of
+    bake = live.bake_parts
 
     def slow(*arguments: object) -> dict:
         now[0] += 3
         return bake(*arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(live, "parts_of", slow)
+    monkeypatch.setattr(live, "bake_parts", slow)
     return now
 
 
@@ -73,9 +73,9 @@ def test_browser_shows_news_and_losses(scene: TrainedScene, server: PageServer, 
     server.add_loss(3, 0.5)
     server.add_loss(7, 0.25)
     page.show(scene)
-    dom = open_page(server.url, tmp_path, "--virtual-time-budget=3000", "--dump-dom")
-    assert "step 7, training loss 0.250" in dom
-    assert 'points="428' in dom
+    with Browser(server.url, tmp_path) as browser:
+        browser.wait_for("document.body.textContent.includes('step 7, training loss 0.250')")
+        browser.wait_for("document.querySelector('polyline[points^=\"428\"]') !== null")
     assert server.watched
 
 
@@ -89,7 +89,7 @@ def test_training_serves_its_model(
     assert re.search(r"^nerfro: the model as it learns: http://localhost:\d+$", done.out, re.MULTILINE)
     taken = train_here(*options, f"hydra.run.dir={tmp_path / 'taken'}", f"viewer_port={server.url.rpartition(':')[2]}")
     assert taken.code == 1
-    assert "cannot be served on" in taken.err
+    assert "is not available" in taken.err
     refused = train_here(*tiny_run, *options[-3:-1], f"hydra.run.dir={tmp_path / 'refused'}", "viewer_port=0")
     assert refused.code == 1
     assert "an interactive page shows bodies with a surface" in refused.err

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import base64
+import io
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,10 +34,10 @@ from nerfro.testing import example_draws
 from nerfro.types import Radiance, Samples
 from nerfro.variants import variant
 from nerfro.viewing.changes import with_changed_scene
-from nerfro.viewing.page import page_of, upwards
+from nerfro.viewing.page import make_page
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.media.vessels import spherical_vessel
-from tests.viewing.chromium import ask, needs_chromium, open_page
+from tests.viewing.browser import Browser, needs_chromium
 from tests.viewing.conftest import IOR, RADIUS, sky_of
 
 # The picture of the canvas after one ray a pixel of camera `number`, bottom row first, as text.
@@ -62,6 +64,12 @@ def picture(text: str) -> Float[torch.Tensor, "H W 3"]:
     return torch.from_numpy(pixels.reshape(size, size, 4)[::-1, :, :3] / 255.0).float()
 
 
+def ask(page: str, script: str, folder: Path) -> Any:
+    """Evaluate an expression in a page."""
+    with Browser(page, folder) as browser:
+        return browser.evaluate(script)
+
+
 def one_ray(scene: TrainedScene, cameras: Cameras | None = None) -> Float[torch.Tensor, "V H W 3"]:
     return scene.render(cameras or scene.cameras("test"), Subdivision()).rgb
 
@@ -84,7 +92,7 @@ def glass_cube(scene: TrainedScene) -> TrainedScene:
 @needs_chromium
 def test_five_cameras_of_a_cube_with_bodies_inside_agree_with_nerfro(glass_cube: TrainedScene, tmp_path: Path) -> None:
     views = [0, 4, 8, 12, 16]
-    page = page_of(glass_cube, 64)
+    page = make_page(glass_cube, 64)
     found = ask(page, f"(() => {{ {SHOT} return {views}.map((view) => shot(view, 64)); }})()", tmp_path)
     expected = one_ray(glass_cube, glass_cube.cameras("test").select(views))
     scores = [float(psnr(picture(shot), rgb)) for shot, rgb in zip(found, expected, strict=True)]
@@ -105,7 +113,7 @@ def test_a_vessel_agrees_with_nerfro(scene: TrainedScene, tmp_path: Path) -> Non
       set(indices.at(-1), 1.5);
       return {{ seen, indices, filled: shot(9, 64) }};
     }})()"""
-    found = ask(page_of(vessel_scene, 64), code, tmp_path)
+    found = ask(make_page(vessel_scene, 64), code, tmp_path)
     assert found["indices"] == ["ior0", "ior2"]
     expected = one_ray(vessel_scene, vessel_scene.cameras("test").select([0, 9]))
     assert min(float(psnr(picture(shot), rgb)) for shot, rgb in zip(found["seen"], expected, strict=True)) > 30
@@ -141,7 +149,9 @@ def test_contracted_surroundings_are_shown(scene: TrainedScene, tmp_path: Path) 
         sampler.after_step([field], example_draws(step=step * sampler.update_every))
     renderer = with_changed_scene(scene.renderer, fields=torch.nn.ModuleList([field]))
     everywhere = replace(scene, renderer=variant(renderer, point_sampler=sampler))
-    found = ask(page_of(everywhere, 96), f"(() => {{ {SHOT} return [0, 1, 2].map((v) => shot(v, 32)); }})()", tmp_path)
+    found = ask(
+        make_page(everywhere, 96), f"(() => {{ {SHOT} return [0, 1, 2].map((v) => shot(v, 32)); }})()", tmp_path
+    )
     expected, without = one_ray(everywhere), one_ray(everywhere.with_(inside=False))
     for shot, rgb, empty in zip(found, expected, without, strict=True):
         assert float(psnr(picture(shot), rgb)) > 33
@@ -169,7 +179,7 @@ def test_controls_change_what_they_say(scene: TrainedScene, tmp_path: Path) -> N
         unnamed: [...document.querySelectorAll("input, canvas")].filter((e) => !e.labels?.length && !e.ariaLabel)
           .length }};
     }})()"""
-    found = ask(page_of(scene, 48), script, tmp_path)
+    found = ask(make_page(scene, 48), script, tmp_path)
     shots = {name: picture(text) for name, text in found["shots"].items()}
 
     def agrees(name: str, changed: TrainedScene) -> bool:
@@ -213,11 +223,11 @@ def _check_reflection(scene: TrainedScene, without: torch.Tensor, with_it: torch
 
 @needs_chromium
 def test_fragment_shows_one_camera_alone(scene: TrainedScene, tmp_path: Path) -> None:
-    file = tmp_path / "page.html"
-    file.write_text(page_of(scene, 32), encoding="utf-8")
-    shot = tmp_path / "shot.png"
-    open_page(f"{file.as_uri()}#camera=test_001&size=48", tmp_path, f"--screenshot={shot}", size=(500, 300))
-    with Image.open(shot) as image:
+    (tmp_path / "scene.html").write_text(make_page(scene, 32), encoding="utf-8")
+    address = (tmp_path / "scene.html").as_uri() + "#camera=test_001&size=48"
+    with Browser(address, tmp_path, size=(500, 300)) as browser:
+        screenshot = base64.b64decode(browser.call("Page.captureScreenshot")["data"])
+    with Image.open(io.BytesIO(screenshot)) as image:
         seen = torch.from_numpy(np.array(image.convert("RGB")) / 255.0).float()
     expected = one_ray(scene, scene.cameras("test").select([1]).resized(48, 48))[0]
     assert float(psnr(seen[:48, :48], expected)) > 30
@@ -227,14 +237,12 @@ def test_fragment_shows_one_camera_alone(scene: TrainedScene, tmp_path: Path) ->
 
 @needs_chromium
 def test_browser_without_webgl2_is_told(scene: TrainedScene, tmp_path: Path) -> None:
-    file = tmp_path / "page.html"
-    file.write_text(page_of(scene, 8), encoding="utf-8")
-    dom = open_page(file.as_uri(), tmp_path, "--disable-3d-apis", "--dump-dom")
-    assert "This page needs WebGL2" in dom.partition('id="message"')[2][:200]
+    with Browser(make_page(scene, 8), tmp_path, "--disable-3d-apis") as browser:
+        assert "This page needs WebGL2" in browser.evaluate("$('message').textContent")
 
 
 def test_page_loads_nothing_and_names_its_cameras(scene: TrainedScene) -> None:
-    page = page_of(scene, 8)
+    page = make_page(scene, 8)
     assert 'src="http' not in page
     assert "import " not in page.partition("<script>")[2]
     assert page.count('"name": "test_') == 3
@@ -243,17 +251,10 @@ def test_page_loads_nothing_and_names_its_cameras(scene: TrainedScene) -> None:
 @pytest.mark.parametrize(("branches", "begins"), [("none", "false"), ("all", "true")])
 def test_page_begins_with_the_light_that_the_model_follows(scene: TrainedScene, branches: str, begins: str) -> None:
     scene = replace(scene, renderer=variant(scene.renderer, path_sampler=Snell(branches=branches)))
-    assert f'"reflection": {begins}' in page_of(scene, 8)
+    assert f'"reflection": {begins}' in make_page(scene, 8)
 
 
 def test_page_of_a_medium_without_surface_is_refused(scene: TrainedScene) -> None:
     lens = replace(scene, renderer=with_changed_scene(scene.renderer, medium=Luneburg()))
     with pytest.raises(NerfroError, match="bodies with a surface"):
-        page_of(lens, 8)
-
-
-def test_up_is_where_cameras_have_it(scene: TrainedScene) -> None:
-    cameras = scene.cameras("test")
-    assert upwards(cameras).tolist() == [0, 0, 1]
-    turn = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    assert upwards(replace(cameras, camera_to_world=turn @ cameras.camera_to_world)).tolist() == [0, 1, 0]
+        make_page(lens, 8)

@@ -1,4 +1,4 @@
-"""What a person does with a page: pointers, fingers, keys and dropped files change what they should."""
+"""Input on a page: pointers, fingers, keys and dropped files."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ import torch
 
 from nerfro.evaluation.metrics import psnr
 from nerfro.files import lat_long
-from nerfro.viewing.page import page_of
+from nerfro.viewing.page import make_page
 from nerfro.viewing.trained_scene import TrainedScene
-from tests.viewing.chromium import needs_chromium
-from tests.viewing.devtools import Browser
+from tests.viewing.browser import Browser, needs_chromium
 from tests.viewing.test_page import SHOT, one_ray, picture
 
 pytestmark = needs_chromium
@@ -24,11 +23,8 @@ VIEW = "({ azimuth: page.orbit.azimuth, elevation: page.orbit.elevation, radius:
 
 @pytest.fixture
 def browser(scene: TrainedScene, tmp_path: Path) -> Iterator[Browser]:
-    file = tmp_path / "page.html"
-    file.write_text(page_of(scene, 24), encoding="utf-8")
-    with Browser(file.as_uri(), tmp_path, (800, 400)) as browser:
+    with Browser(make_page(scene, 24), tmp_path, size=(800, 400)) as browser:
         yield browser
-        assert browser.said == [], "nothing may stand in the console"
 
 
 def middle(browser: Browser) -> tuple[float, float]:

@@ -17,27 +17,22 @@ import nerfro.render
 from nerfro.files.lat_long import save_lat_long
 from nerfro.subdivision import Subdivision
 from nerfro.viewing.trained_scene import TrainedScene
+from tests.conftest import finish
 
 
 @pytest.fixture
 def render(
     scene: TrainedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., tuple[int, str]]:
-    """The entry point in this process, on the scene in closed form; exit code and what it printed."""
+    """The entry point in this process, on the scene in closed form; exit code and output."""
     (tmp_path / "a.ckpt").write_bytes(b"scene")
     monkeypatch.setattr(nerfro.render, "load", lambda run, device, root: scene)
     monkeypatch.chdir(tmp_path)
+    common = ["checkpoint=a.ckpt", "out=O", "resolution=16", "subdivision.side=1"]
 
     def run(*arguments: str) -> tuple[int, str]:
-        common = ["checkpoint=a.ckpt", "out=O", "resolution=16", "subdivision.side=1"]
-        monkeypatch.setattr(sys, "argv", ["nerfro.render", *common, *arguments])
-        code = 0
-        try:
-            nerfro.render.main()
-        except SystemExit as end:
-            code = end.code if isinstance(end.code, int) else 1
-        printed = capsys.readouterr()
-        return code, printed.err if code else printed.out
+        done = finish(nerfro.render.main, [*common, *arguments], monkeypatch, capsys)
+        return done.code, done.err if done.code else done.out
 
     return run
 
@@ -84,12 +79,12 @@ def test_an_interrupted_rendering_goes_on_and_another_is_not_mixed_in(render: Ca
     kept = Path("O/frame_0000.png").stat().st_mtime_ns
     code, out = render("path=arc", "frames=3")
     assert code == 0, out
-    assert "2 of 3 frames are there already" in out
+    assert "2 of 3 frames exist already" in out
     assert Path("O/frame_0000.png").stat().st_mtime_ns == kept
     np.testing.assert_array_equal(read("O/frame_0001.png"), whole)
     code, err = render("path=arc", "frames=3", "azimuth=40")
     assert code == 1
-    assert "frame_0000.png shows something else; give another out=... or overwrite=true" in err
+    assert "frame_0000.png belongs to another rendering; give another out=... or overwrite=true" in err
     assert render("path=arc", "frames=3", "azimuth=40", "overwrite=true")[0] == 0
     assert not np.array_equal(read("O/frame_0001.png"), whole)
 
@@ -155,23 +150,23 @@ def test_runs_stand_side_by_side_under_their_names(render: Callable[..., tuple[i
     both = read("O/test_000.png")
     alone = scene.render(scene.cameras().select([0]).resized(64, 64), Subdivision()).rgb[0]
     for left in (0, both.shape[1] - 64):
-        np.testing.assert_allclose(both[-64:, left : left + 64], 255 * alone, atol=0.51)
-        assert both[:-64, left : left + 64].min() < 100, "a label in ink"
+        np.testing.assert_allclose(both[:64, left : left + 64], 255 * alone, atol=0.51)
+        assert both[64:, left : left + 64].min() < 100, "a label in ink"
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "from where is it seen? give one of path=orbit"),
-        (["path=orbit", "views=test"], "from where is it seen?"),
+        ([], "0 options select the cameras (); give exactly one of path=orbit"),
+        (["path=orbit", "views=test"], "2 options select the cameras (path, views)"),
         (["path=loop"], "path=loop is not known; give orbit, spiral, arc, dolly"),
         (["path=nowhere.json"], "nowhere.json does not exist"),
         (["views=test:9"], "test has views 0 to 2"),
         (["position=[1,2]"], "position=[1.0, 2.0] is no point"),
-        (["target=[0,0,0]", "views=test"], "is for a still"),
-        (["views=test", "what=heat"], "what=heat is not allowed; choose one of rgb, depth"),
-        (["views=test", "format=bmp"], "format=bmp is not allowed; choose one of png, exr"),
-        (["path=orbit", "film=[avi]"], "film=['avi'] is not allowed; give some of mp4, gif"),
+        (["target=[0,0,0]", "views=test"], "needs position=[X,Y,Z]"),
+        (["views=test", "what=heat"], "what='heat' is not allowed; choose 'rgb', 'depth'"),
+        (["views=test", "format=bmp"], "format='bmp' is not allowed; choose 'png', 'exr'"),
+        (["path=orbit", "film=[avi]"], "film=['avi'] is not allowed; choose 'mp4', 'gif'"),
         (["views=test", "resolution=[1,2,3]"], "resolution=[1, 2, 3] is not allowed"),
         (["views=test", "resolution=0"], "resolution=0 is not allowed"),
         (["views=test", "sweep=medium.ior:1"], "sweep=medium.ior:1 is not known; give medium.ior:FROM:TO"),

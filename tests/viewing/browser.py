@@ -1,32 +1,47 @@
-"""A headless browser that is driven as by a person: real pointers, touches, keys and dropped files.
+"""Headless Chromium with software WebGL2, driven with real pointers, touches, keys and dropped files.
 
-Speaks the DevTools protocol through a pair of pipes (https://chromedevtools.github.io/devtools-protocol).
+Commands use the DevTools protocol through a pair of pipes (https://chromedevtools.github.io/devtools-protocol).
 """
 
 from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import time
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from tests.viewing.chromium import OPTIONS
+import pytest
+
+needs_chromium = pytest.mark.skipif(shutil.which("chromium") is None, reason="Chromium is not installed")
+_OPTIONS = ("--headless=new", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader",
+            "--enable-unsafe-swiftshader", "--hide-scrollbars", "--touch-events=enabled",
+            "--remote-debugging-pipe")  # fmt: skip
 
 
 class Browser:
-    """One page in a browser of its own; what its console says is kept in `said`."""
+    """One page in a browser of its own. At the end, the page must not have written to the console.
 
-    def __init__(self, address: str, folder: Path, size: tuple[int, int]) -> None:
+    Args:
+        page: address or content of the page.
+        folder: folder for temporary files.
+        options: further options of the command line.
+        size: size of the window in pixels.
+    """
+
+    def __init__(self, page: str, folder: Path, *options: str, size: tuple[int, int] = (900, 600)) -> None:
+        if not page.startswith(("http:", "file:")):
+            (folder / "page.html").write_text(page, encoding="utf-8")
+            page = (folder / "page.html").as_uri()
         to_browser, self._write = os.pipe()
         self._read, from_browser = os.pipe()
         shell = f'exec chromium "$@" 3<&{to_browser} 4>&{from_browser}'
-        options = [*OPTIONS, f"--user-data-dir={folder / 'profile'}", f"--window-size={size[0]},{size[1]}",
-                   "--touch-events=enabled", "--remote-debugging-pipe", "about:blank"]  # fmt: skip
+        folders = f"--user-data-dir={folder / 'profile'}", f"--window-size={size[0]},{size[1]}"
         self._browser = subprocess.Popen(
-            ["bash", "-c", shell, "chromium", *options],
+            ["bash", "-c", shell, "chromium", *_OPTIONS, *folders, *options, "about:blank"],
             pass_fds=(to_browser, from_browser),
             stderr=subprocess.DEVNULL,
         )
@@ -34,15 +49,14 @@ class Browser:
         os.close(from_browser)
         self._number, self._left = 0, b""
         self._session: str | None = None
-        self.said: list[str] = []
-        page = self.call("Target.createTarget", url="about:blank")["targetId"]
-        self._session = self.call("Target.attachToTarget", targetId=page, flatten=True)["sessionId"]
+        self._console: list[str] = []
+        target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         self.call("Runtime.enable")
         self.call("Page.enable")
-        self.call("Page.navigate", url=address)
+        self.call("Page.navigate", url=page)
         while self._receive().get("method") != "Page.loadEventFired":
             pass
-        self.wait_for("page !== null")
 
     def __enter__(self) -> Browser:
         return self
@@ -54,9 +68,10 @@ class Browser:
         self._browser.wait(30)
         os.close(self._write)
         os.close(self._read)
+        assert error is not None or self._console == []
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """What a command of the protocol answers."""
+        """Send a command of the protocol and return the answer."""
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
         if self._session is not None:
@@ -69,7 +84,7 @@ class Browser:
                 return answer["result"]
 
     def evaluate(self, expression: str) -> Any:
-        """The value of an expression in the page."""
+        """Evaluate an expression in the page."""
         found = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
@@ -82,7 +97,7 @@ class Browser:
             time.sleep(0.05)
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], button: str = "left") -> None:
-        """Press a button, move, and let go."""
+        """Press a button, move, and release the button."""
         buttons = {"left": 1, "right": 2}[button]
         named = {"button": button, "buttons": buttons, "clickCount": 1}
         self.call("Input.dispatchMouseEvent", type="mousePressed", x=start[0], y=start[1], **named)
@@ -96,21 +111,21 @@ class Browser:
         self.call("Input.dispatchMouseEvent", type="mouseWheel", x=at[0], y=at[1], deltaX=0, deltaY=down)
 
     def touch(self, *places: list[tuple[float, float]]) -> None:
-        """Fingers that are put down at the first places, moved to the others one after another, and lifted."""
+        """Put fingers down at the first places, move them to the others one after another, and lift them."""
         for kind, fingers in zip(["touchStart", *["touchMove"] * (len(places) - 1)], places, strict=True):
             points = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(fingers)]
             self.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
         self.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
     def press(self, key: str) -> None:
-        """Press a key: a character, or by its name."""
+        """Press a key, given as a character or by name."""
         named: dict[str, Any] = {"key": key, "windowsVirtualKeyCode": 32} if key == " " else {"key": key}
         text = {"text": key} if len(key) == 1 else {}
         self.call("Input.dispatchKeyEvent", type="keyDown", **named, **text)
         self.call("Input.dispatchKeyEvent", type="keyUp", **named)
 
     def drop(self, file: Path, at: tuple[float, float]) -> None:
-        """Drag a file from elsewhere into the page, and let it go."""
+        """Drag a file into the page and drop it."""
         data = {"items": [], "files": [str(file)], "dragOperationsMask": 1}
         for kind in ("dragEnter", "dragOver", "drop"):
             self.call("Input.dispatchDragEvent", type=kind, x=at[0], y=at[1], data=data)
@@ -123,5 +138,5 @@ class Browser:
         text, _, self._left = self._left.partition(b"\0")
         message = json.loads(text)
         if message.get("method") in ("Runtime.consoleAPICalled", "Runtime.exceptionThrown"):
-            self.said.append(json.dumps(message["params"]))
+            self._console.append(json.dumps(message["params"]))
         return message
