@@ -68,7 +68,7 @@ def spoiled(mesh: TriangleMesh, kind: str, share: float) -> TriangleMesh:
 
 def basin(found: Estimate) -> tuple[float, float]:
     """Between which starts the error of a single body falls all the way to the lowest candidate."""
-    values, errors = found.wide.T
+    values, errors = found.coarse.T
     low = high = int(errors.argmin())
     while low > 0 and errors[low - 1] > errors[low]:
         low -= 1

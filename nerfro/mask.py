@@ -23,6 +23,7 @@ from nerfro.capture.mask_files import (
 )
 from nerfro.capture.masking import Segmentation, grab, outline_region, propagate
 from nerfro.capture.outline_hull import AGREES
+from nerfro.capture.overrides import is_given, of_groups
 from nerfro.capture.targets import opencv
 from nerfro.cli import entry_point, warn
 from nerfro.data.base import Frame
@@ -66,9 +67,8 @@ def main(config: DictConfig) -> None:
     _report(frames, found)
     print(f"wrote {len(made)} masks beside their images (mask_*.png); check them in {source.root / _SHEET}")
     print("correct wrong masks in a paint program; or delete them, outline one of these views, and repeat the command")
-    given = [text for text in HydraConfig.get().overrides.task if text.startswith(("data=", "data."))]
-    if not any(text.startswith("data=") for text in given):
-        given = ["data=opencv", *given]
+    given = of_groups(("data",), HydraConfig.get().overrides.task)
+    given = given if is_given("data", given) else ["data=opencv", *given]
     print(f"next: {shlex.join(['python', '-m', 'nerfro.preprocess', *given, 'medium.ior=1.33'])}")
 
 

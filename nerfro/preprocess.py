@@ -1,4 +1,4 @@
-"""`python -m nerfro.preprocess data.root=DIR`: an object's surface by its silhouettes, its index by its pictures."""
+"""`python -m nerfro.preprocess data.root=DIR`: reconstruct the surface and the refractive index of an object."""
 
 from __future__ import annotations
 
@@ -7,27 +7,21 @@ from dataclasses import replace
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
+from jaxtyping import Float
 from omegaconf import DictConfig
 
 from nerfro.capture.camera_refinement import refine_cameras
-from nerfro.capture.medium_search import find_medium, refinable
-from nerfro.capture.overlaps import REPORT, SHEET, draw_overlays, report_overlaps, settled_wrong_masks
+from nerfro.capture.medium_search import FoundMedium, find_medium
+from nerfro.capture.overlaps import choose_wrong_masks, draw_overlays, report_overlaps
 from nerfro.capture.pose_conventions import require_consistent_poses
-from nerfro.capture.preprocess_options import (
-    CAMERAS,
-    MESH,
-    PreprocessConfig,
-    claim,
-    conclude,
-    searches_index,
-    surface_settings,
-)
-from nerfro.capture.refinement_report import FIGURES, PICTURES, refine
+from nerfro.capture.preprocess_options import CAMERAS, MESH, PreprocessConfig, Request, conclude, surface_settings
+from nerfro.capture.refinement_report import refine
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.surface import make_mesh, read_silhouettes, surfaces_inside
-from nerfro.capture.surroundings import Around
+from nerfro.capture.surroundings import Observations
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.cli import entry_point, warn
+from nerfro.data.base import Views
 from nerfro.data.masks import masked_views
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
@@ -39,59 +33,75 @@ from nerfro.viewing.camera_files import write_cameras
 @entry_point("preprocess", PreprocessConfig)
 @torch.no_grad()
 def main(config: DictConfig) -> None:
-    """Carve, fit, compare with the masks, find the index; whatever can be refused is refused before that."""
+    """Reconstruct the surface, search the index, refine the surface if requested, and print the next command."""
     mesh = None if config.mesh is None else load_mesh(resolve_path(config.mesh))
-    overrides = list(HydraConfig.get().overrides.task)
-    folder = claim(config, overrides)
-    views = masked_views(build(config.data).load(config.split))
-    box = None if config.box_min is None else np.array([config.box_min, config.box_max], np.float64)
-    location, written, overlaps, silhouettes = config.mesh, [], None, None
+    request = Request(config, list(HydraConfig.get().overrides.task))
+    request.check()
+    views, silhouettes, overlaps = masked_views(build(config.data).load("train")), None, None
     if mesh is None or views.masks is not None or config.refine_cameras:
-        silhouettes = read_silhouettes(views, box is not None)
-        wrong_masks = settled_wrong_masks(silhouettes, config.wrong_masks)
-        require_consistent_poses(silhouettes, views.names, wrong_masks)
-        carved = mesh is None
-
-        def hull(silhouettes: Silhouettes, voxels: int = config.resolution) -> TriangleMesh:
-            return make_mesh(silhouettes, box, voxels, wrong_masks, config.keep, config.smoothing, config.symmetry)
-
-        if config.refine_cameras:
-            camera = refine_cameras(views, silhouettes, wrong_masks, hull if mesh is None else mesh)
-            write_cameras(folder / CAMERAS, camera, views)
-            written.append(CAMERAS)
-            views = replace(views, cameras=camera.estimated(views.cameras))
-            silhouettes = replace(silhouettes, cameras=views.cameras)
-        if mesh is None:
-            mesh, location = hull(silhouettes), str(folder / MESH)
-            written.append(MESH)
-            mesh.save(folder / MESH)
-        # Pictures and figures first: they help to find out what is wrong with a mesh that the medium then refuses.
-        overlaps = report_overlaps(config.split, views, mesh, silhouettes, wrong_masks if carved else None, folder)
-        written += [SHEET, REPORT]
-    settings = surface_settings(config, views.cameras, mesh, location, overrides)
-    around = Around(views, mesh, config.room)
-    found = find_medium(config, overrides, around, location, settings, folder)
+        views, mesh, silhouettes, overlaps = _reconstruct(request, views, mesh)
+    location = config.mesh or str(request.folder / MESH)
+    settings = surface_settings(request, views.cameras, mesh, location)
+    observations = Observations(views, mesh, config.room)
+    found = find_medium(request, observations, location, settings)
     if config.refine:
         if silhouettes is None:
             silhouettes = Silhouettes.of(views.cameras, mesh_silhouettes(mesh, views.cameras, 1).float())
-        before, location = mesh, str(folder / MESH)
-        written = [MESH, *(name for name in written if name != MESH)]
-        try:
-            mesh = refine(around, mesh, refinable(found), silhouettes, searches_index(config, overrides), folder).mesh
-            written += [FIGURES, PICTURES]
-        except NerfroError as reason:  # all that is known by now is worth keeping
-            warn(f"surface unchanged: {reason}")
-        mesh.save(folder / MESH)
-        settings = surface_settings(config, views.cameras, mesh, location, overrides)
-        if mesh is not before:
+        given, location = mesh, str(request.folder / MESH)
+        mesh = _refine(request, observations, given, found, silhouettes)
+        settings = surface_settings(request, views.cameras, mesh, location)
+        if mesh is not given:
             if overlaps is not None:
-                overlaps = report_overlaps(config.split, views, mesh, silhouettes, None, folder, list_all=False)
-            found = find_medium(config, overrides, around, location, settings, folder)
+                overlaps = report_overlaps(views, mesh, silhouettes, None, request.folder, list_all=False)
+            found = find_medium(request, observations, location, settings)
     inside = surfaces_inside(found.medium)
     if overlaps is not None and inside:
-        draw_overlays(views, mesh, overlaps, inside, folder)
-    settings |= found.settings | ({"camera": "refined"} if config.refine_cameras else {})
-    conclude(folder, [*written, *found.written], settings, overrides, found.doubtful, around.near, views.cameras)
+        draw_overlays(views, mesh, overlaps, inside, request.folder)
+    settings |= {"camera": "refined"} if config.refine_cameras else {}
+    conclude(request, settings, found.index_settings, found.is_doubtful, observations.near, views.cameras)
+
+
+def _reconstruct(
+    request: Request, views: Views, mesh: TriangleMesh | None
+) -> tuple[Views, TriangleMesh, Silhouettes, Float[np.ndarray, "V"]]:
+    """Carve and fit the surface unless a mesh is given, refine the cameras if requested, and compare with the masks.
+
+    Returns:
+        The views with refined cameras, the surface, the silhouettes of the masks, and the overlap of the surface with
+        each mask.
+    """
+    config, folder = request.config, request.folder
+    silhouettes = read_silhouettes(views, request.box is not None)
+    wrong_masks = choose_wrong_masks(silhouettes, config.wrong_masks)
+    require_consistent_poses(silhouettes, views.names, wrong_masks)
+
+    def hull(silhouettes: Silhouettes, voxels: int = config.resolution) -> TriangleMesh:
+        return make_mesh(silhouettes, request.box, voxels, wrong_masks, config.keep, config.smoothing, config.symmetry)
+
+    if config.refine_cameras:
+        camera = refine_cameras(views, silhouettes, wrong_masks, hull if mesh is None else mesh)
+        write_cameras(folder / CAMERAS, camera, views)
+        views = replace(views, cameras=camera.estimated(views.cameras))
+        silhouettes = replace(silhouettes, cameras=views.cameras)
+    surface = hull(silhouettes) if mesh is None else mesh
+    if mesh is None:
+        surface.save(folder / MESH)
+    # The report is written before the medium is built, because the report shows why a medium refuses a surface.
+    overlaps = report_overlaps(views, surface, silhouettes, wrong_masks if mesh is None else None, folder)
+    return views, surface, silhouettes, overlaps
+
+
+def _refine(
+    request: Request, observations: Observations, mesh: TriangleMesh, found: FoundMedium, silhouettes: Silhouettes
+) -> TriangleMesh:
+    """Refine the surface if possible, and save the mesh; returns the given mesh if the surface does not change."""
+    try:
+        medium = found.refinable()
+        mesh = refine(observations, mesh, medium, silhouettes, request.searches_index, request.folder).mesh
+    except NerfroError as reason:  # keep the results so far
+        warn(f"surface unchanged: {reason}")
+    mesh.save(request.folder / MESH)
+    return mesh
 
 
 if __name__ == "__main__":

@@ -115,10 +115,10 @@ def test_a_vessel_stands_upright_in_a_world_whose_z_points_elsewhere(preprocess:
     held = np.array([0.3, 0.9, 0.1]) / np.linalg.norm([0.3, 0.9, 0.1])
     (found,) = (part for part in shlex.split(printed.split("train on it: ")[1]) if part.startswith("medium.up="))
     assert np.array(json.loads(found.split("=")[1])) @ held > 0.99
-    assert "medium.up= says it otherwise" in printed
+    assert "set medium.up= to change the direction" in printed
     given = preprocess(*lengths, "medium.up=[0,0,1]", "overwrite=true")
     assert "medium.up=[0,0,1]" in given
-    assert "says it otherwise" not in given
+    assert "set medium.up=" not in given
 
 
 def test_a_body_of_revolution_is_fitted_where_it_is_asked_for(preprocess: Callable[..., str], capture: Path) -> None:
@@ -152,9 +152,9 @@ def test_nothing_is_overwritten_unasked(preprocess: Callable[..., str], capture:
 def test_supplied_mesh_is_compared_and_kept(preprocess: Callable[..., str], capture: Path, tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(3, RADIUS)
     ball.apply_translation(CENTRE)
-    ball.export(tmp_path / "ball.ply")
-    printed = preprocess(f"mesh={tmp_path / 'ball.ply'}")
-    assert f"medium.mesh={tmp_path / 'ball.ply'}" in printed
+    ball.export(tmp_path / "my ball.ply")
+    printed = preprocess(f"mesh='{tmp_path / 'my ball.ply'}'")
+    assert f'medium.mesh="{tmp_path / "my ball.ply"}"' in printed
     assert not (capture / "mesh.ply").exists()
     assert json.loads((capture / "overlaps.json").read_text())["mean"] > 0.97
 

@@ -20,7 +20,8 @@ from hydra.core.global_hydra import GlobalHydra
 import nerfro.reconstruct
 import nerfro.train
 from nerfro.capture import refinement, refinement_report, stages
-from nerfro.capture.stages import finished, option
+from nerfro.capture.overrides import as_overrides
+from nerfro.capture.stages import run_command
 from nerfro.files.images import save_png
 from tests.ball_photographs import RADIUS, SIZE, cameras, photographs, save
 from tests.conftest import Finished, finish
@@ -95,7 +96,7 @@ class Pretended:
 @pytest.fixture
 def pretended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pretended:
     made = Pretended(tmp_path / "out")
-    monkeypatch.setattr(stages, "finished", made)
+    monkeypatch.setattr(stages, "run_command", made)
     return made
 
 
@@ -120,7 +121,7 @@ def test_photographs_pass_all_stages_once(reconstruct: Reconstruct, pretended: P
     again = reconstruct(*asked)
     assert again.code == 0, again.err
     assert pretended.names == ALL
-    assert again.out.count(" is kept (to make it again, delete it)") == 4
+    assert again.out.count(" is kept (delete the file to repeat the stage)") == 4
 
 
 def test_what_changed_is_followed_by_what_is_made_of_it(
@@ -145,7 +146,7 @@ def test_an_interrupted_training_goes_on(reconstruct: Reconstruct, pretended: Pr
     asked = f"images={photos}", f"out={pretended.out}"
     stopped = reconstruct(*asked)
     assert stopped.code == 130
-    assert stopped.err == "nerfro: interrupted; to go on, start the same command again; train is not done\n"
+    assert stopped.err == "nerfro: interrupted; train is incomplete; repeat the same command to continue\n"
     pretended.ends.clear()
     assert reconstruct(*asked).code == 0
     assert pretended.names == ["calibrate", "preprocess", "train", "train", "summary"]
@@ -159,8 +160,8 @@ def test_a_stage_that_fails_is_named_and_the_others_wait(
     pretended.ends["preprocess"] = 1
     failed = reconstruct(f"images={photos}", f"out={pretended.out}")
     assert failed.code == 1
-    assert failed.err.startswith("nerfro: error: preprocess failed, and the line above says why; ")
-    assert "give preprocess='OPTIONS'" in failed.err
+    assert failed.err.startswith("nerfro: error: preprocess failed for the reason in the line above; ")
+    assert "set preprocess='OPTIONS'" in failed.err
     assert failed.err.count("\n") == 1
     assert pretended.names == ["calibrate", "preprocess"]
     pretended.ends["preprocess"] = 0
@@ -182,17 +183,17 @@ def test_what_was_found_chooses_the_experiment(
     train = pretended.ran[2][1]
     assert train[0] == "+experiment=glass_room"
     assert train[1:5] == ["data=opencv", "medium.ior=1.4", "medium.ior=1.37", "camera.exposure=true"]
-    assert "medium.ior=1.37 fits best, but the photographs do not tell for sure" in done.out
+    assert "training uses the best fit, medium.ior=1.37" in done.out
 
 
 @pytest.mark.parametrize(
     ("overrides", "told"),
     [
         ((), "set out=FOLDER, and images=PHOTOS"),
-        (("images=PHOTOS", "data.root=PHOTOS"), "images= are photographs without poses"),
-        (("images=PHOTOS", "data=blender"), "images= are photographs without poses"),
-        (("data.root=PHOTOS", "masks=PHOTOS"), "masks= belongs to images="),
-        (("images=PHOTOS", "masks=PHOTOS/none"), "none is not a folder; give the one that holds"),
+        (("images=PHOTOS", "data.root=PHOTOS"), "images= is for photographs without poses"),
+        (("images=PHOTOS", "data=blender"), "images= is for photographs without poses"),
+        (("data.root=PHOTOS", "masks=PHOTOS"), "masks= needs images="),
+        (("images=PHOTOS", "masks=PHOTOS/none"), "none is not a folder; give the folder of the masks"),
         (("images=PHOTOS/none",), "none is not a folder; it should hold the images"),
     ],
 )
@@ -209,18 +210,17 @@ def test_a_result_that_was_spoilt_is_refused(reconstruct: Reconstruct, pretended
     asked = f"images={photos}", f"out={pretended.out}"
     reconstruct(*asked)
     pretended.write("surface/preprocess.json", {"options": []})
-    assert "lacks one of doubtful, near, options, pixels; delete it to have it made again" in reconstruct(*asked).err
+    assert "lacks one of doubtful, near, options, pixels; delete the file to repeat" in reconstruct(*asked).err
 
 
 def test_paths_are_quoted_for_hydra() -> None:
-    assert option("out", Path("a/b_c.d")) == "out=a/b_c.d"
-    assert option("out", 'a, "b') == 'out="a, \\"b"'
+    settings = {"out": Path("a/b_c.d"), "runs": ['a, "b', 1.5], "medium.mesh": "my scene/mesh.ply"}
+    assert as_overrides(settings) == ["out=a/b_c.d", 'runs=["a, \\"b",1.5]', 'medium.mesh="my scene/mesh.ply"']
 
 
 def test_a_command_is_left_time_to_save_when_this_process_is_asked_to_end() -> None:
-    program = (
-        "from nerfro.capture.stages import finished; import sys; print(finished([sys.executable, '-c', '''{}''']))"
-    )
+    run = "run_command([sys.executable, '-c', '''{}'''])"
+    program = f"import sys; from nerfro.capture.stages import run_command; print({run})"
     saving = "import signal,time; signal.signal(15, lambda *_: exit(130)); print(0, flush=True); time.sleep(60)"
     process = subprocess.Popen([sys.executable, "-c", program.format(saving)], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -229,7 +229,7 @@ def test_a_command_is_left_time_to_save_when_this_process_is_asked_to_end() -> N
     process.send_signal(signal.SIGINT)  # Ctrl-C would have reached the command too
     process.send_signal(signal.SIGTERM)
     assert process.communicate(timeout=30)[0] == "130\n"
-    assert finished([sys.executable, "-c", "exit(3)"]) == 3
+    assert run_command([sys.executable, "-c", "exit(3)"]) == 3
 
 
 def test_posed_photographs_of_a_ball_become_a_scene(
@@ -253,7 +253,7 @@ def test_posed_photographs_of_a_ball_become_a_scene(
             return int(end.code or 0)
         return 0
 
-    monkeypatch.setattr(stages, "finished", here)
+    monkeypatch.setattr(stages, "run_command", here)
     monkeypatch.setattr(nerfro.train, "find_lpips_networks", lambda *files: ({}, {}))
     short = refinement.RefinementSettings((refinement.Stage(20, 1e-4, (3.0, 1.0)),), 1000)
     fast = functools.partial(refinement.refine_surface, settings=short)
@@ -274,4 +274,4 @@ def test_posed_photographs_of_a_ball_become_a_scene(
     assert (out / "surface" / "refinement.png").is_file()
     assert json.loads((out / "run" / "metrics.json").read_text())["steps"] == 2
     assert "unknown" in (out / "report" / "report.html").read_text()
-    assert reconstruct(*asked).out.count(" is kept (to make it again, delete it)") == 3
+    assert reconstruct(*asked).out.count(" is kept (delete the file to repeat the stage)") == 3

@@ -1,4 +1,4 @@
-"""From photographs and a surface to its index: the search, its figures and its curve."""
+"""Search of the refractive indices with progress bar, report file and plot of the error."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from nerfro.capture.index_search import Estimate, find_indices
-from nerfro.capture.surroundings import Around
+from nerfro.capture.surroundings import Observations
 from nerfro.cli import warn
 from nerfro.files.atomic import atomic_file, write_atomically
 from nerfro.media.solid import Solid
@@ -17,33 +17,30 @@ from nerfro.progress import bar
 INDEX, CURVE = "index.json", "index.png"
 
 
-def search_index(around: Around, medium: Solid, folder: Path) -> Estimate:
-    """Find the indices of a medium's bodies; write index.json and index.png, and print what was found.
+def search_index(observations: Observations, medium: Solid, folder: Path) -> Estimate:
+    """Search the indices of the bodies of a medium, print the result, and write index.json and index.png.
 
     Args:
-        around: what photographs show.
+        observations: observations of the object and its surroundings.
         medium: the bodies.
-        folder: to write to.
+        folder: output folder.
     """
-    through, surroundings = around.through, around.surroundings
-    with bar("search") as told:
-        found = find_indices(medium, through, surroundings, told)
-    for name, value, error, bend in zip(found.names, found.values, found.standard_errors, found.curvature, strict=True):
-        print(f"{name}: {value:.5g} +- {error:.2g} (views resampled); curvature of the error {bend:.3g}")
+    through, surroundings = observations.through, observations.surroundings
+    with bar("search") as progress:
+        found = find_indices(medium, through, surroundings, progress)
+    for name, value, error in zip(found.names, found.values, found.standard_errors, strict=True):
+        print(f"{name}: {value:.5g} +- {error:.2g} (standard error by resampling of the views)")
     for doubt in found.doubts:
-        warn(f"the pictures do not tell the {' and '.join(found.names)}: {doubt}; look at {CURVE}")
-    _draw(found, folder / CURVE)
-    figures = {"ior": _rounded(found.values), "standard_error": _rounded(found.standard_errors), "doubts": found.doubts}
+        warn(f"the photographs do not determine the {' and '.join(found.names)}: {doubt}; look at {CURVE}")
+    _plot(found, folder / CURVE)
+    values, errors = ([round(float(x), 5) for x in each] for each in (found.values, found.standard_errors))
+    figures = {"ior": values, "standard_error": errors, "doubts": found.doubts}
     write_atomically(folder / INDEX, json.dumps(figures, indent=1) + "\n")
     return found
 
 
-def _rounded(values: np.ndarray) -> list[float]:
-    return [round(float(x), 5) for x in values]
-
-
-def _draw(found: Estimate, file: Path) -> None:
-    """Write the error against each number, the lowest over the others': from afar, and near the best."""
+def _plot(found: Estimate, file: Path) -> None:
+    """Plot the error against each index, minimized over the other index, on the coarse and on the last fine grid."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -51,9 +48,9 @@ def _draw(found: Estimate, file: Path) -> None:
     figure = Figure(figsize=(11, 4 * count), layout="constrained", dpi=110)
     for number, axes in enumerate(figure.subplots(count, 2, squeeze=False)):
         best, error = found.values[number], found.standard_errors[number]
-        for plot, tried in zip(axes, (found.wide, found.close), strict=True):
-            values = np.unique(tried[:, number])
-            plot.plot(values, [tried[tried[:, number] == value, -1].min() for value in values], "o-", markersize=4)
+        for plot, grid in zip(axes, (found.coarse, found.fine), strict=True):
+            values = np.unique(grid[:, number])
+            plot.plot(values, [grid[grid[:, number] == value, -1].min() for value in values], "o-", markersize=4)
             plot.axvline(best, color="tab:red", linewidth=1)
             plot.axvspan(best - error, best + error, color="tab:red", alpha=0.2)
             plot.set_xlabel(found.names[number])

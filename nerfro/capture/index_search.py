@@ -1,8 +1,8 @@
-"""The refractive indices of a medium's bodies, found by where its rays end up in known surroundings.
+"""Estimation of the refractive indices of bodies from the directions in which their rays leave.
 
-For each candidate, pixels of the object are traced, and what they show is compared with the surroundings in the
-direction in which their rays leave. The error has one wide valley around the true index: an error of 0.1 turns the
-light that leaves a ball by some degrees, the more the farther from its middle.
+For each candidate, rays through pixels of the object are traced, and the colours of the pixels are compared with the
+known surroundings in the exit directions. The error has one wide valley around the true index: for a ball, an index
+error of 0.1 turns the exit direction by some degrees, and by more at larger impact parameters.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,53 +22,58 @@ from nerfro.media.solid import Solid
 from nerfro.samplers.snell import Snell
 from nerfro.variants import variant
 
-LOWEST, HIGHEST = 1.0, 2.5  # indices that are searched
+LOWEST, HIGHEST = 1.0, 2.5  # range of the search
 _RANGE = HIGHEST - LOWEST
-# Candidates along each axis and pixels of the first look, by how many numbers are looked for.
-_COARSE = {1: (31, 12_000), 2: (13, 4_000)}
-# Candidates along each axis of closer looks, and how far they reach from its middle, as shares of what is searched.
-_AROUND = {1: 9, 2: 5}
-_REACHES = {1: (1 / 30, 1 / 75), 2: (1 / 75, 1 / 75)}
-# Two numbers that trade lie in a narrow valley. Candidates reach farther along it than across, so many times at most;
-# where it leads is told by derivatives at so many pixels: differences over this share of what is searched.
-_ELONGATED, _SLOPE_PIXELS, _DIFFERENCE = 6.0, 6_000, 1 / 300
-# Of a closer look, by how many numbers are looked for, and of one at surroundings that are rendered for each ray.
-_FINE_PIXELS, _NEAR_PIXELS = {1: 60_000, 2: 20_000}, 12_000
-_MOST_LOOKS = 10  # of each reach, until the middle stays where it is
-# Rays with more events, or more than two for each surface, are no help: tiny errors of the surface turn them anywhere.
+
+
+class _Plan(NamedTuple):
+    """Sizes of the search grids. Radii are fractions of the range of the search."""
+
+    coarse_steps: int  # candidates along each axis of the first grid
+    coarse_pixels: int
+    fine_steps: int
+    fine_radii: tuple[float, ...]  # one for each refinement
+    fine_pixels: int
+
+
+# By number of bodies.
+_PLANS = {1: _Plan(31, 12_000, 9, (1 / 30, 1 / 75), 60_000), 2: _Plan(13, 4_000, 5, (1 / 75, 1 / 75), 20_000)}
+_NEAR_PIXELS = 12_000  # near surroundings are rendered for each ray, so fewer pixels are used
+# Maximum number of grids of one radius, which follow the minimum, and usual number of grids, for the progress.
+_MAX_GRIDS, _USUAL_GRIDS = 10, 4
+# The indices of two bodies trade, so their valley is narrow. Grids are elongated along the valley by at most this
+# factor. Finite differences at so many pixels, over this fraction of the range, determine the direction of the valley.
+_MAX_ELONGATION, _SLOPE_PIXELS, _DIFFERENCE = 6.0, 6_000, 1 / 300
+# Rays with more events, or more than two per surface, are left out: small errors of the surface turn them far.
 _MAX_EVENTS = 4
-# Residuals count half at this share of the surroundings' standard deviation: what is inside spoils many pixels.
-_HALF = 0.5
-_RESAMPLES = 200
-# Without a valley so deep (share of the error of unrelated colours), or with a larger standard error (share of what is
-# searched), the pictures do not tell.
-_SHALLOW, _LOOSE = 0.03, 0.02
-_END = 1 / 150  # so near to an end of what is searched (share of it), the lowest error may lie beyond
-# Nor if for less than this share of the pixels it is known where their light comes from.
-_UNKNOWN = 0.1
+# Residuals have half weight at this fraction of the standard deviation of the surroundings, because opaque objects
+# inside the body spoil many pixels.
+_HALF_WEIGHT = 0.5
+_NUM_BOOTSTRAP = 200
+# Limits of a reliable estimate: depth of the valley relative to the error of unrelated colours, standard error and
+# distance from the ends of the search relative to the range, and fraction of the pixels with known surroundings.
+_MIN_DEPTH, _MAX_STANDARD_ERROR, _MIN_DISTANCE_FROM_END, _MIN_KNOWN = 0.03, 0.02, 1 / 150, 0.1
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Refractive indices of bodies, the outer one first, and how they were found.
+    """Estimated refractive indices of K bodies, the outer one first.
 
     Attributes:
-        names: of the bodies' indices, for people.
+        names: names of the indices for messages.
         values: the indices.
-        standard_errors: by resampling views. What is wrong with the surface is not in them.
-        curvature: second derivative of the error along each number.
-        wide, close: candidates of the first look and of the last, with their robust errors in the last column: 0 where
-            all is explained, 1 where nothing is. They are of other pixels and not to be compared.
-        unrelated: the error of colours that have nothing to do with each other.
-        doubts: why the pictures do not tell the numbers; empty where they do.
+        standard_errors: standard errors by resampling of the views; errors of the surface are not included.
+        coarse, fine: candidates of the first and of the last grid, with their mean robust errors in the last column: 0
+            for exact colours, 1 for outliers. The two grids use different pixels and are not comparable.
+        unrelated: mean robust error of unrelated colours.
+        doubts: reasons why the photographs do not determine the indices; empty for a reliable estimate.
     """
 
     names: list[str]
     values: Float[np.ndarray, "K"]
     standard_errors: Float[np.ndarray, "K"]
-    curvature: Float[np.ndarray, "K"]
-    wide: Float[np.ndarray, "C K+1"]
-    close: Float[np.ndarray, "c K+1"]
+    coarse: Float[np.ndarray, "C K+1"]
+    fine: Float[np.ndarray, "c K+1"]
     unrelated: float
     doubts: list[str]
 
@@ -75,73 +81,87 @@ class Estimate:
 def find_indices(
     medium: Solid, through: Pixels, surroundings: Surroundings, progress: Callable[[float], None] = lambda done: None
 ) -> Estimate:
-    """Search the indices of a medium's bodies, one or two, over all that they may be: coarse, then fine.
+    """Search the indices of one or two bodies from coarse to fine grids.
 
     Args:
-        medium: the bodies; each is given one index for all colours.
-        through: pixels that the object fills.
-        surroundings: what is seen around it.
-        progress: is told the share done.
+        medium: the bodies; each receives one index for all wavelengths.
+        through: pixels inside the silhouette of the object.
+        surroundings: known surroundings.
+        progress: called with the completed fraction.
 
     Raises:
         NerfroError: there are more than two bodies, or no ray of the pixels meets the medium.
     """
-    count = len(medium.iors)
-    if count not in _COARSE:
-        raise NerfroError(f"the indices of {count} bodies are not searched for, but of two at most; give medium.ior=")
-    names = ["index"] if count == 1 else [f"index of body {body + 1}" for body in range(count)]
-    num_fine = _NEAR_PIXELS if isinstance(surroundings.boundary, Room) else _FINE_PIXELS[count]
-    search = _Search(medium, through.some(num_fine), surroundings)
-    per_axis, num_pixels = _COARSE[count]
-    num_pixels = min(num_pixels, num_fine // 4)
-    coarse = np.array(list(itertools.product(np.linspace(LOWEST, HIGHEST, per_axis), repeat=count)))
-    share = len(coarse) * num_pixels / (len(coarse) * num_pixels + 4 * _AROUND[count] ** count * num_fine)
-    costs = search.costs(coarse, num_pixels, False, lambda done: progress(share * done)).mean_error()
-    middle = coarse[costs.argmin()]
-    looks = len(_REACHES[count]) * _MOST_LOOKS
-    look = 0
-    for part in _REACHES[count]:
-        steps = np.linspace(-1, 1, _AROUND[count])
-        for _ in range(_MOST_LOOKS):
-            reach = part * _RANGE * search.valley(middle)
-            aside = np.abs(reach).sum(1)
-            middle = middle.clip(LOWEST + aside, HIGHEST - aside)
-            stencil = middle + np.array(list(itertools.product(steps, repeat=count))) @ reach.T
-            begun, look = share + (1 - share) * look / looks, look + 1
-            closest = part == _REACHES[count][-1]
-            fine = search.costs(
-                stencil,
-                num_fine if closest else num_fine // 3,
-                True,
-                lambda done, b=begun: progress(b + (1 - share) * done / looks),  # type: ignore[misc]
-            )
-            errors = fine.mean_error()
-            found, curvature = _lowest(stencil, errors[None], reach)
-            settled = (np.abs(np.linalg.solve(reach, found[0] - middle)) < 0.5).all()
-            middle = found[0].clip(LOWEST, HIGHEST)
-            if settled:
+    num_bodies = len(medium.iors)
+    if num_bodies not in _PLANS:
+        raise NerfroError(
+            f"the medium has {num_bodies} bodies, and at most two indices are searched for; set medium.ior= and "
+            "medium.inner_iors="
+        )
+    plan = _PLANS[num_bodies]
+    if isinstance(surroundings.boundary, Room):
+        plan = plan._replace(coarse_pixels=_NEAR_PIXELS // 4, fine_pixels=_NEAR_PIXELS)
+    coarse, offsets = (_grid(steps, num_bodies) for steps in (plan.coarse_steps, plan.fine_steps))
+    coarse = 0.5 * (LOWEST + HIGHEST + _RANGE * coarse)
+    work = len(coarse) * plan.coarse_pixels + _USUAL_GRIDS * len(offsets) * plan.fine_pixels
+    search = _Search(medium, through.some(plan.fine_pixels), surroundings, lambda done: progress(min(1, done / work)))
+    coarse_errors = _mean_errors(*search.errors(coarse, plan.coarse_pixels, False))
+    middle = coarse[coarse_errors.argmin()]
+    for radius in plan.fine_radii:
+        num_pixels = plan.fine_pixels // (1 if radius == plan.fine_radii[-1] else 3)
+        for _ in range(_MAX_GRIDS):
+            axes = radius * _RANGE * search.valley(middle)
+            extent = np.abs(axes).sum(1)
+            middle = middle.clip(LOWEST + extent, HIGHEST - extent)
+            fine = middle + offsets @ axes.T
+            sums, counts = search.errors(fine, num_pixels, True)
+            errors = _mean_errors(sums, counts)
+            minimum, curvature = _minimum(fine, errors, axes)
+            converged = (np.abs(np.linalg.solve(axes, minimum[0] - middle)) < 0.5).all()
+            middle = minimum[0].clip(LOWEST, HIGHEST)
+            if converged:
                 break
     progress(1.0)
-    num_views = len(fine.counts)
-    weights = np.random.default_rng(0).multinomial(num_views, np.full(num_views, 1 / num_views), _RESAMPLES)
-    spread = _lowest(stencil, fine.mean_error(weights), reach)[0].std(0)
-    known = fine.counts.sum() / max(1, search.num_pixels)
-    doubts = _doubts(names, middle, spread, curvature[0], 1 - errors.min() / search.unrelated, known)
-    wide, close = np.column_stack([coarse, costs]), np.column_stack([stencil, errors])
-    return Estimate(names, middle, spread, curvature[0], wide, close, search.unrelated, doubts)
+    num_views = len(counts)
+    weights = np.random.default_rng(0).multinomial(num_views, np.full(num_views, 1 / num_views), _NUM_BOOTSTRAP)
+    standard_errors = _minimum(fine, _mean_errors(sums, counts, weights), axes)[0].std(0)
+    names = ["index"] if num_bodies == 1 else [f"index of body {body + 1}" for body in range(num_bodies)]
+    depth, known = 1 - errors.min() / search.unrelated, counts.sum() / search.num_pixels
+    doubts = _doubts(names, middle, np.where(curvature[0] > 0, standard_errors, np.inf), depth, known)
+    first, last = np.column_stack([coarse, coarse_errors.T]), np.column_stack([fine, errors.T])
+    return Estimate(names, middle, standard_errors, first, last, search.unrelated, doubts)
 
 
-def _lowest(
-    stencil: Float[np.ndarray, "C K"], errors: Float[np.ndarray, "B C"], reach: Float[np.ndarray, "K K"]
+def _grid(steps: int, num_axes: int) -> Float[np.ndarray, "C K"]:
+    """Return the points of a regular grid in [-1, 1]^K."""
+    return np.array(list(itertools.product(np.linspace(-1, 1, steps), repeat=num_axes)))
+
+
+def _mean_errors(
+    sums: Float[np.ndarray, "C V"], counts: Float[np.ndarray, "V"], weights: Float[np.ndarray, "B V"] | int = 1
+) -> Float[np.ndarray, "B C"]:
+    """Average errors that are summed by view over all pixels, optionally for B weightings of the views."""
+    weights = np.atleast_2d(weights * np.ones_like(counts))
+    return (weights @ sums.T) / (weights @ counts)[:, None].clip(1)
+
+
+def _minimum(
+    candidates: Float[np.ndarray, "C K"], errors: Float[np.ndarray, "B C"], axes: Float[np.ndarray, "K K"]
 ) -> tuple[Float[np.ndarray, "B K"], Float[np.ndarray, "B K"]]:
-    """Where the parabolas through errors around a middle are lowest, and their second derivatives by each number.
+    """Fit a quadratic function to the errors of a grid of candidates, and find its minimum.
 
-    `reach` has in its columns how far the stencil reaches, in directions of its own. A parabola that has no lowest
-    place near the stencil has it at the stencil's best candidate.
+    Args:
+        candidates: points of the grid.
+        errors: B sets of errors.
+        axes: half axes of the grid, in columns.
+
+    Returns:
+        The minima, or the best candidates for functions without a minimum near the grid; and the second derivatives of
+        the function by each index.
     """
-    count, middle = stencil.shape[1], stencil.mean(0)
-    back = np.linalg.inv(reach)
-    x = (stencil - middle) @ back.T
+    count, middle = candidates.shape[1], candidates.mean(0)
+    inverse = np.linalg.inv(axes)
+    x = (candidates - middle) @ inverse.T
     pairs = list(itertools.combinations_with_replacement(range(count), 2))
     terms = np.stack([np.ones(len(x)), *x.T, *(x[:, i] * x[:, j] for i, j in pairs)], 1)
     fitted = errors @ np.linalg.pinv(terms).T
@@ -149,110 +169,114 @@ def _lowest(
     for (i, j), factor in zip(pairs, fitted[:, 1 + count :].T, strict=True):
         hessian[:, i, j] += factor
         hessian[:, j, i] += factor
-    regular = np.linalg.eigvalsh(hessian)[:, 0] > 1e-9
-    hessian_or_one = np.where(regular[:, None, None], hessian, np.eye(count))
-    place = -np.linalg.solve(hessian_or_one, fitted[:, 1 : 1 + count, None])[..., 0]
-    near = regular & (np.abs(place).max(1) < 1.5)
-    place = np.where(near[:, None], place, x[errors.argmin(1)])
-    return middle + place @ reach.T, np.diagonal(back.T @ hessian @ back, axis1=1, axis2=2)
+    convex = np.linalg.eigvalsh(hessian)[:, 0] > 1e-9
+    invertible = np.where(convex[:, None, None], hessian, np.eye(count))
+    minimum = -np.linalg.solve(invertible, fitted[:, 1 : 1 + count, None])[..., 0]
+    near = convex & (np.abs(minimum).max(1) < 1.5)
+    minimum = np.where(near[:, None], minimum, x[errors.argmin(1)])
+    return middle + minimum @ axes.T, np.diagonal(inverse.T @ hessian @ inverse, axis1=1, axis2=2)
 
 
-def _doubts(
-    names: list[str], values: np.ndarray, standard_errors: np.ndarray, curvature: np.ndarray, depth: float, known: float
-) -> list[str]:
+def _doubts(names: list[str], values: np.ndarray, standard_errors: np.ndarray, depth: float, known: float) -> list[str]:
+    """List the reasons why the photographs do not determine the indices."""
     doubts = []
-    if known < _UNKNOWN:
-        doubts.append(f"of {1 - known:.0%} of the object's light no photograph shows where it comes from")
-    if depth < _SHALLOW:
+    if known < _MIN_KNOWN:
+        doubts.append(f"for {1 - known:.0%} of the object's pixels no photograph shows the origin of the light")
+    if depth < _MIN_DEPTH:
         doubts.append(
-            f"the best {' and '.join(names)} explains only {max(0.0, depth):.1%} of what unrelated colours "
-            "leave unexplained: the object may be opaque, or its surroundings not known where its light comes from"
+            f"the best {' and '.join(names)} reduces the error of unrelated colours by only {max(0.0, depth):.1%}: the "
+            "object may be opaque, or the surroundings are unknown in the exit directions"
         )
-    end = _END * _RANGE
-    for name, value, error, bend in zip(names, values, standard_errors, curvature, strict=True):
+    end = _MIN_DISTANCE_FROM_END * _RANGE
+    for name, value, error in zip(names, values, standard_errors, strict=True):
         if not LOWEST + end < value < HIGHEST - end:
-            doubts.append(f"the {name} is at the end of what is searched, {LOWEST:.4g} to {HIGHEST:.4g}")
-        elif bend <= 0 or error > _LOOSE * _RANGE:
-            doubts.append(f"the {name} has a standard error of {error:.2g}: views do not agree on it")
+            doubts.append(f"the {name} is at an end of the search range, {LOWEST:.4g} to {HIGHEST:.4g}")
+        elif error > _MAX_STANDARD_ERROR * _RANGE:
+            doubts.append(f"the {name} has a standard error of {error:.2g}: the views do not agree")
     return doubts
 
 
-@dataclass(frozen=True)
-class _Costs:
-    """Robust errors of candidates: sums over the pixels of each view, and how many pixels there are."""
-
-    sums: Float[np.ndarray, "C V"]
-    counts: Float[np.ndarray, "V"]
-
-    def mean_error(self, weights: Float[np.ndarray, "B V"] | None = None) -> np.ndarray:
-        """Mean over pixels of each candidate [C], or of each weighting of views [B, C]."""
-        if weights is None:
-            return self.sums.sum(1) / self.counts.sum().clip(1)
-        return (weights @ self.sums.T) / (weights @ self.counts)[:, None].clip(1)
-
-
 class _Search:
-    def __init__(self, medium: Solid, through: Pixels, surroundings: Surroundings) -> None:
-        self._white, self._surroundings = variant(medium, abbe=[]), surroundings
-        medium = self._white.with_indices(torch.full_like(medium.iors, 0.5 * (LOWEST + HIGHEST)))
+    """Errors of candidate indices at pixels of the object; `progress` is called with the number of traced rays."""
+
+    def __init__(
+        self, medium: Solid, through: Pixels, surroundings: Surroundings, progress: Callable[[int], None]
+    ) -> None:
+        self._achromatic, self._surroundings = variant(medium, abbe=[]), surroundings
+        self._progress, self._num_traced = progress, 0
+        medium = self._achromatic.with_indices(torch.full_like(medium.iors, 0.5 * (LOWEST + HIGHEST)))
         self._sampler = Snell(max_events=max(_MAX_EVENTS, 2 * len(medium.iors)))
         self._pixels = through[self._sampler(through.rays, medium).refracted]
         self.num_pixels = len(self._pixels)
         if not self.num_pixels:
-            raise NerfroError("no ray of the object's pixels meets its surface; mesh and poses do not belong together")
+            raise NerfroError(
+                "no ray of the object's pixels meets the surface; check that mesh, masks and poses belong together"
+            )
         colours = surroundings.colours
-        self._half = max(_HALF * float(colours.std(0).mean()), 1e-3)
+        self._half_weight = max(_HALF_WEIGHT * float(colours.std(0).mean()), 1e-3)
         other = colours[torch.randint(len(colours), (len(self._pixels),), generator=torch.Generator().manual_seed(1))]
-        self.unrelated = float(robust(other - self._pixels.radiance, self._half).mean())
+        self.unrelated = float(robust(other - self._pixels.radiance, self._half_weight).mean())
 
-    def valley(self, place: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K K"]:
-        """In columns, in shares of what is searched: directions across a valley and along it, where it is long.
+    def valley(self, values: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K K"]:
+        """Return directions across and along the valley of the error, in columns, elongated along the valley.
 
-        Of a single number it is 1. By products of the derivatives of robust residuals with each other.
+        The directions are the eigenvectors of the Gauss-Newton matrix of the robust residuals. For one index the
+        result is 1.
         """
-        count = len(place)
+        count = len(values)
         if count == 1:
             return np.eye(count)
         pixels = self._pixels.some(_SLOPE_PIXELS)
-        residuals, known = self._residuals(pixels, place)
-        derivatives = []
-        for away in _DIFFERENCE * _RANGE * np.eye(count):
-            (ahead, known_ahead), (behind, known_behind) = (self._residuals(pixels, place + d) for d in (away, -away))
-            derivatives.append(ahead - behind)
-            known &= known_ahead & known_behind
-        weights = (self._half**2 / (residuals.square().mean(-1) + self._half**2)).square()
-        slopes = torch.stack(derivatives, -1)[known].double()
-        products = torch.einsum("p,pci,pcj->ij", weights[known].double(), slopes, slopes).numpy()
-        values, directions = np.linalg.eigh(products)
-        if not values.max() > 0:  # nothing is known of any pixel
+        residuals, known = self._residuals(pixels, values)
+        slopes = []
+        for offset in _DIFFERENCE * _RANGE * np.eye(count):
+            (after, known_after), (before, known_before) = (
+                self._residuals(pixels, values + each) for each in (offset, -offset)
+            )
+            slopes.append(after - before)
+            known &= known_after & known_before
+        weights = (self._half_weight**2 / (residuals.square().mean(-1) + self._half_weight**2)).square()
+        jacobian = torch.stack(slopes, -1)[known].double()
+        products = torch.einsum("p,pci,pcj->ij", weights[known].double(), jacobian, jacobian).numpy()
+        eigenvalues, directions = np.linalg.eigh(products)
+        if not eigenvalues.max() > 0:  # the surroundings are unknown for all pixels
             return np.eye(count)
-        return directions * np.sqrt(values.max() / values.clip(1e-9 * values.max())).clip(max=_ELONGATED)
+        ratio = eigenvalues.max() / eigenvalues.clip(1e-9 * eigenvalues.max())
+        return directions * np.sqrt(ratio).clip(max=_MAX_ELONGATION)
 
     def _residuals(
         self, pixels: Pixels, values: Float[np.ndarray, "K"]
     ) -> tuple[Float[torch.Tensor, "P 3"], Bool[torch.Tensor, "P"]]:
-        """How far off pixels are with a candidate, and for which it is known."""
-        medium = self._white.with_indices(torch.from_numpy(values.clip(LOWEST, HIGHEST)))
+        """Compute the residuals of pixels for one candidate, and whether the residuals are known."""
+        medium = self._achromatic.with_indices(torch.from_numpy(values.clip(LOWEST, HIGHEST)))
         trace = self._sampler.trace(pixels.rays, medium)
         radiance, known = self._surroundings.radiance(trace.path.exits())
         return radiance - pixels.radiance, known & ~trace.exceeded
 
-    def costs(
-        self, candidates: Float[np.ndarray, "C K"], num_pixels: int, alike: bool, progress: Callable[[float], None]
-    ) -> _Costs:
-        """Errors of candidates. Where a ray's light comes from is not always known, and that differs among candidates.
+    def errors(
+        self, candidates: Float[np.ndarray, "C K"], num_pixels: int, common: bool
+    ) -> tuple[Float[np.ndarray, "C V"], Float[np.ndarray, "V"]]:
+        """Sum the robust errors of candidates over the pixels of each view.
 
-        Far apart, they are compared by all pixels, with an error that favours none where nothing is known; `alike`
-        ones by those pixels for which all know it, or they would be preferred for knowing more.
+        Args:
+            candidates: indices of the bodies.
+            num_pixels: maximum number of pixels.
+            common: use only pixels whose surroundings are known for all candidates, because similar candidates would
+                otherwise be preferred for more known pixels. If false, pixels with unknown surroundings have the error
+                of unrelated colours.
+
+        Returns:
+            Sums of the errors, and number of pixels of each view.
         """
         pixels = self._pixels.some(num_pixels)
-        errors, everywhere = [], torch.ones(len(pixels), dtype=torch.bool)
-        for number, values in enumerate(candidates):
+        errors, known_for_all = [], torch.ones(len(pixels), dtype=torch.bool)
+        for values in candidates:
             residuals, known = self._residuals(pixels, values)
-            everywhere &= known
-            errors.append(torch.where(known, robust(residuals, self._half), self.unrelated))
-            progress((number + 1) / len(candidates))
-        used = everywhere if alike else torch.ones_like(everywhere)
+            known_for_all &= known
+            errors.append(torch.where(known, robust(residuals, self._half_weight), self.unrelated))
+            self._num_traced += len(pixels)
+            self._progress(self._num_traced)
+        used = known_for_all if common else torch.ones_like(known_for_all)
         view, num_views = pixels.view[used], len(pixels.cameras)
         sums = [torch.bincount(view, error[used].double(), num_views).numpy() for error in errors]
-        return _Costs(np.stack(sums), torch.bincount(view, minlength=num_views).double().numpy())
+        return np.stack(sums), torch.bincount(view, minlength=num_views).double().numpy()

@@ -1,82 +1,64 @@
-"""From photographs and a surface to the medium, whose index is searched for where it is not known."""
+"""Construction of the medium from a surface, with a search for unknown refractive indices."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import cast
 
 import torch
-from omegaconf import DictConfig
 
-from nerfro.capture.index_report import CURVE, INDEX, search_index
-from nerfro.capture.preprocess_options import build_medium, index_settings, searches_index
-from nerfro.capture.surroundings import Around
+from nerfro.capture.index_report import search_index
+from nerfro.capture.preprocess_options import Request, build_medium, index_settings
+from nerfro.capture.surroundings import Observations
 from nerfro.errors import NerfroError
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
 
 
-@dataclass
+@dataclass(frozen=True)
 class FoundMedium:
-    """A medium, and what its search has told.
+    """A medium with all indices.
 
     Attributes:
-        medium: with all numbers that were found.
-        settings: options that say them; not those that are doubtful.
-        doubtful: options that the pictures do not tell, with what fits best.
-        written: names of the files.
+        medium: the medium.
+        index_settings: options of the indices that were searched.
+        is_doubtful: whether the photographs do not determine these indices.
     """
 
     medium: Medium
-    settings: dict[str, object] = field(default_factory=dict)
-    doubtful: dict[str, object] = field(default_factory=dict)
-    written: list[str] = field(default_factory=list)
+    index_settings: dict[str, object] = field(default_factory=dict)
+    is_doubtful: bool = False
 
+    def refinable(self) -> SdfGrid:
+        """Return the medium for the refinement of its surface.
 
-def refinable(found: FoundMedium) -> SdfGrid:
-    """The medium, if its surface can be refined.
-
-    Raises:
-        NerfroError: it cannot, and why.
-    """
-    if found.doubtful:
-        option = next(iter(found.doubtful))
-        raise NerfroError(f"refine=true needs the index, and the pictures do not tell it; give {option}=N")
-    return cast(SdfGrid, found.medium)
+        Raises:
+            NerfroError: the indices are in doubt.
+        """
+        if self.is_doubtful:
+            options = " ".join(f"{name}=N" for name in self.index_settings)
+            raise NerfroError(f"the photographs do not determine the index, and refine=true needs one; add {options}")
+        return cast(SdfGrid, self.medium)
 
 
 def find_medium(
-    config: DictConfig,
-    overrides: list[str],
-    around: Around,
-    location: str,
-    settings: dict[str, object],
-    folder: Path,
+    request: Request, observations: Observations, location: str, settings: dict[str, object]
 ) -> FoundMedium:
-    """The medium with a surface in it, and with the index where that is searched for.
+    """Build the medium with a surface, and search the indices if they are not given.
 
     Args:
-        config, overrides: of this command line.
-        around: what photographs show around the surface and through it.
-        location: of the surface's file.
-        settings: what has to be said beside the overrides, so that the medium holds the surface.
-        folder: to write to.
+        request: options of the command.
+        observations: observations of the object and its surroundings.
+        location: file of the surface.
+        settings: options of the surface (see `surface_settings`).
     """
-    if not searches_index(config, overrides):
-        return FoundMedium(build_medium(config, settings, location, {}))
-    num_bodies = 1 + len(config.medium.get("inner_meshes", []))
-    medium = build_medium(config, settings, location, index_settings([1.5] * num_bodies))
+    if not request.searches_index:
+        return FoundMedium(build_medium(request, settings, location, {}))
+    num_bodies = 1 + len(request.config.medium.get("inner_meshes", []))
+    medium = build_medium(request, settings, location, index_settings([1.5] * num_bodies))
     if not isinstance(medium, Solid):
-        raise NerfroError("the index of this medium is not searched for; give medium.ior=, or take medium=object")
-    found = search_index(around, medium, folder)
-    options: dict[str, object] = {
-        f"medium.{name}": value for name, value in index_settings(found.values.tolist()).items()
-    }
-    return FoundMedium(
-        medium.with_indices(torch.from_numpy(found.values)),
-        settings={} if found.doubts else options,
-        doubtful=options if found.doubts else {},
-        written=[INDEX, CURVE],
-    )
+        raise NerfroError("the index of this type of medium cannot be searched for; set medium.ior=, or medium=object")
+    found = search_index(observations, medium, request.folder)
+    options: dict[str, object] = {f"medium.{name}": value for name, value in index_settings(found.values).items()}
+    return FoundMedium(medium.with_indices(torch.from_numpy(found.values)), options, bool(found.doubts))

@@ -22,7 +22,7 @@ SHEET, REPORT = "overlays.png", "overlaps.json"
 _MAX_PIXELS = 256
 
 
-def settled_wrong_masks(silhouettes: Silhouettes, wrong_masks: int | None) -> int:
+def choose_wrong_masks(silhouettes: Silhouettes, wrong_masks: int | None) -> int:
     """Return the given number of views that may be wrong, or else the number for which the hull agrees best."""
     if wrong_masks is None:
         wrong_masks = better_wrong_masks(silhouettes, 0) or 0
@@ -31,7 +31,6 @@ def settled_wrong_masks(silhouettes: Silhouettes, wrong_masks: int | None) -> in
 
 
 def report_overlaps(
-    split: str,
     views: Views,
     mesh: TriangleMesh,
     silhouettes: Silhouettes,
@@ -42,7 +41,6 @@ def report_overlaps(
     """Print and write the overlap of the silhouettes of a surface with the masks.
 
     Args:
-        split: split of the views.
         views: views with masks.
         mesh: surface.
         silhouettes: silhouettes of the masks.
@@ -62,7 +60,7 @@ def report_overlaps(
     _warn_of_bad(overlaps, views.names, silhouettes, wrong_masks)
     draw_overlays(views, mesh, overlaps, [], folder)
     each = dict(zip(views.names, (round(float(x), 4) for x in overlaps), strict=True))
-    figures = {"split": split, "mean": round(float(overlaps.mean()), 4), "views": each}
+    figures = {"mean": round(float(overlaps.mean()), 4), "views": each}
     write_atomically(folder / REPORT, json.dumps(figures, indent=1) + "\n")
     return overlaps
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.capture.refinement import Refined, refine_surface
-from nerfro.capture.surroundings import VALIDATION_EVERY, Around, Surroundings
+from nerfro.capture.surroundings import VALIDATION_EVERY, Observations, Surroundings
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import Interrupted
 from nerfro.files.atomic import write_atomically
@@ -30,16 +30,21 @@ _WIDTH = 256  # width of an image, in pixels
 
 
 def refine(
-    around: Around, mesh: TriangleMesh, medium: SdfGrid, silhouettes: Silhouettes, learn_index: bool, folder: Path
+    observations: Observations,
+    mesh: TriangleMesh,
+    medium: SdfGrid,
+    silhouettes: Silhouettes,
+    learn_index: bool,
+    folder: Path,
 ) -> Refined:
     """Refine a surface with a progress bar, write refinement.json and refinement.png, and print the improvement.
 
     Args:
-        around: observations of the object and its surroundings.
+        observations: observations of the object and its surroundings.
         mesh, medium, silhouettes, learn_index: see `refine_surface`.
         folder: output folder.
     """
-    through, surroundings = around.through, around.surroundings
+    through, surroundings = observations.through, observations.surroundings
     try:
         with bar("surface") as progress:
             refined = refine_surface(
@@ -56,13 +61,13 @@ def refine(
         print(f"surface refined: {change}; median displacement {moved:.2g} world units")
     figures = {"steps": refined.steps, "held_back_error": [round(error, 5) for error in refined.errors]}
     write_atomically(folder / FIGURES, json.dumps(figures, indent=1) + "\n")
-    _draw(around, medium, refined.medium, folder / PICTURES)
+    _draw(observations, medium, refined.medium, folder / PICTURES)
     return refined
 
 
-def _draw(around: Around, before: SdfGrid, after: SdfGrid, file: Path) -> None:
+def _draw(observations: Observations, before: SdfGrid, after: SdfGrid, file: Path) -> None:
     """Draw validation photographs beside the surroundings as refracted by both surfaces."""
-    views, cameras, every = around.views, around.through.cameras, VALIDATION_EVERY
+    views, cameras, every = observations.views, observations.through.cameras, VALIDATION_EVERY
     validation = range(every - 1, len(views), every) if len(views) >= every else range(len(views))
     pictures, captions = [], []
     for view in list(validation)[:: max(1, len(validation) // _NUM_PICTURES)][:_NUM_PICTURES]:
@@ -70,7 +75,7 @@ def _draw(around: Around, before: SdfGrid, after: SdfGrid, file: Path) -> None:
         captions.append(f"photograph {views.names[view][-16:]}")
         for state, medium in (("before", before), ("after", after)):
             rays = cameras.image_rays(view)
-            radiance = _seen_through(around.surroundings, medium, rays)
+            radiance = _seen_through(observations.surroundings, medium, rays)
             pictures.append(to_srgb(radiance.view(cameras.height, cameras.width, 3)).clamp(0, 1))
             captions.append(f"{state}, nothing inside")
     save_image(file, sheet(pictures, captions, _WIDTH, 3, "surroundings as refracted by the surface"))

@@ -1,9 +1,8 @@
-"""Commands one after the other, each made of the files of those before; what is there already is kept."""
+"""Stages of `python -m nerfro.reconstruct`: commands whose results are reused until their input files change."""
 
 from __future__ import annotations
 
 import itertools
-import re
 import shlex
 import signal
 import subprocess
@@ -23,65 +22,66 @@ _INTERRUPTED = (EXIT_INTERRUPTED, -signal.SIGINT, -signal.SIGTERM)  # exit statu
 
 @dataclass(frozen=True)
 class Stage:
-    """A command of nerfro, and what is there when it is done.
+    """A command of nerfro with its input and output files.
 
     Attributes:
-        command: its name, as in `python -m nerfro.COMMAND`.
-        options: of the command.
-        result: the file that it writes last.
-        look_at: what a person should look at.
-        made_of: files that it reads; where one is newer than the result, the command is run again.
+        command: name of the command, as in `python -m nerfro.COMMAND`.
+        options: command-line options.
+        result: the last file that the command writes.
+        preview: file or folder that the user should check.
+        inputs: files that the command reads; the command is repeated if one of them is newer than the result.
     """
 
     command: str
     options: Sequence[str]
     result: Path
-    look_at: Path
-    made_of: Sequence[Path] = ()
+    preview: Path
+    inputs: Sequence[Path] = ()
 
     @property
     def is_done(self) -> bool:
-        """Whether the result is there, and nothing that it is made of has changed since."""
-        return self.result.is_file() and not is_older(self.result, self.made_of)
+        """Whether the result exists and no input is newer."""
+        return self.result.is_file() and not is_older(self.result, self.inputs)
 
     def run(self) -> None:
-        """Run the command unless it is done, and say which it is.
+        """Run the command unless the stage is done.
 
         Raises:
-            NerfroError: it failed.
-            Interrupted: it was interrupted.
+            NerfroError: the command failed.
+            Interrupted: the command was interrupted.
         """
         if self.is_done:
-            print(f"{self.command}: done; {self.result} is kept (to make it again, delete it)", flush=True)
+            print(f"{self.command}: done; {self.result} is kept (delete the file to repeat the stage)", flush=True)
             return
-        options = [*self.options]
-        print(f"\n{self.command}: {shlex.join(['python', '-m', f'nerfro.{self.command}', *options])}", flush=True)
-        status = finished([sys.executable, "-m", f"nerfro.{self.command}", *options])
+        arguments = ["-m", f"nerfro.{self.command}", *self.options]
+        print(f"\n{self.command}: {shlex.join(['python', *arguments])}", flush=True)
+        status = run_command([sys.executable, *arguments])
         if status in _INTERRUPTED:
-            raise Interrupted(f"to go on, start the same command again; {self.command} is not done")
+            raise Interrupted(f"{self.command} is incomplete; repeat the same command to continue")
         if status != 0 or not self.result.is_file():
             raise NerfroError(
-                f"{self.command} failed, and the line above says why; mend that, give {self.command}='OPTIONS', or run "
-                "its command yourself with others; then start this again: what is done is kept"
+                f"{self.command} failed for the reason in the line above; correct the input, set "
+                f"{self.command}='OPTIONS', or run the printed command with other options; then repeat this command, "
+                "which keeps all completed stages"
             )
-        print(f"{self.command}: done; look at {self.look_at}", flush=True)
+        print(f"{self.command}: done; look at {self.preview}", flush=True)
 
 
 def is_older(file: Path, others: Iterable[Path]) -> bool:
-    """Whether one of some other files has changed after a file; those that do not exist have not."""
+    """Test whether one of the existing other files was modified after a file."""
     written = file.stat().st_mtime_ns
     return any(other.stat().st_mtime_ns > written for other in others if other.exists())
 
 
-def finished(command: list[str]) -> int:
-    """The exit status of a command, which is left time to save its work when this process is asked to end."""
+def run_command(command: list[str]) -> int:
+    """Run a command and return the exit status. On SIGTERM or Ctrl-C, wait until the command has saved its work."""
     process = subprocess.Popen(command)
 
-    def pass_on(number: int, frame: FrameType | None) -> None:
-        if number == signal.SIGTERM:  # Ctrl-C reaches the command without us
+    def forward(number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGTERM:  # the terminal sends Ctrl-C to the command as well
             process.terminate()
 
-    previous = {number: signal.signal(number, pass_on) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous = {number: signal.signal(number, forward) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         return process.wait()
     finally:
@@ -89,34 +89,26 @@ def finished(command: list[str]) -> int:
             signal.signal(number, handler)
 
 
-def option(name: str, value: object) -> str:
-    """`name=value`, the value quoted where Hydra would not take it for one text."""
-    text = str(value)
-    if not re.fullmatch(r"[\w./+@%-]+", text, re.ASCII):
-        text = '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
-    return f"{name}={text}"
-
-
 def move_aside(folder: Path) -> Path:
-    """Rename a folder, so that its name is free; returns the new one."""
+    """Rename a folder to the first free name with a number, and return the new path."""
     free = next(path for n in itertools.count(1) if not (path := folder.with_name(f"{folder.name}_{n}")).exists())
     return folder.rename(free)
 
 
-def gather(photographs: Path, masks: Path | None, out: Path) -> None:
-    """Links to photographs in `out`/images, and to masks where loaders look for them.
+def link_photographs(photographs: Path, masks: Path | None, out: Path) -> None:
+    """Link photographs into `out`/images and masks into `out`/masks, so that no result lies among the originals.
 
-    So what is made later lies in `out`, and not among the photographs. Links and files that exist are kept.
+    Existing links and files are kept.
 
     Args:
-        photographs: their folder; `mask_*` files in it come along.
-        masks: folder of `<photograph>.png` or `mask_<photograph>.png`, if there is one.
-        out: the data set's folder.
+        photographs: folder of the photographs, which may also contain masks (`mask_*`).
+        masks: folder of the masks, `<photograph>.png` or `mask_<photograph>.png`.
+        out: folder of the data set.
     """
-    list_images(photographs)  # refuses a folder without any
+    list_images(photographs)  # raises an error for a folder without images
     for folder in (photographs, *([] if masks is None else [masks])):
         if not folder.is_dir():
-            raise NerfroError(f"masks={folder} is not a folder; give the one that holds the photographs' masks")
+            raise NerfroError(f"masks={folder} is not a folder; give the folder of the masks of the photographs")
         for file in sorted(folder.iterdir()):
             if file.suffix.lower() not in IMAGE_SUFFIXES or file.name.startswith("."):
                 continue
@@ -124,5 +116,5 @@ def gather(photographs: Path, masks: Path | None, out: Path) -> None:
             link = out / ("images" if among_images else "masks") / file.name
             link.parent.mkdir(parents=True, exist_ok=True)
             if not link.exists():
-                link.unlink(missing_ok=True)  # one that leads nowhere
+                link.unlink(missing_ok=True)  # a broken link
                 link.symlink_to(file.resolve())

@@ -198,7 +198,7 @@ def learn_surroundings(
     return found
 
 
-class Around:
+class Observations:
     """Observations of an object and its surroundings, computed on first use.
 
     Args:

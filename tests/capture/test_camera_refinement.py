@@ -70,7 +70,9 @@ def test_poses_come_back_with_the_hull(
 
 
 @pytest.mark.parametrize(
-    ("option", "reason"), [("room=true", "far away"), ("mesh={}/mesh.ply", "has no masks")], ids=["near", "no masks"]
+    ("option", "reason"),
+    [("room=true", "needs distant surroundings"), ("mesh={}/mesh.ply", "has no masks")],
+    ids=["near", "no masks"],
 )
 def test_what_cannot_be_refined_is_refused(
     option: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -224,4 +224,4 @@ def test_what_cannot_be_refined_is_refused_at_once(
     monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", f"out={tmp_path}", "refine=true", "medium=object_voxels"])
     with pytest.raises(SystemExit):
         nerfro.preprocess.main()
-    assert "take medium=object or medium=vessel" in capsys.readouterr().err
+    assert "set medium=object or medium=vessel" in capsys.readouterr().err
