@@ -37,7 +37,7 @@ class SummaryConfig:
     view: Any = None  # view of each figure, such as {torus: 3}; by default the view of median score
     # Insets of each figure in pixels, such as {torus: [[top, left, size], ...]}; by default where methods differ most.
     crops: Any = None
-    error_map: str = "squared_error"  # metric of the error maps: squared_error, ssim, lpips, lpips_vgg or flip
+    error_map: Annotated[str, Literal["squared_error", "ssim", "lpips", "lpips_vgg", "flip"]] = "squared_error"
     overwrite: bool = False  # whether to replace files in `out`
 
 

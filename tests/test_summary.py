@@ -4,7 +4,6 @@ import json
 import os
 import re
 import statistics
-import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +21,7 @@ from nerfro.files.images import save_png
 from nerfro.report.comparison import compare, differing, find_metrics, to_table
 from nerfro.report.runs import duration, find_runs
 from nerfro.training.run_folder import record
+from tests.conftest import finish
 
 PAPER = find_metrics(["psnr", "ssim", "lpips"])
 FIELD = {"_target_": "nerfro.fields.nerf.NerfField", "width": 64, "scale": 1.0}
@@ -303,19 +303,12 @@ def test_spreads_that_do_not_fit_the_columns_are_refused() -> None:
 
 @pytest.fixture
 def summarise(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
-    """`python -m nerfro.summary`'s main in this process: exit code, and all that it printed."""
+    """Exit code and output of `python -m nerfro.summary`'s main in this process."""
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
 
     def run(*overrides: str) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["nerfro.summary", *overrides])
-        monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-        capsys.readouterr()
-        code = 0
-        try:
-            nerfro.summary.main()
-        except SystemExit as end:
-            code = end.code if isinstance(end.code, int) else 1
-        printed = capsys.readouterr()
-        return code, printed.out + printed.err
+        done = finish(nerfro.summary.main, overrides, monkeypatch, capsys)
+        return done.code, done.out + done.err
 
     return run
 
@@ -353,6 +346,7 @@ def test_command_prints_writes_all_forms_and_refuses_to_overwrite(
         ("view={ship: 0}", "'ship' is not a scene of these runs; choose from torus"),
         ("view={torus: 2}", "give 0 to 1"),
         ("crops={torus: 5}", "is not in the form"),
+        ("error_map=foo", "choose 'squared_error', 'ssim'"),
         ("crops={torus: [[8,8,9]]}", "exceeds 16 x 16 pixels"),
         ("runz=[x]", "runz"),
     ],

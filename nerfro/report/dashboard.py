@@ -6,7 +6,6 @@ import contextlib
 import io
 import logging
 import re
-import shutil
 import socket
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,10 +36,13 @@ class DashboardConfig:
 def link_runs(outputs: Path, names: Path) -> int:
     """Link the logs of every run below `outputs` into the folder `names`, because TensorBoard names runs by folder.
 
-    Existing links remain. If links are not allowed, the logs are copied, and new content is appended on each call.
+    Existing links remain.
 
     Returns:
         Number of runs.
+
+    Raises:
+        NerfroError: the operating system does not allow links.
     """
     logs = sorted(path for path in outputs.rglob(_LOGS) if path.is_dir())
     for path in logs:
@@ -49,21 +51,12 @@ def link_runs(outputs: Path, names: Path) -> int:
             continue
         try:
             link.parent.mkdir(parents=True, exist_ok=True)
-            if not link.exists():
-                link.symlink_to(path.resolve(), target_is_directory=True)
-                continue
-        except OSError:  # on Windows, only administrators may create links
-            link.mkdir()
-        _copy_new(path, link)
+            link.symlink_to(path.resolve(), target_is_directory=True)
+        except OSError as error:
+            raise NerfroError(
+                f"cannot link {path} to {link} ({error.strerror}); run `tensorboard --logdir {outputs}` instead"
+            ) from error
     return len(logs)
-
-
-def _copy_new(logs: Path, copies: Path) -> None:
-    """Append the new content of log files, which only grow, to the copies."""
-    for path in logs.glob("events.*"):
-        with path.open("rb") as source, (copies / path.name).open("ab") as copy:
-            source.seek(copy.tell())
-            shutil.copyfileobj(source, copy)
 
 
 def run_name(folder: Path, outputs: Path) -> str:

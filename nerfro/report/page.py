@@ -16,11 +16,10 @@ from nerfro.evaluation.tables import Table, to_html
 from nerfro.files.drawing import magma
 from nerfro.files.templates import fill_template
 from nerfro.paths import PACKAGE_DIR
-from nerfro.report import curves
 from nerfro.report.comparison import Comparison
-from nerfro.report.curves import Chart, draw_charts, read_curves
+from nerfro.report.curves import COLOURS, Chart, make_charts, read_curves
 from nerfro.report.runs import Run, device, duration, shown
-from nerfro.report.views import JPEG_QUALITY, PNG_SIDE, SceneImages, Selection, data_uri, scene_images
+from nerfro.report.views import JPEG_QUALITY, PNG_SIDE, SceneImages, Selection, embed_image, scene_images
 
 _TEMPLATES = PACKAGE_DIR / "report"
 
@@ -86,8 +85,8 @@ def report_page(compared: Sequence[tuple[Comparison, Table]], unfinished: Sequen
         _TEMPLATES / "page.html.jinja",
         sections=sections,
         unfinished=unfinished,
-        chart=curves,
-        error_ramp=data_uri(ramp),
+        colours=COLOURS,
+        error_ramp=embed_image(ramp),
         png_side=PNG_SIDE,
         jpeg_quality=JPEG_QUALITY,
     )
@@ -111,7 +110,7 @@ def _scenes(prefix: str, comparison: Comparison, selection: Selection) -> list[S
             for method, name in enumerate(comparison.methods)
             for run in comparison.cells.get((name, test_set), ())
         ]
-        sections.append(SceneSection(f"{prefix}s{number}", title, draw_charts(logged), images, reason))
+        sections.append(SceneSection(f"{prefix}s{number}", title, make_charts(logged), images, reason))
     return sections
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +10,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from omegaconf import OmegaConf
-from PIL import Image
 from torch import Tensor
 
 from nerfro.data.base import Views
@@ -22,12 +19,11 @@ from nerfro.evaluation.image_grid import Crop, most_different_crop
 from nerfro.evaluation.lpips import LpipsNetwork, find_lpips_networks
 from nerfro.evaluation.results import FULL, METRICS, Metric, Region, Score
 from nerfro.evaluation.tables import MISSING
-from nerfro.files.images import load_png, to_8bit
+from nerfro.files.images import data_uri, load_png, to_8bit
 from nerfro.report.comparison import Comparison
 from nerfro.report.runs import EvaluationSet, Run
 from nerfro.training.config import build_data
 
-ERROR_MAPS = ("squared_error", "ssim", "lpips", "lpips_vgg", "flip")
 NUM_CROPS = 2
 CROP_DIVISOR = 4  # ratio of the shorter side of an image to the side of an inset
 PNG_SIDE = 256  # pixels; larger images are embedded as JPEG to limit the size of the page
@@ -42,7 +38,7 @@ class Selection:
         num_views: number of evenly spread views per scene; 0 for all.
         view: view of the figure, by scene.
         crops: insets of the figure, by scene.
-        error_map: one of `ERROR_MAPS`.
+        error_map: name of the metric of the error maps.
         lpips_networks: networks for the error map.
         metric: metric shown below each image.
         region: region of this metric.
@@ -59,37 +55,31 @@ class Selection:
     @classmethod
     def of(
         cls,
-        num_views: int,
-        view: Any,
-        crops: Any,
+        num_views: int = 8,
+        view: Any = None,
+        crops: Any = None,
         error_map: str = "squared_error",
         metric: Metric = METRICS[0],
         region: Region = FULL,
     ) -> Selection:
-        """Parse the options of the user; `view` and `crops` may be None.
+        """Convert the options of the user; `view` and `crops` may be None.
 
         Raises:
-            NerfroError: an option has the wrong format, or the error map is unknown or not available.
+            NerfroError: an option has another form, or the weights for the error map are not available.
         """
-        if error_map not in ERROR_MAPS:
-            raise NerfroError(f"error_map={error_map} is not an error map; choose from {', '.join(ERROR_MAPS)}")
         networks, reasons = find_lpips_networks() if error_map.startswith("lpips") else ({}, {})
         if error_map in reasons:
             raise NerfroError(f"error_map={error_map}: {reasons[error_map]}")
-        if num_views < 0:
-            raise NerfroError(f"views={num_views} is not a number of views; give 1 or more, or 0 for all")
         try:
             chosen = {str(scene): int(index) for scene, index in (view or {}).items()}
-        except (AttributeError, TypeError, ValueError) as error:
-            raise NerfroError(f"view={view} is not in the form {{SCENE: INDEX}}; give views by scene") from error
-        try:
             insets = {
                 str(scene): tuple(Crop(*map(int, square)) for square in squares)
                 for scene, squares in (crops or {}).items()
             }
         except (AttributeError, TypeError, ValueError) as error:
             raise NerfroError(
-                f"crops={crops} is not in the form {{SCENE: [[TOP, LEFT, SIZE], ...]}}; give squares in pixels"
+                f"view={view}, crops={crops} is not in the form view={{SCENE: INDEX}}, "
+                "crops={SCENE: [[TOP, LEFT, SIZE], ...]}; give integers by scene"
             ) from error
         return cls(num_views, chosen, insets, error_map, networks, metric, region)
 
@@ -223,9 +213,9 @@ def _view(
         value = _score(run, index, selection)
         score = f"{metric.title} {MISSING if value is None else f'{value:.{metric.decimals}f}'}"
         error = _error_map(image, reference, selection)
-        predictions[number] = PageImage(f"{title}, view {index}", score, data_uri(image))
-        errors[number] = PageImage(f"{error.title} of {title}, view {index}", score, data_uri(error.colours()))
-    return View(index, PageImage(f"reference, view {index}", "", data_uri(reference)), predictions, errors)
+        predictions[number] = PageImage(f"{title}, view {index}", score, embed_image(image))
+        errors[number] = PageImage(f"{error.title} of {title}, view {index}", score, embed_image(error.colours()))
+    return View(index, PageImage(f"reference, view {index}", "", embed_image(reference)), predictions, errors)
 
 
 def _error_map(prediction: Tensor, reference: Tensor, selection: Selection) -> ErrorMap:
@@ -247,13 +237,9 @@ def _choose_crops(reference: Tensor, predictions: Sequence[Tensor]) -> tuple[Cro
     return tuple(crops)
 
 
-def data_uri(rgb: Float[Tensor, "H W 3"]) -> str:
+def embed_image(rgb: Float[Tensor, "H W 3"]) -> str:
     """Encode an image as a data URI: PNG up to `PNG_SIDE` pixels per side, otherwise JPEG."""
-    exact = max(rgb.shape[:2]) <= PNG_SIDE
-    encoded = io.BytesIO()
-    image = Image.fromarray(to_8bit(rgb).numpy())
-    if exact:
-        image.save(encoded, format="PNG", optimize=True)
-    else:
-        image.save(encoded, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
-    return f"data:image/{'png' if exact else 'jpeg'};base64,{base64.b64encode(encoded.getvalue()).decode()}"
+    pixels = to_8bit(rgb).numpy()
+    if max(pixels.shape[:2]) <= PNG_SIDE:
+        return data_uri(pixels, "PNG", optimize=True)
+    return data_uri(pixels, "JPEG", quality=JPEG_QUALITY, subsampling=0)
