@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from nerfro.allowed import Coordinate, check
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
+from nerfro.geometry.file_normals import informative_normals
 from nerfro.geometry.orientation import area_vectors, inward_faces
 
 
@@ -22,7 +23,8 @@ class TriangleMesh:
     Attributes:
         vertices: corner positions.
         faces: vertex indices of each triangle.
-        normals: unit normals at the corners of the triangles if the file has normals, else None.
+        normals: unit normals at the corners of the triangles, or zero, if the file has normals that say more than the
+            triangles; else None.
     """
 
     vertices: Float[np.ndarray, "V 3"]
@@ -106,7 +108,7 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
 
 
 def _facing_outwards(mesh: TriangleMesh) -> TriangleMesh:
-    """Reverse triangles and normals that face the inside; see `inward_faces`."""
+    """Reverse triangles and normals that face the inside, and leave out normals that say nothing."""
     if not len(mesh.faces):
         return mesh
     inwards = inward_faces(mesh.vertices, mesh.faces)[:, None]
@@ -115,6 +117,8 @@ def _facing_outwards(mesh: TriangleMesh) -> TriangleMesh:
         normals = np.where(inwards[..., None], normals[:, ::-1], normals)
         outward = np.einsum("fcx,fx->fc", normals, area_vectors(mesh.vertices[faces])) >= 0
         normals = np.where(outward[..., None], normals, -normals)
+        informative = informative_normals(mesh.vertices, faces, normals)
+        normals = normals * informative[:, None, None] if informative.any() else None
     return TriangleMesh(mesh.vertices, faces, normals)
 
 

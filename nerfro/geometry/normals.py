@@ -23,7 +23,8 @@ def smooth_normals(
 ) -> Float[Tensor, "F 3 3"]:
     """Compute the unit normal at each corner of each triangle, smooth up to creases and differentiable.
 
-    Normals of the mesh file are used if they lie within the crease angle of the face. Otherwise the normal is the mean
+    Informative normals of the mesh file (see `informative_normals`) are used if they lie within the crease angle of
+    the face. Otherwise the normal is the mean
     normal of the faces around the vertex whose normals are within the crease angle of the corner's face. The weights
     are |e1 x e2| / (|e1|^2 |e2|^2) with the edges e1 and e2 at the vertex, which is exact for spheres. Where a large
     face meets much smaller faces, for example a flat side and a rounded edge, the weights are the areas, because the

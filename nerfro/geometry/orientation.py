@@ -25,7 +25,7 @@ def inward_faces(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3
         vertices: world units; equal positions must be merged.
         faces: vertex indices of each triangle.
     """
-    patch, inwards = _patches(faces)
+    patch, inwards = patches(faces)
     triangles = vertices[faces]
     crosses = area_vectors(triangles)
     crosses[inwards] *= -1
@@ -52,8 +52,11 @@ def area_vectors(triangles: Float[np.ndarray, "F 3 3"]) -> Float[np.ndarray, "F 
     return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
 
 
-def _patches(faces: Int[np.ndarray, "F 3"]) -> tuple[Int[np.ndarray, "F"], Bool[np.ndarray, "F"]]:
-    """Return the patch of each triangle, and the triangles to reverse for one orientation per patch."""
+def patches(faces: Int[np.ndarray, "F 3"]) -> tuple[Int[np.ndarray, "F"], Bool[np.ndarray, "F"]]:
+    """Return the patch of each triangle, and the triangles to reverse for one orientation per patch.
+
+    Triangles of a patch are connected by edges that belong to exactly two triangles.
+    """
     start, end = faces.reshape(-1), np.roll(faces, -1, 1).reshape(-1)
     edge = np.minimum(start, end) * (faces.max() + 1) + np.maximum(start, end)
     order = np.argsort(edge, kind="stable")

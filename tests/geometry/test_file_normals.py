@@ -1,16 +1,18 @@
-"""A modeller's normals are kept: faces that are flat in the file stay flat."""
+"""Normals of a mesh file are used where they say more than the triangles do."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 import trimesh
 
 from nerfro.geometry.mesh import load_mesh
 from nerfro.geometry.normals import corner_normals
 from nerfro.media.sdf_grid import SdfGrid
+from nerfro.samplers.bend import bend
 
 TORUS_CUBE = "embedded:torus/mesh.ply"
 
@@ -22,6 +24,63 @@ def test_normals_of_the_file_are_taken_and_averages_are_not(tmp_path: Path) -> N
     mesh = load_mesh(tmp_path / "ball.ply")
     corners = mesh.vertices[mesh.faces]
     np.testing.assert_allclose(corner_normals(mesh), corners, atol=1e-6)
+
+
+def _write(path: Path, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> Path:
+    trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False).export(path)
+    return path
+
+
+def _averages(shape: trimesh.Trimesh, weight: str) -> np.ndarray:
+    """Average the normals of the triangles around each vertex."""
+    weights = {"uniform": np.ones((len(shape.faces), 3)), "angle": shape.face_angles, "area": shape.area_faces[:, None]}
+    terms = np.broadcast_to(weights[weight], shape.faces.shape)[..., None] * shape.face_normals[:, None]
+    sums = np.stack([np.bincount(shape.faces.reshape(-1), terms[..., i].reshape(-1)) for i in range(3)], -1)
+    return sums / np.linalg.norm(sums, axis=1, keepdims=True)
+
+
+def _bevelled_box(half: float = 0.5, radius: float = 0.06) -> tuple[trimesh.Trimesh, np.ndarray]:
+    """Return a cube with edges rounded by three flat strips, and the normals of the round edges."""
+    polar, azimuth = np.meshgrid(*[np.linspace(0, np.pi / 2, 4)] * 2)
+    octant = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], -1)
+    signs = np.stack(np.meshgrid(*[[-1, 1]] * 3), -1).reshape(-1, 1, 3)
+    shape = trimesh.convex.convex_hull((signs * ((half - radius) + radius * octant.reshape(1, -1, 3))).reshape(-1, 3))
+    normals = shape.vertices - np.clip(shape.vertices, radius - half, half - radius)
+    return shape, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("interface", ["mesh", "sdf"])
+@pytest.mark.parametrize("weight", ["uniform", "angle", "area"])
+def test_averages_in_the_file_do_not_bend_rays_through_flat_sides(weight: str, interface: str, tmp_path: Path) -> None:
+    box, _ = _bevelled_box()
+    file = _write(tmp_path / "box.ply", box.vertices, box.faces, _averages(box, weight))
+    generator = np.random.default_rng(0)
+    tilt, azimuth = np.radians(generator.uniform(0, 25, 500)), generator.uniform(0, 2 * np.pi, 500)
+    towards = np.stack([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)], -1)
+    entry = np.concatenate([generator.uniform(-0.2, 0.2, (500, 2)), np.full((500, 1), 0.5)], axis=1)
+    exits = bend(file, 1.5, entry - 2 * towards, towards, interface).directions.numpy()
+    assert np.degrees(np.linalg.norm(exits - towards, axis=1)).mean() < 0.35
+
+
+def test_normals_of_smooth_shapes_are_kept(tmp_path: Path) -> None:
+    ball, scale = trimesh.creation.icosphere(2), np.array([2.0, 1.0, 0.5])
+    points = np.random.default_rng(0).normal(size=(300, 3))
+    irregular = trimesh.convex.convex_hull(points / np.linalg.norm(points, axis=1, keepdims=True))
+    for shape in (ball, trimesh.creation.uv_sphere(count=[12, 24]), irregular):
+        normals = shape.vertices / scale / np.linalg.norm(shape.vertices / scale, axis=1, keepdims=True)
+        mesh = load_mesh(_write(tmp_path / "ellipsoid.ply", shape.vertices * scale, shape.faces, normals))
+        corners = mesh.triangles / scale**2
+        exact = corners / np.linalg.norm(corners, axis=-1, keepdims=True)
+        np.testing.assert_allclose(corner_normals(mesh, 60.0), exact, atol=1e-6)
+    box, normals = _bevelled_box()
+    assert load_mesh(_write(tmp_path / "box.ply", box.vertices, box.faces, normals)).normals is not None
+
+
+def test_copies_of_the_normals_of_triangles_do_not_make_facets(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(3)
+    vertices, faces = ball.triangles.reshape(-1, 3), np.arange(3 * len(ball.faces)).reshape(-1, 3)
+    mesh = load_mesh(_write(tmp_path / "ball.ply", vertices, faces, np.repeat(ball.face_normals, 3, axis=0)))
+    np.testing.assert_allclose(corner_normals(mesh), mesh.triangles, atol=1e-6)
 
 
 def test_normals_that_contradict_the_faces_are_not_trusted(tmp_path: Path) -> None:
