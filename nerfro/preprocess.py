@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import torch
@@ -11,20 +12,19 @@ from jaxtyping import Float
 from omegaconf import DictConfig
 
 from nerfro.capture.camera_refinement import refine_cameras
-from nerfro.capture.medium_search import FoundMedium, find_medium
+from nerfro.capture.medium_search import find_medium
 from nerfro.capture.overlaps import choose_wrong_masks, draw_overlays, report_overlaps
 from nerfro.capture.pose_conventions import require_consistent_poses
 from nerfro.capture.preprocess_options import CAMERAS, MESH, PreprocessConfig, Request, conclude, surface_settings
 from nerfro.capture.refinement_report import refine
-from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.surface import make_mesh, read_silhouettes, surfaces_inside
 from nerfro.capture.surroundings import Observations
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.cli import entry_point, warn
 from nerfro.data.base import Views
 from nerfro.data.masks import masked_views
-from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
+from nerfro.media.sdf_grid import SdfGrid
 from nerfro.paths import resolve_path
 from nerfro.registry import build
 from nerfro.viewing.camera_files import write_cameras
@@ -45,13 +45,16 @@ def main(config: DictConfig) -> None:
     observations = Observations(views, mesh, config.room)
     found = find_medium(request, observations, location, settings)
     if config.refine:
-        if silhouettes is None:
-            silhouettes = Silhouettes.of(views.cameras, mesh_silhouettes(mesh, views.cameras, 1).float())
         given, location = mesh, str(request.folder / MESH)
-        mesh = _refine(request, observations, given, found, silhouettes)
+        if found.is_doubtful:
+            warn("surface unchanged: refine=true needs the index, and the photographs do not determine the index")
+        else:
+            medium = cast(SdfGrid, found.medium)  # see Request.check
+            mesh = refine(observations, mesh, medium, silhouettes, request.searches_index, request.folder)
+        mesh.save(request.folder / MESH)
         settings = surface_settings(request, views.cameras, mesh, location)
         if mesh is not given:
-            if overlaps is not None:
+            if silhouettes is not None:
                 overlaps = report_overlaps(views, mesh, silhouettes, None, request.folder, list_all=False)
             found = find_medium(request, observations, location, settings)
     inside = surfaces_inside(found.medium)
@@ -89,19 +92,6 @@ def _reconstruct(
     # The report is written before the medium is built, because the report shows why a medium refuses a surface.
     overlaps = report_overlaps(views, surface, silhouettes, wrong_masks if mesh is None else None, folder)
     return views, surface, silhouettes, overlaps
-
-
-def _refine(
-    request: Request, observations: Observations, mesh: TriangleMesh, found: FoundMedium, silhouettes: Silhouettes
-) -> TriangleMesh:
-    """Refine the surface if possible, and save the mesh; returns the given mesh if the surface does not change."""
-    try:
-        medium = found.refinable()
-        mesh = refine(observations, mesh, medium, silhouettes, request.searches_index, request.folder).mesh
-    except NerfroError as reason:  # keep the results so far
-        warn(f"surface unchanged: {reason}")
-    mesh.save(request.folder / MESH)
-    return mesh
 
 
 if __name__ == "__main__":

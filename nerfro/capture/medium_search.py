@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import cast
 
 import torch
 
@@ -12,7 +11,6 @@ from nerfro.capture.preprocess_options import Request, build_medium, index_setti
 from nerfro.capture.surroundings import Observations
 from nerfro.errors import NerfroError
 from nerfro.media.base import Medium
-from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
 
 
@@ -29,17 +27,6 @@ class FoundMedium:
     medium: Medium
     index_settings: dict[str, object] = field(default_factory=dict)
     is_doubtful: bool = False
-
-    def refinable(self) -> SdfGrid:
-        """Return the medium for the refinement of its surface.
-
-        Raises:
-            NerfroError: the indices are in doubt.
-        """
-        if self.is_doubtful:
-            options = " ".join(f"{name}=N" for name in self.index_settings)
-            raise NerfroError(f"the photographs do not determine the index, and refine=true needs one; add {options}")
-        return cast(SdfGrid, self.medium)
 
 
 def find_medium(

@@ -9,10 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.capture.refinement import Refined, refine_surface
+from nerfro.capture.refinement import refine_surface
+from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.surroundings import VALIDATION_EVERY, Observations, Surroundings
 from nerfro.capture.visual_hull import Silhouettes
-from nerfro.errors import Interrupted
+from nerfro.cli import warn
+from nerfro.errors import Interrupted, NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.drawing import sheet
 from nerfro.files.images import save_image
@@ -33,18 +35,24 @@ def refine(
     observations: Observations,
     mesh: TriangleMesh,
     medium: SdfGrid,
-    silhouettes: Silhouettes,
+    silhouettes: Silhouettes | None,
     learn_index: bool,
     folder: Path,
-) -> Refined:
+) -> TriangleMesh:
     """Refine a surface with a progress bar, write refinement.json and refinement.png, and print the improvement.
 
     Args:
         observations: observations of the object and its surroundings.
-        mesh, medium, silhouettes, learn_index: see `refine_surface`.
+        mesh, medium, learn_index: see `refine_surface`.
+        silhouettes: silhouettes of the masks; None uses projections of the mesh.
         folder: output folder.
+
+    Returns:
+        The refined surface; the given one without a significant improvement, or if the refinement is impossible.
     """
-    through, surroundings = observations.through, observations.surroundings
+    through, surroundings, cameras = observations.through, observations.surroundings, observations.views.cameras
+    if silhouettes is None:
+        silhouettes = Silhouettes.of(cameras, mesh_silhouettes(mesh, cameras, 1).float())
     try:
         with bar("surface") as progress:
             refined = refine_surface(
@@ -52,6 +60,9 @@ def refine(
             )
     except KeyboardInterrupt:
         raise Interrupted("to resume the refinement, repeat the command with overwrite=true") from None
+    except NerfroError as reason:  # keep the results of the other steps
+        warn(f"surface unchanged: {reason}")
+        return mesh
     before, after = refined.errors[0], min(refined.errors)
     change = f"validation error {before:.4f} -> {after:.4f} (0 exact, 1 unrelated)"
     if refined.mesh is mesh:
@@ -62,7 +73,7 @@ def refine(
     figures = {"steps": refined.steps, "held_back_error": [round(error, 5) for error in refined.errors]}
     write_atomically(folder / FIGURES, json.dumps(figures, indent=1) + "\n")
     _draw(observations, medium, refined.medium, folder / PICTURES)
-    return refined
+    return refined.mesh
 
 
 def _draw(observations: Observations, before: SdfGrid, after: SdfGrid, file: Path) -> None:
