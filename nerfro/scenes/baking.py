@@ -1,4 +1,4 @@
-"""Light on flat things, computed once for all pictures of a scene."""
+"""Precomputed light on flat surfaces, shared by all images of a scene."""
 
 from __future__ import annotations
 
@@ -11,34 +11,34 @@ from nerfro.light import to_linear, to_srgb
 from nerfro.scenes.path_tracer import PathTracer, Pinhole
 from nerfro.scenes.scene import Panel, Scene
 
-TEXELS = 16  # of the light on a panel, each way
-_ABOVE = 2e-3  # world units; more than the renderer's own offsets, less than the gap under the globe
+TEXELS = 16  # resolution of the light on a panel
+_ABOVE = 2e-3  # world units; more than the offsets of the renderer, less than the gap under the globe
 
 
 def bake(scene: Scene, spp: int, variant: str = "auto") -> Scene:
-    """Replace the light that falls on panels by light that they send out: shading and shadows without noise.
+    """Replace the reflected light of panels by emitted light, so that shading and shadows have no noise.
 
-    Panels are diffuse, so that they look the same from all sides. While the light is computed, each has its mean
-    colour; light that is thrown back and forth between them has no finer pattern than that.
+    The radiance of a panel is independent of the direction, because panels are diffuse. During the computation, each
+    panel has its mean colour; light that panels reflect onto each other has no finer pattern.
 
     Args:
-        scene: with panels.
-        spp: samples for each of `TEXELS` x `TEXELS` places on a panel.
+        scene: scene with panels.
+        spp: samples for each of `TEXELS` x `TEXELS` positions on a panel.
         variant: Mitsuba variant, see `load_mitsuba`.
     """
-    plain = [panel if panel.glows else replace(panel, picture=_mean(panel)) for panel in scene.panels]
+    plain = [panel if panel.glows else replace(panel, image=_mean(panel)) for panel in scene.panels]
     tracer = PathTracer(replace(scene, panels=tuple(plain)), False, Pinhole.square(1.0, TEXELS), variant)
     baked = []
-    for number, (panel, even) in enumerate(zip(scene.panels, plain, strict=True)):
+    for number, (panel, mean) in enumerate(zip(scene.panels, plain, strict=True)):
         if not panel.glows:
-            light = tracer.render_flat(panel.to_world, _ABOVE, spp, number) / to_linear(even.picture[:1, :1])
-            fine = resize(light, panel.picture.shape, order=1, mode="edge", anti_aliasing=False)
-            lit = np.clip(fine * to_linear(panel.picture), 0.0, 1.0)
-            panel = replace(panel, picture=to_srgb(lit).astype(np.float32), glows=True)
+            light = tracer.render_flat(panel.to_world, _ABOVE, spp, number) / to_linear(mean.image[:1, :1])
+            fine = resize(light, panel.image.shape, order=1, mode="edge", anti_aliasing=False)
+            lit = np.clip(fine * to_linear(panel.image), 0.0, 1.0)
+            panel = replace(panel, image=to_srgb(lit).astype(np.float32), glows=True)
         baked.append(panel)
     return replace(scene, panels=tuple(baked))
 
 
 def _mean(panel: Panel) -> np.ndarray:
-    """A picture [2, 2, 3] of the mean of the panel's linear colours."""
-    return np.tile(to_srgb(to_linear(panel.picture).mean((0, 1))).astype(np.float32), (2, 2, 1))
+    """Return an image [2, 2, 3] of the mean linear colour of a panel."""
+    return np.tile(to_srgb(to_linear(panel.image).mean((0, 1))).astype(np.float32), (2, 2, 1))

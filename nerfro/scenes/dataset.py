@@ -1,4 +1,4 @@
-"""A rendered scene as a folder that an interrupted run continues: views in Blender format, or photographs."""
+"""Output folder of a rendered scene: views in Blender format, or photographs; an interrupted rendering resumes."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 
 from nerfro.errors import NerfroError
+from nerfro.files import lat_long
 from nerfro.files.atomic import write_atomically
 from nerfro.files.images import save_image
-from nerfro.files.lat_long import save_lat_long
 from nerfro.light import to_srgb
 from nerfro.scenes.baking import bake
 from nerfro.scenes.path_tracer import Pinhole
 from nerfro.scenes.scene import Scene
-from nerfro.scenes.skies import lat_long_directions, lat_long_texture
+from nerfro.scenes.skies import lat_long_texture
 from nerfro.scenes.viewpoints import directions_on_sphere, hand_held, look_at_origin
 
-CAMERA_ANGLE_X = 0.6911112070083618  # the camera of the NeRF synthetic scenes, which the paper's scenes share
+CAMERA_ANGLE_X = 0.6911112070083618  # field of view of the NeRF synthetic scenes and of the paper's scenes
 CAMERA_DISTANCE = 4.03
 SPLITS = ("train", "val", "test")
 PHOTOGRAPHER_DISTANCE, ELEVATIONS, LAPS = 4.5, (5.0, 68.0), 4
-# Of the width, and in shares of it from the picture's centre: no lens sits exactly in front of the middle.
+# Focal length, and offset of the principal point from the centre of the image, relative to the width of the image.
 FOCAL, OFF_CENTRE = 1.18, (0.006, -0.005)
 BAKING_SPP = 256
 
 
 @dataclass(frozen=True)
-class Planned:
-    """A picture that is to be rendered.
+class PlannedImage:
+    """An image that has to be rendered.
 
     Attributes:
-        image_path, mask_path: where it and its mask go within the folder.
+        image_path, mask_path: paths of image and mask within the folder.
         pose: camera-to-world matrix [4, 4], OpenGL axes.
         spp: samples per pixel.
-        seed: of the sampler (and of noise), different for every picture.
+        seed: seed of the sampler (and of noise), different for every image.
     """
 
     image_path: str
@@ -57,44 +57,44 @@ class Planned:
 
 @dataclass(frozen=True)
 class DataSet(ABC):
-    """The pictures of a scene in a folder; `config` is a resolved `SynthesizeConfig`."""
+    """Images of a scene in a folder; `config` is a resolved `SynthesizeConfig`."""
 
     config: DictConfig
     scene: Scene
     folder: Path
 
-    META: ClassVar[str]  # the file in which the settings stand
+    META: ClassVar[str]  # file with the settings
     FILES: ClassVar[tuple[str, ...]]  # patterns of all files
-    FACTS: ClassVar[dict[str, Any]] = {}  # that META tells beside the settings
-    OPTIONS: ClassVar[tuple[str, ...]]  # that decide the contents of the pictures
-    THINGS: ClassVar[str]
+    FACTS: ClassVar[dict[str, Any]] = {}  # further content of META
+    OPTIONS: ClassVar[tuple[str, ...]]  # options that change the images
+    NOUN: ClassVar[str]
 
     @property
     @abstractmethod
     def camera(self) -> Pinhole:
-        """The camera that takes all pictures."""
+        """Camera of all images."""
 
     @abstractmethod
-    def planned(self) -> list[Planned]:
-        """All pictures, in the order in which they are rendered."""
+    def planned(self) -> list[PlannedImage]:
+        """Return all images in the order of rendering."""
 
     @abstractmethod
-    def write(self, picture: Planned, radiance: np.ndarray, share: np.ndarray) -> None:
-        """Write a picture of linear radiance [H, W, 3], and a mask of the share of each pixel [H, W]."""
+    def write(self, image: PlannedImage, radiance: np.ndarray, coverage: np.ndarray) -> None:
+        """Write an image of linear radiance [H, W, 3], and a mask of the covered fraction of each pixel [H, W]."""
 
     @abstractmethod
-    def finish(self, planned: list[Planned]) -> None:
-        """Write what belongs to the pictures; the cameras last, as they say that the pictures are complete."""
+    def finish(self, planned: list[PlannedImage]) -> None:
+        """Write the files that belong to the images; the cameras come last and mark the data set as complete."""
 
     def lit(self) -> Scene:
-        """The scene as it is rendered."""
+        """Return the scene as the renderer receives the scene."""
         return self.scene
 
     def prepare(self, mitsuba: ModuleType) -> None:
-        """Make the folder ready: new, continued if its settings are equal, or cleared.
+        """Create the folder, keep a folder with equal settings, or remove the files of another data set.
 
         Raises:
-            NerfroError: the folder holds another data set, and not `overwrite`, or other files.
+            NerfroError: the folder contains other files, or another data set while `overwrite` is false.
         """
         options: Any = OmegaConf.to_container(self.config)
         settings = {"scene": self.config.scene, "fingerprint": fingerprint(self.scene)}
@@ -109,30 +109,30 @@ class DataSet(ABC):
             if not self.config.overwrite:
                 raise NerfroError(
                     f"'{self.folder}' holds a data set with other settings; choose another folder with out=DIR, "
-                    "or replace it with overwrite=true"
+                    "or replace the data set with overwrite=true"
                 )
-            # Nothing else, that somebody may have put beside them.
+            # Other files in the folder may belong to the user.
             for path in [path for pattern in self.FILES for path in self.folder.glob(pattern)]:
                 path.unlink()
         elif self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
-            raise NerfroError(f"'{self.folder}' exists and is no data set of ours; choose another folder with out=DIR")
+            raise NerfroError(f"'{self.folder}' exists and is not a data set of nerfro; choose another with out=DIR")
         versions = {name: importlib.metadata.version(name) for name in ("mitsuba", "drjit", "numpy")}
         versions |= {"python": platform.python_version(), "variant": mitsuba.variant()}
         meta = {"scene": self.config.scene, "ior": self.scene.ior, "tint": list(self.scene.tint)}
         meta |= {"absorption": list(self.scene.absorption), **self.FACTS}
         _write_json(self.folder / self.META, {**meta, "settings": settings, "versions": versions})
 
-    def missing(self, planned: list[Planned]) -> list[Planned]:
-        """Those whose picture or mask is not on disk yet."""
+    def missing(self, planned: list[PlannedImage]) -> list[PlannedImage]:
+        """Return the images without file or mask."""
         return [
-            picture
-            for picture in planned
-            if not all((self.folder / path).is_file() for path in (picture.image_path, picture.mask_path))
+            image
+            for image in planned
+            if not all((self.folder / path).is_file() for path in (image.image_path, image.mask_path))
         ]
 
 
 class Views(DataSet):
-    """Views from all sides in Blender format, split for training."""
+    """Views from all sides in Blender format, in splits."""
 
     META = "meta.json"
     FILES = (
@@ -140,22 +140,15 @@ class Views(DataSet):
         *(f"{folder}{split}/r_*.png" for split in SPLITS for folder in ("", "masks/")),
         *("mesh.ply", "interior.ply", "sky.png", "sky.exr", META),
     )
-    FACTS: ClassVar[dict[str, Any]] = {
-        "box": ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5)),
-        "near": 2.0,
-        "far": 6.0,
-        "camera_distance": CAMERA_DISTANCE,
-        "sky": "lat-long, z up: column u = 0.5 - atan2(y, x) / (2 pi), row v = acos(z) / pi, pixel centres + 0.5",
-        "masks": "share of the pixel that the glass covers",
-    }
+    FACTS: ClassVar[dict[str, Any]] = {"box": ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5)), "near": 2.0, "far": 6.0}
     OPTIONS = ("resolution", "spp", "test_spp", "views", "fresnel", "seed")
-    THINGS = "views"
+    NOUN = "views"
 
     @property
     def camera(self) -> Pinhole:
         return Pinhole.square(CAMERA_ANGLE_X, self.config.resolution)
 
-    def planned(self) -> list[Planned]:
+    def planned(self) -> list[PlannedImage]:
         planned = []
         for number, split in enumerate(SPLITS):
             spp = self.config.test_spp if split == "test" else self.config.spp
@@ -163,21 +156,21 @@ class Views(DataSet):
             for index, direction in enumerate(directions):
                 pose = look_at_origin(CAMERA_DISTANCE * direction)
                 seed, name = (self.config.seed * 3 + number) * 100_000 + index, f"{split}/r_{index:03d}.png"
-                planned.append(Planned(name, f"masks/{name}", pose, spp, seed))
+                planned.append(PlannedImage(name, f"masks/{name}", pose, spp, seed))
         return planned
 
-    def write(self, picture: Planned, radiance: np.ndarray, share: np.ndarray) -> None:
-        _write_image(self.folder / picture.mask_path, share)
-        _write_image(self.folder / picture.image_path, to_srgb(radiance))
+    def write(self, image: PlannedImage, radiance: np.ndarray, coverage: np.ndarray) -> None:
+        _write_image(self.folder / image.mask_path, coverage)
+        _write_image(self.folder / image.image_path, to_srgb(radiance))
 
-    def finish(self, planned: list[Planned]) -> None:
+    def finish(self, planned: list[PlannedImage]) -> None:
         assert self.scene.sky is not None
         sky = lat_long_texture(self.scene.sky, self.config.sky_height)
         self.scene.glass.save(self.folder / "mesh.ply")
         _write_image(self.folder / "sky.png", to_srgb(sky))
         if self.config.extras:
             self.scene.interior.save(self.folder / "interior.ply")
-            save_lat_long(self.folder / "sky.exr", torch.from_numpy(sky))
+            lat_long.save_lat_long(self.folder / "sky.exr", torch.from_numpy(sky))
         for split in SPLITS:
             frames = [
                 {
@@ -193,7 +186,7 @@ class Views(DataSet):
 
 
 class Photographs(DataSet):
-    """Photographs and masks as somebody brings them home, and apart from them the truth."""
+    """Photographs and masks without poses, as from a real capture; the true poses and surfaces are in `truth/`."""
 
     META = "truth/meta.json"
     FILES = (
@@ -201,7 +194,7 @@ class Photographs(DataSet):
         *(f"truth/{name}" for name in ("transforms_train.json", "mesh.ply", "interior.ply", "meta.json")),
     )
     OPTIONS = ("resolution", "photographs", "spp", "noise", "fresnel", "seed")
-    THINGS = "photographs"
+    NOUN = "photographs"
 
     @property
     def camera(self) -> Pinhole:
@@ -212,26 +205,26 @@ class Photographs(DataSet):
     def lit(self) -> Scene:
         return bake(self.scene, BAKING_SPP, self.config.variant)
 
-    def planned(self) -> list[Planned]:
+    def planned(self) -> list[PlannedImage]:
         config = self.config
         poses = hand_held(config.photographs, config.seed, self.scene.aim, PHOTOGRAPHER_DISTANCE, ELEVATIONS, LAPS)
         return [
-            Planned(f"images/{name}", f"masks/{name}", pose, config.spp, config.seed * 100_000 + index)
+            PlannedImage(f"images/{name}", f"masks/{name}", pose, config.spp, config.seed * 100_000 + index)
             for index, pose in enumerate(poses)
             for name in [f"photo_{index:03d}.png"]
         ]
 
-    def write(self, picture: Planned, radiance: np.ndarray, share: np.ndarray) -> None:
-        """As 8-bit sRGB with noise, and a mask in black and white.
+    def write(self, image: PlannedImage, radiance: np.ndarray, coverage: np.ndarray) -> None:
+        """Write 8-bit sRGB with noise, and a mask in black and white.
 
-        Noise of equal strength on sRGB values is about what the noise of counted photons becomes under sRGB's curve.
+        Noise of constant strength in sRGB approximates the noise of counted photons after encoding.
         """
-        grain = np.random.default_rng(picture.seed).normal(scale=self.config.noise, size=radiance.shape)
-        _write_image(self.folder / picture.mask_path, share >= 0.5)
-        _write_image(self.folder / picture.image_path, to_srgb(np.clip(radiance, 0.0, 1.0)) + grain)
+        grain = np.random.default_rng(image.seed).normal(scale=self.config.noise, size=radiance.shape)
+        _write_image(self.folder / image.mask_path, coverage >= 0.5)
+        _write_image(self.folder / image.image_path, to_srgb(np.clip(radiance, 0.0, 1.0)) + grain)
 
-    def finish(self, planned: list[Planned]) -> None:
-        """Write the truth: the surface, and the cameras as data of the format `opencv`."""
+    def finish(self, planned: list[PlannedImage]) -> None:
+        """Write the true surfaces, and the true cameras in the format `opencv`."""
         camera, truth = self.camera, self.folder / "truth"
         self.scene.glass.save(truth / "mesh.ply")
         self.scene.interior.save(truth / "interior.ply")
@@ -249,22 +242,21 @@ class Photographs(DataSet):
 
 
 def fingerprint(scene: Scene) -> str:
-    """A short hash of a scene, so that pictures of an older model are not mixed in."""
-    material = (scene.ior, scene.tint, *([scene.absorption] if any(scene.absorption) else []))
-    digest = hashlib.sha256(repr(material).encode())
+    """Compute a short hash of a scene, so that images of different scenes are not mixed in one folder."""
+    digest = hashlib.sha256(repr((scene.ior, scene.tint, scene.absorption)).encode())
     for surface in (scene.glass, scene.interior):
         for array in (surface.vertices, surface.faces, surface.normals, surface.colours):
             if array is not None:
                 digest.update(array.tobytes())
     if scene.sky is not None:
-        digest.update(scene.sky(lat_long_directions(64, 128)).astype(np.float32).tobytes())
+        digest.update(scene.sky(lat_long.directions(64).numpy()).astype(np.float32).tobytes())
     for panel in scene.panels:
-        digest.update(repr((panel.to_world.tolist(), panel.glows, panel.smooth)).encode() + panel.picture.tobytes())
+        digest.update(repr((panel.to_world.tolist(), panel.glows, panel.smooth)).encode() + panel.image.tobytes())
     return digest.hexdigest()[:16]
 
 
 def _write_image(path: Path, image: np.ndarray) -> None:
-    """Write sRGB [H, W, 3] or shares [H, W], clipped to [0, 1], as an 8-bit PNG, or bool [H, W] as a 1-bit PNG."""
+    """Write sRGB [H, W, 3] or coverage [H, W], clipped to [0, 1], as an 8-bit PNG, or bool [H, W] as a 1-bit PNG."""
     levels = image if image.dtype == bool else np.rint(np.clip(image, 0.0, 1.0) * 255).astype(np.uint8)
     save_image(path, Image.fromarray(levels), optimize=True)
 

@@ -1,4 +1,4 @@
-"""Mitsuba materials of glass: what it transmits, reflects and absorbs."""
+"""Mitsuba materials for transmission, reflection and absorption of glass."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ EMBEDDED = "embedded_in_glass"
 
 @functools.cache
 def register_materials(variant: str) -> None:
-    """Register two BSDFs for a Mitsuba variant, which must be the active one: their base class is.
+    """Register two BSDFs for the active Mitsuba variant, whose base class they derive from.
 
-    `transmitting_glass`: a ray that meets the surface below the critical angle is transmitted as Snell's law says and
-    keeps its radiance: there is no partial Fresnel reflection, and no scaling by n^2, which cancels anyway as both ends
-    of every path lie in air. Above the critical angle it is reflected totally. That is the paper's image formation: one
-    path per ray. With `fresnel` it reflects Fresnel's share, as Mitsuba's dielectric does.
+    `transmitting_glass` is the image formation of the paper, with one path per ray. Below the critical angle, a ray is
+    transmitted by Snell's law without loss: there is neither partial Fresnel reflection nor scaling by n^2. The scaling
+    cancels, because both ends of every path lie in air. Above the critical angle, a ray is reflected totally. With
+    `fresnel`, the material also reflects partially, like Mitsuba's dielectric.
     Parameters: `int_ior` (float, inside over outside), `tint` (linear RGB factor per transmission), `fresnel` (bool),
-    and `absorption` (RGB per world unit), by which light is attenuated that comes through the body to its surface.
+    and `absorption` (RGB per world unit), which attenuates light that reaches the surface from inside.
 
-    `embedded_in_glass`: the nested BSDF of a thing inside the body, attenuated likewise (`absorption`). Together the
-    two attenuate every run of a path inside the body, each where it ends.
+    `embedded_in_glass` is the nested BSDF of an object inside the body, attenuated in the same way (`absorption`).
+    Together, the two materials attenuate every segment of a path inside the body at its end.
     """
     import drjit as dr
     import mitsuba as mi
@@ -55,7 +55,7 @@ def register_materials(variant: str) -> None:
             sampled.sampled_type = dr.select(
                 reflected, mi.UInt32(+mi.BSDFFlags.DeltaReflection), mi.UInt32(+mi.BSDFFlags.DeltaTransmission)
             )
-            # The surface is seen from within where the ray has come through the body.
+            # A negative cosine means that the ray reaches the surface from inside.
             depth = dr.select(cosine < 0, interaction.t, 0.0)
             value = dr.select(reflected, mi.Color3f(1.0), self.tint) * dr.exp(-self.absorption * depth)
             return sampled, mi.Spectrum(value) & active

@@ -1,9 +1,9 @@
 """Choice of the LLVM library that Dr.Jit, the compiler behind Mitsuba, loads at run time.
 
-Dr.Jit loads the library that the environment variable `DRJIT_LIBLLVM_PATH` names, otherwise `libLLVM.so`, otherwise one
-of the versions in the system's library folder. It accepts LLVM 15, which aborts the process while it compiles vector
-code on processors with AVX-512. Therefore nerfro names the newest library before Dr.Jit loads one, and afterwards asks
-Dr.Jit for the version that it has loaded.
+Dr.Jit loads the library in the environment variable `DRJIT_LIBLLVM_PATH`, otherwise `libLLVM.so`, otherwise one of the
+versions in the system's library folder. Dr.Jit accepts LLVM 15, which aborts the process while compiling vector code on
+processors with AVX-512. Therefore nerfro sets the variable to the newest library before Dr.Jit is loaded, and later
+queries the version of the loaded library.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ def version_in_name(library: Path) -> int | None:
 
 
 def newest(libraries: Iterable[Path]) -> Path | None:
-    """Return the library with the highest version in its name, or None where none is `MIN_VERSION` or newer."""
+    """Return the library with the highest version in its name, or None if all are older than `MIN_VERSION`."""
     usable = {version: library for library in libraries if (version := version_in_name(library)) is not None}
     version = max(usable, default=0)
     return usable[version] if version >= MIN_VERSION else None
 
 
 def select_llvm() -> None:
-    """Set `DRJIT_LIBLLVM_PATH` to the newest LLVM library of this machine, unless it is set already.
+    """Set `DRJIT_LIBLLVM_PATH` to the newest LLVM library of this machine, unless the variable is set already.
 
     Call this function before Dr.Jit is used for the first time, because Dr.Jit loads a library only once.
     """
@@ -55,13 +55,13 @@ def select_llvm() -> None:
 
 
 def missing_llvm() -> str | None:
-    """Return why Dr.Jit cannot compile for the processor, or None where it can.
+    """Return the reason why Dr.Jit cannot compile for the processor, or None.
 
-    The answer is that of the library which Dr.Jit has loaded. `select_llvm` chooses the library.
+    The reason concerns the library that Dr.Jit has loaded. `select_llvm` chooses the library.
     """
     import drjit
 
     if not drjit.has_backend(drjit.JitBackend.LLVM):
-        return "Dr.Jit finds no LLVM library that it can use"
+        return "Dr.Jit finds no usable LLVM library"
     version = int(re.findall(r"\d+", str(drjit.detail.llvm_version()))[0])
     return None if version >= MIN_VERSION else f"Dr.Jit loads LLVM {version}, which is too old"

@@ -1,4 +1,4 @@
-"""Rendering a scene with Mitsuba 3: pictures by path tracing, silhouettes by rays through parts of each pixel."""
+"""Rendering of a scene with Mitsuba 3: images by path tracing, and silhouettes of the glass."""
 
 from __future__ import annotations
 
@@ -19,11 +19,14 @@ from nerfro.scenes.skies import Sky
 from nerfro.scenes.surface import Surface
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "scalar_rgb")
-# Hammersley's points: no two of them in one row or column, along which an edge might run.
+# Hammersley points: at most one point lies in each row and column, which edges may be parallel to.
 SILHOUETTE_PLACES = [((k + 0.5) / 128, (int(f"{k:07b}"[::-1], 2) + 0.5) / 128) for k in range(128)]
-SAMPLES_PER_PASS = 6_000_000  # a wavefront of paths is held in memory at once: about 1 GB per 10 M paths
+SAMPLES_PER_PASS = 6_000_000  # a wavefront of paths takes about 1 GB of memory per 10 million paths
 _TEXELS_PER_TASK, _EDGE_CONTRAST = 1 << 17, 0.1
-ROULETTE_DEPTH, MAX_DEPTH = 32, 1024  # light bounces long between the walls of a cube: cut late and without bias
+ROULETTE_DEPTH, MAX_DEPTH = (
+    32,
+    1024,
+)  # large, because cubes reflect light many times inside
 
 
 @functools.cache
@@ -31,8 +34,8 @@ def load_mitsuba(variant: str = "auto") -> ModuleType:
     """Import Mitsuba, activate one of its variants, and register nerfro's materials for it.
 
     Args:
-        variant: one of `VARIANTS`, or "auto" for the first of them that works on this machine. "auto" prints one line
-            if only the scalar variant works, which is about seventy times slower.
+        variant: one of `VARIANTS`, or "auto" for the first that works on this machine. "auto" prints one line if only
+            the scalar variant works, which is about seventy times slower.
 
     Raises:
         NerfroError: Mitsuba is not installed, or the variant does not work on this machine.
@@ -70,7 +73,7 @@ class Pinhole:
     Attributes:
         width, height: resolution, pixels.
         focal: focal length, pixels.
-        cx, cy: principal point, pixels from the picture's left and upper edge.
+        cx, cy: principal point, pixels from the left and upper edge of the image.
     """
 
     width: int
@@ -81,12 +84,12 @@ class Pinhole:
 
     @classmethod
     def square(cls, angle_x: float, size: int) -> Pinhole:
-        """A camera of square pictures with a field of view of `angle_x` radians."""
+        """Make a camera of square images with a field of view of `angle_x` radians."""
         return cls(size, size, 0.5 * size / np.tan(0.5 * angle_x), 0.5 * size, 0.5 * size)
 
     @property
     def angle_x(self) -> float:
-        """Angle, radians, under which the picture's width is seen from in front of its middle."""
+        """Horizontal field of view of a camera with the principal point in the centre of the image, radians."""
         return float(2 * np.arctan(0.5 * self.width / self.focal))
 
 
@@ -94,10 +97,10 @@ class PathTracer:
     """Renders one scene from many cameras.
 
     Args:
-        scene: what to render.
+        scene: scene to render.
         fresnel: False for transmission and total reflection only (the paper's image formation), True for a physical
             dielectric with partial reflection.
-        camera: that takes the pictures.
+        camera: camera of all images.
         variant: Mitsuba variant, see `load_mitsuba`.
     """
 
@@ -118,7 +121,7 @@ class PathTracer:
         if scene.sky is not None:
             # Two texels per pixel of the background.
             height = int(np.clip(2 * np.pi / camera.angle_x * camera.width, 256, 2048))
-            # The sky stands on its edge in Mitsuba's frame (y up); this turns y to our z.
+            # The y axis is up in an environment map of Mitsuba, and the z axis in nerfro.
             upright = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
             texture = mi.Bitmap(envmap_texture(scene.sky, height, np.asarray(upright.matrix)[:3, :3]))
             surroundings["sky"] = {"type": "envmap", "bitmap": texture, "to_world": upright}
@@ -134,12 +137,12 @@ class PathTracer:
         )
 
     def render(self, pose: np.ndarray, spp: int, seed: int) -> np.ndarray:
-        """Return linear radiance [H, W, 3], averaged over each pixel with a box filter; equal seeds, equal pictures.
+        """Return linear radiance [H, W, 3], averaged over each pixel with a box filter.
 
         Args:
             pose: camera-to-world matrix [4, 4], OpenGL axes.
             spp: samples per pixel; rendered in passes of at most `SAMPLES_PER_PASS` samples.
-            seed: of the sampler.
+            seed: seed of the sampler; equal seeds give equal images.
         """
         camera = self.camera
         sensor = {
@@ -154,10 +157,10 @@ class PathTracer:
         return self._render(sensor, pose, spp, seed)
 
     def render_flat(self, to_world: np.ndarray, above: float, spp: int, seed: int) -> np.ndarray:
-        """Return the linear radiance [H, W, 3] that a rectangle sends straight up, averaged over its pixels.
+        """Return the linear radiance [H, W, 3] of a rectangle along its normal, averaged over pixels.
 
         Args:
-            to_world: matrix [4, 4] from the square [-1, 1]^2 of x (to the right) and y (upwards); z points up from it.
+            to_world: matrix [4, 4] from the square [-1, 1]^2 of x (right) and y (up) to the world; z is the normal.
             above: distance from the rectangle at which rays begin, world units.
             spp, seed: as for `render`.
         """
@@ -166,24 +169,24 @@ class PathTracer:
         sensor = {"type": "orthographic", "near_clip": 0.1 * above, "far_clip": 10.0 * above}
         return self._render(sensor, pose, spp, seed)
 
-    def _render(self, kind: dict, pose: np.ndarray, spp: int, seed: int) -> np.ndarray:
+    def _render(self, sensor: dict, pose: np.ndarray, spp: int, seed: int) -> np.ndarray:
         mi, camera = self.mitsuba, self.camera
         film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
         film |= {"pixel_format": "rgb", "component_format": "float32"}
-        # Mitsuba's cameras look along +z with x to the left; ours look along -z with x to the right.
+        # Mitsuba's cameras look along +z with x to the left, and nerfro's cameras along -z with x to the right.
         to_world = mi.ScalarTransform4f((pose @ np.diag([-1.0, 1.0, -1.0, 1.0])).tolist())
-        sensor = mi.load_dict({**kind, "to_world": to_world, "film": film, "sampler": {"type": "independent"}})
+        loaded = mi.load_dict({**sensor, "to_world": to_world, "film": film, "sampler": {"type": "independent"}})
         per_pass = max(1, min(spp, SAMPLES_PER_PASS // (camera.width * camera.height)))
         total = np.zeros((camera.height, camera.width, 3))
         for number, first in enumerate(range(0, spp, per_pass)):
             count = min(per_pass, spp - first)
-            # Mitsuba hashes the seed, so neighbouring seeds are independent; 4096 passes is 24 G samples per view.
-            picture = mi.render(self.scene, sensor=sensor, spp=count, seed=(seed * 4096 + number) % 2**32)
-            total += count * np.asarray(picture, np.float64)
+            # Mitsuba hashes the seed, so neighbouring seeds are independent; 4096 passes are 24 G samples per view.
+            image = mi.render(self.scene, sensor=loaded, spp=count, seed=(seed * 4096 + number) % 2**32)
+            total += count * np.asarray(image, np.float64)
         return total / spp
 
     def silhouette(self, pose: np.ndarray) -> np.ndarray:
-        """Return the share [H, W] of each pixel that the glass, which nothing may hide, covers, to about 1 / 128."""
+        """Return the fraction [H, W] of each pixel that the unoccluded glass covers, to about 1 / 128."""
         mi, camera = self.mitsuba, self.camera
         total = np.zeros((camera.height, camera.width))
         for x, y in SILHOUETTE_PLACES:
@@ -201,11 +204,11 @@ class PathTracer:
 
 
 def envmap_texture(sky: Sky, height: int, to_world: np.ndarray) -> np.ndarray:
-    """Return the sky sampled where Mitsuba's `envmap` looks it up, float32 [H, 2H, 3].
+    """Return the sky sampled at the texels of Mitsuba's `envmap`, float32 [H, 2H, 3].
 
-    Mitsuba reads row j at the polar angle pi j / (H - 1), the first and last rows being the poles, but column i at the
-    azimuth 2 pi (i + 1/2) / W. Texels at edges of the sky are averages of several samples; elsewhere one is enough.
-    `to_world` [3, 3] turns the emitter's frame (y up) to ours.
+    Mitsuba reads row j at the polar angle pi j / (H - 1), so the first and last rows are the poles, and column i at the
+    azimuth 2 pi (i + 1/2) / W. Texels at edges of the sky are averages of several samples; other texels are one sample.
+    `to_world` [3, 3] rotates the frame of the emitter (y up) to the world.
     """
     width = 2 * height
 
@@ -231,18 +234,18 @@ def envmap_texture(sky: Sky, height: int, to_world: np.ndarray) -> np.ndarray:
 
 
 def _panel(mi: ModuleType, panel: Panel) -> dict:
-    """Return a Mitsuba rectangle with the panel's picture, decoded to linear, as light or as albedo."""
+    """Return a Mitsuba rectangle with the image of the panel, decoded to linear, as radiance or albedo."""
     linear = {
         "type": "bitmap",
-        # Mitsuba's v runs upwards along a rectangle, and its rows of pixels run with v.
-        "bitmap": mi.Bitmap(np.ascontiguousarray(to_linear(panel.picture[::-1]), np.float32)),
+        # In Mitsuba, v and the rows of pixels run upwards along a rectangle.
+        "bitmap": mi.Bitmap(np.ascontiguousarray(to_linear(panel.image[::-1]), np.float32)),
         "raw": True,
         "filter_type": "bilinear" if panel.smooth else "nearest",
         "wrap_mode": "clamp",
     }
     shape = {"type": "rectangle", "to_world": mi.ScalarTransform4f(panel.to_world.tolist())}
     if panel.glows:
-        # A black mirror and not a black diffuser, which would send out shadow rays for nothing.
+        # A black mirror and not a black diffuser, for which the integrator would trace useless shadow rays.
         black = {"type": "conductor", "material": "none", "specular_reflectance": {"type": "rgb", "value": 0.0}}
         return shape | {"bsdf": black, "light": {"type": "area", "radiance": linear}}
     return shape | {"bsdf": {"type": "diffuse", "reflectance": linear}}
@@ -259,7 +262,7 @@ def _mesh(mi: ModuleType, name: str, surface: Surface, material: dict):
     parameters["vertex_positions"] = surface.vertices.ravel()
     parameters["faces"] = surface.faces.astype(np.uint32).ravel()
     parameters.update()
-    # Normals last: some versions of Mitsuba replace them by averages over facets when positions change.
+    # Normals come last, because some versions of Mitsuba replace normals by averages over facets when positions change.
     parameters["vertex_normals"] = surface.normals.ravel()
     parameters.update()
     return mesh

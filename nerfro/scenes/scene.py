@@ -1,4 +1,4 @@
-"""What a scene is: a glass body, coloured things inside it, and its surroundings."""
+"""Description of a scene: a glass body, coloured objects inside, and the surroundings."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from nerfro.scenes.surface import Surface
 
 @dataclass(frozen=True)
 class Panel:
-    """A picture on a rectangle, seen from the side on which it is unmirrored; its back is black.
+    """A rectangle with an image on the front; the back is black.
 
     Attributes:
-        corner: its upper left corner [3], world units.
-        right: its upper edge [3], from left to right.
-        down: its left edge [3], from above.
-        picture: sRGB in [0, 1], float32 [H, W, 3].
-        glows: whether the picture is light that it sends out equally in all directions, or else its albedo.
-        smooth: whether the picture is interpolated between its pixels.
+        corner: upper left corner [3], world units.
+        right: upper edge [3], from left to right.
+        down: left edge [3], from top to bottom.
+        image: sRGB in [0, 1], float32 [H, W, 3].
+        glows: whether the image is emitted radiance, equal in all directions, instead of albedo.
+        smooth: whether the image is interpolated between pixels.
     """
 
     corner: np.ndarray
     right: np.ndarray
     down: np.ndarray
-    picture: np.ndarray
+    image: np.ndarray
     glows: bool = False
     smooth: bool = True
 
     @property
     def to_world(self) -> np.ndarray:
-        """Matrix [4, 4] from the square [-1, 1]^2 of x (to the right) and y (upwards), and z towards the viewer."""
+        """Matrix [4, 4] from the square [-1, 1]^2 of x (right) and y (up) to the world; z points to the front."""
         matrix = np.eye(4)
         out = np.cross(self.down, self.right)
         columns = [0.5 * self.right, -0.5 * self.down, out / np.linalg.norm(out)]
@@ -57,15 +57,15 @@ class Scene:
     """A refractive object in world units, z up.
 
     Attributes:
-        ior: refractive index of the glass; the surroundings have 1.
+        ior: refractive index of the glass; the index of the surroundings is 1.
         glass: closed outer surface of the glass.
-        interior: coloured diffuse surfaces embedded in the glass; they never touch its outer surface.
+        interior: coloured diffuse surfaces inside the glass, without contact to the outer surface.
         sky: linear radiance in [0, 1] from every direction, or None where panels close the scene.
-        panels: flat things at finite distance around the object.
-        tint: linear factor per colour channel on each crossing of the glass surface. Absorption along the path is not
-            part of the paper's image formation, so tinted glass is tinted at its surface.
-        absorption: of the glass, for each colour channel, per world unit of the path in it (Beer-Lambert).
-        aim: what a photographer looks at.
+        panels: flat surfaces at finite distance around the object.
+        tint: linear factor per colour channel on each crossing of the glass surface, as in the paper's image formation,
+            where paths are not absorbed.
+        absorption: absorption of the glass for each colour channel, per world unit (Beer-Lambert).
+        aim: point in the centre of the photographs.
     """
 
     ior: float

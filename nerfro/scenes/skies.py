@@ -1,7 +1,7 @@
 """Procedural surroundings at infinity: layers painted as functions of direction, and their lat-long textures.
 
-Directions are unit vectors in a z-up world. Layers return sRGB colours, because that is what a person judges by eye; a
-sky returns linear radiance at most 1, so that 8-bit pictures never clip.
+Directions are unit vectors in a z-up world. Layers return sRGB colours, which a person judges by eye. A sky returns
+linear radiance of at most 1, so that 8-bit images never clip.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from nerfro.files import lat_long
 from nerfro.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
 
 Sky = Callable[[np.ndarray], np.ndarray]
@@ -52,7 +53,7 @@ def skyline(
     across = turn - house
     key = house[..., None]
     roof = heights[0] + (heights[1] - heights[0]) * hashed(key, seed)
-    # Every third house or so carries a gable, so that roof lines are not all horizontal.
+    # About a third of the houses have a gable, so that some roof lines are not horizontal.
     gable = np.where(hashed(key, seed + 1) < 0.4, 5.0 * (1 - 2 * np.abs(across - 0.5)), 0.0)
     facade = chosen(palette, hashed(key, seed + 2))
     columns = 3 + np.floor(3 * hashed(key, seed + 3))
@@ -69,23 +70,12 @@ def skyline(
     return np.where(above_roof[..., None], np.array([0.55, 0.24, 0.18]), colour), covered.astype(np.float64)
 
 
-def lat_long_directions(height: int, width: int) -> np.ndarray:
-    """Return the directions at the pixel centres of a lat-long picture, [H, W, 3].
-
-    Column centre u = 0.5 - atan2(y, x) / (2 pi) and row centre v = acos(z) / pi: z is up, the middle of the picture
-    looks along +x, and a viewer inside sees it unmirrored. Blender's environment textures use the same convention.
-    """
-    rows, columns = (np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width
-    theta, phi = np.pi * rows[:, None], 2 * np.pi * (0.5 - columns[None])
-    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi], -1)
-
-
 def lat_long_texture(sky: Sky, height: int, supersampling: int = 2) -> np.ndarray:
-    """Return the sky as a float32 lat-long picture [H, 2H, 3] of linear radiance, averaged over each pixel."""
+    """Return the sky as a float32 lat-long image [H, 2H, 3] of linear radiance, averaged over each pixel."""
     k = supersampling
     texture = np.empty((height, 2 * height, 3), np.float32)
-    fine = lat_long_directions(k * height, 2 * k * height)
-    for row in range(height):  # row by row: the layers' temporaries of a whole 4k sky would not fit in memory
+    fine = lat_long.directions(k * height).numpy()
+    for row in range(height):  # by rows, because the intermediate arrays of a 4k sky exceed the memory
         band = sky(fine[k * row : k * (row + 1)])
         texture[row] = band.reshape(k, 2 * height, k, 3).mean((0, 2))
     return texture

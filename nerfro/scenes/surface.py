@@ -1,4 +1,4 @@
-"""Triangle surfaces with exact normals, and the shapes that are meshed directly rather than from a distance field."""
+"""Triangle surfaces with exact normals, and shapes that are meshed without a distance field."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Surface:
     Attributes:
         vertices: float32 [V, 3].
         faces: int32 [F, 3], counter-clockwise seen from outside.
-        normals: float32 [V, 3], unit length. Normals of the underlying smooth surface, not averages over facets.
+        normals: float32 [V, 3], unit normals of the underlying smooth surface, not averages over facets.
         colours: float32 [V, 3] sRGB albedo in [0, 1], or None for glass.
     """
 
@@ -33,19 +33,19 @@ class Surface:
         return replace(self, vertices=(self.vertices + np.asarray(offset)).astype(np.float32))
 
     def as_trimesh(self) -> trimesh.Trimesh:
-        """Return a trimesh with the same vertex order (nothing merged or reordered)."""
+        """Return a trimesh with the same vertices in the same order."""
         colours = None if self.colours is None else np.rint(self.colours * 255).astype(np.uint8)
         return trimesh.Trimesh(
             self.vertices, self.faces, vertex_normals=self.normals, vertex_colors=colours, process=False
         )
 
     def save(self, path: Path) -> None:
-        """Write a binary PLY with normals, and sRGB vertex colours where there are any."""
+        """Write a binary PLY with normals and, if present, sRGB vertex colours."""
         write_atomically(path, trimesh.exchange.ply.export_ply(self.as_trimesh(), vertex_normal=True))
 
 
 def join(surfaces: Sequence[Surface]) -> Surface:
-    """Return one surface holding all `surfaces`, which must all be coloured."""
+    """Join coloured surfaces to one surface."""
     offsets = np.cumsum([0] + [len(surface.vertices) for surface in surfaces[:-1]])
     return Surface(
         vertices=np.concatenate([surface.vertices for surface in surfaces]),
@@ -59,7 +59,7 @@ def rounded_box(half_sides: Sequence[float], radius: float, edge_steps: int) -> 
     """Mesh a box around the origin whose edges and corners are rounded with `radius`, watertight.
 
     The surface is the set of points at distance `radius` from the inner box of half sides `half_sides - radius`. Flat
-    faces are two triangles each; all the resolution goes into the edges, in `edge_steps` equal angles per 45 degrees.
+    faces consist of two triangles each; edges are divided into `edge_steps` equal angles per 45 degrees.
     """
     outer = np.asarray(half_sides, np.float64)
     inner = outer - radius
@@ -82,7 +82,7 @@ def rounded_box(half_sides: Sequence[float], radius: float, edge_steps: int) -> 
     core = np.clip(cube, -inner, inner)
     normals = cube - core
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    # Neighbouring cube faces repeat the vertices of their common edge: weld them, or the mesh is not watertight.
+    # Merge the vertices of common edges, which neighbouring faces repeat, because the mesh must be watertight.
     _, first, inverse = np.unique(np.round(cube, 9), axis=0, return_index=True, return_inverse=True)
     quad = inverse.reshape(-1)[np.concatenate(quads)]
     faces = np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
@@ -98,9 +98,9 @@ def sphere(radius: float, subdivisions: int) -> Surface:
 
 
 def torus_angles(major_radius: float, minor_radius: float, spacing: float) -> tuple[Surface, np.ndarray]:
-    """Mesh a torus around the z axis with vertices every `spacing`, and return the angles its colours are drawn with.
+    """Mesh a torus around the z axis with vertices every `spacing`, and return the angles of the vertices.
 
-    Angles [V, 2] in [0, 2 pi) run around the axis, and around the tube, whose centre line has `major_radius`.
+    Angles [V, 2] in [0, 2 pi) run around the axis, and around the tube; the centre line of the tube has `major_radius`.
     """
     around = int(np.ceil(2 * np.pi * (major_radius + minor_radius) / spacing))
     across = int(np.ceil(2 * np.pi * minor_radius / spacing))

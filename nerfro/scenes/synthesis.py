@@ -1,4 +1,4 @@
-"""Rendering the pictures of a synthetic scene that a folder lacks."""
+"""Rendering of the missing images of a synthetic scene."""
 
 from __future__ import annotations
 
@@ -52,10 +52,10 @@ class SynthesizeConfig:
 
 
 def build_scene(name: str, resolution: int) -> Scene:
-    """Model a scene, with colours as fine as half a pixel of pictures that are `resolution` pixels wide.
+    """Model a scene, with colours as fine as half a pixel of images that are `resolution` pixels wide.
 
     Raises:
-        NerfroError: no such scene.
+        NerfroError: the name is unknown.
     """
     if name not in SCENES + CAPTURES:
         raise NerfroError(f"unknown scene '{name}'; choose one of {', '.join(SCENES + CAPTURES)}")
@@ -67,32 +67,32 @@ def build_scene(name: str, resolution: int) -> Scene:
 
 
 def synthesize(config: DictConfig) -> tuple[Scene, Path]:
-    """Render what is missing of a data set; return the scene and the folder.
+    """Render the missing images of a data set, and return the scene and the folder.
 
     Args:
         config: resolved `SynthesizeConfig`.
 
     Raises:
-        NerfroError: Mitsuba is missing, or `out` holds something else.
+        NerfroError: Mitsuba is missing, or `out` contains another data set or other files.
     """
     if len(config.absorption) != 3:
         raise NerfroError(f"absorption={list(config.absorption)} is not allowed; give red, green and blue")
     scene, folder = build_scene(config.scene, config.resolution), user_path(config.out)
     ior = scene.ior if config.ior is None else config.ior
     scene = replace(scene, absorption=tuple(config.absorption), ior=ior)
-    mitsuba = load_mitsuba(config.variant)  # before anything is cleared that could not be rendered again
+    mitsuba = load_mitsuba(config.variant)  # a missing Mitsuba is reported before files are removed
     data = (dataset.Photographs if config.scene in CAPTURES else dataset.Views)(config, scene, folder)
     data.prepare(mitsuba)
     planned = data.planned()
     waiting = data.missing(planned)
-    print(f"{config.scene}: {len(planned)} {data.THINGS}, {len(planned) - len(waiting)} of them already in {folder}")
+    print(f"{config.scene}: {len(planned)} {data.NOUN}, {len(planned) - len(waiting)} of them already in {folder}")
     if waiting:
         tracer = PathTracer(data.lit(), config.fresnel, data.camera, config.variant)
-        # The estimate counts samples, not pictures: test views have more of them.
-        with tqdm(total=sum(picture.spp for picture in waiting), unit="spp", desc="render", dynamic_ncols=True) as bar:
-            for picture in waiting:
-                radiance = tracer.render(picture.pose, picture.spp, picture.seed)
-                data.write(picture, radiance, tracer.silhouette(picture.pose))
-                bar.update(picture.spp)
+        # The remaining time is estimated from samples, because test views have more samples.
+        with tqdm(total=sum(image.spp for image in waiting), unit="spp", desc="render", dynamic_ncols=True) as bar:
+            for image in waiting:
+                radiance = tracer.render(image.pose, image.spp, image.seed)
+                data.write(image, radiance, tracer.silhouette(image.pose))
+                bar.update(image.spp)
     data.finish(planned)
     return scene, folder

@@ -134,15 +134,6 @@ def test_background_pixels_show_the_sky_in_the_direction_of_the_pixel(poses):
         assert np.abs(picture - expected)[background].max() < 2e-3
 
 
-@pytest.mark.usefixtures("mitsuba")
-def test_equal_seeds_give_equal_pictures(white_torus, poses):
-    scene = replace(white_torus, sky=torus.sky)
-    tracer = PathTracer(scene, False, Pinhole.square(CAMERA_ANGLE_X, 16))
-    first, again, other = (tracer.render(poses[0], spp=8, seed=seed) for seed in (3, 3, 4))
-    assert np.array_equal(first, again)
-    assert not np.array_equal(first, other)
-
-
 def test_a_missing_mitsuba_is_told_with_the_extra_to_install():
     """In a process of its own, which has not imported Mitsuba before."""
     code = (
