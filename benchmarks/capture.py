@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.data.transforms import find_splits, parse_matrix, read_manifest
+from nerfro.data.transforms import find_splits, read_manifest
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.occupancy import occupancy_fraction
@@ -81,7 +81,7 @@ def read_cameras(root: Path) -> tuple[Float[np.ndarray, "3 3"], dict[Path, Float
     matrix = np.eye(3)
     for split in find_splits(root):
         manifest = read_manifest(root, split)
-        matrix = parse_matrix(manifest.require("cam_mat", "the camera matrix"), ((3, 3),), str(manifest.path))
+        matrix = np.array(manifest.document["cam_mat"], np.float64)
         poses |= {frame.image.resolve(): np.asarray(frame.camera_to_world) for frame in manifest.frames}
     return matrix, poses
 

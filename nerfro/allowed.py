@@ -13,6 +13,8 @@ import math
 import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
+from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -24,9 +26,9 @@ from nerfro.errors import NerfroError, nearest_of
 Class = TypeVar("Class")
 
 
-def _is_finite(number: float) -> bool:
+def _is_finite(number: object) -> bool:
     try:
-        return math.isfinite(number)
+        return isinstance(number, Real) and not isinstance(number, bool) and math.isfinite(number)
     except OverflowError:  # an integer of hundreds of digits
         return False
 
@@ -51,7 +53,8 @@ class Range:
 
     def __str__(self) -> str:
         ends = dataclasses.asdict(self).items()
-        return " and ".join(f"{word.replace('_', ' ')} {end}" for word, end in ends if end is not None)
+        limits = " and ".join(f"{word.replace('_', ' ')} {end}" for word, end in ends if end is not None)
+        return limits or "a finite number"
 
 
 _FURTHEST = 10**6  # world units: beyond, neighbouring float32 numbers are 0.06 apart
@@ -154,6 +157,8 @@ def _refusal(value: Any, hint: Any) -> str | None:
         return _refusal(value, hints[1])
     if hint in (float, int) and isinstance(value, str):  # what an interpolation may bring
         return "take a number"
+    if hint is str:
+        return None if isinstance(value, (str, Path)) else "take text"
     if hint is float:
         return None if _is_finite(value) else "take a finite number"
     if origin is list and isinstance(value, str):

@@ -14,7 +14,7 @@ from nerfro.capture.calibration import Calibration, Intrinsics, Pose
 from nerfro.cli import warn
 from nerfro.data.colmap import lens_of
 from nerfro.data.colmap_model import read_colmap
-from nerfro.data.frames import Lens
+from nerfro.data.lenses import Lens, check_lenses
 from nerfro.errors import NerfroError, first_of
 
 # The pose of a group of cameras relative to the others is doubtful if the group shares fewer points with the others, or
@@ -55,6 +55,7 @@ def import_model(folder: Path, images: Sequence[Path], size: tuple[int, int]) ->
         )
     camera, where = parsed.cameras[numbers.pop()], f"{folder}: the camera"
     lens = lens_of(camera, where).resized((camera.width, camera.height), size, where)
+    check_lenses([lens], [where], size)
     reconstruction = pycolmap.Reconstruction(folder)
     _warn_of_loose_groups(reconstruction)
     errors = _reprojection_errors(reconstruction, size[0] / camera.width)

@@ -10,8 +10,9 @@ from jaxtyping import Float
 from nerfro.allowed import Distance, Factor
 from nerfro.data.base import Frame
 from nerfro.data.colmap_model import ColmapCamera, ColmapModel, read_colmap
-from nerfro.data.frames import Every, FrameSet, Lens, PosedImages
+from nerfro.data.frames import Every, FrameSet, PosedImages
 from nerfro.data.image_files import Alpha, read_size
+from nerfro.data.lenses import Lens
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
 from nerfro.lens import coefficients, opencv_coefficients
@@ -82,17 +83,13 @@ def lens_of(camera: ColmapCamera, where: str) -> Lens:
     """Convert the intrinsics of a perspective COLMAP camera; both use the same pixel coordinates."""
     p = camera.params
     if camera.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
-        lens = Lens(p[0], p[0], p[1], p[2], coefficients(p[3:]))
-    elif camera.model in ("PINHOLE", "OPENCV", "FULL_OPENCV"):
-        lens = Lens(p[0], p[1], p[2], p[3], opencv_coefficients(p[4:]))
-    else:
-        raise NerfroError(
-            f"{where} has the model {camera.model}, which is not supported; undistort the images with "
-            "`colmap image_undistorter`, or reconstruct with PINHOLE, RADIAL, OPENCV or FULL_OPENCV"
-        )
-    if lens.fx <= 0 or lens.fy <= 0:
-        raise NerfroError(f"{where} has the focal lengths {lens.fx:g}, {lens.fy:g}; these must be positive")
-    return lens
+        return Lens(p[0], p[0], p[1], p[2], coefficients(p[3:]))
+    if camera.model in ("PINHOLE", "OPENCV", "FULL_OPENCV"):
+        return Lens(p[0], p[1], p[2], p[3], opencv_coefficients(p[4:]))
+    raise NerfroError(
+        f"{where} has the model {camera.model}, which is not supported; undistort the images with "
+        "`colmap image_undistorter`, or reconstruct with PINHOLE, RADIAL, OPENCV or FULL_OPENCV"
+    )
 
 
 def _distance_range(model: ColmapModel, folder: Path) -> tuple[float, float]:

@@ -18,9 +18,9 @@ from nerfro.cameras import Cameras, central_window
 from nerfro.data.base import DataSource, Frame, Views
 from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb
 from nerfro.data.lazy_images import LazyImages
+from nerfro.data.lenses import Lens, check_lenses
 from nerfro.data.masks import find_masks, find_usable
 from nerfro.errors import NerfroError
-from nerfro.lens import distort, undistort
 from nerfro.paths import resolve_path
 
 Every = Annotated[int, Range(at_least=2)]  # every n-th view is a test view
@@ -28,53 +28,6 @@ SPLITS = ["train", "val", "test"]
 Item = TypeVar("Item")
 
 _ROTATION_TOLERANCE = 1e-3
-_FOCAL = Annotated[float, Range(at_least=1e-3, at_most=1e9)]
-_INTRINSICS = {"fx": _FOCAL, "fy": _FOCAL, "cx": Coordinate, "cy": Coordinate}
-
-# Maximum error in pixels after undistorting and distorting a point again.
-_LENS_TOLERANCE = 0.01
-
-
-@dataclass(frozen=True)
-class Lens:
-    """Intrinsics of a perspective camera with lens distortion.
-
-    Attributes:
-        fx, fy: focal lengths in pixels.
-        cx, cy: principal point in pixels; the corner of the image is at (0, 0).
-        distortion: nine coefficients (see `nerfro.lens.coefficients`), or None.
-    """
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, ...] | None = None
-
-    @classmethod
-    def of_angle(cls, angle: float, width: int, height: int) -> Lens:
-        """Return the ideal lens with a horizontal field of view in radians and a centred principal point."""
-        focal = 0.5 * width / math.tan(0.5 * angle)
-        return cls(focal, focal, 0.5 * width, 0.5 * height)
-
-    def resized(self, calibrated: tuple[float, float], size: tuple[int, int], where: str) -> Lens:
-        """Scale the intrinsics to images that were resized after the calibration.
-
-        Args:
-            calibrated: width and height in pixels that the intrinsics belong to.
-            size: width and height in pixels of the images.
-            where: subject of the error message.
-
-        Raises:
-            NerfroError: the aspect ratios differ.
-        """
-        by_width, by_height = size[0] / calibrated[0], size[1] / calibrated[1]
-        if abs(by_width - by_height) > 1.5 * max(1 / calibrated[0], 1 / calibrated[1]):
-            raise NerfroError(
-                f"{where} is calibrated for {calibrated[0]:g}x{calibrated[1]:g} pixels but the images have "
-                f"{size[0]}x{size[1]} and another aspect ratio; restore the images that were calibrated"
-            )
-        return Lens(self.fx * by_width, self.fy * by_height, self.cx * by_width, self.cy * by_height, self.distortion)
 
 
 @dataclass(frozen=True)
@@ -86,7 +39,6 @@ class FrameSet:
         lenses: one lens per frame, for the images in their stored size.
         axes: camera axes of the poses: `opengl` (x right, y up, viewing direction -z) or `opencv` (y down, +z).
         near, far: bounds of the rays (arc lengths, world units) that apply where the options leave these open.
-        size: stored width and height of the images in pixels, if the data set states them.
         crop: fraction of each side that is kept around the centre.
         usable: masks of the pixels that training may use, one per frame; empty if all pixels are usable.
     """
@@ -96,7 +48,6 @@ class FrameSet:
     axes: Literal["opengl", "opencv"]
     near: float = 0.0
     far: float = math.inf
-    size: tuple[int, int] | None = None
     crop: float = 1.0
     usable: Sequence[Path | None] = ()
 
@@ -152,13 +103,12 @@ class PosedImages(DataSource):
         _check_bounds(near, far)
         frames, files, alpha = read.frames, [frame.image for frame in read.frames], self.alpha
         composited = alpha != "drop"
-        images = LazyImages.of(
-            files, lambda path: read_rgb(path, alpha), self.downscale, read.size, composited, recipe=alpha
-        )
+        images = LazyImages.of(files, lambda path: read_rgb(path, alpha), self.downscale, composited, recipe=alpha)
         (height, width), stored = images.shape, images.size[::-1]
         masks = find_masks(files, [frame.mask for frame in frames], self.downscale, stored)
-        for frame, lens in zip(frames, read.lenses, strict=True):
-            check(f"{frame.name}: its lens has ", _INTRINSICS, vars(lens))
+        for frame in frames:
+            check_pose(frame.camera_to_world, frame.name, "the pose")
+        check_lenses(read.lenses, [frame.name for frame in frames], stored)
         poses = np.stack([frame.camera_to_world for frame in frames])
         if read.axes == "opencv":
             poses = poses * np.array([1.0, -1.0, -1.0, 1.0])
@@ -168,7 +118,6 @@ class PosedImages(DataSource):
         distorted = any(lens.distortion is not None for lens in read.lenses)
         distortion = torch.tensor([lens.distortion or (0.0,) * 9 for lens in read.lenses]) if distorted else None
         cameras = Cameras(torch.from_numpy(poses).float(), fx, fy, cx, cy, width, height, near, far, distortion)
-        _check_distortion(cameras, frames)
         usable = find_usable(files, read.usable, self.downscale, stored) if any(read.usable) else None
         if read.crop < 1:
             window = central_window(height, width, read.crop)
@@ -225,23 +174,3 @@ def check_pose(
         raise NerfroError(f"{where}: the last row of {name} is {matrix[3].tolist()}; it must be 0, 0, 0, 1")
     check(f"{where}: position in ", {name: list[Coordinate]}, {name: matrix[:3, 3].tolist()})
     return matrix[:3]
-
-
-def _check_distortion(cameras: Cameras, frames: Sequence[Frame]) -> None:
-    """Refuse a distortion that is not invertible within the image, as for polynomials fitted to the image centre."""
-    if cameras.distortion is None:
-        return
-    fractions = torch.linspace(0, 1, 9, dtype=torch.float64)
-    size = torch.tensor([cameras.width, cameras.height])
-    grid = torch.cartesian_prod(fractions, fractions) * size  # the interior as well, because the fold may lie there
-    for view, frame in enumerate(frames):
-        fx, fy, cx, cy = (getattr(cameras, name)[view].double() for name in ("fx", "fy", "cx", "cy"))
-        points = (grid - torch.stack([cx, cy])) / torch.stack([fx, fy])
-        lens = cameras.distortion[view].double().expand(len(points), 9)
-        ideal, area = undistort(points, lens)
-        error = (distort(ideal, lens)[0] - points).norm(dim=-1) * fx
-        if not bool(((error < _LENS_TOLERANCE) & (area > 0)).all()):
-            raise NerfroError(
-                f"{frame.name}: the lens distortion is not invertible everywhere in the image; "
-                "check the coefficients and their order, or undistort the images first"
-            )

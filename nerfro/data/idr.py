@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -11,11 +12,11 @@ from jaxtyping import Float
 
 from nerfro.allowed import Distance, Factor
 from nerfro.data.base import Frame
-from nerfro.data.frames import Every, FrameSet, Lens, PosedImages, list_images
+from nerfro.data.frames import Every, FrameSet, PosedImages, list_images
 from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha
-from nerfro.data.transforms import parse_matrix
+from nerfro.data.lenses import Lens
 from nerfro.errors import NerfroError
-from nerfro.files.reading import load_arrays
+from nerfro.files.reading import load_arrays, parse_matrix
 from nerfro.registry import register
 
 _MAX_SKEW = 1e-3
@@ -105,12 +106,9 @@ def decompose(projection: Float[np.ndarray, "3 4"], where: str) -> tuple[Float[n
     signs = np.diag(np.sign(np.diag(upper)))
     intrinsics, rotation = upper @ signs, signs @ rotation
     intrinsics /= intrinsics[2, 2]
-    fx, fy = float(intrinsics[0, 0]), float(intrinsics[1, 1])
-    if abs(intrinsics[0, 1]) > _MAX_SKEW * fx:
-        raise NerfroError(f"{where} has the skew {intrinsics[0, 1]:.3g}, which is not supported; calibrate without")
+    lens = Lens.of_matrix(intrinsics, f"the camera matrix of {where}", _MAX_SKEW)
     centre = -np.linalg.solve(square, projection[:, 3])
-    lens = Lens(fx, fy, float(intrinsics[0, 2]) + 0.5, float(intrinsics[1, 2]) + 0.5)
-    return np.column_stack([rotation.T, centre]), lens
+    return np.column_stack([rotation.T, centre]), replace(lens, cx=lens.cx + 0.5, cy=lens.cy + 0.5)
 
 
 def _first_folder(root: Path, names: tuple[str, ...]) -> Path:

@@ -52,7 +52,6 @@ class LazyImages:
         files: Sequence[Path],
         read: Callable[[Path], Levels],
         downscale: float = 1,
-        expected_size: tuple[int, int] | None = None,
         deep: bool = False,
         recipe: str = "",
     ) -> LazyImages:
@@ -62,7 +61,6 @@ class LazyImages:
             files: at least one file.
             read: function that reads the levels [H, W, *C] of one file.
             downscale: downscaling factor, 1 or more.
-            expected_size: stored width and height in pixels, if the data set states them.
             deep: whether `read` may convert 8-bit to 16-bit levels.
             recipe: see `LazyImages`.
 
@@ -70,11 +68,6 @@ class LazyImages:
             NerfroError: a header cannot be read, or the sizes differ.
         """
         width, height, bits = read_size(files[0])
-        if expected_size is not None and expected_size != (width, height):
-            raise NerfroError(
-                f"image {files[0]} has {width}x{height} pixels but the transforms file states "
-                f"{expected_size[0]}x{expected_size[1]}; restore the original image or correct the transforms file"
-            )
         for path in files[1:]:
             *size, depth = read_size(path)
             if size != [width, height]:

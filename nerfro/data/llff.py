@@ -11,8 +11,9 @@ from jaxtyping import Float
 
 from nerfro.allowed import Distance, Factor
 from nerfro.data.base import Frame
-from nerfro.data.frames import Every, FrameSet, Lens, PosedImages, check_pose, list_images, require_root
+from nerfro.data.frames import Every, FrameSet, PosedImages, check_pose, list_images, require_root
 from nerfro.data.image_files import Alpha, read_size
+from nerfro.data.lenses import Lens
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
 from nerfro.files.reading import load_array
@@ -82,7 +83,7 @@ class LlffData(PosedImages):
             chosen = self.held_out(chosen, self.test_every, split)
         frames = [Frame(files[i].name, files[i], find_mask(folder, files[i]), poses[i]) for i in chosen]
         size, where = read_size(frames[0].image)[:2], f"{folder / 'poses_bounds.npy'}"
-        lenses = [Lens(f, f, 0.5 * w, 0.5 * h).resized((w, h), size, where) for h, w, f in sizes[chosen]]
+        lenses = [Lens(f, f, 0.5 * w, 0.5 * h).resized((w, h), size, where) for h, w, f in sizes[chosen].tolist()]
         return FrameSet(frames, lenses, "opengl", 0.9 * float(depths.min()), farthest)
 
 

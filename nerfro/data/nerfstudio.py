@@ -3,28 +3,22 @@
 from __future__ import annotations
 
 import functools
-import math
-from collections.abc import Mapping
 from pathlib import PurePosixPath
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from nerfro.allowed import Distance, Factor
 from nerfro.data.bounds import find_bounds
-from nerfro.data.frames import SPLITS, Every, FrameSet, Lens, PosedImages
-from nerfro.data.image_files import Alpha, read_size
+from nerfro.data.frames import SPLITS, Every, FrameSet, PosedImages
+from nerfro.data.image_files import Alpha
 from nerfro.data.masks import find_mask
-from nerfro.data.transforms import Manifest, find_splits, is_number, parse_manifest, read_manifest
+from nerfro.data.transforms import Manifest, find_splits, parse_manifest, read_manifest
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import load_points
-from nerfro.lens import coefficients
 from nerfro.registry import register
 
 _SINGLE, _MASK_KEY = "transforms.json", "object_mask_path"
-
-# Supported values of `camera_model`. These models differ only in the coefficients that are zero.
-_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
 
 
 @register("data", "nerfstudio")
@@ -74,18 +68,10 @@ class NerfstudioData(PosedImages):
     def read(self, split: str) -> FrameSet:
         manifest = self._manifest(split)
         chosen = self._choose(manifest, split) if self._is_single else list(range(len(manifest.frames)))
-        entries: list[Mapping[str, object]] = manifest.document["frames"]  # type: ignore[assignment]
-        frames = [manifest.frames[i] for i in chosen]
-        width, height, _ = read_size(frames[0].image)
-        lenses, usable = [], []
-        for entry, frame in zip([entries[i] for i in chosen], frames, strict=True):
-            where = f"{manifest.path}: '{frame.name}'"
-            lenses.append(read_lens({**manifest.document, **entry}, width, height, where))
-            path = entry.get("mask_path")
-            if not isinstance(path, str | None):
-                raise NerfroError(f"{where}: 'mask_path' must be text; it is {path!r}")
-            usable.append(None if path is None else find_mask(self.root, frame.image, path))
-        return FrameSet(frames, lenses, "opengl", *self._bounds(split), usable=usable)
+        entries: Any = manifest.document["frames"]
+        frames, stated = [manifest.frames[i] for i in chosen], [entries[i].get("mask_path") for i in chosen]
+        usable = [path and find_mask(self.root, frame.image, path) for path, frame in zip(stated, frames, strict=True)]
+        return FrameSet(frames, manifest.lenses(chosen), "opengl", *self._bounds(split), usable=usable)
 
     def _bounds(self, split: str) -> tuple[float, float]:
         """Return the bounds, which are estimated from the training cameras for all splits."""
@@ -115,37 +101,3 @@ class NerfstudioData(PosedImages):
         if unknown:
             raise NerfroError(f"{manifest.path}: {split}_filenames lists '{unknown[0]}', but no frame has this name")
         return [known[name] for name in names]
-
-
-def read_lens(values: Mapping[str, object], width: int, height: int, where: str) -> Lens:
-    """Read the intrinsics of a frame.
-
-    Args:
-        values: keys of the frame, merged over the keys of the file.
-        width, height: stored size of the image in pixels.
-        where: subject of the error message.
-    """
-    model = values.get("camera_model", "OPENCV")
-    if model not in _PERSPECTIVE:
-        raise NerfroError(
-            f"{where}: camera_model={model!r} is not supported; undistort the images to one of "
-            f"{', '.join(_PERSPECTIVE)}, for example with COLMAP's image_undistorter"
-        )
-    for key in ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_angle_x"):
-        if key in values and not is_number(values[key]):
-            raise NerfroError(f"{where}: {key}={values[key]!r} must be a number")
-    numbers = {key: float(value) for key, value in values.items() if is_number(value)}
-    calibrated = numbers.get("w", width), numbers.get("h", height)
-    if "fl_x" in numbers:
-        fx = numbers["fl_x"]
-    elif 0 < numbers.get("camera_angle_x", 0) < math.pi:
-        fx = 0.5 * calibrated[0] / math.tan(0.5 * numbers["camera_angle_x"])
-    else:
-        raise NerfroError(f"{where} has neither 'fl_x' nor a valid 'camera_angle_x'; add the focal length in pixels")
-    fy = numbers.get("fl_y", fx)
-    if fx <= 0 or fy <= 0 or min(calibrated) <= 0:
-        raise NerfroError(f"{where}: fl_x={fx:g}, fl_y={fy:g}, w and h must be positive")
-    k1, k2, k3, k4, p1, p2 = (numbers.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    centre = numbers.get("cx", 0.5 * calibrated[0]), numbers.get("cy", 0.5 * calibrated[1])
-    lens = Lens(fx, fy, *centre, coefficients([k1, k2, k3, k4], [p1, p2]))
-    return lens.resized(calibrated, (width, height), where)

@@ -14,10 +14,11 @@ from jaxtyping import Float
 
 from nerfro.allowed import Distance, Factor
 from nerfro.data.base import Frame, Views
-from nerfro.data.frames import SPLITS, FrameSet, Lens, PosedImages, check_pose
+from nerfro.data.frames import SPLITS, FrameSet, PosedImages, check_pose
 from nerfro.data.image_files import Alpha, read_size
-from nerfro.data.transforms import parse_matrix
+from nerfro.data.lenses import Lens
 from nerfro.errors import NerfroError
+from nerfro.files.reading import parse_matrix
 from nerfro.registry import register
 
 # Constants of RefRef's refref_dataparser.py: horizontal field of view, half side of the scene box, views per split.

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import TypeGuard
+from typing import Any
 
-import numpy as np
-from jaxtyping import Float
-
+from nerfro.allowed import check
 from nerfro.cli import warn
 from nerfro.data.base import Frame
 from nerfro.data.frames import SPLITS, check_pose, require_root
-from nerfro.data.image_files import IMAGE_SUFFIXES
+from nerfro.data.image_files import IMAGE_SUFFIXES, read_size
+from nerfro.data.lenses import Lens, read_lens
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError, first_of
-from nerfro.files.reading import read_json
+from nerfro.files.reading import parse_matrix, read_json
+
+_PATHS = dict.fromkeys(("file_path", "mask_path", "mask_file_path", "object_mask_path"), str)
 
 
 @dataclass(frozen=True)
@@ -35,21 +35,13 @@ class Manifest:
     document: Mapping[str, object]
     frames: list[Frame]
 
-    def require(self, key: str, meaning: str) -> object:
-        """Return a required value; `meaning` explains the key in the error message."""
-        if key not in self.document:
-            raise NerfroError(f"{self.path} has no '{key}' ({meaning}); add it")
-        return self.document[key]
-
-    @property
-    def size(self) -> tuple[int, int] | None:
-        """Width and height of the images in pixels (`w` and `h`), or None if the file does not state both."""
-        width, height = self.document.get("w"), self.document.get("h")
-        if width is None or height is None:
-            return None
-        if not is_number(width) or not is_number(height):
-            raise NerfroError(f"{self.path}: w={width!r} and h={height!r} must be numbers of pixels")
-        return int(width), int(height)
+    def lenses(self, chosen: Sequence[int] | None = None) -> list[Lens]:
+        """Read the lenses of all frames, or of the chosen ones, for the size of their images; see `read_lens`."""
+        entries: Any = self.document["frames"]
+        chosen = range(len(self.frames)) if chosen is None else chosen
+        size = read_size(self.frames[chosen[0]].image)[:2]
+        where = (f"{self.path}: '{self.frames[i].name}'" for i in chosen)
+        return [read_lens(self.document, entries[i], size, place) for i, place in zip(chosen, where, strict=True)]
 
 
 def find_splits(root: Path) -> dict[str, Path]:
@@ -91,77 +83,52 @@ def parse_manifest(path: Path, mask_key: str = "mask_path", skip_missing: bool =
         raise NerfroError(f"{path} has no list 'frames'; see docs/data.md for the format")
     if not frames:
         raise NerfroError(f"{path} has an empty list 'frames'; a split needs at least one")
-    if skip_missing:
-        frames = _with_images(path, frames)
-        document = {**document, "frames": frames}
-    read = [_read_frame(path, i, frame, mask_key) for i, frame in enumerate(frames)]
-    counts = Counter(frame.image for frame in read)  # by file: `r_0` and `r_0.png` are one image
-    repeated = list(dict.fromkeys(f"'{frame.name}'" for frame in read if counts[frame.image] > 1))
+    names = [_frame_name(f"{path}: frame {i}", frame) for i, frame in enumerate(frames)]
+    found = {name: _existing_image(path.parent, name) for name in set(names)}
+    images = [found[name] for name in names]
+    counts = Counter(image for image in images if image is not None)  # by file: `r_0` and `r_0.png` are one image
+    repeated = {f"'{name}'": None for name, image in zip(names, images, strict=True) if image and counts[image] > 1}
     if repeated:
-        raise NerfroError(f"{path}: {first_of(repeated)} occurs in several frames; keep one frame per image")
-    return Manifest(path, document, read)
+        raise NerfroError(f"{path}: {first_of(list(repeated))} occurs in several frames; keep one frame per image")
+    kept = list(range(len(frames)))
+    missing = [names[i] for i in kept if images[i] is None]
+    if skip_missing and 0 < len(missing) < len(frames):
+        warn(f"{path}: {len(missing)} of {len(frames)} frames have no image and are skipped: {first_of(missing)}")
+        kept = [i for i in kept if images[i] is not None]
+    read = [
+        _read_frame(f"{path}: frame {i} ('{names[i]}')", frames[i], names[i], images[i], path.parent, mask_key)
+        for i in kept
+    ]
+    return Manifest(path, document | {"frames": [frames[i] for i in kept]}, read)
 
 
-def parse_matrix(value: object, shapes: tuple[tuple[int, int], ...], where: str) -> Float[np.ndarray, "rows columns"]:
-    """Convert nested lists to a matrix of finite numbers that has one of the shapes."""
-    allowed = " or ".join(f"{rows}x{columns}" for rows, columns in shapes)
-    try:
-        matrix = np.array(value)
-    except ValueError:  # rows of different lengths
-        matrix = np.empty(0, object)
-    if matrix.dtype.kind not in "fiu":
-        raise NerfroError(f"{where} is not a matrix of numbers; give {allowed} numbers")
-    matrix = matrix.astype(np.float64)
-    if matrix.shape not in shapes:
-        raise NerfroError(
-            f"{where} has shape {'x'.join(map(str, matrix.shape)) or 'of a number'}; give {allowed} numbers"
-        )
-    if not np.isfinite(matrix).all():
-        raise NerfroError(f"{where} holds NaN or infinite numbers; correct it or take the frame out")
-    return matrix
-
-
-def is_number(value: object) -> TypeGuard[float]:
-    """Return whether a JSON value is a finite number."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _with_images(path: Path, frames: list) -> list:
-    """Drop the frames whose image does not exist, with a warning. Other errors are reported by `_read_frame`."""
-    names = [frame.get("file_path") if isinstance(frame, dict) else None for frame in frames]
-    missing = [isinstance(name, str) and _existing_image(path.parent, name) is None for name in names]
-    if all(missing) or not any(missing):
-        return frames
-    skipped = first_of([str(name) for name, gone in zip(names, missing, strict=True) if gone])
-    warn(f"{path}: {sum(missing)} of {len(frames)} frames have no image and are skipped: {skipped}")
-    return [frame for frame, gone in zip(frames, missing, strict=True) if not gone]
-
-
-def _read_frame(path: Path, index: int, entry: object, mask_key: str) -> Frame:
-    where = f"{path}: frame {index}"
+def _frame_name(where: str, entry: object) -> str:
+    """Check the types in one entry of `frames`, and return the path of its image."""
     if not isinstance(entry, dict):
         raise NerfroError(f"{where} is not an object; see docs/data.md for the format")
     for key in ("file_path", "transform_matrix"):
-        if key not in entry:
+        if entry.get(key) is None:
             raise NerfroError(f"{where} has no '{key}'; add it or take the frame out")
+    check(f"{where}: ", _PATHS, {key: entry.get(key) for key in _PATHS})
+    return PurePosixPath(entry["file_path"].replace("\\", "/")).as_posix()
+
+
+def _read_frame(
+    where: str, entry: Mapping[str, Any], name: str, image: Path | None, root: Path, mask_key: str
+) -> Frame:
+    pose = check_pose(parse_matrix(entry["transform_matrix"], ((4, 4), (3, 4)), f"{where}: transform_matrix"), where)
+    if image is None:
+        raise NerfroError(
+            f"{where}: image {_candidates(root, name)[0]} does not exist; restore it or take the frame out"
+        )
     # `mask_file_path` is RefRef's key for the silhouette.
     stated = entry.get(mask_key, entry.get("mask_file_path"))
-    if not isinstance(entry["file_path"], str) or not isinstance(stated, str | None):
-        raise NerfroError(f"{where}: 'file_path' and '{mask_key}' must be text")
-    name = PurePosixPath(entry["file_path"].replace("\\", "/")).as_posix()
-    where += f" ('{name}')"
-    pose = check_pose(parse_matrix(entry["transform_matrix"], ((4, 4), (3, 4)), f"{where}: transform_matrix"), where)
-    image = _existing_image(path.parent, name)
-    if image is None:
-        missing = _candidates(path.parent, name)[0]
-        raise NerfroError(f"{where}: image {missing} does not exist; restore it or take the frame out")
     has_mask = mask_key == "mask_path" or stated is not None
-    return Frame(name, image, find_mask(path.parent, image, stated) if has_mask else None, pose)
+    return Frame(name, image, find_mask(root, image, stated) if has_mask else None, pose)
 
 
 def _candidates(root: Path, name: str) -> list[Path]:
     """List the possible image files of a `file_path`, which may lack its extension."""
-    name = name.replace("\\", "/")
     known = PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES
     return [root / name] if known else [root / f"{name}{suffix}" for suffix in IMAGE_SUFFIXES]
 

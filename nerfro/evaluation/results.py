@@ -9,10 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from nerfro.data.transforms import is_number
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
-from nerfro.files.reading import read_json
+from nerfro.files.reading import is_number, read_json
 
 Score = float | None  # None if not available; the notes contain the reason
 

@@ -15,10 +15,12 @@ import threading
 import warnings
 import zipfile
 from collections.abc import Iterator
+from numbers import Real
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeGuard
 
 import numpy as np
+from jaxtyping import Float
 from PIL import ExifTags, Image, TiffImagePlugin, UnidentifiedImageError
 
 from nerfro.errors import NerfroError
@@ -139,6 +141,27 @@ def read_json(path: Path, unreadable: str) -> Any:
         content = path.read_bytes()
     with reading(path, trouble="is not valid JSON"):
         return json.loads(content, parse_int=parse_int)
+
+
+def parse_matrix(value: object, shapes: tuple[tuple[int, int], ...], where: str) -> Float[np.ndarray, "rows columns"]:
+    """Convert nested lists or an array to a matrix of finite numbers that has one of the shapes."""
+    allowed = " or ".join(f"{rows}x{columns}" for rows, columns in shapes)
+    numbers = np.array(value, dtype=object)  # NumPy alone takes `true` for 1
+    if not all(isinstance(number, Real) and not isinstance(number, bool) for number in numbers.flat):
+        raise NerfroError(f"{where} is not a matrix of numbers; give {allowed} numbers")
+    matrix = numbers.astype(np.float64)
+    if matrix.shape not in shapes:
+        raise NerfroError(
+            f"{where} has shape {'x'.join(map(str, matrix.shape)) or 'of a number'}; give {allowed} numbers"
+        )
+    if not np.isfinite(matrix).all():
+        raise NerfroError(f"{where} holds NaN or infinite numbers; correct it or take the frame out")
+    return matrix
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Return whether a JSON value is a finite number."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def load_arrays(path: Path, most_bytes: float = MAX_ARRAY_BYTES) -> dict[str, np.ndarray]:

@@ -17,16 +17,16 @@ from nerfro.camera.similarity import motion_between
 from nerfro.cameras import Cameras
 from nerfro.capture.calibrated_data import relative
 from nerfro.data.base import Views
-from nerfro.data.frames import Lens, check_pose
-from nerfro.data.nerfstudio import read_lens
-from nerfro.data.transforms import is_number, parse_matrix
+from nerfro.data.frames import check_pose
+from nerfro.data.lenses import Lens, check_lenses, read_lens
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
-from nerfro.files.reading import read_json
+from nerfro.files.reading import is_number, parse_matrix, read_json
 from nerfro.viewing.camera_paths import CaptureGeometry
 
-# Names of the nine coefficients (`nerfro.lens`); other programs know the first six.
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2", "k5", "k6", "k7")
+# Names of the nine coefficients (`nerfro.lens`) without and with a denominator. OpenCV's rational model has no r^8.
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_RATIONAL = ("k1", "k2", "k3", "", "p1", "p2", "k4", "k5", "k6")
 
 
 def read_cameras(file: Path, geometry: CaptureGeometry) -> Cameras:
@@ -43,7 +43,7 @@ def read_cameras(file: Path, geometry: CaptureGeometry) -> Cameras:
         NerfroError: the file has another format, or a value is missing or invalid.
     """
     document = read_json(file, "check the path")
-    lens_of: Callable[[Mapping[str, Any], int, int, str], Lens] = read_lens
+    lens_of: Callable[[Mapping[str, Any], Mapping[str, Any], tuple[int, int], str], Lens] = read_lens
     if isinstance(document, dict) and isinstance(document.get("camera_path"), list):
         size = ("render_width", "render_height")
         entries, pose_key, lens_of = document["camera_path"], "camera_to_world", _lens_of_path
@@ -65,7 +65,8 @@ def read_cameras(file: Path, geometry: CaptureGeometry) -> Cameras:
         flat = np.asarray(entry[pose_key], dtype=object)
         matrix = flat.reshape(-1, 4).tolist() if flat.size in (12, 16) else entry[pose_key]
         poses.append(check_pose(parse_matrix(matrix, ((3, 4), (4, 4)), where), where, pose_key))
-        lenses.append(lens_of({**document, **entry}, width, height, where))
+        lenses.append(lens_of(document, entry, (width, height), where))
+    check_lenses(lenses, [f"{file}: camera {number}" for number in range(len(lenses))], (width, height))
     fx, fy, cx, cy = torch.tensor([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in lenses]).unbind(-1)
     distorted = any(lens.distortion is not None for lens in lenses)
     distortion = torch.tensor([lens.distortion or (0.0,) * 9 for lens in lenses]) if distorted else None
@@ -84,29 +85,33 @@ def write_cameras(file: Path, camera: Camera, views: Views) -> None:
     given, estimated = views.cameras, camera.estimated(views.cameras).to("cpu")
     turned, shifted = (values.tolist() for values in motion_between(given.camera_to_world, estimated.camera_to_world))
     gains = None if camera.exposure is None else camera.exposure.gains().tolist()
+    rational = estimated.distortion is not None and bool(estimated.distortion[:, 6:].any())
+    names = _RATIONAL if rational else _DISTORTION
     frames = []
     for view, frame in enumerate(views.frames):
         lens = {"fl_x": estimated.fx, "fl_y": estimated.fy, "cx": estimated.cx, "cy": estimated.cy}
         entry: dict[str, Any] = {"file_path": relative(frame.image, file.parent)}
         entry |= {name: float(values[view]) for name, values in lens.items()}
         if estimated.distortion is not None:
-            entry |= dict(zip(_DISTORTION, estimated.distortion[view].tolist(), strict=True))
+            entry |= {name: k for name, k in zip(names, estimated.distortion[view].tolist(), strict=False) if name}
         entry["transform_matrix"] = [*estimated.camera_to_world[view].tolist(), [0.0, 0.0, 0.0, 1.0]]
         entry |= {"turned_degrees": turned[view], "shifted": shifted[view]}
         if gains is not None:
             entry["gain"] = gains[view]
         frames.append(entry)
-    document = {"camera_model": "OPENCV", "w": given.width, "h": given.height, "frames": frames}
+    model = "FULL_OPENCV" if rational else "OPENCV"
+    document = {"camera_model": model, "w": given.width, "h": given.height, "frames": frames}
     write_atomically(file, json.dumps(document, indent=1) + "\n")
 
 
-def _lens_of_path(entry: Mapping[str, Any], width: int, height: int, where: str) -> Lens:
+def _lens_of_path(document: Mapping[str, Any], entry: Mapping[str, Any], size: tuple[int, int], where: str) -> Lens:
+    entry = {**document, **entry}
     angle = entry.get("fov")
     if entry.get("camera_type", "perspective") != "perspective":
         raise NerfroError(f"{where}: camera_type={entry['camera_type']!r} is not supported; take perspective")
     if not is_number(angle) or not 0 < angle < 180:
         raise NerfroError(f"{where}: fov={angle!r} must be the vertical field of view, between 0 and 180 degrees")
-    return replace(Lens.of_angle(math.radians(angle), height, height), cx=0.5 * width)
+    return replace(Lens.of_angle(math.radians(angle), size[1], size[1]), cx=0.5 * size[0])
 
 
 def _pixels(document: Mapping[str, Any], key: str, default: int, file: Path) -> int:

@@ -65,7 +65,10 @@ def test_decomposition_does_not_depend_on_the_matrix_factor(factor):
         ({"world_mat_1": np.eye(3)}, "world_mat_1 has shape 3x3; give 4x4 numbers"),
         ({"world_mat_1": np.full((4, 4), np.nan)}, "world_mat_1 holds NaN"),
         ({"world_mat_1": np.diag([1.0, 1, 0, 1])}, "world_mat_1 is singular"),
-        ({"world_mat_1": np.array([[9.0, 2, 4, 0], [0, 9, 3, 0], [0, 0, 1, 5], [0, 0, 0, 1]])}, "has the skew 2"),
+        (
+            {"world_mat_1": np.array([[9.0, 2, 4, 0], [0, 9, 3, 0], [0, 0, 1, 5], [0, 0, 0, 1]])},
+            "must have no skew",
+        ),
     ],
 )
 def test_wrong_matrices_are_refused(write, changes, message):

@@ -101,7 +101,7 @@ def test_transforms_are_read_without_their_pictures(around: CaptureGeometry, tmp
         ({"camera_path": [{"fov": 400, "camera_to_world": torch.eye(4).flatten().tolist()}]}, "fov=400 must be"),
         ({"camera_path": [{"fov": 40, "camera_to_world": [1, 2]}]}, "camera 0 has shape 2"),
         ({"frames": [{"transform_matrix": (2 * torch.eye(4)).tolist()}], "fl_x": 3}, "is not a rotation"),
-        ({"frames": [{"transform_matrix": torch.eye(4).tolist()}]}, "has neither 'fl_x'"),
+        ({"frames": [{"transform_matrix": torch.eye(4).tolist()}]}, "has no focal length"),
     ],
 )
 def test_damaged_cameras_are_refused(document: dict, message: str, around: CaptureGeometry, tmp_path: Path) -> None:
