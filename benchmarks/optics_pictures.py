@@ -107,7 +107,7 @@ def picture(sampler: Snell, medium: SdfGrid, side: int = 260, parts: int = 3) ->
     radiance_of_sky = lat_long.load_lat_long(ASSETS_DIR / "torus" / "sky.png")
     radiance = []
     for pixels in torch.arange(cameras.width * cameras.height).split(8192):
-        path = medium.tinted(sampler(part_rays(cameras, pixels, parts), medium))
+        path = medium.with_absorption(sampler(part_rays(cameras, pixels, parts), medium))
         light = lat_long.sample(radiance_of_sky, path.exit_directions, width=4096)
         if path.absorbs:
             light = light * path.transmitted(path.far[:, None])[:, 0]

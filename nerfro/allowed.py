@@ -1,7 +1,7 @@
-"""What a parameter or setting may be, said once, in its annotation: `Annotated[int, Range(at_least=1)]`, or `Count`.
+"""Allowed values of parameters and settings, declared by annotations such as `Annotated[int, Range(at_least=1)]`.
 
-A number is finite unless its annotation says otherwise. `Annotated[str, Literal["a", "b"]]` has choices for OmegaConf,
-which knows no `Literal`.
+A number must be finite unless the annotation is `AnyNumber`. A choice of texts in a configuration dataclass is
+`Annotated[str, Literal["a", "b"]]`, because OmegaConf does not support `Literal`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,12 @@ def _is_finite(number: object) -> bool:
 
 @dataclass(frozen=True)
 class Range:
-    """Finite numbers from one end to the other; an end that is not given allows all on its side."""
+    """A range of finite numbers.
+
+    Attributes:
+        at_least, at_most: inclusive bounds; None for no bound.
+        more_than, less_than: exclusive bounds; None for no bound.
+    """
 
     at_least: float | None = None
     more_than: float | None = None
@@ -57,12 +62,12 @@ class Range:
         return limits or "a finite number"
 
 
-_FURTHEST = 10**6  # world units: beyond, neighbouring float32 numbers are 0.06 apart
+_FURTHEST = 10**6  # world units; the spacing of float32 numbers is 0.06 there
 
-AnyNumber = Annotated[float, None]  # infinite ones and NaN too
+AnyNumber = Annotated[float, None]  # including infinity and NaN
 Count = Annotated[int, Range(at_least=1)]
-NumRays = Annotated[int, Range(at_least=1, at_most=2**22)]  # computed at once
-Side = Annotated[int, Range(at_least=1, at_most=32)]  # rays along each side of a pixel
+NumRays = Annotated[int, Range(at_least=1, at_most=2**22)]  # computed in one chunk
+Side = Annotated[int, Range(at_least=1, at_most=32)]  # number of rays along each side of a pixel
 Resolution = Annotated[int, Range(at_least=4, at_most=2048)]  # vertices along each side of a grid
 Natural = Annotated[int, Range(at_least=0)]
 Positive = Annotated[float, Range(more_than=0)]
@@ -74,7 +79,11 @@ Distance = Annotated[float, Range(at_least=0, at_most=_FURTHEST)]  # world units
 
 
 def checked(where: str) -> Callable[[type[Class]], type[Class]]:
-    """Let a class refuse arguments that its constructor's annotations do not allow, with `where` before the message."""
+    """Decorate a class so that its constructor refuses arguments that its annotations do not allow.
+
+    Args:
+        where: start of the error message, such as `medium=ball`.
+    """
 
     def wrap(cls: type[Class]) -> type[Class]:
         constructor = cls.__init__  # type: ignore[misc]
@@ -92,7 +101,16 @@ def checked(where: str) -> Callable[[type[Class]], type[Class]]:
 
 
 def check_settings(config: DictConfig, schema: type, prefix: str = "") -> None:
-    """Refuse settings that the annotations of a configuration's dataclass, or of one inside it, do not allow."""
+    """Refuse settings that the annotations of a configuration dataclass do not allow, including nested dataclasses.
+
+    Args:
+        config: the configuration.
+        schema: dataclass with the annotations.
+        prefix: full name of the node, with a dot at the end.
+
+    Raises:
+        NerfroError: a value is not allowed.
+    """
     hints = get_type_hints(schema, include_extras=True)
     settings = {name: config[name] for name in hints if not OmegaConf.is_missing(config, name)}
     check(prefix, hints, settings)
@@ -102,16 +120,25 @@ def check_settings(config: DictConfig, schema: type, prefix: str = "") -> None:
 
 
 def check_names(config: DictConfig, prefix: str = "", groups: Sequence[str] = (), also: Sequence[str] = ()) -> None:
-    """Refuse settings that the dataclass of a configuration, or of any node in it, does not have.
+    """Refuse settings that the dataclass of a configuration, or of a nested node, does not declare.
 
-    Hydra lets a `+` add them to any node. `groups` may have been meant, `also` are allowed in the root.
+    Hydra adds such settings where an override begins with `+`.
+
+    Args:
+        config: the configuration.
+        prefix: full name of the node, with a dot at the end.
+        groups: names of configuration groups, which the error message may suggest.
+        also: further names that the root may have.
+
+    Raises:
+        NerfroError: a name is unknown.
     """
     schema = OmegaConf.get_type(config)
     fields = None if not dataclasses.is_dataclass(schema) else [field.name for field in dataclasses.fields(schema)]
     for key, node in config.items_ex(resolve=False):
         name = str(key)
         if fields is not None and name not in (*fields, *also):
-            raise NerfroError(f"{prefix}{name} is no setting; {nearest_of(name, [*fields, *groups])}")
+            raise NerfroError(f"{prefix}{name} is not a setting; {nearest_of(name, [*fields, *groups])}")
         if isinstance(node, DictConfig) and not (node._is_none() or node._is_missing() or node._is_interpolation()):
             check_names(node, f"{prefix}{name}.")
 
@@ -119,8 +146,13 @@ def check_names(config: DictConfig, prefix: str = "", groups: Sequence[str] = ()
 def check(where: str, hints: Mapping[str, Any], values: Mapping[str, Any]) -> None:
     """Refuse the first value that its annotation does not allow.
 
+    Args:
+        where: start of the error message.
+        hints: annotations by name, including `Annotated`.
+        values: values by name.
+
     Raises:
-        NerfroError: the value, and what is allowed.
+        NerfroError: a value is not allowed; the message names the value and the allowed ones.
     """
     for name, value in values.items():
         reason = _refusal(value, hints.get(name))
@@ -131,15 +163,19 @@ def check(where: str, hints: Mapping[str, Any], values: Mapping[str, Any]) -> No
 def corners_of_box(
     box_min: Sequence[float], box_max: Sequence[float], bounded: bool = True
 ) -> Float[np.ndarray, "2 3"]:
-    """The corners of a box as an array.
+    """Return the corners of a box as an array.
+
+    Args:
+        box_min, box_max: lower and upper corner, world units.
+        bounded: refuse corners farther than 10^6 units from the origin.
 
     Raises:
-        NerfroError: not three numbers each, the first below the second, and coordinates where it is `bounded`.
+        NerfroError: a corner does not have three numbers, or the lower corner is not below the upper one.
     """
     box = np.array([box_min, box_max], np.float64) if len(box_min) == len(box_max) == 3 else np.zeros((2, 3))
     if not (box[1] > box[0]).all() or (bounded and not (np.abs(box) <= _FURTHEST).all()):
         raise NerfroError(
-            f"box_min={list(box_min)}, box_max={list(box_max)} is no box; give three numbers each, min below max, "
+            f"box_min={list(box_min)}, box_max={list(box_max)} is not a box; give three numbers each, min below max, "
             f"and none beyond {_FURTHEST}"
         )
     return box
@@ -155,7 +191,7 @@ def _refusal(value: Any, hint: Any) -> str | None:
         return f"take {hints[1]}" if value not in hints[1] else None
     if origin is Annotated:
         return _refusal(value, hints[1])
-    if hint in (float, int) and isinstance(value, str):  # what an interpolation may bring
+    if hint in (float, int) and isinstance(value, str):  # the value of an interpolation may be text
         return "take a number"
     if hint is str:
         return None if isinstance(value, (str, Path)) else "take text"

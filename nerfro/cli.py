@@ -1,4 +1,4 @@
-"""What every entry point shares: composing the configuration, and telling a user's mistake in one line."""
+"""Functions that all commands share: composition of the configuration, and errors in one line."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from nerfro.errors import NerfroError, nearest_of
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover
 
-_NO_MEMORY = re.compile("allocate memory|out of memory")  # as torch tells it, on a CPU and on a GPU
+_NO_MEMORY = re.compile("allocate memory|out of memory")  # messages of torch on a CPU and on a GPU
 EXIT_INTERRUPTED = 130
-EXIT_BROKEN_PIPE = 141  # as a shell tells of a program that SIGPIPE ended
+EXIT_BROKEN_PIPE = 141  # exit status of a program that SIGPIPE has ended, in a shell
 
 # Old spellings of configuration keys and of options, which work for one release with a warning. Add one line for each
 # name that you change; command lines, YAML files of users, run folders and checkpoints then follow. Three forms:
@@ -43,8 +43,13 @@ EXIT_BROKEN_PIPE = 141  # as a shell tells of a program that SIGPIPE ended
 #   "loss=nearby": "near_camera"                          an option of a group (`experiment=NAME` is one, too)
 #   "medium.learn_surface": None                          a setting that is gone: refused on the command line and in
 #                                                         YAML files, dropped from the configurations of old runs
+#   "medium[SdfGrid].smoothing_size": None                the same in old runs for one class, where others keep it
 RENAMED: dict[str, str | None] = {
     "camera.hold_world": "camera.fix_gauge",
+    "batches.hold_back": "batches.num_validation_views",
+    "batches.object": "batches.object_fraction",
+    "optimizer.boundary_first": "optimizer.boundary_steps",
+    "optimizer.tint_learning_rate": "optimizer.absorption_learning_rate",
     "medium.learn_surface": None,
     "optimizer.surface_learning_rate": None,
     "optimizer.surface_start": None,
@@ -53,50 +58,60 @@ RENAMED: dict[str, str | None] = {
     "batches.divergence": "batches.subdivision.divergence",
     "batches.contrast": "batches.subdivision.contrast",
     "batches.contrast_start": "batches.subdivision.contrast_start",
-    "batches.hold_back": "batches.num_validation_views",
-    "batches.object": "batches.object_fraction",
     "evaluation.supersample": "evaluation.subdivision.side",
     "evaluation.divergence": "evaluation.subdivision.divergence",
     "evaluation.contrast": "evaluation.subdivision.contrast",
     "supersample": "subdivision.side",  # of evaluate and render
     "divergence": "subdivision.divergence",
     "contrast": "subdivision.contrast",
-    "optimizer.boundary_first": "optimizer.boundary_steps",
     "sampler.points.every": "sampler.points.update_every",
     "sampler.points.looks": "sampler.points.update_fraction",
     "sampler.points.trust": "sampler.points.max_bin_alpha",
     "sampler.points.num_shown": "sampler.points.num_samples_evaluation",
     "trainer.accumulate_grad_batches": None,
+    "boundary.direction_degree": None,
+    "field.base_resolution": None,
+    "field.direction_degree": None,
+    "field.normalise": None,
+    "loss.boundary.threshold": None,
+    "loss.total_variation.num_directions": None,
+    "medium.crease_degrees": None,
+    "medium.grid": None,
+    "medium.half_width": None,
+    "medium.subsamples": None,
+    "medium[SdfGrid].smoothing_sigma": None,
+    "medium[SdfGrid].smoothing_size": None,
 }
 
 
 def entry_point(
     config_name: str, schema: type, config_dir: Path = CONF_DIR, verbatim: tuple[str, ...] = ()
 ) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
-    """Decorate `main(cfg)` so that it is composed from <config_dir>/<config_name>.yaml, checked against a dataclass.
+    """Decorate the main function of a command, which receives a checked configuration.
 
-    The YAML's defaults list must begin with `<config_name>_schema`, or misspelt root keys pass unnoticed.
+    The defaults list of the YAML file must begin with `<config_name>_schema`. Otherwise Hydra does not refuse misspelt
+    keys of the root.
 
     Args:
-        config_name: file in `config_dir`, without extension.
+        config_name: name of the YAML file in `config_dir`, without extension.
         schema: dataclass of the root.
-        config_dir: conf/, or a folder in it whose entry point must not see the groups of conf/.
-        verbatim: keys of texts that may have commas and equals signs, which Hydra takes for more than text.
+        config_dir: conf/, or a folder in it for a command that must not see the groups of conf/.
+        verbatim: keys whose values are texts that may contain commas and equals signs, which Hydra would parse.
     """
 
     def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
         @functools.wraps(task)
         def job(config: DictConfig) -> None:
-            with errors_in_one_line():  # inside the job too, or Hydra prints a line of its own first
+            with errors_in_one_line():  # here too, because Hydra prints a line of its own for errors of the job
                 check_names(config, groups=[path.name for path in config_dir.iterdir() if path.is_dir()])
-                # Hydra adds a group that its own dataclass lacks.
+                # Hydra adds the group `env`, which its dataclass lacks.
                 check_names(cast(DictConfig, HydraConfig.get()), "hydra.", also=["env"])
                 check_settings(config, schema)
                 task(config)
 
         @functools.wraps(task)
         def run() -> None:
-            # Without this Hydra prints its own report of errors and exits, before we can.
+            # Otherwise Hydra prints its own report and exits.
             os.environ["HYDRA_FULL_ERROR"] = "1"
             with errors_in_one_line():
                 sys.argv[1:] = _flags_first(sys.argv[1:])
@@ -106,7 +121,7 @@ def entry_point(
                 sys.argv[1:] = [_quoted(renamed_override(argument), verbatim) for argument in sys.argv[1:]]
                 try:
                     hydra.main(version_base="1.3", config_path=str(config_dir), config_name=config_name)(job)()
-                except OSError as error:  # not of the job: Hydra makes its folder
+                except OSError as error:  # raised by Hydra, which creates the run folder
                     if isinstance(error, HydraException):
                         raise
                     reason = f"{error.filename} cannot be used: {error.strerror}"
@@ -118,23 +133,23 @@ def entry_point(
 
 
 def _flags_first(arguments: list[str]) -> list[str]:
-    """Hydra's flags before the overrides: its parser takes no overrides behind a flag that stands among them."""
+    """Move Hydra's flags before the overrides, because its parser accepts no overrides after a flag among them."""
     known, others = get_args_parser().parse_known_args(arguments)
     flag = next((text for text in others if text.startswith("-")), None)
     if flag is not None:
-        raise NerfroError(f"{flag} is no option; write key=value, or see --help")
+        raise NerfroError(f"{flag} is not an option; write key=value, or see --help")
     overrides = [*known.overrides, *others]
     return [text for text in arguments if text not in overrides] + overrides
 
 
 @contextlib.contextmanager
 def errors_in_one_line() -> Iterator[None]:
-    """Tell whatever goes wrong in one line and exit with status 1; with NERFRO_DEBUG=1 in the traceback instead."""
+    """Print any error in one line and exit with status 1. With NERFRO_DEBUG=1 the error is raised instead."""
     try:
         yield
         sys.stdout.flush()
-    except BrokenPipeError:  # `| head` has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still to be flushed at exit
+    except BrokenPipeError:  # the reader has closed the pipe, as in `| head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
         sys.exit(EXIT_BROKEN_PIPE)
     except KeyboardInterrupt as interruption:
         print(f"nerfro: interrupted{f'; {interruption}' if str(interruption) else ''}", file=sys.stderr)
@@ -147,7 +162,7 @@ def errors_in_one_line() -> Iterator[None]:
 
 
 def in_one_line(error: Exception) -> str:
-    """What to tell the user of an error: a mistake of theirs, something that the machine lacks, or a bug of ours."""
+    """Describe an error for the user: a mistake in the input, a missing resource, or a bug of nerfro."""
     if isinstance(error, NerfroError):
         return str(error)
     if isinstance(error, OverrideParseException):
@@ -158,11 +173,11 @@ def in_one_line(error: Exception) -> str:
         reason = " ".join(str(error).split("\n")[0].split())
         return f"not enough memory{reason and f' ({reason})'}; take smaller sizes, such as batches.size"
     setting = re.search(r"full_key: (\S+)", str(error)) if isinstance(error, OverflowError) else None
-    if setting is not None:  # as OmegaConf tells of an integer of hundreds of digits
+    if setting is not None:  # OmegaConf, about an integer of hundreds of digits
         return f"{setting[1]} is too large; take a number that a float can hold"
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return " ".join(_messages(error))
-    # Hydra's refusal of a group that is set to no option (field=null); any other ValueError is a bug.
+    # Hydra refuses a group without an option (field=null) by a ValueError; any other ValueError is a bug.
     if isinstance(error, ValueError) and str(error).startswith("Config group override"):
         return f"{error}; give the name of an option, as in field=nerf"
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -173,7 +188,7 @@ def in_one_line(error: Exception) -> str:
 
 
 def _unforeseen(error: Exception) -> str:
-    """Keep the traceback of a bug in a file, and say where."""
+    """Write the traceback of a bug to a file and return a message with the name of the file."""
     what = f"{type(error).__name__}: {error}".splitlines()[0]
     try:
         with tempfile.NamedTemporaryFile("w", prefix="nerfro_", suffix=".txt", delete=False) as file:
@@ -186,7 +201,7 @@ def _unforeseen(error: Exception) -> str:
 
 
 def _quoted(argument: str, keys: tuple[str, ...]) -> str:
-    """An override of one of some keys, with its value as a quoted text."""
+    """Quote the value of an override if its key is one of `keys`."""
     key, _, value = argument.partition("=")
     if key not in keys or not set(",=") & set(value) or value[0] in "\"'":
         return argument
@@ -194,16 +209,16 @@ def _quoted(argument: str, keys: tuple[str, ...]) -> str:
 
 
 def _not_parsed(override: str) -> str:
-    """What to tell about an override that Hydra's grammar does not allow."""
+    """Describe an override that Hydra cannot parse."""
     key, equals, value = override.partition("=")
     if not equals or not key:
-        return f"{override} is no option; write key=value"
+        return f"{override} is not an option; write key=value"
     quoted = value if value[:1] in "\"'" else '"' + value.replace('"', '\\"') + '"'
     return f"{override} cannot be read; quote the value for Hydra and for the shell: {shlex.quote(f'{key}={quoted}')}"
 
 
 def _messages(error: BaseException) -> list[str]:
-    """An error's lines and its cause's, joined to one; Hydra keeps the name of the bad key in the cause."""
+    """Return the lines of an error and of its cause, in which Hydra keeps the name of the wrong key."""
     lines = [line.strip() for line in str(error).partition("Config search path")[0].splitlines() if line.strip()]
     cause = error.__cause__ or error.__context__ or error
     if not isinstance(cause, OmegaConfBaseException):
@@ -212,7 +227,7 @@ def _messages(error: BaseException) -> list[str]:
     names = schema.__dataclass_fields__ if dataclasses.is_dataclass(schema) else cause.parent_node
     if isinstance(cause, (ConfigKeyError, ConfigAttributeError)) and names is not None:
         where = [f"{lines[0].partition(':')[0]}:"] if lines[0].startswith("In '") else []
-        return [*where, f"{cause.full_key} is no setting; {nearest_of(str(cause.key), list(map(str, names)))}"]
+        return [*where, f"{cause.full_key} is not a setting; {nearest_of(str(cause.key), list(map(str, names)))}"]
     return lines + [line.strip() for line in str(cause).splitlines() if line.strip() and line.strip() not in lines]
 
 
@@ -296,8 +311,9 @@ def _renamed_key(key: str) -> str | None:
 def _move(config: DictConfig, old: str, new: str | None) -> bool:
     """Move a node of a configuration to its new place, or drop it; whether there is one."""
     parent, _, name = old.rpartition(".")
+    parent, _, owner = parent.rstrip("]").partition("[")
     node = OmegaConf.select(config, parent) if parent else config
-    if not isinstance(node, DictConfig) or name not in node:
+    if not isinstance(node, DictConfig) or name not in node or not str(node.get("_target_", "")).endswith(owner):
         return False
     value = node._get_node(name)
     del node[name]
@@ -315,5 +331,5 @@ def _gone(old: str) -> str:
 
 
 def warn(message: str) -> None:
-    """Tell the user of something that is allowed but looks wrong."""
+    """Print a warning about an allowed but suspicious input or result."""
     print(f"nerfro: warning: {message}")

@@ -1,4 +1,4 @@
-"""`python -m nerfro.plugins`: every registered part with its fields, defaults and first line of documentation."""
+"""`python -m nerfro.plugins`: list the registered plugins with their settings, defaults and summaries."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nerfro.registry import Plugin, discover, find, plugins
 
 
 def main() -> None:
-    """List the plugins of the kinds (or `kind=name`) given on the command line, or all."""
+    """List all plugins, or those of the types (`medium`) or options (`medium=ball`) on the command line."""
     with errors_in_one_line():
         discover()
         for plugin in _chosen(sys.argv[1:]):
@@ -22,10 +22,10 @@ def main() -> None:
 
 
 def describe(plugin: Plugin) -> Group:
-    """A plugin's name, summary and fields, for the console."""
+    """Format the name, summary and settings of a plugin for the console."""
     table = Table("field", "type", "default", box=None, pad_edge=False, show_header=False)
     for name, kind, default in plugin.fields():
-        table.add_row(f"    {name}", Text(kind), str(default))  # its brackets are no markup
+        table.add_row(f"    {name}", Text(kind), str(default))  # Text, because brackets would be markup
     heading = Text.assemble((f"{plugin.kind}={plugin.name}", "bold"), f"  {plugin.summary}")
     return Group(heading, table) if table.rows else Group(heading)
 

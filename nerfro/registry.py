@@ -1,7 +1,8 @@
-"""The plugin registry: a class's constructor is its configuration.
+"""The plugin registry, in which the constructor of a class is its configuration schema.
 
-`@register(kind, name)` reads the constructor's signature, makes a typed dataclass of it and stores that in Hydra as
-option `name` of group `kind`. `build(node)` is the only place that instantiates, and only what is registered.
+`@register(kind, name)` converts the signature of the constructor to a typed dataclass and stores the dataclass in Hydra
+as option `name` of group `kind`. `build(node)` is the only place that instantiates classes from a configuration, and it
+instantiates registered classes alone.
 """
 
 from __future__ import annotations
@@ -33,12 +34,12 @@ from nerfro.paths import PLUGINS_DIR
 
 KINDS = ("model", "camera", "medium", "sampler/path", "sampler/points", "field", "boundary", "loss", "data")
 
-# Packages whose modules register the built-in parts, imported by `discover`.
+# Packages whose modules register the built-in plugins; `discover` imports them.
 _BUILT_IN = ("camera", "media", "samplers", "fields", "boundaries", "losses", "models", "data")
 _LOCAL_PACKAGE = "nerfro_plugins"
 _ENTRY_POINTS = "nerfro.plugins"
 
-# Lightning's own objects are configured with Hydra's `_target_`; nothing else may be named there.
+# Objects of Lightning that a configuration may name as Hydra's `_target_`, beside registered classes.
 _LIGHTNING_TARGETS = frozenset(
     "lightning.pytorch." + name
     for name in (
@@ -57,15 +58,23 @@ Part = TypeVar("Part")
 
 @dataclass(frozen=True)
 class Plugin:
-    """A registered class and the configuration made of its constructor."""
+    """A registered class and its configuration.
 
-    # Where it stands in the configuration, as in `sampler/path=eikonal`.
+    Attributes:
+        kind: plugin type, which is also the configuration group, such as `sampler/path`.
+        name: name of the option in that group, such as `eikonal`.
+        cls: the class.
+        config: dataclass of the configurable parameters, with `_target_`.
+        hints: annotations of these parameters with their allowed values, see `nerfro.allowed`.
+        parts: constructor parameters that are not configuration; the caller of `build` passes them.
+    """
+
     kind: str
     name: str
     cls: type
-    config: type  # dataclass of its configurable parameters, with `_target_`
-    hints: Mapping[str, Any]  # annotations of the constructor's parameters, with what they allow (see `nerfro.allowed`)
-    parts: frozenset[str]  # parameters that are not configuration; `build` is given them
+    config: type
+    hints: Mapping[str, Any]
+    parts: frozenset[str]
 
     @property
     def target(self) -> str:
@@ -73,11 +82,11 @@ class Plugin:
 
     @property
     def summary(self) -> str:
-        """First line of the docstring."""
+        """First line of the docstring of the class."""
         return (inspect.getdoc(self.cls) or "").split("\n", 1)[0]
 
     def fields(self) -> Iterator[tuple[str, str, object]]:
-        """Name, type and default of each configurable parameter."""
+        """Yield the name, type and default of each configurable parameter."""
         for field in dataclasses.fields(self.config):
             if field.name == "_target_":
                 continue
@@ -90,19 +99,24 @@ _discovered: set[str] = set()
 
 
 def register(kind: str, name: str) -> Callable[[type[Part]], type[Part]]:
-    """Make a class available as option `name` of `kind`; its constructor's signature becomes its configuration.
+    """Decorate a class to make it available as option `name` of a plugin type.
 
-    Parameters annotated with int, float, bool, str, their optional, list and dict forms or `Literal` are configuration;
-    any other parameter is a part that `build` is given. What annotations do not allow is refused (`nerfro.allowed`).
+    The signature of the constructor becomes the configuration. Parameters annotated with int, float, bool, str, their
+    optional, list and dict forms or `Literal` are configuration. The caller of `build` passes all other parameters.
+    Values that the annotations do not allow are refused (`nerfro.allowed`).
+
+    Args:
+        kind: plugin type, one of `KINDS`.
+        name: name of the option.
 
     Raises:
-        NerfroError: unknown kind, or the name is taken.
+        NerfroError: the plugin type is unknown, or the name is taken.
     """
     _require_kind(kind)
 
     def add(cls: type[Part]) -> type[Part]:
         taken = _plugins.get((kind, name))
-        # The same class twice is a module imported again (a reload), not a clash.
+        # A module that is imported again registers the same class twice.
         if taken is not None and (taken.cls.__module__, taken.cls.__qualname__) != (cls.__module__, cls.__qualname__):
             raise NerfroError(
                 f"{kind}={name} is registered twice, by {taken.cls.__module__} and {cls.__module__}; rename one of them"
@@ -116,7 +130,7 @@ def register(kind: str, name: str) -> Callable[[type[Part]], type[Part]]:
 
 
 def plugins(kind: str | None = None) -> list[Plugin]:
-    """All registered plugins (of one kind), by kind and name."""
+    """Return the registered plugins, of one type or of all, sorted by type and name."""
     if kind is not None:
         _require_kind(kind)
     chosen = (p for p in _plugins.values() if kind in (None, p.kind))
@@ -124,7 +138,11 @@ def plugins(kind: str | None = None) -> list[Plugin]:
 
 
 def find(kind: str, name: str) -> Plugin:
-    """The plugin registered as `name`."""
+    """Return the plugin of a type that is registered as `name`.
+
+    Raises:
+        NerfroError: there is none.
+    """
     if (kind, name) not in _plugins:
         known = ", ".join(p.name for p in plugins(kind))
         raise NerfroError(f"no {kind} is called '{name}'; known: {known}")
@@ -134,37 +152,57 @@ def find(kind: str, name: str) -> Plugin:
 def build(node: DictConfig | Mapping[str, object], **parts: object) -> Any:
     """Instantiate the registered class (or Lightning object) that a configuration node names.
 
-    A class is given those of `parts` that it asks for.
+    Args:
+        node: configuration with `_target_`.
+        parts: objects for constructor parameters that are not configuration; unused ones are ignored.
+
+    Raises:
+        NerfroError: the class is not registered, or the configuration does not fit it.
     """
     if not isinstance(node, Mapping):
         raise NerfroError(
-            f"'{node}' stands where settings belong; a slash chooses an option, as in sampler/path=eikonal"
+            f"'{node}' is not a set of settings; choose an option with a slash, as in sampler/path=eikonal"
         )
     node = node if isinstance(node, DictConfig) else OmegaConf.create(dict(node))
     target = node.get("_target_")
     if target in _LIGHTNING_TARGETS:
         try:
-            # Hydra instantiates nested nodes too, whatever they name.
+            # Hydra instantiates nested nodes too.
             for nested in _targets(OmegaConf.to_container(node, resolve=True)):
                 if nested not in _LIGHTNING_TARGETS:
-                    raise NerfroError(f"'{nested}' inside {target} is not registered, so it is not built; remove it")
+                    raise NerfroError(f"'{nested}' inside {target} is not registered; remove it")
             return instantiate(node, **parts)
         except (InstantiationException, OmegaConfBaseException) as error:
             cause = error.__cause__ or error
             raise NerfroError(f"{target}: {_first_line(cause)}; check this object's fields in conf/") from error
     plugin = next((p for p in _plugins.values() if p.target == target), None)
     if plugin is None:
-        raise NerfroError(f"'{target}' is not registered, so it is not built; `python -m nerfro.plugins` lists what is")
-    return plugin.cls(**configure(plugin, node), **{name: parts[name] for name in plugin.parts if name in parts})
+        raise NerfroError(f"'{target}' is not registered; `python -m nerfro.plugins` lists the registered classes")
+    return create(plugin, node, **{name: parts[name] for name in plugin.parts if name in parts})
+
+
+def create(plugin: Plugin, node: DictConfig | Mapping[str, object], **parts: object) -> Any:
+    """Instantiate a plugin from its configuration node and the parts that its constructor asks for."""
+    values = configure(plugin, node)
+    attributes = {name: values.pop(name) for name in _settings(plugin.cls)}
+    made = plugin.cls(**values, **parts)
+    for name, value in attributes.items():
+        setattr(made, name, value)
+    return made
+
+
+def _settings(cls: type) -> tuple[str, ...]:
+    """Names of class attributes that are configuration beside the constructor's parameters, such as a loss's weight."""
+    return getattr(cls, "SETTINGS", ())
 
 
 def _require_kind(kind: str) -> None:
     if kind not in KINDS:
-        raise NerfroError(f"'{kind}' is not a plugin kind; kinds: {', '.join(KINDS)}")
+        raise NerfroError(f"'{kind}' is not a plugin type; choose one of {', '.join(KINDS)}")
 
 
 def _targets(node: object) -> Iterator[object]:
-    """Every `_target_` in a container, at any depth."""
+    """Yield every `_target_` in a container, at any depth."""
     if isinstance(node, dict):
         if "_target_" in node:
             yield node["_target_"]
@@ -176,14 +214,14 @@ def _targets(node: object) -> Iterator[object]:
 
 
 def configure(plugin: Plugin, node: DictConfig | Mapping[str, object]) -> dict[str, Any]:
-    """Check a node against a plugin's configuration and return the constructor's arguments.
+    """Check a configuration node against a plugin and return the values of all its configurable parameters.
 
     Raises:
-        NerfroError: a field is unknown, missing, of the wrong type or not an allowed choice.
+        NerfroError: a parameter is unknown, missing, of the wrong type, or has a value that is not allowed.
     """
     where = f"{plugin.kind}={plugin.name}"
     try:
-        # Resolved in its place first: a merged copy could not look its interpolations up.
+        # Resolved before merging, because interpolations of a merged copy would lose their parent nodes.
         given = OmegaConf.to_container(node, resolve=True) if isinstance(node, DictConfig) else dict(node)
         merged = OmegaConf.merge(OmegaConf.structured(plugin.config), given)
         settled = OmegaConf.to_container(merged, resolve=True, throw_on_missing=True)
@@ -196,13 +234,16 @@ def configure(plugin: Plugin, node: DictConfig | Mapping[str, object]) -> dict[s
 
 
 def discover(plugins_dir: Path = PLUGINS_DIR) -> None:
-    """Import the built-in parts, then the local plugins, then the installed ones; importing registers them.
+    """Import all modules that register plugins: built-in, installed and local ones.
 
-    Local plugins are the modules and packages of `plugins/` beside conf/ and of the folders in `NERFRO_PLUGINS`;
-    installed ones are the modules that entry points of group `nerfro.plugins` name.
+    Installed plugins are the modules that entry points of group `nerfro.plugins` name. Local plugins are the modules
+    and packages in `plugins_dir` and in the folders of the environment variable `NERFRO_PLUGINS`.
+
+    Args:
+        plugins_dir: folder of local plugins; by default `plugins/` beside conf/.
 
     Raises:
-        NerfroError: a plugin cannot be imported; the file and the cause are named.
+        NerfroError: a plugin cannot be imported; the message names the file and the cause.
     """
     if not _discovered:
         for package in _BUILT_IN:
@@ -224,7 +265,7 @@ def _import_folder(folder: Path) -> None:
     if str(folder) in _discovered:
         return
     if not folder.is_dir():
-        if folder == PLUGINS_DIR.resolve():  # a wheel may come without local plugins
+        if folder == PLUGINS_DIR.resolve():  # a wheel may lack local plugins
             return
         raise NerfroError(f"plugin folder {folder} does not exist; correct NERFRO_PLUGINS")
     # A real parent package, so that `_target_` can be located by name.
@@ -247,7 +288,7 @@ def _import_plugin(module: str, where: str) -> None:
         importlib.import_module(module)
     except NerfroError as error:
         raise NerfroError(f"plugin {where}: {error}") from error
-    except Exception as error:  # whatever a plugin's author did wrong, its file is named
+    except Exception as error:  # any error of a plugin's author; the message names the file
         raise NerfroError(f"plugin {where} cannot be imported: {type(error).__name__}: {error}") from error
 
 
@@ -256,7 +297,7 @@ def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
     hints = typing.get_type_hints(constructor)
     fields: list[tuple[str, Any, Any]] = []
     parts: set[str] = set()
-    # Classes without a constructor of their own have no configuration; nn.Module's takes anything.
+    # Classes without their own constructor have no configuration; the signature of nn.Module is generic.
     own = constructor not in (object.__init__, nn.Module.__init__)
     for parameter in list(inspect.signature(constructor).parameters.values())[1:] if own else []:
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
@@ -267,15 +308,21 @@ def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
             parts.add(parameter.name)
             continue
         fields.append((parameter.name, config_type, _default(parameter)))
+    allowing = typing.get_type_hints(constructor, include_extras=True)
+    if _settings(cls):
+        annotations = typing.get_type_hints(cls, include_extras=True)
+        for attribute in _settings(cls):
+            allowing[attribute] = annotations[attribute]
+            default = dataclasses.field(default=getattr(cls, attribute))
+            fields.append((attribute, get_args(annotations[attribute])[0], default))
     target = f"{cls.__module__}.{cls.__qualname__}"
     fields.append(("_target_", str, dataclasses.field(default=target)))
     config = dataclasses.make_dataclass(f"{cls.__name__}Config", fields, kw_only=True)
-    allowing = typing.get_type_hints(constructor, include_extras=True)
     return Plugin(kind, name, cls, config, allowing, frozenset(parts))
 
 
 def _config_type(hint: Any) -> Any:
-    """The annotation as OmegaConf understands it, or None where it is not configuration."""
+    """Return the annotation as OmegaConf supports it, or None if the parameter is not configuration."""
     if hint in (int, float, bool, str):
         return hint
     origin, args = get_origin(hint), get_args(hint)

@@ -155,7 +155,7 @@ class Path:
         last = (turns * torch.arange(1, self.s.shape[1], device=self.s.device)).amax(-1)
         start = self.positions.gather(1, last[:, None, None].expand(-1, 1, 3))[:, 0]
         directions = self.exit_directions if directions is None else directions
-        return Exits(directions, start, self.radii, self.ray if self.splits else None)
+        return Exits(directions, start, self.radii)
 
     @property
     def near(self) -> Float[Tensor, "R"]:
@@ -240,8 +240,6 @@ class Exits:
     positions: Float[Tensor, "*batch 3"] | None = None
     # Of the pixel's cone at unit distance along the line; 0 where nothing is known of it.
     radii: Float[Tensor, "*batch"] | float = 0.0
-    # The ray that each line belongs to, see `Path`; None where each is one of its own.
-    ray: Int[Tensor, "*batch"] | None = None
 
     @classmethod
     def unbent(cls, rays: Rays) -> Exits:

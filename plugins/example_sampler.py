@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import torch
 
+from nerfro.allowed import Count
 from nerfro.draws import Draws
-from nerfro.errors import NerfroError
 from nerfro.registry import register
 from nerfro.samplers.base import PointSampler
 from nerfro.samplers.stratified import point_samples
 from nerfro.types import Path, Rendering, Samples
+
+_GROWTH = 4.0  # ratio of the last spacing to the first
 
 
 @register("sampler/points", "logarithmic")
@@ -20,22 +22,19 @@ class LogarithmicSampler(PointSampler):
     """Samples whose spacing grows with distance: denser where a pixel's footprint is small.
 
     Args:
-        num_samples: on each path.
-        growth: ratio of the last spacing to the first.
+        num_samples: number of samples on each path.
     """
 
     num_levels = 1
 
-    def __init__(self, num_samples: int = 64, growth: float = 4.0) -> None:
+    def __init__(self, num_samples: Count = 64) -> None:
         super().__init__()
-        if num_samples < 2 or growth <= 1:
-            raise NerfroError(f"logarithmic: num_samples={num_samples} growth={growth}; take 2 or more, and above 1")
-        self.num_samples, self.growth = num_samples, growth
+        self.num_samples = num_samples
 
     def forward(self, path: Path, previous: Rendering | None, draws: Draws | None = None) -> Samples:
         bins = torch.arange(self.num_samples, device=path.s.device, dtype=path.s.dtype).expand(len(path.s), -1)
         # Random in training, central in evaluation: the contract of every sampler.
         offsets = 0.5 if draws is None else draws.for_rays(path.ray, self.num_samples)
         u = (bins + offsets) / self.num_samples
-        fraction = (self.growth**u - 1) / (self.growth - 1)
+        fraction = (_GROWTH**u - 1) / (_GROWTH - 1)
         return point_samples(path, path.near[:, None] + fraction * (path.far - path.near)[:, None])

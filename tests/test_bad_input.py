@@ -163,9 +163,9 @@ def test_open_mesh_is_accepted_when_asked(
         ("trainer.max_steps=1.5", ["trainer.max_steps", "could not be converted to Integer"]),
         ("trainer.max_steps=99999999999", ["trainer.max_steps=99999999999 is not allowed"]),
         ("trainer.precision=8", ["trainer.precision='8' is not allowed; choose '32-true'"]),
-        ("sampler.path=nothing", ["'nothing' stands where settings belong"]),
+        ("sampler.path=nothing", ["'nothing' is not a set of settings"]),
         ("trainer.accumulate_grad_batches=2", ["trainer.accumulate_grad_batches was removed in this release"]),
-        ("+trainer.limit_train_batches=0", ["trainer.limit_train_batches is no setting"]),
+        ("+trainer.limit_train_batches=0", ["trainer.limit_train_batches is not a setting"]),
         ("checkpoint.every_seconds=-1", ["checkpoint.every_seconds=-1.0 is not allowed"]),
         ("checkpoint.every_seconds=inf", ["checkpoint.every_seconds=inf is not allowed"]),
         ("checkpoint={every_steps: -1, every_seconds: null}", ["checkpoint.every_steps=-1 is not allowed"]),
@@ -194,7 +194,7 @@ def test_impossible_options_are_refused(
 @pytest.mark.parametrize(
     ("module", "override", "words"),
     [
-        ("nerfro.train", "field.widht=3", "field.widht is no setting; did you mean width?"),
+        ("nerfro.train", "field.widht=3", "field.widht is not a setting; did you mean width?"),
         ("nerfro.train", "data.root=/nowhere", "/nowhere is not a folder"),
         ("nerfro.evaluate", "checkpoint=no.ckpt", "checkpoint no.ckpt does not exist"),
     ],

@@ -69,7 +69,7 @@ def test_flags_may_stand_anywhere() -> None:
     given = ["seed=1", "--config-dir", "mine", "seed=2", "-m"]
     assert _flags_first(given) == ["--config-dir", "mine", "-m", "seed=1", "seed=2"]
     assert _flags_first(["~seed", "+a=-1"]) == ["~seed", "+a=-1"]
-    with pytest.raises(NerfroError, match="--sed is no option; write key=value"):
+    with pytest.raises(NerfroError, match="--sed is not an option; write key=value"):
         _flags_first(["--sed"])
 
 

@@ -70,7 +70,7 @@ def test_logs_of_other_programs_keep_their_folder(tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         (["outputs=nowhere"], "outputs=nowhere is not a folder"),
-        (["prot=1"], "prot is no setting; did you mean port?"),
+        (["prot=1"], "prot is not a setting; did you mean port?"),
         (["outputs=.", "port=-5"], "port=-5 is not allowed"),
         (["outputs=.", "host=nosuchhost.invalid"], "host=nosuchhost.invalid is not an address"),
     ],

@@ -13,8 +13,8 @@ from nerfro import progress
 @pytest.mark.parametrize(
     ("options", "work"),
     [
-        (["medium=voxel_grid", "sampler/path=eikonal"], ["occupancy", "smoothing"]),
-        (["medium=sdf_grid"], ["distances", "occupancy", "smoothing"]),
+        (["medium=voxel_grid", "sampler/path=eikonal", "medium.smoothing_size=5"], ["occupancy", "smoothing"]),
+        (["medium=sdf_grid"], ["distances", "occupancy"]),
     ],
 )
 def test_pictures_and_grids_have_bars_once_they_take_long(
@@ -29,7 +29,6 @@ def test_pictures_and_grids_have_bars_once_they_take_long(
         *tiny_default_run,
         *options,
         "medium.mesh=${data.root}/mesh.ply",
-        "medium.smoothing_size=5",
         "trainer.max_steps=1",
         "evaluation.every=0",
         "evaluation.subdivision.side=1",

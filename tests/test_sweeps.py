@@ -290,7 +290,7 @@ def test_damaged_record_costs_its_own_cell_alone(sweep: Callable[..., Any], tmp_
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("+batches.foo=1", "batches.foo is no setting"),
+        ("+batches.foo=1", "batches.foo is not a setting"),
         ("batches.precrop_fraction=nan", "fraction=nan is not allowed"),
     ],
 )

@@ -185,7 +185,7 @@ def test_evaluation_never_replaces_an_earlier_one_unasked(run: Path, evaluate_he
         (["split=night"], "has no split 'night'; it has train, val, test"),
         (["chunk_size=0"], "chunk_size=0 is not allowed; take at least 1"),
         (["root=/nowhere"], "data.root=/nowhere is not a folder"),
-        (["chekpoint=x"], "chekpoint is no setting; did you mean checkpoint?"),
+        (["chekpoint=x"], "chekpoint is not a setting; did you mean checkpoint?"),
         (["device=tpu9"], "device=tpu9 cannot be used; choose cpu, cuda or auto"),
     ],
 )

@@ -1,4 +1,4 @@
-"""What a boundary is."""
+"""The base class of backgrounds: radiance from beyond the volume."""
 
 from __future__ import annotations
 
@@ -13,11 +13,18 @@ from nerfro.types import Exits
 
 
 class Boundary(nn.Module, ABC):
-    """Radiance that arrives from beyond the volume, C'(d) of the paper's Eqn. volrendBd."""
+    """Background radiance: light that arrives from beyond the volume, C'(d) of the paper's Eqn. volrendBd."""
 
     @abstractmethod
     def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
-        """Linear radiance, not negative and unbounded above; a sky needs the exits' directions alone."""
+        """Evaluate the background radiance.
+
+        Args:
+            exits: lines on which light arrives; a background at infinity needs their directions alone.
+
+        Returns:
+            Linear radiance, at least 0 and without upper bound.
+        """
 
 
 def background_radiance(

@@ -1,4 +1,4 @@
-"""A boundary of one colour."""
+"""A background of one colour."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from nerfro.types import Exits
 
 @register("boundary", "constant")
 class ConstantBoundary(Boundary):
-    """The same radiance in every direction, black by default: what stock NeRF and mip-NeRF assume.
+    """The same radiance in every direction, black by default, as NeRF and mip-NeRF assume.
 
     Args:
-        rgb: linear radiance.
+        rgb: linear radiance of the three channels.
     """
 
     rgb: Float[Tensor, "3"]
@@ -26,7 +26,7 @@ class ConstantBoundary(Boundary):
     def __init__(self, rgb: list[NotNegative] = (0.0, 0.0, 0.0)) -> None:  # type: ignore[assignment]
         super().__init__()
         if len(rgb) != 3:
-            raise NerfroError(f"boundary=constant: rgb={list(rgb)} needs three numbers")
+            raise NerfroError(f"boundary=constant: rgb={list(rgb)} has {len(rgb)} numbers; give three, linear radiance")
         self.register_buffer("rgb", torch.tensor(list(rgb)), persistent=False)
 
     def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:

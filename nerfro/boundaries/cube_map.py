@@ -1,10 +1,10 @@
 """An equi-angular cube map with several resolutions, in plain PyTorch.
 
-Face 2 a + b is the side of the cube that the axis a pierces, on the positive end for b = 0 and on the negative one for
-b = 1. Its first texture coordinate is the angle towards the axis a + 1 (modulo 3), its second towards a + 2; texels are
-equally wide in angle, which keeps their solid angles within a factor of 1.4.
+Face 2 a + b is the side of the cube at the positive (b = 0) or negative (b = 1) end of axis a. The first texture
+coordinate of a face is the angle towards axis a + 1 (modulo 3), and the second the angle towards axis a + 2. All texels
+have the same width in angle, which keeps their solid angles within a factor of 1.4.
 
-The compiled kernels in `nerfro.boundaries.cube_map_cpu` are tested against `lookup`, which is also the path on a GPU.
+`lookup` runs on GPUs, and is the reference implementation of the kernels in `nerfro.boundaries.cube_map_cpu`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from nerfro.kernels.constants import constant
 
 @dataclass(frozen=True)
 class CubeLevels:
-    """Where the texels of each level lie in one list; within a level ordered by face, row and column."""
+    """Layout of the texels of all levels in one list; each level is ordered by face, row and column."""
 
     resolutions: tuple[int, ...]  # texels along a face's side
 
@@ -39,7 +39,7 @@ class CubeLevels:
 
     @property
     def num_padded(self) -> int:
-        """Of places of the faces grown by one texel on every side, see `padded_texels`."""
+        """Number of texels of all faces with a margin of one texel on every side, see `padded_texels`."""
         return sum(6 * (n + 2) ** 2 for n in self.resolutions)
 
     def __len__(self) -> int:
@@ -47,7 +47,7 @@ class CubeLevels:
 
 
 def project(directions: Float[Tensor, "P 3"]) -> tuple[Int[Tensor, "P"], Float[Tensor, "P 2"]]:
-    """The face that a direction pierces, and where: texture coordinates in [-1, 1], equal steps in angle."""
+    """Return the face that a direction hits and the texture coordinates in [-1, 1], which are linear in angle."""
     axis = directions.abs().argmax(-1, keepdim=True)
     main = directions.gather(-1, axis)
     across = directions.gather(-1, torch.cat([axis + 1, axis + 2], dim=-1) % 3)
@@ -56,9 +56,9 @@ def project(directions: Float[Tensor, "P 3"]) -> tuple[Int[Tensor, "P"], Float[T
 
 
 def unproject(face: Int[Tensor, "P"], coordinates: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
-    """The unit direction at texture coordinates of a face; the inverse of `project`.
+    """Return the unit direction at texture coordinates of a face; the inverse of `project`.
 
-    Coordinates may lie up to one beyond [-1, 1]: the face's plane continues.
+    Coordinates may exceed [-1, 1] by up to 1; such points lie on the extended plane of the face.
     """
     axis = torch.div(face, 2, rounding_mode="floor")
     sign = 1.0 - 2.0 * (face % 2)
@@ -70,24 +70,24 @@ def unproject(face: Int[Tensor, "P"], coordinates: Float[Tensor, "P 2"]) -> Floa
 
 
 def texel_directions(resolution: int) -> Float[Tensor, "6*n*n 3"]:
-    """Directions of the texels' centres."""
+    """Return the unit directions of the texel centres of one level."""
     return _directions((torch.arange(resolution) + 0.5) / resolution * 2 - 1)
 
 
 def padded_texels(resolution: int) -> Int[Tensor, "6 n+2 n+2"]:
-    """The texel at each place of the faces, grown by one texel on every side with those of the neighbouring faces.
+    """Return the texel at each place of the faces, with a margin of one texel from the neighbouring faces.
 
-    At the faces' corners three faces meet and there is no fourth texel: these places are not to be used.
+    Three faces meet at a corner, where no fourth texel exists. The corners of the margin are therefore not valid.
     """
     n = resolution
-    # In double precision, because texels beside a corner project to almost the border of their neighbour.
+    # In double precision, because texels beside a corner project almost to the border of the neighbouring face.
     face, coordinates = project(_directions((torch.arange(-1, n + 1, dtype=torch.float64) + 0.5) / n * 2 - 1))
     column, row = ((coordinates + 1) / 2 * n).long().clamp(0, n - 1).unbind(-1)
     return ((face * n + row) * n + column).view(6, n + 2, n + 2).int()
 
 
 def _directions(centres: Float[Tensor, "n"]) -> Float[Tensor, "6*n*n 3"]:
-    """Directions at all faces' places with the given coordinates, by face, row and column."""
+    """Return the directions of a grid of coordinates on all faces, ordered by face, row and column."""
     n = len(centres)
     face = torch.arange(6).repeat_interleave(n * n)
     row, column = (place.flatten().repeat(6) for place in torch.meshgrid(centres, centres, indexing="ij"))
@@ -101,17 +101,22 @@ def lookup(
     padded: Int[Tensor, "Q"],
     levels: CubeLevels,
 ) -> Float[Tensor, "P 3"]:
-    """Bilinear lookups of all levels, summed; continuous over the whole sphere.
+    """Sum the bilinear interpolations of all levels, which are continuous over the sphere.
 
-    Differentiable in the texels and, between their centres, in the coordinates.
-    `padded` are the `padded_texels` of all levels, flattened one after the other.
+    The result is differentiable with respect to the texels and, between texel centres, to the coordinates.
+
+    Args:
+        face, coordinates: see `project`.
+        texels: of all levels.
+        padded: `padded_texels` of all levels, flattened, one level after the other.
+        levels: layout of the texels.
     """
     padded_sizes = [6 * (n + 2) ** 2 for n in levels.resolutions]
     padded_offsets = tuple(sum(padded_sizes[:level]) for level in range(len(levels)))
     resolution, offset, padded_offset = (
         constant(values, texels.device) for values in (levels.resolutions, levels.offsets, padded_offsets)
     )
-    place = (coordinates[:, None] + 1) * (0.5 * resolution[:, None]) + 0.5  # of padded texels, with integer centres
+    place = (coordinates[:, None] + 1) * (0.5 * resolution[:, None]) + 0.5  # in padded texels, with integer centres
     corner = torch.minimum(place.long().clamp(min=0), resolution[:, None])
     (u, v), (column, row) = (place - corner).unbind(-1), corner.unbind(-1)
     weights = torch.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], dim=-1)
@@ -124,5 +129,5 @@ def lookup(
     first = padded_offset + (face[:, None] * width + row) * width + column
     index = torch.stack([first, first + 1, first + width, first + width + 1], dim=-1)
     texel = padded.index_select(0, index.flatten()).view(index.shape) + offset[:, None]
-    # index_select, because its gradient is one index_add: indexing with brackets would sort all indices first.
+    # The gradient of index_select is one index_add; that of indexing with brackets sorts all indices first.
     return (texels.index_select(0, texel.flatten()).view(*texel.shape, 3) * weights[..., None]).sum((1, 2))

@@ -1,6 +1,7 @@
-"""Compiled CPU kernels of the cube map's lookup; `nerfro.boundaries.cube_map.lookup` is their reference.
+"""Compiled CPU kernels of the cube map lookup; `nerfro.boundaries.cube_map.lookup` is the reference.
 
-Forward, threads share the directions; backward, the levels, so that no two threads write to the same texel.
+Threads divide the directions in the forward pass and the levels in the backward pass, where no two threads may write to
+the same texel.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ def lookup(
     padded: Int[Tensor, "Q"],
     levels: CubeLevels,
 ) -> Float[Tensor, "P 3"]:
-    """The same as `nerfro.boundaries.cube_map.lookup`, on the CPU."""
+    """Compute `nerfro.boundaries.cube_map.lookup` on the CPU."""
     return _Lookup.apply(face, coordinates.contiguous(), texels, padded, levels)
 
 
@@ -70,7 +71,7 @@ def _places(face: Tensor, coordinates: Tensor, padded: Tensor, levels: CubeLevel
 
 @compiled
 def _taps(face, x, y, n, padded, padded_offset):
-    """Four texels of a level, the place between them, and which of them is missing where three faces meet (or -1)."""
+    """Return four texels of a level, the position between them, and the missing one at a cube corner (or -1)."""
     x = (x + _ONE) * np.float32(0.5 * n) + np.float32(0.5)
     y = (y + _ONE) * np.float32(0.5 * n) + np.float32(0.5)
     column, row = max(min(np.int64(x), n), 0), max(min(np.int64(y), n), 0)
@@ -85,7 +86,7 @@ def _taps(face, x, y, n, padded, padded_offset):
 
 @compiled
 def _weights(u, v, missing):
-    """Weights of the four texels; the missing one is the mean of the other three."""
+    """Return the weights of the four texels; the missing one is the mean of the other three."""
     w0, w1, w2, w3 = (_ONE - u) * (_ONE - v), u * (_ONE - v), (_ONE - u) * v, u * v
     if missing >= 0:
         absent = (w0 if missing == 0 else w1 if missing == 1 else w2 if missing == 2 else w3) / np.float32(3)
@@ -134,7 +135,7 @@ def _backward_to_coordinates(face, coordinates, padded, resolutions, offsets, te
     for p in prange(face.shape[0]):
         padded_offset = 0
         along_x, along_y = np.float32(0), np.float32(0)
-        # What the loss would gain from each of the four texels if it alone had weight.
+        # Derivative of the loss with respect to the weight of each of the four texels.
         gain = np.empty(4, np.float32)
         for level in range(resolutions.shape[0]):
             n = resolutions[level]

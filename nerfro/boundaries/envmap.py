@@ -1,4 +1,4 @@
-"""A texture of the whole sphere as the boundary."""
+"""A texture of the whole sphere as the background."""
 
 from __future__ import annotations
 
@@ -25,13 +25,15 @@ _BLACK = 1e-3
 
 @register("boundary", "envmap")
 class EnvironmentMap(Boundary):
-    """Squared softplus of a sum of cube maps, coarse to fine, so that coarse ones fill in where no ray has looked.
+    """Squared softplus of a sum of cube maps of increasing resolution.
 
-    It starts as an even grey, or as the given picture. There is no preferred axis; lat-long pictures have z up.
+    Coarse levels fill in directions that no ray has sampled. The map has no preferred axis. It is initialized
+    to an even grey or to a given image.
 
     Args:
-        resolutions: texels along a face's side (90 degrees) of each level; the default's finest texel is 0.35 degrees.
-        image: lat-long picture to start from (.png, .jpg, .hdr or .exr); none for grey.
+        resolutions: texels along each side of a face (90 degrees) of each level. The finest texel of the default is
+            0.35 degrees wide.
+        image: initial equirectangular image with z up (.png, .jpg, .hdr or .exr); None for grey.
     """
 
     padded: Int[Tensor, "Q"]
@@ -53,7 +55,7 @@ class EnvironmentMap(Boundary):
 
     @classmethod
     def of_texels(cls, radiance: Float[Tensor, "6*n*n 3"]) -> EnvironmentMap:
-        """A sky that learns no more: the linear radiance of each texel, see `cube_map.texel_directions`."""
+        """Make a map with fixed linear radiance at the `cube_map.texel_directions` of one level."""
         sky = cls([math.isqrt(len(radiance) // 6)])
         sky.requires_grad_(False).texels.copy_(_raw(radiance))
         return sky.eval()
@@ -69,16 +71,16 @@ class EnvironmentMap(Boundary):
 
     @torch.no_grad()
     def to_lat_long(self, height: int) -> Float[Tensor, "H 2*H 3"]:
-        """The sky as a lat-long picture of linear radiance, z up, +x in the middle (see `lat_long.directions`)."""
+        """Render an equirectangular image of linear radiance: z up, +x in the middle (see `lat_long.directions`)."""
         return self(Exits(lat_long.directions(height).to(self.texels.device)))
 
     def save_lat_long(self, path: Path | str, height: int = 512) -> None:
-        """Write the sky as a lat-long picture: clipped sRGB for .png, all of its linear radiance for .hdr and .exr."""
+        """Write an equirectangular image: clipped sRGB for .png, linear radiance for .hdr and .exr."""
         lat_long.save_lat_long(path, self.to_lat_long(height).cpu())
 
     @torch.no_grad()
     def set_lat_long(self, radiance: Float[Tensor, "H 2*H 3"]) -> None:
-        """Start from a picture: the finest level takes its linear radiance, the coarser ones become zero."""
+        """Set the finest level to the linear radiance of an equirectangular image, and the coarser levels to zero."""
         n = self.levels.resolutions[-1]
         radiance = lat_long.sample(radiance, cube_map.texel_directions(n), width=4 * n)
         self.texels.zero_()
@@ -86,11 +88,11 @@ class EnvironmentMap(Boundary):
 
 
 def _radiance(raw: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-    """Linear radiance: the square of a softplus that is 0.5 at 0; see `HashGridField` for why, without end above."""
+    """Map raw values to linear radiance, by the square of a softplus that is 0.5 at 0; see `HashGridField`."""
     return (F.softplus(raw.float()) * _GREY).square()
 
 
 def _raw(radiance: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-    """The inverse of `_radiance`; black is not quite reached."""
+    """Invert `_radiance`; the darkest value is slightly above black."""
     y = (radiance.sqrt() / _GREY).clamp(min=_BLACK)
     return y + torch.log(-torch.expm1(-y))

@@ -1,13 +1,13 @@
-"""The paper's skybox: a small MLP of the leaving direction."""
+"""The skybox of the paper: a small MLP of the exit direction."""
 
 from __future__ import annotations
 
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Count, Natural
+from nerfro.allowed import Count
 from nerfro.boundaries.base import Boundary
-from nerfro.fields.encoding import positional_encoding
+from nerfro.fields.encoding import DIRECTION_DEGREE, positional_encoding
 from nerfro.fields.mlp import SkipMLP, glorot_linear, padded_sigmoid
 from nerfro.registry import register
 from nerfro.types import Exits
@@ -17,18 +17,16 @@ from nerfro.types import Exits
 class Skybox(Boundary):
     """4x128 MLP of the encoded direction, after NeRFactor's normal field (paper, Eqn. volrendBd, F_psi).
 
-    Its sigmoid ends at 1, as the authors' does: no lamp is brighter.
+    The radiance is a sigmoid and at most 1, as in the authors' code. Bright lamps are therefore clipped.
 
     Args:
         width, depth, skip: of the MLP.
-        direction_degree: octaves of the direction's encoding; 4 in the paper, which bounds how sharp a sky can be.
     """
 
-    def __init__(self, width: Count = 128, depth: Count = 4, skip: int = 3, direction_degree: Natural = 4) -> None:
+    def __init__(self, width: Count = 128, depth: Count = 4, skip: int = 3) -> None:
         super().__init__()
-        self.direction_degree = direction_degree
-        self.trunk = SkipMLP(3 * (1 + 2 * direction_degree), width, depth, skip)
+        self.trunk = SkipMLP(3 * (1 + 2 * DIRECTION_DEGREE), width, depth, skip)
         self.rgb = glorot_linear(self.trunk.num_outputs, 3)
 
     def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
-        return padded_sigmoid(self.rgb(self.trunk(positional_encoding(exits.directions, 0, self.direction_degree))))
+        return padded_sigmoid(self.rgb(self.trunk(positional_encoding(exits.directions, 0, DIRECTION_DEGREE))))

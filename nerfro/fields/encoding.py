@@ -8,6 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+# Octaves of the encoded viewing direction in NeRF, mip-NeRF and the paper.
+DIRECTION_DEGREE = 4
+
 
 def positional_encoding(
     x: Float[Tensor, "*batch D"], min_degree: int, max_degree: int, identity: bool = True

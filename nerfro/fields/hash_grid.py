@@ -26,6 +26,9 @@ _GEOMETRY_FEATURES = 16
 # The exponential is clamped at e^15 times the initial density, in value and gradient.
 _MAX_EXPONENT = 15.0
 
+# Cells of the coarsest level along the box's longest side, as in Instant-NGP.
+_COARSEST_RESOLUTION = 16
+
 
 @register("field", "hash_grid")
 class HashGridField(Field):
@@ -40,7 +43,7 @@ class HashGridField(Field):
         radius: radius of a ball around the centre of the box, world units, within which the resolution is finest.
             Outside, cells grow with the distance. None if the scene is empty outside the box.
         num_levels: number of levels of the encoding, with 2 features each.
-        base_resolution, finest_resolution: number of cells along the longest side of the box.
+        finest_resolution: number of cells of the finest level along the longest side of the box.
         log2_table_size: base-2 logarithm of the largest number of entries of a level.
         width: width of the hidden layers.
         direction_bands: number of bands of spherical harmonics of the direction; 1 for view-independent colour.
@@ -61,7 +64,6 @@ class HashGridField(Field):
         box_max: list[float] = (1.0, 1.0, 1.0),  # type: ignore[assignment]
         radius: Positive | None = None,
         num_levels: Count = 12,
-        base_resolution: Count = 16,
         finest_resolution: Count = 256,
         log2_table_size: Annotated[int, Range(at_least=4, at_most=24)] = 15,
         width: Count = 64,
@@ -78,7 +80,7 @@ class HashGridField(Field):
         self.side = float((box[1] - box[0]).max())
         self.initial_density = initial_depth / self.side
         self.direction_bands, self.shortcut, self.precision = direction_bands, shortcut, precision
-        self.levels = hash_encoding.grid_levels(num_levels, base_resolution, finest_resolution, log2_table_size)
+        self.levels = hash_encoding.grid_levels(num_levels, _COARSEST_RESOLUTION, finest_resolution, log2_table_size)
         self.table = nn.Parameter(torch.empty(self.levels.num_entries, hash_encoding.NUM_FEATURES))
         nn.init.uniform_(self.table, -1e-4, 1e-4)
         num_harmonics = harmonics.spherical_harmonics(torch.zeros(1, 3), direction_bands).shape[-1]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Count, Natural
+from nerfro.allowed import Count
 from nerfro.fields.base import Field
-from nerfro.fields.encoding import integrated_positional_encoding, positional_encoding
+from nerfro.fields.encoding import DIRECTION_DEGREE, integrated_positional_encoding, positional_encoding
 from nerfro.fields.mlp import RadianceMLP
 from nerfro.registry import register
 from nerfro.types import Radiance, Samples
@@ -20,7 +20,6 @@ class MipNerfField(Field):
     Args:
         width, depth, skip, view_width: shape of the MLP, see `RadianceMLP`.
         position_degree: number of octaves of the integrated encoding, which damps octaves finer than the frustum.
-        direction_degree: number of octaves of the encoding of directions.
     """
 
     def __init__(
@@ -30,17 +29,16 @@ class MipNerfField(Field):
         skip: int = 5,
         view_width: Count = 128,
         position_degree: Count = 16,
-        direction_degree: Natural = 4,
     ) -> None:
         super().__init__()
-        self.position_degree, self.direction_degree = position_degree, direction_degree
-        num_position, num_direction = 6 * position_degree, 3 * (1 + 2 * direction_degree)
+        self.position_degree = position_degree
+        num_position, num_direction = 6 * position_degree, 3 * (1 + 2 * DIRECTION_DEGREE)
         self.mlp = RadianceMLP(num_position, num_direction, width, depth, skip, view_width)
 
     def forward(self, samples: Samples) -> Radiance:
         mean, variance = frustum_gaussians(samples)
         position = integrated_positional_encoding(mean, variance, 0, self.position_degree)
-        direction = positional_encoding(samples.directions, 0, self.direction_degree)
+        direction = positional_encoding(samples.directions, 0, DIRECTION_DEGREE)
         return Radiance(*self.mlp(position, direction))
 
 

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import AnyNumber, Count, Natural, Positive, corners_of_box
+from nerfro.allowed import AnyNumber, Count, Natural, corners_of_box
 from nerfro.fields.base import Field
-from nerfro.fields.encoding import positional_encoding
+from nerfro.fields.encoding import DIRECTION_DEGREE, positional_encoding
 from nerfro.fields.mlp import RadianceMLP
 from nerfro.fields.selection import evaluate_selected, inside_box
 from nerfro.registry import register
@@ -24,8 +24,6 @@ class NerfField(Field):
     Args:
         width, depth, skip, view_width: shape of the MLP, see `RadianceMLP`.
         position_degree: number of octaves of the encoding of positions.
-        direction_degree: number of octaves of the encoding of directions.
-        normalise: divisor of positions before the encoding, world units.
         box_min, box_max: opposite corners of the bounds of the scene, world units. The field is empty outside, and
             samples there are not evaluated. With infinite corners, all samples are evaluated, as in the authors' code.
     """
@@ -39,8 +37,6 @@ class NerfField(Field):
         skip: int = 5,
         view_width: Count = 128,
         position_degree: Natural = 10,
-        direction_degree: Natural = 4,
-        normalise: Positive = 1.0,
         box_min: list[AnyNumber] = (-inf, -inf, -inf),  # type: ignore[assignment]
         box_max: list[AnyNumber] = (inf, inf, inf),  # type: ignore[assignment]
     ) -> None:
@@ -48,8 +44,8 @@ class NerfField(Field):
         box = corners_of_box(box_min, box_max, bounded=False)
         self.register_buffer("box", torch.from_numpy(box).float(), persistent=False)
         self.everywhere = not self.box.isfinite().any()
-        self.position_degree, self.direction_degree, self.normalise = position_degree, direction_degree, normalise
-        num_position, num_direction = 3 * (1 + 2 * position_degree), 3 * (1 + 2 * direction_degree)
+        self.position_degree = position_degree
+        num_position, num_direction = 3 * (1 + 2 * position_degree), 3 * (1 + 2 * DIRECTION_DEGREE)
         self.mlp = RadianceMLP(num_position, num_direction, width, depth, skip, view_width)
 
     @property
@@ -65,6 +61,6 @@ class NerfField(Field):
         self, positions: Float[Tensor, "*batch 3"], directions: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         """Evaluate density and colour at positions for unit directions."""
-        position = positional_encoding(positions / self.normalise, 0, self.position_degree)
-        direction = positional_encoding(directions, 0, self.direction_degree)
+        position = positional_encoding(positions, 0, self.position_degree)
+        direction = positional_encoding(directions, 0, DIRECTION_DEGREE)
         return self.mlp(position, direction)

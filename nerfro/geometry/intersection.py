@@ -29,14 +29,11 @@ class Triangles:
     body: Int[Tensor, "F"]
 
     @classmethod
-    def of(
-        cls, meshes: list[TriangleMesh], crease_degrees: float, vertices: Float[Tensor, "V 3"] | None = None
-    ) -> Triangles:
+    def of(cls, meshes: list[TriangleMesh], vertices: Float[Tensor, "V 3"] | None = None) -> Triangles:
         """Collect the triangles of meshes, with smooth normals up to the crease angle.
 
         Args:
             meshes: one mesh per body.
-            crease_degrees: largest angle between faces whose normals are averaged, degrees.
             vertices: vertices of all meshes together that replace the vertices of the meshes, world units.
         """
         counts = [len(mesh.vertices) for mesh in meshes]
@@ -44,7 +41,7 @@ class Triangles:
             vertices = torch.from_numpy(np.concatenate([mesh.vertices for mesh in meshes]))
         parts = vertices.double().cpu().split(counts)
         corners = [part[torch.from_numpy(mesh.faces)] for mesh, part in zip(meshes, parts, strict=True)]
-        normals = [smooth_normals(mesh, part, crease_degrees) for mesh, part in zip(meshes, corners, strict=True)]
+        normals = [smooth_normals(mesh, part) for mesh, part in zip(meshes, corners, strict=True)]
         body = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
         return cls(torch.cat(corners), torch.cat(normals), torch.from_numpy(body))
 

@@ -12,14 +12,17 @@ from nerfro.geometry.mesh import TriangleMesh
 # Ratio of the largest to the smallest triangle around a vertex above which areas are the weights.
 _UNEVEN = 8.0
 
+# Edges with larger angles between their faces stay sharp, in degrees; 30 is a common default of modelling programs.
+CREASE_DEGREES = 30.0
 
-def corner_normals(mesh: TriangleMesh, crease_degrees: float = 30.0) -> Float[np.ndarray, "F 3 3"]:
+
+def corner_normals(mesh: TriangleMesh, crease_degrees: float = CREASE_DEGREES) -> Float[np.ndarray, "F 3 3"]:
     """Return the unit normal at each corner of each triangle, smooth up to creases; see `smooth_normals`."""
     return smooth_normals(mesh, torch.from_numpy(mesh.triangles), crease_degrees).numpy()
 
 
 def smooth_normals(
-    mesh: TriangleMesh, triangles: Float[Tensor, "F 3 3"], crease_degrees: float
+    mesh: TriangleMesh, triangles: Float[Tensor, "F 3 3"], crease_degrees: float = CREASE_DEGREES
 ) -> Float[Tensor, "F 3 3"]:
     """Compute the unit normal at each corner of each triangle, smooth up to creases and differentiable.
 

@@ -23,7 +23,6 @@ def signed_distance_grid(
     box: Float[np.ndarray, "2 3"],
     resolution: int,
     band: float,
-    crease_degrees: float = 30.0,
     lid: Bool[np.ndarray, "F"] | None = None,
 ) -> Float[np.ndarray, "X Y Z"]:
     """Compute the signed distance to a mesh at the vertices of a grid, world units; negative inside.
@@ -36,14 +35,13 @@ def signed_distance_grid(
 
     which is exact to second order in the size of the triangle for any curvature. Facets of a finely tessellated curved
     surface are therefore invisible. Farther away, the value is a lower bound of the distance that is at most sqrt(3)
-    voxels too small.
+    voxels too small. Edges with angles above `CREASE_DEGREES` stay sharp.
 
     Args:
         mesh: world units. The inside of an open mesh is decided as in `occupancy_fraction`.
         box: lower and upper corner of the grid, world units.
         resolution: number of vertices per side.
         band: width of the band of exact distances, voxels.
-        crease_degrees: edges with larger angles stay sharp.
         lid: triangles whose distances do not count. Points that are nearer to the lid than to other triangles are
             inside, so that the inside extends through the lid to infinity.
 
@@ -54,7 +52,7 @@ def signed_distance_grid(
     spacing = (np.asarray(box[1], np.float64) - origin) / (resolution - 1)
     reach = band * float(spacing.max())
     triangles = np.ascontiguousarray(mesh.triangles)
-    normals = corner_normals(mesh, crease_degrees)
+    normals = corner_normals(mesh)
     shown = np.ones(len(triangles), bool) if lid is None else ~lid
     distance, height = _distance_to(triangles[shown], normals[shown], origin, spacing, resolution, reach)
     inside = occupancy_fraction(mesh, box, resolution, subsamples=1) > 0.5

@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerfro.allowed import Natural, NotNegative
 from nerfro.errors import NerfroError
 from nerfro.losses.base import Loss
 from nerfro.registry import register
@@ -36,10 +35,10 @@ class Backdrop(Loss):
 
     colour: Float[Tensor, "3"] | None
 
-    def __init__(
-        self, colour: list[float] | None = None, weight: NotNegative = 0.1, start: Natural = 0, ramp: Natural = 0
-    ) -> None:
-        super().__init__(weight, start, ramp)
+    weight = 0.1
+
+    def __init__(self, colour: list[float] | None = None) -> None:
+        super().__init__()
         if colour is not None and (len(colour) != 3 or not all(0 <= value <= 1 for value in colour)):
             raise NerfroError(f"loss=backdrop: colour={list(colour)} is no sRGB colour; give three numbers in [0, 1]")
         self.register_buffer("colour", None if colour is None else torch.tensor(colour), persistent=False)

@@ -3,31 +3,35 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import ClassVar
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.allowed import Natural, NotNegative, checked
+from nerfro.allowed import Natural, NotNegative
 from nerfro.rendering import Scene
 from nerfro.types import Batch, Rendering
 
 
-@checked("loss")
 class Loss(nn.Module, ABC):
-    """A term of the training objective, weighted by `weight` once `start` steps are done, ramped in over `ramp` steps.
+    """A term of the training objective.
 
-    Args:
+    Every loss has the settings `loss.NAME.weight`, `start` and `ramp`. They are no parameters of the constructor: the
+    registry sets them, and a subclass overrides their defaults as class attributes.
+
+    Attributes:
         weight: final weight.
-        start: number of optimiser steps during which the weight is zero.
-        ramp: number of steps after that over which it grows linearly.
+        start: number of optimizer steps during which the weight is zero.
+        ramp: number of steps after that over which the weight grows linearly.
     """
 
-    def __init__(self, weight: NotNegative = 1.0, start: Natural = 0, ramp: Natural = 0) -> None:
-        super().__init__()
-        self.weight, self.start, self.ramp = weight, start, ramp
+    SETTINGS: ClassVar = ("weight", "start", "ramp")
+    weight: NotNegative = 1.0
+    start: Natural = 0
+    ramp: Natural = 0
 
     def weight_at(self, step: int) -> float:
-        """Weight at the given optimiser step (0 is the first)."""
+        """Return the weight at an optimizer step; the first step is 0."""
         if step < self.start:
             return 0.0
         return self.weight * min(1.0, (step - self.start + 1) / (self.ramp + 1))

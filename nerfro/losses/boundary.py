@@ -5,12 +5,14 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Natural, NotNegative
 from nerfro.distributed import rank_and_size, sum_over_processes
 from nerfro.losses.base import Loss
 from nerfro.registry import register
 from nerfro.rendering import Scene
 from nerfro.types import Batch, Rendering
+
+# Rays count whose transmittance at the end is above this, as in the paper.
+_MIN_TRANSMITTANCE = 0.5
 
 
 @register("loss", "boundary")
@@ -21,25 +23,19 @@ class BoundaryRegulariser(Loss):
     Channels are summed and the sum over rays is divided by their number plus one, as in the authors' code.
 
     Args:
-        threshold: final transmittance above which a ray counts.
         refracted_only: count only rays that meet the medium.
     """
 
-    def __init__(
-        self,
-        weight: NotNegative = 0.025,
-        start: Natural = 2500,
-        ramp: Natural = 0,
-        threshold: NotNegative = 0.5,
-        refracted_only: bool = False,
-    ) -> None:
-        super().__init__(weight, start, ramp)
-        self.threshold, self.refracted_only = threshold, refracted_only
+    weight, start = 0.025, 2500
+
+    def __init__(self, refracted_only: bool = False) -> None:
+        super().__init__()
+        self.refracted_only = refracted_only
 
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         fine = renderings[-1]
         path = fine.path
-        counts = batch.per_pixel(path.per_ray(fine.transmittance.detach())) > self.threshold
+        counts = batch.per_pixel(path.per_ray(fine.transmittance.detach())) > _MIN_TRANSMITTANCE
         if self.refracted_only:
             counts = counts & (batch.per_pixel(path.first_of_ray(path.refracted).to(fine.rgb)) > 0.5)
         background = path.per_ray(fine.transmittance[:, None] * fine.boundary_rgb.detach())

@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Natural, NotNegative
 from nerfro.losses.base import Loss
 from nerfro.registry import register
 from nerfro.rendering import Scene
@@ -22,8 +21,7 @@ class Distortion(Loss):
     well, at infinity: a loss of what is stopped alone would make things transparent.
     """
 
-    def __init__(self, weight: NotNegative = 1e-2, start: Natural = 0, ramp: Natural = 0) -> None:
-        super().__init__(weight, start, ramp)
+    weight = 1e-2
 
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         rendering = renderings[-1]

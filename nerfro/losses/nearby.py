@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Natural, NotNegative, corners_of_box
+from nerfro.allowed import corners_of_box
 from nerfro.losses.base import Loss
 from nerfro.registry import register
 from nerfro.rendering import Scene
@@ -26,16 +26,14 @@ class Nearby(Loss):
     """
 
     middle: Float[Tensor, "3"]
+    weight = 1e-2
 
     def __init__(
         self,
         box_min: list[float] = (-1.0, -1.0, -1.0),  # type: ignore[assignment]
         box_max: list[float] = (1.0, 1.0, 1.0),  # type: ignore[assignment]
-        weight: NotNegative = 1e-2,
-        start: Natural = 0,
-        ramp: Natural = 0,
     ) -> None:
-        super().__init__(weight, start, ramp)
+        super().__init__()
         middle = torch.from_numpy(corners_of_box(box_min, box_max)).float().mean(0)
         self.register_buffer("middle", middle, persistent=False)
 

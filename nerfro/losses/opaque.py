@@ -5,7 +5,6 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Natural, NotNegative
 from nerfro.losses.base import Loss
 from nerfro.registry import register
 from nerfro.rendering import Scene
@@ -20,8 +19,7 @@ class Opaque(Loss):
     The loss is what a background of random grey of that variance would cost on average.
     """
 
-    def __init__(self, weight: NotNegative = 1e-2, start: Natural = 0, ramp: Natural = 0) -> None:
-        super().__init__(weight, start, ramp)
+    weight = 1e-2
 
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         passed = renderings[-1].transmittance.square()

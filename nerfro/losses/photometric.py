@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import mse_loss
 
-from nerfro.allowed import Natural, NotNegative
+from nerfro.allowed import NotNegative
 from nerfro.losses.base import Loss
 from nerfro.registry import register
 from nerfro.rendering import Scene
@@ -23,10 +23,8 @@ class Photometric(Loss):
         coarse: factor of the earlier levels' errors; 1 in the paper, 0.1 in mip-NeRF.
     """
 
-    def __init__(
-        self, weight: NotNegative = 1.0, start: Natural = 0, ramp: Natural = 0, coarse: NotNegative = 1.0
-    ) -> None:
-        super().__init__(weight, start, ramp)
+    def __init__(self, coarse: NotNegative = 1.0) -> None:
+        super().__init__()
         self.coarse = coarse
 
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:

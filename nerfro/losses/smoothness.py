@@ -7,7 +7,7 @@ from typing import Annotated
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Natural, NotNegative, Range
+from nerfro.allowed import Range
 from nerfro.losses.base import Loss
 from nerfro.registry import register
 from nerfro.rendering import Scene
@@ -22,14 +22,10 @@ class Smoothness(Loss):
         tile_size: side in pixels of a random window of a random training view, whose directions are the tile.
     """
 
-    def __init__(
-        self,
-        weight: NotNegative = 1.0,
-        start: Natural = 2500,
-        ramp: Natural = 0,
-        tile_size: Annotated[int, Range(at_least=2)] = 128,
-    ) -> None:
-        super().__init__(weight, start, ramp)
+    start = 2500
+
+    def __init__(self, tile_size: Annotated[int, Range(at_least=2)] = 128) -> None:
+        super().__init__()
         self.tile_size = tile_size
 
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:

@@ -9,11 +9,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Count, Natural, NotNegative, Range
+from nerfro.allowed import Range
 from nerfro.losses.base import Loss
 from nerfro.registry import register
 from nerfro.rendering import Scene
 from nerfro.types import Batch, Exits, Rendering
+
+# Random pairs of directions for each step.
+_NUM_PAIRS = 1024
 
 
 @register("loss", "total_variation")
@@ -24,27 +27,21 @@ class TotalVariation(Loss):
     Fatemi, 1992), and it reaches directions in which no training ray leaves.
 
     Args:
-        num_directions: random pairs for each step.
         angle: between the two directions of a pair, degrees; about a texel of the boundary.
     """
 
-    def __init__(
-        self,
-        weight: NotNegative = 1e-3,
-        start: Natural = 0,
-        ramp: Natural = 0,
-        num_directions: Count = 1024,
-        angle: Annotated[float, Range(more_than=0, less_than=90)] = 0.7,
-    ) -> None:
-        super().__init__(weight, start, ramp)
-        self.num_directions, self.angle = num_directions, angle
+    weight = 1e-3
+
+    def __init__(self, angle: Annotated[float, Range(more_than=0, less_than=90)] = 0.7) -> None:
+        super().__init__()
+        self.angle = angle
 
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
-        index = torch.arange(self.num_directions, device=batch.rgb.device)
+        index = torch.arange(_NUM_PAIRS, device=batch.rgb.device)
         numbers = batch.draws.uniform(index, 3, "total variation")
         first, second = direction_pairs(numbers, math.radians(self.angle))
         rgb = scene.colour_space.to_srgb(scene.boundary(Exits(torch.cat([first, second]))))
-        return (rgb[self.num_directions :] - rgb[: self.num_directions]).abs().mean()
+        return (rgb[_NUM_PAIRS:] - rgb[:_NUM_PAIRS]).abs().mean()
 
 
 def direction_pairs(numbers: Float[Tensor, "N 3"], angle: float) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:

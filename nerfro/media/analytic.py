@@ -1,4 +1,4 @@
-"""Media in closed form: nothing at all, and a classical gradient-index lens."""
+"""Media in closed form: vacuum, and a classical gradient-index lens."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from nerfro.registry import register
 
 @register("medium", "vacuum")
 class Vacuum(Medium):
-    """Nothing: n = 1 everywhere, every ray is straight."""
+    """Vacuum: n = 1 everywhere, and every ray is straight."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -23,7 +23,11 @@ class Vacuum(Medium):
 
 @register("medium", "luneburg")
 class Luneburg(Medium):
-    """The Luneburg lens, n^2 = 2 - r^2 / R^2 for r < R: parallel rays meet in a point of its surface."""
+    """The Luneburg lens, n^2 = 2 - r^2 / R^2 for r < R, which focuses parallel rays on a point of its surface.
+
+    Args:
+        radius: R, world units.
+    """
 
     def __init__(self, radius: Positive = 1.0) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""What a medium is."""
+"""The base class of media: refractive index in space, and what learns about it."""
 
 from __future__ import annotations
 
@@ -18,72 +18,98 @@ Vectors = Float[Tensor, "*batch 3"]
 
 
 class lazy_buffer:  # noqa: N801 (used like functools.cached_property)
-    """A tensor computed when it is first asked for, and kept as a buffer: it moves to other devices with its module."""
+    """Decorate a method so that its tensor is computed at the first access and kept as a non-persistent buffer.
+
+    Unlike `functools.cached_property`, the tensor moves to other devices with its module.
+    """
 
     def __init__(self, compute: Callable[[Any], Tensor]) -> None:
         self._compute, self._name, self.__doc__ = compute, f"_{compute.__name__}", compute.__doc__
 
     def __get__(self, module: nn.Module, owner: type) -> Tensor:
         if self._name not in module._buffers:
-            with torch.inference_mode(False):  # pictures may be the first to ask, but training asks too
+            with torch.inference_mode(False):  # the first access may be in evaluation, and training needs it too
                 module.register_buffer(self._name, self._compute(module), persistent=False)
         return module.get_buffer(self._name)
 
 
-# Steps along the diagonal of a medium that says nothing about where its index varies.
+# Steps along the diagonal of a medium that does not override `step_length`.
 _STEPS_PER_DIAGONAL = 512
 
 
 class Medium(nn.Module, ABC):
-    """Refractive index in space; outside its box n = 1 and grad n = 0."""
+    """Refractive index in space.
 
-    box: Float[Tensor, "2 3"]  # lower and upper corner, world units
+    A subclass implements `forward` and sets `box`. It overrides `clearance` and `step_length` where it can tell the
+    Eikonal integrators how far the index is constant and how small their steps must be.
+
+    Attributes:
+        box: lower and upper corner of the medium [2, 3], world units. Outside of it n = 1 and grad n = 0.
+    """
+
+    box: Float[Tensor, "2 3"]
 
     @abstractmethod
     def forward(self, positions: Vectors) -> tuple[Scalars, Vectors]:
-        """Refractive index and its gradient (per world unit)."""
+        """Evaluate the refractive index and its gradient.
+
+        Args:
+            positions: points, world coordinates.
+
+        Returns:
+            n without unit, and grad n per world unit.
+        """
 
     @property
     def indices(self) -> Float[Tensor, "K"]:
-        """Refractive index of each body; of none where the index is not that of bodies."""
+        """Refractive index of each body; empty for media without bodies."""
         return torch.empty(0)
 
     def with_indices(self, indices: Float[Tensor, "K"]) -> Medium:
-        """The same bodies of another index."""
+        """Return the same bodies with other refractive indices.
+
+        Raises:
+            NerfroError: the medium is not made of bodies.
+        """
         raise NerfroError(f"the index of {type(self).__name__} cannot be changed; take a medium of bodies")
 
     @property
     def content_box(self) -> Float[Tensor, "2 3"]:
-        """Corners of the object's own bounds, world units: what lies inside it lies in here."""
+        """Corners of the object's bounds, world units."""
         return self.box
 
     @property
     def absorption(self) -> Tensor | None:
-        """Of each body, for each colour channel, per world unit; None where nothing absorbs."""
+        """Absorption coefficients of each body and colour channel, per world unit; None if nothing absorbs."""
         return None
 
     @property
     def disperses(self) -> bool:
-        """Whether the index depends on the wavelength."""
+        """Whether the refractive index depends on the wavelength."""
         return False
 
-    def tinted(self, path: Path) -> Path:
-        """The path with the absorption of the bodies that it crosses."""
+    def with_absorption(self, path: Path) -> Path:
+        """Return the path with the absorption of the bodies that it crosses."""
         return path
 
     def bending_parameters(self) -> list[nn.Parameter]:
-        """What paths depend on, of all that learns."""
+        """Return the learned parameters that paths depend on."""
         return list(self.parameters())
 
     def learned(self) -> dict[str, float]:
-        """Physical quantities that learn, by names for the log."""
+        """Return learned physical quantities by their names in the log."""
         return {}
 
     def clearance(self, positions: Vectors) -> Scalars:
-        """Distance around each point of the box within which the index surely does not vary; 0 where unknown."""
+        """Return a distance around each point within which the index is constant, world units; 0 where unknown."""
         return torch.zeros_like(positions[..., 0])
 
     def step_length(self, directions: Vectors, gradients: Vectors) -> Scalars:
-        """Arc length of a step that resolves the medium, for a ray of that unit direction where grad n is as given."""
+        """Return the arc length of an integration step that resolves the medium, world units.
+
+        Args:
+            directions: unit directions of rays.
+            gradients: grad n where the rays are, per world unit.
+        """
         diagonal = torch.linalg.vector_norm(self.box[1] - self.box[0])
         return (diagonal / _STEPS_PER_DIAGONAL).expand(directions.shape[:-1])

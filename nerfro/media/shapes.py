@@ -1,4 +1,4 @@
-"""Solids whose signed distance is known in closed form."""
+"""Solids with a signed distance in closed form."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from nerfro.media.base import Vectors
 from nerfro.media.solid import Solid
 from nerfro.registry import register
 
-# Air around a shape, as a share of its size: the shell lies outside its surface.
+# Air around a shape as a share of its size, because half of the shell lies outside the surface.
 _MARGIN = 0.05
+# Slab: half side of the box along x and y, world units, larger than the scenes of the paper.
+_HALF_WIDTH = 10.0
 
 
 @register("medium", "ball")
@@ -21,7 +23,7 @@ class Ball(Solid):
     """A ball around the origin.
 
     Args:
-        radius: world units.
+        radius: of the ball, world units.
         ior, shell, absorption, learn_absorption, abbe: see `Solid`.
     """
 
@@ -40,7 +42,7 @@ class Ball(Solid):
         self.register_buffer("box", torch.tensor([[-side] * 3, [side] * 3]), persistent=False)
 
     def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
-        """|x| - R and x / |x|."""
+        """Return |x| - R and x / |x|."""
         distance = torch.linalg.vector_norm(positions, dim=-1, keepdim=True)
         return distance - self.radius, functional.normalize(positions, dim=-1)[..., None, :]
 
@@ -50,8 +52,8 @@ class RoundedBox(Solid):
     """A cube around the origin with rounded edges and corners.
 
     Args:
-        half_side: from the centre to a face, world units.
-        edge_radius: of the rounding, world units.
+        half_side: distance from the centre to a face, world units.
+        edge_radius: radius of the rounded edges, world units.
         ior, shell, absorption, learn_absorption, abbe: see `Solid`.
     """
 
@@ -71,7 +73,7 @@ class RoundedBox(Solid):
         self.register_buffer("box", torch.tensor([[-side] * 3, [side] * 3]), persistent=False)
 
     def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
-        """|max(q, 0)| + min(max q, 0) - r with q = |x| - (a - r): the distance to a smaller cube, less the radius."""
+        """Return |max(q, 0)| + min(max q, 0) - r with q = |x| - (a - r): the distance to a smaller cube, less r."""
         q = positions.abs() - (self.half_side - self.edge_radius)
         outward = q.clamp(min=0)
         outside = torch.linalg.vector_norm(outward, dim=-1, keepdim=True)
@@ -83,11 +85,10 @@ class RoundedBox(Solid):
 
 @register("medium", "slab")
 class Slab(Solid):
-    """A plate across the z axis, as wide as its box.
+    """A plate across the z axis that fills the medium's box along x and y.
 
     Args:
         thickness: along z, world units.
-        half_width: half side of the box along x and y, world units.
         ior, shell, absorption, learn_absorption, abbe: see `Solid`.
     """
 
@@ -95,7 +96,6 @@ class Slab(Solid):
         self,
         thickness: Positive = 0.5,
         ior: Positive = 1.5,
-        half_width: Positive = 2.0,
         shell: Positive = 0.002,
         absorption: list[NotNegative] = (),  # type: ignore[assignment]
         learn_absorption: bool = False,
@@ -103,11 +103,11 @@ class Slab(Solid):
     ) -> None:
         super().__init__([ior], shell, absorption, learn_absorption, abbe)
         self.thickness = thickness
-        corner = torch.tensor([half_width, half_width, thickness * (0.5 + _MARGIN) + shell])
+        corner = torch.tensor([_HALF_WIDTH, _HALF_WIDTH, thickness * (0.5 + _MARGIN) + shell])
         self.register_buffer("box", torch.stack([-corner, corner]), persistent=False)
 
     def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
-        """|z| - h / 2 and the sign of z."""
+        """Return |z| - h / 2 and the sign of z."""
         z = positions[..., 2:]
         normal = torch.cat([torch.zeros_like(positions[..., :2]), z.sign()], -1)
         return z.abs() - 0.5 * self.thickness, normal[..., None, :]

@@ -1,4 +1,4 @@
-"""Homogeneous bodies with a surface: sharp for Snell's law, a thin smooth shell for the Eikonal equation."""
+"""Homogeneous bodies with sharp surfaces for Snell's law, or thin smooth shells for the Eikonal equation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.types import Path
 from nerfro.variants import variant
 
-# Absorption per world unit from which learning starts: what is inside must not be explained by it at first.
+# Initial absorption per world unit where it is learned. A larger one would explain the content at first.
 _ALMOST_CLEAR = 0.02
 # Wavelengths of the lines d, F and C, nm.
 _FRAUNHOFER = (587.56, 486.13, 656.27)
@@ -31,25 +31,30 @@ Self = TypeVar("Self", bound="Solid")  # typing has it from Python 3.11 on
 class Solid(Medium):
     """Bodies of constant index, bounded by the zero levels of signed distances; later bodies lie inside earlier ones.
 
-    For the Eikonal equation the surface is a shell of half width w around the zero level, in which the index rises as
-    a cubic step of the signed distance phi: S = t^2 (3 - 2 t), t = (1 - phi / w) / 2. Body after body,
-    n <- n + (ior - n) S; in a `nested` medium with the product of the steps so far in place of S.
+    For the Eikonal equation the surface is a shell of half width w around the zero level. In the shell the index rises
+    as a cubic step of the signed distance phi: S = t^2 (3 - 2 t), t = (1 - phi / w) / 2. The bodies are applied in
+    order, n <- n + (ior - n) S; a `nested` medium uses the product of all steps so far in place of S.
 
     Args:
         iors: refractive index of each body.
         shell: half width w, world units.
-        absorption: of red, green and blue per world unit, of each body after the others; one number for all of them,
-            none for clear bodies.
-        learn_absorption: whether it is learned, from there or from almost nothing.
-        abbe: Abbe number of each body, or one for all, where the index depends on the wavelength; the indices are then
-            those of the d line, 587.6 nm.
+        absorption: coefficients per world unit: red, green and blue of the first body, then of the next. A single
+            number holds for all bodies and channels; an empty list makes clear bodies.
+        learn_absorption: learn the absorption, starting from the given values or from almost none.
+        abbe: Abbe number of each body, or one for all bodies; the refractive index then depends on the wavelength, and
+            `iors` are those of the d line, 587.6 nm. An empty list switches dispersion off.
+        learn_ior: learn the refractive indices.
+
+    Attributes:
+        nested: whether a body exists only where all bodies before it exist. A nested body may then reach beyond the
+            others and touch them without a gap, and a body of index 1 is air, as outside. Otherwise a point belongs to
+            the last body that contains it.
+        iors: refractive index of each body [K]; a parameter if it is learned.
     """
 
-    # Whether a body is only where all before it are too, so that it may reach beyond them and touch without a gap; one
-    # of index 1 is air, as outside. Otherwise a point belongs to the last body that holds it.
     nested = False
-    iors: Float[Tensor, "K"]  # refractive index of each body; a parameter where it is learned
-    _absorption: Float[Tensor, "K 3"] | None  # or, where it is learned, what softplus makes it of
+    iors: Float[Tensor, "K"]
+    _absorption: Float[Tensor, "K 3"] | None  # a parameter is passed through softplus
 
     def __init__(
         self,
@@ -74,7 +79,7 @@ class Solid(Medium):
             self._absorption = nn.Parameter(given.clamp(min=_ALMOST_CLEAR).expm1().log())
         else:
             self.register_buffer("_absorption", given if given.any() else None, persistent=False)
-        # Double precision: kernels ask for it, and a number without dimensions takes on the precision of what it meets.
+        # Double precision, as the kernels need; scalar tensors do not promote float32 operands.
         indices = torch.tensor(iors, dtype=torch.float64)
         if learn_ior:
             self.iors = nn.Parameter(indices)
@@ -91,7 +96,7 @@ class Solid(Medium):
 
     @property
     def absorption(self) -> Float[Tensor, "K 3"] | None:
-        """Of each body, for each colour channel, per world unit; None where all are clear."""
+        """Absorption coefficients of each body and colour channel, per world unit; None if all bodies are clear."""
         return softplus(self._absorption) if isinstance(self._absorption, nn.Parameter) else self._absorption
 
     @property
@@ -99,7 +104,7 @@ class Solid(Medium):
         return bool(self.abbe)
 
     def at_wavelength(self: Self, wavelength: float) -> Self:
-        """The same bodies with their indices at a wavelength, nm; gradients reach the indices that they are made of.
+        """Return the same bodies with their indices at a wavelength in nm; gradients reach the original indices.
 
         Cauchy's two terms: n(w) = n_d + B (1 / w^2 - 1 / w_d^2), with B from Abbe's V = (n_d - 1) / (n_F - n_C).
         """
@@ -107,7 +112,7 @@ class Solid(Medium):
         per_unit = (wavelength**-2 - line_d) / (line_f - line_c) / self.iors.new_tensor(self.abbe)
         return variant(self, iors=self.iors + (self.iors - 1) * per_unit)
 
-    def tinted(self, path: Path) -> Path:
+    def with_absorption(self, path: Path) -> Path:
         of_bodies = self.absorption
         if of_bodies is None:
             return path
@@ -127,10 +132,13 @@ class Solid(Medium):
 
     @abstractmethod
     def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
-        """Signed distance to each body's surface, negative inside, and its gradient; a lower bound far away will do."""
+        """Evaluate the signed distance to the surface of each body, negative inside, and its gradient.
+
+        Far from a surface, a lower bound of the distance suffices.
+        """
 
     def regions(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
-        """As `signed_distances`, of what of each body is there: in a `nested` medium what lies in all before it."""
+        """Evaluate `signed_distances`; in a `nested` medium, of the part of each body inside all bodies before it."""
         phi, gradients = self.signed_distances(positions)
         if not self.nested:
             return phi, gradients
@@ -138,24 +146,27 @@ class Solid(Medium):
         return phi, gradients.gather(-2, body[..., None].expand_as(gradients))
 
     def innermost(self, inside: Bool[Tensor, "*batch K"]) -> Int[Tensor, "*batch"]:
-        """Number of the body that a point belongs to, from 1 on, by whether it is within each surface; 0 in none."""
+        """Return the number of the body that contains a point, given which surfaces enclose it; 0 for none."""
         numbers = torch.arange(inside.shape[-1] + 1, device=inside.device)
         if self.nested:
-            # Air in the open is air: a ray goes from the one into the other without an event.
+            # Air in a vessel is the air outside: a ray passes between them without an event.
             numbers[1:] *= self.iors != 1
             return numbers[inside.long().cumprod(-1).sum(-1)]
         return torch.where(inside, numbers[1:], 0).amax(-1)
 
     def index_inside(self, inside: Bool[Tensor, "*batch K"]) -> Float[Tensor, "*batch"]:
-        """Index of the body that a point belongs to, 1 in none."""
+        """Return the refractive index of the body that contains a point; 1 outside all bodies."""
         return torch.cat([self.iors.new_ones(1), self.iors]).to(self.box)[self.innermost(inside)]
 
     def forward(self, positions: Vectors) -> tuple[Scalars, Vectors]:
-        """Index of the smooth shells and its exact gradient."""
+        """Evaluate the refractive index of the smooth shells and its exact gradient."""
         phi, normals = self.signed_distances(positions)
         in_box = ((positions >= self.box[0]) & (positions <= self.box[1])).all(-1)
         n, gradient = torch.ones_like(phi[..., 0]), torch.zeros_like(positions)
-        within, rise = torch.ones_like(n)[..., None], torch.zeros_like(positions)  # product of steps, and its gradient
+        within, rise = (
+            torch.ones_like(n)[..., None],
+            torch.zeros_like(positions),
+        )  # product of steps, its gradient
         for body, ior in enumerate(self.iors.unbind()):
             t = (0.5 - 0.5 * phi[..., body] / self.shell).clamp(0, 1)
             step = (t * t * (3 - 2 * t))[..., None]
@@ -168,14 +179,14 @@ class Solid(Medium):
         return torch.where(in_box, n, 1.0), torch.where(in_box[..., None], gradient, 0.0)
 
     def clearance(self, positions: Vectors) -> Scalars:
-        """Most of the distance to the nearest shell."""
+        """Return most of the distance to the nearest shell, world units."""
         phi, _ = self.signed_distances(positions)
         return (SAFE_SHARE * phi.abs().amin(-1) - self.shell).clamp(min=0)
 
     def step_length(self, directions: Vectors, gradients: Vectors) -> Scalars:
-        """The shell's width over `STEPS_PER_SHELL`, longer for slanting rays."""
+        """Return the width of the shell over `STEPS_PER_SHELL`, divided by the cosine of incidence."""
         slope = torch.linalg.vector_norm(gradients, dim=-1)
-        # Where there is no gradient there is no normal either; dividing by it would make gradients nan.
+        # Dividing by a gradient of zero would make derivatives nan.
         varies = slope > 0
         cosine = ((directions * gradients).sum(-1) / torch.where(varies, slope, 1.0)).abs()
         cosine = torch.where(varies, cosine, 1.0)

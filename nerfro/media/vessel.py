@@ -1,4 +1,4 @@
-"""A vessel with a liquid in it: nested bodies made of one outer surface and a few lengths."""
+"""A vessel that contains a liquid: nested bodies made from one outer surface and a few lengths."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nerfro.geometry.mesh import load_mesh
 from nerfro.kernels.available import require_bytes
 from nerfro.media.sdf_grid import AIR, BAND, SdfGrid, cached_distance
 from nerfro.media.solid import Solid
-from nerfro.media.voxel_grid import BYTES_A_VERTEX, check_margin, grid_box
+from nerfro.media.voxel_grid import BYTES_PER_VERTEX, check_margin, grid_box
 from nerfro.paths import resolve_path
 from nerfro.registry import register
 from nerfro.variants import variant
@@ -23,37 +23,39 @@ from nerfro.variants import variant
 
 @register("medium", "sdf_vessel")
 class SdfVessel(SdfGrid):
-    """A wall of glass around a cavity with a liquid, up to a level, and air above it.
+    """A wall of glass around a cavity that contains a liquid up to a level, and air above the liquid.
 
-    The bodies are nested: all within the outer surface is wall; in it what is deeper than the wall, and above the foot,
-    is air; of that what is below the level is liquid. So liquid touches glass without a gap. Without a level there is
-    no air. A wall may be much thinner than a voxel, for both its surfaces are smooth ones of their own.
+    The bodies are nested. The outer body is the wall. The cavity is the part of it that is deeper than the wall and
+    above the foot, and contains air. The liquid is the part of the cavity below the level. Liquid therefore touches
+    glass without a gap. A vessel without a level is full and has no air. The wall may be much thinner than a voxel,
+    because each of its surfaces is a smooth distance field.
 
-    Lengths are in world units, or where `height` is given in the unit of that: millimetres, say. Heights are measured
-    from the lowest point up.
+    Lengths are in world units. If `height` is given, they are in the same unit as `height`, for example millimetres.
+    Heights are measured upwards from the lowest point.
 
     Args:
-        mesh: the vessel's outer surface as silhouettes show it, an opening closed: a closed triangle mesh, world units.
+        mesh: outer surface of the vessel with its opening closed, as silhouettes show it: a closed triangle mesh, world
+            units.
         wall: thickness of the wall.
-        foot: thickness of the bottom; by default the wall's.
-        level: height of the liquid's surface; by default the vessel is full.
-        closed: whether the wall goes on over the top; otherwise what closes the outer surface there, and looks up, is
-            an opening.
+        foot: thickness of the bottom; by default that of the wall.
+        level: height of the liquid; by default the vessel is full.
+        closed: whether the wall continues over the top. Otherwise the part of the outer surface at the top that faces
+            up is an opening.
         ior: refractive index of the wall.
         liquid_ior: refractive index of the liquid; 1 for an empty vessel.
-        up: direction from the bottom to the top, world axes, of any length.
-        height: the vessel's height, outside, in the unit in which lengths are given.
-        resolution, box_min, box_max, shell_voxels, crease_degrees, accept_open_mesh, cache: see `SdfGrid`.
+        up: direction from the bottom to the top, world axes; its length does not matter.
+        height: outer height of the vessel, in the unit of the other lengths.
+        resolution, box_min, box_max, shell_voxels, accept_open_mesh, cache: see `SdfGrid`.
         absorption, learn_absorption, abbe: of wall and liquid, see `Solid`.
 
     Attributes:
-        lengths: wall, foot and level as they were given; no level where the vessel is full.
+        lengths: wall, foot and level as given; a full vessel has no level.
     """
 
     nested = True
-    _outer: Float[Tensor, "X Y Z"]  # signed distances to the outer surface, and to it without its lid
+    _outer: Float[Tensor, "X Y Z"]  # signed distances to the outer surface, and to the outer surface without its lid
     _side: Float[Tensor, "X Y Z"]
-    _heights: Float[Tensor, "X Y Z"]  # of the vertices over the lowest point
+    _heights: Float[Tensor, "X Y Z"]  # of the grid vertices above the lowest point
 
     def __init__(
         self,
@@ -70,14 +72,13 @@ class SdfVessel(SdfGrid):
         box_min: list[float] | None = None,
         box_max: list[float] | None = None,
         shell_voxels: Positive = 0.1,
-        crease_degrees: NotNegative = 30.0,
         accept_open_mesh: bool = False,
         absorption: list[NotNegative] = [],  # noqa: B006
         learn_absorption: bool = False,
         abbe: list[Positive] = [],  # noqa: B006
         cache: bool = True,
     ) -> None:
-        require_bytes(BYTES_A_VERTEX * resolution**3, f"medium.resolution={resolution}")
+        require_bytes(BYTES_PER_VERTEX * resolution**3, f"medium.resolution={resolution}")
         surface = load_mesh(resolve_path(mesh), accept_open_mesh)
         box = grid_box(box_min, box_max, [surface], resolution, AIR)
         spacing = float((box[1] - box[0]).min()) / (resolution - 1)
@@ -90,7 +91,7 @@ class SdfVessel(SdfGrid):
             learn_absorption,
             _of_bodies(abbe, 1, len(iors), 1.0, "abbe"),
         )
-        self.meshes = []  # rays bend at distances, not at triangles
+        self.meshes = []  # rays are refracted at the distance field, not at triangles
         upwards = _direction(up)
         check_margin(surface, box, resolution, 2)
         if surface.is_closed:
@@ -105,7 +106,7 @@ class SdfVessel(SdfGrid):
         self._require_lengths_within()
         # The wall's inner surface is made of these distances, and a refinement moves it.
         band = min(BAND + 2 * wall * self.unit / spacing, resolution)
-        settings = surface, box, resolution, band, crease_degrees, cache
+        settings = surface, box, resolution, band, cache
         outer = side = torch.from_numpy(cached_distance(*settings))
         if not closed:
             side = torch.from_numpy(cached_distance(*settings, find_lid(surface, upwards)))
@@ -116,7 +117,7 @@ class SdfVessel(SdfGrid):
         if not (self.distances[:2].amax(0) < 0).any():
             deepest = -float(side[outer < 0].min()) / self.unit
             raise NerfroError(
-                f"medium.wall={wall:g} and medium.foot={self.lengths['foot']:g} leave no cavity: no place of the body "
+                f"medium.wall={wall:g} and medium.foot={self.lengths['foot']:g} leave no cavity: no point of the body "
                 f"is deeper than {deepest:.3g}; give smaller ones, in world units, or medium.height= in the same unit"
             )
 
@@ -126,17 +127,17 @@ class SdfVessel(SdfGrid):
 
     @property
     def absorption(self) -> Float[Tensor, "K 3"] | None:
-        """Of each body; air absorbs nothing, whatever is learned."""
+        """Absorption coefficients of each body and colour channel, per world unit; those of air are zero."""
         values = super().absorption
         return values if values is None or len(values) == 2 else values * values.new_tensor([[1.0], [0.0], [1.0]])
 
     def grown(self, outwards: Float[Tensor, "X Y Z"]) -> SdfVessel:
-        """See `SdfGrid`; the cavity moves too, for the wall is as thick as it was."""
+        """Return the vessel with a displaced outer surface. The cavity follows, as the wall keeps its thickness."""
         changed = variant(self, _outer=self._outer - outwards, _side=self._side - outwards)
-        return changed._of_distances(changed._distances())
+        return changed._with_distances(changed._distances())
 
     def _distances(self) -> Float[Tensor, "K X Y Z"]:
-        """Signed distances of all within the outer surface, of the cavity and of all below the level, world units."""
+        """Compute the signed distances of the outer body, the cavity and the space below the level, world units."""
         wall, foot, *level = (length * self.unit for length in self.lengths.values())
         cavity = torch.maximum(self._side + wall, foot - self._heights)
         return torch.stack([self._outer, cavity, *(self._heights - height for height in level)])
@@ -159,14 +160,14 @@ def _direction(up: list[float]) -> Float[np.ndarray, "3"]:
 
 
 def _heights(box: Float[np.ndarray, "2 3"], resolution: int, up: Float[np.ndarray, "3"]) -> Float[Tensor, "X Y Z"]:
-    """Of a grid's vertices over the world's origin."""
+    """Return the heights of the vertices of a grid above the world origin."""
     axes = (part * np.linspace(low, high, resolution) for low, high, part in zip(*box, up, strict=True))
     x, y, z = map(torch.from_numpy, axes)
     return x[:, None, None] + y[:, None] + z
 
 
 def _of_bodies(given: list[float], each: int, num_bodies: int, air: float, name: str) -> list[float]:
-    """Numbers of all bodies from those of wall and liquid, or from one for both; none where none are given."""
+    """Expand the numbers of wall and liquid, or one number for both, to all bodies; an empty list stays empty."""
     if len(given) not in (0, 1, 2 * each):
         raise NerfroError(
             f"medium.{name}={list(given)} has {len(given)} numbers; give {2 * each}, of wall and liquid, or one for all"

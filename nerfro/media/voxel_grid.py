@@ -1,20 +1,18 @@
-"""The paper's medium: a mesh, voxelised to occupancy fractions and smoothed (paper, section 3.1)."""
+"""The medium of the paper: a mesh that is voxelized to occupancy fractions and smoothed (section 3.1)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated, get_type_hints
+from typing import Annotated
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Count, Positive, Range, Resolution, check, corners_of_box
+from nerfro.allowed import Positive, Range, Resolution, corners_of_box
 from nerfro.errors import NerfroError
-from nerfro.files.cache import cached_arrays, content_hash, save_arrays
-from nerfro.files.reading import load_arrays
+from nerfro.files.cache import cached_arrays, content_hash
 from nerfro.geometry.bodies import require_separate
 from nerfro.geometry.interpolation import gradient, smooth, trilinear
 from nerfro.geometry.mesh import TriangleMesh, load_mesh, require_inside
@@ -26,29 +24,29 @@ from nerfro.media.base import Medium, Scalars, Vectors, lazy_buffer
 from nerfro.paths import resolve_path
 from nerfro.registry import register
 
-# Part of the cache's key: raise it when the same mesh and settings give other fractions than before.
+# Part of the cache key. Increase it when the same mesh and settings give different fractions.
 _VERSION = 1
-BYTES_A_VERTEX = 64  # of a grid while it is made
+# Inside tests along each side around a vertex.
+_SUBSAMPLES = 4
+BYTES_PER_VERTEX = 64  # peak memory while a grid is built
 
 
 @register("medium", "voxel_grid")
 class VoxelGrid(Medium):
-    """A grid of refractive index and gradient, made of a mesh by super-sampling and Gaussian smoothing (the paper's).
+    """A grid of refractive index and gradient, computed from a mesh by supersampling and Gaussian smoothing (paper).
 
-    n = 1 + (ior - 1) * smooth(occupancy); grad n is the central difference of n on the grid; both are interpolated
-    trilinearly between the vertices, so the gradient that is returned is not the derivative of the n that is returned.
+    n = 1 + (ior - 1) * smooth(occupancy), and grad n is the central difference of n on the grid. Both are interpolated
+    trilinearly. Therefore the returned gradient is not the derivative of the returned n.
 
     Args:
         mesh: closed triangle mesh in world units, any format trimesh reads.
         ior: refractive index inside the mesh.
-        resolution: grid vertices a side; 64 to 512 are usual.
+        resolution: vertices along each side of the grid; 64 to 512 are usual.
         box_min, box_max: corners of the grid, world units; the object needs a margin of air inside.
-        smoothing_size: taps of the Gaussian kernel a side, odd; 0 for none.
+        smoothing_size: taps of the Gaussian kernel along each axis, odd; 0 switches smoothing off.
         smoothing_sigma: standard deviation of the kernel, voxels.
-        subsamples: inside tests a side around each vertex.
-        accept_open_mesh: take a mesh with holes; the majority of three axes decides what is inside.
+        accept_open_mesh: accept a mesh with holes; the majority of three axes decides which points are inside.
         cache: keep the occupancy in the cache folder.
-        grid: file written by `save`, used with the box, index and smoothing it holds instead of all the above.
     """
 
     table: Float[Tensor, "X Y Z 4"]  # n and grad n (per world unit) at each vertex
@@ -56,40 +54,32 @@ class VoxelGrid(Medium):
 
     def __init__(
         self,
-        mesh: str | None = None,
+        mesh: str,
         ior: Positive = 1.5,
         resolution: Resolution = 128,
         box_min: list[float] = [-1.5, -1.5, -1.5],  # noqa: B006 (the registry reads and copies it)
         box_max: list[float] = [1.5, 1.5, 1.5],  # noqa: B006
         smoothing_size: Annotated[int, Range(at_least=0, at_most=99)] = 9,
         smoothing_sigma: Positive = 1.0,
-        subsamples: Count = 4,
         accept_open_mesh: bool = False,
         cache: bool = True,
-        grid: str | None = None,
     ) -> None:
         super().__init__()
-        if (mesh is None) == (grid is None):
-            raise NerfroError("medium=voxel_grid needs one source; set either medium.mesh or medium.grid")
-        if grid is not None:
-            stored = _load_grid(resolve_path(grid))
-            self._set(*stored)
-            return
-        require_bytes(BYTES_A_VERTEX * resolution**3, f"medium.resolution={resolution}")
+        require_bytes(BYTES_PER_VERTEX * resolution**3, f"medium.resolution={resolution}")
         box = corners_of_box(box_min, box_max)
-        loaded = load_mesh(resolve_path(str(mesh)), accept_open_mesh)
-        # One voxel for the sub-samples, one for the gradient's difference, and what the smoothing spreads.
+        loaded = load_mesh(resolve_path(mesh), accept_open_mesh)
+        # One voxel for the subsamples, one for the central difference, and the radius of the smoothing kernel.
         check_margin(loaded, box, resolution, 2 + smoothing_size // 2)
         if loaded.is_closed:
             require_separate(loaded)
-        key = "occupancy_" + content_hash(_VERSION, loaded.vertices, loaded.faces, box, resolution, subsamples)
+        key = "occupancy_" + content_hash(_VERSION, loaded.vertices, loaded.faces, box, resolution, _SUBSAMPLES)
         occupancy = cached_arrays(
             key,
             # Multiples of 1/64 are exact in half precision.
-            lambda: {"occupancy": occupancy_fraction(loaded, box, resolution, subsamples).astype(np.float16)},
+            lambda: {"occupancy": occupancy_fraction(loaded, box, resolution, _SUBSAMPLES).astype(np.float16)},
             cache,
         )["occupancy"]
-        require_inside(occupancy.max() > 0.25)  # more than what happens to lie on a flat mesh
+        require_inside(occupancy.max() > 0.25)  # vertices on a flat mesh count as inside to some extent
         fractions, corners = torch.from_numpy(occupancy).float(), torch.from_numpy(box).float()
         self._set(fractions, corners, ior, smoothing_size, smoothing_sigma)
 
@@ -102,10 +92,14 @@ class VoxelGrid(Medium):
         size: int,
         sigma: float,
     ) -> VoxelGrid:
-        """Make the medium of given occupancy fractions.
+        """Make the medium from occupancy fractions.
 
-        They are of the vertices of a grid over `box`, 0 to 1, with air at the border; smoothed with `size` taps a side
-        and a standard deviation of `sigma` voxels.
+        Args:
+            occupancy: fractions in [0, 1] at the vertices of a grid; 0 at the border.
+            box: lower and upper corner of the grid, world units.
+            ior: refractive index inside the object.
+            size: taps of the smoothing kernel along each axis.
+            sigma: standard deviation of the smoothing kernel, voxels.
         """
         medium = cls.__new__(cls)
         Medium.__init__(medium)
@@ -116,7 +110,7 @@ class VoxelGrid(Medium):
         if any(float(face.abs().max()) > 0 for face in _faces(occupancy)):
             raise NerfroError("the object touches the grid's border; enlarge medium.box_min and medium.box_max")
         self.ior, self.smoothing_size, self.smoothing_sigma = float(ior), int(size), float(sigma)
-        # Grids are made of the mesh at every start and do not belong in checkpoints.
+        # Grids are rebuilt from the mesh at every start and do not belong in checkpoints.
         self.register_buffer("occupancy", occupancy, persistent=False)
         self.register_buffer("box", box, persistent=False)
         n = 1 + (ior - 1) * smooth(occupancy, size, sigma)
@@ -139,12 +133,12 @@ class VoxelGrid(Medium):
 
     @property
     def content_box(self) -> Float[Tensor, "2 3"]:
-        """Bounds of the occupied vertices."""
+        """Bounds of the occupied vertices, world units."""
         occupied = self.occupancy.nonzero()
         return self.box[0] + torch.stack([occupied.amin(0), occupied.amax(0)]) * self.spacing
 
     def forward(self, positions: Vectors) -> tuple[Scalars, Vectors]:
-        """Refractive index and its gradient (per world unit), trilinear; n = 1 and grad n = 0 outside the box."""
+        """Interpolate the refractive index and its gradient (per world unit); n = 1 and grad n = 0 outside the box."""
         values = trilinear(self.table, self.box, positions)
         inside = ((positions >= self.box[0]) & (positions <= self.box[1])).all(-1)
         n = torch.where(inside, values[..., 0], 1.0)
@@ -152,55 +146,51 @@ class VoxelGrid(Medium):
 
     @lazy_buffer
     def clearance_grid(self) -> Float[Tensor, "X-1 Y-1 Z-1"]:
-        """Distance from any point of each cell within which grad n is zero, world units."""
+        """Lower bound of the distance to the next cell with grad n != 0, for any point of each cell, world units."""
         varies = (self.table[..., 1:] != 0).any(-1).cpu()
         for axis in range(3):
             length = varies.shape[axis] - 1
             varies = varies.narrow(axis, 0, length) | varies.narrow(axis, 1, length)
         spacing = self.spacing.double().cpu().numpy()
-        # Between the centres of two cells it is at most a cell's diagonal farther than between any of their points.
+        # The distance between two cell centres exceeds that between any of their points by at most a cell diagonal.
         distance = distance_to_set(varies.numpy(), spacing) - np.linalg.norm(spacing)
         diagonal = float(torch.linalg.vector_norm(self.box[1] - self.box[0]))
         return torch.from_numpy(distance.clip(0, diagonal)).to(self.table)
 
     def clearance(self, positions: Vectors) -> Scalars:
-        """Distance within which grad n is zero, for the cell that holds each point."""
+        """Return the distance within which grad n is zero, world units."""
         grid = self.clearance_grid
         cell = ((positions - self.box[0]) / self.spacing).floor().long()
         x, y, z = torch.minimum(cell.clamp(min=0), constant(grid.shape, grid.device) - 1).unbind(-1)
         return grid[x, y, z]
 
     def step_length(self, directions: Vectors, gradients: Vectors) -> Scalars:
-        """Half a voxel."""
+        """Return half a voxel."""
         return (0.5 * self.spacing.min()).expand(directions.shape[:-1])
-
-    def save(self, path: Path) -> None:
-        """Write occupancy, box, index and smoothing to a .npz that `medium.grid` loads."""
-        save_arrays(
-            path,
-            {
-                "occupancy": self.occupancy.cpu().numpy(),
-                "box": self.box.cpu().numpy(),
-                "ior": np.float64(self.ior),
-                "smoothing": np.array([self.smoothing_size, self.smoothing_sigma]),
-            },
-        )
 
 
 def grid_box(
     box_min: list[float] | None, box_max: list[float] | None, meshes: Sequence[TriangleMesh], resolution: int, air: int
 ) -> Float[np.ndarray, "2 3"]:
-    """Corners of a medium's grid: the given ones, or the meshes' bounds and so many voxels of air on each side.
+    """Return the corners of a medium's grid: the given ones, or the bounds of the meshes with a margin of air.
 
-    A flat object gets a box at least half as thick as it is long, so that voxels are not much longer than wide.
+    A flat object gets a box at least half as thick as it is long, because voxels should not be much longer than wide.
+
+    Args:
+        box_min, box_max: given corners, world units; both None to use the meshes.
+        meshes: the bodies.
+        resolution: vertices along each side of the grid.
+        air: voxels of air on each side.
 
     Raises:
-        NerfroError: one corner is given without the other, or they are no corners of a box.
+        NerfroError: one corner is given without the other, or the corners do not make a box.
     """
     if box_min is not None and box_max is not None:
         return corners_of_box(box_min, box_max)
     if box_min is not None or box_max is not None:
-        raise NerfroError("give both medium.box_min and medium.box_max, or neither to have the box found")
+        raise NerfroError(
+            "medium.box_min and medium.box_max belong together; give both, or neither for the bounds of the mesh"
+        )
     low, high = np.min([mesh.bounds[0] for mesh in meshes], 0), np.max([mesh.bounds[1] for mesh in meshes], 0)
     sides = np.maximum(high - low, 0.5 * (high - low).max())
     share = min(2 * air / (resolution - 1), 0.5)
@@ -208,15 +198,17 @@ def grid_box(
 
 
 def check_margin(mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], resolution: int, voxels: int) -> None:
-    """Refuse a mesh that does not leave so many voxels of air on each side of the box."""
+    """Refuse a mesh that leaves fewer than `voxels` voxels of air on a side of the box."""
     low, high = mesh.bounds
     margin = voxels * (box[1] - box[0]) / (resolution - 1)
     if (low - margin >= box[0]).all() and (high + margin <= box[1]).all():
         return
-    # A larger box has larger voxels.
+    # A larger box has larger voxels, so the margin is solved for.
     share = 2 * voxels / (resolution - 1)
     if share >= 0.9:
-        raise NerfroError(f"medium.resolution={resolution} leaves no room for {voxels} voxels of air; raise it")
+        raise NerfroError(
+            f"medium.resolution={resolution} has no room for {voxels} voxels of air on each side; increase it"
+        )
     margin = 0.5 * (high - low).max() * share / (1 - share)
     raise NerfroError(
         f"the mesh does not fit into the box with {voxels} voxels of air; it needs a box such as "
@@ -231,20 +223,3 @@ def _rounded(corner: Float[np.ndarray, "3"], direction: int) -> str:
 
 def _faces(values: Tensor) -> list[Tensor]:
     return [values.select(axis, end) for axis in range(3) for end in (0, -1)]
-
-
-def _load_grid(path: Path) -> tuple[Tensor, Tensor, float, int, float]:
-    arrays = load_arrays(path)
-    missing = {"occupancy", "box", "ior", "smoothing"} - arrays.keys()
-    if missing:
-        raise NerfroError(f"{path} is no voxel grid, it lacks {', '.join(sorted(missing))}; make it again")
-    shapes = {"occupancy": (*arrays["occupancy"].shape, 0, 0, 0)[:3], "box": (2, 3), "ior": (), "smoothing": (2,)}
-    if any(arrays[name].shape != shape or arrays[name].dtype.kind not in "fiu" for name, shape in shapes.items()):
-        raise NerfroError(f"{path} is no voxel grid; make it again")
-    occupancy, (size, sigma), ior = arrays["occupancy"], arrays["smoothing"].tolist(), float(arrays["ior"])
-    values = {"ior": ior, "smoothing_size": int(size), "smoothing_sigma": sigma}
-    values["occupancy"] = [float(occupancy.min()), float(occupancy.max())]
-    hints = get_type_hints(VoxelGrid.__init__, include_extras=True)
-    check(f"{path}: ", hints | {"occupancy": list[Annotated[float, Range(at_least=0, at_most=1)]]}, values)
-    box = torch.from_numpy(corners_of_box(*arrays["box"].tolist())).float()
-    return torch.from_numpy(occupancy).float(), box, ior, int(size), sigma

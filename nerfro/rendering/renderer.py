@@ -141,7 +141,7 @@ class Renderer(nn.Module, ABC):
         """
         medium = self.scene.medium
         path = self.path_sampler(rays, medium) if path is None else path
-        return medium.tinted(self._refined(path, rays) if self.paths_learn else path)
+        return medium.with_absorption(self._refined(path, rays) if self.paths_learn else path)
 
     def exit_directions(self, rays: Rays) -> Float[Tensor, "R 3"]:
         """Unit direction in which the main polyline of each ray leaves, without its branches and their cost."""

@@ -63,7 +63,7 @@ class Scene(nn.Module):
             "fields": list(self.fields.parameters()),
             "boundary": list(self.boundary.parameters()),
             "medium": bending,
-            "tint": [own for own in self.medium.parameters() if all(own is not other for other in bending)],
+            "absorption": [own for own in self.medium.parameters() if all(own is not other for other in bending)],
             "camera": self.camera.bending_parameters(),
             "exposure": self.camera.brightness_parameters(),
         }

@@ -1,4 +1,4 @@
-"""The typed root of a training run's configuration, and the model that it composes."""
+"""Configuration of a training run, and construction of the model from it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nerfro.data.validation_views import WithValidationViews
 from nerfro.errors import NerfroError
 from nerfro.losses.base import Loss
 from nerfro.media.analytic import Vacuum
-from nerfro.registry import build, configure, find
+from nerfro.registry import build, create, find
 from nerfro.rendering import Components, Renderer
 from nerfro.subdivision import Subdivision
 from nerfro.training.backdrop import settle_backdrop
@@ -26,18 +26,18 @@ from nerfro.training.optimizer import OptimizerConfig
 
 @dataclass
 class SamplerConfig:
-    """How rays become paths and paths samples."""
+    """Path sampler and point sampler."""
 
-    path: Any = MISSING  # plugin of kind `sampler/path`
-    points: Any = MISSING  # plugin of kind `sampler/points`
+    path: Any = MISSING  # plugin of type `sampler/path`
+    points: Any = MISSING  # plugin of type `sampler/points`
 
 
 @dataclass
 class BatchesConfig:
-    """Which pixels are trained on."""
+    """Selection of the training pixels."""
 
-    size: NumRays = 1024  # pixels of a step
-    # Pixels of `single_image` at a time, or of `all_images`.
+    size: NumRays = 1024  # number of pixels in a step
+    # Whether the pixels of a step come from one image or from all images.
     batching: Annotated[str, Literal["single_image", "all_images"]] = "single_image"
     jitter: bool = False  # draw each ray anywhere inside its pixel instead of through its centre
     # Fraction of the pixels of a step that is drawn from the object's alone, which masks mark; the others are from all.
@@ -52,16 +52,16 @@ class BatchesConfig:
 
 @dataclass
 class EvaluationConfig:
-    """How a trained model is evaluated."""
+    """Evaluation of the trained model."""
 
     split: str = "test"  # of the data
-    chunk_size: NumRays = 8192  # rays rendered at once; bounds the memory
-    # File of AlexNet weights; none looks in torch's hub cache and then on the network.
+    chunk_size: NumRays = 8192  # rays rendered in one chunk; bounds the memory
+    # File of AlexNet weights; None searches torch's hub cache, then downloads the weights.
     lpips_backbone: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    # File of VGG-16 weights; none looks in torch's hub cache only.
+    # File of VGG-16 weights; None searches torch's hub cache alone.
     lpips_vgg_backbone: Optional[str] = None  # noqa: UP045
-    # Steps between two pictures of validation views while training; PSNR of some of their pixels is taken five times as
-    # often. 0 for never.
+    # Steps between two images of validation views during training; the PSNR of a subset of their pixels is computed
+    # five times as often. 0 switches validation off.
     every: Natural = 500
     subdivision: Subdivision = dataclasses.field(default_factory=Subdivision)  # which pixels get several rays
     # Steps in which test cameras are refined on the left halves of their photographs, to be scored on the right ones
@@ -71,7 +71,7 @@ class EvaluationConfig:
 
 @dataclass
 class CheckpointConfig:
-    """When a checkpoint is written while training; one of the two. The last one is kept."""
+    """Interval between checkpoints: in seconds or in steps. Only the latest checkpoint is kept."""
 
     every_seconds: Optional[Positive] = 60.0  # noqa: UP045
     every_steps: Optional[Count] = None  # noqa: UP045
@@ -79,16 +79,16 @@ class CheckpointConfig:
 
 @dataclass
 class TrainerConfig:
-    """Lightning's Trainer: those of its arguments that mean something here. None is Lightning's default."""
+    """The supported arguments of Lightning's Trainer; None selects the default of Lightning."""
 
     _target_: str = "lightning.pytorch.Trainer"
     accelerator: str = "auto"
     devices: Any = 1
     num_nodes: Optional[Count] = None  # noqa: UP045
     strategy: Any = "auto"
-    max_steps: Annotated[int, Range(at_least=-1, at_most=10**9)] = -1  # -1 for as many as max_time allows
+    max_steps: Annotated[int, Range(at_least=-1, at_most=10**9)] = -1  # -1 trains until max_time
     max_time: Any = None  # DD:HH:MM:SS
-    # `fastest` is bf16-mixed where the machine has units for it, else 32-true.
+    # `fastest` selects bf16-mixed if the machine has bfloat16 units, else 32-true.
     precision: Annotated[str, Literal["32-true", "fastest", "16-mixed", "bf16-mixed", "64-true"]] = "32-true"
     gradient_clip_val: Optional[Positive] = None  # noqa: UP045
     gradient_clip_algorithm: Annotated[Optional[str], Literal["norm", "value"]] = None  # noqa: UP045
@@ -102,35 +102,37 @@ class TrainerConfig:
 
 @dataclass
 class AuthorsConfig:
-    """What the authors of the paper set for a scene, taken up by their experiments: `paper_*`, `ablation_euler`."""
+    """Settings of the authors of the paper for a scene, which `paper_*` and `ablation_euler` refer to."""
 
-    # Corners of the index grid, world units, and its vertices a side.
+    # Corners of the index grid, world units, and its vertices along each side.
     box_min: list[float] = dataclasses.field(default_factory=lambda: [-1.5] * 3)
     box_max: list[float] = dataclasses.field(default_factory=lambda: [1.5] * 3)
     resolution: Resolution = 512
-    # Taps and standard deviation (voxels) of its smoothing.
+    # Taps and standard deviation (voxels) of the smoothing kernel.
     smoothing_size: Natural = 9
     smoothing_sigma: Positive = 1.0
-    num_steps: Count = 768  # Eikonal steps, N_c x N_e
-    boundary_weight: NotNegative = 0.025  # of the boundary regulariser
-    max_steps: Count = 200_000  # iterations
+    num_steps: Count = 768  # number of Eikonal steps, N_c x N_e
+    boundary_weight: NotNegative = 0.025  # weight of the boundary regularizer
+    max_steps: Count = 200_000  # number of training steps
 
 
 @dataclass
 class TrainConfig:
-    """Everything that `python -m nerfro.train` composes from conf/train.yaml."""
+    """Root of the configuration of `python -m nerfro.train`, composed from conf/train.yaml."""
 
-    name: str = "refractive"  # of the experiment; names the run folder
-    seed: Annotated[int, Range(at_least=0, at_most=2**32 - 1)] = 0  # of initialisation and of all random draws
-    # data, camera, medium, field, boundary, model: one plugin of that kind.
+    name: str = "refractive"  # name of the experiment and of the run folder
+    seed: Annotated[int, Range(at_least=0, at_most=2**32 - 1)] = (
+        0  # seed of the initialization and of all random numbers
+    )
+    # One plugin of each type.
     data: Any = MISSING
     camera: Any = MISSING
     medium: Any = MISSING
-    sampler: SamplerConfig = dataclasses.field(default_factory=SamplerConfig)  # path and point sampler
+    sampler: SamplerConfig = dataclasses.field(default_factory=SamplerConfig)  # path sampler and point sampler
     field: Any = MISSING
     boundary: Any = MISSING
     model: Any = MISSING
-    # Fields of each training loss, by the loss's registered name.
+    # Settings of each training loss, by the registered name of the loss.
     loss: dict[str, Any] = dataclasses.field(default_factory=dict)
     content: ContentConfig = dataclasses.field(default_factory=ContentConfig)
     authors: AuthorsConfig = dataclasses.field(default_factory=AuthorsConfig)
@@ -139,13 +141,13 @@ class TrainConfig:
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
     checkpoint: CheckpointConfig = dataclasses.field(default_factory=CheckpointConfig)
     trainer: TrainerConfig = dataclasses.field(default_factory=TrainerConfig)
-    logger: Any = None  # Lightning objects by any name
-    # Checkpoint to go on from, or `last` for the newest of this experiment.
+    logger: Any = None  # Lightning loggers, by any name
+    # Checkpoint to resume from, or `last` for the newest checkpoint of this experiment.
     ckpt_path: Optional[str] = None  # noqa: UP045
-    viewer: bool = False  # serve an interactive page of the model while it trains, to this machine's browsers
-    viewer_port: Annotated[int, Range(at_least=0, at_most=65535)] = 8008  # that it is served on; 0 for any free one
-    # Backend of torch.compile for the networks, such as inductor or cudagraphs on a GPU; none runs them as they
-    # are. Compiling takes a minute or more at the start.
+    viewer: bool = False  # serve an interactive page of the model during training, to browsers on this machine
+    viewer_port: Annotated[int, Range(at_least=0, at_most=65535)] = 8008  # port of that page; 0 selects a free port
+    # Backend of torch.compile for the networks, such as inductor or cudagraphs on a GPU; None does not compile them.
+    # Compilation takes a minute or more at the start.
     compile: Optional[str] = None  # noqa: UP045
 
 
@@ -157,23 +159,28 @@ def build_data(config: DictConfig) -> DataSource:
 
 
 def build_losses(nodes: DictConfig, known: bool = True) -> dict[str, Loss]:
-    """Build the training losses from `loss.<registered name>.<field>`.
+    """Build the training losses from the nodes `loss.<registered name>`.
 
     Args:
-        nodes: of all losses.
-        known: whether what the fields follow from is known; if not, those keep their defaults.
+        nodes: configuration nodes of all losses.
+        known: whether interpolations in the nodes can be resolved; otherwise such settings keep their defaults.
+
+    Raises:
+        NerfroError: there is no loss, or a node does not fit its loss.
     """
     if not nodes:
-        raise NerfroError("there is no loss to train with; give one, such as +loss.photometric.weight=1")
+        raise NerfroError("there is no loss to train with; add one, such as +loss.photometric.weight=1")
     losses = {}
     for name in map(str, nodes):
         node = {} if nodes[name] is None else nodes[name]
         if not isinstance(node, Mapping):
-            raise NerfroError(f"loss.{name}={node} is no set of fields; write loss.{name}.weight={node} for its weight")
+            raise NerfroError(
+                f"loss.{name}={node} is not a set of settings; write loss.{name}.weight={node} for its weight"
+            )
         plugin = find("loss", name)
         if not known:
             node = {field: node[field] for field in node if not OmegaConf.is_interpolation(node, field)}
-        losses[name] = plugin.cls(**configure(plugin, node))
+        losses[name] = create(plugin, node)
     return losses
 
 
@@ -181,8 +188,11 @@ def build_model(config: DictConfig, training: Views | None = None) -> Renderer:
     """Compose the model of a configuration (see `TrainConfig`); fills in what it leaves to the data.
 
     Args:
-        config: of the run.
-        training: views, where they are loaded already; without them, a checkpoint must tell what was believed of them.
+        config: configuration of the run, see `TrainConfig`; it is changed.
+        training: training views; None to restore a checkpoint, which contains the estimated cameras and exposures.
+
+    Raises:
+        NerfroError: a component cannot be built.
     """
     build_losses(config.loss, known=False)  # mistakes are told before anything is read
     path_sampler = build(config.sampler.path)

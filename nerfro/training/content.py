@@ -1,4 +1,4 @@
-"""Which space a run covers: the object's box, or all of space around what the cameras look at."""
+"""The space that fields cover: the box of the object, or all of space around the point that the cameras face."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from nerfro.media.base import Medium
 from nerfro.paths import resolve_path
 from nerfro.registry import build
 
-# The ball's radius, of the cameras' usual distance from what they look at: what they look at is finest.
+# Radius of the uncontracted ball, as a fraction of the median distance from the cameras to the point they face.
 _RADIUS_SHARE = 0.5
-# Samples begin at this share of the nearest camera's distance. Few rays cross what is close before a camera, so that
-# what is learned there explains its photograph and no other.
+# Samples begin at this fraction of the distance of the nearest camera. Few rays cross the space close to a camera, so
+# that density there explains the photograph of that camera alone.
 _NEAR_SHARE = 0.3
-# A pixel's detail takes two cells of the finest grid along each side, as a wave takes two samples.
+# A detail of one pixel needs two cells of the finest grid along each side (sampling theorem).
 _CELLS_PER_PIXEL = 2
-# Cells of the finest grid; memory bounds them above.
+# Bounds of the number of cells of the finest grid; memory limits the upper one.
 _FEWEST_CELLS, _MOST_CELLS = 128, 4096
-# Below this share of cameras' directions across it, a place is not told by where optical axes meet.
+# Smallest eigenvalue with which the point nearest to all optical axes is determined along an eigenvector.
 _PARALLEL = 0.01
 
 
@@ -39,41 +39,43 @@ _PARALLEL = 0.01
 class ContentConfig:
     """The space that fields and samplers cover."""
 
-    # `box`: a box outside of which there is nothing but the boundary. `all`: all of space, as it is within a ball
-    # and contracted beyond, with the boundary at infinity alone.
+    # `box`: a box, with the background outside of it. `all`: all of space, contracted outside of a ball, with the
+    # background at infinity.
     space: str = "box"
-    # Corners of the box, or of one around whose middle the ball lies, world units; none takes the bounds of the
-    # object, or for the ball where the cameras look.
+    # Corners of the box, world units; the ball is centred in it. None takes the bounds of the object, or for the ball
+    # the point that the cameras face.
     box_min: Optional[list[float]] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     box_max: Optional[list[float]] = None  # noqa: UP045
-    # .npy of the box's centre and half sides [2, 3] instead, as Eikonal Fields stores it.
+    # Alternatively, an .npy file with the centre and the half sides of the box [2, 3], as Eikonal Fields stores them.
     box_file: Optional[str] = None  # noqa: UP045
-    # Of the ball, the arc length at which samples begin (world units), and cells of the finest grid along the cube
-    # around contracted space; none finds them from the cameras.
+    # Radius of the ball and arc length of the first samples (world units), and number of cells of the finest grid along
+    # the cube around contracted space. None derives them from the cameras.
     radius: Optional[Positive] = None  # noqa: UP045
     near: Optional[NotNegative] = None  # noqa: UP045
     cells: Optional[Count] = None  # noqa: UP045
 
 
 def settle_content(config: DictConfig, medium: Medium, cameras: Cameras | None = None) -> None:
-    """Fill in what is left open in `config.content`.
+    """Derive the settings of `config.content` that are None.
 
     Args:
-        config: of a run, see `TrainConfig`.
-        medium: of the run, which knows where the object is.
-        cameras: of the training views; read from the data where they are needed and not given.
+        config: configuration of a run, see `TrainConfig`; it is changed.
+        medium: medium of the run, which contains the object.
+        cameras: cameras of the training views; None to read them from the data if they are needed.
 
     Raises:
-        NerfroError: half a box, an unknown space, or no place that the cameras look at.
+        NerfroError: one corner is given without the other, the space is unknown, or the cameras face no common point.
     """
     content = config.content
-    for option in dataclasses.fields(ContentConfig):  # runs from before it was there lack it
+    for option in dataclasses.fields(ContentConfig):  # configurations of older releases may lack it
         if option.name not in content:
             content[option.name] = option.default
     if content.space not in ("box", "all"):
         raise NerfroError(f"content.space={content.space} is not allowed; choose box, all")
     if (content.box_min is None) != (content.box_max is None):
-        raise NerfroError("content: give both box_min and box_max, or neither for the bounds of the object")
+        raise NerfroError(
+            "content.box_min and content.box_max belong together; give both, or neither for the object's bounds"
+        )
     if content.box_min is None:
         box = _box(config, medium)
         if box is not None:
@@ -85,7 +87,7 @@ def settle_content(config: DictConfig, medium: Medium, cameras: Cameras | None =
 
 
 def describe(content: DictConfig) -> str:
-    """A line on the space that a run covers, for whoever started it; nothing where it is a box."""
+    """Describe the space of a run in one line; the result is empty if the space is a box."""
     if content.space == "box":
         return ""
     middle = ", ".join(f"{0.5 * (low + high):.3g}" for low, high in zip(content.box_min, content.box_max, strict=True))
@@ -96,7 +98,7 @@ def describe(content: DictConfig) -> str:
 
 
 def _settle_ball(content: DictConfig, cameras: Cameras) -> None:
-    """The ball that the cameras stand around, and what its resolution can be."""
+    """Derive the ball that the cameras surround, and the resolution that they can resolve in it."""
     poses = cameras.camera_to_world.double().cpu().numpy()
     centres, forward = poses[:, :, 3], -poses[:, :, 2]
     if content.box_min is None:
@@ -106,7 +108,7 @@ def _settle_ball(content: DictConfig, cameras: Cameras) -> None:
     distances = np.linalg.norm(centres - middle, axis=1)
     radius = _RADIUS_SHARE * float(np.median(distances)) if content.radius is None else content.radius
     if not radius > 0:
-        raise NerfroError("content: the cameras stand where they look; give content.radius, in units of the poses")
+        raise NerfroError("the cameras lie at the point that they face; give content.radius, in units of the poses")
     content.radius = float(f"{radius:.4g}")
     if content.box_min is None:
         corners = middle + np.array([[-1.0], [1.0]]) * radius
@@ -121,7 +123,7 @@ def _settle_ball(content: DictConfig, cameras: Cameras) -> None:
 def looked_at(
     centres: Float[np.ndarray, "V 3"], forward: Float[np.ndarray, "V 3"], depth: float
 ) -> Float[np.ndarray, "3"]:
-    """The place nearest to all optical axes (least squares); along axes that are nearly parallel, at a usual depth."""
+    """Return the point nearest to all optical axes (least squares); for nearly parallel axes, a point at `depth`."""
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]  # projects out the axis
     usual = centres.mean(0) + depth * forward.mean(0)
     values, axes = np.linalg.eigh(across.mean(0))
@@ -130,39 +132,41 @@ def looked_at(
 
 
 def _depth(cameras: Cameras) -> float:
-    """A usual depth where only the data's bounds tell: that in the middle of the inverse distances."""
+    """Return a typical depth from the bounds of the data: the harmonic mean of near and far."""
     return 2 / (1 / max(cameras.near, 1e-3 * cameras.far) + 1 / cameras.far)
 
 
 def _box(config: DictConfig, medium: Medium) -> Float[np.ndarray, "2 3"] | None:
-    """Where the object is, as far as something other than the cameras tells."""
+    """Return the bounds of the object from the content file, the medium or its mesh; None if there is none of these."""
     if config.content.box_file is not None:
         centre, half = _read_box(resolve_path(config.content.box_file))
         return np.stack([centre - half, centre + half])
     if not isinstance(medium, Vacuum):
         return medium.content_box.double().numpy().round(6)
     if "mesh" in config.medium and resolve_path(config.medium.mesh).is_file():
-        # Straight rays need no medium, but a baseline is told where the object is, as ours is.
+        # Straight rays need no medium, but the baselines get the same bounds as the refractive model.
         return load_mesh(resolve_path(config.medium.mesh), accept_open_mesh=True).bounds.round(6)
     return None
 
 
 def _require_no_box(config: DictConfig) -> None:
-    """Refuse parts that stay inside the content's box where nothing says where that is."""
+    """Refuse components that need the box of the content if the box is unknown."""
     for name, node in (("field", config.field), ("sampler/points", config.sampler.points)):
         written = OmegaConf.to_container(node, resolve=False)
         if isinstance(written, dict) and "content.box" in str(written.get("box_min")):
             mesh = f", and medium.mesh={config.medium.mesh} does not exist" if "mesh" in config.medium else ""
             raise NerfroError(
-                f"{name} stays inside a box, and straight rays know no object to take it from{mesh}; for an ordinary "
-                "photo set take +experiment=straight, which needs none, or give content.box_min=[X,Y,Z] "
-                "content.box_max=[X,Y,Z] in world units, around what shall be seen sharply"
+                f"{name} needs the box of the object, and no medium defines it{mesh}; for an ordinary photo set take "
+                "+experiment=straight, which needs no box, or give content.box_min=[X,Y,Z] content.box_max=[X,Y,Z] "
+                "in world units"
             )
 
 
 def _read_box(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Centre and half sides of a box, from Eikonal Fields' bounding_box_vals.npy."""
+    """Read the centre and the half sides of a box from bounding_box_vals.npy of Eikonal Fields."""
     values = load_array(path)
     if values.shape != (2, 3) or not np.isfinite(values).all() or values[1].min() <= 0:
-        raise NerfroError(f"content.box_file={path} must hold a box's centre and positive half sides, 2x3 numbers")
+        raise NerfroError(
+            f"content.box_file={path} must hold the centre and the positive half sides of a box, 2x3 numbers"
+        )
     return values[0], values[1]

@@ -49,5 +49,5 @@ def test_constant_boundary_is_the_same_in_every_direction() -> None:
 
 
 def test_colour_of_other_than_three_numbers_is_refused() -> None:
-    with pytest.raises(NerfroError, match="needs three numbers"):
+    with pytest.raises(NerfroError, match="give three"):
         ConstantBoundary([1.0])

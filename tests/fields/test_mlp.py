@@ -84,16 +84,6 @@ def test_weights_are_glorot_uniform_and_biases_zero() -> None:
     assert (layer.bias == 0).all()
 
 
-def test_nerf_field_depends_on_position_through_the_unit_of_length() -> None:
-    torch.manual_seed(1)
-    field = NerfField(width=16, depth=2, skip=1, view_width=8)
-    torch.manual_seed(1)
-    scaled = NerfField(width=16, depth=2, skip=1, view_width=8, normalise=2.0)
-    samples = example_samples()
-    doubled = type(samples)(2 * samples.positions, samples.directions, samples.s, samples.edges, samples.radii)
-    torch.testing.assert_close(field(samples).density, scaled(doubled).density)
-
-
 def test_mip_nerf_field_sees_the_size_of_the_cone() -> None:
     field = MipNerfField(width=16, depth=2, skip=1, view_width=8)
     samples = Stratified(8, cast="cones").eval()(example_path(), None)

@@ -113,7 +113,7 @@ def test_options_of_other_commands(world: World, draw: st.DataObject) -> None:
     np.savez(world.root / "rays.npz", **rays())
     commands = {
         "trace": ["medium.mesh", "medium.ior", "medium.resolution", "medium.box_max", "medium.shell_voxels",
-                  "medium.crease_degrees", "medium.smoothing_size", "medium.inner_iors", "sampler.path.max_events",
+                  "medium.inner_iors", "sampler.path.max_events",
                   "sampler.path.interface", "near", "far", "rays", "plot", "out", "overwrite"],
         "evaluate": ["split", "root", "chunk_size", "subdivision.side", "subdivision.divergence", "masks", "alpha",
                      "protocol", "device", "lpips_backbone", "predictions", "references", "overwrite"],

@@ -36,7 +36,9 @@ def learned_opacity(seen: torch.Tensor, loss: Backdrop, num_steps: int = 200) ->
 
 
 def test_white_before_white_becomes_empty() -> None:
-    assert learned_opacity(torch.ones(3), Backdrop(WHITE, weight=0.0)) > 0.95
+    uncharged = Backdrop(WHITE)
+    uncharged.weight = 0.0
+    assert learned_opacity(torch.ones(3), uncharged) > 0.95
     assert learned_opacity(torch.ones(3), Backdrop(WHITE)) < 0.05
 
 

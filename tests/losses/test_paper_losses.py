@@ -17,6 +17,7 @@ from nerfro.losses.photometric import Photometric
 from nerfro.losses.smoothness import Smoothness, tile_roughness
 from nerfro.media.analytic import Luneburg
 from nerfro.models.refractive import RefractiveModel
+from nerfro.registry import create, find
 from nerfro.rendering import Components, Renderer
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.hierarchical import Hierarchical
@@ -124,7 +125,7 @@ def test_smoothness_teaches_the_boundary_only(model: Renderer) -> None:
 
 
 def test_weight_is_zero_before_the_start_then_grows_linearly_to_its_value() -> None:
-    loss = Photometric(weight=2.0, start=10, ramp=4)
+    loss = create(find("loss", "photometric"), {"weight": 2.0, "start": 10, "ramp": 4})
     assert [loss.weight_at(step) for step in (0, 9)] == [0, 0]
     torch.testing.assert_close(
         torch.tensor([loss.weight_at(step) for step in range(10, 16)]), torch.tensor([0.4, 0.8, 1.2, 1.6, 2.0, 2.0])
@@ -138,8 +139,8 @@ def test_weight_without_a_ramp_steps_to_its_value() -> None:
 
 @pytest.mark.parametrize("option", ["weight", "start", "ramp"])
 def test_negative_schedules_are_refused(option: str) -> None:
-    with pytest.raises(NerfroError, match=f"{option}=-1 is not allowed; take at least 0"):
-        Photometric(**{option: -1})
+    with pytest.raises(NerfroError, match=f"{option}=-1.* is not allowed; take at least 0"):
+        create(find("loss", "photometric"), {option: -1})
 
 
 def test_tile_without_neighbours_is_refused() -> None:

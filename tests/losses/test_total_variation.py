@@ -35,12 +35,12 @@ def scene(boundary) -> SimpleNamespace:
 def test_value_is_that_of_a_linear_sky() -> None:
     # For C = d . a the mean of |C(d') - C(d)| is angle |a| / 2, the mean of |cos| over the sphere, to second order.
     sky = scene(lambda exits: (exits.directions * 0.8).sum(-1, keepdim=True).expand(-1, 3) * 0.5 / math.sqrt(3))
-    value = TotalVariation(num_directions=100_000, angle=1.0)([], BATCH, sky)
-    assert float(value) == pytest.approx(math.radians(1.0) * 0.4 / 2, rel=0.02)
+    value = TotalVariation(angle=1.0)([], BATCH, sky)
+    assert float(value) == pytest.approx(math.radians(1.0) * 0.4 / 2, rel=0.08)
 
 
 def test_descending_it_flattens_a_sky() -> None:
-    boundary, loss = EnvironmentMap([8]), TotalVariation(num_directions=512, angle=5.0)
+    boundary, loss = EnvironmentMap([8]), TotalVariation(angle=5.0)
     torch.nn.init.normal_(boundary.texels)
     optimiser, values = torch.optim.Adam(boundary.parameters(), lr=0.05), []
     for step in range(100):

@@ -23,7 +23,7 @@ SIGMA = [0.3, 1.0, 2.5]
 
 def _path(heights: list[float]) -> Path:
     medium = Ball(0.8, 1.5, absorption=SIGMA).double()
-    return medium.tinted(Snell()(beam(torch.tensor(heights, dtype=torch.float64)), medium))
+    return medium.with_absorption(Snell()(beam(torch.tensor(heights, dtype=torch.float64)), medium))
 
 
 def test_what_lies_behind_a_ball_is_attenuated_by_its_chord() -> None:
@@ -52,7 +52,7 @@ def test_what_lies_inside_is_attenuated_by_the_glass_before_it() -> None:
 
 def test_a_reflection_past_the_ball_is_not_tinted() -> None:
     medium = Ball(0.8, 1.5, absorption=SIGMA).double()
-    path = medium.tinted(Snell(branches="first")(beam(torch.tensor([0.5]).double()), medium))
+    path = medium.with_absorption(Snell(branches="first")(beam(torch.tensor([0.5]).double()), medium))
     through, reflected = path.transmitted(path.far[:, None])[:, 0]
     assert (through < 0.9).all()
     assert (reflected == 1).all()
@@ -61,7 +61,7 @@ def test_a_reflection_past_the_ball_is_not_tinted() -> None:
 def test_absorption_learns_without_tracing_again() -> None:
     model = RefractiveModel(replace(example_components(), medium=Ball(learn_absorption=True), path_sampler=Snell()))
     assert not model.paths_learn, "paths may be traced ahead"
-    parameters = model.parameter_groups()["tint"]
+    parameters = model.parameter_groups()["absorption"]
     assert [tuple(parameter.shape) for parameter in parameters] == [(1, 3)]
     with torch.no_grad():
         path = model.trace(example_rays())

@@ -74,16 +74,6 @@ def test_clearance_holds_no_gradient() -> None:
     assert (grad[clearance > 0] == 0).all()
 
 
-def test_saved_grid_is_loaded_as_it_was(sphere: str, tmp_path: Path) -> None:
-    medium = VoxelGrid(sphere, ior=1.4, resolution=40, smoothing_size=5, smoothing_sigma=1.5, cache=False)
-    medium.save(tmp_path / "grid.npz")
-    with np.load(tmp_path / "grid.npz", allow_pickle=False) as file:
-        assert {"box", "ior", "smoothing"} <= set(file.files)
-    loaded = VoxelGrid(grid=str(tmp_path / "grid.npz"))
-    torch.testing.assert_close(loaded.table, medium.table, rtol=0, atol=0)
-    torch.testing.assert_close(loaded.box, medium.box, rtol=0, atol=0)
-
-
 def test_cached_occupancy_is_bit_for_bit_the_computed_one(
     sphere: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -101,13 +91,11 @@ def test_grids_are_not_in_checkpoints() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"mesh": None}, "medium.mesh or medium.grid"),
         ({"box_max": [1.0, 0.8, 1.0]}, r"box_min=.*box_max="),
         ({"box_max": [1.5, -2.0, 1.5]}, "min below max"),
         ({"resolution": 2}, "resolution=2 is not allowed; take at least 4"),
         ({"smoothing_size": 4}, "must be odd"),
         ({"ior": -1.0}, "medium=voxel_grid: ior=-1.0 is not allowed"),
-        ({"grid": "missing.npz", "mesh": None}, "missing.npz does not exist"),
     ],
 )
 def test_bad_options_are_named(sphere: str, options: dict, message: str) -> None:

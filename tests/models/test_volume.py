@@ -72,7 +72,7 @@ def scores(space: dict, boundary: Boundary, num_steps: int = 150) -> list[float]
     """PSNR of unseen views: of all pixels, of those behind glass, of those that see the toy."""
     path, target, _ = photographs(24, 1)
     field = HashGridField(
-        **space, num_levels=6, base_resolution=8, finest_resolution=64, log2_table_size=14, width=32, initial_depth=3.0,
+        **space, num_levels=6, finest_resolution=64, log2_table_size=14, width=32, initial_depth=3.0,
         direction_bands=1,
     )  # fmt: skip
     sampler = DensityGridSampler(24, 48, **space, near=0.3, resolution=32, update_every=4, decay=0.6)

@@ -51,7 +51,7 @@ def test_adaptive_luneburg_lens_focuses_on_its_rim() -> None:
 def test_adaptive_steps_refract_exactly_at_a_flat_shell() -> None:
     angles = torch.linspace(0, 80, 9, dtype=torch.float64).deg2rad()
     directions = torch.stack([angles.sin(), 0 * angles, angles.cos()], -1)
-    slab = Slab(0.5, 1.5, half_width=8.0, shell=0.001).double()
+    slab = Slab(0.5, 1.5, shell=0.001).double()
     path = Eikonal()(make_rays(-2 * directions, directions, 0, 8), slab)
     # Exit parallel to entry, shifted by h sin(i) (1 - cos(i) / sqrt(n^2 - sin^2 i)).
     torch.testing.assert_close(path.exit_directions, directions, atol=1e-12, rtol=0)

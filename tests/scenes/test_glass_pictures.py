@@ -109,7 +109,7 @@ def test_pictures_of_empty_glass_are_those_of_a_dielectric(what: str, tmp_path: 
         glass.save(tmp_path / "glass.ply")
         water.save(tmp_path / "water.ply")
         files = str(tmp_path / "glass.ply"), 1.5, [str(tmp_path / "water.ply")], [1.33]
-        medium = SdfGrid(*files, 48, BOX[0].tolist(), BOX[1].tolist(), crease_degrees=60, cache=False)
+        medium = SdfGrid(*files, 48, BOX[0].tolist(), BOX[1].tolist(), cache=False)
     else:
         medium = on_grid(what)
     expected, rays = path_traced(glass, 1.5, inner=inner), rays_of_picture()
@@ -133,7 +133,7 @@ def test_absorption_is_that_of_the_path_and_is_learned_from_a_picture(what: str)
     given, learner = on_grid(what, absorption=list(COLOURED)), on_grid(what, learn_absorption=True)
 
     def picture(medium: SdfGrid, path: Path) -> Tensor:
-        return seen(path, medium.tinted(path).transmitted(path.far[:, None])[:, 0])
+        return seen(path, medium.with_absorption(path).transmitted(path.far[:, None])[:, 0])
 
     assert agreement(picture(given, BRANCHES(rays_of_picture(), given)), expected) > 35
     few = BRANCHES(rays_of_picture(8), given)
