@@ -82,5 +82,5 @@ def test_setting_of_a_configuration_is_named_in_full(override: str, message: str
 
 @pytest.mark.parametrize("box_max", [[1.0, 0.0, 1.0], [1.0, 1.0], [1.0, 1.0, math.nan], [1.0, 1.0, math.inf]])
 def test_what_is_no_box_is_refused(box_max: list[float]) -> None:
-    with pytest.raises(NerfroError, match="is no box; give three numbers each, min below max"):
+    with pytest.raises(NerfroError, match="is not a box; give three numbers each, min below max"):
         corners_of_box([0.0] * 3, box_max)

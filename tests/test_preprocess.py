@@ -219,7 +219,7 @@ def test_options_out_of_range(preprocess: Callable[..., str]) -> None:
     assert "resolution=8 is not allowed" in preprocess("resolution=8")
     assert "keep=0" in preprocess("keep=0")
     assert "give both box_min and box_max" in preprocess("box_min=[0,0,0]")
-    assert "is no box" in preprocess("box_min=[0,0,0]", "box_max=[1,1,0]")
+    assert "is not a box" in preprocess("box_min=[0,0,0]", "box_max=[1,1,0]")
     assert "add out=FOLDER" in preprocess("data.root=embedded:torus")
 
 

@@ -111,7 +111,7 @@ def test_nerf_field_with_a_box_equals_one_without_inside_and_is_empty_outside() 
 
 @pytest.mark.parametrize("box_max", [[1.0, 0.0, 1.0], [1.0, 1.0]])
 def test_nerf_field_refuses_an_empty_box(box_max: list[float]) -> None:
-    with pytest.raises(NerfroError, match="is no box"):
+    with pytest.raises(NerfroError, match="is not a box"):
         NerfField(box_min=[0.0, 0.0, 0.0], box_max=box_max)
 
 

@@ -177,7 +177,7 @@ def test_bad_solids_are_named(tmp_path: Path) -> None:
         Ball(shell=0.0)
     with pytest.raises(NerfroError, match=r"box_min=.*box_max="):
         SdfGrid(mesh, box_min=[-1.5] * 3, box_max=[0.7] * 3, resolution=16, cache=False)
-    with pytest.raises(NerfroError, match=r"give both medium\.box_min and medium\.box_max"):
+    with pytest.raises(NerfroError, match=r"medium\.box_min and medium\.box_max belong together"):
         SdfGrid(mesh, box_max=[1.5] * 3, resolution=16, cache=False)
 
 
