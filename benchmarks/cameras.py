@@ -99,7 +99,8 @@ def write_disturbed(root: Path, cameras: Cameras, folder: Path) -> Path:
             continue
         document = json.loads(path.read_text("utf-8")) | {name: float(values[0]) for name, values in lens.items()}
         for frame in document["frames"]:
-            frame["object_mask_path"] = frame.pop("mask_path")  # a frame's `mask_path` says what to ignore there
+            if "mask_path" in frame:  # in nerfstudio's format it says what to ignore
+                frame["object_mask_path"] = frame.pop("mask_path")
         if path.name == "transforms_train.json":
             for frame, pose in zip(document["frames"], cameras.camera_to_world.tolist(), strict=True):
                 frame["transform_matrix"] = [*pose, [0.0, 0.0, 0.0, 1.0]]

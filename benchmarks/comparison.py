@@ -1,15 +1,26 @@
-"""The README's table and picture grid: every method on the embedded scene, trained for the same time, one by one.
+"""The README's table and picture grid: every method on the embedded scene, trained for the same time on one core.
 
-    python benchmarks/comparison.py 00:00:04:00
+    python benchmarks/comparison.py [00:00:01:30] [--rows mipnerf refractive] [--core 1]
 
-writes outputs/comparison/<method>/ (finished runs are kept) and docs/images/comparison.png, and prints the table.
+The time limit counts processor time of the whole process (see processor_time.py), and the process is pinned to one
+core. A thread that traces rays therefore gets no time of its own, and other work on the machine does not matter.
+Finished rows are kept in outputs/comparison/<time>/<method>/, so an interrupted comparison continues with the row that
+was interrupted. Prints the table, and writes docs/images/comparison.png if all methods of the picture are there.
 """
 
 from __future__ import annotations
 
+import argparse
+import contextlib
+import os
+import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+
+from jaxtyping import Float
+from torch import Tensor
 
 from nerfro.evaluation.image_grid import ImageRow, image_grid, most_different_crop
 from nerfro.evaluation.results import METRICS, RunMetrics, read_metrics_json
@@ -27,24 +38,55 @@ METHODS = {
 SHOWN = ("mipnerf", "refractive", "ablation_noH", "ablation_noBD")
 VIEWS = (1, 3)
 ROOT = Path(__file__).resolve().parent.parent
-RUNS = ROOT / "outputs" / "comparison"
 
 
 def main() -> None:
-    """Train what is not trained yet, then draw and tabulate."""
-    max_time = sys.argv[1] if len(sys.argv) > 1 else "00:00:04:00"
-    for name in METHODS:
-        folder = RUNS / name
-        if not (folder / "metrics.json").exists():
-            command = [sys.executable, "-m", "nerfro.train", f"+experiment={name}", f"hydra.run.dir={folder}"]
-            subprocess.run([*command, f"trainer.max_time={max_time}"], check=True, cwd=ROOT)
-    metrics = {name: read_metrics_json(RUNS / name / "metrics.json") for name in METHODS}
+    """Train the rows that are not finished, then print the table and draw the picture."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("time", nargs="?", default="00:00:01:30", help="processor time of a row, DD:HH:MM:SS")
+    parser.add_argument("--rows", nargs="+", choices=METHODS, default=list(METHODS), help="which methods; default: all")
+    parser.add_argument("--core", type=int, help="number of the core; default: the last one that is allowed")
+    parser.add_argument("--out", type=Path, default=ROOT / "outputs" / "comparison", help="folder of the runs")
+    parser.add_argument("--picture", type=Path, default=ROOT / "docs" / "images" / "comparison.png")
+    parser.add_argument("--options", nargs="+", default=[], help="of nerfro.train, for all rows")
+    given = parser.parse_args()
+    out = given.out / given.time.replace(":", "")
+    with one_core(given.core):
+        for name in given.rows:
+            train(name, out / name, [f"trainer.max_time={given.time}", *given.options])
+    metrics = {name: read_metrics_json(out / name / "metrics.json") for name in given.rows}
     print(to_markdown(table(metrics)))
-    save_png(ROOT / "docs" / "images" / "comparison.png", grid(metrics))
+    if set(SHOWN) <= metrics.keys():
+        save_png(given.picture, grid(out, metrics))
+
+
+def train(name: str, folder: Path, options: list[str]) -> None:
+    """Train a method, unless its folder holds a finished run; a run that was interrupted begins again."""
+    if (folder / "metrics.json").exists():
+        return
+    shutil.rmtree(folder, ignore_errors=True)
+    command = [sys.executable, str(ROOT / "benchmarks" / "processor_time.py"), f"+experiment={name}"]
+    subprocess.run([*command, f"hydra.run.dir={folder.resolve()}", *options], check=True, cwd=ROOT)
+
+
+@contextlib.contextmanager
+def one_core(core: int | None) -> Iterator[None]:
+    """Pin this process and those that it starts to one core, and give their libraries one thread."""
+    allowed = os.sched_getaffinity(0)
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+    before = {name: os.environ.get(name) for name in threads}
+    os.sched_setaffinity(0, {max(allowed) if core is None else core})
+    os.environ.update(threads)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, allowed)
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
 def table(metrics: dict[str, RunMetrics]) -> Table:
-    """Mean scores, optimiser steps and rays per second of every method."""
+    """Tabulate mean scores, optimizer steps and rays per second by the clock."""
     shown = [metric for metric in METRICS if metric.name in ("psnr", "ssim", "lpips")]
     columns = (
         *(Column(metric.title, metric.better, metric.decimals) for metric in shown),
@@ -60,12 +102,12 @@ def table(metrics: dict[str, RunMetrics]) -> Table:
     return Table("Embedded torus, 20 test views", "method", columns, tuple(rows), mark="best", notes=tuple(notes))
 
 
-def grid(metrics: dict[str, RunMetrics]):
-    """Some test views by the methods of the paper's figure."""
+def grid(runs: Path, metrics: dict[str, RunMetrics]) -> Float[Tensor, "H W 3"]:
+    """Draw some test views by the methods of the paper's figure."""
     rows = []
     for view in VIEWS:
         reference = load_png(ASSETS_DIR / "torus" / "test" / f"r_{view:03d}.png")
-        predictions = [load_png(RUNS / name / "images" / f"test_{view:03d}.png") for name in SHOWN]
+        predictions = [load_png(runs / name / "images" / f"test_{view:03d}.png") for name in SHOWN]
         scores = [f"{metrics[name].result.views[view].scores['psnr']:.2f} dB" for name in SHOWN]
         crop = most_different_crop(reference, predictions, 32)
         rows.append(ImageRow(reference, predictions, captions=scores, crops=[crop]))

@@ -41,7 +41,6 @@ from nerfro.types import Exits
 
 TRUTH = 16  # rays a side of a pixel
 SIDES = (1, 2, 3, 4, 6, 8)  # rays a side
-FINEST = 512  # texels a face's side of the exact sky: 0.18 degrees
 CHUNK = 200_000
 
 
@@ -128,17 +127,22 @@ def main() -> None:
     parser.add_argument("--sky", default="torus", help="scene whose sky is taken")
     parser.add_argument("--views", type=int, default=2, help="test views")
     parser.add_argument("--run", type=Path, help="folder of a trained run")
+    parser.add_argument("--size", type=int, default=128, help="pixels a side of the views of the rounded cube")
+    parser.add_argument("--resolution", type=int, default=256, help="of the cube's grid of distances")
+    parser.add_argument("--texture", type=int, default=1024, help="height of the exact sky in texels")
     arguments = parser.parse_args()
     torch.set_grad_enabled(False)
     if arguments.run is not None:
         trained_run(arguments.run, arguments.views)
         return
-    sky = torch.from_numpy(lat_long_texture(importlib.import_module(f"nerfro.scenes.{arguments.sky}").sky, 1024))
-    pyramid = Pyramid(lat_long.sample(sky.float(), cube_map.texel_directions(FINEST), 4 * FINEST))
+    scene = importlib.import_module(f"nerfro.scenes.{arguments.sky}")
+    sky = torch.from_numpy(lat_long_texture(scene.sky, arguments.texture))
+    finest = arguments.texture // 2  # texels along a face's side; by default 0.18 degrees
+    pyramid = Pyramid(lat_long.sample(sky.float(), cube_map.texel_directions(finest), 4 * finest))
     medium = SdfGrid.from_distances(
-        grid_distances(RoundedBox(HALF_SIDE, EDGE, N_CUBE).double(), 256), BOX, [N_CUBE], 0.002
+        grid_distances(RoundedBox(HALF_SIDE, EDGE, N_CUBE).double(), arguments.resolution), BOX, [N_CUBE], 0.002
     )
-    cameras = BlenderData().load("test").cameras
+    cameras = BlenderData().load("test").cameras.resized(arguments.size, arguments.size)
     views = [
         View(cameras, view * (len(cameras) // arguments.views), medium, pyramid) for view in range(arguments.views)
     ]

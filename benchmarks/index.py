@@ -21,7 +21,7 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.paths import resolve_path
 from nerfro.registry import discover, find
 
-_RESOLUTION, _BAND, _MARGIN_SHARE = 128, 3.0, 0.2
+_BAND, _MARGIN_SHARE = 3.0, 0.2
 # Bumps are sums of so many waves, of lengths from a third of the object's size to its size.
 _WAVES = 12
 
@@ -34,6 +34,7 @@ def main() -> None:
     parser.add_argument("--format", default="blender", help="of the data, as in data=")
     parser.add_argument("--ior", type=float, default=1.5, help="the true one")
     parser.add_argument("--errors", type=float, nargs="+", default=[0, 0.5, 1, 2, 5], help="percent of the size")
+    parser.add_argument("--resolution", type=int, default=128, help="of the surfaces' grids")
     given = parser.parse_args()
     discover()
     views = find("data", given.format).cls(given.data).load("train")
@@ -43,7 +44,8 @@ def main() -> None:
     print("surface                  index   error    standard error   falls from")
     for error in given.errors:
         for kind in ("coat", "lack", "bumps") if error else ("as given",):
-            found = find_indices(_medium(spoiled(mesh, kind, error / 100)), through, surroundings)
+            medium = _medium(spoiled(mesh, kind, error / 100), given.resolution)
+            found = find_indices(medium, through, surroundings)
             low, high = basin(found)
             share = 100 * (found.values[0] / given.ior - 1)
             print(
@@ -77,10 +79,10 @@ def basin(found: Estimate) -> tuple[float, float]:
     return float(values[low]), float(values[high])
 
 
-def _medium(mesh: TriangleMesh) -> SdfGrid:
+def _medium(mesh: TriangleMesh, resolution: int) -> SdfGrid:
     centre, half = mesh.bounds.mean(0), (0.5 + _MARGIN_SHARE) * np.ptp(mesh.bounds, axis=0).max()
     box: Float[np.ndarray, "2 3"] = np.stack([centre - half, centre + half])
-    distances = torch.from_numpy(signed_distance_grid(mesh, box, _RESOLUTION, _BAND)).float()[None]
+    distances = torch.from_numpy(signed_distance_grid(mesh, box, resolution, _BAND)).float()[None]
     return SdfGrid.from_distances(distances, torch.from_numpy(box).float(), [1.5], 0.01)
 
 

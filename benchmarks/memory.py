@@ -28,28 +28,29 @@ from PIL import Image
 
 from nerfro.files.cache import cache_dir
 
-# Training pictures, width and height; 0 for the embedded scene.
-ROWS = {"embedded": (0, 128, 128), "800x800": (200, 800, 800), "1600x1200": (300, 1600, 1200)}
+# The embedded scene, and numbers of training pictures with their width and height.
+ROWS = ("embedded", "200x800x800", "300x1600x1200")
 _FIRST_STEP = re.compile(r"step [1-9]")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
-    parser.add_argument("rows", nargs="*", metavar="ROW", help=f"of {', '.join(ROWS)}; all by default")
+    parser.add_argument("rows", nargs="*", metavar="ROW", help=f"default: {', '.join(ROWS)}")
     parser.add_argument("--steps", type=int, default=300, help="of training")
+    parser.add_argument("--options", nargs="+", default=[], help="of nerfro.train, for all rows")
     arguments = parser.parse_args()
     print(f"{os.cpu_count()} CPU cores, torch {torch.__version__}, {arguments.steps} steps, {date.today()}\n")
     print("| training pictures | first step, s | resident after it, MiB | a minute later | at the last step | peak |")
     print("|---|---|---|---|---|---|")
     for name in arguments.rows or ROWS:
-        count, width, height = ROWS[name]
+        count, width, height = (0, 128, 128) if name == "embedded" else map(int, name.split("x"))
         with tempfile.TemporaryDirectory() as folder:
             options = [f"trainer.max_steps={arguments.steps}", f"hydra.run.dir={folder}/run"]
             if count > 0:
                 make_noise(Path(folder), count, width, height)
                 options += [f"data.root={folder}", "medium.mesh=embedded:torus/mesh.ply"]
             kept = set(cache_dir().glob("mapped_*.npy"))
-            measured = measure(["trainer.max_time=null", "evaluation.every=0", *options])
+            measured = measure(["trainer.max_time=null", "evaluation.every=0", *options, *arguments.options])
             for path in set(cache_dir().glob("mapped_*.npy")) - kept:
                 path.unlink()
         print(f"| {count or 100} of {width}x{height} | {' | '.join(measured)} |", flush=True)

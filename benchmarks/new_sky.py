@@ -37,6 +37,7 @@ def main() -> None:
     parser.add_argument("--sky", default="ship", help="scene whose sky is taken")
     parser.add_argument("--fresnel", action="store_true", help="partial reflection in the truth")
     parser.add_argument("--views", type=int, default=4)
+    parser.add_argument("--texture", type=int, default=1024, help="height of the sky in texels")
     parser.add_argument("--spp", type=int, default=256)
     parser.add_argument("--folder", type=Path, help="for the sky, and pictures: truth above, rendered below")
     arguments = parser.parse_args()
@@ -44,7 +45,7 @@ def main() -> None:
     cameras = trained.cameras("test").select(list(range(arguments.views)))
     sky = build_scene(arguments.sky, cameras.width).sky
     assert sky is not None
-    texture = torch.from_numpy(lat_long_texture(sky, 1024)).float()
+    texture = torch.from_numpy(lat_long_texture(sky, arguments.texture)).float()
     truth = replace(build_scene(arguments.scene, cameras.width), sky=sky)
     tracer = PathTracer(truth, arguments.fresnel, Pinhole.square(CAMERA_ANGLE_X, cameras.width))
     rendered = trained.with_(sky=texture).render(cameras)

@@ -28,7 +28,6 @@ from nerfro.subdivision import part_rays
 from nerfro.types import Path as RayPath
 from nerfro.types import Rays
 
-RESOLUTION = 256
 IMAGES = Path(__file__).resolve().parent.parent / "docs" / "images"
 
 
@@ -36,23 +35,25 @@ def main() -> None:
     """Draw all pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--folder", type=Path, default=IMAGES)
+    parser.add_argument("--resolution", type=int, default=256, help="of the grids")
+    parser.add_argument("--side", type=int, default=260, help="pixels of a rendered picture")
     parser.add_argument("--light", action="store_true", help="only those of light that splits, is absorbed, disperses")
     arguments = parser.parse_args()
     folder = arguments.folder
     torch.set_grad_enabled(False)
     if arguments.light:
-        draw_light(folder)
+        draw_light(folder, arguments.side)
         return
     with tempfile.TemporaryDirectory() as temporary:
         mesh = Path(temporary) / "ball.ply"
         trimesh.creation.icosphere(6, RADIUS).export(mesh)
-        voxels = VoxelGrid(str(mesh), N_BALL, RESOLUTION, cache=False)
+        voxels = VoxelGrid(str(mesh), N_BALL, arguments.resolution, cache=False)
     draw_paths(voxels, folder / "optics_paths.png")
-    draw_errors(voxels, folder / "optics_error.png")
-    draw_light(folder)
+    draw_errors(voxels, folder / "optics_error.png", arguments.resolution)
+    draw_light(folder, arguments.side)
 
 
-def draw_light(folder: Path) -> None:
+def draw_light(folder: Path, side: int) -> None:
     """Light that splits, is absorbed and disperses: paths, and an empty cube under the torus scene's sky."""
     heights = np.linspace(-0.7, 0.7, 7)
     beam = make_rays(np.stack([0 * heights - 4, heights, 0 * heights], -1), np.tile([[1.0, 0, 0]], (7, 1)), 0.0, 12.0)
@@ -67,19 +68,19 @@ def draw_light(folder: Path) -> None:
     ball = Ball(RADIUS, N_BALL).double()
     pictures: dict[str, tuple[RayPath, Medium, dict[str, np.ndarray]]] = {
         "optics_branches.png": (splitting(beam, ball), ball, {
-            "one path": picture(Snell(), clear),
-            "first reflection, F and 1 - F": picture(Snell(branches="first"), clear),
-            "all branches of 2 % or more": picture(Snell(branches="all"), clear),
+            "one path": picture(Snell(), clear, side),
+            "first reflection, F and 1 - F": picture(Snell(branches="first"), clear, side),
+            "all branches of 2 % or more": picture(Snell(branches="all"), clear, side),
         }),
         "optics_tint.png": (Snell(branches="all")(into_cube, clear), clear, {
-            "clear": picture(Snell(branches="all"), clear),
-            "absorption 1.2, 0.25, 0.8": picture(Snell(branches="all"), green),
+            "clear": picture(Snell(branches="all"), clear, side),
+            "absorption 1.2, 0.25, 0.8": picture(Snell(branches="all"), green, side),
         }),
         "optics_dispersion.png": (Snell()(into_cube, flint), flint, {
-            "one index": picture(Snell(branches="all"), clear),
-            "Abbe number 8, three bands": picture(Snell(branches="all"), flint),
+            "one index": picture(Snell(branches="all"), clear, side),
+            "Abbe number 8, three bands": picture(Snell(branches="all"), flint, side),
             "the same, nine bands": picture(
-                Snell(branches="all", wavelengths=[640, 610, 580, 565, 545, 525, 490, 465, 440]), flint
+                Snell(branches="all", wavelengths=[640, 610, 580, 565, 545, 525, 490, 465, 440]), flint, side
             ),
         }),
     }  # fmt: skip
@@ -101,9 +102,9 @@ def cube_of_distances(**options: list[float]) -> SdfGrid:
     return SdfGrid.from_distances(values, BOX, [1.5], 0.02, **options)
 
 
-def picture(sampler: Snell, medium: SdfGrid, side: int = 260, parts: int = 3) -> np.ndarray:
+def picture(sampler: Snell, medium: SdfGrid, side: int, parts: int = 3) -> np.ndarray:
     """The medium under the sky of the scene `torus`, several rays a pixel, sRGB."""
-    cameras = view().resized(side, side).crop(central_window(side, side, 0.75))
+    cameras = view(side).crop(central_window(side, side, 0.75))
     radiance_of_sky = lat_long.load_lat_long(ASSETS_DIR / "torus" / "sky.png")
     radiance = []
     for pixels in torch.arange(cameras.width * cameras.height).split(8192):
@@ -137,7 +138,7 @@ def draw_paths(voxels: VoxelGrid, file: Path) -> None:
     figure.savefig(file, dpi=90)
 
 
-def draw_errors(voxels: VoxelGrid, file: Path) -> None:
+def draw_errors(voxels: VoxelGrid, file: Path, resolution: int) -> None:
     """Error of the exit direction against the impact parameter."""
     figure = Figure(figsize=(7.5, 4.6), layout="constrained")
     FigureCanvasAgg(figure)
@@ -150,8 +151,8 @@ def draw_errors(voxels: VoxelGrid, file: Path) -> None:
     deviation = 2 * (np.arcsin(share) - np.arcsin(share / N_BALL))[:, None]
     exact = torch.from_numpy(turn * np.cos(deviation) - side * np.sin(deviation))
     rays = make_rays(side * share[:, None] * RADIUS - 4 * turn, turn)
-    spacing = 3 / (RESOLUTION - 1)
-    distances = grid_distances(Ball(RADIUS).double(), RESOLUTION)
+    spacing = 3 / (resolution - 1)
+    distances = grid_distances(Ball(RADIUS).double(), resolution)
     curves = [
         ("euler 768, voxels 9/1 (the paper's)", euler(voxels)),
         ("eikonal, the same voxels", exits(Eikonal(), voxels)),
@@ -167,7 +168,7 @@ def draw_errors(voxels: VoxelGrid, file: Path) -> None:
     axes.text(1.0, 0.07, "one pixel of 400", color="grey", fontsize=8, ha="right", va="top")
     axes.set_xlabel("impact parameter b / R")
     axes.set_ylabel("error of the exit direction, degrees")
-    axes.set_title(f"Glass ball, R {RADIUS}, n {N_BALL}, {RESOLUTION}^3 grids")
+    axes.set_title(f"Glass ball, R {RADIUS}, n {N_BALL}, {resolution}^3 grids")
     axes.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 0.04))
     figure.savefig(file, dpi=90)
 

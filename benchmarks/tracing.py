@@ -34,7 +34,6 @@ NEAR, FAR = 2.0, 6.0
 NUM_EULER_STEPS = 768
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 CHUNK = 8192  # rays at once, as in evaluation
-SIDE = 400
 BINS = (("b/R < .5", 0.0, 0.5), (".5 to .8", 0.5, 0.8), (".8 to .95", 0.8, 0.951))
 
 Trace = Callable[[Rays], Tensor]
@@ -46,6 +45,8 @@ def main() -> None:
     parser.add_argument("--resolution", type=int, default=256, help="of the signed-distance grids")
     parser.add_argument("--branches", action="store_true", help="only the cost of light that splits")
     parser.add_argument("--euler-resolution", type=int, default=512, help="of the paper's voxel grid (authors: 512)")
+    parser.add_argument("--side", type=int, default=400, help="pixels of the view whose rays are timed")
+    parser.add_argument("--rays", type=int, default=4000, help="rays through the ball; 3/8 of them through the cube")
     arguments = parser.parse_args()
     torch.set_grad_enabled(False)
     with tempfile.TemporaryDirectory() as folder:
@@ -56,7 +57,7 @@ def main() -> None:
         if arguments.branches:
             solids = {"sphere": (ball, N_BALL), "cube": (cube, N_CUBE)}
             branches({name: SdfGrid(str(mesh), n, resolution=arguments.resolution, cache=False)
-                      for name, (mesh, n) in solids.items()})  # fmt: skip
+                      for name, (mesh, n) in solids.items()}, arguments.side)  # fmt: skip
             return
         print(f"{torch.get_num_threads()} threads; ball of {len(sphere.faces)} faces\n")
         start = time.perf_counter()
@@ -68,17 +69,16 @@ def main() -> None:
             f"{arguments.resolution}^3 signed distance {time.perf_counter() - built:.1f} s (compilation included)\n"
         )
         mesh_cube = SdfGrid(str(cube), N_CUBE, resolution=arguments.resolution, cache=False)
-        sphere_errors(voxels, mesh_ball, arguments.resolution)
-        cube_errors(mesh_cube, arguments.resolution)
+        sphere_errors(voxels, mesh_ball, arguments.resolution, arguments.rays)
+        cube_errors(mesh_cube, arguments.resolution, 3 * arguments.rays // 8)
         coarse = VoxelGrid(str(ball), N_BALL, arguments.resolution, cache=False)
-        speed([voxels, coarse], {"sphere": mesh_ball, "cube": mesh_cube})
-        branches({"sphere": mesh_ball, "cube": mesh_cube})
+        speed([voxels, coarse], {"sphere": mesh_ball, "cube": mesh_cube}, arguments.side)
+        branches({"sphere": mesh_ball, "cube": mesh_cube}, arguments.side)
     print("\nGPU: not measured, there was none.")
 
 
-def sphere_errors(voxels: VoxelGrid, mesh_ball: SdfGrid, resolution: int) -> None:
-    """Error of the exit direction against 2 (asin(b / R) - asin(b / (n R))), 4000 rays of random directions."""
-    num = 4000
+def sphere_errors(voxels: VoxelGrid, mesh_ball: SdfGrid, resolution: int, num: int) -> None:
+    """Error of the exit direction against 2 (asin(b / R) - asin(b / (n R))), for rays of random directions."""
     generator = np.random.default_rng(0)
     d = generator.normal(size=(num, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
@@ -112,12 +112,11 @@ def sphere_errors(voxels: VoxelGrid, mesh_ball: SdfGrid, resolution: int) -> Non
         print(f"| {name} | {' | '.join(cells)} | {limit} | {met} |", flush=True)
 
 
-def cube_errors(mesh_cube: SdfGrid, resolution: int) -> None:
+def cube_errors(mesh_cube: SdfGrid, resolution: int, num: int) -> None:
     """Error of the exit direction behind the rounded cube against the independent tracer.
 
     A ray is well-conditioned when neighbours 1e-4 units beside it see as many reflections and leave within 0.5 degrees.
     """
-    num = 1500
     generator = np.random.default_rng(1)
     d = generator.normal(size=(num, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
@@ -157,15 +156,15 @@ def cube_errors(mesh_cube: SdfGrid, resolution: int) -> None:
         print(f"| {name} | {median:.5f} | {high:.4f} | {bound} | {met} |", flush=True)
 
 
-def speed(baselines: list[VoxelGrid], solids: dict[str, SdfGrid]) -> None:
+def speed(baselines: list[VoxelGrid], solids: dict[str, SdfGrid], side: int) -> None:
     """Rays per second over all rays of a view, against Euler steps in the same kind of compiled kernel.
 
     Euler's cost does not depend on the object; a smaller grid is faster, because more of it stays in the CPU's caches.
     """
-    print(f"\n### All {SIDE}x{SIDE} rays of a view, {CHUNK} at once\n")
+    print(f"\n### All {side}x{side} rays of a view, {CHUNK} at once\n")
     print("| object | sampler | ms | million rays/s | against the faster euler | bound | met |")
     print("|---|---|---|---|---|---|---|")
-    rays = view().image_rays(0)
+    rays = view(side).image_rays(0)
     for scene, solid in solids.items():
         rows: list[tuple[str, Trace, float]] = [
             *((f"euler, {NUM_EULER_STEPS} steps, {grid.table.shape[0]}^3", euler(grid), 0.0) for grid in baselines),
@@ -189,12 +188,12 @@ def speed(baselines: list[VoxelGrid], solids: dict[str, SdfGrid]) -> None:
             )
 
 
-def branches(solids: dict[str, SdfGrid]) -> None:
+def branches(solids: dict[str, SdfGrid], side: int) -> None:
     """What it costs to follow light that splits, over the same rays; in processor time, as cores may be shared."""
-    print(f"\n### Light that splits, all {SIDE}x{SIDE} rays of a view\n")
+    print(f"\n### Light that splits, all {side}x{side} rays of a view\n")
     print("| object | branches, least weight | paths a ray that meets it | ms | million rays/s | against one path |")
     print("|---|---|---|---|---|---|")
-    rays = view().image_rays(0)
+    rays = view(side).image_rays(0)
     chunks = [rays[first : first + CHUNK] for first in range(0, len(rays), CHUNK)]
     ways = {"none": Snell(), "first, 0.02": Snell(branches="first")}
     ways |= {f"all, {least}": Snell(branches="all", least_weight=least) for least in (0.05, 0.02, 0.005)}
@@ -269,14 +268,14 @@ def rounded_cube_mesh(per_edge: int = 24, per_face: int = 8) -> trimesh.Trimesh:
     return cube
 
 
-def view() -> Cameras:
+def view(side: int) -> Cameras:
     """A camera as in the synthetic scenes: 39.6 degrees wide, 4.03 units from the origin."""
     z = np.array([0.5, 0.6, 0.62]) / np.linalg.norm([0.5, 0.6, 0.62])
     x = np.cross([0.0, 0.0, 1.0], z)
     x /= np.linalg.norm(x)
     pose = torch.from_numpy(np.stack([x, np.cross(z, x), z, 4.03 * z], -1)[None]).float()
-    focal, centre = torch.tensor([0.5 * SIDE / math.tan(0.5 * 0.6911)]), torch.tensor([SIDE / 2])
-    return Cameras(pose, focal, focal, centre, centre, SIDE, SIDE, NEAR, FAR)
+    focal, centre = torch.tensor([0.5 * side / math.tan(0.5 * 0.6911)]), torch.tensor([side / 2])
+    return Cameras(pose, focal, focal, centre, centre, side, side, NEAR, FAR)
 
 
 def angles(a: Tensor, b: Tensor) -> np.ndarray:

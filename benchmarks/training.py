@@ -24,6 +24,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from datetime import date
 from pathlib import Path
+from typing import Any
 
 import lightning.pytorch as pl
 import numpy as np
@@ -58,35 +59,37 @@ PLAIN, FAST = "paper_refractive", "paper_fast"
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parts = parser.add_subparsers(dest="part", required=True)
-    step = parts.add_parser("step")
-    step.add_argument("--turns", type=int, default=3)
-    curve = parts.add_parser("curve")
-    curve.add_argument("--steps", type=int, default=200)
-    curve.add_argument("--rays", type=int, default=64)
-    profiled = parts.add_parser("profile")
-    profiled.add_argument("experiment")
-    profiled.add_argument("--steps", type=int, default=20)
-    parts.add_parser("paths")
-    parts.add_parser("branches")
-    budget = parts.add_parser("budget")
-    budget.add_argument("time")
+    trained = {name: parts.add_parser(name) for name in ("step", "curve", "profile", "paths", "branches", "budget")}
+    for name, default in (("step", 3), ("paths", 6), ("branches", 3)):
+        trained[name].add_argument("--turns", type=int, default=default)
+    trained["curve"].add_argument("--rays", type=int, default=64)
+    for name, default in (("curve", 200), ("profile", 20), ("paths", 11), ("branches", 9)):
+        trained[name].add_argument("--steps", type=int, default=default)
+    trained["profile"].add_argument("experiment")
+    trained["budget"].add_argument("budget", metavar="time")
+    trained["budget"].add_argument("--out", type=Path, default=ROOT / "outputs" / "training_benchmark")
+    for part in trained.values():
+        part.add_argument("--options", nargs="+", default=[], help="of nerfro.train, for all trainings")
     view = parts.add_parser("view")
     view.add_argument("checkpoint", type=Path)
+    view.add_argument("--side", type=int, default=400, help="pixels")
+    view.add_argument("--turns", type=int, default=5)
     arguments = parser.parse_args()
     keep_freed_memory()
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     print(f"{platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__}, {date.today()}", end="")
     print(f", load average {os.getloadavg()[0]:.1f}\n")
-    run: dict[str, Callable[[], None]] = {
-        "step": lambda: report_step(arguments.turns),
-        "curve": lambda: report_curve(arguments.steps, arguments.rays),
-        "profile": lambda: report_profile(arguments.experiment, arguments.steps),
+    reports: dict[str, Callable[..., None]] = {
+        "step": report_step,
+        "curve": report_curve,
+        "profile": report_profile,
         "paths": report_paths,
         "branches": report_branches,
-        "budget": lambda: report_budget(arguments.time),
-        "view": lambda: report_view(arguments.checkpoint),
+        "budget": report_budget,
+        "view": report_view,
     }
-    run[arguments.part]()
+    settings = vars(arguments)
+    reports[settings.pop("part")](**settings)
 
 
 class Steps(pl.Callback):
@@ -101,13 +104,13 @@ class Steps(pl.Callback):
         self._last, self._last_processor = time.perf_counter(), time.process_time()
 
     def on_train_batch_end(
-        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object, batch: Batch, batch_idx: int
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Batch, batch_idx: int
     ) -> None:
         now, processor = time.perf_counter(), time.process_time()
         self.seconds.append(now - self._last)
         self.processor.append(processor - self._last_processor)
         self._last, self._last_processor = now, processor
-        self.losses.append(float(trainer.callback_metrics["loss/total"]))
+        self.losses.append(float(outputs["loss"]))
 
 
 class Training:
@@ -154,12 +157,14 @@ def paper_recipe(experiment: str, *overrides: str) -> Training:
     return Training(*EMBEDDED, f"+experiment={experiment}", MESH, "medium.resolution=256", *overrides)
 
 
-def report_step(turns: int) -> None:
+def report_step(turns: int, options: list[str]) -> None:
     """A step of 1024 rays in single precision with every sample evaluated, and what makes it faster."""
     variants = {
-        "plain: float32, every sample evaluated (`paper_refractive`)": paper_recipe(PLAIN),
-        "bfloat16 products (`trainer.precision=bf16-mixed`)": paper_recipe(PLAIN, "trainer.precision=bf16-mixed"),
-        "bfloat16, only samples in the object's bounds (`paper_fast`)": paper_recipe(FAST),
+        "plain: float32, every sample evaluated (`paper_refractive`)": paper_recipe(PLAIN, *options),
+        "bfloat16 products (`trainer.precision=bf16-mixed`)": paper_recipe(
+            PLAIN, "trainer.precision=bf16-mixed", *options
+        ),
+        "bfloat16, only samples in the object's bounds (`paper_fast`)": paper_recipe(FAST, *options),
     }
     fastest = dict.fromkeys(variants, float("inf"))
     for _ in range(turns):
@@ -171,9 +176,9 @@ def report_step(turns: int) -> None:
         print(f"| {name} | {1e3 * seconds:.0f} | {plain / seconds:.1f}x |")
 
 
-def report_curve(num_steps: int, num_rays: int) -> None:
+def report_curve(steps: int, rays: int, options: list[str]) -> None:
     """Total losses of plain and fast training from the same weights and pixels, against other pixels."""
-    rate = ("optimizer.warmup_steps=0", f"batches.size={num_rays}")  # no warm-up, or nothing would be learned yet
+    rate = (*options, "optimizer.warmup_steps=0", f"batches.size={rays}")  # no warm-up, or nothing would be learned yet
     bf16 = "trainer.precision=bf16-mixed"
     runs = {
         "plain": paper_recipe(PLAIN, *rate),
@@ -181,9 +186,9 @@ def report_curve(num_steps: int, num_rays: int) -> None:
         "`paper_fast`": paper_recipe(FAST, *rate),
         "plain, another seed": paper_recipe(PLAIN, *rate, "seed=1"),
     }
-    losses = {name: np.array(training.run(num_steps).losses) for name, training in runs.items()}
-    print(f"Total loss, {num_rays} rays a step, mean of 50 steps:\n")
-    windows = range(0, num_steps, 50)
+    losses = {name: np.array(training.run(steps).losses) for name, training in runs.items()}
+    print(f"Total loss, {rays} rays a step, mean of 50 steps:\n")
+    windows = range(0, steps, 50)
     print(f"| run | {' | '.join(f'{w + 1} to {w + 50}' for w in windows)} | mean difference from plain, step by step |")
     print("|---|" + "---|" * (len(windows) + 1))
     for name, loss in losses.items():
@@ -191,16 +196,16 @@ def report_curve(num_steps: int, num_rays: int) -> None:
         print(f"| {name} | {means} | {np.abs(loss - losses['plain']).mean():.4f} |")
 
 
-def report_profile(experiment: str, num_steps: int) -> None:
+def report_profile(experiment: str, steps: int, options: list[str]) -> None:
     """Share of a step's time by part, its matrix work, and the rate of that work against the machine's."""
     paper = experiment.startswith("paper")
-    training = paper_recipe(experiment) if paper else Training(f"+experiment={experiment}")
+    training = paper_recipe(experiment, *options) if paper else Training(f"+experiment={experiment}", *options)
     model, module = training.renderer, training.module
     training.run(3)
     with FlopCounterMode(display=False) as counter:
         training.run(1)
     flops = counter.get_total_flops()
-    seconds = float(np.mean(training.run(num_steps).seconds[1:]))
+    seconds = float(np.mean(training.run(steps).seconds[1:]))
     parts = {
         "point sampling": [(model.point_sampler, "forward")],
         "fields, forward": [(field, "forward") for field in model.scene.fields],
@@ -218,8 +223,8 @@ def report_profile(experiment: str, num_steps: int) -> None:
             for owner, method in methods:
                 label(stack, owner, method, name)
         with profile(activities=[ProfilerActivity.CPU]) as measured:
-            training.run(num_steps)
-    events = {event.key: event.cpu_time_total / 1e3 / num_steps for event in measured.key_averages()}
+            training.run(steps)
+    events = {event.key: event.cpu_time_total / 1e3 / steps for event in measured.key_averages()}
     ms = {name: events.get(name, 0.0) for name in (parts | around | whole)}
     # Lightning runs the whole step inside the optimiser's.
     ms["Adam"] -= ms["training step"] + ms["backward pass"]
@@ -256,14 +261,14 @@ class TracedInStep(RayDataModule):
             return self.batches.batch(batch)
 
 
-def report_paths(turns: int = 6, num_steps: int = 11) -> None:
+def report_paths(turns: int, steps: int, options: list[str]) -> None:
     """What live tracing costs of a step of the default preset, against the same batches made before.
 
     Ways take turns, and the median of each way's turns counts. Processor time is of all threads.
     """
-    training = Training("+experiment=refractive")
+    training = Training("+experiment=refractive", *options)
     batches = training.batches
-    ready = ReadyBatches(batches, num_steps)
+    ready = ReadyBatches(batches, steps)
     ways: dict[str, Callable[[], RayDataModule]] = {
         "ready before training": lambda: ready,
         "one step ahead (as trained)": lambda: RayDataModule(batches, None, 0),
@@ -273,9 +278,9 @@ def report_paths(turns: int = 6, num_steps: int = 11) -> None:
     for turn in range(turns + 1):
         for name, make in ways.items():
             begun = time.process_time()
-            steps = training.run(num_steps, make()).seconds[1:]
+            walls = training.run(steps, make()).seconds[1:]
             if turn > 0:  # the first one compiles and allocates
-                seconds[name].append((float(np.median(steps)), (time.process_time() - begun) / num_steps))
+                seconds[name].append((float(np.median(walls)), (time.process_time() - begun) / steps))
     base = np.median([wall for wall, _ in seconds["ready before training"]])
     cores = len(os.sched_getaffinity(0))
     print(f"| default preset, {cores} cores: paths | ms a step | cost | processor, ms a step |\n|---|---|---|---|")
@@ -284,24 +289,24 @@ def report_paths(turns: int = 6, num_steps: int = 11) -> None:
         print(f"| {name} | {1e3 * wall:.1f} | {wall / base - 1:+.1%} | {1e3 * processor:.1f} |")
 
 
-def report_branches(turns: int = 3, num_steps: int = 9) -> None:
+def report_branches(turns: int, steps: int, options: list[str]) -> None:
     """A step of the default preset with and without light that splits, and with a tint that learns, in turns.
 
     Processor time is of all threads, and hardly depends on what else the machine does.
     """
     of_path = "sampler.path.branches"
     ways = {
-        "none (`refractive`)": Training("+experiment=refractive"),
-        "first": Training("+experiment=refractive", f"{of_path}=first"),
-        "all": Training("+experiment=refractive", f"{of_path}=all"),
-        "all, and the tint learns (`glass`)": Training("+experiment=glass"),
+        "none (`refractive`)": Training("+experiment=refractive", *options),
+        "first": Training("+experiment=refractive", f"{of_path}=first", *options),
+        "all": Training("+experiment=refractive", f"{of_path}=all", *options),
+        "all, and the tint learns (`glass`)": Training("+experiment=glass", *options),
     }
     seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
     for turn in range(turns + 1):
         for name, training in ways.items():
-            steps = training.run(num_steps)
+            measured = training.run(steps)
             if turn > 0:  # the first one compiles and allocates
-                seconds[name].append((float(np.median(steps.seconds[1:])), float(np.median(steps.processor[1:]))))
+                seconds[name].append((float(np.median(measured.seconds[1:])), float(np.median(measured.processor[1:]))))
     base = np.median(seconds["none (`refractive`)"], 0)
     print("| default preset, branches | paths a training ray | ms a step | processor, ms | against one path |")
     print("|---|---|---|---|---|")
@@ -356,7 +361,7 @@ def timed(task: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def report_budget(budget: str) -> None:
+def report_budget(budget: str, out: Path, options: list[str]) -> None:
     """Test scores of the default preset and of the paper's recipe after the same time on the embedded scene.
 
     The recipe in its fast form, which gets several times as many steps as the plain one.
@@ -366,12 +371,14 @@ def report_budget(budget: str) -> None:
         f"| experiment | steps in {budget} | rays/s | PSNR, 20 test views | SSIM |\n|---|---|---|---|---|", flush=True
     )
     for name, overrides in commands.items():
-        folder = ROOT / "outputs" / "training_benchmark" / f"{name}_{budget.replace(':', '')}"
+        folder = out / f"{name}_{budget.replace(':', '')}"
         if not (folder / "metrics.json").exists():
             command = [sys.executable, "-m", "nerfro.train", *overrides, f"+experiment={name}"]
-            command += [f"trainer.max_time={budget}", "trainer.max_steps=-1", "evaluation.every=0"]
-            with (ROOT / "outputs" / f"{name}.log").open("w") as log:
-                subprocess.run([*command, f"hydra.run.dir={folder}"], check=True, cwd=ROOT, stdout=log, stderr=log)
+            command += [f"hydra.run.dir={folder.resolve()}"]
+            command += [f"trainer.max_time={budget}", "trainer.max_steps=-1", "evaluation.every=0", *options]
+            folder.mkdir(parents=True, exist_ok=True)
+            with (folder / "output.log").open("w") as log:
+                subprocess.run(command, check=True, cwd=ROOT, stdout=log, stderr=log)
         run = read_metrics_json(folder / "metrics.json")
         means = run.result.means()
         print(
@@ -380,12 +387,12 @@ def report_budget(budget: str) -> None:
         )
 
 
-def report_view(path: Path, side: int = 400, turns: int = 5) -> None:
+def report_view(checkpoint: Path, side: int, turns: int) -> None:
     """Seconds to render a test camera's view with one ray a pixel and supersampled as trained; where the first go.
 
     Processor time hardly depends on what else the machine does; the fastest of the turns counts.
     """
-    scene = nerfro.load(path)
+    scene = nerfro.load(checkpoint)
     cameras, model = scene.cameras("test").resized(side, side), scene.renderer
     print(f"| {side}x{side} view of `{scene.name}` | s | processor, s |\n|---|---|---|")
     for name, sampling in (("one ray a pixel", Subdivision()), ("supersampled", scene.subdivision)):

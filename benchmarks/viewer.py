@@ -19,8 +19,6 @@ import nerfro.train
 from nerfro.training.viewer import Viewer
 from nerfro.viewing import server
 
-_WARM_UP = 20.0  # seconds
-
 
 class TimedViewer(Viewer):
     """Record the end of each step, and whether a browser was connected."""
@@ -50,18 +48,20 @@ def browse(window: float) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--minutes", type=int, default=4)
+    parser.add_argument("--seconds", type=int, default=240, help="of training")
+    parser.add_argument("--warm-up", type=float, default=20.0, help="seconds that are not counted")
     parser.add_argument("--window", type=float, default=20.0, help="seconds")
+    parser.add_argument("--options", nargs="+", default=[], help="of nerfro.train")
     arguments = parser.parse_args()
     server._WATCHED = 2.5  # a window without requests begins soon after the last one
     nerfro.train.Viewer = TimedViewer  # type: ignore[misc]
     threading.Thread(target=browse, args=(arguments.window,), daemon=True).start()
     with tempfile.TemporaryDirectory() as folder:
-        limit = f"trainer.max_time=00:00:{arguments.minutes:02d}:00"
-        sys.argv = ["nerfro.train", "viewer=true", "viewer_port=0", limit, "evaluation.every=0", "logger=none",
-                    f"hydra.run.dir={folder}/run"]  # fmt: skip
+        limit = f"trainer.max_time=00:00:{arguments.seconds // 60:02d}:{arguments.seconds % 60:02d}"
+        options = ["viewer=true", "viewer_port=0", limit, "evaluation.every=0", "logger=none"]
+        sys.argv = ["nerfro.train", *arguments.options, *options, f"hydra.run.dir={folder}/run"]
         nerfro.train.main()
-    steps = [(at, watched) for at, watched in TimedViewer.steps if at > TimedViewer.steps[0][0] + _WARM_UP]
+    steps = [(at, watched) for at, watched in TimedViewer.steps if at > TimedViewer.steps[0][0] + arguments.warm_up]
     spent = {True: 0.0, False: 0.0}
     count = {True: 0, False: 0}
     for (before, _), (now, watched) in pairwise(steps):
