@@ -197,9 +197,9 @@ def _refusal(value: Any, hint: Any) -> str | None:
         return None if isinstance(value, (str, Path)) else "take text"
     if hint is float:
         return None if _is_finite(value) else "take a finite number"
-    if origin is list and isinstance(value, str):
+    if origin in (list, Sequence) and isinstance(value, str):
         return "take a list"
-    if origin in (list, tuple) and isinstance(value, Sequence):
+    if origin in (list, tuple, Sequence) and isinstance(value, Sequence):
         return next((reason for each in value if (reason := _refusal(each, hints[0]))), None)
     if origin in (Union, types.UnionType):
         return next((reason for each in hints if (reason := _refusal(value, each))), None)

@@ -104,9 +104,9 @@ class Cameras:
     def rays(
         self,
         view: Int[Tensor, "R"],
-        row: Int[Tensor, "R"],
-        column: Int[Tensor, "R"],
-        jitter: Float[Tensor, "R 2"] | None = None,
+        row: Int[Tensor, "R"] | Float[Tensor, "R"],
+        column: Int[Tensor, "R"] | Float[Tensor, "R"],
+        jitter: Float[Tensor, "R 2"] | Float[Tensor, "2"] | None = None,
     ) -> Rays:
         """Rays through pixels.
 

@@ -16,7 +16,7 @@ import pkgutil
 import sys
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Optional, TypeVar, Union, get_args, get_origin
@@ -331,7 +331,7 @@ def _config_type(hint: Any) -> Any:
     if origin in (Union, types.UnionType) and type(None) in args and len(args) == 2:
         inner = _config_type(next(a for a in args if a is not type(None)))
         return None if inner is None else Optional[inner]  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    if origin in (list, tuple):
+    if origin in (list, tuple, Sequence):
         element = next((a for a in args if a is not Ellipsis), Any)
         return list[element] if element is Any or _config_type(element) is not None else None
     if origin is dict:
@@ -356,7 +356,7 @@ def _type_name(hint: Any) -> str:
         return _type_name(args[0])
     if origin in (Union, types.UnionType):
         return " | ".join("none" if a is type(None) else _type_name(a) for a in args)
-    if origin in (list, tuple):
+    if origin in (list, tuple, Sequence):
         return f"list[{_type_name(args[0])}]"
     name: str = getattr(origin or hint, "__name__", str(hint))
     return name

@@ -69,12 +69,12 @@ def unproject(face: Int[Tensor, "P"], coordinates: Float[Tensor, "P 2"]) -> Floa
     return torch.nn.functional.normalize(components.gather(-1, order), dim=-1)
 
 
-def texel_directions(resolution: int) -> Float[Tensor, "6*n*n 3"]:
+def texel_directions(resolution: int) -> Float[Tensor, "T 3"]:
     """Return the unit directions of the texel centres of one level."""
     return _directions((torch.arange(resolution) + 0.5) / resolution * 2 - 1)
 
 
-def padded_texels(resolution: int) -> Int[Tensor, "6 n+2 n+2"]:
+def padded_texels(resolution: int) -> Int[Tensor, "6 m m"]:
     """Return the texel at each place of the faces, with a margin of one texel from the neighbouring faces.
 
     Three faces meet at a corner, where no fourth texel exists. The corners of the margin are therefore not valid.
@@ -86,7 +86,7 @@ def padded_texels(resolution: int) -> Int[Tensor, "6 n+2 n+2"]:
     return ((face * n + row) * n + column).view(6, n + 2, n + 2).int()
 
 
-def _directions(centres: Float[Tensor, "n"]) -> Float[Tensor, "6*n*n 3"]:
+def _directions(centres: Float[Tensor, "n"]) -> Float[Tensor, "T 3"]:
     """Return the directions of a grid of coordinates on all faces, ordered by face, row and column."""
     n = len(centres)
     face = torch.arange(6).repeat_interleave(n * n)

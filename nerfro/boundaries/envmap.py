@@ -54,7 +54,7 @@ class EnvironmentMap(Boundary):
             self.set_lat_long(lat_long.load_lat_long(image))
 
     @classmethod
-    def of_texels(cls, radiance: Float[Tensor, "6*n*n 3"]) -> EnvironmentMap:
+    def of_texels(cls, radiance: Float[Tensor, "T 3"]) -> EnvironmentMap:
         """Make a map with fixed linear radiance at the `cube_map.texel_directions` of one level."""
         sky = cls([math.isqrt(len(radiance) // 6)])
         sky.requires_grad_(False).texels.copy_(_raw(radiance))

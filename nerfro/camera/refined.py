@@ -85,7 +85,7 @@ class _Motions(PerView):
         """Return rotations (radians) and translations (world units), without the motion of the world."""
         return without_world(self.motion * self.units, self.of_world, self.weights)
 
-    def common_rotations(self) -> Float[Tensor, "3*V 3"]:
+    def common_rotations(self) -> Float[Tensor, "M 3"]:
         """Return an orthonormal basis of common rotations of all cameras, each about its centre; units of pixels."""
         own = self.moved()[..., :3].mT / self.units[:, :3, None]
         return torch.linalg.qr(own.flatten(0, 1))[0]

@@ -72,8 +72,8 @@ class Estimate:
     names: list[str]
     values: Float[np.ndarray, "K"]
     standard_errors: Float[np.ndarray, "K"]
-    coarse: Float[np.ndarray, "C K+1"]
-    fine: Float[np.ndarray, "c K+1"]
+    coarse: Float[np.ndarray, "C N"]
+    fine: Float[np.ndarray, "c N"]
     unrelated: float
     doubts: list[str]
 

@@ -35,7 +35,7 @@ class RoomPicture(Boundary):
         distances: distance of each texel (see `cube_map.texel_directions`), world units.
     """
 
-    def __init__(self, middle: Float[Tensor, "3"], colours: EnvironmentMap, distances: Float[Tensor, "6*n*n"]) -> None:
+    def __init__(self, middle: Float[Tensor, "3"], colours: EnvironmentMap, distances: Float[Tensor, "T"]) -> None:
         super().__init__()
         self.middle, self.colours, self.distances = middle, colours, distances
         side = round((len(distances) / 6) ** 0.5)

@@ -93,7 +93,7 @@ def image_grid(
 
 def triptych(
     prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], error_limit: float = SQUARED_ERROR_LIMIT
-) -> Float[Tensor, "H 3W 3"]:
+) -> Float[Tensor, "H 3*W 3"]:
     """Concatenate prediction, reference and squared error for the training log, on the CPU and without text."""
     error = magma(squared_error_map(prediction, target), error_limit)
     return torch.cat([prediction.detach().cpu().float().clamp(0, 1), target.detach().cpu().float(), error], dim=1)

@@ -117,7 +117,7 @@ class ImageMetrics(torchmetrics.Metric):
         number = scores.new_tensor([len(self.rows) if view is None else view])
         self.rows.append(torch.cat([number, scores.flatten()])[None])
 
-    def compute(self) -> Float[Tensor, "V 1+K"]:
+    def compute(self) -> Float[Tensor, "V M"]:
         """Gather the scores of all views from all processes.
 
         Returns:

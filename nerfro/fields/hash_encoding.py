@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerfro.errors import NerfroError
@@ -67,7 +67,7 @@ def grid_levels(num_levels: int, base_resolution: int, finest_resolution: int, l
 
 def hash_encode(
     positions: Float[Tensor, "P 3"], table: Float[Tensor, "T 2"], levels: GridLevels
-) -> Float[Tensor, "P 2*L"]:
+) -> Float[Tensor, "P F"]:
     """Interpolate the features of every level trilinearly and concatenate them.
 
     Args:
@@ -83,7 +83,7 @@ def hash_encode(
 
 def _vertices(
     positions: Float[Tensor, "P 3"], levels: GridLevels
-) -> tuple[Float[Tensor, "P L 8"], Float[Tensor, "P L 8"]]:
+) -> tuple[Int[Tensor, "P L 8"], Float[Tensor, "P L 8"]]:
     """Return table entries and interpolation weights of the eight vertices around each position, for every level."""
     resolution, size, offset = (
         constant(values, positions.device) for values in (levels.resolutions, levels.sizes, levels.offsets)

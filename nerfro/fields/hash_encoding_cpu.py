@@ -32,7 +32,7 @@ _UINT, _Y, _Z = np.uint32, np.uint32(HASH_Y), np.uint32(HASH_Z)
 
 def hash_encode(
     positions: Float[Tensor, "P 3"], table: Float[Tensor, "T 2"], levels: GridLevels
-) -> Float[Tensor, "P 2*L"]:
+) -> Float[Tensor, "P F"]:
     """Evaluate `nerfro.fields.hash_encoding.hash_encode` on the CPU."""
     return _HashEncode.apply(positions.float().t().contiguous(), table, levels)
 
@@ -41,7 +41,7 @@ class _HashEncode(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, positions: Float[Tensor, "3 P"], table: Float[Tensor, "T 2"], levels: GridLevels
-    ) -> Float[Tensor, "P 2*L"]:
+    ) -> Float[Tensor, "P F"]:
         ctx.save_for_backward(positions, table)
         ctx.levels = levels
         features = positions.new_empty(positions.shape[1], NUM_FEATURES * len(levels))
@@ -51,7 +51,7 @@ class _HashEncode(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Float[Tensor, "P 2*L"]) -> tuple[Tensor | None, Tensor | None, None]:
+    def backward(ctx: Any, gradient: Float[Tensor, "P F"]) -> tuple[Tensor | None, Tensor | None, None]:
         positions, table = ctx.saved_tensors
         places, entries, upstream = arrays(positions, table, gradient)
         layout, threads = _layout(ctx.levels), num_threads()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Annotated, Literal
 
@@ -60,8 +61,8 @@ class HashGridField(Field):
 
     def __init__(
         self,
-        box_min: list[float] = (-1.0, -1.0, -1.0),  # type: ignore[assignment]
-        box_max: list[float] = (1.0, 1.0, 1.0),  # type: ignore[assignment]
+        box_min: Sequence[float] = (-1.0, -1.0, -1.0),
+        box_max: Sequence[float] = (1.0, 1.0, 1.0),
         radius: Positive | None = None,
         num_levels: Count = 12,
         finest_resolution: Count = 256,

@@ -18,7 +18,7 @@ from nerfro.files.atomic import atomic_file
 from nerfro.files.reading import open_image
 
 
-def to_8bit(rgb: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
+def to_8bit(rgb: Float[Tensor, "*batch 3"]) -> UInt8[Tensor, "*batch 3"]:
     """Clip finite sRGB values to [0, 1] and round to the nearest of 256 levels.
 
     Truncation instead of rounding would darken every image by half a level.

@@ -46,7 +46,7 @@ def contracted_box(box: Float[Tensor, "2 3"], radius: float) -> Float[Tensor, "2
 
 
 def contracted_length(
-    t: Float[Tensor, "*batch"], impact_parameter: Float[Tensor, "*batch"], radius: float
+    t: Float[Tensor, "*batch"], impact_parameter: Float[Tensor, "*#batch"], radius: float
 ) -> Float[Tensor, "*batch"]:
     """Integrate the contraction scale along a line, from the point of closest approach to arc length `t` from there.
 
@@ -66,7 +66,7 @@ def contracted_length(
 
 
 def world_length(
-    length: Float[Tensor, "*batch"], impact_parameter: Float[Tensor, "*batch"], radius: float
+    length: Float[Tensor, "*batch"], impact_parameter: Float[Tensor, "*#batch"], radius: float
 ) -> Float[Tensor, "*batch"]:
     """Invert `contracted_length` for arc lengths up to `FAR`."""
     a = impact_parameter.clamp(min=NEAREST * radius)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import functools
 import hashlib
+import inspect
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -30,7 +31,7 @@ def compiled(function: Function) -> Function:
 
 def inlined(function: Function) -> Function:
     """Compile a function into the kernels that call the function, for code that runs at every step along a ray."""
-    return cast(Function, numba.njit(inline="always")(function))
+    return cast(Function, numba.njit(inline="always")(inspect.unwrap(function)))
 
 
 def compiled_parallel(function: Function) -> Function:
@@ -52,6 +53,7 @@ def compiled_parallel(function: Function) -> Function:
 
 
 def _compile(function: Function, parallel: bool, allocates: bool = True) -> Function:
+    function = inspect.unwrap(function)  # Numba cannot compile the type checks that tests add
     # Fused multiply-add is the only relaxation of floating-point arithmetic: infinities and exact comparisons stay.
     options: dict[str, Any] = {"parallel": parallel, "nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
     if not allocates:

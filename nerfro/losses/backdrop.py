@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -37,7 +39,7 @@ class Backdrop(Loss):
 
     weight = 0.1
 
-    def __init__(self, colour: list[float] | None = None) -> None:
+    def __init__(self, colour: Sequence[float] | None = None) -> None:
         super().__init__()
         if colour is not None and (len(colour) != 3 or not all(0 <= value <= 1 for value in colour)):
             raise NerfroError(f"loss=backdrop: colour={list(colour)} is no sRGB colour; give three numbers in [0, 1]")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -30,8 +32,8 @@ class Nearby(Loss):
 
     def __init__(
         self,
-        box_min: list[float] = (-1.0, -1.0, -1.0),  # type: ignore[assignment]
-        box_max: list[float] = (1.0, 1.0, 1.0),  # type: ignore[assignment]
+        box_min: Sequence[float] = (-1.0, -1.0, -1.0),
+        box_max: Sequence[float] = (1.0, 1.0, 1.0),
     ) -> None:
         super().__init__()
         middle = torch.from_numpy(corners_of_box(box_min, box_max)).float().mean(0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -80,15 +81,15 @@ class SdfGrid(Solid):
         mesh: str,
         ior: Positive = 1.5,
         inner_meshes: list[str] = [],  # noqa: B006 (the registry reads and copies it)
-        inner_iors: list[Positive] = [],  # noqa: B006
+        inner_iors: Sequence[Positive] = (),
         resolution: Resolution = 128,
-        box_min: list[float] | None = None,
-        box_max: list[float] | None = None,
+        box_min: Sequence[float] | None = None,
+        box_max: Sequence[float] | None = None,
         shell_voxels: Positive = 0.1,
         accept_open_mesh: bool = False,
-        absorption: list[NotNegative] = [],  # noqa: B006
+        absorption: Sequence[NotNegative] = (),
         learn_absorption: bool = False,
-        abbe: list[Positive] = [],  # noqa: B006
+        abbe: Sequence[Positive] = (),
         learn_ior: bool = False,
         cache: bool = True,
     ) -> None:
@@ -117,7 +118,7 @@ class SdfGrid(Solid):
         cls,
         distances: Float[Tensor, "K X Y Z"],
         box: Float[Tensor, "2 3"],
-        iors: list[float],
+        iors: Sequence[float],
         shell: float,
         **glass: Any,
     ) -> SdfGrid:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -32,9 +34,9 @@ class Ball(Solid):
         radius: Positive = 0.8,
         ior: Positive = 1.5,
         shell: Positive = 0.002,
-        absorption: list[NotNegative] = (),  # type: ignore[assignment]
+        absorption: Sequence[NotNegative] = (),
         learn_absorption: bool = False,
-        abbe: list[Positive] = (),  # type: ignore[assignment]
+        abbe: Sequence[Positive] = (),
     ) -> None:
         super().__init__([ior], shell, absorption, learn_absorption, abbe)
         self.radius = radius
@@ -63,9 +65,9 @@ class RoundedBox(Solid):
         edge_radius: NotNegative = 0.08,
         ior: Positive = 1.52,
         shell: Positive = 0.002,
-        absorption: list[NotNegative] = (),  # type: ignore[assignment]
+        absorption: Sequence[NotNegative] = (),
         learn_absorption: bool = False,
-        abbe: list[Positive] = (),  # type: ignore[assignment]
+        abbe: Sequence[Positive] = (),
     ) -> None:
         super().__init__([ior], shell, absorption, learn_absorption, abbe)
         self.half_side, self.edge_radius = half_side, edge_radius
@@ -97,9 +99,9 @@ class Slab(Solid):
         thickness: Positive = 0.5,
         ior: Positive = 1.5,
         shell: Positive = 0.002,
-        absorption: list[NotNegative] = (),  # type: ignore[assignment]
+        absorption: Sequence[NotNegative] = (),
         learn_absorption: bool = False,
-        abbe: list[Positive] = (),  # type: ignore[assignment]
+        abbe: Sequence[Positive] = (),
     ) -> None:
         super().__init__([ior], shell, absorption, learn_absorption, abbe)
         self.thickness = thickness

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -58,11 +59,11 @@ class Solid(Medium):
 
     def __init__(
         self,
-        iors: list[Positive],
+        iors: Sequence[Positive],
         shell: Positive,
-        absorption: list[NotNegative] = (),  # type: ignore[assignment]
+        absorption: Sequence[NotNegative] = (),
         learn_absorption: bool = False,
-        abbe: list[Positive] = (),  # type: ignore[assignment]
+        abbe: Sequence[Positive] = (),
         learn_ior: bool = False,
     ) -> None:
         super().__init__()

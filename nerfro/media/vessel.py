@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -69,13 +71,13 @@ class SdfVessel(SdfGrid):
         up: list[Coordinate] = [0.0, 0.0, 1.0],  # noqa: B006 (the registry reads and copies it)
         height: Positive | None = None,
         resolution: Resolution = 128,
-        box_min: list[float] | None = None,
-        box_max: list[float] | None = None,
+        box_min: Sequence[float] | None = None,
+        box_max: Sequence[float] | None = None,
         shell_voxels: Positive = 0.1,
         accept_open_mesh: bool = False,
-        absorption: list[NotNegative] = [],  # noqa: B006
+        absorption: Sequence[NotNegative] = (),
         learn_absorption: bool = False,
-        abbe: list[Positive] = [],  # noqa: B006
+        abbe: Sequence[Positive] = (),
         cache: bool = True,
     ) -> None:
         require_bytes(BYTES_PER_VERTEX * resolution**3, f"medium.resolution={resolution}")
@@ -152,7 +154,7 @@ class SdfVessel(SdfGrid):
             )
 
 
-def _direction(up: list[float]) -> Float[np.ndarray, "3"]:
+def _direction(up: Sequence[float]) -> Float[np.ndarray, "3"]:
     length = np.linalg.norm(up)
     if len(up) != 3 or not length > 0:
         raise NerfroError(f"medium.up={list(up)} is no direction; give three numbers, not all of them 0")
@@ -166,7 +168,7 @@ def _heights(box: Float[np.ndarray, "2 3"], resolution: int, up: Float[np.ndarra
     return x[:, None, None] + y[:, None] + z
 
 
-def _of_bodies(given: list[float], each: int, num_bodies: int, air: float, name: str) -> list[float]:
+def _of_bodies(given: Sequence[float], each: int, num_bodies: int, air: float, name: str) -> list[float]:
     """Expand the numbers of wall and liquid, or one number for both, to all bodies; an empty list stays empty."""
     if len(given) not in (0, 1, 2 * each):
         raise NerfroError(

@@ -57,8 +57,8 @@ class VoxelGrid(Medium):
         mesh: str,
         ior: Positive = 1.5,
         resolution: Resolution = 128,
-        box_min: list[float] = [-1.5, -1.5, -1.5],  # noqa: B006 (the registry reads and copies it)
-        box_max: list[float] = [1.5, 1.5, 1.5],  # noqa: B006
+        box_min: Sequence[float] = (-1.5, -1.5, -1.5),
+        box_max: Sequence[float] = (1.5, 1.5, 1.5),
         smoothing_size: Annotated[int, Range(at_least=0, at_most=99)] = 9,
         smoothing_sigma: Positive = 1.0,
         accept_open_mesh: bool = False,
@@ -79,7 +79,7 @@ class VoxelGrid(Medium):
             lambda: {"occupancy": occupancy_fraction(loaded, box, resolution, _SUBSAMPLES).astype(np.float16)},
             cache,
         )["occupancy"]
-        require_inside(occupancy.max() > 0.25)  # vertices on a flat mesh count as inside to some extent
+        require_inside(bool(occupancy.max() > 0.25))  # vertices on a flat mesh count as inside to some extent
         fractions, corners = torch.from_numpy(occupancy).float(), torch.from_numpy(box).float()
         self._set(fractions, corners, ior, smoothing_size, smoothing_sigma)
 
@@ -145,7 +145,7 @@ class VoxelGrid(Medium):
         return n, torch.where(inside[..., None], values[..., 1:], 0.0)
 
     @lazy_buffer
-    def clearance_grid(self) -> Float[Tensor, "X-1 Y-1 Z-1"]:
+    def clearance_grid(self) -> Float[Tensor, "U V W"]:
         """Lower bound of the distance to the next cell with grad n != 0, for any point of each cell, world units."""
         varies = (self.table[..., 1:] != 0).any(-1).cpu()
         for axis in range(3):
@@ -170,7 +170,11 @@ class VoxelGrid(Medium):
 
 
 def grid_box(
-    box_min: list[float] | None, box_max: list[float] | None, meshes: Sequence[TriangleMesh], resolution: int, air: int
+    box_min: Sequence[float] | None,
+    box_max: Sequence[float] | None,
+    meshes: Sequence[TriangleMesh],
+    resolution: int,
+    air: int,
 ) -> Float[np.ndarray, "2 3"]:
     """Return the corners of a medium's grid: the given ones, or the bounds of the meshes with a margin of air.
 

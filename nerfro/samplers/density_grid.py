@@ -67,8 +67,8 @@ class DensityGridSampler(PointSampler):
         self,
         num_samples: Annotated[int, Range(at_least=1, at_most=8192)] = 32,
         num_bins: Annotated[int, Range(at_least=2, at_most=8192)] = 96,
-        box_min: list[float] = (-1.0, -1.0, -1.0),  # type: ignore[assignment]
-        box_max: list[float] = (1.0, 1.0, 1.0),  # type: ignore[assignment]
+        box_min: Sequence[float] = (-1.0, -1.0, -1.0),
+        box_max: Sequence[float] = (1.0, 1.0, 1.0),
         radius: Positive | None = None,
         near: NotNegative = 0.0,
         resolution: Annotated[int, Range(at_least=2, at_most=1024)] = 64,
@@ -103,7 +103,7 @@ class DensityGridSampler(PointSampler):
         along = Samples.along(path, samples.s, samples.edges)
         return replace(along, occupied=samples.occupied, lengths=samples.lengths, measure=samples.measure)
 
-    def _quantiles(self, path: Path, draws: Draws | None) -> Float[Tensor, "P N+1"]:
+    def _quantiles(self, path: Path, draws: Draws | None) -> Float[Tensor, "P E"]:
         """Compute the values of the cumulative weights at which edges of samples lie.
 
         In training, polylines of rays that split get samples in proportion to their weight. The intervals that one

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import torch
@@ -45,8 +46,8 @@ class Hierarchical(PointSampler):
         draw: Literal["arc_length", "vertices"] = "arc_length",
         cast: Literal["points", "cones"] = "points",
         offset: Annotated[float, Range(at_least=0, less_than=1)] = 0.5,
-        box_min: list[float] = (),  # type: ignore[assignment]
-        box_max: list[float] = (),  # type: ignore[assignment]
+        box_min: Sequence[float] = (),
+        box_max: Sequence[float] = (),
     ) -> None:
         super().__init__()
         if cast == "cones" and union:
@@ -69,7 +70,7 @@ class Hierarchical(PointSampler):
 
     @torch.no_grad()
     def _draw(
-        self, edges: Float[Tensor, "R B+1"], weights: Float[Tensor, "R B"], u: Float[Tensor, "R N"]
+        self, edges: Float[Tensor, "R E"], weights: Float[Tensor, "R E-1"], u: Float[Tensor, "R N"]
     ) -> Float[Tensor, "R N"]:
         weights = weights.detach().to(edges.dtype)
         weights = blur_weights(weights, self.padding) if self.blur else weights + self.padding

@@ -67,7 +67,7 @@ def smallest_cosine(path: Path, medium: Medium) -> Float[Tensor, "P"]:
         return torch.where(path.surface[:, 1:] >= 0, cosines, 1.0).amin(-1)
 
 
-def indices_of(medium: Medium, like: Tensor) -> Float[Tensor, "K+1"]:
+def indices_of(medium: Medium, like: Tensor) -> Float[Tensor, "M"]:
     """Refractive index of air and of each body, with gradients."""
     bodies = [medium.iors] if isinstance(medium, Solid) else []
     return torch.cat([like.new_ones(1), *(iors.to(like) for iors in bodies)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated, Literal
 
@@ -55,7 +56,7 @@ class Snell(PathSampler):
         max_events: Annotated[int, Range(at_least=1, at_most=1000)] = 16,
         branches: Literal["none", "first", "all"] = "none",
         least_weight: Share = 0.02,
-        wavelengths: list[Positive] = (610.0, 550.0, 465.0),  # type: ignore[assignment]
+        wavelengths: Sequence[Positive] = (610.0, 550.0, 465.0),
     ) -> None:
         super().__init__()
         if len(wavelengths) == 0 or len(wavelengths) % 3:

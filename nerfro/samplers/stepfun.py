@@ -47,7 +47,7 @@ def spread_uniform(path: Path, num_samples: int, draws: Draws | None, stream: st
 
 
 def invert_cdf(
-    edges: Float[Tensor, "R B+1"], weights: Float[Tensor, "R B"], u: Float[Tensor, "R N"]
+    edges: Float[Tensor, "R E"], weights: Float[Tensor, "R E-1"], u: Float[Tensor, "R N"]
 ) -> Float[Tensor, "R N"]:
     """Inverse transform sampling of a step function (paper, Eqn. hierarchical).
 
@@ -74,6 +74,6 @@ def blur_weights(weights: Float[Tensor, "R B"], padding: float) -> Float[Tensor,
     return 0.5 * (highest[..., :-1] + highest[..., 1:]) + padding
 
 
-def midpoints(edges: Float[Tensor, "R B+1"]) -> Float[Tensor, "R B"]:
+def midpoints(edges: Float[Tensor, "R E"]) -> Float[Tensor, "R E-1"]:
     """Middle of each interval."""
     return 0.5 * (edges[..., 1:] + edges[..., :-1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import torch
@@ -41,8 +42,8 @@ class Stratified(PointSampler):
         draw: Literal["arc_length", "vertices"] = "arc_length",
         cast: Literal["points", "cones"] = "points",
         offset: Annotated[float, Range(at_least=0, less_than=1)] = 0.5,
-        box_min: list[float] = (),  # type: ignore[assignment]
-        box_max: list[float] = (),  # type: ignore[assignment]
+        box_min: Sequence[float] = (),
+        box_max: Sequence[float] = (),
     ) -> None:
         super().__init__()
         if cast == "cones" and draw == "vertices":
@@ -74,7 +75,7 @@ class Stratified(PointSampler):
             return draws.for_rays(path.ray, self.num_samples).to(path.s)
         return path.s.new_full((len(path.s), self.num_samples), self.offset)
 
-    def _cone_fractions(self, path: Path, draws: Draws | None) -> Float[Tensor, "P N+1"]:
+    def _cone_fractions(self, path: Path, draws: Draws | None) -> Float[Tensor, "P E"]:
         like = path.s
         fractions = torch.linspace(0.0, 1.0, self.num_samples + 1, device=like.device, dtype=like.dtype)
         if draws is not None:  # each edge moves within half a bin of its place, as mip-NeRF's do
@@ -104,7 +105,7 @@ def point_samples(path: Path, s: Float[Tensor, "R N"]) -> Samples:
     return Samples.along(path, s, _edges_from_starts(s))
 
 
-def cone_samples(path: Path, edges: Float[Tensor, "R N+1"]) -> Samples:
+def cone_samples(path: Path, edges: Float[Tensor, "R E"]) -> Samples:
     """Samples that fill the intervals between ascending edges, placed at their middles."""
     return Samples.along(path, 0.5 * (edges[:, 1:] + edges[:, :-1]), edges)
 

@@ -6,7 +6,7 @@ import itertools
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import cast
+from typing import Generic, TypeVar, cast
 
 import torch
 from jaxtyping import Float
@@ -93,22 +93,25 @@ class RayDataModule(LightningDataModule):
             self._ahead = None
 
 
-class OneAhead:
+Made = TypeVar("Made")
+
+
+class OneAhead(Generic[Made]):
     """Has a thread make what is asked for next, on a core that waits. It makes the same as it would when it is asked.
 
     The thread keeps to one core, and kernels leave Python and Numba's threads to others (`kernels.compilation`).
     """
 
-    def __init__(self, make: Callable[[int], Batch]) -> None:
+    def __init__(self, make: Callable[[int], Made]) -> None:
         self._make = make
-        self._next: tuple[int, Future[Batch]] | None = None
+        self._next: tuple[int, Future[Made]] | None = None
         # PyTorch counts threads for each thread on its own, and gives the last count to those that begin.
         threads = torch.get_num_threads()
         self._thread = ThreadPoolExecutor(1, "paths", lambda: torch.set_num_threads(1))
         self._thread.submit(torch.get_num_threads).result()
         torch.set_num_threads(threads)
 
-    def __call__(self, step: int) -> Batch:
+    def __call__(self, step: int) -> Made:
         """The batch of a step; whatever goes wrong in the thread is raised here."""
         if self._next is None or self._next[0] != step:
             self._next = (step, self._thread.submit(self._without_gradients, step))
@@ -126,7 +129,7 @@ class OneAhead:
         """End the thread."""
         self._thread.shutdown(cancel_futures=True)
 
-    def _without_gradients(self, step: int) -> Batch:
+    def _without_gradients(self, step: int) -> Made:
         with torch.no_grad():
             return self._make(step)
 

@@ -116,7 +116,7 @@ def bake_sky(boundary: Boundary, device: torch.device) -> Baked:
     return Baked({"size": size}, {"sky": upper, "sky_exponent": rest})
 
 
-def cube_directions(size: int) -> Float[Tensor, "6*size*size 3"]:
+def cube_directions(size: int) -> Float[Tensor, "T 3"]:
     """Compute the unit directions of the texels of a cube map by face, row and column.
 
     The texels of a face are equally wide in angle: position (1, a, b) in [-1, 1] stands for the direction

@@ -152,7 +152,7 @@ class TrainedScene:
 
     def with_(
         self,
-        sky: str | Path | Float[Tensor, "H 2*H 3"] | None = None,
+        sky: str | Path | Float[Tensor, "H W 3"] | None = None,
         ior: float | Sequence[float] | Tensor | None = None,
         absorption: Sequence[float] | Tensor | None = None,
         glass: bool = True,

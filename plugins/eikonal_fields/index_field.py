@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -37,8 +39,8 @@ class IndexField(Medium):
     def __init__(
         self,
         mesh: str | None = None,
-        box_min: list[float] = (-1.0, -1.0, -1.0),  # type: ignore[assignment]
-        box_max: list[float] = (1.0, 1.0, 1.0),  # type: ignore[assignment]
+        box_min: Sequence[float] = (-1.0, -1.0, -1.0),
+        box_max: Sequence[float] = (1.0, 1.0, 1.0),
         margin: float = 0.1,
         width: int = 64,
         depth: int = 6,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 
 import torch
@@ -57,8 +57,8 @@ class EikonalFields(Renderer):
         components: Components,
         scene_share: float = 0.4,
         index_share: float = 0.4,
-        box_min: list[float] = (-1.0, -1.0, -1.0),  # type: ignore[assignment]
-        box_max: list[float] = (1.0, 1.0, 1.0),  # type: ignore[assignment]
+        box_min: Sequence[float] = (-1.0, -1.0, -1.0),
+        box_max: Sequence[float] = (1.0, 1.0, 1.0),
         resolution: int = 128,
         blur: float = 2.0,
         num_levels: int = 5,

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import torch
 
 from nerfro.errors import NerfroError
 from nerfro.losses.backdrop import Backdrop
-from nerfro.rendering import composite
+from nerfro.rendering import Scene, composite
 from nerfro.testing import example_batch, example_path
 from nerfro.types import Radiance, Samples
+
+SCENE = Mock(spec=Scene)
 
 WHITE = [1.0, 1.0, 1.0]
 
@@ -28,7 +31,7 @@ def learned_opacity(seen: torch.Tensor, loss: Backdrop, num_steps: int = 200) ->
         density = raw.exp().expand(8, 8)
         rendering = composite(samples, Radiance(density, torch.ones(8, 8, 3)), torch.ones(8, 3), path)
         error = (rendering.rgb - 1).square().mean()
-        total = error + loss.weight * loss([rendering], batch, None)  # type: ignore[arg-type]
+        total = error + loss.weight * loss([rendering], batch, SCENE)
         optimizer.zero_grad()
         total.backward()
         optimizer.step()

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import pytest
 import torch
 
 from nerfro.losses.distortion import Distortion, distortion
+from nerfro.rendering import Scene
 from nerfro.testing import example_batch
 from nerfro.types import Path, Rendering, Samples
+
+SCENE = Mock(spec=Scene)
 
 
 def random_intervals(num_rays: int, num_samples: int, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
@@ -63,7 +68,7 @@ def loss(weights: torch.Tensor, s: torch.Tensor, measure: torch.Tensor | None = 
     samples = Samples(positions, positions, s[:, :-1], s, torch.ones(5), measure=measure)
     colour = torch.zeros(5, 3)
     rendering = Rendering(colour, weights, 1 - weights.sum(-1), colour, samples, path)
-    return Distortion()([rendering], example_batch(len(colour)), None)  # type: ignore[arg-type]
+    return Distortion()([rendering], example_batch(len(colour)), SCENE)
 
 
 def test_loss_does_not_depend_on_the_scenes_scale_or_place() -> None:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import torch
 
 from nerfro.losses.nearby import Nearby
-from nerfro.rendering import composite
+from nerfro.rendering import Scene, composite
 from nerfro.testing import example_batch, example_path
 from nerfro.types import Path, Radiance, Rendering, Samples
+
+SCENE = Mock(spec=Scene)
 
 BATCH = example_batch(8)
 
@@ -39,7 +42,7 @@ def test_white_fog_before_white_clears_where_it_is_near_alone() -> None:
     optimizer, nearby = torch.optim.Adam([raw], lr=0.1), loss_around(path)
     for _ in range(200):
         rendering = white_fog(path, raw.exp())
-        loss = (1 - rendering.rgb).square().mean() + 0.1 * nearby([rendering], BATCH, None)  # type: ignore[arg-type]
+        loss = (1 - rendering.rgb).square().mean() + 0.1 * nearby([rendering], BATCH, SCENE)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -52,5 +55,5 @@ def test_a_wall_counts_by_how_near_it_is(interval: int, counts: float) -> None:
     path = first_camera(example_path(8))
     density = torch.zeros(8)
     density[interval] = 100.0
-    found = loss_around(path)([white_fog(path, density)], BATCH, None)  # type: ignore[arg-type]
+    found = loss_around(path)([white_fog(path, density)], BATCH, SCENE)
     assert float(found) == pytest.approx(counts, abs=1e-5)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import torch
 
 from nerfro.losses.opaque import Opaque
-from nerfro.rendering import composite
+from nerfro.rendering import Scene, composite
 from nerfro.testing import example_batch, example_path
 from nerfro.types import Radiance, Samples
+
+SCENE = Mock(spec=Scene)
 
 
 def learned_opacity(weight: float, num_steps: int = 200) -> float:
@@ -21,7 +25,7 @@ def learned_opacity(weight: float, num_steps: int = 200) -> float:
     for _ in range(num_steps):
         density = raw.exp().expand(8, 8)
         rendering = composite(samples, Radiance(density, torch.zeros(8, 8, 3)), torch.zeros(8, 3), path)
-        loss = rendering.rgb.square().mean() + weight * Opaque()([rendering], batch, None)  # type: ignore[arg-type]
+        loss = rendering.rgb.square().mean() + weight * Opaque()([rendering], batch, SCENE)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

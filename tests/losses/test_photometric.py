@@ -32,7 +32,9 @@ def rendering(colour: Tensor, background: Tensor, passed: Tensor) -> Rendering:
 def batch() -> Batch:
     """Three pixels of any colour."""
     rows = torch.arange(3)
-    return replace(example_batch(8), pixel=PIXEL, index=rows, view=0 * rows, rgb=torch.rand(3, 3))
+    return replace(
+        example_batch(8), pixel=PIXEL, index=rows, view=0 * rows, rgb=torch.rand(3, 3), teaches_background=rows >= 0
+    )
 
 
 def test_values_of_a_pixel_are_the_mean_over_its_rays_in_any_order() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ import torch
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.errors import NerfroError
 from nerfro.losses.total_variation import TotalVariation, direction_pairs
-from nerfro.rendering import ColourSpace
+from nerfro.rendering import ColourSpace, Scene
 from nerfro.testing import example_batch, example_draws
 
 BATCH = example_batch()
@@ -28,8 +28,8 @@ def test_pairs_are_the_angle_apart_and_uniform() -> None:
     torch.testing.assert_close((first * second).sum(-1), torch.full((20_000,), math.cos(0.3)), rtol=0, atol=1e-5)
 
 
-def scene(boundary) -> SimpleNamespace:
-    return SimpleNamespace(boundary=boundary, colour_space=ColourSpace.SRGB)
+def scene(boundary) -> Mock:
+    return Mock(spec=Scene, boundary=boundary, colour_space=ColourSpace.SRGB)
 
 
 def test_value_is_that_of_a_linear_sky() -> None:

@@ -8,19 +8,23 @@ import time
 import weakref
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
+from lightning.pytorch import Trainer
 
 from nerfro.data.blender import BlenderData
 from nerfro.data.pixel_store import PixelStore
 from nerfro.kernels import compilation
 from nerfro.media.sdf_grid import SdfGrid
+from nerfro.rendering import Renderer, Scene
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.snell import Snell
 from nerfro.training.data_module import OneAhead, RayDataModule, can_trace_ahead
+from nerfro.training.module import TrainingModule
+from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Rays
 from tests.pretended_gpu import GPU, PretendedGpu
 
@@ -151,7 +155,7 @@ def test_nothing_is_traced_ahead_where_paths_learn_or_python_is_needed(ball: Sdf
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1}, raising=False)
 
     def model(path_sampler, learns: bool = False) -> Any:
-        return SimpleNamespace(path_sampler=path_sampler, scene=SimpleNamespace(medium=ball), paths_learn=learns)
+        return Mock(spec=Renderer, path_sampler=path_sampler, scene=Mock(spec=Scene, medium=ball), paths_learn=learns)
 
     assert can_trace_ahead(model(Snell()))
     assert not can_trace_ahead(model(Snell(), learns=True))
@@ -168,14 +172,15 @@ def test_a_batch_is_made_when_its_step_begins_if_paths_learn(
     """Lightning fetches one step early, so what it fetches must not be the batch."""
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1}, raising=False)
     made: list[int] = []
-    batches: Any = SimpleNamespace(batch=lambda step: made.append(step) or step * 10)
+    batches: Any = Mock(spec=RayBatches, batch=lambda step: made.append(step) or step * 10)
     batches.to = lambda device, dtype: batches
     batches.forget = lambda: None
     data = RayDataModule(batches, None, 0)
-    renderer = SimpleNamespace(path_sampler=Snell(), scene=SimpleNamespace(medium=ball), paths_learn=learns)
-    module = SimpleNamespace(renderer=renderer, dtype=torch.float32)
-    strategy = SimpleNamespace(root_device=torch.device("cpu"))
-    data.trainer = SimpleNamespace(strategy=strategy, lightning_module=module, global_step=5, training=True)  # type: ignore[assignment]
+    scene = Mock(spec=Scene, medium=ball)
+    renderer = Mock(spec=Renderer, path_sampler=Snell(), scene=scene, paths_learn=learns)
+    module = Mock(spec=TrainingModule, renderer=renderer, dtype=torch.float32)
+    strategy = Mock(root_device=torch.device("cpu"))
+    data.trainer = Mock(spec=Trainer, strategy=strategy, lightning_module=module, global_step=5, training=True)  # type: ignore[assignment]
     steps = iter(data.train_dataloader())
     first, _second = next(steps), next(steps)
     assert not made

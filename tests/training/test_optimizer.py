@@ -5,10 +5,11 @@ from __future__ import annotations
 import itertools
 import math
 from datetime import timedelta
-from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
+from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Timer
 
 from nerfro.errors import NerfroError
@@ -45,7 +46,7 @@ def test_without_warm_up_the_first_step_has_the_full_rate() -> None:
 
 
 def run(step: int, max_steps: int, timer: Timer | None = None) -> Any:
-    return SimpleNamespace(global_step=step, max_steps=max_steps, callbacks=[] if timer is None else [timer])
+    return Mock(spec=Trainer, global_step=step, max_steps=max_steps, callbacks=[] if timer is None else [timer])
 
 
 class StoppedClock(Timer):

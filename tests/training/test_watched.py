@@ -7,8 +7,8 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
 from nerfro.light import to_srgb
 from nerfro.media.shapes import Ball
-from nerfro.rendering import ColourSpace
+from nerfro.rendering import ColourSpace, Renderer, Scene
 from nerfro.samplers.snell import Snell
 from nerfro.subdivision import Subdivision
 from nerfro.training.data_module import NO_PICTURE, RayDataModule, RotatingView, looks_every
@@ -153,8 +153,9 @@ def test_the_same_usable_pixels_are_watched_each_time(tiny_scene: Path) -> None:
 def bending() -> Any:
     """What is asked of a model that bends rays by a ball."""
     ball, sampler = Ball(0.6, 1.5), Snell()
-    return SimpleNamespace(
-        scene=SimpleNamespace(device=torch.device("cpu"), medium=ball, colour_space=ColourSpace.LINEAR),
+    return Mock(
+        spec=Renderer,
+        scene=Mock(spec=Scene, device=torch.device("cpu"), medium=ball, colour_space=ColourSpace.LINEAR),
         path_sampler=sampler,
         exit_directions=lambda rays: sampler.main(rays, ball).exit_directions,
     )
@@ -215,7 +216,7 @@ def test_looks_come_five_times_as_often_as_pictures(every: int, looks: int, tiny
     assert looks_every(every) == looks
     if not every:
         return
-    module = RayDataModule(None, BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val"), every)  # type: ignore[arg-type]
+    module = RayDataModule(Mock(spec=RayBatches), BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val"), every)
     shown = {}
     for step in range(looks, 10 * every + 1, looks):
         module.trainer = Steps(step)  # type: ignore[assignment]
