@@ -16,6 +16,7 @@ from lightning.pytorch.loggers import WandbLogger
 from lightning.pytorch.strategies import DDPStrategy
 from omegaconf import DictConfig, OmegaConf
 
+from nerfro.cli import warn
 from nerfro.errors import NerfroError
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.kernels.precision import fast_bfloat16
@@ -66,10 +67,12 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
     if config.trainer.get("strategy") == "ddp":
         # The index grid is a buffer and would be sent around in every step, though all processes have the same one.
         ours["strategy"] = DDPStrategy(broadcast_buffers=False, find_unused_parameters=False)
+    accelerator = training_accelerator(config.trainer.accelerator)
     limit = config.trainer.get("max_time")
     if isinstance(limit, (int, float)):
         raise NerfroError(f"trainer.max_time={limit} has no unit; write DD:HH:MM:SS, such as 00:00:05:00")
-    trainer = build({name: value for name, value in config.trainer.items() if value is not None}, **ours)
+    given = {name: value for name, value in config.trainer.items() if value is not None}
+    trainer = build(given | {"accelerator": accelerator}, **ours)
     if trainer.world_size > 1 and HydraConfig.get().mode == RunMode.MULTIRUN:
         raise NerfroError("a sweep (-m) cannot use several devices; start its runs one by one")
     if trainer.world_size > 1 and config.ckpt_path == "last" and not (folder / CONFIG_FILE).is_file():
@@ -79,12 +82,28 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
     return trainer
 
 
+def training_accelerator(name: str) -> str:
+    """Replace `auto` by `cpu`, because compiled kernels exist for CPUs alone, and report a GPU that stays unused.
+
+    Args:
+        name: `trainer.accelerator`.
+    """
+    if name != "auto":
+        return name
+    if torch.cuda.is_available() or torch.backends.mps.is_available():
+        warn(
+            "training uses the CPU, because nerfro has no GPU kernels and has not been tested on a GPU; "
+            "set trainer.accelerator=gpu to use the GPU nevertheless"
+        )
+    return "cpu"
+
+
 def lightning_precision(config: DictConfig) -> str:
     """`trainer.precision` as Lightning names it."""
     precision: str = config.trainer.precision
     if precision != "fastest":
         return precision
-    on_gpu = torch.cuda.is_available() and config.trainer.accelerator in ("auto", "gpu", "cuda")
+    on_gpu = torch.cuda.is_available() and config.trainer.accelerator in ("gpu", "cuda")
     return "bf16-mixed" if fast_bfloat16("cuda" if on_gpu else "cpu") else "32-true"
 
 
