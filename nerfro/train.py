@@ -63,8 +63,8 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     first = few.batch(0)
     require_reach(renderer, first)
     share, device = few.batch_size / batches.batch_size, trainer.strategy.root_device
+    memory = require_memory(renderer, first.rays, device, share, batches.pixel_bytes)
     del batches, few  # the data module moves the pixels to the training device
-    memory = require_memory(renderer, first.rays, device, share)
     if trainer.is_global_zero:
         begin(folder, config, renderer)
         print(memory, flush=True)

@@ -35,6 +35,11 @@ class PixelStore:
         moved._array = self._array if moved._levels.device == self._levels.device else None
         return moved
 
+    @property
+    def nbytes(self) -> int:
+        """Size of all colours in memory."""
+        return self._levels.nbytes
+
     def forget(self) -> None:
         """Release the memory of a memory-mapped store. The pages are read again on the next access."""
         if isinstance(self._array, np.memmap) and hasattr(mmap, "MADV_DONTNEED"):

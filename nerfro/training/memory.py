@@ -21,31 +21,55 @@ _STEP, _EVALUATION = 2.0, 0.5
 _LATER_BYTES = 250e6
 
 
-def require_memory(renderer: Renderer, rays: Rays, device: torch.device, share: float = 1.0) -> str:
-    """What a run will need at most, in one line.
+def require_memory(
+    renderer: Renderer, rays: Rays, device: torch.device, share: float = 1.0, pixel_bytes: int = 0
+) -> str:
+    """Estimate the peak memory of a run, and refuse a run that does not fit.
 
-    A few rays are rendered, and what autograd keeps of them is counted: it grows with rays, and is most of what does.
-    The rays are this `share` of a step's.
+    A few rays are rendered on the device, and the bytes that autograd keeps of them are counted. They grow with the
+    number of rays and dominate the total.
+
+    Args:
+        renderer: moved to `device`, because the implementations for different devices keep different tensors.
+        rays: of a part of a training batch.
+        device: that training uses.
+        share: of a batch's rays that `rays` are.
+        pixel_bytes: size of the training pixels, which are copied to a GPU. On the CPU they are already in memory.
+
+    Returns:
+        The estimate in one line.
+
+    Raises:
+        NerfroError: the run needs more memory than is free.
     """
-    probed = rays[:: max(len(rays) // _PROBED_RAYS, 1)]
+    renderer.to(device)
+    probed = rays[:: max(len(rays) // _PROBED_RAYS, 1)].to(device)
     kept = _kept_bytes(renderer, probed)
-    state = sum(tensor.nbytes for tensor in renderer.state_dict().values())
     learned = sum(p.nbytes for p in renderer.parameters() if p.requires_grad)
-    # Gradients and Adam's two moments beside the weights.
     num_rays = len(rays) / share
-    needed: float = 3 * learned + kept * max(_STEP * num_rays, _EVALUATION * renderer.chunk_size)
+    # Gradients and Adam's two moments beside the weights.
+    step = 3 * learned + kept * max(_STEP * num_rays, _EVALUATION * renderer.chunk_size)
+    # A checkpoint is built in main memory before it is written: the state, and the moments.
+    host = _LATER_BYTES + sum(tensor.nbytes for tensor in renderer.state_dict().values()) + 2 * learned
+    per_ray = f"{kept / 1e3:.0f} kB"
+    advice = f"{per_ray} are for each ray: take a smaller batches.size or evaluation.chunk_size"
     if device.type == "cuda":
-        needed, there = needed + state, float(torch.cuda.mem_get_info(device)[0])
+        _require(host, available_bytes(), "main", "use a machine with more memory")
+        needed, free = step + pixel_bytes, float(torch.cuda.mem_get_info(device)[0])
     else:
         resident = number_in(Path("/proc/self/status"), r"VmRSS:\s+(\d+)", 1024)
-        needed, there = needed + resident + _LATER_BYTES, available_bytes() + resident
-    if needed > there:
+        needed, free = step + host + resident, available_bytes() + resident
+    _require(needed, free, device.type, advice)
+    of = "" if free == math.inf else f" of {free / 1e9:.1f} GB that are free"
+    return f"memory: about {needed / 1e9:.1f} GB{of}, {per_ray} of it for each of {num_rays:.0f} rays a step"
+
+
+def _require(needed: float, free: float, where: str, advice: str) -> None:
+    if needed > free:
         raise NerfroError(
-            f"the run needs about {needed / 1e9:.1f} GB of {device.type} memory and {max(there, 0) / 1e9:.1f} GB are "
-            f"free; {kept / 1e3:.0f} kB are for each ray: take a smaller batches.size or evaluation.chunk_size"
+            f"the run needs about {needed / 1e9:.1f} GB of {where} memory and {max(free, 0) / 1e9:.1f} GB are free; "
+            f"{advice}"
         )
-    of = "" if there == math.inf else f" of {there / 1e9:.1f} GB that are free"
-    return f"memory: about {needed / 1e9:.1f} GB{of}, {kept / 1e3:.0f} kB of it for each of {num_rays:.0f} rays a step"
 
 
 def _kept_bytes(renderer: Renderer, rays: Rays) -> float:

@@ -85,6 +85,11 @@ class RayBatches:
         moved._cameras, moved._pixels = self._cameras.to(device, dtype), self._pixels.to(device)
         return moved
 
+    @property
+    def pixel_bytes(self) -> int:
+        """Size of the colours of all training pixels in memory."""
+        return self._pixels.nbytes
+
     def traced(
         self, trace: Trace, trace_exits: TraceExits | None = None, subdivision: Subdivision | None = None
     ) -> RayBatches:

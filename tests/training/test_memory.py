@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,7 @@ from nerfro.samplers.stratified import Stratified
 from nerfro.testing import example_rays
 from nerfro.training import memory
 from nerfro.training.memory import require_memory
+from tests.pretended_gpu import GPU, OnGpu, PretendedGpu
 
 
 def model_of(width: int) -> Renderer:
@@ -82,3 +84,35 @@ def test_share_of_a_steps_rays_stands_for_all(monkeypatch: pytest.MonkeyPatch) -
     assert f"each of {100 * len(rays)} rays a step" in line
     with pytest.raises(NerfroError, match="needs about"):
         require_memory(model, rays, device, share=1e-9)
+
+
+def needed_gigabytes(model: NerfModel, monkeypatch: pytest.MonkeyPatch) -> float:
+    monkeypatch.setattr(memory, "available_bytes", lambda: -1e12)
+    with pytest.raises(NerfroError) as refused:
+        require_memory(model, example_rays(), torch.device("cpu"))
+    return float(re.search(r"about ([\d.]+) GB", str(refused.value))[1])  # type: ignore[index]
+
+
+def test_checkpoint_is_counted_with_weights_gradients_and_moments(monkeypatch: pytest.MonkeyPatch) -> None:
+    small = needed_gigabytes(model_of(16), monkeypatch)
+    model = model_of(2048)
+    weights = sum(parameter.nbytes for parameter in model.parameters())
+    # Weights, gradients and two moments, and the checkpoint, which holds all but the gradients.
+    assert needed_gigabytes(model, monkeypatch) - small > 6.5 * weights / 1e9
+
+
+def test_memory_of_a_gpu_is_estimated_there_and_holds_the_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, free = model_of(16), 1e9
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, free))
+    with PretendedGpu():
+        assert "memory: about 0.0 GB of 1.0 GB" in require_memory(model, example_rays(), GPU)
+        with pytest.raises(NerfroError, match=r"needs about 2\.\d GB of cuda memory and 1\.0 GB are free"):
+            require_memory(model, example_rays(), GPU, pixel_bytes=int(2e9))
+    assert all(isinstance(parameter, OnGpu) for parameter in model.parameters())
+
+
+def test_gpu_training_needs_main_memory_for_the_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1e12, 1e12))
+    monkeypatch.setattr(memory, "available_bytes", lambda: 1e8)
+    with PretendedGpu(), pytest.raises(NerfroError, match="GB of main memory"):
+        require_memory(model_of(16), example_rays(), GPU)
