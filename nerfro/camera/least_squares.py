@@ -93,7 +93,8 @@ def with_priors(
         priors: priors of the parameters.
     """
     for prior in priors:
-        information = (variance * prior.information).to(matrix)
+        # Checkpoints are read to the CPU.
+        information = variance * prior.information.to(matrix)
         matrix = matrix + information
-        vector = vector + information @ (numbers - prior.numbers).to(vector)
+        vector = vector + information @ (numbers - prior.numbers.to(numbers)).to(vector)
     return matrix, vector

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -13,10 +14,14 @@ from benchmarks.cameras import disturbed
 from nerfro.camera.gauss_newton import Step, gauss_newton_step, informative_pixels
 from nerfro.camera.refined import RefinedCamera
 from nerfro.camera.similarity import motion_between
+from nerfro.data.base import Views
 from nerfro.light import to_srgb
 from nerfro.rays import Rays
 from nerfro.samplers.snell import Snell
+from nerfro.training.camera_steps import CameraSteps
+from nerfro.training.ray_batches import RayBatches
 from tests.ball_photographs import NUM_VIEWS, SIZE, cameras, sky, solid
+from tests.pretended_gpu import GPU, PretendedGpu
 
 MEDIUM = solid([1.45])
 
@@ -93,3 +98,19 @@ def test_pixels_with_contrast_are_looked_at_first() -> None:
     assert chosen.shape == (50 * NUM_VIEWS,)
     assert (chosen.view(NUM_VIEWS, 50) // SIZE**2 == torch.arange(NUM_VIEWS)[:, None]).all()
     assert float((chosen % SIZE >= SIZE // 2 - 1).float().mean()) > 0.95
+
+
+def test_a_resumed_step_on_a_gpu_uses_what_the_checkpoint_holds_on_the_cpu() -> None:
+    """A camera whose prior is certain stays."""
+    camera = RefinedCamera(hold_world=False)
+    camera.begin(TRUE)
+    size = camera.numbers().numel()
+    steps = CameraSteps(Mock(spec=RayBatches), Mock(spec=Views))
+    steps.load_state_dict({"panorama": {"numbers": torch.zeros(size), "information": 1e12 * torch.eye(size).double()}})
+    with PretendedGpu():
+        camera, given = camera.to(GPU), TRUE.to(GPU)
+        pixels, pictures = looked_at(0, 20).to(GPU), 1 - PHOTOGRAPHS.to(GPU)
+        sky_alone = lambda rays, view: to_srgb(sky(rays.directions))  # noqa: E731
+        how = Step(reach=0.5, scale=10.0, longest=0.25, checked=False)
+        improve(camera, given, pixels, lambda chosen: pictures[chosen], sky_alone, how, list(steps._told.values()))
+        assert float(camera.motions.motion.abs().max()) < 1e-4
