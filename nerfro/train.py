@@ -55,7 +55,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     require_same_run(folder, checkpoint, config)
     throughput, interruption = Throughput(), StopOnSignal()
     # Cameras move by sky and outlines before the sky is learned.
-    cameras, boundary = CameraSteps(training), BoundaryFirst(config.optimizer.boundary_steps)
+    cameras, boundary = CameraSteps(training), BoundaryFirst(config.optimizer.boundary_steps, interruption)
     trainer = make_trainer(config, folder, throughput, [interruption, cameras, boundary, Viewer(config, source, test)])
     batches = traced(batches.share(trainer.global_rank, trainer.world_size), renderer, config)
     datamodule = RayDataModule(batches, validation, config.evaluation.every)

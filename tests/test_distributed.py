@@ -7,16 +7,20 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
+from datetime import timedelta
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
+from lightning.pytorch import LightningModule, Trainer
 
-from nerfro.training.callbacks import StopOnSignal
+from nerfro.training.callbacks import Checkpoints, SharedTimer, StopOnSignal
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
+from nerfro.types import Batch
 
 # Gradients are sums in another order, so they differ in their last bits. Adam divides them by their size, and would
 # make whole steps of what rounding has left of zero.
@@ -205,10 +209,46 @@ def test_a_signal_is_not_lost_while_the_processes_agree() -> None:
         callback._signalled = True
         return decision
 
-    trainer: Any = SimpleNamespace(strategy=SimpleNamespace(reduce_boolean_decision=agree), should_stop=False)
-    arguments: Any = (trainer, None, None, None, 0)
-    callback.on_train_batch_end(*arguments)
+    trainer: Any = Mock(spec=Trainer, strategy=Mock(reduce_boolean_decision=agree), should_stop=False, world_size=1)
+    callback.stop(trainer)
     assert not callback.received
-    callback.on_train_batch_end(*arguments)
+    callback.stop(trainer)
     assert callback.received
+    assert trainer.should_stop
+
+
+class Others:
+    """A strategy of several processes that counts exchanges."""
+
+    num_exchanges = 0
+
+    def reduce_boolean_decision(self, decision: bool, all: bool) -> bool:
+        self.num_exchanges += 1
+        return decision
+
+    def broadcast(self, value: Any) -> Any:
+        self.num_exchanges += 1
+        return value
+
+
+def test_several_processes_exchange_a_few_times_a_second_and_not_at_each_step(tmp_path: Path) -> None:
+    others, interruption, timer = Others(), StopOnSignal(), SharedTimer(timedelta(seconds=1000))
+    checkpoints = Checkpoints(dirpath=tmp_path, train_time_interval=timedelta(seconds=1000))
+    trainer: Any = Mock(spec=Trainer, strategy=others, should_stop=False, world_size=2, fast_dev_run=False)
+    trainer.state, trainer.sanity_checking, trainer.global_step = Mock(fn="fit"), False, 1
+    timer.on_train_start(trainer, Mock(spec=LightningModule))
+    begun = time.perf_counter()
+    for step in range(1000):
+        time.sleep(2e-4)
+        elapsed = timer.time_elapsed()
+        for callback in (interruption, timer, checkpoints):
+            callback.on_train_batch_end(trainer, Mock(spec=LightningModule), None, Mock(spec=Batch), step)
+    spent = time.perf_counter() - begun
+    assert others.num_exchanges < 60 + 30 * spent
+    assert 0 < elapsed <= spent
+    # Within a second of a signal, training ends.
+    interruption._signalled, begun = True, time.perf_counter()
+    while not interruption.stop(trainer):
+        time.sleep(2e-4)
+    assert time.perf_counter() - begun < 1
     assert trainer.should_stop

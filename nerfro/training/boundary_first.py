@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from lightning.pytorch import Callback, LightningModule, Trainer
@@ -10,6 +12,7 @@ from torch import Tensor
 from nerfro.fields.base import Field
 from nerfro.progress import track
 from nerfro.rendering import Renderer
+from nerfro.training.callbacks import StopOnSignal
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Exits
@@ -26,15 +29,22 @@ class BoundaryFirst(Callback):
     """Lets the boundary learn, for some steps, from rays that miss the boxes of content and object.
 
     Their pixels cost one look-up each and no tracing, and a sky that is known lets the first gradients of the field be
-    about the object. The run's own optimiser does it, so that the boundary's moments are warm as well. A run that goes
-    on from a checkpoint has it behind it.
+    about the object. The run's own optimiser does it, so that the boundary's moments are warm as well.
 
     Args:
-        num_steps: how many.
+        num_steps: number of steps.
+        interruption: ends these steps as well; a resumed run takes the others.
     """
 
-    def __init__(self, num_steps: int) -> None:
-        self._num_steps = num_steps
+    def __init__(self, num_steps: int, interruption: StopOnSignal) -> None:
+        self._num_steps, self._interruption = num_steps, interruption
+        self._num_done = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"num_done": self._num_done}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self._num_done = state_dict["num_done"]
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, TrainingModule)
@@ -50,7 +60,9 @@ class BoundaryFirst(Callback):
         first, last = _RATES
         batches: RayBatches = trainer.datamodule.batches  # type: ignore[attr-defined]
         num_pixels = min(_NUM_PIXELS, int(_SHARE * batches.num_pixels))
-        for step in track("boundary", range(self._num_steps)):
+        for step in track("boundary", range(self._num_done, self._num_steps)):
+            if self._interruption.stop(trainer):
+                break
             rays, view, rgb = batches.missing(box, num_pixels, step, scene.camera)
             if len(rays) < _FEWEST:
                 break
@@ -63,6 +75,7 @@ class BoundaryFirst(Callback):
             for parameter, gradient in zip(learning, gradients, strict=True):
                 parameter.grad = gradient
             optimizer.step()
+            self._num_done = step + 1
         optimizer.zero_grad()
 
 

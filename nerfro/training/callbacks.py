@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import signal
 import time
+from datetime import timedelta
 from types import FrameType
 from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import ProgressBar
+from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar, Timer
+from lightning.pytorch.trainer.states import RunningStage
 from tqdm import tqdm
 
 from nerfro.training.module import training_progress
@@ -113,10 +115,84 @@ class TrainingProgress(ProgressBar):
             self._bar.close()
 
 
+class Agreements:
+    """Choose the steps, about half a second apart, at which several processes exchange what only one of them knows.
+
+    An exchange makes each process wait for its device and for the other processes. One process needs no exchange, and
+    may ask at every step.
+    """
+
+    _SECONDS, _MOST_STEPS = 0.5, 1000
+
+    def __init__(self) -> None:
+        self._step = self._next = 0
+        self._last: tuple[int, float] | None = None
+
+    def due(self, trainer: Trainer) -> bool:
+        """Count a step, and tell whether processes agree at this one; all of them get the same answer."""
+        if trainer.world_size == 1:
+            return True
+        self._step += 1
+        if self._step < self._next:
+            return False
+        num_steps, now = 1, time.perf_counter()
+        if self._last is not None:
+            step, before = self._last
+            num_steps = int(self._SECONDS * (self._step - step) / max(now - before, 1e-6))
+        self._last = self._step, now
+        wanted = self._step + min(max(num_steps, 1), self._MOST_STEPS)
+        self._next = trainer.strategy.broadcast(wanted)
+        return True
+
+
+class SharedTimer(Timer):
+    """Lightning's timer, with one time for all processes.
+
+    The time of the first process is taken over at each agreement. All learning rates and the end of training depend on
+    it, and parameters of processes with different times would drift apart.
+    """
+
+    state_key = "Timer"  # type: ignore[assignment]  # as Lightning's in checkpoints
+
+    def __init__(self, duration: timedelta) -> None:
+        super().__init__(duration)
+        self._agreements = Agreements()
+        self._elapsed: float | None = None  # where several processes share one
+
+    def time_elapsed(self, stage: str = RunningStage.TRAINING) -> float:
+        if stage != RunningStage.TRAINING or self._elapsed is None:
+            return super().time_elapsed(stage)
+        return self._elapsed
+
+    def on_train_batch_end(self, trainer: Trainer, *args: Any, **kwargs: Any) -> None:
+        if not self._agreements.due(trainer):
+            return
+        if trainer.world_size > 1:
+            self._elapsed = trainer.strategy.broadcast(super().time_elapsed())
+        super().on_train_batch_end(trainer, *args, **kwargs)
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        super().on_train_start(trainer, pl_module)
+        if trainer.world_size > 1:
+            self._elapsed = trainer.strategy.broadcast(super().time_elapsed())
+
+
+class Checkpoints(ModelCheckpoint):
+    """Lightning's checkpoints, for which several processes look at the clock together now and then."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._agreements = Agreements()
+
+    def on_train_batch_end(self, trainer: Trainer, *args: Any, **kwargs: Any) -> None:
+        if self._train_time_interval is None or self._agreements.due(trainer):
+            super().on_train_batch_end(trainer, *args, **kwargs)
+
+
 class StopOnSignal(Callback):
     """Ends training after the current step on Ctrl-C or SIGTERM, so that it can be saved whole and resumed.
 
-    Several processes end together, whichever of them the signal reached.
+    Several processes end together, within about half a second, whichever of them the signal reached.
 
     Attributes:
         received: whether that happened.
@@ -124,6 +200,7 @@ class StopOnSignal(Callback):
 
     def __init__(self) -> None:
         self.received = self._signalled = False
+        self._agreements = Agreements()
         self._previous: dict[signal.Signals, Any] = {}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -139,8 +216,13 @@ class StopOnSignal(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
     ) -> None:
-        if trainer.strategy.reduce_boolean_decision(self._signalled, all=False):
+        self.stop(trainer)
+
+    def stop(self, trainer: Trainer) -> bool:
+        """End training if a signal has arrived; tell whether it ends. Every process asks at the same steps."""
+        if self._agreements.due(trainer) and trainer.strategy.reduce_boolean_decision(self._signalled, all=False):
             self.received = trainer.should_stop = True
+        return self.received
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._restore()

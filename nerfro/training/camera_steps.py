@@ -43,24 +43,27 @@ class CameraSteps(Callback):
 
     def __init__(self, views: Views) -> None:
         self._views = views
-        self._told: dict[str, PriorInformation] = {}  # by what
+        self._priors: dict[str, PriorInformation] = {}  # by source
+        self._aligned = False  # by sky and outlines; a run that resumes at step 0 does not repeat the alignment
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, TrainingModule)
         scene, box = pl_module.scene, occupied(pl_module.renderer)
         camera = scene.camera
-        if trainer.global_step > 0 or box is None or not isinstance(camera, RefinedCamera):
+        if trainer.global_step > 0 or self._aligned or box is None or not isinstance(camera, RefinedCamera):
             return
         batches = cast(RayDataModule, trainer.datamodule).batches  # type: ignore[attr-defined]
         panorama = align(camera, batches.cameras, batches.photographed, lambda rays: misses(box, rays))
         known = {"panorama": panorama, "outlines": meet_masks(camera, self._views, scene.medium, panorama)}
-        self._told = {name: told for name, told in known.items() if told is not None}
+        self._priors = {name: prior for name, prior in known.items() if prior is not None}
+        self._aligned = True
 
     def state_dict(self) -> dict[str, Any]:
-        return {name: dict(vars(told)) for name, told in self._told.items()}
+        return {"aligned": self._aligned, "priors": {name: dict(vars(prior)) for name, prior in self._priors.items()}}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._told = {name: PriorInformation(**told) for name, told in state_dict.items()}
+        self._aligned = state_dict["aligned"]
+        self._priors = {name: PriorInformation(**prior) for name, prior in state_dict["priors"].items()}
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
         assert isinstance(pl_module, TrainingModule)
@@ -73,7 +76,7 @@ class CameraSteps(Callback):
         reach = max(_LEAST_REACH, _FIRST_REACH * _SHRINKING**before)
         # Not asked whether errors fall: every camera has painted its own ghost, which holds it where it is.
         how = Step(reach, _SCALE * reach, _LONGEST, fraction=min(1.0, _WHOLE / (before + 1)), keep_improvements=False)
-        _move(pl_module.renderer, camera, data.batches, step, how, self._told)
+        _move(pl_module.renderer, camera, data.batches, step, how, self._priors)
 
 
 @torch.no_grad()
@@ -83,7 +86,7 @@ def _move(
     batches: RayBatches,
     step: int,
     how: Step,
-    told: dict[str, PriorInformation],
+    priors: dict[str, PriorInformation],
 ) -> None:
     """A step of all cameras by pixels with contrast, drawn anew for each training step.
 
@@ -92,7 +95,7 @@ def _move(
     box = occupied(renderer)
     candidates = batches.of_each_view(_DRAWN * camera.num_pixels, step)
     past = None
-    if "panorama" in told and box is not None:
+    if "panorama" in priors and box is not None:
         view = candidates.flatten() // (batches.cameras.height * batches.cameras.width)
         past = misses(box, camera(pixel_rays(batches.cameras, candidates.flatten()), view)).view(candidates.shape)
     pixels = informative_pixels(candidates, camera.num_pixels, batches.photographed, batches.cameras, past)
@@ -100,4 +103,4 @@ def _move(
     def shown(rays: Rays, view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
         return renderer.scene.colour_space.to_display(renderer.radiance(rays), camera.gains(view))
 
-    gauss_newton_step(camera, batches.cameras, pixels, batches.photographed, shown, how, list(told.values()))
+    gauss_newton_step(camera, batches.cameras, pixels, batches.photographed, shown, how, list(priors.values()))

@@ -80,9 +80,8 @@ class TrainingModule(LightningModule):
     def on_train_batch_start(self, batch: Batch, batch_index: int) -> None:
         every: int = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
         self._is_logged_step = (self.global_step + 1) % every == 0
-        # Under a time limit every process has its own idea of it, and parameters would drift apart at different rates.
-        progress = self.trainer.strategy.broadcast(training_progress(self.trainer))
-        factor = learning_rate_factor(self.global_step, self.renderer.begin_step(progress), self.optimizer_config)
+        progress = self.renderer.begin_step(training_progress(self.trainer))
+        factor = learning_rate_factor(self.global_step, progress, self.optimizer_config)
         for group in self.trainer.optimizers[0].param_groups:
             waits = self.global_step < self.optimizer_config.start(group["name"])
             group["lr"] = 0.0 if waits else group["initial_lr"] * factor

@@ -11,7 +11,7 @@ import lightning.pytorch as pl
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, Timer
 from lightning.pytorch.loggers import WandbLogger
 from lightning.pytorch.strategies import DDPStrategy
 from omegaconf import DictConfig, OmegaConf
@@ -21,7 +21,7 @@ from nerfro.errors import NerfroError
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.kernels.precision import fast_bfloat16
 from nerfro.registry import build
-from nerfro.training.callbacks import ConfigInCheckpoint, Throughput, TrainingProgress
+from nerfro.training.callbacks import Checkpoints, ConfigInCheckpoint, SharedTimer, Throughput, TrainingProgress
 from nerfro.training.checkpoint_files import CheckpointFiles
 from nerfro.training.data_module import looks_every
 from nerfro.training.log import TrainingLog
@@ -34,7 +34,7 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
     if (config.checkpoint.every_seconds is None) == (config.checkpoint.every_steps is None):
         raise NerfroError("set one of checkpoint.every_seconds and checkpoint.every_steps, and the other to null")
     seconds, every = config.checkpoint.every_seconds, config.evaluation.every
-    checkpoints = ModelCheckpoint(
+    checkpoints = Checkpoints(
         dirpath=folder / LAST_CHECKPOINT.parent,
         filename=LAST_CHECKPOINT.stem,
         every_n_train_steps=config.checkpoint.every_steps,
@@ -73,6 +73,7 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
         raise NerfroError(f"trainer.max_time={limit} has no unit; write DD:HH:MM:SS, such as 00:00:05:00")
     given = {name: value for name, value in config.trainer.items() if value is not None}
     trainer = build(given | {"accelerator": accelerator}, **ours)
+    trainer.callbacks = [_shared(callback) for callback in trainer.callbacks]
     if trainer.world_size > 1 and HydraConfig.get().mode == RunMode.MULTIRUN:
         raise NerfroError("a sweep (-m) cannot use several devices; start its runs one by one")
     if trainer.world_size > 1 and config.ckpt_path == "last" and not (folder / CONFIG_FILE).is_file():
@@ -80,6 +81,15 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
     if limit is None and trainer.max_steps < 0:
         raise NerfroError("the run would never end; set trainer.max_time (DD:HH:MM:SS), trainer.max_steps, or both")
     return trainer
+
+
+def _shared(callback: Callback) -> Callback:
+    """Replace Lightning's timer of `max_time`."""
+    if type(callback) is not Timer:
+        return callback
+    remaining = callback.time_remaining()
+    assert remaining is not None
+    return SharedTimer(timedelta(seconds=remaining))
 
 
 def training_accelerator(name: str) -> str:

@@ -19,7 +19,6 @@ from nerfro.light import to_srgb
 from nerfro.rays import Rays
 from nerfro.samplers.snell import Snell
 from nerfro.training.camera_steps import CameraSteps
-from nerfro.training.ray_batches import RayBatches
 from tests.ball_photographs import NUM_VIEWS, SIZE, cameras, sky, solid
 from tests.pretended_gpu import GPU, PretendedGpu
 
@@ -102,15 +101,17 @@ def test_pixels_with_contrast_are_looked_at_first() -> None:
 
 def test_a_resumed_step_on_a_gpu_uses_what_the_checkpoint_holds_on_the_cpu() -> None:
     """A camera whose prior is certain stays."""
-    camera = RefinedCamera(hold_world=False)
+    camera = RefinedCamera(fix_gauge=False)
     camera.begin(TRUE)
     size = camera.numbers().numel()
-    steps = CameraSteps(Mock(spec=RayBatches), Mock(spec=Views))
-    steps.load_state_dict({"panorama": {"numbers": torch.zeros(size), "information": 1e12 * torch.eye(size).double()}})
+    steps = CameraSteps(Mock(spec=Views))
+    prior = {"numbers": torch.zeros(size), "information": 1e12 * torch.eye(size).double()}
+    steps.load_state_dict({"aligned": True, "priors": {"panorama": prior}})
     with PretendedGpu():
         camera, given = camera.to(GPU), TRUE.to(GPU)
         pixels, pictures = looked_at(0, 20).to(GPU), 1 - PHOTOGRAPHS.to(GPU)
         sky_alone = lambda rays, view: to_srgb(sky(rays.directions))  # noqa: E731
-        how = Step(reach=0.5, scale=10.0, longest=0.25, checked=False)
-        improve(camera, given, pixels, lambda chosen: pictures[chosen], sky_alone, how, list(steps._told.values()))
+        step = Step(difference_pixels=0.5, scale=10.0, max_pixels=0.25, keep_improvements=False)
+        priors = list(steps._priors.values())
+        gauss_newton_step(camera, given, pixels, lambda chosen: pictures[chosen], sky_alone, step, priors)
         assert float(camera.motions.motion.abs().max()) < 1e-4

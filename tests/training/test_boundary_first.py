@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,7 +30,7 @@ def weights(
 
     def run(name: str, *overrides: str) -> dict[str, Tensor]:
         finished = train_here(*tiny_default_run, *still, f"{FOLDER}={tmp_path / name}", *overrides)
-        assert finished.code == 0, finished.err
+        assert finished.code == 0, finished.out + finished.err
         return load_checkpoint(tmp_path / name / LAST_CHECKPOINT)[0]["state_dict"]
 
     return run
@@ -66,3 +68,24 @@ def test_rays_that_miss_a_box_have_their_own_colours(tiny_scene: Path) -> None:
     again, others = (batches.missing(box, 500, step)[0] for step in (0, 1))
     assert torch.equal(again.directions, rays.directions)
     assert len(others) != len(rays) or not torch.equal(others.directions, rays.directions)
+
+
+def test_a_signal_ends_these_steps_and_a_resumed_run_takes_the_others(
+    weights: Callable[..., dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    options, drawn, missing = ("optimizer.boundary_steps=20", "trainer.max_steps=2"), [], RayBatches.missing
+
+    def signalled(self: RayBatches, *given: Any) -> Any:
+        drawn.append(given[2])
+        if drawn[-1] == 7:
+            os.kill(os.getpid(), signal.SIGINT)
+        return missing(self, *given)
+
+    undisturbed = weights("undisturbed", *options)
+    with monkeypatch.context() as context:
+        context.setattr(RayBatches, "missing", signalled)
+        with pytest.raises(AssertionError, match="interrupted after step 0 and saved"):
+            weights("run", *options)
+    assert drawn == list(range(8))
+    resumed = weights("run", *options, "ckpt_path=last")
+    assert all(torch.equal(value, undisturbed[name]) for name, value in resumed.items())

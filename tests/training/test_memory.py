@@ -86,7 +86,7 @@ def test_share_of_a_steps_rays_stands_for_all(monkeypatch: pytest.MonkeyPatch) -
         require_memory(model, rays, device, share=1e-9)
 
 
-def needed_gigabytes(model: NerfModel, monkeypatch: pytest.MonkeyPatch) -> float:
+def needed_gigabytes(model: Renderer, monkeypatch: pytest.MonkeyPatch) -> float:
     monkeypatch.setattr(memory, "available_bytes", lambda: -1e12)
     with pytest.raises(NerfroError) as refused:
         require_memory(model, example_rays(), torch.device("cpu"))
