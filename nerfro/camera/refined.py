@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -184,7 +184,7 @@ class RefinedCamera(Camera):
         motion = self.motions.motion.flatten()
         return motion if self.lens is None else torch.cat([motion, self.lens])
 
-    def split(self, numbers: Float[Tensor, "N"]) -> tuple[Float[Tensor, "V 6"], Float[Tensor, "L"]]:
+    def split(self, numbers: Shaped[Tensor, "N"]) -> tuple[Shaped[Tensor, "V 6"], Shaped[Tensor, "L"]]:
         """Split such parameters into motions of the cameras and lens."""
         num = self.motions.motion.numel()
         return numbers[:num].view(-1, 6), numbers[num:]

@@ -95,7 +95,7 @@ class LpipsNetwork(nn.Module):
     shift: Tensor
     scale: Tensor
 
-    def __init__(self, backbone: Backbone, weights: dict[str, Tensor], heads: Sequence[Float[Tensor, "C"]]) -> None:
+    def __init__(self, backbone: Backbone, weights: dict[str, Tensor], heads: Sequence[Float[Tensor, "..."]]) -> None:
         """Create the network.
 
         Args:
@@ -157,7 +157,7 @@ class LpipsNetwork(nn.Module):
             )
         self.register_buffer(name, weights[key].detach().float().clone(), persistent=False)
 
-    def _layer_distances(self, prediction: Tensor, target: Tensor) -> list[Float[Tensor, "1 1 h w"]]:
+    def _layer_distances(self, prediction: Tensor, target: Tensor) -> list[Float[Tensor, "1 1 _ _"]]:
         size = self.backbone.min_size
         if min(prediction.shape[:2]) < size:
             raise NerfroError(
@@ -171,7 +171,7 @@ class LpipsNetwork(nn.Module):
                 for i, (f, g) in enumerate(pairs)
             ]
 
-    def _features(self, rgb: Float[Tensor, "H W 3"]) -> list[Float[Tensor, "1 C h w"]]:
+    def _features(self, rgb: Float[Tensor, "H W 3"]) -> list[Float[Tensor, "1 _ _ _"]]:
         x = (2 * rgb.float().permute(2, 0, 1)[None] - 1 - self.shift) / self.scale
         features = []
         for i, layer in enumerate(self.backbone.layers):

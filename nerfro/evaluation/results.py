@@ -184,7 +184,7 @@ def _views(rows: list[Any]) -> tuple[ViewScores, ...]:
     )
 
 
-def _scores(row: Mapping[str, Score]) -> dict[str, Score]:
+def _scores(row: Mapping[str, Any]) -> dict[str, Score]:
     return {metric.name: _number(row.get(metric.name)) for metric in METRICS}
 
 

@@ -36,7 +36,7 @@ def fit(image: Float[Tensor, "h w 3"] | None, width: int, height: int) -> Image.
 
 
 def sheet(
-    images: Sequence[Float[Tensor, "h w 3"]], captions: Sequence[str], width: int, columns: int, title: str = ""
+    images: Sequence[Float[Tensor, "_ _ 3"]], captions: Sequence[str], width: int, columns: int, title: str = ""
 ) -> Image.Image:
     """Draw sRGB images `width` pixels wide in rows of at most `columns`, with captions below and a title on top."""
     columns, height = min(columns, len(images)), round(width * images[0].shape[0] / images[0].shape[1])

@@ -186,6 +186,7 @@ def test_cameras_move_by_sky_and_masks_before_training_and_what_these_told_is_ke
     assert bool((without.motions.motion[:, :3] != 0).all())
     assert not bool(without.motions.motion[:, 3:].any())
     assert bool((with_masks.motions.motion != 0).all())
+    kept = [state["told"] for state in kept]
     assert list(kept[0]) == ["panorama"]
     assert list(kept[1]) == ["panorama", "outlines"]
     for told, camera in ((kept[0]["panorama"], without), (kept[1]["outlines"], with_masks)):

@@ -34,6 +34,7 @@ def test_scale_is_fixed_and_not_fitted_to_the_values() -> None:
     assert torch.equal(magma(large, 0.05)[0, 2], magma(torch.tensor([[0.05]]), 0.05)[0, 0])
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_impossible_maps_are_refused() -> None:
     with pytest.raises(NerfroError, match="limit=0 of a colour scale"):
         magma(torch.zeros(2, 2), 0)
@@ -50,6 +51,7 @@ class Difference(torch.nn.Module):
         return (prediction - target).abs().mean(-1)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_means_of_the_maps_are_the_metrics() -> None:
     prediction, target = torch.rand(2, 40, 36, 3, generator=torch.Generator().manual_seed(0))
     maps = {error.name: error for error in error_maps(prediction, target, {"lpips": Difference()})}
@@ -71,6 +73,7 @@ def test_border_without_a_window_has_no_similarity_and_is_grey() -> None:
     assert (colours[0, 0] == colours[0, 0, 0]).all()
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_maps_that_a_picture_is_too_small_for_are_left_out() -> None:
     prediction, target = torch.rand(2, 10, 30, 3, generator=torch.Generator().manual_seed(0))
     maps = error_maps(prediction, target, {"lpips": Difference()})

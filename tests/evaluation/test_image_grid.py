@@ -113,6 +113,7 @@ def test_triptych_holds_prediction_reference_and_error() -> None:
         torch.testing.assert_close(part, expected)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_grids_that_do_not_fit_are_refused() -> None:
     reference = picture(0)
     with pytest.raises(NerfroError, match="at least one row"):

@@ -87,6 +87,7 @@ class HalfOfTheDifference(torch.nn.Module):
         return mean_over((prediction - target).abs().mean(-1), inside) / 2
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_lpips_of_a_view_is_that_of_its_network() -> None:
     target = torch.zeros(32, 32, 3)
     metrics = ImageMetrics({"lpips_vgg": HalfOfTheDifference()}, {"lpips": "no AlexNet"}, round_predictions=False)
@@ -98,6 +99,7 @@ def test_lpips_of_a_view_is_that_of_its_network() -> None:
     assert result.notes["lpips"] == "no AlexNet"
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_every_region_has_the_scores_of_its_pixels() -> None:
     prediction, target = pictures(height=190, width=200)
     coverage = torch.zeros(190, 200)
@@ -189,6 +191,7 @@ def test_reset_forgets_all_views() -> None:
         metrics.result()
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_pictures_that_cannot_be_compared_are_refused() -> None:
     metrics = ImageMetrics()
     with pytest.raises(NerfroError, match=r"\[16, 16, 3\] with a reference \[16, 17, 3\]"):

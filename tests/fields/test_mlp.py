@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import jaxtyping
 import pytest
 import torch
 
@@ -116,9 +115,8 @@ def test_nerf_field_refuses_an_empty_box(box_max: list[float]) -> None:
         NerfField(box_min=[0.0, 0.0, 0.0], box_max=box_max)
 
 
-def test_compiled_networks_equal_plain_ones_and_keep_their_weights_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    # The compiler traces functions, and type checks cannot be traced.
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+@pytest.mark.usefixtures("unchecked")  # the compiler cannot trace the checks
+def test_compiled_networks_equal_plain_ones_and_keep_their_weights_names() -> None:
     plain, compiled = (
         NerfField(width=16, depth=2, skip=1, view_width=8),
         NerfField(width=16, depth=2, skip=1, view_width=8),

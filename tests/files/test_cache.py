@@ -128,6 +128,7 @@ def test_pickled_code_is_not_executed(tmp_path: Path) -> None:
         load_arrays(tmp_path / "evil.npz")
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
     class Unwritable:
         def __array__(self, dtype: object = None, copy: object = None) -> np.ndarray:

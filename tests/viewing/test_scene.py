@@ -174,6 +174,7 @@ def test_the_surface_is_that_of_the_ball_with_its_normals(scene: TrainedScene) -
         ({"ior": float("nan")}, "ior=.* is not allowed"),
     ],
 )
+@pytest.mark.usefixtures("unchecked")
 def test_what_a_scene_cannot_be_is_refused_in_one_line(scene: TrainedScene, changes: dict, message: str) -> None:
     with pytest.raises(NerfroError, match=message) as refused:
         scene.with_(**changes)
