@@ -7,7 +7,7 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
@@ -73,6 +73,23 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
     """Turn off the checks of annotations: for stand-ins, values that functions refuse, and code that is compiled."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
+@pytest.fixture
+def restored_registry(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Forget the plugins that a test discovers."""
+    import nerfro.registry
+
+    nerfro.registry.discover()
+    monkeypatch.setattr(nerfro.registry, "_plugins", dict(nerfro.registry._plugins))
+    monkeypatch.setattr(nerfro.registry, "_discovered", set(nerfro.registry._discovered))
+    parent = sys.modules["nerfro_plugins"]
+    monkeypatch.setattr(parent, "__path__", list(parent.__path__))
+    known = set(sys.modules)
+    yield
+    for name in set(sys.modules) - known:
+        if name.startswith("nerfro_plugins."):
+            del sys.modules[name]
 
 
 @pytest.fixture(autouse=True)

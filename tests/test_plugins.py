@@ -6,7 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -39,18 +39,7 @@ class OneGrey(Boundary):
 '''
 
 
-@pytest.fixture(autouse=True)
-def _registry_as_before(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """What a test discovers is forgotten after it."""
-    monkeypatch.setattr(nerfro.registry, "_plugins", dict(nerfro.registry._plugins))
-    monkeypatch.setattr(nerfro.registry, "_discovered", set(nerfro.registry._discovered))
-    parent = sys.modules["nerfro_plugins"]
-    monkeypatch.setattr(parent, "__path__", list(parent.__path__))
-    known = set(sys.modules)
-    yield
-    for name in set(sys.modules) - known:
-        if name.startswith("nerfro_plugins."):
-            del sys.modules[name]
+pytestmark = pytest.mark.usefixtures("restored_registry")
 
 
 @pytest.fixture

@@ -1,0 +1,74 @@
+"""The Python code of README and guides runs, and the plugins that the guides define train."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from nerfro.paths import PACKAGE_DIR
+from nerfro.registry import discover, find
+from nerfro.testing import check
+
+CHECKOUT = PACKAGE_DIR.parent
+pytestmark = pytest.mark.skipif(not (CHECKOUT / "docs").is_dir(), reason="there is no checkout with docs")
+
+
+def python_blocks(page: str) -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```", (CHECKOUT / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+
+
+@pytest.fixture
+def guide_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, restored_registry: None) -> list[str]:
+    """Register the plugins of the guide and return the rest of its code."""
+    rest = []
+    for block in python_blocks("docs/plugins.md"):
+        file = re.match(r"# plugins/(\w+\.py)\n", block)
+        if file is None:
+            rest.append(block)
+        else:
+            (tmp_path / file[1]).write_text(block)
+    monkeypatch.setenv("NERFRO_PLUGINS", str(tmp_path))
+    discover()
+    return rest
+
+
+def test_plugins_of_the_guide_keep_their_contracts(guide_plugins: list[str]) -> None:
+    for kind, name in (("sampler/points", "square_root"), ("loss", "half_transparent"), ("boundary", "horizon")):
+        check(find(kind, name))
+    (test,) = guide_plugins
+    namespace: dict[str, Any] = {}
+    exec(test, namespace)
+    namespace["test_square_root_sampler"]()
+
+
+def test_plugins_of_the_guide_train_where_rays_split(
+    guide_plugins: list[str], train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path
+) -> None:
+    options = ("sampler/points=square_root", "+loss.half_transparent.weight=0.1", "boundary=horizon")
+    finished = train_here(
+        *tiny_run, *options, "medium=ball", "sampler/path=snell", "sampler.path.branches=all", "trainer.max_steps=2",
+        f"hydra.run.dir={tmp_path}/run",
+    )  # fmt: skip
+    assert finished.code == 0, finished.err
+    assert re.search(r"^\|.*psnr", finished.out, re.IGNORECASE | re.MULTILINE)
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/sharing.md"])
+def test_code_that_uses_a_run_executes(
+    page: str, train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    assert train_here(*tiny_default_run, "trainer.max_steps=2", f"hydra.run.dir={run}").code == 0
+    blocks = [block for block in python_blocks(page) if "import nerfro\n" in block]
+    assert blocks
+    for block in blocks:
+        namespace: dict[str, Any] = {"origins": [[-2.0, 0.0, 0.0]], "directions": [[1.0, 0.0, 0.0]]}
+        source = re.sub(r'"(outputs/refractive/)?RUN"', repr(str(run)), block)
+        source = source.replace('"mesh.ply"', '"embedded:torus/mesh.ply"').replace(', sky="dawn.hdr"', "")
+        exec(source, namespace)
+        assert torch.as_tensor(namespace["bent"].directions).norm(dim=-1) == pytest.approx(1)
