@@ -35,8 +35,10 @@ def scene(boundary) -> Mock:
 def test_value_is_that_of_a_linear_sky() -> None:
     # For C = d . a the mean of |C(d') - C(d)| is angle |a| / 2, the mean of |cos| over the sphere, to second order.
     sky = scene(lambda exits: (exits.directions * 0.8).sum(-1, keepdim=True).expand(-1, 3) * 0.5 / math.sqrt(3))
-    value = TotalVariation(angle=1.0)([], BATCH, sky)
-    assert float(value) == pytest.approx(math.radians(1.0) * 0.4 / 2, rel=0.08)
+    loss = TotalVariation(angle=1.0)
+    values = [float(loss([], replace(BATCH, draws=example_draws(step=step)), sky)) for step in range(30)]
+    # The mean over 30 steps of 1024 pairs scatters by 0.3 %.
+    assert sum(values) / len(values) == pytest.approx(math.radians(1.0) * 0.4 / 2, rel=0.02)
 
 
 def test_descending_it_flattens_a_sky() -> None:
