@@ -164,7 +164,7 @@ def test_cameras_wait_for_the_scene(
         assert bool((state["renderer.scene.camera.motions.motion"][:, 3:] != 0).any()) is moves
 
 
-def test_cameras_move_by_sky_and_masks_before_training_and_what_these_told_is_kept(
+def test_cameras_move_by_sky_and_masks_before_training_and_their_priors_are_kept(
     train_here: Callable[..., Any], tiny_default_run: list[str], tiny_scene: Path, tmp_path: Path
 ) -> None:
     options = ["camera=refined", *tiny_default_run, "trainer.max_steps=1"]
@@ -186,7 +186,7 @@ def test_cameras_move_by_sky_and_masks_before_training_and_what_these_told_is_ke
     assert bool((without.motions.motion[:, :3] != 0).all())
     assert not bool(without.motions.motion[:, 3:].any())
     assert bool((with_masks.motions.motion != 0).all())
-    kept = [state["told"] for state in kept]
+    kept = [state["priors"] for state in kept]
     assert list(kept[0]) == ["panorama"]
     assert list(kept[1]) == ["panorama", "outlines"]
     for told, camera in ((kept[0]["panorama"], without), (kept[1]["outlines"], with_masks)):
