@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import cast
 
 import hydra
+import hydra._internal.hydra
 import yaml
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra._internal.sources_registry import SourcesRegistry
@@ -32,6 +33,7 @@ from nerfro.allowed import check_names, check_settings
 from nerfro.errors import NerfroError, nearest_of
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover
+from nerfro.trust import TrustingConfigLoader, leave_current_directory
 
 _NO_MEMORY = re.compile("allocate memory|out of memory")  # messages of torch on a CPU and on a GPU
 EXIT_INTERRUPTED = 130
@@ -117,6 +119,8 @@ def entry_point(
                 sys.argv[1:] = _flags_first(sys.argv[1:])
                 ConfigStore.instance().store(name=f"{config_name}_schema", node=schema, provider="nerfro")
                 SourcesRegistry.instance().types["file"] = _RenamingFiles
+                leave_current_directory()
+                hydra._internal.hydra.ConfigLoaderImpl = TrustingConfigLoader
                 discover()
                 sys.argv[1:] = [_quoted(renamed_override(argument), verbatim) for argument in sys.argv[1:]]
                 try:
@@ -138,6 +142,8 @@ def _flags_first(arguments: list[str]) -> list[str]:
     flag = next((text for text in others if text.startswith("-")), None)
     if flag is not None:
         raise NerfroError(f"{flag} is not an option; write key=value, or see --help")
+    if known.experimental_rerun is not None:
+        raise NerfroError("--experimental-rerun executes code of the file that it reads; use config.yaml of the run")
     overrides = [*known.overrides, *others]
     return [text for text in arguments if text not in overrides] + overrides
 

@@ -6,7 +6,6 @@ import itertools
 import shlex
 import signal
 import subprocess
-import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from nerfro.cli import EXIT_INTERRUPTED
 from nerfro.data.frames import list_images
 from nerfro.data.image_files import IMAGE_SUFFIXES
 from nerfro.errors import Interrupted, NerfroError
+from nerfro.trust import command_of_module
 
 _INTERRUPTED = (EXIT_INTERRUPTED, -signal.SIGINT, -signal.SIGTERM)  # exit statuses
 
@@ -53,9 +53,9 @@ class Stage:
         if self.is_done:
             print(f"{self.command}: done; {self.result} is kept (delete the file to repeat the stage)", flush=True)
             return
-        arguments = ["-m", f"nerfro.{self.command}", *self.options]
-        print(f"\n{self.command}: {shlex.join(['python', *arguments])}", flush=True)
-        status = run_command([sys.executable, *arguments])
+        module = f"nerfro.{self.command}"
+        print(f"\n{self.command}: {shlex.join(['python', '-m', module, *self.options])}", flush=True)
+        status = run_command([*command_of_module(module), *self.options])
         if status in _INTERRUPTED:
             raise Interrupted(f"{self.command} is incomplete; repeat the same command to continue")
         if status != 0 or not self.result.is_file():

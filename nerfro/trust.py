@@ -1,0 +1,86 @@
+"""Restrict what a command executes to nerfro, Hydra, and registered plugins.
+
+The command line, the folder `plugins/` and installed packages are trusted. Data, checkpoints, run folders, the current
+directory, and configuration files of other people are not.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.types import RunMode
+from omegaconf import DictConfig, ListConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from nerfro.errors import NerfroError
+from nerfro.paths import PACKAGE_DIR
+
+# Classes that the node `hydra` of a configuration may name. The module `logging` takes factories from `()` and `class`.
+_TARGETS = ("hydra_plugins.", "hydra._internal.core_plugins.", "hydra.experimental.callbacks.", "optuna.samplers.")
+_HANDLERS = ("logging.", "colorlog.")
+_STREAMS = ("ext://sys.stdout", "ext://sys.stderr")
+
+
+def leave_current_directory() -> None:
+    """Remove the current directory, which `python -m` puts first, from the module search path.
+
+    Hydra imports every module of a folder `hydra_plugins` on the search path, and the current directory may be a
+    downloaded data set. The directory stays if nerfro itself is imported from there.
+    """
+    here = Path.cwd().resolve()
+    if here != PACKAGE_DIR.parent.resolve():
+        sys.path[:] = [place for place in sys.path if Path(place).resolve() != here]
+
+
+def command_of_module(name: str) -> list[str]:
+    """Return the command line that runs `python -m NAME` without importing from the current directory."""
+    program = f"import runpy, sys; sys.path[0] = {str(PACKAGE_DIR.parent)!r}; "
+    return [sys.executable, "-c", f"{program}runpy.run_module({name!r}, run_name='__main__', alter_sys=True)"]
+
+
+class TrustingConfigLoader(ConfigLoaderImpl):
+    """Hydra's composition of a configuration, which refuses foreign classes before Hydra instantiates any.
+
+    Hydra builds its callbacks, launcher, sweeper and log handlers from the node `hydra`, and any YAML file can set it.
+    """
+
+    def load_configuration(
+        self,
+        config_name: str | None,
+        overrides: list[str],
+        run_mode: RunMode,
+        from_shell: bool = True,
+        validate_sweep_overrides: bool = True,
+    ) -> DictConfig:
+        config = super().load_configuration(config_name, overrides, run_mode, from_shell, validate_sweep_overrides)
+        for key, value in _foreign(config.hydra, "hydra"):
+            raise NerfroError(
+                f"{key}={value} is not allowed; choose a launcher, sweeper or callback of Hydra by its name"
+            )
+        return config
+
+
+def _foreign(node: DictConfig | ListConfig, path: str) -> Iterator[tuple[str, object]]:
+    """Yield keys and values that would execute code outside of Hydra's own."""
+    keys = range(len(node)) if isinstance(node, ListConfig) else list(node)
+    for key in keys:
+        try:
+            value = node[key]
+        except OmegaConfBaseException:  # missing until the run begins
+            value = node._get_node(key)._value()  # type: ignore[union-attr]
+        where = f"{path}.{key}"
+        if isinstance(value, DictConfig | ListConfig):
+            yield from _foreign(value, where)
+        elif value is not None and not _is_allowed(key, str(value)):
+            yield where, value
+
+
+def _is_allowed(key: object, value: str) -> bool:
+    if key == "_target_":
+        return value.startswith(_TARGETS)
+    if key in ("class", "()"):
+        return value.startswith(_HANDLERS)
+    return not value.startswith("ext://") or value in _STREAMS

@@ -1,0 +1,106 @@
+"""Commands execute nerfro, Hydra and registered plugins, and nothing that files or the current directory name."""
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from nerfro.errors import NerfroError
+from nerfro.paths import CONF_DIR
+from nerfro.registry import discover
+from nerfro.trust import TrustingConfigLoader, command_of_module
+
+discover()
+
+EVIL = "import pathlib\n\n\ndef run(*args, **options):\n    pathlib.Path(__file__).with_name('executed').touch()\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with a module `evil` and a Hydra plugin, which leave a file where they are executed."""
+    (tmp_path / "evil.py").write_text(EVIL)
+    (tmp_path / "hydra_plugins").mkdir()
+    (tmp_path / "hydra_plugins" / "evil.py").write_text(f"{EVIL}\n\nrun()\n")
+    return tmp_path
+
+
+def executed(folder: Path) -> list[Path]:
+    return list(folder.rglob("executed"))
+
+
+def run(folder: Path, *command: str) -> subprocess.CompletedProcess:
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
+    assert not executed(folder), done.stderr
+    return done
+
+
+def test_plugins_of_hydra_in_the_current_directory_are_not_imported(folder: Path) -> None:
+    for command in ([sys.executable, "-m", "nerfro.train"], command_of_module("nerfro.train")):
+        done = run(folder, *command, "--cfg", "job")
+        assert done.returncode == 0, done.stderr
+
+
+def test_a_stage_imports_nothing_from_the_current_directory(folder: Path) -> None:
+    (folder / "hydra").mkdir()
+    (folder / "hydra" / "__init__.py").write_text((folder / "hydra_plugins" / "evil.py").read_text())
+    assert run(folder, *command_of_module("nerfro.train"), "--cfg", "job").returncode == 0
+
+
+@pytest.mark.parametrize(
+    "hydra",
+    [
+        "callbacks: {a: {_target_: evil.run}}",
+        "callbacks: {a: {_target_: hydra.experimental.callbacks.LogJobReturnCallback, x: {_target_: evil.run}}}",
+        "sweeper: {_target_: evil.run}",
+        "launcher: {_target_: evil.run}",
+        "job_logging: {handlers: {console: {class: evil.run}}}",
+        "hydra_logging: {formatters: {simple: {(): evil.run}}}",
+        "job_logging: {handlers: {console: {class: logging.StreamHandler, stream: 'ext://evil.run'}}}",
+        "callbacks: {a: '${loss.a}'}",
+    ],
+)
+def test_configuration_files_name_no_foreign_code(hydra: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hydra._internal.hydra.ConfigLoaderImpl", TrustingConfigLoader)
+    write_experiment(folder, hydra)
+    options = ["+experiment=other", f"hydra.searchpath=[file://{folder}/conf]"]
+    with (
+        initialize_config_dir(str(CONF_DIR), version_base="1.3"),
+        pytest.raises(NerfroError, match=r"^hydra\..*evil.run is not allowed"),
+    ):
+        compose("train", options, return_hydra_config=True)
+
+
+@pytest.mark.parametrize("flags", [(), ("-m", "seed=1,2")], ids=["run", "sweep"])
+def test_no_foreign_code_is_executed_before_it_is_refused(flags: tuple[str, ...], folder: Path) -> None:
+    write_experiment(folder, "callbacks: {a: {_target_: evil.run}}")
+    options = ("--config-dir", str(folder / "conf"), *flags, "+experiment=other", "trainer.max_steps=1")
+    done = run(folder, sys.executable, "-m", "nerfro.train", *options)
+    assert done.returncode == 1
+    assert done.stderr.startswith("nerfro: error: hydra.callbacks.a._target_=evil.run is not allowed")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def write_experiment(folder: Path, hydra: str) -> None:
+    conf = folder / "conf" / "experiment"
+    conf.mkdir(parents=True)
+    loss = "loss: {a: {_target_: evil.run}}\n" if "loss" in hydra else ""
+    (conf / "other.yaml").write_text(f"# @package _global_\nhydra: {{{hydra}}}\n{loss}")
+
+
+def test_a_pickled_configuration_is_not_read(folder: Path) -> None:
+    (folder / "config.pickle").write_bytes(pickle.dumps(Evil()))
+    done = run(folder, sys.executable, "-m", "nerfro.train", "--experimental-rerun", "config.pickle")
+    assert done.returncode == 1
+    assert "--experimental-rerun executes code" in done.stderr
+
+
+class Evil:
+    """A value that executes code when it is unpickled."""
+
+    def __reduce__(self) -> tuple:
+        return exec, ("open('executed', 'w').close()",)
