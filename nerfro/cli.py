@@ -120,7 +120,7 @@ def entry_point(
                 ConfigStore.instance().store(name=f"{config_name}_schema", node=schema, provider="nerfro")
                 SourcesRegistry.instance().types["file"] = _RenamingFiles
                 leave_current_directory()
-                hydra._internal.hydra.ConfigLoaderImpl = TrustingConfigLoader
+                hydra._internal.hydra.ConfigLoaderImpl = TrustingConfigLoader  # type: ignore[misc]
                 discover()
                 sys.argv[1:] = [_quoted(renamed_override(argument), verbatim) for argument in sys.argv[1:]]
                 try:

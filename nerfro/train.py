@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 
 from nerfro.cli import EXIT_INTERRUPTED, entry_point
 from nerfro.distributed import leave
+from nerfro.errors import NerfroError
 from nerfro.evaluation.lpips import find_lpips_networks
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import RunMetrics
@@ -52,7 +53,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     subdivision = Subdivision(**config.evaluation.subdivision)
     lpips = find_lpips_networks(config.evaluation.lpips_backbone, config.evaluation.lpips_vgg_backbone)
     renderer = build_model(config, training)
-    require_same_run(folder, checkpoint, config)
+    require_same_run(folder, checkpoint, config, renderer)
     throughput, interruption = Throughput(), StopOnSignal()
     # Cameras move by sky and outlines before the sky is learned.
     cameras, boundary = CameraSteps(training), BoundaryFirst(config.optimizer.boundary_steps, interruption)
@@ -70,7 +71,14 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
         print(memory, flush=True)
     if config.compile is not None:
         compile_networks(renderer, config.compile)
-    trainer.fit(TrainingModule.of(renderer, config), datamodule=datamodule, ckpt_path=checkpoint, weights_only=True)
+    module = TrainingModule.of(renderer, config)
+    try:
+        trainer.fit(module, datamodule=datamodule, ckpt_path=checkpoint, weights_only=True)
+    except Exception as error:
+        if checkpoint is None or throughput.has_begun:
+            raise
+        reason = f"{type(error).__name__}: {error}".partition("\n")[0]
+        raise NerfroError(f"{checkpoint} cannot be resumed ({reason}); start without ckpt_path") from error
     trainer.save_checkpoint(folder / LAST_CHECKPOINT)
     finish_logs(trainer)
     leave()

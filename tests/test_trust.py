@@ -9,10 +9,12 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
 
 from nerfro.errors import NerfroError
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover
+from nerfro.training.config import TrainConfig
 from nerfro.trust import TrustingConfigLoader, command_of_module
 
 discover()
@@ -66,6 +68,7 @@ def test_a_stage_imports_nothing_from_the_current_directory(folder: Path) -> Non
 )
 def test_configuration_files_name_no_foreign_code(hydra: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hydra._internal.hydra.ConfigLoaderImpl", TrustingConfigLoader)
+    ConfigStore.instance().store(name="train_schema", node=TrainConfig)
     write_experiment(folder, hydra)
     options = ["+experiment=other", f"hydra.searchpath=[file://{folder}/conf]"]
     with (

@@ -26,10 +26,11 @@ class Throughput(Callback):
     Attributes:
         num_rays: rays trained on so far.
         seconds: wall-clock time of the training loop, without validation.
+        has_begun: whether this process has begun to train, after it restored a checkpoint.
     """
 
     def __init__(self) -> None:
-        self.num_rays, self.seconds = 0, 0.0
+        self.num_rays, self.seconds, self.has_begun = 0, 0.0, False
         self._last: float | None = None
 
     @property
@@ -37,7 +38,7 @@ class Throughput(Callback):
         return self.num_rays / self.seconds if self.seconds > 0 else None
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._last = time.perf_counter()
+        self._last, self.has_begun = time.perf_counter(), True
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int

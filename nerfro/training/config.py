@@ -5,11 +5,23 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Optional
+from pathlib import Path
+from typing import Annotated, Any, Literal, Optional, cast
 
 from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
-from nerfro.allowed import Count, Natural, NotNegative, NumRays, Positive, Range, Resolution
+from nerfro.allowed import (
+    Count,
+    Natural,
+    NotNegative,
+    NumRays,
+    Positive,
+    Range,
+    Resolution,
+    check_settings,
+    corners_of_box,
+)
 from nerfro.data.base import DataSource, Views
 from nerfro.data.exposure import exif_exposures
 from nerfro.data.validation_views import WithValidationViews
@@ -151,10 +163,31 @@ class TrainConfig:
     compile: Optional[str] = None  # noqa: UP045
 
 
+def check_trained(config: DictConfig, origin: Path) -> DictConfig:
+    """Check the configuration of a trained run, which may come from somebody else, and add missing defaults.
+
+    Args:
+        config: configuration from a checkpoint or run folder.
+        origin: file that the configuration was read from, for messages.
+
+    Raises:
+        NerfroError: a name or a value does not fit `TrainConfig`.
+    """
+    try:
+        typed = cast(DictConfig, OmegaConf.merge(OmegaConf.structured(TrainConfig), config))
+        check_settings(typed, TrainConfig)
+        content = typed.content
+        if content.box_min is not None or content.box_max is not None:
+            corners_of_box(content.box_min or [], content.box_max or [], bounded=False)
+    except (OmegaConfBaseException, NerfroError) as error:
+        reason = " ".join(str(error).split())
+        raise NerfroError(f"{origin} has a configuration that nerfro.train does not write: {reason}") from error
+    return typed
+
+
 def build_data(config: DictConfig) -> DataSource:
     """Build the data set of a run; training views that are left out for validation are its `val` split."""
-    source = build(config.data)
-    number = OmegaConf.select(config, "batches.num_validation_views")  # checkpoints of older releases lack it
+    source, number = build(config.data), config.batches.num_validation_views
     return WithValidationViews(source, number) if number else source
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,9 +66,6 @@ def settle_content(config: DictConfig, medium: Medium, cameras: Cameras | None =
         NerfroError: one corner is given without the other, the space is unknown, or the cameras face no common point.
     """
     content = config.content
-    for option in dataclasses.fields(ContentConfig):  # configurations of older releases may lack it
-        if option.name not in content:
-            content[option.name] = option.default
     if content.space not in ("box", "all"):
         raise NerfroError(f"content.space={content.space} is not allowed; choose box, all")
     if (content.box_min is None) != (content.box_max is None):

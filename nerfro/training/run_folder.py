@@ -9,7 +9,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -19,6 +19,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
 
 from nerfro.errors import Interrupted, NerfroError, first_of
 from nerfro.files.atomic import write_atomically
@@ -28,12 +29,21 @@ from nerfro.kernels.precision import fast_bfloat16
 from nerfro.paths import PACKAGE_DIR, user_path
 from nerfro.rendering import Renderer
 from nerfro.training import backdrop, content
-from nerfro.training.config import build_model
+from nerfro.training.config import build_model, check_trained
 from nerfro.training.settings import RESUMING, first_difference, settings
 
 LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
 CONFIG_FILE, CELL_FILE = "config.yaml", "cell.json"  # what the run is; what it is in a sweep
-_PARTS = {"nerfro_config", "state_dict", "optimizer_states", "lr_schedulers", "callbacks", "global_step", "loops"}
+# Required entries of a checkpoint and their types.
+_PARTS = {
+    "nerfro_config": str,
+    "state_dict": dict,
+    "optimizer_states": list,
+    "lr_schedulers": list,
+    "callbacks": dict,
+    "global_step": int,
+    "loops": dict,
+}
 _SPARE_BYTES = 64 * 2**20  # pictures and logs, beside the checkpoints
 _PACKAGES = ("nerfro", "torch", "lightning", "hydra-core", "torchmetrics", "numpy", "numba", "trimesh")
 
@@ -137,10 +147,14 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], DictConfig]:
     """Read a checkpoint without executing pickled code, and the configuration that it was trained with."""
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        missing = _PARTS - checkpoint.keys()
+        missing = _PARTS.keys() - checkpoint.keys()
         if missing:
             raise NerfroError(f"{path} lacks {first_of(sorted(missing))}, so it is no checkpoint of nerfro.train")
-        config = foreign_config(checkpoint["nerfro_config"], path)
+        for name, kind in _PARTS.items():
+            if not isinstance(checkpoint[name], kind):
+                raise NerfroError(f"{path} holds a {type(checkpoint[name]).__name__} as {name}; it is damaged")
+        require_finite(checkpoint["state_dict"], path)
+        config = check_trained(foreign_config(checkpoint["nerfro_config"], path), path)
     except NerfroError:
         raise
     except FileNotFoundError as error:
@@ -151,6 +165,32 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], DictConfig]:
         reason = str(error).strip().split("\n", 1)[0]
         raise NerfroError(f"{path} is not a readable nerfro checkpoint ({type(error).__name__}: {reason})") from error
     return checkpoint, config
+
+
+def require_finite(weights: Mapping[str, Any], path: Path) -> None:
+    """Refuse weights that are no tensors, or that are infinite or NaN."""
+    for name, weight in weights.items():
+        if not isinstance(weight, Tensor):
+            raise NerfroError(f"{path} holds a {type(weight).__name__} as {name}; it is damaged")
+        if not weight.isfinite().all():
+            raise NerfroError(f"{path} holds infinite numbers or NaN in {name}; train the run again, with another seed")
+
+
+def require_optimizer_fits(checkpoint: Mapping[str, Any], renderer: Renderer, path: Path) -> None:
+    """Refuse an optimizer state whose moments have other shapes than the learned parameters."""
+    groups = renderer.parameter_groups().values()
+    shapes = [parameter.shape for parameters in groups for parameter in parameters]
+    try:
+        (optimizer,) = checkpoint["optimizer_states"]
+        fits = all(
+            optimizer["state"][number][moment].shape == shapes[number]
+            for number in optimizer["state"]
+            for moment in ("exp_avg", "exp_avg_sq")
+        )
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError):
+        fits = False
+    if not fits:
+        raise NerfroError(f"{path} has an optimizer state that does not fit its weights; start without ckpt_path")
 
 
 def restore(checkpoint: dict, config: DictConfig) -> Renderer:
@@ -170,11 +210,13 @@ def restore(checkpoint: dict, config: DictConfig) -> Renderer:
     return renderer.eval()
 
 
-def require_same_run(folder: Path, checkpoint: Path | None, config: DictConfig) -> None:
-    """Refuse to go on from a checkpoint of another configuration, or in a folder that another run has begun."""
+def require_same_run(folder: Path, checkpoint: Path | None, config: DictConfig, renderer: Renderer) -> None:
+    """Refuse to resume from a checkpoint that does not fit, or in a folder that another run has begun."""
     begun = folder / CONFIG_FILE
     if checkpoint is not None:
-        require_same_configuration(checkpoint, load_checkpoint(checkpoint)[1], config)
+        content, trained = load_checkpoint(checkpoint)
+        require_same_configuration(checkpoint, trained, config)
+        require_optimizer_fits(content, renderer, checkpoint)
     elif config.ckpt_path is not None:
         require_same_configuration(begun, foreign_config(begun.read_text(encoding="utf-8"), begun), config)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import subprocess
 import sys
@@ -10,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+from omegaconf import OmegaConf
 
 import nerfro.evaluate
 import nerfro.train
@@ -247,3 +250,81 @@ def test_what_the_machine_lacks_is_told_as_such(
     with pytest.raises(SystemExit):
         entry_point("train", TrainConfig)(broken)()
     assert words in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_default_run: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The checkpoint of a run of two steps."""
+    folder = tmp_path_factory.mktemp("trained") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(nerfro.train, "find_lpips_networks", lambda *files: ({}, {}))
+        options = ("trainer.max_steps=2", "evaluation.every=0", f"hydra.run.dir={folder}")
+        patch.setattr(sys, "argv", ["train", *tiny_default_run, *options])
+        nerfro.train.main()
+    return folder / LAST_CHECKPOINT
+
+
+def set_weight(content: dict[str, Any], value: object) -> None:
+    name = next(name for name, weight in content["state_dict"].items() if weight.is_floating_point() and weight.numel())
+    content["state_dict"][name] = (
+        value if isinstance(value, str) else torch.full_like(content["state_dict"][name], value)
+    )
+
+
+def set_config(content: dict[str, Any], key: str, value: object) -> None:
+    config = OmegaConf.create(content["nerfro_config"])
+    OmegaConf.update(config, key, value)
+    content["nerfro_config"] = OmegaConf.to_yaml(config)
+
+
+DAMAGE: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
+    "weights are NaN": (lambda content: set_weight(content, math.nan), "infinite numbers or NaN in"),
+    "weights are infinite": (lambda content: set_weight(content, math.inf), "infinite numbers or NaN in"),
+    "weights are text": (lambda content: set_weight(content, "seven"), "holds a str as"),
+    "weights are a list": (lambda content: content.update(state_dict=[1]), "holds a list as state_dict"),
+    "callbacks are a list": (lambda content: content.update(callbacks=[1]), "holds a list as callbacks"),
+    "loops are a number": (lambda content: content.update(loops=3), "holds a int as loops"),
+    "a chunk of none": (lambda content: set_config(content, "evaluation.chunk_size", 0), "chunk_size=0 is not allowed"),
+    "a chunk of text": (lambda content: set_config(content, "evaluation.chunk_size", "many"), "'many'"),
+    "a box of two": (lambda content: set_config(content, "content.box_min", [0, 0]), "is not a box"),
+    "a box of NaN": (lambda content: set_config(content, "content.box_min", [math.nan] * 3), "box_min"),
+    "a box of text": (lambda content: set_config(content, "content.box_max", "large"), "box_max"),
+    "an unknown setting": (lambda content: set_config(content, "evaluation.chunks", 1), "chunks"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damaged_checkpoints_are_refused_in_one_line(damage: str, trained: Path, tmp_path: Path) -> None:
+    content = torch.load(trained, weights_only=True)
+    change, message = DAMAGE[damage]
+    change(content)
+    torch.save(content, tmp_path / "damaged.ckpt")
+    with pytest.raises(NerfroError) as refused:
+        load_checkpoint(tmp_path / "damaged.ckpt")
+    line = str(refused.value)
+    assert message in line
+    assert "damaged.ckpt" in line
+    assert "\n" not in line
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda content: content.update(optimizer_states=[]), "does not fit its weights"),
+        (lambda content: content["optimizer_states"][0]["state"][0].update(exp_avg=torch.zeros(7)), "does not fit"),
+        (lambda content: content.update(loops={"fit_loop": 3}), "cannot be resumed"),
+        (lambda content: content["callbacks"].update(Throughput=4), "cannot be resumed"),
+    ],
+)
+def test_checkpoints_that_cannot_be_resumed_are_refused_in_one_line(
+    change: Callable[[dict[str, Any]], object], message: str, train: Callable[..., Any], tmp_path: Path
+) -> None:
+    assert train().code == 0
+    path = tmp_path / "run" / LAST_CHECKPOINT
+    content = torch.load(path, weights_only=True)
+    change(content)
+    torch.save(content, path)
+    resumed = train("ckpt_path=last", "trainer.max_steps=4")
+    assert resumed.code == 1
+    assert message in resumed.err
+    assert len([line for line in resumed.err.splitlines() if line.startswith("nerfro: error: ")]) == 1
