@@ -14,7 +14,7 @@ import tempfile
 import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import cast
+from typing import NoReturn, cast
 
 import hydra
 import hydra._internal.hydra
@@ -130,6 +130,12 @@ def entry_point(
                         raise
                     reason = f"{error.filename} cannot be used: {error.strerror}"
                     raise NerfroError(f"{reason}; choose another hydra.run.dir, or hydra.sweep.dir") from error
+                except ValueError as error:
+                    if "null byte" not in str(error):
+                        raise
+                    raise NerfroError(
+                        "the name of a folder contains a null byte; choose another hydra.run.dir"
+                    ) from error
 
         return run
 
@@ -138,14 +144,22 @@ def entry_point(
 
 def _flags_first(arguments: list[str]) -> list[str]:
     """Move Hydra's flags before the overrides, because its parser accepts no overrides after a flag among them."""
-    known, others = get_args_parser().parse_known_args(arguments)
+    parser = get_args_parser()
+    parser.error = _refuse_flag  # type: ignore[method-assign]  # argparse prints its usage before the message
+    known, others = parser.parse_known_args(arguments)
     flag = next((text for text in others if text.startswith("-")), None)
     if flag is not None:
         raise NerfroError(f"{flag} is not an option; write key=value, or see --help")
+    if known.resolve and not known.cfg:
+        raise NerfroError("--resolve needs --cfg; write --cfg job --resolve to print the resolved configuration")
     if known.experimental_rerun is not None:
         raise NerfroError("--experimental-rerun executes code of the file that it reads; use config.yaml of the run")
     overrides = [*known.overrides, *others]
     return [text for text in arguments if text not in overrides] + overrides
+
+
+def _refuse_flag(message: str) -> NoReturn:
+    raise NerfroError(f"{message}; --help lists the flags")
 
 
 @contextlib.contextmanager
@@ -169,6 +183,11 @@ def errors_in_one_line() -> Iterator[None]:
 
 def in_one_line(error: Exception) -> str:
     """Describe an error for the user: a mistake in the input, a missing resource, or a bug of nerfro."""
+    # Names of files may contain line breaks and other control characters.
+    return re.sub(r"[\x00-\x1f\x7f]", lambda character: repr(character[0])[1:-1], _description(error))
+
+
+def _description(error: Exception) -> str:
     if isinstance(error, NerfroError):
         return str(error)
     if isinstance(error, OverrideParseException):

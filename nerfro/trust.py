@@ -7,10 +7,13 @@ directory, and configuration files of other people are not.
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.config_repository import CachingConfigRepository
+from hydra.core.override_parser.types import Override
 from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig
 from omegaconf.errors import OmegaConfBaseException
@@ -61,6 +64,17 @@ class TrustingConfigLoader(ConfigLoaderImpl):
                 f"{key}={value} is not allowed; choose a launcher, sweeper or callback of Hydra by its name"
             )
         return config
+
+    def _parse_overrides_and_create_caching_repo(
+        self, config_name: str | None, overrides: list[str]
+    ) -> tuple[list[Override], CachingConfigRepository]:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Hydra warns of a missing folder and continues
+            parsed, repository = super()._parse_overrides_and_create_caching_repo(config_name, overrides)
+        for source in repository.get_sources():
+            if not source.available():
+                raise NerfroError(f"{source.provider}: the configuration folder {source.path} does not exist")
+        return parsed, repository
 
 
 def _foreign(node: DictConfig | ListConfig, path: str) -> Iterator[tuple[str, object]]:

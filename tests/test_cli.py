@@ -27,6 +27,7 @@ from nerfro.paths import CONF_DIR, PACKAGE_DIR, resolve_path, user_path
 from nerfro.registry import KINDS, discover, plugins
 from nerfro.training import callbacks
 from nerfro.training.config import TrainConfig
+from nerfro.trust import TrustingConfigLoader
 
 
 @pytest.mark.parametrize("num_lines", [1, 10_000])  # less and more than a pipe's buffer
@@ -71,6 +72,32 @@ def test_flags_may_stand_anywhere() -> None:
     assert _flags_first(["~seed", "+a=-1"]) == ["~seed", "+a=-1"]
     with pytest.raises(NerfroError, match="--sed is not an option; write key=value"):
         _flags_first(["--sed"])
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--resolve"], "--resolve needs --cfg"),
+        (["--config-dir"], "expected one argument"),
+        (["--cfg", "nothing"], "invalid choice: 'nothing'"),
+    ],
+)
+def test_flags_that_cannot_be_used_are_refused(flags: list[str], message: str) -> None:
+    with pytest.raises(NerfroError, match=message):
+        _flags_first(flags)
+
+
+def test_messages_are_one_line_whatever_files_are_called() -> None:
+    assert in_one_line(NerfroError("a\nb\x1b.png does not exist")) == "a\\nb\\x1b.png does not exist"
+
+
+def test_a_configuration_folder_that_does_not_exist_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hydra._internal.hydra.ConfigLoaderImpl", TrustingConfigLoader)
+    with (
+        initialize_config_dir(str(CONF_DIR), version_base="1.3"),
+        pytest.raises(NerfroError, match=r"hydra\.searchpath in command-line: the configuration folder /no/where does"),
+    ):
+        compose("train", ["hydra.searchpath=[file:///no/where]"])
 
 
 def test_a_file_that_is_no_yaml_is_named_with_the_line(tmp_path: Path) -> None:
