@@ -53,7 +53,7 @@ def main() -> None:
     parser.add_argument("--window", type=float, default=20.0, help="seconds")
     parser.add_argument("--options", nargs="+", default=[], help="of nerfro.train")
     arguments = parser.parse_args()
-    server._WATCHED = 2.5  # a window without requests begins soon after the last one
+    server._WATCHED_SECONDS = 2.5  # a window without requests begins soon after the last one
     nerfro.train.Viewer = TimedViewer  # type: ignore[misc]
     threading.Thread(target=browse, args=(arguments.window,), daemon=True).start()
     with tempfile.TemporaryDirectory() as folder:

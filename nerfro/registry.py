@@ -149,7 +149,7 @@ def find(kind: str, name: str) -> Plugin:
     return _plugins[kind, name]
 
 
-def build(node: DictConfig | Mapping[str, object], **parts: object) -> Any:
+def build(node: object, **parts: object) -> Any:
     """Instantiate the registered class (or Lightning object) that a configuration node names.
 
     Args:

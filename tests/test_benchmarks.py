@@ -16,6 +16,7 @@ import torch
 from lightning.pytorch.callbacks import timer
 
 import nerfro.train
+from nerfro.viewing import server
 from tests.viewing.test_exports import write
 
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
@@ -53,7 +54,9 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> R
         monkeypatch.setattr(subprocess, "run", train_here)
         monkeypatch.setattr(nerfro.train, "find_lpips_networks", lambda *files: ({}, {}))
         monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
-        monkeypatch.setattr(timer, "time", timer.time)  # processor_time.py replaces it
+        # Benchmarks replace these.
+        for module, attribute in ((timer, "time"), (nerfro.train, "Viewer"), (server, "_WATCHED_SECONDS")):
+            monkeypatch.setattr(module, attribute, getattr(module, attribute))
         capfd.readouterr()
         threads, gradients = torch.get_num_threads(), torch.is_grad_enabled()
         try:

@@ -9,8 +9,8 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Optional, get_type_hints
+from unittest.mock import Mock
 
 import pytest
 import yaml
@@ -18,6 +18,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
+from lightning.pytorch import LightningModule, Trainer
 from omegaconf import OmegaConf
 
 from nerfro.cli import RENAMED, _flags_first, _RenamingFiles, in_one_line, renamed_override
@@ -28,6 +29,7 @@ from nerfro.registry import KINDS, discover, plugins
 from nerfro.training import callbacks
 from nerfro.training.config import TrainConfig
 from nerfro.trust import TrustingConfigLoader
+from nerfro.types import Batch
 
 
 @pytest.mark.parametrize("num_lines", [1, 10_000])  # less and more than a pipe's buffer
@@ -127,12 +129,13 @@ def test_what_is_not_embedded_is_refused(location: str) -> None:
 
 def test_progress_begins_with_the_step(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(callbacks, "training_progress", lambda trainer: trainer.done)
-    trainer = SimpleNamespace(done=0.0, global_step=250, callback_metrics={"val/psnr": 19.0})
+    trainer, module = Mock(spec=Trainer, done=0.0, global_step=250), Mock(spec=LightningModule)
+    trainer.callback_metrics = {"val/psnr": 19.0}
     progress = callbacks.TrainingProgress(callbacks.Throughput())
-    progress.on_train_start(trainer, None)
+    progress.on_train_start(trainer, module)
     trainer.done = 0.25
-    progress.on_train_batch_end(trainer, None, {"squared_error": 0.01}, None, 0)
-    progress.on_train_end(trainer, None)
+    progress.on_train_batch_end(trainer, module, {"squared_error": 0.01}, Mock(spec=Batch), 0)
+    progress.on_train_end(trainer, module)
     last = capsys.readouterr().err.split("\r")[-1].strip()
     assert last.startswith("train  25%|")
     assert "| step 250 ETA " in last

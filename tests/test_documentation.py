@@ -47,15 +47,15 @@ def test_plugins_of_the_guide_keep_their_contracts(guide_plugins: list[str]) -> 
 
 
 def test_plugins_of_the_guide_train_where_rays_split(
-    guide_plugins: list[str], train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path
+    guide_plugins: list[str], train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
 ) -> None:
     options = ("sampler/points=square_root", "+loss.half_transparent.weight=0.1", "boundary=horizon")
     finished = train_here(
-        *tiny_run, *options, "medium=ball", "sampler/path=snell", "sampler.path.branches=all", "trainer.max_steps=2",
-        f"hydra.run.dir={tmp_path}/run",
+        *(option for option in tiny_default_run if not option.startswith(("sampler.points", "boundary."))), *options,
+        "sampler.path.branches=all", "trainer.max_steps=2", f"hydra.run.dir={tmp_path}/run",
     )  # fmt: skip
     assert finished.code == 0, finished.err
-    assert re.search(r"^\|.*psnr", finished.out, re.IGNORECASE | re.MULTILINE)
+    assert "2 steps in" in finished.out
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/sharing.md"])

@@ -82,7 +82,7 @@ def test_random_numbers_are_drawn_for_each_ray(sampler: Stratified | Hierarchica
     assert torch.equal(samples.s[::2], sampler(same, None, example_draws()).s), "and splitting changes nobody's"
 
 
-@pytest.mark.parametrize("loss", [Photometric(), BoundaryRegulariser(start=0), Distortion()])
+@pytest.mark.parametrize("loss", [Photometric(), BoundaryRegulariser(), Distortion()])
 def test_losses_take_rays_that_split(loss: Photometric | BoundaryRegulariser | Distortion) -> None:
     model, batch = RefractiveModel(example_components()).eval(), example_batch()
     with torch.no_grad():
@@ -132,7 +132,11 @@ def test_exits_begin_where_the_last_straight_run_does() -> None:
 
 
 def test_a_pixel_is_the_encoded_mean_of_radiance_not_the_mean_of_its_code() -> None:
-    batch = replace(example_batch(), pixel=torch.zeros(NUM_RAYS, dtype=torch.long), rgb=torch.zeros(1, 3))
+    one = torch.zeros(1, dtype=torch.long)
+    batch = replace(
+        example_batch(), pixel=one.expand(NUM_RAYS), index=one, view=one, rgb=torch.zeros(1, 3),
+        teaches_background=torch.ones(1, dtype=torch.bool),
+    )  # fmt: skip
     radiance = torch.zeros(NUM_RAYS, 3)
     radiance[::2] = 1
     assert float(to_srgb(batch.per_pixel(radiance))[0, 0]) == pytest.approx(0.7354, abs=1e-3)

@@ -9,6 +9,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,32 +17,21 @@ import torch
 from torch import Tensor, nn
 
 from nerfro.boundaries.skybox import Skybox
-from nerfro.draws import Draws
+from nerfro.cameras import Cameras
 from nerfro.fields.nerf import NerfField
 from nerfro.losses.base import Loss
-from nerfro.losses.boundary import BoundaryRegulariser
-from nerfro.losses.photometric import Photometric
-from nerfro.losses.smoothness import Smoothness
 from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.models.refractive import RefractiveModel
+from nerfro.registry import create, discover, find
 from nerfro.rendering import Components
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.hierarchical import Hierarchical
 from nerfro.testing import example_batch
 from nerfro.types import Batch, Rays, Rendering
 
+discover()
+
 RECORDING = Path(os.environ.get("NERFRO_REFERENCE", Path(__file__).parent / "reference_sphere.npz"))
-
-
-class RecordedTile:
-    """Stands in for the training cameras: its one tile of directions is the recorded one."""
-
-    def __init__(self, directions: Tensor) -> None:
-        self.directions = directions
-
-    def tile(self, size: int, draws: Draws) -> Tensor:
-        assert self.directions.shape[:2] == (size, size)
-        return self.directions
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +53,10 @@ def batch(recorded: dict[str, Tensor]) -> Batch:
     num_rays = len(recorded["origins"])
     near, far = (recorded[key].expand(num_rays) for key in ("near", "far"))
     rays = Rays(recorded["origins"], recorded["directions"], torch.zeros(num_rays), near, far)
-    tile: Any = RecordedTile(recorded["sky_patch_directions"])
-    return replace(example_batch(num_rays), rays=rays, rgb=recorded["target_rgb"], cameras=tile)
+    # The training cameras have one tile of directions, which is the recorded one.
+    cameras: Any = Mock(spec=Cameras)
+    cameras.tile.return_value = recorded["sky_patch_directions"]
+    return replace(example_batch(num_rays), rays=rays, rgb=recorded["target_rgb"], cameras=cameras)
 
 
 @pytest.fixture(scope="module")
@@ -131,11 +123,12 @@ def test_parity_of_the_rendering(
 def test_parity_of_the_losses_and_their_gradients(
     recorded: dict[str, Tensor], renderings: list[Rendering], model: RefractiveModel, batch: Batch
 ) -> None:
-    losses: dict[str, Loss] = {
-        "photometric": Photometric(),
-        "boundary": BoundaryRegulariser(weight=0.025, start=0),
-        "smoothness": Smoothness(weight=1.0, start=0, tile_size=len(recorded["sky_patch_directions"])),
+    settings: dict[str, dict[str, Any]] = {
+        "photometric": {},
+        "boundary": {"weight": 0.025, "start": 0},
+        "smoothness": {"weight": 1.0, "start": 0, "tile_size": len(recorded["sky_patch_directions"])},
     }
+    losses: dict[str, Loss] = {name: create(find("loss", name), options) for name, options in settings.items()}
     values = {name: loss(renderings, batch, model.scene) for name, loss in losses.items()}
     fine_only = losses["photometric"](renderings[1:], batch, model.scene)
     assert_relative(fine_only, recorded["loss_rgb_fine"], 1e-3)

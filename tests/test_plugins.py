@@ -169,7 +169,7 @@ def test_list_of_one_kind_or_one_plugin_shows_no_other(
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
-        ("colour", "'colour' is not a plugin kind; kinds: model, camera, medium"),
+        ("colour", "'colour' is not a plugin type; choose one of model, camera, medium"),
         ("field=x", "no field is called 'x'; known: "),
     ],
 )

@@ -249,8 +249,8 @@ def test_budget_and_name_may_change_between_runs(tmp_path: Path) -> None:
 
 def test_damaged_checkpoints_are_refused_in_one_line(tmp_path: Path) -> None:
     whole = tmp_path / "whole.ckpt"
-    parts = ("state_dict", "optimizer_states", "lr_schedulers", "callbacks", "global_step", "loops")
-    torch.save({"nerfro_config": "seed: 0", **dict.fromkeys(parts, torch.zeros(100))}, whole)
+    parts = {"state_dict": {"weight": torch.zeros(100)}, "callbacks": {}, "loops": {}, "global_step": 0}
+    torch.save({"nerfro_config": "seed: 0", "optimizer_states": [], "lr_schedulers": [], **parts}, whole)
     assert load_checkpoint(whole)[1].seed == 0
     content = whole.read_bytes()
     foreign = tmp_path / "foreign.ckpt"

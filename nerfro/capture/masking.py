@@ -52,7 +52,7 @@ def grab(
     scale = min(1.0, MAX_SIDE / max(height, width))
     small = max(1, round(width * scale)), max(1, round(height * scale))
 
-    def shrink(region: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    def shrink(region: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "h w"]:
         return cv2.resize(region[window].astype(np.uint8), small, interpolation=cv2.INTER_NEAREST) > 0
 
     labels = np.full(small[::-1], cv2.GC_BGD, np.uint8)

@@ -90,7 +90,7 @@ def unit(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True).clip(1e-12)
 
 
-def solve_symmetric(system: sparse.csr_matrix, right: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
+def solve_symmetric(system: sparse.spmatrix, right: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
     """Solve a sparse symmetric positive definite system, without pivoting and with a fill-reducing ordering."""
     options = {"SymmetricMode": True}
     return splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0, options=options).solve(right)

@@ -118,7 +118,7 @@ def cubic_bspline(t: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     return torch.where(t < 1, 2 / 3 - t**2 + t**3 / 2, (2 - t).clamp(min=0) ** 3 / 6)
 
 
-def smooth(values: Float[Tensor, "X Y Z"], size: int, sigma: float) -> Float[Tensor, "X Y Z"]:
+def smooth(values: Float[Tensor, "X Y Z *C"], size: int, sigma: float) -> Float[Tensor, "X Y Z *C"]:
     """Convolve a grid with a normalized Gaussian of size^3 taps and replicated borders; size 0 changes nothing.
 
     Raises:

@@ -17,7 +17,7 @@ class ColourSpace(Enum):
     SRGB = "srgb"  # as in the authors' code
 
     def to_srgb(
-        self, radiance: Float[Tensor, "*batch 3"], gains: Float[Tensor, "*batch 3"] | None = None
+        self, radiance: Float[Tensor, "*batch 3"], gains: Float[Tensor, "*#batch 3"] | None = None
     ) -> Float[Tensor, "*batch 3"]:
         """Encode radiance, multiplied by the gains, as sRGB.
 
@@ -27,7 +27,7 @@ class ColourSpace(Enum):
         return radiance if self is ColourSpace.SRGB else to_srgb(radiance)
 
     def to_display(
-        self, radiance: Float[Tensor, "*batch 3"], gains: Float[Tensor, "*batch 3"] | None = None
+        self, radiance: Float[Tensor, "*batch 3"], gains: Float[Tensor, "*#batch 3"] | None = None
     ) -> Float[Tensor, "*batch 3"]:
         """Encode radiance, multiplied by the gains, as sRGB in [0, 1], as a photograph shows it."""
         return self.to_srgb(radiance, gains).clamp(0, 1)
@@ -40,7 +40,7 @@ class ColourSpace(Enum):
         self,
         radiance: Float[Tensor, "*batch 3"],
         rgb: Float[Tensor, "*batch 3"],
-        gains: Float[Tensor, "*batch 3"] | None = None,
+        gains: Float[Tensor, "*#batch 3"] | None = None,
     ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]:
         """Return the sRGB values that a loss compares.
 

@@ -19,6 +19,7 @@ from nerfro.evaluation.results import RunMetrics, read_metrics_json
 from nerfro.files.foreign_config import foreign_config
 from nerfro.files.reading import open_image, read_json
 from nerfro.paths import EMBEDDED_PREFIX, user_path
+from nerfro.training.config import check_trained
 from nerfro.training.run_folder import CELL_FILE
 from nerfro.training.sweeps import scene_name
 
@@ -156,8 +157,10 @@ def read_run(folder: Path) -> Run:
     """Read an evaluated run folder."""
     metrics = read_metrics_json(folder / "metrics.json")
     try:
-        text = (folder / "config.yaml").read_text(encoding="utf-8")
-        config: Any = OmegaConf.to_container(foreign_config(text, folder / "config.yaml"))
+        path = folder / "config.yaml"
+        config: Any = OmegaConf.to_container(
+            check_trained(foreign_config(path.read_text(encoding="utf-8"), path), path)
+        )
         facts = read_json(folder / "run.json", "repair it, or omit the run")
         absent = _FACTS - facts.keys()
         if absent:

@@ -101,7 +101,7 @@ def triangulate(distance: Distance, low: Vector, high: Vector, spacing: float) -
         start = np.asarray(corner) * _BLOCK
         place = origin + start * spacing
         here = tuple(slice(first, first + _BLOCK) for first in start)
-        centre = float(distance(place + middle))
+        centre = float(distance((place + middle)[None])[0])
         values[here] = distance(place + cell) if abs(centre) < reach else centre
     vertices, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent")
     vertices = origin + vertices * spacing

@@ -55,7 +55,7 @@ def join(surfaces: Sequence[Surface]) -> Surface:
     )
 
 
-def rounded_box(half_sides: Sequence[float], radius: float, edge_steps: int) -> Surface:
+def rounded_box(half_sides: Sequence[float] | np.ndarray, radius: float, edge_steps: int) -> Surface:
     """Mesh a box around the origin whose edges and corners are rounded with `radius`, watertight.
 
     The surface is the set of points at distance `radius` from the inner box of half sides `half_sides - radius`. Flat
