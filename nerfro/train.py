@@ -11,7 +11,6 @@ from omegaconf import DictConfig
 
 from nerfro.cli import EXIT_INTERRUPTED, entry_point
 from nerfro.distributed import leave
-from nerfro.errors import NerfroError
 from nerfro.evaluation.lpips import find_lpips_networks
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import RunMetrics
@@ -29,7 +28,7 @@ from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.reach import require_reach
 from nerfro.training.run_folder import LAST_CHECKPOINT, begin, own, require_same_run
-from nerfro.training.trainer import finish_logs, make_trainer, prepare_process
+from nerfro.training.trainer import finish_logs, fit, make_trainer, prepare_process
 from nerfro.training.viewer import Viewer
 from nerfro.viewing.camera_files import write_cameras
 
@@ -71,14 +70,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
         print(memory, flush=True)
     if config.compile is not None:
         compile_networks(renderer, config.compile)
-    module = TrainingModule.of(renderer, config)
-    try:
-        trainer.fit(module, datamodule=datamodule, ckpt_path=checkpoint, weights_only=True)
-    except Exception as error:
-        if checkpoint is None or throughput.has_begun:
-            raise
-        reason = f"{type(error).__name__}: {error}".partition("\n")[0]
-        raise NerfroError(f"{checkpoint} cannot be resumed ({reason}); start without ckpt_path") from error
+    fit(trainer, TrainingModule.of(renderer, config), datamodule, checkpoint, throughput)
     trainer.save_checkpoint(folder / LAST_CHECKPOINT)
     finish_logs(trainer)
     leave()

@@ -124,6 +124,27 @@ def prepare_process(seed: int) -> None:
     pl.seed_everything(seed, verbose=False)
 
 
+def fit(
+    trainer: pl.Trainer,
+    module: pl.LightningModule,
+    data: pl.LightningDataModule,
+    checkpoint: Path | None,
+    throughput: Throughput,
+) -> None:
+    """Train, from a checkpoint if there is one.
+
+    Raises:
+        NerfroError: the state of the trainer in the checkpoint cannot be restored.
+    """
+    try:
+        trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+    except Exception as error:  # Lightning and its callbacks raise many kinds of errors on a damaged state
+        if checkpoint is None or throughput.has_begun:
+            raise
+        reason = f"{type(error).__name__}: {error}".partition("\n")[0]
+        raise NerfroError(f"{checkpoint} cannot be resumed ({reason}); start without ckpt_path") from error
+
+
 def finish_logs(trainer: pl.Trainer) -> None:
     """End logs that the next job of a sweep would go on with."""
     for logger in trainer.loggers:
