@@ -221,7 +221,7 @@ def exits(sampler: Eikonal | Snell, medium: torch.nn.Module) -> Trace:
 
 def euler(voxels: VoxelGrid) -> Trace:
     """Exit directions by the paper's tracker; only the last vertex is written, which flatters its speed."""
-    return lambda rays: uniform_exit_on_grid(rays, voxels, "euler", NUM_EULER_STEPS)
+    return lambda rays: uniform_exit_on_grid(rays, voxels, NUM_EULER_STEPS)
 
 
 def make_rays(origins: np.ndarray, directions: np.ndarray, near: float = NEAR, far: float = FAR) -> Rays:

@@ -201,7 +201,7 @@ def tiny_run(tiny_scene: Path) -> list[str]:
         "sampler/points=hierarchical",
         "field=nerf",
         "boundary=skybox",
-        "sampler.path.integrator=leapfrog",
+        "sampler.path.integrator=euler",
         "loss.boundary.weight=0.025",
         "loss.boundary.ramp=0",
         "loss.smoothness.weight=1",

@@ -12,7 +12,6 @@ from nerfro.media.shapes import Ball
 from nerfro.rendering import composite
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.hierarchical import Hierarchical
-from nerfro.samplers.integrators import INTEGRATORS
 from nerfro.samplers.snell import Snell
 from nerfro.samplers.stepfun import volume_weights
 from nerfro.samplers.straight import Straight, straight_path
@@ -110,7 +109,7 @@ def test_opacity_is_what_does_not_pass() -> None:
     torch.testing.assert_close(rendering.opacity, 1 - rendering.transmittance)
 
 
-@pytest.mark.parametrize("integrator", sorted(INTEGRATORS))
+@pytest.mark.parametrize("integrator", ["adaptive", "euler"])
 @pytest.mark.parametrize("levels", ["stratified", "hierarchical"])
 def test_straight_and_eikonal_render_the_same_image_where_n_is_one(integrator: str, levels: str) -> None:
     rays, vacuum = example_rays(), Vacuum()
@@ -162,7 +161,7 @@ def test_point_before_near_or_beyond_far_goes_straight_on() -> None:
 
 
 def test_every_vertex_of_a_path_is_found_at_its_arc_length() -> None:
-    path = Eikonal("leapfrog", 64)(example_rays(), Luneburg())
+    path = Eikonal("euler", 64)(example_rays(), Luneburg())
     positions, _ = path.at(path.s)
     # Between vertices the path is followed along a tangent, off by half the squared step at the next vertex.
     torch.testing.assert_close(positions, path.positions, atol=0.5 * float(path.s.diff(dim=1).max()) ** 2, rtol=0)

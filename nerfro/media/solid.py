@@ -155,10 +155,6 @@ class Solid(Medium):
             return numbers[inside.long().cumprod(-1).sum(-1)]
         return torch.where(inside, numbers[1:], 0).amax(-1)
 
-    def index_inside(self, inside: Bool[Tensor, "*batch K"]) -> Float[Tensor, "*batch"]:
-        """Return the refractive index of the body that contains a point; 1 outside all bodies."""
-        return torch.cat([self.iors.new_ones(1), self.iors]).to(self.box)[self.innermost(inside)]
-
     def forward(self, positions: Vectors) -> tuple[Scalars, Vectors]:
         """Evaluate the refractive index of the smooth shells and its exact gradient."""
         phi, normals = self.signed_distances(positions)

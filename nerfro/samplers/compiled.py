@@ -1,4 +1,4 @@
-"""From rays and media to the compiled kernels' arrays, and back to paths."""
+"""Conversion of rays and media to the arrays of the compiled kernels, and of their results to paths."""
 
 from __future__ import annotations
 
@@ -21,17 +21,15 @@ if TYPE_CHECKING:
     from nerfro.media.voxel_grid import VoxelGrid
     from nerfro.samplers.snell_cpu import Polylines
 
-# Vertices that a first attempt has room for; the few rays that need more are traced again. Those of many reflections
-# are slow, so there is room for all that is usual.
-_CAPACITY = 18
-# Polylines of a ray that a first attempt has room for.
-_ROOM = 8
+# Capacity of the first attempt, in vertices of a polyline and polylines of a ray. Rays that need more are traced again;
+# these have many reflections and are slow, so the capacity covers the usual numbers.
+_CAPACITY, _ROOM = 18, 8
 
 
 def snell_on_grid(
     rays: Rays, medium: SdfGrid, min_step: float, max_events: int, branching: Branching
 ) -> tuple[Path, Int[Tensor, "P"], Bool[Tensor, "P"]]:
-    """`samplers.snell.trace_interfaces` by the compiled kernel."""
+    """Evaluate `samplers.snell.trace_interfaces` by the compiled kernel."""
     from nerfro.samplers.snell_cpu import Settings, trace_snell
 
     solids = _for_kernels(medium)
@@ -62,11 +60,11 @@ def snell_on_grid(
 
 
 def _polylines(rows: Polylines, counts: Int[np.ndarray, "R"], width: int) -> tuple[np.ndarray, ...]:
-    """Return the ray of each polyline, its arrays with a column per vertex, its weight, events and excess.
+    """Select polylines; returns their rays, arrays with a column per vertex, weights, numbers of events, and excess.
 
     Args:
-        rows: traced.
-        counts: polylines of each ray that are wanted, as many as there is room for at most.
+        rows: results of the kernel.
+        counts: number of polylines to select of each ray, at most the capacity.
         width: number of vertices.
     """
     from nerfro.samplers.snell_cpu import polylines_of_width
@@ -80,7 +78,7 @@ def _polylines(rows: Polylines, counts: Int[np.ndarray, "R"], width: int) -> tup
 def eikonal_on_grid(
     rays: Rays, medium: VoxelGrid | SdfGrid, step: float, tolerance: float, max_steps: int
 ) -> tuple[Path, Bool[Tensor, "R"]]:
-    """`samplers.eikonal.march_adaptive` by the compiled kernel."""
+    """Evaluate `samplers.eikonal.march_adaptive` by the compiled kernel."""
     from nerfro.samplers.eikonal_cpu import march_adaptive
 
     settings = (_for_kernels(medium), step, tolerance, max_steps)
@@ -88,34 +86,28 @@ def eikonal_on_grid(
     return _path(rays, vertices, refracted), torch.from_numpy(exceeded)
 
 
-def uniform_on_grid(rays: Rays, medium: VoxelGrid, integrator: str, num_steps: int) -> Path:
-    """`samplers.eikonal.march_uniform` by the compiled kernel."""
-    *vertices, refracted = _march_uniform(rays, medium, integrator, num_steps, keep_all=True)
+def uniform_on_grid(rays: Rays, medium: VoxelGrid, num_steps: int) -> Path:
+    """Evaluate `samplers.eikonal.march_uniform` with Euler steps by the compiled kernel."""
+    from nerfro.samplers.eikonal_cpu import march_uniform
+
+    *vertices, refracted = march_uniform(*_ray_arrays(rays), _for_kernels(medium), num_steps, True)
     return _path(rays, vertices, refracted)
 
 
-def uniform_exit_on_grid(rays: Rays, medium: VoxelGrid, integrator: str, num_steps: int) -> Float[Tensor, "R 3"]:
-    """Exit directions alone of `uniform_on_grid`, without the memory of all vertices."""
-    return torch.from_numpy(_march_uniform(rays, medium, integrator, num_steps, keep_all=False)[1][:, 0])
+def uniform_exit_on_grid(rays: Rays, medium: VoxelGrid, num_steps: int) -> Float[Tensor, "R 3"]:
+    """Return the exit directions of `uniform_on_grid` without the memory of all vertices."""
+    from nerfro.samplers.eikonal_cpu import march_uniform
 
-
-def _march_uniform(
-    rays: Rays, medium: VoxelGrid, integrator: str, num_steps: int, keep_all: bool
-) -> tuple[np.ndarray, ...]:
-    from nerfro.samplers import eikonal_cpu as eikonal
-
-    code = {"euler": eikonal.EULER, "leapfrog": eikonal.LEAPFROG, "rk4": eikonal.RK4}[integrator]
-    origins, directions, near, far = _ray_arrays(rays)
-    return eikonal.march_uniform(origins, directions, near, far, _for_kernels(medium), code, num_steps, keep_all)
+    return torch.from_numpy(march_uniform(*_ray_arrays(rays), _for_kernels(medium), num_steps, False)[1][:, 0])
 
 
 def _with_enough_vertices(
     rays: Rays, kernel: Callable, settings: tuple, num_arrays: int
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Run a kernel, and run it again for the rays whose vertices did not fit.
+    """Run a kernel, and again for the rays with more vertices than the capacity.
 
     Returns:
-        The first `num_arrays` results, which have a column for each vertex, and those that follow the counts.
+        The first `num_arrays` results, which have a column for each vertex, and the results after the counts.
     """
     of_rays = _ray_arrays(rays)
     capacity = _CAPACITY

@@ -1,4 +1,4 @@
-"""Rays bent by a continuous refractive index."""
+"""Paths of rays through a continuous refractive index."""
 
 from __future__ import annotations
 
@@ -19,32 +19,30 @@ from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.registry import register
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.compiled import eikonal_on_grid, uniform_on_grid
-from nerfro.samplers.integrators import INTEGRATORS, Integrator, RayState, leapfrog
+from nerfro.samplers.integrators import Integrator, RayState, euler, leapfrog
 from nerfro.samplers.polylines import Polylines
 from nerfro.samplers.replay import Vertices, assembled, is_interior, with_gradient
 from nerfro.types import Path, Rays
 
-# Share of a step by which a replay may reach the end of one earlier than the trace.
+# Fraction of a step by which a replay may reach the end of a step earlier than the trace.
 _ROUNDING = 0.01
 
 
 @register("sampler/path", "eikonal")
 class Eikonal(PathSampler):
-    """Paths that solve the Eikonal equation: adaptive steps, or equal ones (the paper's: integrator=euler).
+    """Trace rays by the Eikonal equation, with adaptive steps or with the equal Euler steps of the paper.
 
     Args:
-        integrator: adaptive is a leapfrog that steps only where the index varies, jumps elsewhere and keeps few
-            vertices; the others take equal steps from near to far and keep them all. euler is the paper's,
-            leapfrog and rk4 hold |v| = n.
-        num_steps: vertices of a path of equal steps; the paper has 768.
-        tolerance: adaptive: distance of a path from its last tangent at which it gets a vertex, as a share of the
-            box's diagonal.
-        max_steps: adaptive: steps of a ray, at most; beyond them it goes straight on.
+        integrator: `adaptive` takes leapfrog steps where the index varies, jumps elsewhere, and keeps few vertices.
+            `euler` takes equal steps from near to far and keeps all vertices, as the paper does.
+        num_steps: number of vertices of a path of equal steps; 768 in the paper.
+        tolerance: largest distance of an adaptive path from its polyline, as a fraction of the box's diagonal.
+        max_steps: largest number of adaptive steps of a ray, after which the path continues straight.
     """
 
     def __init__(
         self,
-        integrator: Literal["adaptive", "euler", "leapfrog", "rk4"] = "adaptive",
+        integrator: Literal["adaptive", "euler"] = "adaptive",
         num_steps: Annotated[int, Range(at_least=2, at_most=8192)] = 768,
         tolerance: Positive = 2e-4,
         max_steps: Count = 16384,
@@ -54,14 +52,14 @@ class Eikonal(PathSampler):
 
     @torch.no_grad()
     def forward(self, rays: Rays, medium: Medium) -> Path:
-        """Trace every ray from near to far; adaptive paths do not end before they have left the medium's box."""
+        """Trace rays from near to far; bent adaptive paths end outside the medium's box, beyond far if necessary."""
         if medium.absorption is not None or medium.disperses:
             raise NerfroError("medium.absorption and medium.abbe need sharp surfaces; take sampler/path=snell")
         on_cpu = rays.origins.device.type == "cpu"
         if self.integrator != "adaptive":
             if on_cpu and isinstance(medium, VoxelGrid):
-                return uniform_on_grid(rays, medium, self.integrator, self.num_steps)
-            return march_uniform(rays, medium, INTEGRATORS[self.integrator], self.num_steps)
+                return uniform_on_grid(rays, medium, self.num_steps)
+            return march_uniform(rays, medium, euler, self.num_steps)
         tolerance = self.tolerance * float(torch.linalg.vector_norm(medium.box[1] - medium.box[0]))
         if on_cpu and isinstance(medium, VoxelGrid):
             return eikonal_on_grid(rays, medium, 0.5 * float(medium.spacing.min()), tolerance, self.max_steps)[0]
@@ -71,14 +69,14 @@ class Eikonal(PathSampler):
         return march_adaptive(rays, medium, tolerance, self.max_steps)[0]
 
     def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
-        """The path with gradients by rays and medium: its steps once more, with the states of all kept for backward.
+        """Repeat the steps of a path with gradients with respect to rays and medium, and keep the states of all steps.
 
-        At a thin shell they grow without bound towards grazing and critical angles, as at a sharp surface.
+        At a thin shell, gradients grow without bound towards grazing and critical angles, as at a sharp surface.
         """
         if self.integrator == "adaptive":
             return replay_adaptive(path, rays, medium, self.max_steps)
         rays = rays[path.ray]
-        replayed = march_uniform(rays, medium, INTEGRATORS[self.integrator], self.num_steps)
+        replayed = march_uniform(rays, medium, euler, self.num_steps)
         names = ("positions", "directions", "s")
         columns: dict[str, Any] = {n: with_gradient(getattr(path, n), getattr(replayed, n)) for n in names}
         return replace(path, **columns)
@@ -88,9 +86,9 @@ class Eikonal(PathSampler):
 
 
 def march_uniform(rays: Rays, medium: Medium, integrator: Integrator, num_steps: int) -> Path:
-    """Vertices at equal steps ds = (far - near) / (num_steps - 1) (paper, Eqn. eikonal).
+    """Trace rays by equal steps ds = (far - near) / (num_steps - 1) (paper, Eqn. eikonal).
 
-    s is the length of the polyline. At near, v = n d.
+    The arc length of a vertex is the length of the polyline. At near, v = n d.
     """
     ds = (rays.far - rays.near) / (num_steps - 1)
     x = rays.origins + rays.near[:, None] * rays.directions
@@ -110,7 +108,7 @@ def march_uniform(rays: Rays, medium: Medium, integrator: Integrator, num_steps:
 
 
 class _NewVertices:
-    """The vertices of a trace: kept where a path has left the tangent of the last one, and at the start of jumps."""
+    """Vertices of a trace: recorded where a path is far from its last tangent, and at the start of jumps."""
 
     def __init__(self, rays: Rays, tolerance: float) -> None:
         self.kept = _start(rays)
@@ -134,7 +132,7 @@ class _NewVertices:
 
 
 class _KnownVertices:
-    """The vertices of a replay: where the trace has them."""
+    """Vertices of a replay: at the arc lengths of the traced vertices."""
 
     def __init__(self, path: Path) -> None:
         self.s, self.last = path.s, is_interior(path).sum(-1)
@@ -142,11 +140,11 @@ class _KnownVertices:
         self.found: list[Vertices] = []
 
     def before_jump(self, rows: Tensor, x: Tensor, d: Tensor, s: Tensor) -> None:
-        """It begins where the step before has ended."""
+        """Do nothing: the vertex at the start of a jump is at the end of the previous step."""
 
     def after_step(self, rows: Tensor, length: Tensor, x: Tensor, d: Tensor, s: Tensor) -> None:
         column = self.next[rows]
-        # A vertex lies at the end of a step; rounding must not move it to the end of the next one.
+        # A vertex lies at the end of a step; rounding errors must not move the vertex to the next step.
         due = (column <= self.last[rows]) & (s[rows] >= self.s[rows, column] - _ROUNDING * length)
         rows, column = rows[due], column[due]
         self.found.append((rows, column, x[rows], d[rows], s[rows]))
@@ -154,10 +152,13 @@ class _KnownVertices:
 
 
 def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int) -> tuple[Path, Bool[Tensor, "R"]]:
-    """Leapfrog steps where the index varies, straight jumps elsewhere: the plain reference of the compiled kernel.
+    """Trace rays by leapfrog steps where the index varies and by straight jumps elsewhere.
 
-    A vertex is kept where the path has left the tangent of the last one by `tolerance`, and at the start of jumps.
-    Lengths are in world units. Also returned is whether a ray met the limit; such a ray goes straight on.
+    This is the reference implementation of the compiled kernel. A vertex is recorded when the path is more than
+    `tolerance` world units from the tangent of the last vertex, and at the start of jumps.
+
+    Returns:
+        The path, and whether each ray met the limit of steps, after which the path continues straight.
     """
     vertices = _NewVertices(rays, tolerance)
     state, refracted, exceeded = _march(rays, medium, max_steps, vertices)
@@ -167,9 +168,9 @@ def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int)
 
 
 def replay_adaptive(path: Path, rays: Rays, medium: Medium, max_steps: int) -> Path:
-    """The steps of `march_adaptive` once more, with gradients by rays and medium, lengths of steps included.
+    """Repeat the steps of `march_adaptive` with gradients with respect to rays and medium, including the step lengths.
 
-    In double precision, as the compiled kernel computes. The states of all steps are kept for the backward pass.
+    The precision is double, as in the compiled kernel. The backward pass needs the states of all steps.
     """
     precise = rays[path.ray].to(torch.float64)
     vertices = _KnownVertices(path)
@@ -186,13 +187,12 @@ def _start(rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
 def _march(
     rays: Rays, medium: Medium, max_steps: int, vertices: _NewVertices | _KnownVertices
 ) -> tuple[tuple[Tensor, Tensor, Tensor], Bool[Tensor, "R"], Bool[Tensor, "R"]]:
-    """Follow rays until they have left the medium's box, which is entered and left along straight lines.
+    """Trace rays until they leave the medium's box; outside the box, rays are straight.
 
-    Inside it a ray jumps by the medium's clearance where there is any, and else takes a leapfrog step of the medium's
-    step length.
+    Inside the box, a ray jumps by the clearance of the medium if there is any, and otherwise takes a leapfrog step.
 
     Returns:
-        Last positions, directions and arc lengths; whether the index varied on the way; whether a ray met the limit.
+        Last positions, directions and arc lengths; whether the index varied on the path; whether a ray met the limit.
     """
     num_rays = len(rays)
     rows = torch.arange(num_rays, device=rays.near.device)
@@ -203,7 +203,7 @@ def _march(
     jump = enter[active].clamp(min=0)
     x[active] += jump[:, None] * d[active]
     s[active] += jump
-    # Values of all rays are changed in place, so what autograd keeps are those of rows.
+    # Tensors of all rays are changed in place, so autograd must save only tensors of selected rows.
     n, g, v = torch.ones_like(s), torch.zeros_like(x), torch.zeros_like(x)
     n[active], g[active] = medium(x[active])
     v[active] = n[active, None] * d[active]
@@ -227,7 +227,7 @@ def _march(
         length = torch.linalg.vector_norm(state.positions - x[stepping], dim=-1)
         s[stepping] += length
         x[stepping], v[stepping], n[stepping], g[stepping] = state
-        # A straight step leaves the direction as it is, to the last bit; but a replay must learn what would bend it.
+        # A straight step must not change the direction by rounding, but a replay needs the gradients of the direction.
         bent = stepping if v.requires_grad else stepping[varies | (state.gradients != 0).any(-1)]
         d[bent] = torch.nn.functional.normalize(v[bent], dim=-1)
         vertices.after_step(stepping, length, x, d, s)

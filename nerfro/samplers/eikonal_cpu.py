@@ -1,6 +1,6 @@
-"""The Eikonal equation through a voxel grid or through bodies with thin shells, one thread per ray.
+"""Compiled integration of the Eikonal equation through voxel grids and bodies with thin shells, one thread per ray.
 
-The same algorithms as `samplers.eikonal`, for one ray at a time.
+The algorithms are those of `samplers.eikonal`, for one ray at a time.
 """
 
 from __future__ import annotations
@@ -23,18 +23,10 @@ from nerfro.kernels.lookup import (
 )
 from nerfro.kernels.tolerances import MIN_COSINE, MIN_NORMAL_PART, MIN_TURN, REACHED, RESOLVED
 
-EULER, LEAPFROG, RK4 = 0, 1, 2
-
-
-@compiled
-def _rescaled(vx, vy, vz, n):
-    scale = n / math.sqrt(vx * vx + vy * vy + vz * vz)
-    return vx * scale, vy * scale, vz * scale
-
 
 @compiled
 def _with_length_along(vx, vy, vz, kx, ky, kz, n, varies):
-    """Set the length of v to n by its component along the kick, where that is called for (`integrators.leapfrog`)."""
+    """Set |v| to n by the component along the kick, under the conditions of `integrators.leapfrog`."""
     kick = kx * kx + ky * ky + kz * kz
     excess = vx * vx + vy * vy + vz * vz - n * n
     if kick == 0.0 or (varies and abs(excess) <= RESOLVED * n * n):
@@ -48,17 +40,8 @@ def _with_length_along(vx, vy, vz, kx, ky, kz, n, varies):
 
 
 @inlined
-def _euler(table, low, inverse_spacing, ds, x, y, z, vx, vy, vz, n, gx, gy, gz):
-    """`integrators.euler`, for one ray."""
-    h = ds / n
-    x, y, z = x + h * vx, y + h * vy, z + h * vz
-    vx, vy, vz = vx + ds * gx, vy + ds * gy, vz + ds * gz
-    return x, y, z, vx, vy, vz, *voxel_index(table, low, inverse_spacing, x, y, z)
-
-
-@inlined
 def _drift(ds, x, y, z, vx, vy, vz, n, gx, gy, gz):
-    """First half of a leapfrog step: where it leads, v after half a kick, and the step's parameter."""
+    """Take the first half of a leapfrog step; returns the new position, v after half a kick, and dsigma."""
     h = ds / max(n + 0.5 * ds * (gx * vx + gy * vy + gz * vz) / n, 0.5 * n)
     kick = 0.5 * h * n
     px, py, pz = vx + kick * gx, vy + kick * gy, vz + kick * gz
@@ -67,47 +50,19 @@ def _drift(ds, x, y, z, vx, vy, vz, n, gx, gy, gz):
 
 @inlined
 def _kick(h, px, py, pz, vx, vy, vz, n, gx, gy, gz):
-    """Second half: v after the other half of the kick, of length n."""
+    """Take the second half of a leapfrog step; returns v after the other half of the kick, with length n."""
     kick = 0.5 * h * n
     px, py, pz = px + kick * gx, py + kick * gy, pz + kick * gz
     varies = gx != 0.0 or gy != 0.0 or gz != 0.0
     return _with_length_along(px, py, pz, px - vx, py - vy, pz - vz, n, varies)
 
 
-@inlined
-def _leapfrog(table, low, inverse_spacing, ds, x, y, z, vx, vy, vz, n, gx, gy, gz):
-    """`integrators.leapfrog`, for one ray."""
-    x, y, z, px, py, pz, h = _drift(ds, x, y, z, vx, vy, vz, n, gx, gy, gz)
-    n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
-    vx, vy, vz = _kick(h, px, py, pz, vx, vy, vz, n, gx, gy, gz)
-    return x, y, z, vx, vy, vz, n, gx, gy, gz
-
-
-@inlined
-def _rk4(table, low, inverse_spacing, ds, x, y, z, vx, vy, vz, n, gx, gy, gz):
-    """`integrators.rk4`, for one ray."""
-    half, sixth = 0.5 * ds, ds / 6.0
-    ax, ay, az = vx / n, vy / n, vz / n
-    n2, bgx, bgy, bgz = voxel_index(table, low, inverse_spacing, x + half * ax, y + half * ay, z + half * az)
-    bx, by, bz = (vx + half * gx) / n2, (vy + half * gy) / n2, (vz + half * gz) / n2
-    n3, cgx, cgy, cgz = voxel_index(table, low, inverse_spacing, x + half * bx, y + half * by, z + half * bz)
-    cx, cy, cz = (vx + half * bgx) / n3, (vy + half * bgy) / n3, (vz + half * bgz) / n3
-    n4, dgx, dgy, dgz = voxel_index(table, low, inverse_spacing, x + ds * cx, y + ds * cy, z + ds * cz)
-    ex, ey, ez = (vx + ds * cgx) / n4, (vy + ds * cgy) / n4, (vz + ds * cgz) / n4
-    x += sixth * (ax + 2.0 * bx + 2.0 * cx + ex)
-    y += sixth * (ay + 2.0 * by + 2.0 * cy + ey)
-    z += sixth * (az + 2.0 * bz + 2.0 * cz + ez)
-    vx += sixth * (gx + 2.0 * bgx + 2.0 * cgx + dgx)
-    vy += sixth * (gy + 2.0 * bgy + 2.0 * cgy + dgy)
-    vz += sixth * (gz + 2.0 * bgz + 2.0 * cgz + dgz)
-    n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
-    vx, vy, vz = _rescaled(vx, vy, vz, n)
-    return x, y, z, vx, vy, vz, n, gx, gy, gz
-
-
 @compiled
-def _march_ray_uniformly(voxels, origin, direction, near, far, integrator, num_steps, row):
-    """One ray's vertices into its row, the last one alone where it has no place for more; whether the index varied."""
+def _march_ray_uniformly(voxels, origin, direction, near, far, num_steps, row):
+    """Trace one ray by `integrators.euler` and write its vertices, or only the last one if the row has one place.
+
+    Returns whether the index varied along the path.
+    """
     table, low, inverse_spacing = voxels.values, voxels.low, voxels.inverse_spacing
     positions, directions, lengths = row
     vx, vy, vz = float(direction[0]), float(direction[1]), float(direction[2])
@@ -127,28 +82,20 @@ def _march_ray_uniformly(voxels, origin, direction, near, far, integrator, num_s
         if step == num_steps - 1:
             break
         x0, y0, z0 = x, y, z
-        if integrator == EULER:
-            x, y, z, vx, vy, vz, n, gx, gy, gz = _euler(
-                table, low, inverse_spacing, ds, x, y, z, vx, vy, vz, n, gx, gy, gz
-            )
-        elif integrator == LEAPFROG:
-            x, y, z, vx, vy, vz, n, gx, gy, gz = _leapfrog(
-                table, low, inverse_spacing, ds, x, y, z, vx, vy, vz, n, gx, gy, gz
-            )
-        else:
-            x, y, z, vx, vy, vz, n, gx, gy, gz = _rk4(
-                table, low, inverse_spacing, ds, x, y, z, vx, vy, vz, n, gx, gy, gz
-            )
+        h = ds / n
+        x, y, z = x + h * vx, y + h * vy, z + h * vz
+        vx, vy, vz = vx + ds * gx, vy + ds * gy, vz + ds * gz
+        n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
         s += math.sqrt((x - x0) ** 2 + (y - y0) ** 2 + (z - z0) ** 2)
     return bent
 
 
 @compiled_parallel
-def march_uniform(origins, directions, near, far, voxels, integrator, num_steps, keep_all):
-    """Steps of equal arc length through a voxel grid.
+def march_uniform(origins, directions, near, far, voxels, num_steps, keep_all):
+    """Trace rays through a voxel grid by Euler steps of equal arc length.
 
     Returns:
-        positions [R, V, 3], directions [R, V, 3], s [R, V]: with V the number of steps, or 1 (the last vertex alone) if
+        positions [R, V, 3], directions [R, V, 3], s [R, V]: V is the number of steps, or 1 for only the last vertex if
             not `keep_all`.
         refracted [R]: whether the index varied along the path.
     """
@@ -161,15 +108,15 @@ def march_uniform(origins, directions, near, far, voxels, integrator, num_steps,
     for ray in prange(num_rays):
         row = (out_positions[ray], out_directions[ray], out_s[ray])
         refracted[ray] = _march_ray_uniformly(
-            voxels, origins[ray], directions[ray], near[ray], far[ray], integrator, num_steps, row
+            voxels, origins[ray], directions[ray], near[ray], far[ray], num_steps, row
         )
     return out_positions, out_directions, out_s, refracted
 
 
 @compiled
 def _free_length(values, clearance, iors, shell, low, inverse_spacing, inverse_block, x, y, z, enough):
-    """A lower bound of the distance within which the index does not vary; tight where it is not `enough`."""
-    # Blocks are cheap to ask; only near a surface the distance itself is looked up.
+    """Return a lower bound of the distance without a change of the index; the bound is tight if less than `enough`."""
+    # The lookup of a block is cheap. The signed distance is only evaluated near surfaces.
     free = block_clearance(clearance, low, inverse_block, x, y, z) - shell
     if iors is None:
         return free
@@ -180,7 +127,7 @@ def _free_length(values, clearance, iors, shell, low, inverse_spacing, inverse_b
 
 @compiled
 def _look_up(values, clearance, iors, nested, shell, low, inverse_spacing, inverse_block, x, y, z):
-    """Index, gradient and the distance within which the index does not vary."""
+    """Return the index, its gradient, and the distance without a change of the index."""
     if iors is None:
         n, gx, gy, gz = voxel_index(values, low, inverse_spacing, x, y, z)
         return n, gx, gy, gz, float(block_clearance(clearance, low, inverse_block, x, y, z))
@@ -189,7 +136,7 @@ def _look_up(values, clearance, iors, nested, shell, low, inverse_spacing, inver
 
 @compiled
 def _step_length(iors, step, dx, dy, dz, gx, gy, gz):
-    """Arc length of the next step: across a shell it depends on the slant (`media.solid.Solid.step_length`)."""
+    """Return the length of the next step, which depends on the slant in a shell (`media.solid.Solid.step_length`)."""
     if iors is None:
         return step
     slope = math.sqrt(gx * gx + gy * gy + gz * gz)
@@ -200,7 +147,7 @@ def _step_length(iors, step, dx, dy, dz, gx, gy, gz):
 
 @compiled
 def _march_ray(medium, origin, direction, near, far, step, tolerance, max_steps, row):
-    """One ray's vertices into its row: their number, whether the index varied, and whether it took `max_steps`."""
+    """Trace one ray and write its vertices; returns their number, whether the index varied, and the excess of steps."""
     values, clearance, iors, nested, shell, low, high, inverse_spacing, inverse_block = medium[:9]
     positions, directions, lengths = row
     skip = REACHED * step
@@ -210,7 +157,7 @@ def _march_ray(medium, origin, direction, near, far, step, tolerance, max_steps,
     count, refracted, exceeded = put_vertex(positions, directions, lengths, 0, x, y, z, dx, dy, dz, s), False, False
     enter, leave = box_span(low, high, x, y, z, dx, dy, dz)
     if enter < leave and leave > 0.0 and enter < end - s:
-        # Position, direction and length at the last vertex that was kept.
+        # Position, direction and arc length of the last recorded vertex.
         kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
         jump = max(enter, 0.0)
         x, y, z, s = x + jump * dx, y + jump * dy, z + jump * dz, s + jump
@@ -242,7 +189,7 @@ def _march_ray(medium, origin, direction, near, far, step, tolerance, max_steps,
                     values, clearance, iors, nested, shell, low, inverse_spacing, inverse_block, x, y, z
                 )
                 vx, vy, vz = _kick(h, px, py, pz, vx, vy, vz, n, gx, gy, gz)
-                # A straight step leaves the direction as it is, to the last bit.
+                # A straight step must not change the direction by rounding.
                 if varied or gx != 0.0 or gy != 0.0 or gz != 0.0:
                     norm = math.sqrt(vx * vx + vy * vy + vz * vz)
                     dx, dy, dz = vx / norm, vy / norm, vz / norm
@@ -264,13 +211,15 @@ def _march_ray(medium, origin, direction, near, far, step, tolerance, max_steps,
 
 @compiled_parallel
 def march_adaptive(origins, directions, near, far, medium, step, tolerance, max_steps, capacity):
-    """Steps where the index varies, straight jumps elsewhere; vertices where the path leaves its last tangent.
+    """Trace rays by steps in regions of varying index, and straight jumps elsewhere.
+
+    A vertex is recorded when the path is more than `tolerance` from its last tangent.
 
     Returns:
-        positions [R, V, 3], directions [R, V, 3], s [R, V]: with V the capacity, in the rays' precision.
-        counts [R]: vertices of each path, more than the capacity where it did not suffice.
+        positions [R, V, 3], directions [R, V, 3], s [R, V]: V is the capacity; in the precision of the rays.
+        counts [R]: number of vertices of each path, which may be more than the capacity.
         refracted [R]: whether the index varied along the path.
-        exceeded [R]: whether a ray took `max_steps`; it goes straight on from there.
+        exceeded [R]: whether a ray took `max_steps`, after which the path continues straight.
     """
     num_rays = origins.shape[0]
     out_positions = np.empty((num_rays, capacity, 3), origins.dtype)

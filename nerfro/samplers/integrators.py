@@ -1,4 +1,4 @@
-"""One step of the Eikonal equation in arc length, d/ds (n dx/ds) = grad n.
+"""Single steps of the Eikonal equation in arc length, d/ds (n dx/ds) = grad n.
 
 With v = n dx/ds the equation is x' = v / n, v' = grad n (paper, Eqn. eikonal), and |v| = n along every exact solution.
 """
@@ -19,11 +19,17 @@ Index = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 class RayState(NamedTuple):
-    """Where rays are."""
+    """State of rays.
 
-    positions: Float[Tensor, "R 3"]  # world units
-    velocities: Float[Tensor, "R 3"]  # v, direction times refractive index
-    # The medium there.
+    Attributes:
+        positions: positions in world units.
+        velocities: v, the unit direction times the refractive index.
+        n: refractive index at the positions.
+        gradients: gradient of the index at the positions, per world unit.
+    """
+
+    positions: Float[Tensor, "R 3"]
+    velocities: Float[Tensor, "R 3"]
     n: Float[Tensor, "R"]
     gradients: Float[Tensor, "R 3"]
 
@@ -32,23 +38,26 @@ Integrator = Callable[[RayState, Float[Tensor, "R"], Index], RayState]
 
 
 def euler(state: RayState, ds: Float[Tensor, "R"], index: Index) -> RayState:
-    """Explicit Euler, x + ds v / n, v + ds grad n, both from the old state (the paper's); |v| drifts away from n."""
+    """Take an explicit Euler step, x + ds v / n and v + ds grad n, both from the old state, as the paper does.
+
+    |v| drifts away from n.
+    """
     x, v, n, g = state
     x, v = x + (ds / n)[:, None] * v, v + ds[:, None] * g
     return RayState(x, v, *index(x))
 
 
 def leapfrog(state: RayState, ds: Float[Tensor, "R"], index: Index) -> RayState:
-    """Kick, drift, kick with the force n grad n of dx/dsigma = v; second order, one look-up a step.
+    """Take a kick-drift-kick step with the force n grad n of dx/dsigma = v; second order, with one lookup of the index.
 
-    dsigma = ds / n with n in the middle of the step, n + ds/2 dn/ds, so that the step is ds long to second order.
-    Exact where n^2 is linear in space.
+    dsigma = ds / n with the index in the middle of the step, n + ds/2 dn/ds, so that the step has length ds to second
+    order. The step is exact where n^2 is linear in space.
 
-    Where a step does not resolve the index, so that |v| differs from n after it, and where the index stops varying,
-    |v| = n is restored by v's component along the kick alone. The component across, n sin(angle) at a surface, is what
-    refraction conserves, so a flat interface is refracted exactly however few steps it takes. Steps that resolve the
-    index are left alone: the error of |v| does not grow with their number, and what remains of it turns with the
-    gradient and is not along the kick. Nor is a small component along the kick (the ray turns) determined by |v| = n.
+    If a step does not resolve the index, so that |v| differs from n, and at the end of a varying index, the component
+    of v along the kick is changed so that |v| = n. The component across the kick, n sin(angle) at a surface, is
+    conserved by refraction, so a flat interface is refracted exactly in any number of steps. Steps that resolve the
+    index are not corrected: their error of |v| does not accumulate, and mostly is not along the kick because the
+    gradient turns. A small component along the kick, as of a ray that turns, is not determined by |v| = n.
     """
     _, v, n, g = state
     middle = n + 0.5 * ds * (g * v).sum(-1) / n
@@ -58,9 +67,9 @@ def leapfrog(state: RayState, ds: Float[Tensor, "R"], index: Index) -> RayState:
 
 
 def kick_drift_kick(state: RayState, dsigma: Float[Tensor, "R"], index: Index) -> RayState:
-    """The step of `leapfrog` in the parameter of dx/dsigma = v, dv/dsigma = n grad n.
+    """Take the step of `leapfrog` in the parameter sigma of dx/dsigma = v, dv/dsigma = n grad n.
 
-    A symplectic map, and its own inverse when v is turned round, for any fixed dsigma.
+    For a fixed dsigma, the step is a symplectic map, and its own inverse with reversed v.
     """
     x, v, n, g = state
     dsigma = dsigma[:, None]
@@ -73,38 +82,13 @@ def kick_drift_kick(state: RayState, dsigma: Float[Tensor, "R"], index: Index) -
 def _with_length_along(
     v: Float[Tensor, "R 3"], axis: Float[Tensor, "R 3"], length: Float[Tensor, "R"], varies: Bool[Tensor, "R"]
 ) -> Float[Tensor, "R 3"]:
-    """Change the component of v along an axis so that |v| becomes `length`, where that is called for (`leapfrog`)."""
+    """Change the component of v along an axis so that |v| equals `length`, under the conditions of `leapfrog`."""
     unit = functional.normalize(axis, dim=-1, eps=torch.finfo(v.dtype).tiny)
     along = (v * unit).sum(-1)
     excess = v.square().sum(-1) - length**2
     squared = along**2 - excess
     resolved = varies & (excess.abs() <= RESOLVED * length**2)
     sound = (torch.minimum(along**2, squared) >= MIN_NORMAL_PART * length**2) & ~resolved
-    # The root of 1 where it is not used: that of a negative number would make gradients nan.
+    # Unused roots are taken of 1, because the root of a negative number would make gradients NaN.
     change = torch.copysign(torch.where(sound, squared, 1.0).sqrt(), along) - along
     return v + torch.where(sound, change, 0.0)[:, None] * unit
-
-
-def rk4(state: RayState, ds: Float[Tensor, "R"], index: Index) -> RayState:
-    """The classical fourth-order Runge-Kutta step; the length of v is set to n after it."""
-    x, v, n, g = state
-    ds = ds[:, None]
-    x1, v1 = v / n[:, None], g
-    n2, v2 = index(x + 0.5 * ds * x1)
-    x2 = (v + 0.5 * ds * v1) / n2[:, None]
-    n3, v3 = index(x + 0.5 * ds * x2)
-    x3 = (v + 0.5 * ds * v2) / n3[:, None]
-    n4, v4 = index(x + ds * x3)
-    x4 = (v + ds * v3) / n4[:, None]
-    x = x + ds / 6 * (x1 + 2 * x2 + 2 * x3 + x4)
-    v = v + ds / 6 * (v1 + 2 * v2 + 2 * v3 + v4)
-    n, g = index(x)
-    return RayState(x, with_length(v, n), n, g)
-
-
-def with_length(v: Float[Tensor, "R 3"], length: Float[Tensor, "R"]) -> Float[Tensor, "R 3"]:
-    """Vectors of the same direction and the given length."""
-    return v * (length / v.norm(dim=-1))[:, None]
-
-
-INTEGRATORS: dict[str, Integrator] = {"euler": euler, "leapfrog": leapfrog, "rk4": rk4}

@@ -6,94 +6,44 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.samplers.branching import Branching, Event
-from nerfro.samplers.polylines import Crossed, Polylines
-from nerfro.samplers.snell_law import reflectance, refract
+from nerfro.samplers.branching import Branching
+from nerfro.samplers.wavefront import Wavefront
 from nerfro.types import Path, Rays
 
-# A new ray starts this share of the box's diagonal ahead, beyond the rounding of Embree's single precision.
+# The search for the next triangle begins at this share of the box's diagonal from the last one, beyond the rounding
+# errors of Embree's single precision.
 _OFFSET = 1e-6
 
 
 def snell_on_mesh(
     rays: Rays, medium: SdfGrid, max_events: int, branching: Branching
 ) -> tuple[Path, Int[Tensor, "P"], Bool[Tensor, "P"]]:
-    """Follow rays from triangle to triangle.
+    """Trace rays from triangle to triangle, on the CPU and in double precision.
 
-    Whether a ray is in a body is known from how often it crossed its surface, not from the triangles' orientation.
-    Rays are traced on the CPU, in double precision; the signed distance says which begin inside. Returned are paths,
-    the number of events on each polyline, and whether it met the limit.
+    The number of crossings of its surface determines whether a ray is inside a body; the orientation of triangles does
+    not matter. Signed distances determine which rays begin inside.
+
+    Returns:
+        Paths, the number of events of each polyline, and whether the polyline met the limit.
     """
     triangles, scene = medium.traced_triangles()
-    iors = torch.cat([torch.ones(1), medium.iors.detach().cpu()]).double()
-    box, device = medium.box.double().cpu(), rays.origins.device
-    origins, far = rays.origins.double().cpu(), rays.far.double().cpu()
-    d, s = rays.directions.double().cpu().clone(), rays.near.double().cpu().clone()
-    x = origins + s[:, None] * d
-    rows = torch.arange(len(rays))
-    enter, leave = intersect_box(box, x, d)
-    active = rows[(enter < leave) & (leave > 0) & (enter < far - s)]
-    inside = torch.zeros(len(rays), len(medium.iors), dtype=torch.bool)
-    within = active[enter[active] < 0]
-    if len(within):
-        inside[within] = (medium.signed_distances(x[within].to(medium.box))[0] < 0).cpu()
-    lines = Polylines(len(rays), x)
-    lines.append(rows, x, d, s, Crossed(medium.innermost(inside)))
-    num_events, exceeded = torch.zeros_like(rows), torch.zeros(len(rays), dtype=torch.bool)
-    last_face = torch.full_like(rows, -1)
-    weight, ray = torch.ones_like(s), rows
+    box = medium.box.double().cpu()
     offset = _OFFSET * float(torch.linalg.vector_norm(box[1] - box[0]))
-    start = torch.zeros_like(s)
-    while len(active):
-        face = scene.first_hits(x[active] + start[active, None] * d[active], d[active])
-        active, face = active[face >= 0], face[face >= 0]
-        length = triangles.distance(x[active], d[active], face)
-        # A straight line meets a plane once: the triangle that the ray comes from is found again only by rounding.
-        again = face == last_face[active]
-        start[active[again]] += offset
-        retry, ahead = active[again], ~again
-        active, face, length = active[ahead], face[ahead], length[ahead].clamp(min=0)
-        flipped = inside[active]
-        body = triangles.body[face][:, None]
-        flipped = flipped.scatter(1, body, ~flipped.gather(1, body))
-        across = medium.innermost(flipped)
-        n_before, n_after = iors[medium.innermost(inside[active])], iors[across]
-        visible = n_before != n_after
-        over = visible & (num_events[active] >= max_events)
-        exceeded[active] = over
-        hit = x[active] + length[:, None] * d[active]
-        normal = triangles.normal(hit, face)
-        turned, reflected = refract(d[active], normal, n_before, n_after)
-        reflected &= visible
-        keep = ~over
-        active, face, hit, length, visible = active[keep], face[keep], hit[keep], length[keep], visible[keep]
-        turned, reflected, flipped, across = turned[keep], reflected[keep], flipped[keep], across[keep]
-        if branching.num_events:
-            normal, n_before, n_after = normal[keep], n_before[keep], n_after[keep]
-            share = torch.where(visible, reflectance(d[active], normal, n_before, n_after), 0.0)
-            event = Event(branching, active, weight, num_events, share, reflected)
-            retry = event.row[retry]
-            state = (x, d, s, inside, num_events, exceeded, weight, ray, start, last_face)
-            x, d, s, inside, num_events, exceeded, weight, ray, start, last_face = (v[event.source] for v in state)
-            lines.take(event.source)
-            met = (face, hit, length, visible, flipped, across, normal, n_before, n_after)
-            face, hit, length, visible, flipped, across, normal, n_before, n_after = (v[event.place] for v in met)
-            active, reflected = event.active, event.reflected
-            weight[active] *= event.factor
-            turned, _ = refract(d[active], normal, n_before, n_after, reflected)
-        inside[active] = torch.where(reflected[:, None], inside[active], flipped)
-        x[active], s[active], last_face[active] = hit, s[active] + length, face
-        start[active] = offset
-        d[active] = torch.where(visible[:, None], turned, d[active])
-        num_events[active] += visible
-        bent = active[visible]
-        at_surface = Crossed(
-            medium.innermost(inside[bent]), triangles.body[face[visible]], across[visible], face[visible]
-        )
-        lines.append(bent, x[bent], d[bent], s[bent], at_surface)
-        active = torch.cat([active, retry])
-    lines.append_ends(far[ray], box, num_events > 0, x, d, s)
-    split = (ray, weight) if branching.num_events else (None, None)
-    return lines.path(rays, num_events > 0, *split), num_events.to(device), exceeded.to(device)
+    front = Wavefront(rays.to("cpu").to(torch.float64), medium, box, max_events, branching, offset)
+    within = (front.moving & (front.enter < 0)).nonzero()[:, 0]
+    if len(within):
+        front.inside[within] = (medium.signed_distances(front.x[within].to(medium.box))[0] < 0).cpu()
+    front.add_vertices(front.ray)
+    while len(rows := front.moving.nonzero()[:, 0]):
+        face = scene.first_hits(front.x[rows] + front.start[rows, None] * front.d[rows], front.d[rows])
+        front.moving[rows] = face >= 0
+        rows, face = rows[face >= 0], face[face >= 0]
+        # A straight line meets a plane once, so finding the triangle of the last vertex again is a rounding error.
+        again = face == front.triangle[rows]
+        front.start[rows[again]] += offset
+        rows, face = rows[~again], face[~again]
+        length = triangles.distance(front.x[rows], front.d[rows], face).clamp(min=0)
+        normal = triangles.normal(front.x[rows] + length[:, None] * front.d[rows], face)
+        front.meet(rows, length, length, triangles.body[face], normal, face)
+    return front.finish(rays)

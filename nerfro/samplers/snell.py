@@ -21,13 +21,12 @@ from nerfro.media.solid import Solid
 from nerfro.registry import register
 from nerfro.samplers.bands import SnellTrace, refined_in_bands, traced_in_bands
 from nerfro.samplers.base import PathSampler
-from nerfro.samplers.branching import ONE_PATH, Branching, Event
+from nerfro.samplers.branching import ONE_PATH, Branching
 from nerfro.samplers.compiled import snell_on_grid
 from nerfro.samplers.mesh_interfaces import snell_on_mesh
-from nerfro.samplers.polylines import Crossed, Polylines
 from nerfro.samplers.replay import meet_solid, meet_triangles, replay, smallest_cosine
-from nerfro.samplers.snell_law import reflectance, refract
 from nerfro.samplers.straight import straight_path
+from nerfro.samplers.wavefront import Wavefront
 from nerfro.types import Path, Rays
 
 _ROOT_ITERATIONS = 60
@@ -134,78 +133,35 @@ class Snell(PathSampler):
 def trace_interfaces(
     rays: Rays, medium: Solid, max_events: int, branching: Branching = ONE_PATH
 ) -> tuple[Path, Int[Tensor, "P"], Bool[Tensor, "P"]]:
-    """Follow rays from surface to surface of any solid: the plain reference of the compiled kernel.
+    """Trace rays from surface to surface of any solid; the reference implementation of the compiled kernel.
 
-    Surfaces are found by sphere tracing: the signed distance is a step that cannot jump over them. A change of sign
-    ends the search, and the root is bracketed. A refracted ray goes on from the far end of the bracket, a reflected one
-    from its near end, so that both begin on their own side.
+    Sphere tracing finds the surfaces, because a step of the signed distance cannot miss one. A change of sign ends the
+    search, and bisection shrinks the bracket around the surface.
+
+    Returns:
+        Paths, the number of events of each polyline, and whether the polyline met the limit.
     """
-    num_rays = len(rays)
-    rows = torch.arange(num_rays, device=rays.near.device)
-    x, d, s = rays.origins + rays.near[:, None] * rays.directions, rays.directions.clone(), rays.near.clone()
-    enter, leave = intersect_box(medium.box, x, d)
-    in_box = ((x >= medium.box[0]) & (x <= medium.box[1])).all(-1, keepdim=True)
-    lines = Polylines(num_rays, x)
-    lines.append(rows, x, d, s, Crossed(medium.innermost(in_box & (medium.signed_distances(x)[0] < 0))))
-    num_events = torch.zeros_like(rows)
-    exceeded = torch.zeros_like(rows, dtype=torch.bool)
-    weight, ray = torch.ones_like(s), rows
-    active = rows[(enter < leave) & (leave > 0) & (enter < rays.far - s)]
-    jump = enter[active].clamp(min=0)
-    x[active] += jump[:, None] * d[active]
-    s[active] += jump
-    inside = medium.signed_distances(x)[0] < 0
-    min_step = MIN_SEARCH_STEP * float((medium.box[1] - medium.box[0]).min())
-    while len(active):
-        _, leave = intersect_box(medium.box, x[active], d[active])
-        before, after, crossed = _search(medium, x[active], d[active], inside[active], leave, min_step)
-        active, before, after = active[crossed], before[crossed], after[crossed]
-        if not len(active):
-            break
-        before, after, body = _first_crossing(medium, x[active], d[active], inside[active], before, after)
-        n_before = medium.index_inside(inside[active])
-        flipped = inside[active]
-        flipped.scatter_(1, body[:, None], ~flipped.gather(1, body[:, None]))
-        across, n_after = medium.innermost(flipped), medium.index_inside(flipped)
-        visible = n_before != n_after
-        over = visible & (num_events[active] >= max_events)
-        exceeded[active] = over
-        _, normals = medium.signed_distances(x[active] + after[:, None] * d[active])
+    box = medium.box
+    front = Wavefront(rays, medium, box, max_events, branching)
+    in_box = ((front.x >= box[0]) & (front.x <= box[1])).all(-1, keepdim=True)
+    front.inside = in_box & (medium.signed_distances(front.x)[0] < 0)
+    front.add_vertices(front.ray)
+    entry = torch.where(front.moving, front.enter.clamp(min=0), 0.0)
+    front.x += entry[:, None] * front.d
+    front.s += entry
+    front.inside = medium.signed_distances(front.x)[0] < 0
+    min_step = MIN_SEARCH_STEP * float((box[1] - box[0]).min())
+    while len(rows := front.moving.nonzero()[:, 0]):
+        x, d, inside = front.x[rows], front.d[rows], front.inside[rows]
+        before, after, crossed = _search(medium, x, d, inside, intersect_box(box, x, d)[1], min_step)
+        front.moving[rows] = crossed
+        rows, x, d, inside, before, after = (values[crossed] for values in (rows, x, d, inside, before, after))
+        before, after, body = _first_crossing(medium, x, d, inside, before, after)
+        _, normals = medium.signed_distances(x + after[:, None] * d)
         normal = normals.gather(1, body[:, None, None].expand(-1, 1, 3))[:, 0]
         normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
-        turned, reflected = refract(d[active], normal, n_before, n_after)
-        reflected &= visible
-        keep = ~over
-        met = (active, before, after, body, flipped, across, normal, n_before, n_after, visible, turned, reflected)
-        active, before, after, body, flipped, across, normal, n_before, n_after, visible, turned, reflected = (
-            values[keep] for values in met
-        )
-        if branching.num_events:
-            share = torch.where(visible, reflectance(d[active], normal, n_before, n_after), 0.0)
-            event = Event(branching, active, weight, num_events, share, reflected)
-            state = (x, d, s, inside, num_events, exceeded, weight, ray)
-            x, d, s, inside, num_events, exceeded, weight, ray = (values[event.source] for values in state)
-            lines.take(event.source)
-            of_event = (before, after, body, flipped, across, normal, n_before, n_after, visible)
-            before, after, body, flipped, across, normal, n_before, n_after, visible = (
-                values[event.place] for values in of_event
-            )
-            active, reflected = event.active, event.reflected
-            weight[active] *= event.factor
-            turned, _ = refract(d[active], normal, n_before, n_after, reflected)
-        length = torch.where(reflected, before, after)
-        inside[active] = torch.where(reflected[:, None], inside[active], flipped)
-        x[active] += length[:, None] * d[active]
-        s[active] += length
-        d[active] = torch.where(visible[:, None], turned, d[active])
-        num_events[active] += visible
-        bent = active[visible]
-        at_surface = Crossed(medium.innermost(inside[bent]), body[visible], across[visible])
-        lines.append(bent, x[bent], d[bent], s[bent], at_surface)
-    refracted = num_events > 0
-    lines.append_ends(rays.far[ray], medium.box, refracted, x, d, s)
-    split = (ray, weight) if branching.num_events else (None, None)
-    return lines.path(rays, refracted, *split), num_events, exceeded
+        front.meet(rows, before, after, body, normal)
+    return front.finish(rays)
 
 
 def _search(

@@ -28,7 +28,7 @@ from nerfro.testing import NUM_RAYS, example_batch, example_rendering
 def model() -> Renderer:
     parts = Components(
         medium=Luneburg(),
-        path_sampler=Eikonal("leapfrog", 32),
+        path_sampler=Eikonal("euler", 32),
         point_sampler=Hierarchical(8, 8),
         make_field=lambda: NerfField(width=16, depth=2, skip=1, view_width=8),
         boundary=Skybox(width=8),

@@ -36,7 +36,7 @@ class Compass(Boundary):
 def parts() -> Components:
     return Components(
         medium=Luneburg(),
-        path_sampler=Eikonal("leapfrog", 64),
+        path_sampler=Eikonal("euler", 64),
         point_sampler=Hierarchical(8, 8),
         make_field=lambda: NerfField(width=16, depth=2, skip=1, view_width=8),
         boundary=Skybox(width=8),

@@ -15,7 +15,7 @@ from torch import Tensor
 from nerfro.geometry.interpolation import quadratic_spline, spline_coefficients
 from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.samplers.eikonal import march_uniform
-from nerfro.samplers.integrators import INTEGRATORS, RayState, kick_drift_kick
+from nerfro.samplers.integrators import Integrator, RayState, euler, kick_drift_kick, leapfrog
 from nerfro.samplers.snell_law import refract
 from tests.closed_forms import FunctionMedium, Squared, blurred_ball, make_rays
 
@@ -81,7 +81,7 @@ def _of_alpha(alpha: Tensor) -> Squared:
     return squared
 
 
-@pytest.mark.parametrize("integrator", sorted(INTEGRATORS))
+@pytest.mark.parametrize("integrator", [euler, leapfrog])
 @pytest.mark.parametrize(
     ("profile", "value"),
     [
@@ -93,12 +93,12 @@ def _of_alpha(alpha: Tensor) -> Squared:
     ids=["ball-index", "ball-radius", "luneburg", "fibre"],
 )
 def test_autodiff_agrees_with_central_differences(
-    integrator: str, profile: Callable[[Tensor], Squared], value: float
+    integrator: Integrator, profile: Callable[[Tensor], Squared], value: float
 ) -> None:
     rays = make_rays([[-1.1, 0.4, 0.1], [-1.1, -0.7, 0.2]], [[1, 0.1, 0.2], [1, 0, 0]], 0, 2)
 
     def loss(parameter: Tensor) -> Tensor:
-        path = march_uniform(rays, FunctionMedium(profile(parameter)), INTEGRATORS[integrator], 129)
+        path = march_uniform(rays, FunctionMedium(profile(parameter)), integrator, 129)
         return (path.exit_positions * _double(0.3, 0.7, -0.4)).sum() + (path.exit_directions * _double(1, -2, 3)).sum()
 
     parameter = torch.tensor(value, dtype=torch.float64, requires_grad=True)
@@ -120,7 +120,7 @@ def test_a_voxel_grid_gets_the_gradient_of_central_differences() -> None:
 
     def loss(values: Tensor) -> Tensor:
         medium.table = values
-        path = march_uniform(rays, medium, INTEGRATORS["leapfrog"], 65)
+        path = march_uniform(rays, medium, leapfrog, 65)
         return (path.exit_positions * _double(0.3, 0.7, -0.4)).sum() + path.exit_directions[0, 1]
 
     (gradient,) = torch.autograd.grad(loss(table.clone().requires_grad_()), medium.table)
@@ -132,11 +132,11 @@ def test_a_voxel_grid_gets_the_gradient_of_central_differences() -> None:
         torch.testing.assert_close(gradient.flatten()[flat], expected, rtol=1e-5, atol=1e-8)
 
 
-@pytest.mark.parametrize("integrator", sorted(INTEGRATORS))
-def test_gradients_are_finite_where_the_index_is_constant(integrator: str) -> None:
+@pytest.mark.parametrize("integrator", [euler, leapfrog])
+def test_gradients_are_finite_where_the_index_is_constant(integrator: Integrator) -> None:
     index = torch.tensor(1.5, dtype=torch.float64, requires_grad=True)
     medium = FunctionMedium(lambda x: (index.square().expand(len(x)), torch.zeros_like(x)))
-    path = march_uniform(make_rays([[0, 0, 0]], [[1, 2, 2]], 0, 2), medium, INTEGRATORS[integrator], 9)
+    path = march_uniform(make_rays([[0, 0, 0]], [[1, 2, 2]], 0, 2), medium, integrator, 9)
     (gradient,) = torch.autograd.grad(path.exit_positions.sum() + path.exit_directions.sum(), index)
     assert float(gradient) == pytest.approx(0, abs=1e-12)  # the index of everywhere bends nothing
 

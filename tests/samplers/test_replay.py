@@ -187,7 +187,6 @@ REFINED: list[tuple[PathSampler, Callable[[FilePath], Medium]]] = [
     *(SCENES[name] for name in ("snell-ball", "snell-nested-mesh", "eikonal-ball")),
     (Snell(), lambda folder: _nested_grid()),
     (Eikonal(), lambda folder: _nested_grid()),
-    (Eikonal("leapfrog", 64), lambda folder: _nested_grid()),
     (Eikonal("euler", 64), lambda folder: _voxels()),
     (Snell(), lambda folder: Vacuum()),
     (Straight(), lambda folder: Vacuum()),

@@ -20,7 +20,7 @@ NUM_VERTICES = 48
 
 @pytest.fixture(scope="module")
 def bent() -> Path:
-    return Eikonal("leapfrog", NUM_VERTICES)(example_rays(200), Luneburg())
+    return Eikonal("euler", NUM_VERTICES)(example_rays(200), Luneburg())
 
 
 def fractions(path: Path, s: torch.Tensor) -> torch.Tensor:

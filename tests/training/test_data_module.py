@@ -160,7 +160,7 @@ def test_nothing_is_traced_ahead_where_paths_learn_or_python_is_needed(ball: Sdf
     assert can_trace_ahead(model(Snell()))
     assert not can_trace_ahead(model(Snell(), learns=True))
     assert not can_trace_ahead(model(Snell("mesh")))
-    assert not can_trace_ahead(model(Eikonal("rk4")))
+    assert not can_trace_ahead(model(Eikonal("euler")))
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0}, raising=False)
     assert not can_trace_ahead(model(Snell())), "one core has nobody who waits"
 
