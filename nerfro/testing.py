@@ -1,7 +1,7 @@
-"""Contracts that every plugin keeps; the test suite runs them over all that are registered, yours included.
+"""Contracts of plugins. The test suite checks all registered plugins, including yours.
 
-`check(plugin)` builds the plugin with its defaults, asks it as the model would, and raises `ContractError` with what it
-broke. Plugins whose required fields have no default are checked with the fields that you give.
+`check(plugin)` builds the plugin with its defaults, calls the plugin as the model does, and raises `ContractError` for
+a broken contract. For plugins with required fields, give the values of these fields.
 """
 
 from __future__ import annotations
@@ -35,20 +35,28 @@ NUM_RAYS = 24
 
 
 class ContractError(AssertionError):
-    """A plugin does not do what its kind promises."""
+    """A plugin breaks the contract of its type."""
 
 
 def check(plugin: Plugin, fields: Mapping[str, object] | None = None) -> None:
-    """Check a registered plugin against the contract of its kind."""
+    """Check a registered plugin against the contract of its type.
+
+    Args:
+        plugin: plugin to check.
+        fields: values of required fields.
+
+    Raises:
+        ContractError: the plugin breaks a contract.
+    """
     _require(bool(plugin.summary), "the class has no docstring, which `python -m nerfro.plugins` shows")
-    base, keeps_contract = _CONTRACTS[plugin.kind]
-    part = build({"_target_": plugin.target, **(fields or {})}, components=example_components())
-    _require(isinstance(part, base), f"a {plugin.kind} derives from {base.__module__}.{base.__name__}")
-    keeps_contract(part)
+    base, check_contract = _CONTRACTS[plugin.kind]
+    built = build({"_target_": plugin.target, **(fields or {})}, components=example_components())
+    _require(isinstance(built, base), f"a {plugin.kind} derives from {base.__module__}.{base.__name__}")
+    check_contract(built)
 
 
 def example_rays(num_rays: int = NUM_RAYS) -> Rays:
-    """Rays from around the unit cube towards it; many meet a ball of radius 0.8."""
+    """Return rays from around the unit cube towards the cube; many meet a ball of radius 0.8."""
     generator = torch.Generator().manual_seed(7)
     origins = torch.nn.functional.normalize(torch.randn(num_rays, 3, generator=generator), dim=-1) * 4
     targets = torch.randn(num_rays, 3, generator=generator) * 0.6
@@ -58,19 +66,19 @@ def example_rays(num_rays: int = NUM_RAYS) -> Rays:
 
 
 def example_path(num_rays: int = NUM_RAYS) -> Path:
-    """Paths bent by a glass ball."""
+    """Return paths through a glass ball."""
     return Snell()(example_rays(num_rays), Ball())
 
 
 def example_samples() -> Samples:
-    """Sixteen samples on each example path."""
+    """Return sixteen samples on each example path."""
     path = example_path()
     fractions = torch.linspace(0.0, 0.95, 16)
     return point_samples(path, path.near[:, None] + fractions * (path.far - path.near)[:, None])
 
 
 def example_rendering() -> Rendering:
-    """A rendering of the example samples with a smooth density, whose densities and colours want gradients."""
+    """Render the example samples with a smooth density; densities and colours require gradients."""
     samples = example_samples()
     density = torch.exp(-samples.positions.square().sum(-1)).requires_grad_()
     rgb = torch.sigmoid(samples.positions).requires_grad_()
@@ -78,7 +86,7 @@ def example_rendering() -> Rendering:
 
 
 def example_batch(num_rays: int = NUM_RAYS) -> Batch:
-    """A batch of the example rays, one through each grey pixel, with two small training cameras."""
+    """Return a batch of the example rays, one through each grey pixel, with two small training cameras."""
     pose = torch.eye(4)[:3].repeat(2, 1, 1)
     pose[:, 2, 3] = 4
     two = torch.full((2,), 8.0)
@@ -97,7 +105,7 @@ def example_batch(num_rays: int = NUM_RAYS) -> Batch:
 
 
 def example_draws(num_rays: int = NUM_RAYS, step: int = 0) -> Draws:
-    """Random numbers of a training step."""
+    """Return random numbers of a training step."""
     return Draws(seed=0, step=step, ray=torch.arange(num_rays))
 
 
@@ -232,7 +240,7 @@ _CONTRACTS: dict[str, tuple[type, Callable[[Any], None]]] = {
 
 
 def example_components() -> Components:
-    """Components of a small model on straight rays before a black sky."""
+    """Return the components of a small model with straight rays and a black background."""
     return Components(
         medium=Ball(),
         path_sampler=Straight(),

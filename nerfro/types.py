@@ -1,7 +1,7 @@
-"""The values that pass between the parts. Shapes use the axis letters below, lengths are in world units.
+"""Values that pass between components. Lengths are in world units, and shapes use the following axis letters.
 
-R rays, P polylines, S path vertices, N samples, V views, H and W pixels, L sampling levels. There are as many polylines
-as rays where no ray splits; what is documented with R then has P rows.
+R rays, P polylines, S path vertices, N samples, V views, H and W pixels, L sampling levels. If no ray splits, the
+number of polylines equals the number of rays, P = R.
 """
 
 from __future__ import annotations
@@ -25,33 +25,33 @@ __all__ = ["Batch", "Exits", "Path", "Radiance", "Rays", "Rendering", "Samples"]
 class Path:
     """Rays as polylines in arc length.
 
-    Vertex i is left in `directions[i]`, along which the polyline runs straight until vertex i + 1. A straight ray is a
-    path of two vertices. Rows with fewer vertices than others repeat their last one (arc length included).
+    The segment between vertices i and i + 1 has the direction `directions[i]`. A straight ray is a path of two
+    vertices. Rows with fewer vertices than others repeat their last vertex, including the arc length.
 
-    Light that splits at a surface takes several polylines of one ray, each complete from the camera on. Rendering sums
-    what they contribute (`per_ray`). `unbranched` makes the ordinary path, one polyline per ray; `dataclasses.replace`
-    derives a path from another, `path[rows]` and `of_rays` select from it, and `joined` concatenates.
+    If light splits at a surface, the ray has several polylines, each complete from the camera on. Rendering sums their
+    contributions (`per_ray`). `unbranched` creates an ordinary path with one polyline per ray, `dataclasses.replace`
+    derives a path from another, `path[rows]` and `of_rays` select rows, and `joined` concatenates paths.
 
     Attributes:
         positions: vertices, world units.
-        directions: unit direction in which each vertex is left; at the last vertex, in which the polyline leaves the
-            bounded volume.
+        directions: unit direction of the segment after each vertex; at the last vertex, the exit direction.
         s: arc length from the camera at each vertex, non-decreasing, world units. `s[:, 0]` is near; `s[:, -1]` is far,
-            or more where the object is left later.
-        refracted: whether the polyline met the medium (an index other than 1) at all.
+            or more if the ray leaves the object later.
+        refracted: whether the polyline meets the medium (an index other than 1).
         radii: pixel cone radius at unit distance, from the rays.
         splits: whether rays may have several polylines. If not, `ray` counts from 0 and `throughput` is 1 everywhere.
-        ray: ray that each polyline belongs to, non-decreasing; every ray has at least one polyline.
-        throughput: linear factor of the light that the polyline contributes; those of one ray sum to at most 1.
-        body: innermost body of the medium in which each vertex is left, numbered from 1; 0 in air, or where the index
-            varies continuously.
-        surface: body on whose surface each vertex lies, numbered from 0; -1 where there is no sharp surface, as at both
-            ends.
-        across: body on the other side of that surface, numbered as `body`: the one that transmitted light enters, and
-            that reflected light does not. 0 where there is no surface.
-        triangle: triangle that each vertex lies on, where the trace met triangles; otherwise -1.
-        absorption: of air and of each body for red, green and blue, per world unit; empty where all is clear.
-        band: number of the wavelength at which the polyline is bent, where the index depends on it; otherwise 0.
+        ray: ray of each polyline, non-decreasing; every ray has at least one polyline.
+        throughput: linear factor of the light of the polyline; the factors of a ray sum to at most 1.
+        body: innermost body of the segment after each vertex, numbered from 1; 0 in air, or if the index varies
+            continuously.
+        surface: body on whose surface each vertex lies, numbered from 0; -1 for vertices on no sharp surface, such as
+            both ends.
+        across: body on the other side of the surface, numbered as `body`. Transmitted light enters the body, reflected
+            light does not. 0 for vertices on no surface.
+        triangle: triangle on which each vertex lies; -1 if the surface has no triangles.
+        absorption: absorption coefficients of air and of each body for red, green and blue, per world unit; empty if
+            all media are clear.
+        band: number of the wavelength of the polyline in dispersive media; otherwise 0.
     """
 
     positions: Float[Tensor, "P S 3"]
@@ -78,9 +78,9 @@ class Path:
         refracted: Bool[Tensor, "R"],
         radii: Float[Tensor, "R"],
     ) -> Path:
-        """Make a path of one polyline per ray, in clear media and without sharp surfaces.
+        """Create a path of one polyline per ray, in clear media and without sharp surfaces.
 
-        The remaining fields are expanded constants, which take no memory. Arguments are described in the class.
+        The class documents the arguments. The other fields are expanded constants, which take no memory.
         """
         none = torch.full((), -1, dtype=torch.int8, device=s.device)
         of_vertices, air = none.expand(s.shape), (none + 1).expand(s.shape)
@@ -93,7 +93,7 @@ class Path:
 
     @classmethod
     def joined(cls, paths: Sequence[Path]) -> Path:
-        """Concatenate paths: the polylines of the rays of the first one, then those of the next."""
+        """Concatenate the polylines of paths; the rays of each path follow the rays of the previous path."""
         num_vertices = max(path.s.shape[1] for path in paths)
         columns: dict[str, list[Any]] = {field.name: [] for field in fields(cls)}
         num_rays = 0
@@ -112,12 +112,12 @@ class Path:
 
     @property
     def absorbs(self) -> bool:
-        """Whether the path may cross bodies that absorb."""
+        """Whether the path may cross absorbing bodies."""
         return len(self.absorption) > 0
 
     @property
     def num_rays(self) -> int:
-        """Number of rays; equal to the number of polylines where none splits."""
+        """Number of rays, equal to the number of polylines if no ray splits."""
         return int(self.ray[-1]) + 1 if self.splits and len(self.ray) else len(self.ray)
 
     def per_ray(self, values: Float[Tensor, "P *C"]) -> Float[Tensor, "R *C"]:
@@ -132,25 +132,25 @@ class Path:
         return values[self.ray] if self.splits else values
 
     def first_of_ray(self, values: Shaped[Tensor, "P *C"]) -> Shaped[Tensor, "R *C"]:
-        """Select the value of the first polyline of each ray, which is the main one."""
+        """Select the value of the main polyline of each ray, which is the first."""
         if not self.splits:
             return values
         return values[torch.searchsorted(self.ray, torch.arange(self.num_rays, device=self.ray.device))]
 
     def transmitted(self, s: Float[Tensor, "P N"]) -> Float[Tensor, "P N 3"]:
-        """Share of light that comes from arc lengths `s` through what absorbs before them (Beer-Lambert), linear."""
-        vertex, runs = self._vertex_before(s), self.s.diff(dim=1)
+        """Compute the transmittance of absorbing bodies between the camera and arc lengths `s` (Beer-Lambert law)."""
+        vertex, lengths = self._vertex_before(s), self.s.diff(dim=1)
         since = s - self.s.gather(1, vertex)
         depth = s.new_zeros(*s.shape, 3)
         for number in range(1, len(self.absorption)):
             within = (self.body == number).to(s)
-            before = torch.nn.functional.pad((within[:, :-1] * runs).cumsum(1), (1, 0))
+            before = torch.nn.functional.pad((within[:, :-1] * lengths).cumsum(1), (1, 0))
             length = before.gather(1, vertex) + within.gather(1, vertex) * since
             depth = depth + length[..., None] * self.absorption[number]
         return torch.exp(-depth)
 
     def exits(self, directions: Float[Tensor, "P 3"] | None = None) -> Exits:
-        """Where light comes from beyond all vertices: the last straight run of each polyline."""
+        """Return the last segment of each polyline, along which background radiance arrives."""
         turns = (self.directions[:, 1:] != self.directions[:, :-1]).any(-1)
         last = (turns * torch.arange(1, self.s.shape[1], device=self.s.device)).amax(-1)
         start = self.positions.gather(1, last[:, None, None].expand(-1, 1, 3))[:, 0]
@@ -175,13 +175,13 @@ class Path:
         return self.directions[:, -1]
 
     def __getitem__(self, index: slice | Tensor) -> Path:
-        """Select polylines, each as that of a ray of its own."""
+        """Select polylines; each becomes the only polyline of a new ray."""
         rows = {name: value[index] for name, value in vars(self).items() if name not in _OF_PATHS}
         rows["ray"] = torch.arange(len(rows["s"]), device=self.s.device)
         return replace(self, **rows)
 
     def of_rays(self, rows: Int[Tensor, "C"]) -> Path:
-        """Select rays, each with all its polylines."""
+        """Select rays with all their polylines."""
         if not self.splits:
             return self[rows]
         counts = torch.bincount(self.ray, minlength=self.num_rays)
@@ -191,13 +191,13 @@ class Path:
         return replace(self[first[ray] + place], ray=ray)
 
     def span(self, box: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
-        """Arc lengths between which the path runs inside a box, from its first entry to its last exit.
+        """Return the arc lengths of the first entry into a box and of the last exit.
 
-        Rows that never meet the box have an empty span at far.
+        Rows that miss the box have an empty span at far.
         """
         starts, directions = self.positions[:, :-1], self.directions[:, :-1]
         lengths = self.s[:, 1:] - self.s[:, :-1]
-        # Slab test; a direction parallel to a slab divides by zero, and the infinities compare as they should.
+        # Slab test; a direction parallel to a slab divides by zero, and infinities compare correctly.
         to_low, to_high = (box[0] - starts) / directions, (box[1] - starts) / directions
         enter = torch.minimum(to_low, to_high).nan_to_num(-torch.inf).amax(-1).clamp(min=0)
         leave = torch.minimum(torch.maximum(to_low, to_high).nan_to_num(torch.inf).amin(-1), lengths)
@@ -208,10 +208,10 @@ class Path:
         return first, torch.maximum(first, last)
 
     def at(self, s: Float[Tensor, "R N"]) -> tuple[Float[Tensor, "R N 3"], Float[Tensor, "R N 3"]]:
-        """Positions and directions at arc lengths `s` (paper, section 2: the nearest former vertex, floor of t).
+        """Return positions and directions at arc lengths `s`, from the nearest previous vertex (paper, section 2).
 
-        The vertex before `s` is the last one strictly before it, as in the authors' code, so a sample that lies on a
-        vertex has the direction of the segment that leads to it.
+        As in the authors' code, the previous vertex is strictly before `s`, so a sample on a vertex has the direction
+        of the segment before the vertex.
         """
         vertex = self._vertex_before(s)
         index = vertex[..., None].expand(-1, -1, 3)
@@ -220,68 +220,79 @@ class Path:
         return positions, directions
 
     def _vertex_before(self, s: Float[Tensor, "P N"]) -> Int[Tensor, "P N"]:
-        # searchsorted needs contiguous rows of its own; both calls are free for tensors that already are.
+        # searchsorted needs contiguous rows; `contiguous` is free for contiguous tensors.
         vertex = torch.searchsorted(self.s.detach().contiguous(), s.detach().contiguous(), side="left") - 1
         return vertex.clamp(min=0)
 
 
-# Fields of `Path` with a column for each vertex, and those that have no row for each polyline.
+# Fields of `Path` with a column for each vertex, and fields without rows.
 _OF_VERTICES = frozenset({"positions", "directions", "s", "body", "surface", "across", "triangle"})
 _OF_PATHS = frozenset({"splits", "absorption"})
 
 
 @dataclass(frozen=True)
 class Exits:
-    """What a boundary is asked: lines on which light arrives from far away. Leading axes may have any form."""
+    """Segments along which background radiance arrives from far away; leading axes may have any shape.
 
-    directions: Float[Tensor, "*batch 3"]  # unit directions in which light is looked for, pointing away from the volume
-    # Where these lines begin: at the last event of a path, or at the camera where there is none; None asks for
-    # what is seen from the middle of all.
+    Attributes:
+        directions: unit directions away from the volume.
+        positions: starts of the segments: the last event of the path, or the camera. None for the centre of the scene.
+        radii: radius of the pixel cone at unit distance along the segment; 0 if unknown.
+    """
+
+    directions: Float[Tensor, "*batch 3"]
     positions: Float[Tensor, "*batch 3"] | None = None
-    # Of the pixel's cone at unit distance along the line; 0 where nothing is known of it.
     radii: Float[Tensor, "*batch"] | float = 0.0
 
     @classmethod
     def unbent(cls, rays: Rays) -> Exits:
-        """Of rays that meet nothing."""
+        """Return the segments of straight rays."""
         return cls(rays.directions, rays.origins + rays.near[:, None] * rays.directions, rays.radii)
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Samples of the radiance field along a path; sample i stands for the interval from edges[i] to edges[i + 1].
+    """Samples of the radiance field along a path; sample i represents the interval from edges[i] to edges[i + 1].
 
-    Point samples (NeRF) lie at the start of their interval, cone samples (mip-NeRF) in its middle.
+    Point samples (NeRF) lie at the start of their interval, cone samples (mip-NeRF) in the middle.
+
+    Attributes:
+        positions: positions at which the field is evaluated.
+        directions: unit directions of the path at the samples.
+        s: arc lengths from the camera.
+        edges: bounds of the intervals in arc length.
+        radii: pixel cone radius at unit distance.
+        occupied: samples at which the field may be dense, and is evaluated; None for all.
+        lengths: world lengths by which densities are multiplied, if space is contracted within the intervals; None for
+            the lengths of the intervals.
+        measure: bounds of the intervals in contracted length; None without contraction.
     """
 
-    positions: Float[Tensor, "R N 3"]  # where the field is asked
-    directions: Float[Tensor, "R N 3"]  # unit direction of the path there
-    s: Float[Tensor, "R N"]  # arc length from the camera
-    edges: Float[Tensor, "R N+1"]  # interval bounds in arc length
-    radii: Float[Tensor, "R"]  # pixel cone radius at unit distance
-    # Where the field is worth asking; it holds next to nothing elsewhere. None for all.
+    positions: Float[Tensor, "R N 3"]
+    directions: Float[Tensor, "R N 3"]
+    s: Float[Tensor, "R N"]
+    edges: Float[Tensor, "R N+1"]
+    radii: Float[Tensor, "R"]
     occupied: Bool[Tensor, "R N"] | None = None
-    # World lengths in which the density at a sample stands for the optical depth of its interval, where that is wide
-    # and space is contracted in it; None for the intervals' own.
     lengths: Float[Tensor, "R N"] | None = None
-    measure: Float[Tensor, "R N+1"] | None = None  # the intervals' bounds in contracted length, where space is
+    measure: Float[Tensor, "R N+1"] | None = None
 
     @classmethod
     def along(cls, path: Path, s: Float[Tensor, "R N"], edges: Float[Tensor, "R N+1"]) -> Samples:
-        """Samples at chosen arc lengths of a path, which gives positions and directions, with its gradients."""
+        """Create samples at arc lengths of a path; positions and directions have the gradients of the path."""
         s, edges = s.detach(), edges.detach()
         positions, directions = path.at(s)
         return cls(positions, directions, s, edges, path.radii)
 
     @property
     def deltas(self) -> Float[Tensor, "R N"]:
-        """Length by which the density of each sample is multiplied, world units."""
+        """Length by which the density of each sample is multiplied, in world units."""
         return self.lengths if self.lengths is not None else self.edges[:, 1:] - self.edges[:, :-1]
 
 
 @dataclass(frozen=True)
 class Radiance:
-    """What a field returns: volume density (per world unit, not negative) and linear radiance."""
+    """Result of a field: volume density (per world unit, not negative) and linear radiance."""
 
     density: Float[Tensor, "R N"]
     rgb: Float[Tensor, "R N 3"]
@@ -289,22 +300,30 @@ class Radiance:
 
 @dataclass(frozen=True)
 class Rendering:
-    """One sampling level of rendered rays (paper, Eqn. volrendBd)."""
+    """One sampling level of rendered rays (paper, Eqn. volrendBd).
 
-    # Radiance of each ray, boundary term included, of all its polylines together. Linear, and unbounded above;
-    # sRGB where the model adds up sRGB (`Scene.colour_space`).
+    Attributes:
+        rgb: radiance of each ray in the colour space of the scene, including the background; the sum over all
+            polylines of the ray. Linear radiance is unbounded above.
+        weights: contribution of each sample to its polyline.
+        transmittance: transmittance at the end of each polyline, T_{N+1}.
+        boundary_rgb: background radiance in the exit direction, C'(d_N), after absorption by the medium.
+        samples: samples of the level.
+        path: path of the samples.
+        gain: brightness of the photograph relative to the scene, already applied to `rgb` and `boundary_rgb`; None for
+            no gain.
+    """
+
     rgb: Float[Tensor, "R 3"]
-    weights: Float[Tensor, "P N"]  # contribution of each sample to its polyline
-    transmittance: Float[Tensor, "P"]  # what is left at the end of the polyline, T_{N+1}
-    # Radiance of the boundary in the leaving direction, C'(d_N), as the glass tints it.
+    weights: Float[Tensor, "P N"]
+    transmittance: Float[Tensor, "P"]
     boundary_rgb: Float[Tensor, "P 3"]
     samples: Samples
-    path: Path  # the polylines that they lie on
-    # Factor by which the photograph of each polyline is brighter than its light, which `rgb` and `boundary_rgb` have.
+    path: Path
     gain: Float[Tensor, "P 3"] | None = None
 
     def exposed(self, gain: Float[Tensor, "R 3"]) -> Rendering:
-        """What photographs make of linear radiance that are brighter by a factor."""
+        """Multiply linear radiance by the gain of the photograph of each ray."""
         of_path = self.path.of_ray(gain)
         return replace(self, rgb=self.rgb * gain, boundary_rgb=self.boundary_rgb * of_path, gain=of_path)
 
@@ -314,7 +333,7 @@ class Rendering:
 
     @property
     def depth(self) -> Float[Tensor, "R"]:
-        """Expected arc length of the samples that were hit; the main polyline's end where nothing was."""
+        """Expected arc length of the samples; the end of the main polyline if the opacity is zero."""
         weight = self.opacity
         edges = self.samples.edges
         centres = self.samples.s if self.samples.lengths is not None else 0.5 * (edges[:, 1:] + edges[:, :-1])
@@ -323,7 +342,7 @@ class Rendering:
 
     @property
     def exit_directions(self) -> Float[Tensor, "R 3"]:
-        """Unit direction in which the main polyline of each ray leaves."""
+        """Unit exit direction of the main polyline of each ray."""
         return self.path.first_of_ray(self.path.exit_directions)
 
 
@@ -331,20 +350,19 @@ class Rendering:
 class Batch:
     """Training pixels and the rays through them: R rays through Q pixels, at least one through each.
 
-    Losses compare pixels, not rays: they average over the rays of each pixel with `per_pixel`, then over pixels with
-    `mean()`. That mean is right for several processes as well, because each has equally many pixels of a batch.
+    Losses compare pixels, not rays: losses average over the rays of each pixel with `per_pixel`, then over pixels with
+    `mean()`. With several processes, the mean is correct because each process has the same number of pixels.
 
     Attributes:
-        rays: rays as the data set's cameras give them.
-        pixel: row of the pixel, from 0 to Q - 1, that each ray belongs to.
+        rays: rays of the cameras of the data set.
+        pixel: row of the pixel of each ray, from 0 to Q - 1.
         index: number of each pixel in the data set, view * H * W + row * W + column.
         view: number of the training view of each pixel.
         rgb: colour of each pixel in its photograph, sRGB in [0, 1].
-        teaches_background: pixels from which the background learns; the others would teach it speckle, because their
-            rays diverge.
+        teaches_background: pixels from which the background learns; diverging rays of other pixels would cause noise.
         cameras: all training cameras, for losses that need further directions.
         draws: random numbers of the step, with an index for each ray.
-        path: paths of the rays without gradients; None where they are not traced yet.
+        path: paths of the rays without gradients; None before tracing.
     """
 
     rays: Rays
@@ -368,7 +386,7 @@ class Batch:
 
 
 def mean_per_pixel(values: Float[Tensor, "R *C"], pixel: Int[Tensor, "R"], num_pixels: int) -> Float[Tensor, "Q *C"]:
-    """Average the values of each pixel's rays, given the row of the pixel that each ray belongs to."""
+    """Average the values of the rays of each pixel, given the row of the pixel of each ray."""
     if len(pixel) == num_pixels:  # one ray through each pixel, in their order
         return values
     total = values.new_zeros(num_pixels, *values.shape[1:]).index_add(0, pixel, values)

@@ -42,6 +42,14 @@ def beam(heights: Tensor, far: float = 9.0) -> Rays:
     return make_rays(origins, [[1, 0, 0]] * len(heights), 0.5, far)
 
 
+def random_rays(num: int, width: float, seed: int, far: float) -> Rays:
+    """Rays from all sides through random points of a cube around the origin, from a distance of 3."""
+    generator = torch.Generator().manual_seed(seed)
+    directions = torch.nn.functional.normalize(torch.randn(num, 3, generator=generator), dim=-1)
+    targets = width * (torch.rand(num, 3, generator=generator) - 0.5)
+    return make_rays(targets - 3 * directions, directions, 0.5, far)
+
+
 def angle(a: Tensor, b: Tensor) -> Tensor:
     """Angle between unit vectors in degrees, exact for small ones."""
     return torch.rad2deg(2 * torch.asin((0.5 * torch.linalg.vector_norm(a.double() - b.double(), dim=-1)).clamp(max=1)))

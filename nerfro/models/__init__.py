@@ -1,1 +1,1 @@
-"""LightningModules: rays -> renderings -> loss."""
+"""Models: renderers with radiance fields, from rays to renderings."""

@@ -1,4 +1,4 @@
-"""The baseline."""
+"""The mip-NeRF baseline."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nerfro.types import Path, Rendering
 
 @register("model", "mip_nerf")
 class MipNerfModel(Renderer):
-    """mip-NeRF: one field for all levels, resampled where it had weight, with a boundary term (constant or a sky).
+    """Render straight rays with one radiance field for all sampling levels, as mip-NeRF, and a background.
 
     Args:
         colour: see `model=refractive`.

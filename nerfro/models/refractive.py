@@ -1,4 +1,4 @@
-"""The paper's model."""
+"""The model of the paper."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from nerfro.types import Path, Rendering
 
 @register("model", "refractive")
 class RefractiveModel(Renderer):
-    """Radiance fields sampled along bent rays, with a boundary term (paper, section 2); one field for each level.
+    """Render bent rays with one radiance field for each sampling level, and a background (paper, section 2).
 
     Args:
-        boundary_direction: where the boundary is asked: in the path's `exit` direction, or in the direction of the
-            `last_coarse` sample as in the authors' code.
-        colour: what fields and boundary return and rays add up: `linear` radiance, or `srgb` as in the authors' code.
+        boundary_direction: direction of the background radiance: the `exit` direction of the path, or the direction of
+            the `last_coarse` sample, as in the authors' code.
+        colour: colour space in which fields and background return radiance and rays sum radiance: `linear`, or `srgb`
+            as in the authors' code.
     """
 
     empty_shows_boundary = True

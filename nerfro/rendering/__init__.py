@@ -1,4 +1,4 @@
-"""The scene, and the renderer that turns rays into radiance: trace, sample, query, composite."""
+"""The scene, and the renderer from rays to radiance: trace, sample, query, composite."""
 
 from nerfro.rendering.colour_space import ColourSpace
 from nerfro.rendering.compositing import composite

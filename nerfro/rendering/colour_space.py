@@ -1,4 +1,4 @@
-"""Conversion between the radiance that rays add up and the sRGB values of photographs."""
+"""Conversion between radiance and the sRGB values of photographs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from nerfro.light import clipped_alike, to_linear, to_srgb
 
 
 class ColourSpace(Enum):
-    """Colour space in which fields and background return radiance and in which rays add it up."""
+    """Colour space in which fields and background return radiance, and rays sum radiance."""
 
     LINEAR = "linear"
     SRGB = "srgb"  # as in the authors' code
@@ -21,7 +21,7 @@ class ColourSpace(Enum):
     ) -> Float[Tensor, "*batch 3"]:
         """Encode radiance, multiplied by the gains, as sRGB.
 
-        Values are not clipped, so that a prediction that is too bright keeps its gradient.
+        Values are not clipped, so that overexposed predictions have gradients.
         """
         radiance = radiance if gains is None else radiance * gains
         return radiance if self is ColourSpace.SRGB else to_srgb(radiance)
@@ -29,7 +29,7 @@ class ColourSpace(Enum):
     def to_display(
         self, radiance: Float[Tensor, "*batch 3"], gains: Float[Tensor, "*#batch 3"] | None = None
     ) -> Float[Tensor, "*batch 3"]:
-        """Encode radiance, multiplied by the gains, as sRGB in [0, 1], as a photograph shows it."""
+        """Encode radiance, multiplied by the gains, as sRGB in [0, 1], like a photograph."""
         return self.to_srgb(radiance, gains).clamp(0, 1)
 
     def to_linear(self, radiance: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
@@ -42,12 +42,12 @@ class ColourSpace(Enum):
         rgb: Float[Tensor, "*batch 3"],
         gains: Float[Tensor, "*#batch 3"] | None = None,
     ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]:
-        """Return the sRGB values that a loss compares.
+        """Return the sRGB values of a prediction and a photograph for a loss.
 
         Both are equal where prediction and photograph are saturated, because the photograph gives only a lower bound.
 
         Args:
-            radiance: predicted, in this colour space.
+            radiance: predicted radiance in this colour space.
             rgb: values of the photograph, sRGB in [0, 1].
             gains: brightness of each photograph relative to the scene, a factor of linear radiance.
 

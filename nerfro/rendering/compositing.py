@@ -12,7 +12,7 @@ from nerfro.types import Path, Radiance, Rendering, Samples
 def composite(samples: Samples, radiance: Radiance, boundary_rgb: Float[Tensor, "P 3"], path: Path) -> Rendering:
     """Render one level: C = sum_i w_i c_i + T_{N+1} C'(d_N) (paper, Eqn. volrendBd), summed over a ray's polylines.
 
-    Where the medium absorbs, what is seen through it is tinted: samples, and the boundary that the rendering keeps.
+    In absorbing media, the radiance of samples and of the background is multiplied by the transmittance of the medium.
     """
     density, rgb = radiance.density.float(), radiance.rgb.float()  # sums over a ray stay in single precision
     weights, transmittance = volume_weights(density, samples.deltas)

@@ -30,7 +30,7 @@ from nerfro.types import Exits, Path, Rendering
 
 @dataclass(frozen=True)
 class Components:
-    """Components that a model is composed of."""
+    """Components of a model."""
 
     medium: Medium  # refractive index and absorption
     path_sampler: PathSampler  # turns rays into paths
@@ -38,7 +38,7 @@ class Components:
     make_field: Callable[[], Field]  # makes a new radiance field
     boundary: Boundary  # background radiance, from beyond the volume
     camera: Camera = dataclasses.field(default_factory=GivenCamera)  # estimate of the training cameras
-    chunk_size: int = 8192  # rays that are rendered at once in evaluation, which bounds the memory
+    chunk_size: int = 8192  # number of rays rendered at once in evaluation, which limits the memory
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class RenderedRays:
     """Result of rendering R rays in evaluation.
 
     Attributes:
-        radiance: in the scene's colour space.
+        radiance: radiance in the colour space of the scene.
         depth: expected arc length along the path, world units.
-        opacity: of what the fields hold, in [0, 1].
+        opacity: opacity of the fields, in [0, 1].
         exit_directions: unit directions in which the rays leave the volume.
-        normals: unit normals, towards the camera, where the rays first meet a surface; zero where they meet none.
+        normals: unit normals, towards the camera, at the first surface of each ray; zero without a surface.
     """
 
     radiance: Float[Tensor, "R 3"]
@@ -62,22 +62,23 @@ class RenderedRays:
 
 @checked("model")
 class Renderer(nn.Module, ABC):
-    """Render rays through a scene. A model derives from this class and adds how it renders a path.
+    """Render rays through a scene. Models derive from this class and implement `render_path`.
 
     Args:
-        components: that the model is composed of.
+        components: components of the model.
         num_fields: number of radiance fields: one for each sampling level, or one for all.
-        colour: what fields and background return and rays add up: `linear` radiance, or `srgb` as in the authors' code.
+        colour: colour space in which fields and background return radiance and rays sum radiance: `linear`, or `srgb`
+            as in the authors' code.
 
     Attributes:
-        scene: what is learned about the world.
-        path_sampler, point_sampler: how rays become paths and where paths are sampled.
-        chunk_size: rays that are rendered at once in evaluation.
+        scene: everything learned about the world.
+        path_sampler, point_sampler: components that turn rays into paths, and choose samples on paths.
+        chunk_size: number of rays that are rendered at once in evaluation.
     """
 
-    # Whether a straight path that misses all fields shows only the background, so that pictures need no samples on it.
+    # Whether straight paths outside of all fields show only the background, so that images need no samples there.
     empty_shows_boundary: ClassVar[bool] = False
-    # Whether every step has gradients by all parameters, which processes that train together wait for.
+    # Whether every step has gradients of all parameters, as data-parallel training requires.
     trains_in_parallel: ClassVar[bool] = True
 
     def __init__(self, components: Components, num_fields: int, colour: Literal["linear", "srgb"] = "linear") -> None:
@@ -104,18 +105,18 @@ class Renderer(nn.Module, ABC):
         """
 
     def begin_step(self, progress: float) -> float:
-        """Prepare for a training step. A model that trains in stages overrides this method.
+        """Prepare for a training step. Models with several stages of training override this method.
 
         Args:
-            progress: share of the training budget that is spent, in [0, 1].
+            progress: fraction of the training budget, in [0, 1].
 
         Returns:
-            Share of the learning rate schedule that is done, in [0, 1].
+            Progress of the learning rate schedule, in [0, 1].
         """
         return progress
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Return all learned parameters by optimizer group. A model that adds parameters adds a group."""
+        """Return all learned parameters by optimizer group. Models with further parameters add a group."""
         groups = self.scene.parameter_groups()
         groups["medium"] += self.path_sampler.parameters()
         return {name: parameters for name, parameters in groups.items() if parameters}
@@ -130,26 +131,26 @@ class Renderer(nn.Module, ABC):
         teaches_background: Bool[Tensor, "R"] | None = None,
         directions: Float[Tensor, "P 3"] | None = None,
     ) -> Float[Tensor, "P 3"]:
-        """Evaluate the background radiance where polylines leave, or in other `directions`; some rays teach it."""
+        """Evaluate the background radiance in the exit directions of polylines, or in other `directions`.
+
+        Without `teaches_background`, the background learns from all rays.
+        """
         teaches = None if teaches_background is None else path.of_ray(teaches_background)
         return background_radiance(self.scene.boundary, path.exits(directions), teaches)
 
     def trace(self, rays: Rays, path: Path | None = None) -> Path:
-        """Trace rays, or complete paths that were traced before.
-
-        Paths have gradients by the parameters that they depend on, and the absorption of the medium.
-        """
+        """Trace rays, or complete traced paths by their gradients and the absorption of the medium."""
         medium = self.scene.medium
         path = self.path_sampler(rays, medium) if path is None else path
         return medium.with_absorption(self._refined(path, rays) if self.paths_learn else path)
 
     def exit_directions(self, rays: Rays) -> Float[Tensor, "R 3"]:
-        """Unit direction in which the main polyline of each ray leaves, without its branches and their cost."""
+        """Return the unit exit direction of the main polyline of each ray; other branches are not traced."""
         return self.path_sampler.main(rays, self.scene.medium).exit_directions
 
     @property
     def paths_learn(self) -> bool:
-        """Whether paths change during training; then none may be traced before the step that needs it."""
+        """Whether paths depend on learned parameters, and must be traced in the training step."""
         parameters = [*self.scene.path_parameters(), *self.path_sampler.parameters()]
         return torch.is_grad_enabled() and any(parameter.requires_grad for parameter in parameters)
 
@@ -175,14 +176,14 @@ class Renderer(nn.Module, ABC):
         rows = steady.nonzero()[:, 0]
         if not len(rows):
             return path
-        # Unsteady paths have many events, and their replay would take most of the time.
+        # Other paths have many events, and their replay would take most of the time.
         refined = self.path_sampler.refine(path[rows], rays[path.ray[rows]], medium)
         names = ["positions", "directions", "s", *(["throughput"] if path.splits else [])]
         columns = {name: getattr(path, name).index_copy(0, rows, getattr(refined, name)) for name in names}
         return dataclasses.replace(path, **columns)
 
     def _in_chunks(self, render: Callable[[Rays], tuple[Tensor, ...]], rays: Rays) -> list[Tensor]:
-        """Concatenate what is rendered of `chunk_size` rays at a time, in evaluation mode."""
+        """Render `chunk_size` rays at a time in evaluation mode, and concatenate the results."""
         was_training = self.training
         self.eval()
         try:
@@ -197,12 +198,12 @@ class Renderer(nn.Module, ABC):
         return *self._render_traced(rays, path), exits, normals
 
     def _render_traced(self, rays: Rays, path: Path) -> tuple[Tensor, Tensor, Tensor]:
-        """Radiance, depth and opacity of rays by their paths."""
+        """Render radiance, depth and opacity of traced rays."""
         meets = self._may_meet(rays, path)
         if meets.all():
             rendering = self.render_path(path)[-1]
             return rendering.rgb, rendering.depth, rendering.opacity
-        # Most rays of a picture pass by the object, unbent.
+        # Most rays of an image miss the object.
         rgb, depth = torch.empty_like(rays.directions), path.first_of_ray(path.far).clone()
         opacity = torch.zeros_like(depth)
         passing, rows = (~meets).nonzero()[:, 0], meets.nonzero()[:, 0]
@@ -215,7 +216,7 @@ class Renderer(nn.Module, ABC):
         return rgb, depth, opacity
 
     def _may_meet(self, rays: Rays, path: Path) -> Bool[Tensor, "R"]:
-        """Whether each ray may meet what the fields hold; the others are straight and show the background."""
+        """Find the rays that may meet a field; the others are straight and show the background."""
         meets = torch.full((len(rays),), not self.empty_shows_boundary, device=rays.near.device)
         for field in self.scene.fields:
             box: Tensor | None = field.bounds  # type: ignore[assignment]

@@ -1,4 +1,4 @@
-"""The scene: everything that is learned about the world."""
+"""The scene: all learned parameters of the world."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from nerfro.rendering.colour_space import ColourSpace
 
 
 class Scene(nn.Module):
-    """Refractive medium, radiance fields, background and estimated cameras: everything that is learned.
+    """Refractive medium, radiance fields, background and estimated cameras.
 
     Args:
         medium: refractive index and absorption.
-        fields: radiance fields inside the volume, coarsest sampling level first; one may serve all levels.
+        fields: radiance fields inside the volume, coarsest sampling level first, or one field for all levels.
         boundary: background radiance, from beyond the volume.
-        camera: estimate of the training cameras; by default they are as the data gives them.
-        colour_space: of the radiance that fields and background return.
+        camera: estimate of the training cameras; by default the cameras of the data set.
+        colour_space: colour space of the radiance of fields and background.
 
     Raises:
         NerfroError: exposures are learned, which needs linear radiance, but the colour space is sRGB.
@@ -53,7 +53,7 @@ class Scene(nn.Module):
         return on_device.device
 
     def path_parameters(self) -> list[nn.Parameter]:
-        """Return the parameters that paths depend on: of the cameras and of what bends rays."""
+        """Return the parameters on which paths depend: of the cameras, and of the index and surfaces of the medium."""
         return [*self.camera.bending_parameters(), *self.medium.bending_parameters()]
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -69,6 +69,6 @@ class Scene(nn.Module):
         }
 
     def measurements(self) -> dict[str, float]:
-        """Return physical quantities that are learned, such as indices, by their names in the log."""
+        """Return learned physical quantities, such as refractive indices, by their names in the log."""
         found = {"medium": self.medium.learned(), "camera": self.camera.learned()}
-        return {f"{part}/{name}": value for part, values in found.items() for name, value in values.items()}
+        return {f"{component}/{name}": value for component, values in found.items() for name, value in values.items()}

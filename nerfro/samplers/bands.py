@@ -1,4 +1,4 @@
-"""Light of several colours, each bent on a path of its own."""
+"""Dispersion: paths of several wavelengths."""
 
 from __future__ import annotations
 
@@ -16,20 +16,26 @@ from nerfro.types import Path, Rays
 
 @dataclass(frozen=True)
 class SnellTrace:
-    """Paths and what happened on each polyline."""
+    """Result of tracing rays through solids.
 
-    path: Path  # minimal polylines, a vertex for each event beside near and far
-    num_events: Int[Tensor, "P"]  # refractions and reflections
-    exceeded: Bool[Tensor, "P"]  # whether it met the limit of events; it goes straight on from there
+    Attributes:
+        path: polylines with one vertex for each event, besides near and far.
+        num_events: number of refractions and reflections of each polyline.
+        exceeded: whether the polyline met the limit of events, after which it continues straight.
+    """
+
+    path: Path
+    num_events: Int[Tensor, "P"]
+    exceeded: Bool[Tensor, "P"]
 
 
 def traced_in_bands(rays: Rays, media: Sequence[Solid], trace: Callable[[Rays, Solid], SnellTrace]) -> SnellTrace:
-    """Trace rays in every band's medium; those that miss the object are traced once, with light of all colours.
+    """Trace rays at each wavelength; rays that miss the object have one polyline with light of all colours.
 
     Args:
-        rays: of all colours.
-        media: the same bodies as each band sees them; the bands of red, then those of green, then those of blue.
-        trace: for one band.
+        rays: camera rays.
+        media: bodies with the indices at each wavelength: the bands of red, then of green, then of blue.
+        trace: function that traces rays at one wavelength.
     """
     first = trace(rays, media[0])
     bent = first.path.refracted
@@ -39,7 +45,7 @@ def traced_in_bands(rays: Rays, media: Sequence[Solid], trace: Callable[[Rays, S
     of_rays = [first.path.ray, *(rows[trace.path.ray] for trace in traces[1:])]
     band = torch.cat([torch.full_like(ray, number) for number, ray in enumerate(of_rays)])
     num_bands = len(media) // 3
-    # One colour, but all of them where nothing is bent.
+    # Straight polylines have all colours.
     colours = one_hot(torch.div(band, num_bands, rounding_mode="floor"), 3).to(path.s) / num_bands
     colours = torch.where(path.refracted[:, None], colours, 1.0)
     ray = torch.cat(of_rays)
@@ -47,7 +53,7 @@ def traced_in_bands(rays: Rays, media: Sequence[Solid], trace: Callable[[Rays, S
     path = replace(path, throughput=path.throughput * colours, band=band, splits=True)
     path = replace(path[order], ray=ray[order])
     num_events, exceeded = (
-        torch.cat([getattr(part, name) for part in traces])[order] for name in ("num_events", "exceeded")
+        torch.cat([getattr(traced, name) for traced in traces])[order] for name in ("num_events", "exceeded")
     )
     return SnellTrace(path, num_events, exceeded)
 
@@ -55,7 +61,7 @@ def traced_in_bands(rays: Rays, media: Sequence[Solid], trace: Callable[[Rays, S
 def refined_in_bands(
     path: Path, rays: Rays, media: Sequence[Solid], refine: Callable[[Path, Rays, Solid], Path]
 ) -> Path:
-    """Refine each band's polylines in its medium; arguments as for `traced_in_bands`."""
+    """Refine the polylines of each band in the medium at its wavelength; see `traced_in_bands` for the arguments."""
     rows = [(path.band == band).nonzero()[:, 0] for band in range(len(media))]
-    parts = [refine(path[some], rays[path.ray[some]], medium) for some, medium in zip(rows, media, strict=True)]
-    return replace(Path.joined(parts)[torch.cat(rows).argsort()], ray=path.ray)
+    refined = [refine(path[some], rays[path.ray[some]], medium) for some, medium in zip(rows, media, strict=True)]
+    return replace(Path.joined(refined)[torch.cat(rows).argsort()], ray=path.ray)

@@ -1,4 +1,4 @@
-"""What path samplers and point samplers are."""
+"""Base classes of path samplers and point samplers."""
 
 from __future__ import annotations
 
@@ -17,40 +17,45 @@ from nerfro.types import Path, Rays, Rendering, Samples
 
 
 class PathSampler(nn.Module, ABC):
-    """Bends rays into paths: traced without gradients, and refined where something learns from them."""
+    """Turn rays into paths. Paths are traced without gradients, and refined if parameters learn from them.
 
-    needs_medium = True  # whether it asks the medium at all; if not, none is built
-    branching = ONE_PATH  # which parts of light that is partly reflected are followed
+    Attributes:
+        needs_medium: whether the sampler queries the medium; otherwise no medium is built.
+        branching: which parts of light that is partly reflected are followed.
+    """
+
+    needs_medium = True
+    branching = ONE_PATH
 
     @abstractmethod
     def forward(self, rays: Rays, medium: Medium) -> Path:
-        """Trace every ray from near to far through the medium; a bent path ends outside it, if need be beyond far."""
+        """Trace rays from near to far through the medium; bent paths end outside of it, beyond far if necessary."""
 
     def main(self, rays: Rays, medium: Medium) -> Path:
-        """The first polyline of every ray, as `forward` traces it: for what asks only where rays go."""
+        """Trace only the first polyline of each ray, which is enough to find the exit directions."""
         return self(rays, medium)
 
     def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
-        """The traced path with gradients by what bends it, and the same values; asked where something of that learns.
+        """Return a traced path with the same values, and gradients with respect to rays and medium.
 
-        Silhouettes that move, and events that appear or go, have no gradients.
+        Moving silhouettes, and events that appear or disappear, have no gradients.
         """
         return path
 
     def steady(self, path: Path, medium: Medium) -> Bool[Tensor, "P"]:
-        """Which traced paths have derivatives that are bounded; those of others are left out in training."""
+        """Return which traced paths have bounded derivatives; training uses no derivatives of the other paths."""
         return torch.ones_like(path.refracted)
 
-    def releases_python(self, medium: Medium) -> bool:
-        """Whether a thread that traces on the CPU leaves Python to others, so that it can work beside them."""
+    def releases_gil(self, medium: Medium) -> bool:
+        """Return whether tracing on the CPU releases the global interpreter lock, so that other threads can run."""
         return False
 
 
 class PointSampler(nn.Module, ABC):
-    """Chooses arc lengths on a path.
+    """Choose arc lengths on a path.
 
     Attributes:
-        num_levels: number of times that the path is sampled, each level guided by the rendering of the level before.
+        num_levels: number of sampling levels; each level uses the rendering of the previous one.
     """
 
     num_levels: int
@@ -61,7 +66,7 @@ class PointSampler(nn.Module, ABC):
 
         Args:
             path: P polylines in arc length.
-            previous: rendering of the level before; None at the first level.
+            previous: rendering of the previous level; None at the first level.
             draws: random numbers of the training step; None in evaluation, where samples are deterministic. All
                 randomness comes from `draws.for_rays(path.ray, num)`, so that all polylines of a ray share their
                 numbers, and so that a run that resumes repeats the steps of an undisturbed run.
@@ -71,9 +76,9 @@ class PointSampler(nn.Module, ABC):
         """
 
     def after_step(self, fields: Sequence[Field], draws: Draws) -> None:
-        """Update what the sampler remembers of the radiance fields.
+        """Update the state of the sampler after a training step.
 
         Args:
-            fields: radiance field of each sampling level, as `draws.step` training steps have made them.
-            draws: random numbers of the step that follows.
+            fields: radiance field of each sampling level after `draws.step` training steps.
+            draws: random numbers of the next step.
         """

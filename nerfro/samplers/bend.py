@@ -1,4 +1,4 @@
-"""The optics alone: where rays leave a body of glass."""
+"""Exit rays of a glass body, without a scene."""
 
 from __future__ import annotations
 
@@ -19,17 +19,24 @@ from nerfro.paths import resolve_path
 from nerfro.samplers.snell import Snell
 from nerfro.samplers.traced_file import leave_box, make_rays
 
-# Voxels of air around the body; two are the least.
-_AIR = 4
+# Margin of air around the body in voxels; the grid needs at least two.
+_MARGIN = 4
 
 
 class Bent(NamedTuple):
-    """Where rays leave the box around the body: for other programs, on the CPU."""
+    """Rays where they leave the box around the body, on the CPU.
 
-    positions: Float[Tensor, "R 3"]  # world units
-    directions: Float[Tensor, "R 3"]  # unit
-    lengths: Float[Tensor, "R"]  # of the paths up to there, world units
-    hit: Bool[Tensor, "R"]  # whether the ray met the body
+    Attributes:
+        positions: exit positions in world units.
+        directions: unit exit directions.
+        lengths: lengths of the paths from the origins, world units.
+        hit: whether each ray met the body.
+    """
+
+    positions: Float[Tensor, "R 3"]
+    directions: Float[Tensor, "R 3"]
+    lengths: Float[Tensor, "R"]
+    hit: Bool[Tensor, "R"]
 
 
 def bend(
@@ -40,14 +47,17 @@ def bend(
     interface: Literal["mesh", "sdf"] = "mesh",
     resolution: int = 128,
 ) -> Bent:
-    """Follow rays through a body of constant index by Snell's law, total reflection included, until they leave it.
+    """Trace rays through a body of constant index by Snell's law, including total reflection.
 
     Args:
-        mesh: file of a closed triangle mesh, world units, any format trimesh reads.
-        ior: refractive index inside it; 1 outside.
-        origins, directions: of the rays [R, 3], in the mesh's world; directions of any length but zero.
-        interface: see `sampler/path=snell`; `mesh` for the triangles, `sdf` for a smooth surface, as of noisy hulls.
-        resolution: vertices a side of the grid of distances.
+        mesh: file of a closed triangle mesh in world units, in any format that trimesh reads.
+        ior: refractive index of the body; the index outside is 1.
+        origins, directions: rays [R, 3] in the world of the mesh; directions need not have unit length.
+        interface: `mesh` traces the triangles, `sdf` a smooth surface; see `sampler/path=snell`.
+        resolution: number of vertices along each side of the grid of signed distances.
+
+    Returns:
+        Exit positions, exit directions and path lengths.
 
     Raises:
         NerfroError: the mesh cannot be read or is open, or the rays are not [R, 3] finite numbers.
@@ -59,8 +69,9 @@ def bend(
     if not (torch.isfinite(starts).all() and torch.isfinite(lengths).all() and (lengths > 0).all()):
         raise NerfroError("origins and directions must be finite numbers, and no direction zero; correct them")
     low, high = load_mesh(resolve_path(mesh)).bounds
-    air = (high - low).max() * _AIR / (resolution - 1 - 2 * _AIR)
-    medium = SdfGrid(str(mesh), ior, resolution=resolution, box_min=(low - air).tolist(), box_max=(high + air).tolist())
+    margin = (high - low).max() * _MARGIN / (resolution - 1 - 2 * _MARGIN)
+    low, high = (low - margin).tolist(), (high + margin).tolist()
+    medium = SdfGrid(str(mesh), ior, resolution=resolution, box_min=low, box_max=high)
     rays = make_rays(starts, functional.normalize(towards, dim=-1), medium, 0.0, None)
     path = Snell(interface)(rays, medium)
     positions, path_lengths = leave_box(path, medium)

@@ -1,4 +1,4 @@
-"""Light that is partly reflected and partly transmitted: which parts of it are followed."""
+"""Selection of the branches of light that is partly reflected and partly transmitted."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Branching:
-    """A ray splits where both parts of its light are heavy enough; else the heavier part takes the weight of both.
+    """Rule for splitting: light splits if both parts have enough weight; otherwise, the heavier part takes all weight.
 
-    So the weights of a ray's polylines always sum to 1, and there are at most 1 / least_weight of them.
+    Therefore the weights of the polylines of a ray sum to 1, and a ray has at most 1 / least_weight polylines.
 
     Attributes:
-        num_events: at how many of its first events a ray may split; at later ones all light is transmitted where it
-            can be.
-        least_weight: share of the ray's light below which a part is not followed.
-        main_only: whether only a ray's first polyline is followed, though its light splits.
+        num_events: number of first events of a ray at which light may split; at later events, all light is transmitted
+            unless it is totally reflected.
+        least_weight: share of the light of a ray below which a part is not followed.
+        main_only: whether only the first polyline of each ray is followed.
     """
 
     num_events: int = 0
@@ -29,12 +29,12 @@ class Branching:
     def decide(
         self, weight: Float[Tensor, "A"], reflectance: Float[Tensor, "A"], num_events: Int[Tensor, "A"]
     ) -> tuple[Bool[Tensor, "A"], Bool[Tensor, "A"]]:
-        """Which polylines split at an event, and which are reflected whole though they might be transmitted.
+        """Decide which polylines split at an event, and which are wholly reflected although light is transmitted.
 
         Args:
-            weight: of each polyline so far.
-            reflectance: Fresnel's, 1 under total reflection.
-            num_events: that each has had before.
+            weight: weight of each polyline.
+            reflectance: Fresnel reflectance, 1 for total reflection.
+            num_events: number of earlier events of each polyline.
         """
         may = (num_events < self.num_events) & (reflectance < 1)
         splits = may & (weight * torch.minimum(reflectance, 1 - reflectance) >= self.least_weight)

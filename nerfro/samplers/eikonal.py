@@ -81,7 +81,7 @@ class Eikonal(PathSampler):
         columns: dict[str, Any] = {n: with_gradient(getattr(path, n), getattr(replayed, n)) for n in names}
         return replace(path, **columns)
 
-    def releases_python(self, medium: Medium) -> bool:
+    def releases_gil(self, medium: Medium) -> bool:
         return isinstance(medium, VoxelGrid) or (self.integrator == "adaptive" and isinstance(medium, SdfGrid))
 
 

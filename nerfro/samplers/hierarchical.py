@@ -21,17 +21,18 @@ from nerfro.types import Path, Rendering, Samples
 
 @register("sampler/points", "hierarchical")
 class Hierarchical(PointSampler):
-    """Coarse stratified samples, then fine ones by inverse transform sampling of the coarse weights.
+    """Draw coarse stratified samples, and fine samples by inverse transform sampling of the coarse weights.
 
-    Fine arc lengths are mapped to the path by the nearest former vertex, so they lie on the bent ray (Fig. sampling).
+    Fine arc lengths are mapped to the path by the nearest previous vertex, so that fine samples lie on the bent ray
+    (paper, Fig. sampling).
 
     Args:
-        num_coarse: coarse samples, N_c.
-        num_fine: fine samples, N_f; `stratified` has none.
-        union: render the sorted union of both (NeRF, the paper) or the fine ones alone (mip-NeRF).
-        blur: filter the coarse weights with mip-NeRF's max-blur first.
-        padding: weight added to every bin before drawing; mip-NeRF's is 0.01, the authors' code has 0.
-        draw, cast, offset, box_min, box_max: of the coarse samples, see `stratified`.
+        num_coarse: number of coarse samples, N_c.
+        num_fine: number of fine samples, N_f.
+        union: whether to render the sorted union of both (NeRF, the paper) or only the fine samples (mip-NeRF).
+        blur: whether to apply the max-blur of mip-NeRF to the coarse weights.
+        padding: weight added to each bin before sampling; 0.01 in mip-NeRF, 0 in the authors' code.
+        draw, cast, offset, box_min, box_max: options of the coarse samples, see `stratified`.
     """
 
     num_levels = 2
@@ -61,7 +62,7 @@ class Hierarchical(PointSampler):
         if self.cast == "cones":
             u = spread_uniform(path, self.num_fine + 1, draws, "fine samples")
             return cone_samples(path, self._draw(previous.samples.edges, previous.weights, u))
-        # Weights belong to samples; the bins that they are drawn from lie between the samples' midpoints.
+        # Weights belong to samples, so the bins of the distribution lie between the midpoints of samples.
         u = spread_uniform(path, self.num_fine, draws, "fine samples")
         s = self._draw(midpoints(previous.samples.s), previous.weights[:, 1:-1], u)
         if self.union:

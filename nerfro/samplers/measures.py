@@ -1,4 +1,4 @@
-"""Measures of a polyline in which it is sampled evenly: arc length within a box, or contracted length."""
+"""Measures of length for even sampling of a polyline: arc length within a box, and contracted length."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class LengthInBox:
 class ContractedLength:
     """Length of a polyline in contracted space, from `near` to practical infinity.
 
-    The first segment is extended backwards and the last one forwards as far as is needed, beyond the path's own ends.
+    If necessary, the first segment is extended backwards, and the last one forwards, beyond the ends of the path.
 
     Attributes:
         cumulative: contracted length at the start of each segment, and in total.
         start_length: signed contracted length from the segment's closest approach to its start.
         closest: arc length of the segment's closest approach to the centre.
-        impact: distance from the centre there (impact parameter).
+        impact: distance of the closest approach from the centre (impact parameter).
         radius: radius of the ball beyond which space is contracted.
     """
 

@@ -1,4 +1,4 @@
-"""Growing polylines of many rays at once."""
+"""Construction of the polylines of many rays at once."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def distance_to_end(
     directions: Float[Tensor, "R 3"],
     s: Float[Tensor, "R"],
 ) -> Float[Tensor, "R"]:
-    """From the last event of rays to their end: at far, but when bent not before they are out of the box."""
+    """Return the distance from the last event of rays to far, or for bent rays to outside of the box if farther."""
     _, leave = intersect_box(box, positions, directions)
     out = leave.clamp(min=0) + BEYOND_BOX * (box[1] - box[0]).min()
     return torch.where(refracted, torch.maximum(far - s, out), far - s)
 
 
 class Crossed(NamedTuple):
-    """Bodies and surface of a vertex, as in `Path`; by default those of a vertex in air, on no surface."""
+    """Bodies and surface of vertices, see `Path`; by default of a vertex in air."""
 
     body: Int[Tensor, "A"] | int = 0
     surface: Int[Tensor, "A"] | int = -1
@@ -38,7 +38,7 @@ class Crossed(NamedTuple):
 
 
 class Polylines:
-    """Paths under construction: rows of vertices, each row as long as it needs to be."""
+    """Paths under construction: rows of any number of vertices."""
 
     def __init__(self, num_rays: int, like: Float[Tensor, "..."]) -> None:
         self._vertices = like.new_zeros(num_rays, 4, 7)
@@ -63,7 +63,7 @@ class Polylines:
         self.counts[rows] += 1
 
     def take(self, rows: Int[Tensor, "T"]) -> None:
-        """Go on with these rows in the place of all, some more than once."""
+        """Replace all rows by a selection, in which rows may occur several times."""
         self._vertices, self._crossed, self.counts = self._vertices[rows], self._crossed[rows], self.counts[rows]
 
     def append_ends(
@@ -87,12 +87,12 @@ class Polylines:
         ray: Int[Tensor, "P"] | None = None,
         weight: Float[Tensor, "P"] | None = None,
     ) -> Path:
-        """Return the finished paths, as precise as the rays and on their device; short rows repeat their last vertex.
+        """Return the finished paths in the precision and on the device of the rays; short rows repeat the last vertex.
 
         Args:
-            rays: that were traced.
+            rays: traced rays.
             refracted: whether each row met the medium.
-            ray, weight: ray of each row and its share of the light, where rays split.
+            ray, weight: if rays split, ray of each row and share of its light.
         """
         like = rays.origins
         capacity = int(self.counts.max()) if len(self.counts) else 2

@@ -1,11 +1,10 @@
-"""Traced paths with gradients: the same polylines again.
+"""Differentiable replay of traced paths.
 
-A trace knows what happened: which surfaces were met, and whether the ray was refracted or reflected there. With that
-given, every vertex is a smooth function of the ray, the indices and the surfaces, and this is its first derivative.
-What only another trace can find has none: a silhouette that moves, an event that appears or goes. Masks see those.
+A traced path records its surfaces, and whether the ray was refracted or reflected at each. Given the record, every
+vertex is a smooth function of the ray, the indices and the surfaces, and the replay computes the first derivatives.
+Moving silhouettes, and events that appear or disappear, have no derivatives here; a mask loss is sensitive to both.
 
-Derivatives grow without bound where a ray grazes a surface or nears the critical angle; `smallest_cosine` finds such
-paths, so that a loss can leave them out.
+Derivatives grow without bound near grazing incidence and near the critical angle; `smallest_cosine` finds such paths.
 """
 
 from __future__ import annotations
@@ -26,11 +25,11 @@ from nerfro.samplers.polylines import distance_to_end
 from nerfro.samplers.snell_law import reflectance, refract, turning_normals
 from nerfro.types import Path, Rays
 
-# Cosine between ray and normal below which a surface's distance is no longer divided by it: gradients stay finite.
+# Lower bound of the cosine between ray and normal in a division, so that gradients stay finite.
 _MIN_COSINE = 1e-6
 
-# Where rays meet the surfaces that the trace recorded. From the rows and the column of the vertices, the positions and
-# directions of the vertices before, and the traced distances: the distance and the unit normal, with gradients.
+# Intersects rays with the recorded surfaces. Arguments: rows and column of the vertices, positions and directions of
+# the previous vertices, and traced distances. Results, with gradients: distances and unit normals.
 Meet = Callable[[Tensor, int, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 # Rows and columns of vertices; their positions, directions and arc lengths.
 Vertices = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
@@ -49,15 +48,15 @@ class _ValueOf(torch.autograd.Function):
 
 
 def with_gradient(value: Float[Tensor, "..."], replayed: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
-    """A traced value, bit for bit, with the gradient of its replay, which may have been rounded otherwise."""
+    """Give a traced value the gradient of its replay; the value does not change by rounding errors of the replay."""
     return _ValueOf.apply(value, replayed)
 
 
 def smallest_cosine(path: Path, medium: Medium) -> Float[Tensor, "P"]:
-    """Return the least |N . d| of a path just before and just after its events at sharp surfaces; 1 without events.
+    """Compute the least |N . d| of each path just before and just after events at sharp surfaces; 1 without events.
 
-    First derivatives of the path are sound where the cosine is above 0.15. Below, the ray grazes a surface or leaves
-    one near the critical angle, and the derivatives grow without bound.
+    First derivatives of a path are reliable if the cosine is above 0.15. Below, the ray grazes a surface or is near the
+    critical angle, and the derivatives grow without bound.
     """
     with torch.no_grad():
         n = indices_of(medium, path.s)[path.body.long()]
@@ -68,22 +67,22 @@ def smallest_cosine(path: Path, medium: Medium) -> Float[Tensor, "P"]:
 
 
 def indices_of(medium: Medium, like: Tensor) -> Float[Tensor, "M"]:
-    """Refractive index of air and of each body, with gradients."""
+    """Return the refractive index of air and of each body, with gradients."""
     bodies = [medium.iors] if isinstance(medium, Solid) else []
     return torch.cat([like.new_ones(1), *(iors.to(like) for iors in bodies)])
 
 
 def start_of(path: Path, rays: Rays) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"], Float[Tensor, "P"]]:
-    """First vertices, with gradients by the rays."""
+    """Return position, direction and arc length of the first vertices, with gradients with respect to the rays."""
     origins, d, s = (path.of_ray(values) for values in (rays.origins, rays.directions, rays.near))
     return origins + s[:, None] * d, d, s
 
 
 def replay(path: Path, rays: Rays, medium: Medium, meet: Meet, branching: Branching = ONE_PATH) -> Path:
-    """Paths of refractions and reflections, and their throughput, with gradients by rays, indices and surfaces.
+    """Replay paths of refractions and reflections, with gradients with respect to rays, indices and surfaces.
 
-    Event by event the ray goes on to the surface, and there Snell's law holds, or reflection where the trace reflected.
-    Derivatives are taken at the traced vertices, and every value stays that of the trace.
+    Each event is an intersection with the recorded surface, and refraction or reflection as in the trace. Derivatives
+    are taken at the traced vertices, and all values are equal to the traced values.
     """
     x, d, s = start_of(path, rays)
     num_paths, num_vertices = path.s.shape
@@ -120,14 +119,14 @@ def replay(path: Path, rays: Rays, medium: Medium, meet: Meet, branching: Branch
 def assembled(
     path: Path, rays: Rays, medium: Medium, vertices: list[Vertices], last: tuple[Tensor, Tensor, Tensor]
 ) -> Path:
-    """A traced path with the gradients of its replayed vertices.
+    """Give a traced path the gradients of replayed vertices.
 
     Args:
-        path: traced.
-        rays: that were traced.
-        medium: at whose box bent paths end.
-        vertices: replayed; a vertex between the ends that is not among them has no gradient.
-        last: position, direction and arc length of each row after its last event.
+        path: traced path.
+        rays: traced rays.
+        medium: medium, whose box determines the end of bent paths.
+        vertices: replayed vertices; other vertices between the ends have no gradients.
+        last: position, direction and arc length of each row after the last event.
     """
     x, d, s = last
     ahead = distance_to_end(path.of_ray(rays.far).to(s), medium.box, path.refracted, x, d, s)
@@ -145,16 +144,16 @@ def assembled(
 
 
 def is_interior(path: Path) -> Bool[Tensor, "P S"]:
-    """Return which vertices are neither the first one nor the end, which shorter rows repeat."""
+    """Return which vertices are neither the first vertex nor at the end, which short rows repeat."""
     return (path.s < path.s[:, -1:]) & (torch.arange(path.s.shape[1], device=path.s.device) > 0)
 
 
 def meet_solid(medium: Solid, surface: Int[Tensor, "P S"]) -> Meet:
-    """Meet the zero levels of signed distances: t <- t - phi(x + t d) / (grad phi . d), the divisor without gradient.
+    """Intersect rays with zero levels of signed distances: t <- t - phi(x + t d) / (grad phi . d), divisor detached.
 
     Args:
-        medium: whose surfaces were traced.
-        surface: recorded by the path.
+        medium: traced bodies.
+        surface: recorded surface of each vertex.
     """
 
     def meet(rows: Tensor, column: int, x: Tensor, d: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
@@ -174,11 +173,11 @@ def _of_body(gradients: Float[Tensor, "R K 3"], body: Int[Tensor, "R"]) -> Float
 
 
 def meet_triangles(triangles: Triangles, triangle: Int[Tensor, "P S"]) -> Meet:
-    """Meet triangles of meshes, on the CPU and in double precision.
+    """Intersect rays with triangles of meshes, on the CPU and in double precision.
 
     Args:
-        triangles: that were traced.
-        triangle: recorded by the path.
+        triangles: traced triangles.
+        triangle: recorded triangle of each vertex.
     """
 
     def meet(rows: Tensor, column: int, x: Tensor, d: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:

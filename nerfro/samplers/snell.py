@@ -1,4 +1,4 @@
-"""Rays that are refracted and totally reflected at sharp surfaces."""
+"""Paths of rays that are refracted and reflected at sharp surfaces."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ from nerfro.samplers.wavefront import Wavefront
 from nerfro.types import Path, Rays
 
 _ROOT_ITERATIONS = 60
-# Nearer to grazing or to the critical angle, as a cosine, derivatives are too large to learn from.
+# Training uses no derivatives of paths whose `smallest_cosine` is below this value.
 _STEADY = 0.15
 
 
 @register("sampler/path", "snell")
 class Snell(PathSampler):
-    """Exact refraction (Snell's law) and reflection (total, or Fresnel's share) at the surface of a solid.
+    """Trace rays with exact refraction (Snell's law) and reflection (total or Fresnel) at the surfaces of solids.
 
     Args:
-        branches: none transmits all light that is not totally reflected, as the paper does; first adds the reflection
-            at a ray's first surface; all adds every reflection.
-        least_weight: share of a ray's light below which a branch is not followed; what remains takes its weight.
-        wavelengths: at which rays are bent where the medium disperses, nm: as many for each of red, green and blue, one
-            colour's after another's.
-        interface: sdf is the zero level of the signed distance (smooth normals, tolerates noisy hulls);
-            mesh is the triangles themselves (sharp edges, vertex normals where the mesh is smooth).
-        max_events: refractions and reflections of a ray, at most.
+        interface: `sdf` is the zero level of the signed distance, with smooth normals and tolerance of noisy hulls;
+            `mesh` is the triangles, with sharp edges, and vertex normals where the mesh is smooth.
+        max_events: largest number of refractions and reflections of a ray.
+        branches: `none` transmits all light that is not totally reflected, as the paper does; `first` adds the
+            reflection at the first surface of a ray; `all` adds every reflection.
+        least_weight: share of the light of a ray below which a branch is not followed; the other part takes its weight.
+        wavelengths: wavelengths in nm at which rays are traced if the medium disperses: equally many for red, green and
+            blue, in this order.
     """
 
     def __init__(
@@ -68,22 +68,22 @@ class Snell(PathSampler):
 
     @torch.no_grad()
     def forward(self, rays: Rays, medium: Medium) -> Path:
-        """Trace every ray from near to far, or until it has left the medium's box; straight runs are two vertices."""
+        """Trace rays from near to far; bent paths end outside the medium's box, beyond far if necessary."""
         return self.trace(rays, medium).path
 
     @torch.no_grad()
     def main(self, rays: Rays, medium: Medium) -> Path:
         if isinstance(medium, Solid) and medium.disperses:
-            medium = self._seen(medium)[0]
+            medium = self._at_wavelengths(medium)[0]
         return self.trace(rays, medium, replace(self.branching, main_only=True)).path
 
     def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
-        """The path with gradients by rays, indices and the surface that was traced; see `samplers.replay`.
+        """Return the path with gradients with respect to rays, indices and surfaces; see `samplers.replay`.
 
-        They are unbounded at grazing and critical angles: leave out paths whose `smallest_cosine` is below 0.15.
+        Gradients are unbounded at grazing and critical angles; omit paths whose `smallest_cosine` is below 0.15.
         """
         if isinstance(medium, Solid) and medium.disperses:
-            return refined_in_bands(path, rays, self._seen(medium), self._refine)
+            return refined_in_bands(path, rays, self._at_wavelengths(medium), self._refine)
         return self._refine(path, rays, medium)
 
     def _refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
@@ -95,28 +95,28 @@ class Snell(PathSampler):
             return straight_path(rays[path.ray])
         return replay(path, rays, medium, meet, self.branching)
 
-    def _seen(self, medium: Solid) -> list[Solid]:
-        """The medium at each wavelength."""
+    def _at_wavelengths(self, medium: Solid) -> list[Solid]:
+        """Return the medium at each wavelength."""
         if self.interface == "mesh" and isinstance(medium, SdfGrid):
-            medium.traced_triangles()  # made before they are shared
+            medium.traced_triangles()  # created once, before the variants share them
         return [medium.at_wavelength(wavelength) for wavelength in self.wavelengths]
 
     def steady(self, path: Path, medium: Medium) -> Bool[Tensor, "P"]:
         return smallest_cosine(path, medium) > _STEADY
 
-    def releases_python(self, medium: Medium) -> bool:
+    def releases_gil(self, medium: Medium) -> bool:
         return self.interface == "sdf" and isinstance(medium, SdfGrid)
 
     @torch.no_grad()
     def trace(self, rays: Rays, medium: Medium, branching: Branching | None = None) -> SnellTrace:
-        """Paths, the number of events on each, and which rays had too many; branches other than the sampler's."""
+        """Trace rays and count events; `branching` replaces the rule of the sampler."""
         if isinstance(medium, Vacuum):
             none = torch.zeros(len(rays), dtype=torch.long, device=rays.near.device)
             return SnellTrace(straight_path(rays), none, none.bool())
         if not isinstance(medium, Solid):
             raise NerfroError("sampler/path=snell needs a medium with a surface; take medium=sdf_grid, or path=eikonal")
         if medium.disperses:
-            return traced_in_bands(rays, self._seen(medium), self._trace)
+            return traced_in_bands(rays, self._at_wavelengths(medium), self._trace)
         return self._trace(rays, medium, branching)
 
     def _trace(self, rays: Rays, medium: Solid, branching: Branching | None = None) -> SnellTrace:
@@ -167,7 +167,7 @@ def trace_interfaces(
 def _search(
     medium: Solid, x: Tensor, d: Tensor, inside: Tensor, limit: Tensor, min_step: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Sphere tracing up to `limit`: the last step's start and end, and whether a surface was crossed in it."""
+    """Trace spheres up to `limit`; returns start and end of the last step, and whether it crosses a surface."""
     before, after = torch.zeros_like(limit), torch.zeros_like(limit)
     crossed = torch.zeros_like(limit, dtype=torch.bool)
     going = torch.arange(len(limit), device=limit.device)
@@ -185,7 +185,7 @@ def _search(
 def _first_crossing(
     medium: Solid, x: Tensor, d: Tensor, inside: Tensor, before: Tensor, after: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Shrink each bracket by bisection around the first change of sign of any body, and say which body it was."""
+    """Bisect each bracket around the first change of sign; returns the bracket and the body whose sign changes."""
     for _ in range(_ROOT_ITERATIONS):
         middle = 0.5 * (before + after)
         phi, _ = medium.signed_distances(x + middle[:, None] * d)

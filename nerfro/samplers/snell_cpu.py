@@ -1,9 +1,9 @@
-"""Refraction and reflection at the zero level of signed-distance grids, one thread per ray.
+"""Compiled refraction and reflection at the zero level of signed-distance grids, one thread per ray.
 
-The same algorithm as `samplers.snell.trace_interfaces`, for one ray at a time. A *segment* is the straight part of a
-polyline between two *events*, at which light is refracted or reflected at a surface. Where light splits, the
-transmitted part is followed first; the reflected part becomes a *pending branch*, which shares the polyline up to the
-event and is followed later, the last one first.
+The algorithm is `samplers.snell.trace_interfaces`, for one ray at a time. A *segment* is the straight part of a
+polyline between two *events*, refractions or reflections at a surface. If light splits, the transmitted part is
+followed first. The reflected part becomes a *pending branch*, which shares the polyline up to the event; pending
+branches are followed later, the last one first.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.lookup import box_span, distance_out, spline_value_gradient
 from nerfro.samplers.surface_search_cpu import Line, advance, signed_distance, surface_ahead
 
-_BLOCK = 64  # rays that share a thread's scratch memory
+_BLOCK = 64  # number of rays for which a thread allocates scratch memory once
 
 
 class Settings(NamedTuple):
-    """How rays are traced (`samplers.snell.Snell`, `samplers.branching.Branching`)."""
+    """Settings of the trace, see `samplers.snell.Snell` and `samplers.branching.Branching`."""
 
     min_step: float  # shortest step of the search for surfaces, world units
     max_events: int
@@ -33,22 +33,22 @@ class Settings(NamedTuple):
 
 
 class Branch(NamedTuple):
-    """A part of a ray's light on its way: what is known at its last vertex."""
+    """State of a branch of light at the last vertex."""
 
-    line: Line  # the vertex, and the direction in which light leaves it
-    s: float  # arc length there
-    weight: float  # share of the ray's light
+    line: Line  # the vertex, and the direction in which light leaves the vertex
+    s: float  # arc length of the vertex
+    weight: float  # share of the light of the ray
     num_vertices: int
     num_events: int
 
 
 class Event(NamedTuple):
-    """What light does at a surface."""
+    """Refraction, reflection or splitting of light at a surface."""
 
-    line: Line  # of the part that is followed on
-    reflected: bool  # whether that is the reflected part
-    mirrored: Line  # of the reflected part, which becomes a branch where light splits
-    share: float  # of the light in that branch; 0 where light does not split
+    line: Line  # line of the part that is followed first
+    reflected: bool  # whether the first part is reflected
+    mirrored: Line  # line of the reflected part, which becomes a pending branch if light splits
+    share: float  # share of the light in the pending branch; 0 if light does not split
 
 
 class Polylines(NamedTuple):
@@ -73,7 +73,7 @@ class Pending(NamedTuple):
     weight: Float[np.ndarray, "N"]
     num_vertices: Int[np.ndarray, "N"]
     num_events: Int[np.ndarray, "N"]
-    surface: Int[np.ndarray, "N"]  # on which the reflection takes place
+    surface: Int[np.ndarray, "N"]  # surface of the reflection
     inside: Bool[np.ndarray, "N K"]
 
 
@@ -81,13 +81,13 @@ class Scratch(NamedTuple):
     """Memory of a thread."""
 
     inside: Bool[np.ndarray, "K"]  # whether the ray is inside each body's surface
-    known: Float[np.ndarray, "4 K"]  # of the search for surfaces
+    known: Float[np.ndarray, "4 K"]  # see `surface_ahead`
     pending: Pending
 
 
 @compiled
 def _innermost(inside, solids):
-    """Return the number of the body that a point belongs to, from 1 on; 0 in none (`media.solid`)."""
+    """Return the number of the innermost body around a point, from 1; 0 in air (see `media.solid`)."""
     number = 0
     for body in range(len(inside)):
         if inside[body]:
@@ -101,13 +101,13 @@ def _innermost(inside, solids):
 
 @compiled
 def _index(number, solids):
-    """Return the refractive index of a body that is numbered from 1 on; 1 for number 0, the air."""
+    """Return the refractive index of a body by number from 1; number 0 is air."""
     return solids.iors[number - 1] if number > 0 else 1.0
 
 
 @compiled
 def _transmitted(line, nx, ny, nz, ratio):
-    """Refract a line at a surface with a unit normal (Snell's law); returns also whether it is totally reflected."""
+    """Refract a line at a surface with a unit normal by Snell's law; returns also whether reflection is total."""
     x, y, z, dx, dy, dz = line
     cosine = -(nx * dx + ny * dy + nz * dz)
     if cosine < 0.0:
@@ -123,7 +123,7 @@ def _transmitted(line, nx, ny, nz, ratio):
 
 @compiled
 def _reflected(line, nx, ny, nz, ratio):
-    """Reflect a line at a surface with a unit normal; returns also Fresnel's share of the light, 1 where total."""
+    """Reflect a line at a surface with a unit normal; returns also the Fresnel reflectance, 1 for total reflection."""
     x, y, z, dx, dy, dz = line
     cosine = -(nx * dx + ny * dy + nz * dz)
     dx, dy, dz = dx + 2.0 * cosine * nx, dy + 2.0 * cosine * ny, dz + 2.0 * cosine * nz
@@ -138,15 +138,15 @@ def _reflected(line, nx, ny, nz, ratio):
 
 @compiled
 def _event(solids, hit, near, far, ratio, settings, branch):
-    """Decide what light does at a surface.
+    """Decide whether light is refracted, reflected or split at a surface.
 
     Args:
         solids: bodies.
-        hit: body whose surface it is.
-        near, far: the arriving line, begun just before and just behind the surface.
-        ratio: of the index before the surface to that behind it.
-        settings: of the trace.
-        branch: that arrives.
+        hit: body whose surface is met.
+        near, far: arriving line, with its start just before and just behind the surface.
+        ratio: ratio of the index before the surface to the index behind the surface.
+        settings: settings of the trace.
+        branch: arriving branch.
     """
     _, nx, ny, nz = spline_value_gradient(solids.values[hit], solids.low, solids.inverse_spacing, far.x, far.y, far.z)
     norm = math.sqrt(nx * nx + ny * ny + nz * nz)
@@ -166,7 +166,7 @@ def _event(solids, hit, near, far, ratio, settings, branch):
 
 @compiled
 def _put_vertex(rows, row, branch, body, surface, across):
-    """Append a branch's present vertex to its row; beyond the capacity vertices are counted, not kept."""
+    """Append the vertex of a branch to a row; beyond the capacity, vertices are only counted."""
     i, line = branch.num_vertices, branch.line
     if i < rows.s.shape[1]:
         position, direction = rows.positions[row, i], rows.directions[row, i]
@@ -179,7 +179,7 @@ def _put_vertex(rows, row, branch, body, surface, across):
 
 @compiled
 def _put_end(solids, rows, row, branch, far, exceeded):
-    """Append the last vertex of a row, at far; a bent path has left the box by then, if need be later."""
+    """Append the last vertex of a row at far; bent paths end outside of the box, beyond far if necessary."""
     line, ahead = branch.line, far - branch.s
     if branch.num_events > 0:
         x, y, z, dx, dy, dz = line
@@ -207,11 +207,11 @@ def _resume(solids, scratch, top, rows, former, row):
 
     Args:
         solids: bodies.
-        scratch: with the stack.
+        scratch: memory of the thread, with the stack.
         top: index of the branch on the stack.
-        rows: of the ray.
-        former: row that was followed last; it shares the vertices before the reflection.
-        row: that begins.
+        rows: polylines of the ray.
+        former: previous row, which shares the vertices before the reflection.
+        row: row to begin.
     """
     pending, inside = scratch.pending, scratch.inside
     for body in range(len(inside)):
@@ -234,10 +234,10 @@ def _resume(solids, scratch, top, rows, former, row):
 
 @compiled
 def _follow(solids, settings, scratch, rows, row, branch, num_pending):
-    """Follow a branch from event to event, until it meets no surface or the limit of events.
+    """Follow a branch from event to event, until there is no surface ahead or the limit of events is met.
 
     Returns:
-        The branch at its last event, whether it met the limit, and the number of pending branches.
+        The branch at the last event, whether the limit was met, and the number of pending branches.
     """
     inside = scratch.inside
     while True:
@@ -275,9 +275,9 @@ def _follow(solids, settings, scratch, rows, row, branch, num_pending):
 
 @compiled
 def _trace_ray(solids, line, near, far, settings, scratch, rows):
-    """Trace one ray's polylines into its rows; returns their number, and the largest number of vertices.
+    """Trace the polylines of one ray into rows; returns the number of polylines and the largest number of vertices.
 
-    What follows a row's last vertex is left as it is. Rows beyond those that there are are counted, not kept.
+    Entries after the last vertex of a row are undefined. Polylines beyond the capacity are only counted.
     """
     inside, last_row = scratch.inside, len(rows.weight) - 1
     branch = Branch(advance(line, near), near, 1.0, 0, 0)
@@ -308,16 +308,16 @@ def trace_snell(origins, directions, near, far, solids, settings, capacity, room
     """Trace the polylines of all rays, which may split at their first events (`samplers.branching`).
 
     Args:
-        origins, directions, near, far: of the rays [R, ...].
+        origins, directions, near, far: rays [R, ...].
         solids: bodies, a `kernels.lookup.MediumGrid`.
-        settings: how rays are traced.
-        capacity: room for the vertices of a polyline, V.
-        room: for the polylines of a ray, B.
+        settings: settings of the trace.
+        capacity: largest number of vertices of a polyline, V.
+        room: largest number of polylines of a ray, B.
 
     Returns:
-        rows: `Polylines` of all rays, with a leading axis R, in the precision of the rays. There are two vertices more
-            than events; nothing is in the rest.
-        counts [R, 2]: polylines of each ray and the most vertices of one, more than B and V where these do not suffice.
+        rows: `Polylines` of all rays, with a leading axis R, in the precision of the rays. A polyline has two vertices
+            more than events; the other entries are undefined.
+        counts [R, 2]: number of polylines of each ray, and largest number of vertices, which may exceed B and V.
     """
     num_rays, num_bodies, num_splits = origins.shape[0], solids.values.shape[0], settings.num_splits
     rows = Polylines(
@@ -352,11 +352,11 @@ def trace_snell(origins, directions, near, far, solids, settings, capacity, room
 
 @compiled_parallel
 def polylines_of_width(rows, ray, place, width):
-    """Select polylines `place` of rays `ray`, with vertices [P, W]; the last one is repeated where there are fewer.
+    """Select polylines with W vertices each; shorter polylines repeat their last vertex.
 
     Args:
-        rows: what `trace_snell` returns.
-        ray, place: of each of the P polylines.
+        rows: polylines of all rays, from `trace_snell`.
+        ray, place: ray of each selected polyline, and its place among the polylines of the ray.
         width: number of vertices, W.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Snell's law, and Fresnel's."""
+"""Snell's law and the Fresnel equations."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ def refract(
     n_after: Float[Tensor, "R"],
     reflected: Bool[Tensor, "R"] | None = None,
 ) -> tuple[Float[Tensor, "R 3"], Bool[Tensor, "R"]]:
-    """Snell's law in vector form, and total reflection where it has no solution.
+    """Refract rays by Snell's law in vector form, and reflect rays for which the law has no solution.
 
-    With r = n_before / n_after, N against d and c = -N . d: t = r d + (r c - sqrt(1 - r^2 (1 - c^2))) N, or d + 2 c N.
+    With r = n_before / n_after, N against d and c = -N . d, the direction is r d + (r c - sqrt(1 - r^2 (1 - c^2))) N
+    for refraction, and d + 2 c N for reflection.
 
     Args:
-        directions: unit, towards the surface.
-        normals: unit, of either orientation.
-        n_before, n_after: index on the ray's side and beyond.
-        reflected: which rays are reflected, where that is known already; else those without a solution.
+        directions: unit directions towards the surface.
+        normals: unit normals of either orientation.
+        n_before, n_after: refractive index on the near side and on the far side of the surface.
+        reflected: whether each ray is reflected; by default, rays without a solution are reflected.
 
     Returns:
-        Unit directions after the event, and whether it was a reflection.
+        Unit directions after the event, and whether the event is a reflection.
     """
     cosine = -(directions * normals).sum(-1)
     normals = torch.where(cosine[..., None] < 0, -normals, normals)
@@ -35,7 +36,7 @@ def refract(
     squared = 1 - ratio**2 * (1 - cosine**2)
     total = squared <= 0
     reflected = total if reflected is None else reflected
-    # The root of 1 where it is not used: that of zero or less would make gradients nan.
+    # Unused roots are taken of 1, because a root of zero or less would make gradients NaN.
     root = torch.where(total, 1.0, squared).sqrt()
     along = torch.where(reflected, 2 * cosine, ratio * cosine - root)
     scale = torch.where(reflected, 1.0, ratio)
@@ -49,10 +50,11 @@ def reflectance(
     n_before: Float[Tensor, "R"],
     n_after: Float[Tensor, "R"],
 ) -> Float[Tensor, "R"]:
-    """Share of unpolarised light that a surface reflects, by Fresnel's equations; 1 under total reflection.
+    """Compute the reflectance of a surface for unpolarised light by the Fresnel equations; 1 for total reflection.
 
-    With r = n_before / n_after and cosines c, c': ((r c - c') / (r c + c'))^2 and ((c - r c') / (c + r c'))^2 are those
-    of light polarised across and in the plane of incidence; their mean is returned. Arguments as for `refract`.
+    With r = n_before / n_after and cosines c, c', the reflectance is the mean of ((r c - c') / (r c + c'))^2 for light
+    polarised across the plane of incidence and ((c - r c') / (c + r c'))^2 for light polarised in the plane.
+    See `refract` for the arguments.
     """
     cosine = (directions * normals).sum(-1).abs()
     ratio = n_before / n_after
@@ -70,11 +72,11 @@ def turning_normals(
     n_before: Float[Tensor, "*batch"],
     n_after: Float[Tensor, "*batch"],
 ) -> Float[Tensor, "*batch 3"]:
-    """Return unit normals of surfaces from how they turn rays: by Snell's law, n d changes along the normal alone.
+    """Compute unit normals of surfaces from the directions of rays: by Snell's law, n d changes along the normal only.
 
     Args:
         before, after: unit directions of rays before and after the surface.
-        n_before, n_after: index of the media in which the rays arrive and leave; equal for reflected rays.
+        n_before, n_after: refractive index where the rays arrive and where they leave; equal for reflected rays.
     """
     change = n_before[..., None] * before - n_after[..., None] * after
     return functional.normalize(change, dim=-1, eps=torch.finfo(change.dtype).tiny)

@@ -1,4 +1,4 @@
-"""Step functions: intervals of arc length with a weight each, and drawing samples from them."""
+"""Step functions on intervals of arc length, and sampling from step functions."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from torch import Tensor
 from nerfro.draws import Draws
 from nerfro.types import Path
 
-# Below this total weight a ray is treated as empty and sampled uniformly (mip-NeRF's code).
+# Rays with a smaller total weight are sampled uniformly, as in the code of mip-NeRF.
 _MIN_TOTAL_WEIGHT = 1e-5
 
 
 def volume_weights(
     density: Float[Tensor, "R N"], deltas: Float[Tensor, "R N"]
 ) -> tuple[Float[Tensor, "R N"], Float[Tensor, "R"]]:
-    """Weights w_i = T_i (1 - exp(-sigma_i delta_i)) and the final transmittance T_{N+1} (paper, Eqn. volrend).
+    """Compute the weights w_i = T_i (1 - exp(-sigma_i delta_i)) and the transmittance T_{N+1} (paper, Eqn. volrend).
 
     Args:
-        density: per world unit.
+        density: density per world unit.
         deltas: interval lengths in world units.
 
     Returns:
-        Weights and transmittance; together they sum to one on every ray.
+        Weights and transmittance, which sum to one on every ray.
     """
     optical_depth = density * deltas
     total = optical_depth.cumsum(-1)
@@ -49,10 +49,15 @@ def spread_uniform(path: Path, num_samples: int, draws: Draws | None, stream: st
 def invert_cdf(
     edges: Float[Tensor, "R E"], weights: Float[Tensor, "R E-1"], u: Float[Tensor, "R N"]
 ) -> Float[Tensor, "R N"]:
-    """Inverse transform sampling of a step function (paper, Eqn. hierarchical).
+    """Sample a step function by inversion of its cumulative distribution (paper, Eqn. hierarchical).
 
-    Weights need not be normalised; `u` are positions in the cumulative distribution, in [0, 1). Arc lengths ascend
-    where u does; density is constant inside each interval.
+    Args:
+        edges: bounds of the intervals, ascending.
+        weights: weight of each interval, in which the density is constant; the sum need not be 1.
+        u: values of the cumulative distribution in [0, 1).
+
+    Returns:
+        Positions, which ascend if `u` ascends.
     """
     num_bins = weights.shape[-1]
     total = weights.sum(-1, keepdim=True)
@@ -68,12 +73,12 @@ def invert_cdf(
 
 
 def blur_weights(weights: Float[Tensor, "R B"], padding: float) -> Float[Tensor, "R B"]:
-    """Max-then-average filter over neighbours plus a constant, against missed surfaces (mip-NeRF, Eqn. 18)."""
+    """Apply the max-then-average filter of mip-NeRF (Eqn. 18) and add a constant, so that fewer surfaces are missed."""
     padded = torch.cat([weights[..., :1], weights, weights[..., -1:]], dim=-1)
     highest = torch.maximum(padded[..., :-1], padded[..., 1:])
     return 0.5 * (highest[..., :-1] + highest[..., 1:]) + padding
 
 
 def midpoints(edges: Float[Tensor, "R E"]) -> Float[Tensor, "R E-1"]:
-    """Middle of each interval."""
+    """Return the middle of each interval."""
     return 0.5 * (edges[..., 1:] + edges[..., :-1])

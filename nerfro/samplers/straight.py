@@ -1,4 +1,4 @@
-"""Rays of ordinary radiance fields."""
+"""Straight paths, as in ordinary radiance fields."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from nerfro.types import Path, Rays
 
 @register("sampler/path", "straight")
 class Straight(PathSampler):
-    """Straight rays: o + s d, whatever the medium."""
+    """Trace straight rays, o + s d, and ignore the medium."""
 
     needs_medium = False
 
     @torch.no_grad()
     def forward(self, rays: Rays, medium: Medium) -> Path:
-        """The two-vertex path of every ray; `refracted` is false throughout."""
+        """Return a path of two vertices for each ray."""
         return straight_path(rays)
 
     def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
@@ -26,7 +26,7 @@ class Straight(PathSampler):
 
 
 def straight_path(rays: Rays) -> Path:
-    """Paths of two vertices, at near and far."""
+    """Return paths of two vertices, at near and far."""
     s = torch.stack([rays.near, rays.far], -1)
     positions = rays.origins[:, None] + s[..., None] * rays.directions[:, None]
     directions = rays.directions[:, None].expand_as(positions)

@@ -1,4 +1,4 @@
-"""Stratified sampling of a path (paper, Eqn. stratified), along straight and bent ones alike."""
+"""Stratified sampling of straight and bent paths (paper, Eqn. stratified)."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from nerfro.registry import register
 from nerfro.samplers.base import PointSampler
 from nerfro.types import Path, Rendering, Samples
 
-# Width of the last point sample's interval, so that light beyond it reaches the boundary (authors' code).
+# Width of the interval of the last point sample, as in the authors' code; the background is seen behind it.
 LAST_DELTA = 1e-3
 
 
 @register("sampler/points", "stratified")
 class Stratified(PointSampler):
-    """One sample in each of evenly spaced bins: random in training, central in evaluation.
+    """Draw one sample in each of evenly spaced bins: at random in training, at a fixed position in evaluation.
 
     Args:
         num_samples: number of bins, N_c.
-        draw: `arc_length` draws anywhere on the path; `vertices` draws one of every S / N_c path vertices, as the
-            paper does with its Eikonal samples, and needs a path of S = N_c * N_e vertices.
-        cast: `points`, or `cones` whose samples fill the bins (mip-NeRF).
-        offset: bin position used in evaluation, 0 the bin's start, 0.5 its centre.
-        box_min, box_max: corners of a box outside of which there is nothing to sample, world units; empty for no box.
+        draw: `arc_length` draws any arc length; `vertices` selects one of every S / N_c vertices, as the paper does,
+            and needs paths with a multiple of N_c vertices.
+        cast: `points`, or `cones`, whose samples fill the bins (mip-NeRF).
+        offset: position in the bin in evaluation, from 0 for the start to 0.5 for the centre and to 1 for the end.
+        box_min, box_max: corners of the box to sample, world units; empty to sample the whole path.
     """
 
     num_levels = 1
@@ -78,7 +78,7 @@ class Stratified(PointSampler):
     def _cone_fractions(self, path: Path, draws: Draws | None) -> Float[Tensor, "P E"]:
         like = path.s
         fractions = torch.linspace(0.0, 1.0, self.num_samples + 1, device=like.device, dtype=like.dtype)
-        if draws is not None:  # each edge moves within half a bin of its place, as mip-NeRF's do
+        if draws is not None:  # as in mip-NeRF, each edge moves by up to half a bin
             middle = 0.5 * (fractions[1:] + fractions[:-1])
             low = torch.cat([fractions[:1], middle])
             high = torch.cat([middle, fractions[-1:]])
@@ -101,12 +101,12 @@ class Stratified(PointSampler):
 
 
 def point_samples(path: Path, s: Float[Tensor, "R N"]) -> Samples:
-    """Samples at ascending arc lengths, each standing for the interval up to the next."""
+    """Create samples at ascending arc lengths; the interval of each sample ends at the next sample."""
     return Samples.along(path, s, _edges_from_starts(s))
 
 
 def cone_samples(path: Path, edges: Float[Tensor, "R E"]) -> Samples:
-    """Samples that fill the intervals between ascending edges, placed at their middles."""
+    """Create samples at the middle of intervals between ascending edges."""
     return Samples.along(path, 0.5 * (edges[:, 1:] + edges[:, :-1]), edges)
 
 

@@ -1,4 +1,4 @@
-"""Surface normals for pictures and exports, from how paths turn at the first surface that they meet."""
+"""Surface normals for images and exports, from the change of direction at the first surface of each path."""
 
 from __future__ import annotations
 
@@ -15,19 +15,18 @@ from nerfro.types import Path
 
 
 def first_normals(path: Path, medium: Medium) -> Float[Tensor, "R 3"]:
-    """Return unit normals, towards the camera, at the first event of each ray; zero where it meets nothing.
+    """Compute unit normals, towards the camera, at the first event of each ray; zero for rays without events.
 
-    Where the index varies continuously, the normal is that of its level surfaces at the first vertex where the path
-    turns.
+    If the index varies continuously, the normals of its level surfaces at the first bend of each path are returned.
     """
     normals = path.directions.new_zeros(len(path.s), 3)
-    rows = path.refracted.nonzero()[:, 0]  # which few rays of a picture are
+    rows = path.refracted.nonzero()[:, 0]  # only few rays of an image
     normals[rows] = _bent_normals(path[rows], medium).to(normals)
     return path.first_of_ray(normals)
 
 
 def _bent_normals(path: Path, medium: Medium) -> Float[Tensor, "P 3"]:
-    """The same for polylines that meet the medium."""
+    """Compute the normals of polylines that meet the medium."""
     rows = torch.arange(len(path.s), device=path.s.device)
     before, after = path.directions[:, :-1], path.directions[:, 1:]
     events = (path.surface[:, 1:] >= 0) | (before != after).any(-1)

@@ -1,4 +1,4 @@
-"""Search for the first surface on a line, among the zero levels of signed-distance grids."""
+"""Compiled search for the first surface on a line, among the zero levels of signed-distance grids."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ from nerfro.kernels.lookup import (
     spline_value,
 )
 
-# Root search ends at this fraction of the shortest step.
-_ROOT_TOLERANCE = 1e-6
-_BEYOND_WALL = 1e-3  # of the shortest step
-_ROOT_ITERATIONS = 60
-_SECANTS = 6  # without bisection between them
+# Tolerance of roots, and distance of a step beyond the wall of a block, as fractions of the shortest step.
+_ROOT_TOLERANCE, _BEYOND_WALL = 1e-6, 1e-3
+# Largest number of iterations of the root search, and number of secants before bisection alternates with secants.
+_ROOT_ITERATIONS, _SECANTS = 60, 6
 
 
 class Line(NamedTuple):
@@ -36,7 +35,7 @@ class Line(NamedTuple):
 
 @compiled
 def advance(line, length):
-    """Return the line that begins so much further on."""
+    """Move the start of a line forwards."""
     x, y, z, dx, dy, dz = line
     return Line(x + length * dx, y + length * dy, z + length * dz, dx, dy, dz)
 
@@ -50,10 +49,10 @@ def signed_distance(solids, body, line, t):
 
 @compiled
 def _root(solids, body, line, start, end, at_start, at_end, tolerance):
-    """Shrink [start, end] around a change of sign (Anderson and Bjorck's method); start keeps its sign, so does end.
+    """Shrink [start, end] around a change of sign by the method of Anderson and Bjorck; both ends keep their signs.
 
-    The value at the end is known, that at the start too or not a number. Secants close in from one side until one steps
-    over the root; bisection takes turns with them where they do not.
+    The value at the end is known; the value at the start is known or NaN. Secants approach the root from one side until
+    a secant exceeds the root; if none does, bisection alternates with secants.
     """
     if math.isnan(at_start):
         at_start = signed_distance(solids, body, line, start)
@@ -66,10 +65,10 @@ def _root(solids, body, line, start, end, at_start, at_end, tolerance):
             middle = 0.5 * (start + end)
         else:
             middle = (start * weight_end - end * weight_start) / (weight_end - weight_start)
-            # A step past the root brings the far end in as well.
+            # A step beyond the root moves the other end, too.
             middle = min(max(middle, start + 0.25 * tolerance), end - 0.25 * tolerance)
         value = signed_distance(solids, body, line, middle)
-        # The end that stays loses weight, or it would stay for ever: as much as the function bends.
+        # Without a smaller weight, the same end would stay in all iterations.
         if (value < 0.0) == start_inside:
             if moved == 1:
                 weight_end *= 1.0 - value / weight_start if abs(value) < abs(weight_start) else 0.5
@@ -83,18 +82,19 @@ def _root(solids, body, line, start, end, at_start, at_end, tolerance):
 
 @compiled
 def surface_ahead(solids, inside, known, line, min_step):
-    """Find the first surface on a line: body (-1 where there is none), and arc lengths before and after it.
+    """Find the first surface on a line; returns the body, or -1, and arc lengths before and after the surface.
 
-    Blocks in which there is no surface are jumped over. In the others steps are as long as the distance to the nearest
-    surface, as in sphere tracing, or longer: within a block the distance changes no faster than its slopes there; and
-    across a block in which it only grows or only falls, there is at most one surface of each body, between values of
-    other signs. `known` is scratch memory: signed distances to the
-    bodies at the last two points, and the lowest and highest slopes along the line in the present block.
+    Blocks without a surface are skipped. In other blocks, steps are at least as long as the distance to the nearest
+    surface, as in sphere tracing. The bounds of the slope in a block allow longer steps. In a block with a monotonic
+    distance, each body has at most one surface, between values of opposite sign, so one step crosses the block.
+
+    `known` is scratch memory: signed distances to the bodies at the last two points, and the lowest and highest slopes
+    along the line in the current block.
     """
     x, y, z, dx, dy, dz = line
     _, leave = box_span(solids.low, solids.high, x, y, z, dx, dy, dz)
     small = solids.inverse_small
-    # The line in blocks, and how far it goes for one of them.
+    # Direction and start in units of blocks, and arc lengths for one block along each axis.
     rx, ry, rz = dx * small[0], dy * small[1], dz * small[2]
     bx, by, bz = blocks_from(solids.low, small, x, y, z)
     qx, qy, qz = lengths_of_block(rx, ry, rz)
@@ -104,7 +104,7 @@ def surface_ahead(solids, inside, known, line, min_step):
     while not crossed:
         i, j, k = block_at(solids.empty.shape, bx + t * rx, by + t * ry, bz + t * rz)
         reach = solids.empty[i, j, k]
-        # Behind a block there may be a surface in it, even where there is none any more.
+        # After a step across a block, a surface in this block may be behind an empty block.
         if reach > 0 and not across:
             before = t
             known[1, :] = math.nan
@@ -116,7 +116,7 @@ def surface_ahead(solids, inside, known, line, min_step):
             wall = max(t, end_of_blocks(i, j, k, 1, bx, by, bz, qx, qy, qz))
             monotone = slopes_along(solids.slopes, i, j, k, dx, dy, dz, known[2], known[3])
         while True:
-            distance, crossed = _look(solids, inside, known, line, t)
+            distance, crossed = _query(solids, inside, known, line, t)
             if crossed:
                 break
             if t >= leave:
@@ -126,7 +126,7 @@ def surface_ahead(solids, inside, known, line, min_step):
                 break
             step = max(distance, min_step, min(wall - t, _free_length(inside, known)))
             across = monotone and wall - t > step
-            # A little beyond the wall, to be in the next block for sure.
+            # Slightly beyond the wall, so that the next block is certain despite rounding errors.
             t = min((wall if across else t + step) + beyond, leave)
             if t > wall:
                 break
@@ -134,8 +134,8 @@ def surface_ahead(solids, inside, known, line, min_step):
 
 
 @compiled
-def _look(solids, inside, known, line, t):
-    """Evaluate the signed distances at arc length t: the least, and whether a surface lies between here and before."""
+def _query(solids, inside, known, line, t):
+    """Evaluate signed distances at arc length t; returns the least, and whether a surface was crossed."""
     distance, crossed = math.inf, False
     for body in range(len(inside)):
         known[0, body] = known[1, body]
@@ -148,10 +148,10 @@ def _look(solids, inside, known, line, t):
 
 @compiled
 def _free_length(inside, known):
-    """Return the length within which no surface can be, by the distances and their slopes in the present block."""
+    """Return a length without surfaces ahead, from the distances and the bounds of slopes in the current block."""
     free = math.inf
     for body in range(len(inside)):
-        # The fastest that the value may go to zero; not a number at the border, where nothing is known.
+        # Largest slope towards zero; NaN at the border of the grid, where slopes are unknown.
         towards = known[3, body] if inside[body] else -known[2, body]
         if not towards <= 0.0:
             reached = abs(known[1, body]) / towards
@@ -161,7 +161,7 @@ def _free_length(inside, known):
 
 @compiled
 def _first_crossing(solids, inside, known, line, before, t, tolerance):
-    """Find the first of the surfaces that are crossed in a step; returns as `surface_ahead`."""
+    """Find the first surface that is crossed in a step; see `surface_ahead` for the results."""
     hit, hit_before, hit_after = -1, 0.0, math.inf
     for body in range(len(inside)):
         if (known[1, body] < 0.0) != inside[body]:

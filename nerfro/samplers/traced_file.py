@@ -1,4 +1,4 @@
-"""What `python -m nerfro.trace` reads and computes: rays of a file, and where their paths leave the medium's box."""
+"""Input, configuration and results of `python -m nerfro.trace`."""
 
 from __future__ import annotations
 
@@ -20,40 +20,39 @@ from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
 from nerfro.types import Path, Rays
 
-# Without `far`, paths end this many diagonals of the medium's box beyond it: room for rays that are reflected inside.
+# Without `far`, paths end this number of diagonals beyond the medium's box, because reflected rays need long paths.
 _DIAGONALS = 2
 
 
 @dataclass
 class TraceSamplerConfig:
-    """The group sampler/; its path option is a registered plugin's configuration."""
+    """Configuration of the group `sampler`."""
 
     path: Any = MISSING
 
 
 @dataclass
 class TraceConfig:
-    """What `python -m nerfro.trace` is asked."""
+    """Options of `python -m nerfro.trace`, which traces rays of a file through a medium."""
 
-    # What is traced, and how (options of the groups `medium` and `sampler/path`).
-    medium: Any = MISSING
+    medium: Any = MISSING  # plugin of the group `medium`
     sampler: TraceSamplerConfig = dataclasses.field(default_factory=TraceSamplerConfig)
-    rays: str = MISSING  # .npz with `origins` and `directions` [R, 3], world units and unit directions
-    # .npz that is written, with `exit_positions` and `exit_directions` [R, 3], `path_lengths` and `hit` [R]. Where rays
-    # split there is a row for each path, and also its `ray` (row in `rays`) and `throughput` [P, 3].
+    rays: str = MISSING  # .npz file with `origins` and `directions` [R, 3], world units and unit directions
+    # .npz file to write, with `exit_positions` and `exit_directions` [R, 3], `path_lengths` and `hit` [R]. If rays
+    # split, there is one row for each polyline, and the arrays `ray` (row in `rays`) and `throughput` [P, 3].
     out: str = MISSING
     near: Distance = 0.0  # arc length at which paths begin
-    # Arc length at which paths end, or where they have left the medium's box if that is later; by default all end
-    # where they leave it.
+    # Arc length at which paths end; bent paths end outside the medium's box, beyond `far` if necessary. By default, all
+    # paths end where they leave the box.
     far: Optional[Distance] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    plot: bool = False  # whether to draw some of the paths and the object beside `out`, as .png
-    overwrite: bool = False  # whether `out`, and the drawing, may be replaced
+    plot: bool = False  # whether to plot some of the paths and the medium as .png beside `out`
+    overwrite: bool = False  # whether to replace `out` and the plot
 
 
 def make_rays(
     origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], medium: Medium, near: float, far: float | None
 ) -> Rays:
-    """Rays of the given range; without `far`, of one that leads all of them out of the medium's box."""
+    """Create rays from near to far; without `far`, the paths are long enough to leave the medium's box."""
     if far is None:
         centre, diagonal = medium.box.mean(0), float(torch.linalg.vector_norm(medium.box[1] - medium.box[0]))
         distance = float(torch.linalg.vector_norm(origins - centre, dim=-1).max())
@@ -65,8 +64,8 @@ def make_rays(
 
 
 def leave_box(path: Path, medium: Medium) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R"]]:
-    """Where and at which arc length paths leave the box; those that miss it stay where they begin."""
-    # The last vertex before the end that is not a repetition of it.
+    """Return positions and arc lengths at which paths leave the box; rays that miss the box have their first vertex."""
+    # Short rows repeat their last vertex, so the last event is the last vertex before far.
     last = (path.s < path.far[:, None]).sum(-1).sub(1).clamp(min=0)
     rows = torch.arange(len(last))
     start = path.positions[rows, last]
@@ -76,7 +75,7 @@ def leave_box(path: Path, medium: Medium) -> tuple[Float[Tensor, "R 3"], Float[T
 
 
 def read_rays(file: FilePath) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
-    """Origins and unit directions from a file."""
+    """Read origins and unit directions from a file."""
     arrays = load_arrays(file)
     for name in ("origins", "directions"):
         if name not in arrays:

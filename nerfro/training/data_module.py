@@ -138,7 +138,7 @@ def can_trace_ahead(renderer: Renderer) -> bool:
     """Whether a thread can trace the next step's rays meanwhile: nothing that bends them learns, and a core is free."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with torch.enable_grad():
-        return cores > 1 and not renderer.paths_learn and renderer.path_sampler.releases_python(renderer.scene.medium)
+        return cores > 1 and not renderer.paths_learn and renderer.path_sampler.releases_gil(renderer.scene.medium)
 
 
 def traced(batches: RayBatches, renderer: Renderer, config: DictConfig) -> RayBatches:

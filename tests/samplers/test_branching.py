@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import replace
 from pathlib import Path as FilePath
 
 import pytest
 import torch
-import trimesh
 from torch import Tensor
 
 from nerfro.errors import NerfroError
@@ -20,16 +20,11 @@ from nerfro.samplers.replay import smallest_cosine
 from nerfro.samplers.snell import Snell, trace_interfaces
 from nerfro.samplers.snell_law import reflectance
 from nerfro.types import Path, Rays
-from tests.closed_forms import beam, make_rays
+from tests.closed_forms import beam, make_rays, random_rays
+from tests.samplers.nested import NestedBalls, nested_mesh
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
-
-
-def _bundle(num: int = 300) -> Rays:
-    generator = torch.Generator().manual_seed(2)
-    directions = torch.nn.functional.normalize(torch.randn(num, 3, generator=generator), dim=-1)
-    targets = 1.6 * torch.rand(num, 3, generator=generator) - 0.8
-    return make_rays(targets - 3 * directions, directions, 0.5, 6.0)
+_rays = functools.partial(random_rays, width=1.6, seed=2, far=6)
 
 
 def _nested_grid(size: int = 40) -> SdfGrid:
@@ -39,16 +34,6 @@ def _nested_grid(size: int = 40) -> SdfGrid:
     return SdfGrid.from_distances(
         torch.stack([p.norm(dim=-1) - 0.8, (p - centre).norm(dim=-1) - 0.4]), BOX, [1.5, 1.2], 0.02
     )
-
-
-def _nested_mesh(folder: FilePath) -> SdfGrid:
-    outer, inner = trimesh.creation.icosphere(3, 0.8), trimesh.creation.icosphere(3, 0.4)
-    inner.apply_translation([0.2, 0.1, 0])
-    outer.export(folder / "outer.ply")
-    inner.export(folder / "inner.ply")
-    return SdfGrid(
-        str(folder / "outer.ply"), 1.5, [str(folder / "inner.ply")], [1.2], resolution=32, cache=False
-    ).double()
 
 
 def _fresnel(cosine: Tensor, n: float) -> Tensor:
@@ -82,8 +67,8 @@ def test_reflectance_is_fresnels_both_ways() -> None:
 
 @pytest.mark.parametrize("branches", ["first", "all"])
 def test_weights_of_a_ray_sum_to_one(branches: str, tmp_path: FilePath) -> None:
-    rays = _bundle()
-    media = [(Snell, _nested_grid()), (Snell, RoundedBox().double()), (Snell, _nested_mesh(tmp_path))]
+    rays = _rays(300)
+    media = [(Snell, _nested_grid()), (Snell, RoundedBox().double()), (Snell, nested_mesh(tmp_path))]
     for interface, (_, medium) in zip(("sdf", "sdf", "mesh"), media, strict=True):
         sampler = Snell(interface, branches=branches)  # type: ignore[arg-type]
         trace = sampler.trace(rays, medium)
@@ -133,7 +118,7 @@ def test_the_rainbow_is_a_branch_of_the_tracer() -> None:
 
 
 def test_compiled_branches_are_those_of_torch(monkeypatch: pytest.MonkeyPatch) -> None:
-    medium, rays = _nested_grid(), _bundle(400)
+    medium, rays = _nested_grid(), _rays(400)
     sampler = Snell(branches="all", least_weight=0.005)
     fast = sampler.trace(rays, medium)
     # The same with too little room for polylines and vertices at first.
@@ -158,7 +143,7 @@ def test_compiled_branches_are_those_of_torch(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_triangles_split_light_as_the_surface_does(tmp_path: FilePath) -> None:
-    medium = _nested_mesh(tmp_path)
+    medium = nested_mesh(tmp_path)
     heights = torch.linspace(-0.5, 0.5, 21).double()
     on_mesh, on_grid = (Snell(kind, branches="all").trace(beam(heights), medium) for kind in ("mesh", "sdf"))  # type: ignore[arg-type]
     same = torch.bincount(on_mesh.path.ray) == torch.bincount(on_grid.path.ray)
@@ -168,7 +153,7 @@ def test_triangles_split_light_as_the_surface_does(tmp_path: FilePath) -> None:
 
 
 def test_the_first_polyline_is_the_one_that_is_transmitted() -> None:
-    rays, medium = _bundle(), _nested_grid()
+    rays, medium = _rays(300), _nested_grid()
     single, split = Snell()(rays, medium), Snell(branches="all")(rays, medium)
     first = split.first_of_ray(split.exit_directions)
     same = (first - single.exit_directions).norm(dim=-1) < 1e-6
@@ -179,8 +164,11 @@ def test_the_first_polyline_is_the_one_that_is_transmitted() -> None:
 
 @pytest.mark.parametrize("tracer", ["grid", "closed form", "mesh"])
 def test_main_polylines_alone_are_the_first_of_all(tracer: str, tmp_path: FilePath) -> None:
-    rays, medium = _bundle(), {"grid": _nested_grid, "closed form": NestedBalls}.get(tracer, lambda: None)()
-    medium = medium or _nested_mesh(tmp_path)
+    rays, medium = (
+        _rays(300),
+        {"grid": _nested_grid, "closed form": NestedBalls}.get(tracer, lambda: None)(),
+    )
+    medium = medium or nested_mesh(tmp_path)
     sampler = Snell("mesh" if tracer == "mesh" else "sdf", branches="all")
     every, main = sampler(rays, medium), sampler.main(rays, medium)
     assert main.num_rays == len(main.s) == len(rays) < len(every.s)
@@ -195,7 +183,7 @@ def test_what_is_too_light_is_added_to_the_rest() -> None:
     grazing = _weights(path)[-2:]
     assert float(grazing[1]) == pytest.approx(float(_fresnel((1 - (heights[-1:] / 0.8) ** 2).sqrt(), 1.5)))
     for least in (0.3, 0.03, 0.003):
-        counts = torch.bincount(Snell(branches="all", least_weight=least)(_bundle(), Ball().double()).ray)
+        counts = torch.bincount(Snell(branches="all", least_weight=least)(_rays(300), Ball().double()).ray)
         assert counts.max() <= 1 / least
 
 
@@ -207,7 +195,7 @@ def test_least_weights_are_shares(least_weight: float) -> None:
 
 @pytest.mark.parametrize("what", ["index", "origin"])
 def test_replayed_shares_have_the_derivatives_of_traced_ones(what: str) -> None:
-    rays, sampler = _bundle(60), Snell(branches="all", least_weight=1e-3)
+    rays, sampler = _rays(60), Snell(branches="all", least_weight=1e-3)
 
     def traced(step: Tensor) -> tuple[Path, Rays, Solid]:
         medium = NestedBalls()
@@ -233,21 +221,6 @@ def test_replayed_shares_have_the_derivatives_of_traced_ones(what: str) -> None:
     assert float(expected[steady].abs().max()) > 0.05
 
 
-class NestedBalls(Solid):
-    """A ball in a ball in closed form."""
-
-    box = BOX.double()
-
-    def __init__(self) -> None:
-        super().__init__([1.5, 1.2], 0.02)
-
-    def signed_distances(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        centres = torch.tensor([[0, 0, 0], [0.2, 0.1, 0]], dtype=torch.float64)
-        offsets = positions[..., None, :] - centres
-        distances = torch.linalg.vector_norm(offsets, dim=-1)
-        return distances - torch.tensor([0.8, 0.4], dtype=torch.float64), offsets / distances[..., None]
-
-
 class CementedHalves(Solid):
     """A ball of two glasses: the second one fills the half x > 0 and reaches a rounding error beyond the first one."""
 
@@ -269,7 +242,7 @@ class CementedHalves(Solid):
 
 @pytest.mark.parametrize("what", ["radius of the first", "radius of the second", "iors"])
 def test_gradients_belong_to_the_body_that_light_met_where_two_bodies_touch(what: str) -> None:
-    rays, sampler = _bundle(100), Snell(branches="all", least_weight=1e-3)
+    rays, sampler = _rays(100), Snell(branches="all", least_weight=1e-3)
 
     def moved(step: Tensor) -> CementedHalves:
         medium = CementedHalves()
@@ -314,14 +287,14 @@ def test_gradients_belong_to_the_body_that_light_met_where_two_bodies_touch(what
 
 
 def test_rays_are_chosen_and_joined_with_all_their_polylines() -> None:
-    path = Snell(branches="all")(_bundle(20), Ball().double())
+    path = Snell(branches="all")(_rays(20), Ball().double())
     rows = torch.tensor([7, 2, 2, 11])
     chosen = path.of_rays(rows)
     assert chosen.num_rays == 4
     for place, ray in enumerate(rows.tolist()):
         assert torch.equal(chosen.positions[chosen.ray == place], path.positions[path.ray == ray])
         assert torch.equal(chosen.throughput[chosen.ray == place], path.throughput[path.ray == ray])
-    both = Path.joined([chosen, Snell()(_bundle(3), Ball().double())])
+    both = Path.joined([chosen, Snell()(_rays(3), Ball().double())])
     assert both.num_rays == 7
     assert both.ray[-3:].tolist() == [4, 5, 6]
     torch.testing.assert_close(both.per_ray(torch.ones(len(both.s), 3).double()), torch.ones(7, 3).double())

@@ -16,8 +16,7 @@ from nerfro.media.shapes import Ball, RoundedBox
 from nerfro.media.solid import Solid
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.snell import Snell
-from nerfro.types import Rays
-from tests.closed_forms import angle, beam, make_rays
+from tests.closed_forms import angle, beam, make_rays, random_rays
 from tests.samplers.test_snell import _prism
 
 # Water: n_d and Abbe's number.
@@ -28,13 +27,6 @@ def cauchy(n: float, abbe: float, wavelength: float) -> float:
     """A + B / w^2 through n_d, with n_F - n_C = (n_d - 1) / V."""
     b = (n - 1) / abbe / (486.13**-2 - 656.27**-2)
     return n - b / 587.56**2 + b / wavelength**2
-
-
-def _rays(num: int = 60) -> Rays:
-    generator = torch.Generator().manual_seed(3)
-    directions = torch.nn.functional.normalize(torch.randn(num, 3, generator=generator), dim=-1)
-    targets = 2 * torch.rand(num, 3, generator=generator) - 1
-    return make_rays(targets - 3 * directions, directions, 0.5, 6.0)
 
 
 def test_the_index_is_cauchys() -> None:
@@ -85,7 +77,7 @@ def test_a_prism_parts_colours_as_its_formula(tmp_path: FilePath) -> None:
 
 @pytest.mark.parametrize("branches", ["none", "all"])
 def test_every_band_is_traced_as_a_ray_of_its_colour(branches: str) -> None:
-    rays, sampler = _rays(), Snell(branches=branches)  # type: ignore[arg-type]
+    rays, sampler = random_rays(60, 2.0, seed=3, far=6), Snell(branches=branches)  # type: ignore[arg-type]
     medium = RoundedBox(abbe=[30.0]).double()
     path = sampler(rays, medium)
     total = path.per_ray(torch.ones(len(path.s), 3).double())
@@ -129,4 +121,4 @@ def test_what_cannot_be_dispersed_is_refused() -> None:
     with pytest.raises(NerfroError, match="wavelengths"):
         Snell(wavelengths=[500.0, 600.0])
     with pytest.raises(NerfroError, match="path=snell"):
-        Eikonal()(_rays(2), Ball(abbe=[30.0]))
+        Eikonal()(random_rays(2, 2.0, seed=3, far=6), Ball(abbe=[30.0]))

@@ -8,15 +8,14 @@ import pytest
 import torch
 
 from nerfro.errors import NerfroError
-from nerfro.media.analytic import Luneburg, Vacuum
+from nerfro.media.analytic import Luneburg
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball, RoundedBox, Slab
 from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.samplers.eikonal import Eikonal, march_adaptive, march_uniform
 from nerfro.samplers.integrators import Integrator, euler, leapfrog
-from nerfro.types import Rays
-from tests.closed_forms import FunctionMedium, angle, make_rays
+from tests.closed_forms import FunctionMedium, angle, make_rays, random_rays
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 
@@ -98,13 +97,6 @@ def test_rays_that_miss_are_two_vertices() -> None:
     torch.testing.assert_close(path.s, torch.tensor([[0.5, 6.0]] * 2).double())
 
 
-def test_vacuum_bends_nothing() -> None:
-    rays = make_rays(torch.randn(5, 3), torch.randn(5, 3), 0.1, 3).to(torch.float32)
-    path = Eikonal()(rays, Vacuum())
-    torch.testing.assert_close(path.exit_directions, rays.directions)
-    assert path.s.shape == (5, 2)
-
-
 def test_tolerance_bounds_the_distance_to_the_tangents() -> None:
     medium = Luneburg().double()
     rays = make_rays([[-3, 0.7, 0.1]], [[1, 0, 0]], 0.5, 6)
@@ -135,16 +127,9 @@ def _grids() -> tuple[VoxelGrid, SdfGrid]:
     return voxels, SdfGrid.from_distances(torch.stack([radius - 0.9, radius - 0.4]), BOX, [1.5, 1.2], 0.02)
 
 
-def _bundle(num: int = 200) -> Rays:
-    generator = torch.Generator().manual_seed(1)
-    directions = torch.nn.functional.normalize(torch.randn(num, 3, generator=generator, dtype=torch.float64), dim=-1)
-    targets = 1.4 * torch.rand(num, 3, generator=generator, dtype=torch.float64) - 0.7
-    return make_rays(targets - 3.5 * directions, directions, 1.0, 7.0)
-
-
 def test_compiled_uniform_steps_are_those_of_torch() -> None:
     voxels, _ = _grids()
-    rays = _bundle(40)
+    rays = random_rays(40, 1.4, seed=1, far=7)
     compiled = Eikonal("euler", 96)(rays, voxels)
     plain = march_uniform(rays, voxels.double(), euler, 96)
     for name in ("positions", "directions", "s", "exit_directions"):
@@ -157,7 +142,7 @@ def test_compiled_uniform_steps_are_those_of_torch() -> None:
 def test_compiled_adaptive_steps_are_those_of_torch(kind: str) -> None:
     voxels, solid = _grids()
     medium: Medium = voxels if kind == "voxels" else solid
-    rays = _bundle()
+    rays = random_rays(200, 1.4, seed=1, far=7)
     compiled = Eikonal()(rays, medium)
     plain, exceeded = march_adaptive(rays, medium.double(), 2e-4 * 3 * math.sqrt(3), 16384)
     assert not exceeded.any()
@@ -170,7 +155,7 @@ def test_compiled_adaptive_steps_are_those_of_torch(kind: str) -> None:
 def test_paths_of_different_capacity_agree() -> None:
     # A fine tolerance makes rows longer than the kernel's first guess.
     voxels, _ = _grids()
-    rays = _bundle()
+    rays = random_rays(200, 1.4, seed=1, far=7)
     path = Eikonal(tolerance=1e-6)(rays, voxels)
     assert path.s.shape[1] > 24
     single = [Eikonal(tolerance=1e-6)(rays[i : i + 1], voxels) for i in range(0, 200, 40)]

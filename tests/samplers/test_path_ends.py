@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path as FilePath
 
 import pytest
@@ -16,18 +17,12 @@ from nerfro.media.shapes import RoundedBox
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.snell import Snell
-from nerfro.types import Path, Rays
-from tests.closed_forms import make_rays
+from nerfro.types import Path
+from tests.closed_forms import random_rays
 
+_rays = functools.partial(random_rays, 200, 1.2, 4)
 # From the camera at distance 3 the near face of the cube is reached, its far one is not.
 SHORT, LONG = 3.2, 60.0
-
-
-def _rays(far: float) -> Rays:
-    generator = torch.Generator().manual_seed(4)
-    directions = torch.nn.functional.normalize(torch.randn(200, 3, generator=generator), dim=-1)
-    targets = 1.2 * torch.rand(200, 3, generator=generator) - 0.6
-    return make_rays(targets - 3 * directions, directions, 0.5, far)
 
 
 def _medium(folder: FilePath, kind: str) -> Medium:
@@ -46,7 +41,7 @@ CASES = [
 @pytest.mark.parametrize(("sampler", "kind"), CASES)
 def test_far_does_not_cut_a_path_inside_the_object(tmp_path: FilePath, sampler: PathSampler, kind: str) -> None:
     medium = _medium(tmp_path, kind)
-    short, long = sampler(_rays(SHORT), medium), sampler(_rays(LONG), medium)
+    short, long = sampler(_rays(far=SHORT), medium), sampler(_rays(far=LONG), medium)
     bent = long.refracted
     assert bent.sum() > 50
     torch.testing.assert_close(short.exit_directions, long.exit_directions)
@@ -61,7 +56,7 @@ def test_far_does_not_cut_a_path_inside_the_object(tmp_path: FilePath, sampler: 
 @pytest.mark.parametrize(("sampler", "kind"), [(Snell("sdf", 2), "grid"), (Snell("mesh", 2), "grid")])
 def test_rays_that_meet_the_limit_of_events_end_outside_too(tmp_path: FilePath, sampler: Snell, kind: str) -> None:
     medium = _medium(tmp_path, kind)
-    trace = sampler.trace(_rays(SHORT), medium)
+    trace = sampler.trace(_rays(far=SHORT), medium)
     assert trace.exceeded.any()
     assert _outside(trace.path, medium)[trace.path.refracted].all()
 

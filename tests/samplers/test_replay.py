@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path as FilePath
@@ -15,7 +16,6 @@ from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball, RoundedBox
-from nerfro.media.solid import Solid
 from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.eikonal import Eikonal, march_adaptive
@@ -23,9 +23,11 @@ from nerfro.samplers.replay import smallest_cosine
 from nerfro.samplers.snell import Snell, trace_interfaces
 from nerfro.samplers.straight import Straight
 from nerfro.types import Path, Rays
-from tests.closed_forms import beam, make_rays
+from tests.closed_forms import beam, make_rays, random_rays
+from tests.samplers.nested import NestedBalls, nested_mesh
 
 BOX = torch.tensor([[-1.2] * 3, [1.2] * 3], dtype=torch.float64)
+_rays = functools.partial(random_rays, width=1.0, seed=0, far=4)
 STEADY = 0.15
 
 
@@ -45,25 +47,6 @@ class PlainEikonal(Eikonal):
         return march_adaptive(rays, medium, 1e-3, self.max_steps)[0]
 
 
-class NestedBalls(Solid):
-    """A ball in a ball in closed form."""
-
-    box = BOX
-
-    def signed_distances(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        centres = torch.tensor([[0, 0, 0], [0.2, 0.1, 0]], dtype=torch.float64)
-        offsets = positions[..., None, :] - centres
-        distances = torch.linalg.vector_norm(offsets, dim=-1)
-        return distances - torch.tensor([0.8, 0.4], dtype=torch.float64), offsets / distances[..., None]
-
-
-def _rays(num: int = 40, seed: int = 0) -> Rays:
-    generator = torch.Generator().manual_seed(seed)
-    directions = torch.nn.functional.normalize(torch.randn(num, 3, generator=generator), dim=-1)
-    targets = torch.rand(num, 3, generator=generator) - 0.5
-    return make_rays(targets - 3 * directions, directions, 0.5, 4.0)
-
-
 def _ball(centre: list[float], radius: float) -> Tensor:
     axis = torch.linspace(-1.2, 1.2, 33, dtype=torch.float64)
     points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
@@ -77,16 +60,6 @@ def _nested_grid() -> SdfGrid:
     )
 
 
-def _nested_mesh(folder: FilePath) -> SdfGrid:
-    outer, inner = trimesh.creation.icosphere(3, 0.8), trimesh.creation.icosphere(2, 0.4)
-    inner.apply_translation([0.2, 0.1, 0])
-    outer.export(folder / "outer.ply")
-    inner.export(folder / "inner.ply")
-    return SdfGrid(
-        str(folder / "outer.ply"), 1.5, [str(folder / "inner.ply")], [1.2], resolution=24, cache=False
-    ).double()
-
-
 def _cube_mesh(folder: FilePath) -> SdfGrid:
     trimesh.creation.box(extents=[1.1, 1.2, 1.3]).export(folder / "cube.ply")
     return SdfGrid(str(folder / "cube.ply"), 1.52, resolution=24, cache=False).double()
@@ -96,11 +69,11 @@ SCENES: dict[str, tuple[PathSampler, Callable[[FilePath], Medium]]] = {
     "snell-ball": (Snell(), lambda folder: Ball(0.8, 1.5).double()),
     "snell-rounded-cube": (Snell(), lambda folder: RoundedBox(0.6, 0.15, 1.52).double()),
     "snell-nested-grid": (PlainSnell(), lambda folder: _nested_grid()),
-    "snell-nested-mesh": (Snell("mesh"), _nested_mesh),
+    "snell-nested-mesh": (Snell("mesh"), nested_mesh),
     "snell-cube-mesh": (Snell("mesh"), _cube_mesh),
     "eikonal-ball": (Eikonal(), lambda folder: Ball(0.8, 1.5, 0.05).double()),
     "eikonal-rounded-cube": (Eikonal(max_steps=400), lambda folder: RoundedBox(0.6, 0.15, 1.52, 0.05).double()),
-    "eikonal-nested-balls": (Eikonal(), lambda folder: NestedBalls([1.5, 1.2], 0.05)),
+    "eikonal-nested-balls": (Eikonal(), lambda folder: NestedBalls(0.05)),
     "eikonal-nested-grid": (PlainEikonal(), lambda folder: _nested_grid()),
 }
 
@@ -150,7 +123,7 @@ CASES += [("snell-nested-mesh", "vertices"), ("snell-cube-mesh", "vertices")]
 @pytest.mark.parametrize(("name", "what"), CASES)
 def test_derivatives_are_those_of_central_differences(name: str, what: str, tmp_path: FilePath) -> None:
     sampler, make = SCENES[name]
-    rays, medium = _rays(), make(tmp_path)
+    rays, medium = _rays(40), make(tmp_path)
     shift = _shifted(what, rays, medium)
 
     def traced(step: float) -> Path:

@@ -11,8 +11,8 @@ from nerfro.errors import NerfroError
 from nerfro.media.analytic import Luneburg
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.straight import straight_path
-from nerfro.samplers.stratified import LAST_DELTA, Stratified, cone_samples
-from nerfro.testing import example_draws, example_path, example_rays
+from nerfro.samplers.stratified import LAST_DELTA, Stratified
+from nerfro.testing import example_draws, example_rays
 from nerfro.types import Path
 
 NUM_VERTICES = 48
@@ -89,13 +89,6 @@ def test_cones_fill_the_path_without_gaps() -> None:
         within = 0.5 / 16 + 1e-5 if draws else 1e-5
         even = torch.linspace(0, 1, 17)
         assert (fractions(path, samples.edges) - even).abs().max() <= within
-
-
-def test_cone_samples_lie_on_the_path_at_their_middles() -> None:
-    path = example_path()
-    edges = path.near[:, None] + torch.linspace(0, 1, 9) * (path.far - path.near)[:, None]
-    samples = cone_samples(path, edges)
-    torch.testing.assert_close(samples.positions, path.at(samples.s)[0])
 
 
 @pytest.mark.parametrize(

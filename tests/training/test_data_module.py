@@ -121,7 +121,7 @@ def test_the_thread_has_one_core_and_leaves_all_others_theirs(ahead) -> None:
 
 @pytest.mark.parametrize(("sampler", "num_rays"), [(Snell(), 50_000), (Eikonal(), 10_000)], ids=["snell", "eikonal"])
 def test_python_goes_on_while_the_thread_traces(sampler: Snell | Eikonal, num_rays: int, ahead, ball: SdfGrid) -> None:
-    assert sampler.releases_python(ball)
+    assert sampler.releases_gil(ball)
     many = rays(num_rays)
     sampler(many[:10], ball)
     spans: list[float] = []

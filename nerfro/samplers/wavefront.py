@@ -1,0 +1,162 @@
+"""Rays that are traced together from surface to surface, and split where light is partly reflected."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from nerfro.geometry.interpolation import intersect_box
+from nerfro.media.solid import Solid
+from nerfro.samplers.branching import Branching
+from nerfro.samplers.polylines import Crossed, Polylines
+from nerfro.samplers.replay import indices_of
+from nerfro.samplers.snell_law import reflectance, refract
+from nerfro.types import Path, Rays
+
+# Attributes of `Wavefront` with one row for each polyline.
+_COLUMNS = ("x", "d", "s", "inside", "triangle", "start", "moving", "ray", "weight", "num_events", "exceeded")
+
+
+class Wavefront:
+    """Rays on their way through bodies with sharp surfaces, one row for each polyline.
+
+    Tracers find the next surface of each row. The wavefront applies Snell's law, follows branches, and records
+    vertices.
+
+    Args:
+        rays: rays, in the precision and on the device of the computation.
+        medium: bodies.
+        box: box of the medium, as precise as the rays and on their device.
+        max_events: largest number of refractions and reflections of a polyline.
+        branching: which parts of light that is partly reflected are followed.
+        offset: distance from a surface at which the search for the next one begins, world units.
+
+    Attributes:
+        x, d: position in world units and unit direction of each row [P, 3].
+        s: arc length from the camera [P].
+        inside: whether each row is inside the surface of each body [P, K]; the tracers set the first values.
+        triangle: triangle that each row lies on; -1 for none.
+        start: distance from `x` at which the search for the next surface begins.
+        moving: whether each row may meet another surface.
+        ray, weight: ray of each row, and its share of the light of this ray.
+        num_events, exceeded: events of each row, and whether it met the limit.
+        enter: arc length from near at which each ray enters the box.
+    """
+
+    def __init__(
+        self,
+        rays: Rays,
+        medium: Solid,
+        box: Float[Tensor, "2 3"],
+        max_events: int,
+        branching: Branching,
+        offset: float = 0.0,
+    ) -> None:
+        self.medium, self.box, self.max_events, self.branching, self.offset = medium, box, max_events, branching, offset
+        self.indices, self.far = indices_of(medium, box), rays.far
+        self.x, self.d = rays.origins + rays.near[:, None] * rays.directions, rays.directions.clone()
+        self.s = rays.near.clone()
+        self.enter, leave = intersect_box(box, self.x, self.d)
+        self.moving = (self.enter < leave) & (leave > 0) & (self.enter < rays.far - self.s)
+        self.ray = torch.arange(len(rays), device=self.s.device)
+        self.triangle, self.num_events = torch.full_like(self.ray, -1), torch.zeros_like(self.ray)
+        self.start, self.weight = torch.zeros_like(self.s), torch.ones_like(self.s)
+        self.exceeded = torch.zeros_like(self.moving)
+        self.inside = self.exceeded[:, None].repeat(1, len(medium.iors))
+        self.lines = Polylines(len(rays), self.x)
+
+    def add_vertices(
+        self,
+        rows: Int[Tensor, "A"],
+        surface: Int[Tensor, "A"] | int = -1,
+        across: Int[Tensor, "A"] | int = 0,
+        triangle: Int[Tensor, "A"] | int = -1,
+    ) -> None:
+        """Record the present positions of rows as vertices; see `Path` for the numbers."""
+        body = self.medium.innermost(self.inside[rows])
+        self.lines.append(rows, self.x[rows], self.d[rows], self.s[rows], Crossed(body, surface, across, triangle))
+
+    def meet(
+        self,
+        rows: Int[Tensor, "A"],
+        before: Float[Tensor, "A"],
+        after: Float[Tensor, "A"],
+        body: Int[Tensor, "A"],
+        normal: Float[Tensor, "A 3"],
+        triangle: Int[Tensor, "A"] | None = None,
+    ) -> None:
+        """Refract and reflect rows at the next surface.
+
+        Args:
+            rows: rows that meet a surface.
+            before, after: distances to points just before and just behind the surface, from which reflected and
+                transmitted light continues.
+            body: body whose surface is met, from 0.
+            normal: unit normal of either orientation.
+            triangle: triangle that is met; by default none.
+        """
+        triangle = torch.full_like(rows, -1) if triangle is None else triangle
+        inside = self.inside[rows]
+        flipped = inside.scatter(1, body[:, None], ~inside.gather(1, body[:, None]))
+        across = self.medium.innermost(flipped)
+        n_before, n_after = self.indices[self.medium.innermost(inside)], self.indices[across]
+        visible = n_before != n_after
+        exceeds = visible & (self.num_events[rows] >= self.max_events)
+        self.exceeded[rows], self.moving[rows] = exceeds, ~exceeds
+        columns = [before, after, body, normal, triangle, flipped, across, n_before, n_after, visible]
+        rows, columns = rows[~exceeds], [column[~exceeds] for column in columns]
+        normal, n_before, n_after, visible = columns[3], *columns[7:]
+        turned, reflected = refract(self.d[rows], normal, n_before, n_after)
+        reflected &= visible
+        if self.branching.num_events:
+            share = torch.where(visible, reflectance(self.d[rows], normal, n_before, n_after), 0.0)
+            rows, place, reflected = self._split(rows, share, reflected)
+            columns = [column[place] for column in columns]
+            turned, _ = refract(self.d[rows], columns[3], *columns[7:9], reflected)
+        before, after, body, _, triangle, flipped, across, _, _, visible = columns
+        length = torch.where(reflected, before, after)
+        self.inside[rows] = torch.where(reflected[:, None], self.inside[rows], flipped)
+        self.x[rows] += length[:, None] * self.d[rows]
+        self.s[rows] += length
+        self.d[rows] = torch.where(visible[:, None], turned, self.d[rows])
+        self.triangle[rows], self.start[rows] = triangle, self.offset
+        self.num_events[rows] += visible
+        self.add_vertices(rows[visible], body[visible], across[visible], triangle[visible])
+
+    def _split(
+        self, rows: Int[Tensor, "A"], share: Float[Tensor, "A"], reflected: Bool[Tensor, "A"]
+    ) -> tuple[Int[Tensor, "B"], Int[Tensor, "B"], Bool[Tensor, "B"]]:
+        """Duplicate rows whose light splits; the reflected part becomes the next row.
+
+        Args:
+            rows: rows that meet a surface.
+            share: reflectance, 0 where there is nothing to see.
+            reflected: whether each row is totally reflected.
+
+        Returns:
+            The rows and the duplicates, the place of each in the former `rows`, and whether it is reflected.
+        """
+        splits, whole = self.branching.decide(self.weight[rows], share, self.num_events[rows])
+        followed = splits & (not self.branching.main_only)
+        copies = torch.ones_like(self.ray)
+        copies[rows] += followed
+        source = torch.arange(len(copies), device=rows.device).repeat_interleave(copies)
+        place = torch.arange(len(rows), device=rows.device).repeat_interleave(1 + followed.long())
+        second = torch.zeros_like(place, dtype=torch.bool)
+        second[1:] = place[1:] == place[:-1]
+        for name in _COLUMNS:
+            setattr(self, name, getattr(self, name)[source])
+        self.lines.take(source)
+        rows = (copies.cumsum(0) - copies)[rows[place]] + second
+        share = share[place]
+        self.weight[rows] *= torch.where(splits[place], torch.where(second, share, 1 - share), 1.0)
+        return rows, place, (reflected | whole)[place] | second
+
+    def finish(self, rays: Rays) -> tuple[Path, Int[Tensor, "P"], Bool[Tensor, "P"]]:
+        """Return the paths of the rays, the number of events of each polyline, and whether the number met the limit."""
+        refracted, device = self.num_events > 0, rays.origins.device
+        self.lines.append_ends(self.far[self.ray], self.box, refracted, self.x, self.d, self.s)
+        split = (self.ray, self.weight) if self.branching.num_events else (None, None)
+        path = self.lines.path(rays, refracted, *split)
+        return path, self.num_events.to(device), self.exceeded.to(device)
