@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from nerfro.media.analytic import Luneburg, Vacuum
+from nerfro.media.analytic import Vacuum
 from nerfro.media.shapes import Ball
 from nerfro.rendering import composite
 from nerfro.samplers.eikonal import Eikonal
@@ -15,9 +15,9 @@ from nerfro.samplers.hierarchical import Hierarchical
 from nerfro.samplers.snell import Snell
 from nerfro.samplers.stepfun import volume_weights
 from nerfro.samplers.straight import Straight, straight_path
-from nerfro.samplers.stratified import Stratified, point_samples
+from nerfro.samplers.stratified import Stratified
 from nerfro.testing import NUM_RAYS, example_path, example_rays, example_rendering, example_samples
-from nerfro.types import Path, Radiance, Rays, Samples
+from nerfro.types import Path, Radiance, Samples
 from tests.closed_forms import beam
 
 
@@ -25,13 +25,6 @@ def smooth_radiance(samples: Samples) -> Radiance:
     """Density and colour as smooth functions of position and direction."""
     density = 3 * torch.exp(-samples.positions.square().sum(-1))
     return Radiance(density, torch.sigmoid(samples.positions + samples.directions))
-
-
-def test_weights_and_final_transmittance_sum_to_one() -> None:
-    density, deltas = 100 * torch.rand(50, 64) ** 4, torch.rand(50, 64)
-    weights, transmittance = volume_weights(density, deltas)
-    torch.testing.assert_close(weights.sum(-1) + transmittance, torch.ones(50), atol=1e-5, rtol=0)
-    assert (weights >= 0).all()
 
 
 @pytest.mark.parametrize("density", [0.0, 1e-8, 1e8])
@@ -158,18 +151,3 @@ def test_point_of_a_bent_path_follows_the_nearest_former_vertex() -> None:
 def test_point_before_near_or_beyond_far_goes_straight_on() -> None:
     positions, _ = corner().at(torch.tensor([[0.5, 7.0]]))
     torch.testing.assert_close(positions, torch.tensor([[[-0.5, 0.0, 0.0], [2, 4, 0]]]))
-
-
-def test_every_vertex_of_a_path_is_found_at_its_arc_length() -> None:
-    path = Eikonal("euler", 64)(example_rays(), Luneburg())
-    positions, _ = path.at(path.s)
-    # Between vertices the path is followed along a tangent, off by half the squared step at the next vertex.
-    torch.testing.assert_close(positions, path.positions, atol=0.5 * float(path.s.diff(dim=1).max()) ** 2, rtol=0)
-
-
-def test_samples_of_sliced_rays_and_paths_are_slices_of_the_samples() -> None:
-    path, rays = example_path(), example_rays()
-    whole, part = point_samples(path, path.s[:, ::4]), point_samples(path[3:9], path[3:9].s[:, ::4])
-    torch.testing.assert_close(whole.positions[3:9], part.positions)
-    assert isinstance(rays[3:9], Rays)
-    assert len(rays[3:9]) == 6

@@ -12,13 +12,6 @@ from nerfro.files.drawing import magma
 from nerfro.files.images import round_to_8bit
 
 
-def test_mean_of_the_error_map_is_what_psnr_measures() -> None:
-    prediction, target = torch.rand(2, 12, 9, 3, generator=torch.Generator().manual_seed(0))
-    errors = squared_error_map(prediction, target)
-    assert errors.shape == (12, 9)
-    assert -10 * torch.log10(errors.mean()).item() == pytest.approx(psnr(prediction, target).item(), abs=1e-5)
-
-
 def test_colours_grow_brighter_with_the_value() -> None:
     ramp = magma(torch.linspace(0, 2, 256)[None], limit=2.0)[0]
     linear = torch.where(ramp <= 0.04045, ramp / 12.92, ((ramp + 0.055) / 1.055) ** 2.4)

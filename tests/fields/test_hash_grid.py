@@ -68,23 +68,6 @@ def test_only_samples_inside_the_box_are_evaluated() -> None:
     assert torch.equal(inside_box(torch.full((2, 3), float("nan")), field.box_min, field.box_max), torch.zeros(2) > 0)
 
 
-def test_compiled_field_equals_the_plain_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    samples, results = make_samples(), []
-    for plain in (False, True):
-        field = make_field()
-        if plain:
-            monkeypatch.setattr(
-                field,
-                "encode",
-                lambda p, f=field: hash_encoding.hash_encode((p - f.box_min) / f.side, f.table, f.levels),
-            )
-        radiance = field(samples)
-        (radiance.density.sum() + radiance.rgb.square().sum()).backward()
-        results.append([radiance.density.detach(), radiance.rgb.detach(), *(p.grad for p in field.parameters())])
-    for compiled, expected in zip(*results, strict=True):
-        torch.testing.assert_close(compiled, expected, rtol=1e-5, atol=1e-5 * float(expected.abs().max()))
-
-
 def decoded_in_double(
     field: HashGridField, positions: torch.Tensor, directions: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -161,13 +144,6 @@ def test_one_direction_band_makes_colour_independent_of_direction() -> None:
     field, samples = make_field(direction_bands=1), make_samples()
     turned = Samples(samples.positions, -samples.directions, samples.s, samples.edges, samples.radii)
     assert torch.equal(field(samples).rgb, field(turned).rgb)
-
-
-def test_state_restores_the_field() -> None:
-    field, other = make_field(), make_field()
-    torch.nn.init.normal_(other.table)
-    other.load_state_dict(field.state_dict())
-    assert torch.equal(field(make_samples()).rgb, other(make_samples()).rgb)
 
 
 def test_field_learns_a_coloured_ball() -> None:

@@ -24,12 +24,6 @@ from nerfro.samplers.stratified import Stratified
 from nerfro.testing import example_path, example_samples
 
 
-def test_input_is_fed_in_again_after_the_skip_layer() -> None:
-    mlp = SkipMLP(num_inputs=7, width=16, depth=8, skip=5)
-    assert [layer.in_features for layer in mlp.layers] == [7, 16, 16, 16, 16, 16 + 7, 16, 16]
-    assert mlp.num_outputs == 16
-
-
 def test_forward_equals_a_slow_loop_over_layers() -> None:
     mlp = SkipMLP(num_inputs=5, width=8, depth=4, skip=2)
     x = torch.randn(11, 5)
@@ -40,11 +34,6 @@ def test_forward_equals_a_slow_loop_over_layers() -> None:
         if i == 1:
             y = torch.cat([y, x], -1)
     torch.testing.assert_close(mlp(x), y)
-
-
-def test_skip_at_the_last_layer_widens_the_output() -> None:
-    mlp = SkipMLP(num_inputs=5, width=8, depth=3, skip=3)
-    assert mlp(torch.randn(2, 5)).shape == (2, mlp.num_outputs) == (2, 13)
 
 
 def test_published_nerf_has_its_number_of_weights() -> None:

@@ -17,7 +17,6 @@ from nerfro.models.refractive import RefractiveModel
 from nerfro.rendering import Components
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.hierarchical import Hierarchical
-from nerfro.samplers.straight import Straight
 from nerfro.samplers.stratified import Stratified
 from nerfro.testing import example_rays
 from nerfro.training.module import TrainingModule
@@ -50,13 +49,6 @@ def test_refractive_model_has_a_field_for_each_level_and_mip_nerf_one_for_all(pa
     assert len(RefractiveModel(replace(parts, point_sampler=Stratified(8))).scene.fields) == 1
 
 
-def test_levels_of_the_refractive_model_learn_separate_weights(parts: Components) -> None:
-    coarse, fine = RefractiveModel(parts).scene.fields
-    shared = {id(p) for p in coarse.parameters()} & {id(p) for p in fine.parameters()}
-    assert not shared
-    assert not torch.equal(coarse.mlp.rgb.weight, fine.mlp.rgb.weight)
-
-
 def test_boundary_is_asked_where_the_path_leaves_or_at_the_last_coarse_sample(parts: Components) -> None:
     rays, parts = example_rays(), replace(parts, boundary=Compass())
     path = parts.path_sampler(rays, parts.medium)
@@ -65,19 +57,6 @@ def test_boundary_is_asked_where_the_path_leaves_or_at_the_last_coarse_sample(pa
     early = RefractiveModel(parts, "last_coarse").eval()(rays)
     for rendering in early:
         torch.testing.assert_close(rendering.boundary_rgb, 0.5 + 0.5 * early[0].samples.directions[:, -1])
-
-
-def test_rays_that_bend_see_another_sky_than_straight_ones(parts: Components) -> None:
-    rays = example_rays()
-    bent, straight = (
-        RefractiveModel(replace(parts, path_sampler=sampler, boundary=Compass())).eval()(rays)[-1]
-        for sampler in (parts.path_sampler, Straight())
-    )
-    refracted = bent.path.refracted
-    assert 0 < refracted.sum() < len(rays)
-    differs = (bent.boundary_rgb - straight.boundary_rgb).abs().amax(-1) > 1e-4
-    assert not differs[~refracted].any()
-    assert differs[refracted].float().mean() > 0.9
 
 
 @pytest.mark.parametrize("training", [True, False])
