@@ -3,30 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Int
-from torch import Tensor
 from torch.nn.functional import one_hot
 
 from nerfro.media.solid import Solid
+from nerfro.samplers.polylines import SnellTrace
 from nerfro.types import Path, Rays
-
-
-@dataclass(frozen=True)
-class SnellTrace:
-    """Result of tracing rays through solids.
-
-    Attributes:
-        path: polylines with one vertex for each event, besides near and far.
-        num_events: number of refractions and reflections of each polyline.
-        exceeded: whether the polyline met the limit of events, after which it continues straight.
-    """
-
-    path: Path
-    num_events: Int[Tensor, "P"]
-    exceeded: Bool[Tensor, "P"]
 
 
 def traced_in_bands(rays: Rays, media: Sequence[Solid], trace: Callable[[Rays, Solid], SnellTrace]) -> SnellTrace:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from nerfro.kernels.arrays import arrays
 from nerfro.samplers.branching import Branching
+from nerfro.samplers.polylines import SnellTrace
 from nerfro.types import Path, Rays
 
 if TYPE_CHECKING:
@@ -26,9 +27,7 @@ if TYPE_CHECKING:
 _CAPACITY, _ROOM = 18, 8
 
 
-def snell_on_grid(
-    rays: Rays, medium: SdfGrid, min_step: float, max_events: int, branching: Branching
-) -> tuple[Path, Int[Tensor, "P"], Bool[Tensor, "P"]]:
+def snell_on_grid(rays: Rays, medium: SdfGrid, min_step: float, max_events: int, branching: Branching) -> SnellTrace:
     """Evaluate `samplers.snell.trace_interfaces` by the compiled kernel."""
     from nerfro.samplers.snell_cpu import Settings, trace_snell
 
@@ -56,7 +55,7 @@ def snell_on_grid(
     path = replace(path, body=body, surface=surface, across=across)
     if branching.num_events:
         path = replace(path, splits=True, ray=owner, throughput=weight[:, None].expand(-1, 3))
-    return path, num_events, exceeded
+    return SnellTrace(path, num_events, exceeded)
 
 
 def _polylines(rows: Polylines, counts: Int[np.ndarray, "R"], width: int) -> tuple[np.ndarray, ...]:

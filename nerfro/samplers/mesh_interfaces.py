@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Int
-from torch import Tensor
 
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.branching import Branching
+from nerfro.samplers.polylines import SnellTrace
 from nerfro.samplers.wavefront import Wavefront
-from nerfro.types import Path, Rays
+from nerfro.types import Rays
 
 # The search for the next triangle begins at this share of the box's diagonal from the last one, beyond the rounding
 # errors of Embree's single precision.
 _OFFSET = 1e-6
 
 
-def snell_on_mesh(
-    rays: Rays, medium: SdfGrid, max_events: int, branching: Branching
-) -> tuple[Path, Int[Tensor, "P"], Bool[Tensor, "P"]]:
+def snell_on_mesh(rays: Rays, medium: SdfGrid, max_events: int, branching: Branching) -> SnellTrace:
     """Trace rays from triangle to triangle, on the CPU and in double precision.
 
     The number of crossings of its surface determines whether a ray is inside a body; the orientation of triangles does
     not matter. Signed distances determine which rays begin inside.
-
-    Returns:
-        Paths, the number of events of each polyline, and whether the polyline met the limit.
     """
     triangles, scene = medium.traced_triangles()
     box = medium.box.double().cpu()

@@ -28,6 +28,20 @@ def distance_to_end(
     return torch.where(refracted, torch.maximum(far - s, out), far - s)
 
 
+class SnellTrace(NamedTuple):
+    """Result of tracing rays through solids.
+
+    Attributes:
+        path: polylines with one vertex for each event, besides near and far.
+        num_events: number of refractions and reflections of each polyline.
+        exceeded: whether the polyline met the limit of events, after which it continues straight.
+    """
+
+    path: Path
+    num_events: Int[Tensor, "P"]
+    exceeded: Bool[Tensor, "P"]
+
+
 class Crossed(NamedTuple):
     """Bodies and surface of vertices, see `Path`; by default of a vertex in air."""
 

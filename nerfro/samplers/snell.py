@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Annotated, Literal
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool
 from torch import Tensor
 
 from nerfro.allowed import Positive, Range, Share
@@ -19,11 +19,12 @@ from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
 from nerfro.registry import register
-from nerfro.samplers.bands import SnellTrace, refined_in_bands, traced_in_bands
+from nerfro.samplers.bands import refined_in_bands, traced_in_bands
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.branching import ONE_PATH, Branching
 from nerfro.samplers.compiled import snell_on_grid
 from nerfro.samplers.mesh_interfaces import snell_on_mesh
+from nerfro.samplers.polylines import SnellTrace
 from nerfro.samplers.replay import meet_solid, meet_triangles, replay, smallest_cosine
 from nerfro.samplers.straight import straight_path
 from nerfro.samplers.wavefront import Wavefront
@@ -124,22 +125,17 @@ class Snell(PathSampler):
         if self.interface == "mesh":
             if not isinstance(medium, SdfGrid) or not medium.meshes:
                 raise NerfroError("sampler.path.interface=mesh needs a medium made of a mesh; take medium=sdf_grid")
-            return SnellTrace(*snell_on_mesh(rays, medium, self.max_events, branching))
+            return snell_on_mesh(rays, medium, self.max_events, branching)
         if isinstance(medium, SdfGrid) and rays.origins.device.type == "cpu":
-            return SnellTrace(*snell_on_grid(rays, medium, MIN_SEARCH_STEP, self.max_events, branching))
-        return SnellTrace(*trace_interfaces(rays, medium, self.max_events, branching))
+            return snell_on_grid(rays, medium, MIN_SEARCH_STEP, self.max_events, branching)
+        return trace_interfaces(rays, medium, self.max_events, branching)
 
 
-def trace_interfaces(
-    rays: Rays, medium: Solid, max_events: int, branching: Branching = ONE_PATH
-) -> tuple[Path, Int[Tensor, "P"], Bool[Tensor, "P"]]:
+def trace_interfaces(rays: Rays, medium: Solid, max_events: int, branching: Branching = ONE_PATH) -> SnellTrace:
     """Trace rays from surface to surface of any solid; the reference implementation of the compiled kernel.
 
     Sphere tracing finds the surfaces, because a step of the signed distance cannot miss one. A change of sign ends the
     search, and bisection shrinks the bracket around the surface.
-
-    Returns:
-        Paths, the number of events of each polyline, and whether the polyline met the limit.
     """
     box = medium.box
     front = Wavefront(rays, medium, box, max_events, branching)

@@ -9,10 +9,10 @@ from torch import Tensor
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.solid import Solid
 from nerfro.samplers.branching import Branching
-from nerfro.samplers.polylines import Crossed, Polylines
+from nerfro.samplers.polylines import Crossed, Polylines, SnellTrace
 from nerfro.samplers.replay import indices_of
 from nerfro.samplers.snell_law import reflectance, refract
-from nerfro.types import Path, Rays
+from nerfro.types import Rays
 
 # Attributes of `Wavefront` with one row for each polyline.
 _COLUMNS = ("x", "d", "s", "inside", "triangle", "start", "moving", "ray", "weight", "num_events", "exceeded")
@@ -153,10 +153,10 @@ class Wavefront:
         self.weight[rows] *= torch.where(splits[place], torch.where(second, share, 1 - share), 1.0)
         return rows, place, (reflected | whole)[place] | second
 
-    def finish(self, rays: Rays) -> tuple[Path, Int[Tensor, "P"], Bool[Tensor, "P"]]:
-        """Return the paths of the rays, the number of events of each polyline, and whether the number met the limit."""
+    def finish(self, rays: Rays) -> SnellTrace:
+        """Append the last vertices, and return the trace in the precision and on the device of the rays."""
         refracted, device = self.num_events > 0, rays.origins.device
         self.lines.append_ends(self.far[self.ray], self.box, refracted, self.x, self.d, self.s)
         split = (self.ray, self.weight) if self.branching.num_events else (None, None)
         path = self.lines.path(rays, refracted, *split)
-        return path, self.num_events.to(device), self.exceeded.to(device)
+        return SnellTrace(path, self.num_events.to(device), self.exceeded.to(device))
