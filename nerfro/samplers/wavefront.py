@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -16,6 +18,24 @@ from nerfro.types import Rays
 
 # Attributes of `Wavefront` with one row for each polyline.
 _COLUMNS = ("x", "d", "s", "inside", "triangle", "start", "moving", "ray", "weight", "num_events", "exceeded")
+
+
+class _Crossing(NamedTuple):
+    """Crossings of A rows: arguments of `Wavefront.meet`, and the media on both sides."""
+
+    before: Float[Tensor, "A"]
+    after: Float[Tensor, "A"]
+    body: Int[Tensor, "A"]
+    normal: Float[Tensor, "A 3"]
+    triangle: Int[Tensor, "A"]
+    flipped: Bool[Tensor, "A K"]  # whether the far side is inside each surface
+    across: Int[Tensor, "A"]  # body on the far side, numbered from 1; 0 for air
+    n_before: Float[Tensor, "A"]
+    n_after: Float[Tensor, "A"]
+    visible: Bool[Tensor, "A"]  # whether the index changes
+
+    def select(self, index: Tensor) -> _Crossing:
+        return _Crossing(*(values[index] for values in self))
 
 
 class Wavefront:
@@ -104,25 +124,24 @@ class Wavefront:
         visible = n_before != n_after
         exceeds = visible & (self.num_events[rows] >= self.max_events)
         self.exceeded[rows], self.moving[rows] = exceeds, ~exceeds
-        columns = [before, after, body, normal, triangle, flipped, across, n_before, n_after, visible]
-        rows, columns = rows[~exceeds], [column[~exceeds] for column in columns]
-        normal, n_before, n_after, visible = columns[3], *columns[7:]
-        turned, reflected = refract(self.d[rows], normal, n_before, n_after)
-        reflected &= visible
+        met = _Crossing(before, after, body, normal, triangle, flipped, across, n_before, n_after, visible)
+        rows, met = rows[~exceeds], met.select(~exceeds)
+        turned, reflected = refract(self.d[rows], met.normal, met.n_before, met.n_after)
+        reflected &= met.visible
         if self.branching.num_events:
-            share = torch.where(visible, reflectance(self.d[rows], normal, n_before, n_after), 0.0)
-            rows, place, reflected = self._split(rows, share, reflected)
-            columns = [column[place] for column in columns]
-            turned, _ = refract(self.d[rows], columns[3], *columns[7:9], reflected)
-        before, after, body, _, triangle, flipped, across, _, _, visible = columns
-        length = torch.where(reflected, before, after)
-        self.inside[rows] = torch.where(reflected[:, None], self.inside[rows], flipped)
+            share = reflectance(self.d[rows], met.normal, met.n_before, met.n_after)
+            rows, place, reflected = self._split(rows, torch.where(met.visible, share, 0.0), reflected)
+            met = met.select(place)
+            turned, _ = refract(self.d[rows], met.normal, met.n_before, met.n_after, reflected)
+        length = torch.where(reflected, met.before, met.after)
+        self.inside[rows] = torch.where(reflected[:, None], self.inside[rows], met.flipped)
         self.x[rows] += length[:, None] * self.d[rows]
         self.s[rows] += length
-        self.d[rows] = torch.where(visible[:, None], turned, self.d[rows])
-        self.triangle[rows], self.start[rows] = triangle, self.offset
-        self.num_events[rows] += visible
-        self.add_vertices(rows[visible], body[visible], across[visible], triangle[visible])
+        self.d[rows] = torch.where(met.visible[:, None], turned, self.d[rows])
+        self.triangle[rows], self.start[rows] = met.triangle, self.offset
+        self.num_events[rows] += met.visible
+        bent = met.select(met.visible)
+        self.add_vertices(rows[met.visible], bent.body, bent.across, bent.triangle)
 
     def _split(
         self, rows: Int[Tensor, "A"], share: Float[Tensor, "A"], reflected: Bool[Tensor, "A"]
