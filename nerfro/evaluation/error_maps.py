@@ -12,9 +12,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.errors import NerfroError
 from nerfro.evaluation import flip
 from nerfro.evaluation.lpips import LpipsNetwork
+from nerfro.evaluation.regions import require_images
 from nerfro.evaluation.ssim import WINDOW, ssim_map
 from nerfro.files.drawing import GAP, LINE_HEIGHT, colour_scale, fit, magma, paper, write
 from nerfro.files.images import save_png
@@ -79,11 +79,7 @@ def error_maps(
 
 def squared_error_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
     """Compute the squared error of each pixel, averaged over channels. Its mean over the image determines the PSNR."""
-    if prediction.shape != target.shape:
-        raise NerfroError(
-            f"cannot compare a prediction {list(prediction.shape)} with a reference {list(target.shape)}; "
-            "both must have the same size"
-        )
+    require_images(prediction, target)
     return (prediction - target).square().mean(-1)
 
 

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerfro.evaluation.regions import mean_over
+from nerfro.evaluation.regions import mean_over, require_images
 
 
 def is_available() -> bool:
@@ -33,6 +33,7 @@ def flip_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"])
     Returns:
         Values in [0, 1], float32; 0 for an invisible difference.
     """
+    require_images(prediction, target)
     import flip_evaluator  # not available on every platform, see `is_available`
 
     images = [image.detach().cpu().float().contiguous().numpy() for image in (target, prediction)]
@@ -53,4 +54,5 @@ def flip(
     Returns:
         Mean in [0, 1], without unit; NaN for an empty mask.
     """
+    require_images(prediction, target, inside)
     return mean_over(flip_map(prediction, target), inside)

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation.pretrained import ALEXNET, VGG16, Published, load_weights
-from nerfro.evaluation.regions import mean_over
+from nerfro.evaluation.regions import mean_over, require_images
 from nerfro.paths import ASSETS_DIR
 
 _HEADS = ASSETS_DIR / "_lpips/heads.npz"  # arrays alex<l> and vgg<l> of lpips v0.1
@@ -134,6 +134,7 @@ class LpipsNetwork(nn.Module):
         Returns:
             Distance, without unit; NaN for an empty mask.
         """
+        require_images(prediction, target, inside)
         if inside is not None:
             return mean_over(self.distance_map(prediction, target), inside)
         return torch.stack([layer.mean() for layer in self._layer_distances(prediction, target)]).sum()
@@ -158,6 +159,7 @@ class LpipsNetwork(nn.Module):
         self.register_buffer(name, weights[key].detach().float().clone(), persistent=False)
 
     def _layer_distances(self, prediction: Tensor, target: Tensor) -> list[Float[Tensor, "1 1 _ _"]]:
+        require_images(prediction, target)
         size = self.backbone.min_size
         if min(prediction.shape[:2]) < size:
             raise NerfroError(

@@ -16,7 +16,7 @@ from nerfro.evaluation.error_maps import squared_error_map
 from nerfro.evaluation.flip import flip
 from nerfro.evaluation.flip import is_available as flip_available
 from nerfro.evaluation.lpips import LpipsNetwork
-from nerfro.evaluation.regions import crop_rectangle, mean_over, object_pixels
+from nerfro.evaluation.regions import crop_rectangle, mean_over, object_pixels, require_images
 from nerfro.evaluation.results import FULL, METRICS, OBJECT_REGIONS, EvaluationResult, Region, Score, ViewScores
 from nerfro.evaluation.ssim import MS_SSIM_MIN_SIZE, WINDOW, ms_ssim, ssim
 from nerfro.files.images import round_to_8bit
@@ -44,6 +44,7 @@ def psnr(
     Raises:
         NerfroError: the sizes of the images differ.
     """
+    require_images(prediction, target, inside)
     errors = squared_error_map(prediction.double(), target.double())
     return (-10 * torch.log10(mean_over(errors, inside))).clamp(max=MAX_PSNR)
 
@@ -98,13 +99,7 @@ class ImageMetrics(torchmetrics.Metric):
         Raises:
             NerfroError: the sizes differ, or a value is not finite.
         """
-        if prediction.shape != target.shape or prediction.ndim != 3 or prediction.shape[-1] != 3:
-            raise NerfroError(
-                f"cannot compare a prediction {list(prediction.shape)} with a reference {list(target.shape)}; "
-                "both must have the same size [H, W, 3]"
-            )
-        if coverage is not None and coverage.shape != target.shape[:2]:
-            raise NerfroError(f"a mask {list(coverage.shape)} does not fit an image {list(target.shape)}; give [H, W]")
+        require_images(prediction, target, coverage)
         rounded = round_to_8bit(prediction)  # raises an error for values that are not finite
         prediction = rounded if self.round_predictions else prediction.clamp(0, 1)
         scores = torch.full((len(_REGIONS), len(METRICS)), torch.nan, dtype=torch.float64, device=prediction.device)

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.regions import mean_over
+from nerfro.evaluation.regions import mean_over, require_images
 
 WINDOW = 11  # pixels; Gaussian of sigma 1.5, truncated at 3.5 sigma
 SIGMA = 1.5  # pixels
@@ -36,6 +36,7 @@ def ssim_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"])
     Source:
         Wang et al., "Image quality assessment: from error visibility to structural similarity", 2004, Eqn. 13 to 16.
     """
+    require_images(prediction, target)
     if min(prediction.shape[:2]) < WINDOW:
         raise NerfroError(f"SSIM needs at least {WINDOW} x {WINDOW} pixels, got {list(prediction.shape[:2])}; use PSNR")
     luminance, contrast = _luminance_and_contrast(_channels(prediction), _channels(target))
@@ -55,6 +56,7 @@ def ssim(
     Returns:
         Mean in [-1, 1], without unit; NaN if no pixel of the mask has a window inside the image.
     """
+    require_images(prediction, target, inside)
     return mean_over(ssim_map(prediction, target).mean(-1), _with_whole_window(inside))
 
 
@@ -82,6 +84,7 @@ def ms_ssim(
     Source:
         Wang et al., "Multiscale structural similarity for image quality assessment", 2003, Eqn. 7.
     """
+    require_images(prediction, target, inside)
     if min(prediction.shape[:2]) < MS_SSIM_MIN_SIZE:
         raise NerfroError(
             f"MS-SSIM needs at least {MS_SSIM_MIN_SIZE} x {MS_SSIM_MIN_SIZE} pixels for its five scales, "

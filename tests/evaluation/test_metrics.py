@@ -1,4 +1,5 @@
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -200,6 +201,16 @@ def test_pictures_that_cannot_be_compared_are_refused() -> None:
         metrics.update(torch.full((16, 16, 3), math.nan), torch.zeros(16, 16, 3))
     with pytest.raises(NerfroError, match=r"mask \[16, 17\] does not fit an image \[16, 16, 3\]"):
         metrics.update(torch.zeros(16, 16, 3), torch.zeros(16, 16, 3), coverage=torch.ones(16, 17))
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim, ms_ssim, flip])
+@pytest.mark.parametrize("shape", [(2, 165, 165, 3), (165, 165), (165, 165, 4), (3, 165, 165)])
+def test_metrics_refuse_what_is_not_one_image(metric: Callable[..., Tensor], shape: tuple[int, ...]) -> None:
+    images = torch.rand(shape), torch.rand(shape)
+    with pytest.raises(NerfroError, match=r"both must have the same size \[H, W, 3\]"):
+        metric(*images)
+    with pytest.raises(NerfroError, match=r"mask \[2, 2\] does not fit an image"):
+        metric(*2 * [torch.rand(165, 165, 3)], torch.ones(2, 2, dtype=torch.bool))
 
 
 def test_views_scored_by_another_process_are_gathered() -> None:
