@@ -51,6 +51,20 @@ def history(file: Path) -> dict[str, dict[int, Any]]:
     return found
 
 
+def logged_config(file: Path) -> dict[str, Any]:
+    """Settings that the run's own file holds."""
+    from wandb.proto import wandb_internal_pb2
+
+    found: dict[str, Any] = {}
+    for payload in records(file):
+        record = wandb_internal_pb2.Record()
+        record.ParseFromString(payload)
+        kind = record.WhichOneof("record_type")
+        updates = record.config.update if kind == "config" else record.run.config.update if kind == "run" else []
+        found |= {item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in updates}
+    return found
+
+
 @pytest.mark.slow
 def test_offline_run_needs_no_account_and_holds_what_tensorboard_and_the_csv_hold(
     train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -67,6 +81,8 @@ def test_offline_run_needs_no_account_and_holds_what_tensorboard_and_the_csv_hol
     assert finished.code == 0, finished.err
     (log,) = folder.glob("wandb/offline-run-*/run-*.wandb")
     logged = history(log)
+    settings = logged_config(log)
+    assert (settings["trainer"]["max_steps"], settings["loss"]["boundary"]["start"]) == (4, 0)
     events = EventAccumulator(str(folder / "tensorboard"), {"images": 0, "scalars": 0}).Reload()
     tags = events.Tags()
 

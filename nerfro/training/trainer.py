@@ -145,6 +145,13 @@ def fit(
         raise NerfroError(f"{checkpoint} cannot be resumed ({reason}); start without ckpt_path") from error
 
 
+def log_settings(trainer: pl.Trainer, config: DictConfig) -> None:
+    """Write the composed settings of the run to Weights & Biases."""
+    for logger in trainer.loggers:
+        if isinstance(logger, WandbLogger):
+            logger.log_hyperparams(OmegaConf.to_container(config, resolve=True))  # type: ignore[arg-type]
+
+
 def finish_logs(trainer: pl.Trainer) -> None:
     """End logs that the next job of a sweep would go on with."""
     for logger in trainer.loggers:
