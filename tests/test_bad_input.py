@@ -133,6 +133,8 @@ def test_open_mesh_is_accepted_when_asked(
     ("override", "words"),
     [
         ("data.near=7", ["data.near=7.0", "data.far=6.0", "near < far"]),
+        ("data.near=5", ["data.near=5 lies behind the object, which the rays meet at distances from 3."]),
+        ("data.far=2.5", ["data.far=2.5 lies before the object", "set data.near and data.far around these"]),
         ("data.near=-1", ["near=-1.0 is not allowed; take at least 0"]),
         ("data.downscale=0", ["downscale=0"]),
         ("evaluation.split=night", ["no split 'night'; it has train, val, test"]),

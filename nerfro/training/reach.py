@@ -8,6 +8,7 @@ from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.cli import warn
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
+from nerfro.rays import Rays
 from nerfro.rendering import Renderer
 from nerfro.types import Batch
 
@@ -20,8 +21,9 @@ def require_reach(renderer: Renderer, batch: Batch) -> None:
     """Refuse a field that no ray meets; warn where many pass it and see a constant.
 
     Raises:
-        NerfroError: every ray of the batch passes the field's box.
+        NerfroError: every ray of the batch passes the field's box, or ends before the object or begins behind it.
     """
+    _require_object(renderer, batch.rays)
     field = renderer.scene.fields[0]
     assert isinstance(field, Field)
     if (bounds := field.bounds) is None:
@@ -35,6 +37,23 @@ def require_reach(renderer: Renderer, batch: Batch) -> None:
         raise NerfroError(f"no ray of the training views meets {box}, and nothing is outside of it; {advice}")
     if missed > _FEW and isinstance(renderer.scene.boundary, ConstantBoundary):
         warn(f"{missed:.0%} of the rays pass {box} and see boundary=constant alone, which learns nothing; {advice}")
+
+
+def _require_object(renderer: Renderer, rays: Rays) -> None:
+    """Refuse bounds of the rays that leave out the object, for all rays that point at its box."""
+    box = renderer.scene.medium.content_box.to(rays.origins)
+    crossings = (box[:, None] - rays.origins) / rays.directions
+    enters, leaves = crossings.amin(0).amax(-1), crossings.amax(0).amin(-1)
+    meets = (leaves > enters.clamp(min=0)) & bool((box[1] > box[0]).all())
+    for name, bound, wrong, side in (
+        ("near", rays.near, rays.near >= leaves, "behind"),
+        ("far", rays.far, rays.far <= enters, "before"),
+    ):
+        if meets.any() and bool(wrong[meets].all()):
+            raise NerfroError(
+                f"data.{name}={bound.max():.4g} lies {side} the object, which the rays meet at distances from "
+                f"{enters[meets].min():.4g} to {leaves[meets].max():.4g}; set data.near and data.far around these"
+            )
 
 
 def _rounded(corner: torch.Tensor) -> list[float]:
