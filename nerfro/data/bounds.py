@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import get_args
+
 import numpy as np
 from jaxtyping import Float
 
+from nerfro.allowed import Coordinate
 from nerfro.errors import NerfroError
 from nerfro.geometry.lines import nearest_point
+
+_MAX_COORDINATE = get_args(Coordinate)[1].at_most  # world units
 
 # The cameras share a target if it lies in front of at least 90 % of them, within 30 degrees of the optical axis.
 _MIN_COSINE_TO_TARGET, _MIN_SHARE_OF_CAMERAS = 0.87, 0.9
@@ -48,6 +54,17 @@ def find_bounds(poses: Float[np.ndarray, "V 3 4"], points: Float[np.ndarray, "P 
             "points; set both, in world units"
         )
     return _NEAR_FRACTION * float(distances.min()), 2 * float(distances.max())
+
+
+def usable_points(points: Float[np.ndarray, "P 3"], file: Path) -> Float[np.ndarray, "Q 3"]:
+    """Return the points of a file within the coordinates that nerfro accepts; outliers may lie beyond these.
+
+    Raises:
+        NerfroError: a coordinate is NaN or infinite.
+    """
+    if not np.isfinite(points).all():
+        raise NerfroError(f"{file} holds points that are NaN or infinite; export the reconstruction again")
+    return points[(np.abs(points) <= _MAX_COORDINATE).all(1)]
 
 
 def _distances_in_view(

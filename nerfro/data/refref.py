@@ -38,8 +38,8 @@ class RefRefData(PosedImages):
     Args:
         root: folder that contains the .parquet files of the scene at any depth.
         scene: name of the scene, such as cube_smcvx_ampoule. It may be omitted if the folder holds one scene.
-        near, far, downscale, alpha: see `PosedImages`. The default of `far` is the greatest distance between any camera
-            and any corner of RefRef's scene box, whose side is 14.6.
+        near, far, downscale, alpha, mask_labels: see `PosedImages`. The default of `far` is the greatest distance
+            between any camera and any corner of RefRef's scene box, whose side is 14.6.
     """
 
     def __init__(
@@ -50,8 +50,9 @@ class RefRefData(PosedImages):
         far: Distance | None = None,
         downscale: Factor = 1,
         alpha: Alpha = "drop",
+        mask_labels: list[int] | None = None,
     ) -> None:
-        super().__init__(root, near, far, downscale, alpha)
+        super().__init__(root, near, far, downscale, alpha, mask_labels)
         self.scene = scene
 
     def load(self, split: str) -> Views:
@@ -70,9 +71,11 @@ class RefRefData(PosedImages):
 
     def _files(self) -> list[Path]:
         """List the files of the scene in order."""
-        pattern = "*.parquet" if self.scene is None else f"{self.scene}-*.parquet"
-        files = sorted(self.root.rglob(pattern)) or sorted(self.root.rglob(f"{self.scene}.parquet"))
+        scene, files = self.scene, sorted(self.root.rglob("*.parquet"))
+        if scene is not None:
+            files = [path for path in files if path.stem == scene or path.stem.startswith(f"{scene}-")]
         if not files:
+            pattern = "*.parquet" if scene is None else f"{scene}-*.parquet"
             raise NerfroError(f"data.root={self.root} holds no {pattern}; download the scene's files there")
         # `cube_smcvx_ampoule-00000-of-00002.parquet`
         scenes = sorted({path.stem.split("-")[0] for path in files})
@@ -138,8 +141,8 @@ def _unpack(row: dict[str, Any], number: int, folder: Path, source: Path) -> Fra
     where = f"{source.name}: row {number}"
     paths = []
     for column in ("image", "mask"):
-        content = (row[column] or {}).get("bytes")
-        if content is None:
+        content = row[column].get("bytes") if isinstance(row[column], dict) else None
+        if not isinstance(content, bytes):
             raise NerfroError(f"{where}: '{column}' holds no image; download the file again")
         paths.append(folder / f"{column}_{number:04d}.png")
         paths[-1].write_bytes(content)

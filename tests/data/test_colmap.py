@@ -123,6 +123,25 @@ def test_bounds_come_from_the_points_unless_they_are_given(write):
     assert views.cameras.far == pytest.approx(1.1 * distance.max(), rel=1e-3)
 
 
+def test_points_and_poses_beyond_all_coordinates_do_not_give_bounds(write):
+    expected = load(write(), near=None, far=None).cameras
+    for far_away in (1e30, 1e7):
+        cameras = load(write(points=np.vstack([POINTS, [[far_away] * 3]])), near=None, far=None).cameras
+        assert (cameras.near, cameras.far) == (expected.near, expected.far)
+    for value in (np.nan, np.inf):
+        root = write(points=np.vstack([POINTS, [[value, 0, 0]]]))
+        with pytest.raises(NerfroError, match="holds points that are NaN or infinite; export the reconstruction again"):
+            load(root, near=None, far=None)
+    root = write("text")
+    (root / "sparse/0/cameras.bin").unlink()
+    path = root / "sparse/0/images.txt"
+    rows = [line.split() for line in path.read_text().splitlines()]
+    rows[1][5] = "1e30"
+    path.write_text("\n".join(" ".join(row) for row in rows) + "\n")
+    with pytest.raises(NerfroError, match=r"position in the pose=.* is not allowed; take at least -1000000"):
+        load(root)
+
+
 def test_without_points_bounds_must_be_given(write):
     root = write(points=np.zeros((0, 3)))
     with pytest.raises(NerfroError, match=r"no 3-D points in view to find bounds from; set data\.near and data\.far"):

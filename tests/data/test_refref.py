@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
 from nerfro.data.refref import RefRefData
@@ -35,6 +36,18 @@ def test_one_of_several_scenes(tmp_path):
     check_views(RefRefData(str(root), scene="env_mmncvx_jar").load("train"), [5, 4], lens=REFREF_LENS)
     with pytest.raises(NerfroError, match="holds 2 rows, none from 4 on"):
         RefRefData(str(root), scene="env_mmncvx_jar").load("test")
+
+
+@pytest.mark.parametrize("image", ["text", 3, [1, 2], b"bytes", {"bytes": "text"}, {"path": "a.png"}])
+def test_rows_without_an_image_are_named(tmp_path, image):
+    parquet, pyarrow = pytest.importorskip("pyarrow.parquet"), pytest.importorskip("pyarrow")
+    row = {"image": image, "mask": image, "transform_matrix": np.eye(4).tolist()}
+    parquet.write_table(pyarrow.Table.from_pylist([row]), tmp_path / "scene-00000-of-00001.parquet")
+    with pytest.raises(NerfroError, match=r"row 0: 'image' holds no image; download the file again"):
+        RefRefData(str(tmp_path)).load("train")
+    for scene in ("/etc", "**", "a/../b"):
+        with pytest.raises(NerfroError, match=r"holds no .*\.parquet; download"):
+            RefRefData(str(tmp_path), scene=scene).load("train")
 
 
 def test_wrong_files_are_named(tmp_path):
