@@ -52,8 +52,8 @@ def read_silhouettes(views: Views, has_box: bool) -> Silhouettes:
     for wrong, state in ((coverage == 0, "empty"), (coverage == 1, "full")):
         if wrong.any():
             raise NerfroError(
-                f"{_names(views, wrong)}: the mask is {state}; draw the object white and everything else black, or "
-                "remove the view"
+                f"{_names(views, wrong)}: the mask is {state}; draw the object white and everything else black, "
+                "choose its labels with data.mask_labels, or remove the view"
             )
     inverted = (frame_pixels(masks).float().mean(1) > 0.9) & (coverage < 1)
     if inverted.float().mean() > 0.5:

@@ -7,13 +7,16 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfro.cameras import Cameras
+from nerfro.cli import warn
 from nerfro.data.lazy_images import LazyImages
+from nerfro.errors import first_of
 from nerfro.progress import track
 
 
@@ -47,6 +50,7 @@ class Views:
         names: names of the images in the data set.
         usable: pixels [H, W] that training may use (1 or True), or None if all pixels are usable.
         frames: image and mask files, if the data format knows them; otherwise empty.
+        mask_labels: labels of the object in the mask files, see `nerfro.data.image_files.read_mask`.
     """
 
     cameras: Cameras
@@ -55,6 +59,7 @@ class Views:
     names: list[str]
     usable: LazyImages | Bool[Tensor, "V H W"] | None = None
     frames: Sequence[Frame] = ()
+    mask_labels: Sequence[int] | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -63,20 +68,31 @@ class Views:
         """Return the views with the given indices, in this order."""
         chosen = list(views)
         given = {name: getattr(self, name) for name in ("images", "masks", "usable")}
-        images = {name: p.select(chosen) if isinstance(p, LazyImages) else p for name, p in given.items()}
+        images: dict[str, Any] = {
+            name: p.select(chosen) if isinstance(p, LazyImages) else p for name, p in given.items()
+        }
         images = {name: p[chosen] if isinstance(p, Tensor) else p for name, p in images.items()}
         names, frames = [self.names[view] for view in chosen], [self.frames[view] for view in chosen if self.frames]
         return replace(self, cameras=self.cameras.select(chosen), names=names, frames=frames, **images)
 
     def checked(self) -> Views:
-        """Decode every image and mask once, without storing it, and return these views.
+        """Decode every image and mask once, without storing it, warn of useless masks, and return these views.
 
         Raises:
             NerfroError: a file is corrupt.
         """
-        for images in (self.images, self.masks):
-            if isinstance(images, LazyImages):
-                deque(track("reading", images.all_levels(), len(images)), maxlen=0)
+        if isinstance(self.images, LazyImages):
+            deque(track("reading", self.images.all_levels(), len(self.images)), maxlen=0)
+        if isinstance(self.masks, LazyImages):
+            middle, masks = np.iinfo(self.masks.dtype).max // 2, self.masks.all_levels()
+            ends = [(mask.max() <= middle, mask.min() > middle) for mask in track("reading", masks, len(self.masks))]
+            for state, wrong in zip(("empty", "full"), np.transpose(ends), strict=True):
+                if wrong.any():
+                    names = first_of([self.names[view] for view in np.flatnonzero(wrong)])
+                    warn(
+                        f"{wrong.sum()} of {len(self)} masks are {state} ({names}); draw the object white and "
+                        "everything else black, or choose its labels with data.mask_labels"
+                    )
         return self
 
 

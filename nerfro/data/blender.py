@@ -24,8 +24,9 @@ class BlenderData(PosedImages):
         far: Distance = 6.0,
         downscale: Factor = 1,
         alpha: Alpha = "drop",
+        mask_labels: list[int] | None = None,
     ) -> None:
-        super().__init__(root, near, far, downscale, alpha)
+        super().__init__(root, near, far, downscale, alpha, mask_labels)
 
     @property
     def splits(self) -> list[str]:

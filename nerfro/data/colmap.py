@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from nerfro.allowed import Distance, Factor
 from nerfro.data.base import Frame
+from nerfro.data.bounds import usable_points
 from nerfro.data.colmap_model import ColmapCamera, ColmapModel, read_colmap
 from nerfro.data.frames import Every, FrameSet, PosedImages
 from nerfro.data.image_files import Alpha, read_size
@@ -29,8 +30,8 @@ class ColmapData(PosedImages):
     resized after the reconstruction.
 
     Args:
-        root, near, far, downscale, alpha: see `PosedImages`. Without `near` and `far`, the bounds are 0.9 and 1.1 times
-            the distances of the nearest and the farthest 3-D point.
+        root, near, far, downscale, alpha, mask_labels: see `PosedImages`. Without `near` and `far`, the bounds are 0.9
+            and 1.1 times the distances of the nearest and the farthest 3-D point.
         images: folder of the images within the root.
         model: folder of the model within the root. By default, the first model in sparse/0, sparse, colmap/sparse/0 and
             the root is used.
@@ -44,11 +45,12 @@ class ColmapData(PosedImages):
         far: Distance | None = None,
         downscale: Factor = 1,
         alpha: Alpha = "drop",
+        mask_labels: list[int] | None = None,
         images: str = "images",
         model: str | None = None,
         test_every: Every = 8,
     ) -> None:
-        super().__init__(root, near, far, downscale, alpha)
+        super().__init__(root, near, far, downscale, alpha, mask_labels)
         self.images, self.model, self.test_every = images, model, test_every
 
     def read(self, split: str) -> FrameSet:
@@ -94,9 +96,9 @@ def lens_of(camera: ColmapCamera, where: str) -> Lens:
 
 def _distance_range(model: ColmapModel, folder: Path) -> tuple[float, float]:
     """Find the distances of the nearest and the farthest 3-D point in any view, without 0.1 % outliers at each end."""
-    ranges = []
+    ranges, points = [], usable_points(model.points, folder)
     for image in model.images:
-        distances = _distances_in_view(model.points, image.camera_to_world, model.cameras[image.camera])
+        distances = _distances_in_view(points, image.camera_to_world, model.cameras[image.camera])
         if len(distances) > 0:
             ranges.append(np.quantile(distances, [0.001, 0.999]))
     if not ranges:

@@ -19,7 +19,7 @@ from nerfro.data.base import DataSource, Frame, Views
 from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb
 from nerfro.data.lazy_images import LazyImages
 from nerfro.data.lenses import Lens, check_lenses
-from nerfro.data.masks import find_masks, find_usable
+from nerfro.data.masks import find_mask, find_masks, find_usable
 from nerfro.errors import NerfroError
 from nerfro.paths import resolve_path
 
@@ -58,18 +58,29 @@ class PosedImages(DataSource):
     Args:
         root: folder of the data set.
         near, far: bounds of the rays, arc lengths in world units; None to use the bounds of the data set.
-        downscale: downscaling factor, any number from 1. Each pixel becomes the mean of the area that it covers, and
-            the intrinsics are scaled accordingly.
+        downscale: downscaling factor of each side, any number from 1. Each pixel becomes the mean of the area that it
+            covers, and the intrinsics are scaled accordingly.
         alpha: `drop` ignores transparency; `white` and `black` composite the images over this colour.
+        mask_labels: labels of the object in the masks, as indices of palette images or as grey levels; None to use all
+            labels but the background.
 
     Raises:
         NerfroError: an option is out of range.
     """
 
-    def __init__(self, root: str, near: float | None, far: float | None, downscale: float, alpha: Alpha) -> None:
+    def __init__(
+        self,
+        root: str,
+        near: float | None,
+        far: float | None,
+        downscale: float,
+        alpha: Alpha,
+        mask_labels: list[int] | None,
+    ) -> None:
         _check_bounds(near, far)
         self.root = resolve_path(root)
-        self.near, self.far, self.downscale, self.alpha = near, far, downscale, alpha
+        self.near, self.far, self.downscale, self.alpha, self.mask_labels = near, far, downscale, alpha, mask_labels
+        self._images_of_masks: dict[Path, Path] = {}
 
     @property
     def splits(self) -> list[str]:
@@ -105,7 +116,8 @@ class PosedImages(DataSource):
         composited = alpha != "drop"
         images = LazyImages.of(files, lambda path: read_rgb(path, alpha), self.downscale, composited, recipe=alpha)
         (height, width), stored = images.shape, images.size[::-1]
-        masks = find_masks(files, [frame.mask for frame in frames], self.downscale, stored)
+        self._require_own_masks(frames)
+        masks = find_masks(files, [frame.mask for frame in frames], self.downscale, stored, self.mask_labels)
         for frame in frames:
             check_pose(frame.camera_to_world, frame.name, "the pose")
         check_lenses(read.lenses, [frame.name for frame in frames], stored)
@@ -123,7 +135,17 @@ class PosedImages(DataSource):
             window = central_window(height, width, read.crop)
             cameras, images = cameras.crop(window), images.cut(window)
             masks, usable = masks and masks.cut(window), usable and usable.cut(window)
-        return Views(cameras, images, masks, [frame.name for frame in frames], usable, frames)
+        return Views(cameras, images, masks, [frame.name for frame in frames], usable, frames, self.mask_labels)
+
+    def _require_own_masks(self, frames: Sequence[Frame]) -> None:
+        """Refuse a mask file that the search finds for several images, of one split or of several."""
+        for frame in frames:
+            image = frame.mask and self._images_of_masks.setdefault(frame.mask, frame.image)
+            if image not in (None, frame.image) and frame.mask == find_mask(self.root, frame.image):
+                raise NerfroError(
+                    f"mask {frame.mask} is found for {image} and for {frame.image}; put masks into the same folders "
+                    "below masks/ as the images, or name each mask in the data set (mask_path)"
+                )
 
 
 def _check_bounds(near: float | None, far: float | None) -> None:

@@ -31,8 +31,8 @@ class IdrData(PosedImages):
     principal point is shifted by half a pixel.
 
     Args:
-        root, near, far, downscale, alpha: see `PosedImages`. Without `near` and `far`, the bounds enclose the unit
-            sphere in all views.
+        root, near, far, downscale, alpha, mask_labels: see `PosedImages`. Without `near` and `far`, the bounds enclose
+            the unit sphere in all views.
         cameras: name of the file with the matrices.
         world: `sphere` for the frame in which the object lies inside the unit sphere, or `file` for the world of
             `world_mat`, which requires `near` and `far`.
@@ -46,11 +46,12 @@ class IdrData(PosedImages):
         far: Distance | None = None,
         downscale: Factor = 1,
         alpha: Alpha = "drop",
+        mask_labels: list[int] | None = None,
         cameras: str = "cameras_sphere.npz",
         world: Literal["sphere", "file"] = "sphere",
         test_every: Every = 8,
     ) -> None:
-        super().__init__(root, near, far, downscale, alpha)
+        super().__init__(root, near, far, downscale, alpha, mask_labels)
         if world == "file" and (near is None or far is None):
             raise NerfroError("data.world=file needs data.near and data.far; set both, in units of this world")
         self.cameras, self.world, self.test_every = cameras, world, test_every

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -10,11 +11,16 @@ from jaxtyping import Float, UInt8, UInt16
 from PIL import ExifTags, Image
 from scipy.sparse import csr_array
 
+from nerfro.errors import NerfroError
 from nerfro.files.deep_images import read_16bit
 from nerfro.files.reading import open_image
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 Alpha = Literal["drop", "white", "black"]
+# An image has labels if its levels are at most this many, and this share of the pixels between 0 and the highest level
+# have eight equal neighbours.
+_MAX_LABELS, _MIN_FLAT = 64, 0.25
+
 Levels = UInt8[np.ndarray, "H W *C"] | UInt16[np.ndarray, "H W *C"]
 
 
@@ -31,7 +37,11 @@ def to_levels(values: Float[np.ndarray, "H W *C"]) -> UInt16[np.ndarray, "H W *C
 def read_levels(path: Path) -> Levels:
     """Read the 8- or 16-bit levels [H, W, C] of a file; C is 1 (grey), 2 (grey, alpha), 3 (RGB) or 4 (RGBA)."""
     with open_image(path) as (image, bits):
-        return _read_16bit(path, image) if bits > 8 else _read_8bit(image, bits)
+        return _decode(path, image, bits)
+
+
+def _decode(path: Path, image: Image.Image, bits: int) -> Levels:
+    return _read_16bit(path, image) if bits > 8 else _read_8bit(image, bits)
 
 
 def read_size(path: Path) -> tuple[int, int, int]:
@@ -94,15 +104,53 @@ def read_rgb(path: Path, alpha: Alpha) -> Levels:
     return np.broadcast_to(rgb, (*rgb.shape[:2], 3))
 
 
-def read_mask(path: Path) -> Levels:
+def read_mask(path: Path, labels: Sequence[int] | None = None) -> Levels:
     """Read the coverage [H, W] of each pixel by the object.
 
-    Of a coloured mask, the largest channel counts. A mask with the levels 0 and 1 only is read as labels.
+    Alpha is the coverage if it varies. In an image of labels, every label but the background is the object: labels are
+    the colours of a palette image, and few levels that fill areas. Otherwise, a level is the coverage itself; of a
+    coloured mask, the largest channel counts.
+
+    Args:
+        path: the mask.
+        labels: labels of the object, as indices of a palette image or as grey levels of the file; None for all.
     """
-    levels = read_levels(path)
-    share = levels[..., : 1 if levels.shape[-1] < 3 else 3].max(-1)
-    most = np.iinfo(levels.dtype).max
-    return np.where(share > 0, most, 0).astype(levels.dtype) if share.max() < 1.5 / 255 * most else share
+    with open_image(path) as (image, bits):
+        indices, palette = (np.array(image), image.getpalette()) if image.mode == "P" else (None, None)
+        lossy = image.format in ("JPEG", "MPO", "WEBP")
+        levels = _decode(path, image, bits)
+    num_colours = 1 if levels.shape[-1] < 3 else 3
+    colours, share, most = levels[..., :num_colours], levels[..., :num_colours].max(-1), np.iinfo(levels.dtype).max
+    if labels is not None:
+        if indices is None and num_colours == 3:
+            raise NerfroError(f"mask {path} has colours, which have no labels; save it as a palette or grey image")
+        stored = share // (255 // (2**bits - 1)) if bits < 8 else share
+        return np.isin(stored if indices is None else indices, labels).astype(levels.dtype) * most
+    if levels.shape[-1] > num_colours and np.ptp(levels[..., -1]) > 0:
+        return levels[..., -1]
+    if palette is not None and (colours != colours[..., :1]).any():
+        # The background is black, or else the first colour.
+        background = [0, 0, 0] if (share == 0).any() else palette[:3]
+        return (colours != background).any(-1).astype(levels.dtype) * most
+    return (share > 0).astype(levels.dtype) * most if not lossy and _has_labels(share) else share
+
+
+def _has_labels(levels: Levels) -> bool:
+    """Return whether grey levels are labels, with 0 as the background: there is only one label, or labels fill areas.
+
+    Coverage between 0 and 1 occurs along the outline, where neighbouring pixels differ.
+    """
+    present = np.flatnonzero(np.bincount(levels.ravel()))
+    if len(present[present > 0]) == 1:
+        return True
+    inner = levels[1:-1, 1:-1]
+    partial = (inner > 0) & (inner < np.iinfo(levels.dtype).max)
+    if present[0] > 0 or len(present) > _MAX_LABELS or not partial.any():
+        return False
+    height, width = inner.shape
+    offsets = [(row, column) for row in range(3) for column in range(3)]
+    flat = np.all([levels[r : r + height, c : c + width] == inner for r, c in offsets], axis=0)
+    return bool(flat[partial].mean() > _MIN_FLAT)
 
 
 def downscaled(size: tuple[int, int], factor: float) -> tuple[int, int]:

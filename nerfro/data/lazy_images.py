@@ -71,9 +71,14 @@ class LazyImages:
         for path in files[1:]:
             *size, depth = read_size(path)
             if size != [width, height]:
+                advice = "all images of a split must have the same size"
+                if size == [height, width]:
+                    advice = (
+                        "one is upright and the other lies: rotate the pixels of one kind by 90 degrees and calibrate "
+                        "the cameras again, or take its frames out of the data set"
+                    )
                 raise NerfroError(
-                    f"image {path} has {size[0]}x{size[1]} pixels but {files[0]} has {width}x{height}; "
-                    "all images of a split must have the same size"
+                    f"image {path} has {size[0]}x{size[1]} pixels but {files[0]} has {width}x{height}; {advice}"
                 )
             bits = max(bits, depth)
         dtype = np.dtype(np.uint16 if deep or bits > 8 or downscale > 1 else np.uint8)

@@ -31,7 +31,7 @@ class LlffData(PosedImages):
     """Read the LLFF format: images/ and poses_bounds.npy, which has one row of 17 numbers per image, sorted by name.
 
     Args:
-        root, downscale, alpha: see `PosedImages`.
+        root, downscale, alpha, mask_labels: see `PosedImages`.
         near: arc length at which rays begin, in units of the chosen frame. The default is 0.9 times the nearest depth
             in the file.
         far: arc length at which rays end. The default is the arc length to the farthest depth in the file (at most 2
@@ -51,12 +51,13 @@ class LlffData(PosedImages):
         far: Distance | None = None,
         downscale: Factor = 1,
         alpha: Alpha = "drop",
+        mask_labels: list[int] | None = None,
         images: str = "images",
         frame: Literal["llff", "eikonal", "file"] = "llff",
         video: str | None = None,
         test_every: Every = 8,
     ) -> None:
-        super().__init__(root, near, far, downscale, alpha)
+        super().__init__(root, near, far, downscale, alpha, mask_labels)
         self.images, self.frame, self.video, self.test_every = images, frame, video, test_every
 
     def read(self, split: str) -> FrameSet:

@@ -72,7 +72,11 @@ def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None
 
 
 def find_masks(
-    images: Sequence[Path], masks: Sequence[Path | None], downscale: float, size: tuple[int, int]
+    images: Sequence[Path],
+    masks: Sequence[Path | None],
+    downscale: float,
+    size: tuple[int, int],
+    labels: Sequence[int] | None = None,
 ) -> LazyImages | None:
     """Load the silhouettes of images; without silhouette files, the transparency of the images is used.
 
@@ -81,6 +85,7 @@ def find_masks(
         masks: silhouette files. If only some images have one, none is used, with a warning.
         downscale: downscaling factor, 1 or more.
         size: stored width and height of the images in pixels.
+        labels: labels of the object, see `read_mask`.
 
     Returns:
         Coverage of each pixel by the object in [0, 1], or None if there are no silhouettes.
@@ -95,7 +100,7 @@ def find_masks(
         )
         return None
     if not unmasked:
-        return _of_files(images, masks, read_mask, downscale, size)
+        return _of_files(images, masks, lambda mask: read_mask(mask, labels), downscale, size)
     return LazyImages.of(images, _read_alpha, downscale) if _is_transparent(images[0]) else None
 
 
@@ -106,7 +111,8 @@ def masked_views(views: Views) -> Views:
         return views
     frames = [views.frames[i] for i in chosen]
     files = [frame.image for frame in frames]
-    masks = find_masks(files, [frame.mask for frame in frames], views.images.downscale, views.images.size[::-1])
+    found, size = [frame.mask for frame in frames], views.images.size[::-1]
+    masks = find_masks(files, found, views.images.downscale, size, views.mask_labels)
     assert masks is not None
     images = replace(views.images, files=files)
     if images.window is not None:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from nerfro.allowed import Distance, Factor
-from nerfro.data.bounds import find_bounds
+from nerfro.data.bounds import find_bounds, usable_points
 from nerfro.data.frames import SPLITS, Every, FrameSet, PosedImages
 from nerfro.data.image_files import Alpha
 from nerfro.data.masks import find_mask
@@ -30,8 +30,8 @@ class NerfstudioData(PosedImages):
     (black), which are not used for training. The silhouette of the refractive object is `object_mask_path`.
 
     Args:
-        root, near, far, downscale, alpha: see `PosedImages`. Without `near` and `far`, the bounds are estimated from
-            the sparse points (`ply_file_path`) or from the cameras; see `find_bounds`.
+        root, near, far, downscale, alpha, mask_labels: see `PosedImages`. Without `near` and `far`, the bounds are
+            estimated from the sparse points (`ply_file_path`) or from the cameras; see `find_bounds`.
         missing: whether to `skip` frames whose image does not exist, with a warning, or to `refuse` the data set.
         test_every: every n-th frame by name, from the first, belongs to val and test, unless the file has the lists
             {train,val,test}_filenames.
@@ -44,10 +44,11 @@ class NerfstudioData(PosedImages):
         far: Distance | None = None,
         downscale: Factor = 1,
         alpha: Alpha = "drop",
+        mask_labels: list[int] | None = None,
         missing: Literal["skip", "refuse"] = "skip",
         test_every: Every = 10,
     ) -> None:
-        super().__init__(root, near, far, downscale, alpha)
+        super().__init__(root, near, far, downscale, alpha, mask_labels)
         self.skip_missing, self.test_every = missing == "skip", test_every
 
     @property
@@ -80,7 +81,7 @@ class NerfstudioData(PosedImages):
         manifest = self._manifest("train" if "train" in self.splits else split)
         points, file = np.empty((0, 3)), manifest.document.get("ply_file_path")
         if isinstance(file, str) and (self.root / file).is_file():
-            points = load_points(self.root / file)
+            points = usable_points(load_points(self.root / file), self.root / file)
         return find_bounds(np.stack([frame.camera_to_world for frame in manifest.frames]), points)
 
     def _choose(self, manifest: Manifest, split: str) -> list[int]:

@@ -19,7 +19,7 @@ class OpenCVData(PosedImages):
     the paper's authors.
 
     Args:
-        root, near, far, downscale, alpha: see `PosedImages`. The camera matrix belongs to the images in full size.
+        root, near, far, downscale, alpha, mask_labels: see `PosedImages`.
         eval_crop: fraction of each side that is kept around the centre, for the images of every split except train.
     """
 
@@ -30,9 +30,10 @@ class OpenCVData(PosedImages):
         far: Distance = 12.0,
         downscale: Factor = 1,
         alpha: Alpha = "drop",
+        mask_labels: list[int] | None = None,
         eval_crop: Annotated[float, Range(more_than=0, at_most=1)] = 1.0,
     ) -> None:
-        super().__init__(root, near, far, downscale, alpha)
+        super().__init__(root, near, far, downscale, alpha, mask_labels)
         self.eval_crop = eval_crop
 
     @property

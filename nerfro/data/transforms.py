@@ -128,9 +128,12 @@ def _read_frame(
 
 
 def _candidates(root: Path, name: str) -> list[Path]:
-    """List the possible image files of a `file_path`, which may lack its extension."""
-    known = PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES
-    return [root / name] if known else [root / f"{name}{suffix}" for suffix in IMAGE_SUFFIXES]
+    """List the possible image files of a `file_path`, which may lack its extension, or have one in the other case."""
+    suffix = PurePosixPath(name).suffix
+    suffixes: tuple[str, ...] = IMAGE_SUFFIXES
+    if suffix.lower() in IMAGE_SUFFIXES:
+        name, suffixes = name.removesuffix(suffix), (suffix, suffix.lower())
+    return [root / f"{name}{end}" for end in (*suffixes, *(end.upper() for end in suffixes))]
 
 
 def _existing_image(root: Path, name: str) -> Path | None:

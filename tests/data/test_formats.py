@@ -12,12 +12,13 @@ import pytest
 import torch
 from PIL import Image
 
+from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
 from nerfro.data.frames import list_images
 from nerfro.errors import NerfroError
 
-from .formats import FORMATS, Format, few_refref_views, write_blender  # noqa: F401
-from .photographs import HEIGHT, POINTS, WIDTH, check_views, picture
+from .formats import FORMATS, Format, change_json, few_refref_views, write_blender  # noqa: F401
+from .photographs import HEIGHT, POINTS, WIDTH, check_views, picture, save_mask, save_picture
 
 pytestmark = pytest.mark.usefixtures("few_refref_views")
 every_format = pytest.mark.parametrize("form", FORMATS.values(), ids=FORMATS)
@@ -58,6 +59,50 @@ def test_masks_are_optional(form: Format, tmp_path: Path) -> None:
     assert form.load(form.write(tmp_path)).masks is None
 
 
+def label_masks(views: Views) -> None:
+    """Write label 1 for the object in each mask, and label 2 for everything else."""
+    for frame in views.frames:
+        levels = np.asarray(Image.open(frame.mask))
+        Image.fromarray(np.where(levels > 0, 1, 2).astype(np.uint8)).save(frame.mask)
+
+
+@with_files
+def test_chosen_labels_are_the_object_in_every_format(form: Format, tmp_path: Path) -> None:
+    views = form.load(form.write(tmp_path, masks=True))
+    before = torch.stack(list(views.masks))
+    label_masks(views)
+    assert torch.equal(torch.stack(list(form.load(tmp_path, mask_labels=[1]).masks)), before)
+
+
+def test_empty_and_full_masks_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = write_blender(tmp_path, masks=True)
+    Image.new("L", (WIDTH, HEIGHT)).save(root / "train/mask_r_1.png")
+    Image.new("L", (WIDTH, HEIGHT), 255).save(root / "train/mask_r_4.png")
+    BlenderData(str(root)).load("train").checked()
+    out = capsys.readouterr().out
+    assert "1 of 4 masks are empty (train/r_1); draw the object white" in out
+    assert "1 of 4 masks are full (train/r_4)" in out
+
+
+def test_a_mask_that_is_found_for_two_images_is_refused(tmp_path: Path) -> None:
+    root = write_blender(tmp_path)
+    for split, folder in (("train", "front"), ("test", "back")):
+        (root / folder).mkdir()
+        save_picture(root / folder / "000000.png", 1)
+        entry = {"file_path": f"{folder}/000000", "transform_matrix": np.eye(4).tolist()}
+        change_json(root / f"transforms_{split}.json", lambda d, entry=entry: d.update(frames=[entry]))
+    save_mask(root / "masks/000000.png", 1)
+    source = BlenderData(str(root))
+    assert source.load("train").masks is not None
+    with pytest.raises(NerfroError, match=r"masks/000000\.png is found for .*front/000000\.png and for .*back/000000"):
+        source.load("test")
+    (root / "masks/000000.png").rename(root / "mask.png")
+    for split in ("train", "test"):
+        change_json(root / f"transforms_{split}.json", lambda d: d["frames"][0].update(mask_path="mask.png"))
+    source = BlenderData(str(root))
+    assert [source.load(split).masks is not None for split in ("train", "test")] == [True, True]
+
+
 @with_files
 def test_damaged_images_and_masks_are_named(form: Format, tmp_path: Path) -> None:
     frame = form.load(form.write(tmp_path, masks=True)).frames[-1]
@@ -67,6 +112,9 @@ def test_damaged_images_and_masks_are_named(form: Format, tmp_path: Path) -> Non
         form.load(tmp_path).checked()
     Image.new("RGB", (WIDTH + 2, HEIGHT)).save(frame.image)
     with pytest.raises(NerfroError, match=rf"{name} has 26x18 pixels but .* has 24x18; all images of a split"):
+        form.load(tmp_path)
+    Image.new("RGB", (HEIGHT, WIDTH)).save(frame.image)
+    with pytest.raises(NerfroError, match=r"18x24 pixels but .* has 24x18; one is upright and the other lies: rotate"):
         form.load(tmp_path)
     frame.image.write_bytes(content)
     Image.new("L", (4, 3)).save(frame.mask)

@@ -89,13 +89,73 @@ def test_mask_is_the_share_of_the_pixel(save):
     np.testing.assert_allclose(read_mask(save(mask)), [[0, 0.2, 1]], atol=1e-6)
 
 
-def test_mask_of_labels_and_coloured_mask_mark_the_object(save):
-    labels = np.array([[0, 1, 1, 0]], np.uint8)
-    np.testing.assert_array_equal(read_mask(save(labels)), [[0, 1, 1, 0]])
-    coloured = np.zeros((1, 4, 3), np.uint8)
-    coloured[0, 1:3, 2] = 255
-    np.testing.assert_array_equal(read_mask(save(coloured)), [[0, 1, 1, 0]])
-    assert (read_mask(save(np.zeros((2, 2), np.uint8))) == 0).all()
+# Object 1 is left and object 2 right, on a background; both are larger than an outline.
+LABELS = np.kron(np.array([[0, 0, 0, 0], [0, 1, 2, 0], [0, 0, 0, 0]], np.uint8), np.ones((6, 6), np.uint8))
+SEGMENTER = [0, 0, 0, 128, 0, 0, 0, 128, 0]  # black, dark red, dark green
+
+
+def palette_image(labels: np.ndarray, palette: list[int]) -> Image.Image:
+    image = Image.fromarray(labels)
+    image.putpalette(palette)
+    return image
+
+
+def test_masks_of_labels_mark_every_object(tmp_path: Path):
+    colours = np.array(SEGMENTER, np.uint8).reshape(3, 3)[LABELS]
+    alpha = np.dstack([np.full((*LABELS.shape, 3), 200, np.uint8), 255 * (LABELS > 0).astype(np.uint8)])
+    images = {
+        "palette": palette_image(LABELS, SEGMENTER),
+        "palette with a white background": palette_image(LABELS, [255, 255, 255, *SEGMENTER[3:]]),
+        "palette with black in another place": palette_image(
+            np.array([2, 0, 1], np.uint8)[LABELS], [128, 0, 0, 0, 128, 0, 0, 0, 0]
+        ),
+        "colours": Image.fromarray(colours),
+        "grey 0, 1, 2": Image.fromarray(LABELS),
+        "grey 0, 38, 75": Image.fromarray(np.array([0, 38, 75], np.uint8)[LABELS]),
+        "grey 0, 128, 255": Image.fromarray(np.array([0, 128, 255], np.uint8)[LABELS]),
+        "one dark level": Image.fromarray(128 * (LABELS > 0).astype(np.uint8)),
+        "16 bits": Image.fromarray(LABELS.astype(np.uint16)),
+        "alpha": Image.fromarray(alpha),
+    }
+    for name, image in images.items():
+        image.save(tmp_path / "mask.png")
+        np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), LABELS > 0, err_msg=name)
+
+
+def test_chosen_labels_are_indices_or_grey_levels_of_the_file(tmp_path: Path):
+    for bits, image in (
+        (8, palette_image(LABELS, SEGMENTER)),
+        (8, Image.fromarray(LABELS)),
+        (2, palette_image(LABELS, SEGMENTER)),
+    ):
+        image.save(tmp_path / "mask.png", bits=bits)
+        for labels in ([2], [1, 2], [0], [3]):
+            expected = np.isin(LABELS, labels)
+            np.testing.assert_array_equal(to_unit(image_files.read_mask(tmp_path / "mask.png", labels)), expected)
+    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / "mask.png")
+    with pytest.raises(NerfroError, match="has colours, which have no labels"):
+        image_files.read_mask(tmp_path / "mask.png", [1])
+
+
+def test_coverage_along_the_outline_stays_coverage(tmp_path: Path):
+    rows, columns = np.mgrid[:40, :40] / 40 - 0.5
+    parts = np.stack([np.hypot(rows + dr, columns + dc) < 0.3 for dr in (0, 0.0125) for dc in (0, 0.0125)])
+    coverage = np.rint(255 * parts.mean(0)).astype(np.uint8)  # five levels only
+    assert 4 <= len(np.unique(coverage)) <= 5
+    for name, image in {
+        "grey": Image.fromarray(coverage),
+        "palette": palette_image(coverage, [i // 3 for i in range(768)]),
+    }.items():
+        image.save(tmp_path / f"{name}.png")
+        np.testing.assert_allclose(read_mask(tmp_path / f"{name}.png"), coverage / 255, atol=1e-6)
+    Image.fromarray(np.where(coverage > 0, 235, 16).astype(np.uint8)).save(tmp_path / "no_zero.png")
+    assert len(np.unique(read_mask(tmp_path / "no_zero.png"))) == 2
+
+
+def test_empty_masks_and_masks_of_one_label_are_read(save):
+    assert (read_mask(save(np.zeros((4, 4), np.uint8))) == 0).all()
+    assert (read_mask(save(np.ones((4, 4), np.uint8))) == 1).all()
+    np.testing.assert_array_equal(read_mask(save(np.array([[0, 1, 1, 0]], np.uint8))), [[0, 1, 1, 0]])
 
 
 @pytest.mark.parametrize("factor", [1, 2, 3, 6])
@@ -176,7 +236,7 @@ def test_flipped_bit_in_an_8bit_image_is_found(save):
         read_rgb(path, "drop")
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tif"])
 @pytest.mark.parametrize("orientation", [1, 3, 6])
 def test_photograph_that_asks_to_be_turned_is_refused(orientation: int, suffix: str, tmp_path: Path) -> None:
     path, exif = tmp_path / f"a{suffix}", Image.Exif()

@@ -55,6 +55,16 @@ def test_frames_keep_the_order_and_the_names_of_the_file(tmp_path: Path) -> None
     assert BlenderData(str(root)).load("train").names == ["train/r_1", "train/r_2.png", "train/r.004", "train/r_5"]
 
 
+def test_extensions_are_found_in_lower_and_upper_case(tmp_path: Path) -> None:
+    root = write_blender(tmp_path)
+    (root / "train/r_1.png").rename(root / "train/r_1.PNG")
+    (root / "train/r_2.png").rename(root / "train/r_2.PNG")
+    edit(root, lambda d: d["frames"][1].update(file_path="train/r_2.png"))
+    views = BlenderData(str(root)).load("train")
+    assert [frame.image.name for frame in views.frames[:2]] == ["r_1.PNG", "r_2.PNG"]
+    assert [views.names[i] for i in (0, 1)] == ["train/r_1", "train/r_2.png"]
+
+
 def test_rounded_poses_and_poses_of_three_rows_are_accepted(tmp_path: Path) -> None:
     def change(document: dict) -> None:
         for frame in document["frames"]:
