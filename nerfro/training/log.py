@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, UInt8
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
+from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from nerfro.cameras import Cameras
@@ -28,12 +29,20 @@ _NUM_PATHS = 12  # of these, in the picture of bent paths
 
 
 class TrainingLog(Callback):
-    """Logs learning rates and memory with the losses, and pictures at every look at a validation view.
+    """Logs settings (Weights & Biases), learning rates, memory, and images whenever a validation view is evaluated.
 
     The pictures are the view beside its photograph and the error, its depth and opacity, the sky, and the paths of a
     few rays through its middle row; the histograms tell at which arc lengths the rays of that row are sampled, for each
     sampling level.
     """
+
+    def __init__(self, config: DictConfig) -> None:
+        self._config = config
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        for logger in trainer.loggers:
+            if isinstance(logger, WandbLogger):
+                logger.log_hyperparams(OmegaConf.to_container(self._config, resolve=True))  # type: ignore[arg-type]
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int

@@ -50,7 +50,7 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
             throughput,
             TrainingProgress(throughput),
             in_checkpoint,
-            TrainingLog(),
+            TrainingLog(config),
             FallingBehind(),
             *extra,
         ],
@@ -143,13 +143,6 @@ def fit(
             raise
         reason = f"{type(error).__name__}: {error}".partition("\n")[0]
         raise NerfroError(f"{checkpoint} cannot be resumed ({reason}); start without ckpt_path") from error
-
-
-def log_settings(trainer: pl.Trainer, config: DictConfig) -> None:
-    """Write the composed settings of the run to Weights & Biases."""
-    for logger in trainer.loggers:
-        if isinstance(logger, WandbLogger):
-            logger.log_hyperparams(OmegaConf.to_container(config, resolve=True))  # type: ignore[arg-type]
 
 
 def finish_logs(trainer: pl.Trainer) -> None:

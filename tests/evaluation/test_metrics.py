@@ -203,6 +203,7 @@ def test_pictures_that_cannot_be_compared_are_refused() -> None:
         metrics.update(torch.zeros(16, 16, 3), torch.zeros(16, 16, 3), coverage=torch.ones(16, 17))
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("metric", [psnr, ssim, ms_ssim, flip])
 @pytest.mark.parametrize("shape", [(2, 165, 165, 3), (165, 165), (165, 165, 4), (3, 165, 165)])
 def test_metrics_refuse_what_is_not_one_image(metric: Callable[..., Tensor], shape: tuple[int, ...]) -> None:
