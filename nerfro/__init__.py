@@ -22,9 +22,9 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """What is imported when it is asked for: `import nerfro` itself costs nothing."""
+    """Import the public names on first access, so that `import nerfro` is fast."""
     if name == "Scene":
-        warnings.warn("nerfro.Scene is now nerfro.TrainedScene; this name goes with the next release", stacklevel=2)
+        warnings.warn("nerfro.Scene is called nerfro.TrainedScene; the next release removes the old name", stacklevel=2)
         name = "TrainedScene"
     if name not in _HOMES:
         raise AttributeError(f"module 'nerfro' has no attribute '{name}'")

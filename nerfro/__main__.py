@@ -1,4 +1,4 @@
-"""`python -m nerfro`, or `nerfro` where it is installed: lists the commands, or runs one as `nerfro train seed=1`."""
+"""`python -m nerfro`, or `nerfro` after installation: list the commands, or run one, such as `nerfro train seed=1`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from nerfro.paths import PACKAGE_DIR
 
 
 def main() -> None:
-    """List the commands, or run the one that is named with the arguments behind it."""
+    """List the commands, or run the command in the first argument."""
     with errors_in_one_line():
         known = commands()
         name = sys.argv[1] if len(sys.argv) > 1 else "--help"
@@ -24,12 +24,12 @@ def main() -> None:
         if name not in known:
             raise NerfroError(f"there is no command '{name}'; choose one of {', '.join(known)}")
     del sys.argv[1]
-    # As python -m does it: Hydra, launchers and a run's record look for the command in `__main__`.
+    # Like python -m, because Hydra, launchers and the record of a run read the command from `__main__`.
     runpy.run_module(f"nerfro.{name}", run_name="__main__", alter_sys=True)
 
 
 def commands() -> dict[str, str]:
-    """What each command does, by its name: modules whose first line is "`python -m nerfro.NAME ...`: what it does"."""
+    """Find the commands and their descriptions, from modules whose docstring begins "`python -m nerfro.NAME ...`: "."""
     found = {}
     for file in sorted(PACKAGE_DIR.glob("*.py")):
         first = (ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or "").partition("\n")[0]

@@ -26,15 +26,15 @@ class Window(NamedTuple):
     width: int
 
     def cut(self, images: Shaped[Tensor, "V H W *C"]) -> Shaped[Tensor, "V h w *C"]:
-        """The window of each image."""
+        """Crop the window from images."""
         rows, columns = slice(self.top, self.top + self.height), slice(self.left, self.left + self.width)
         return images[:, rows, columns].contiguous()
 
 
 def central_window(height: int, width: int, fraction: float) -> Window:
-    """The window of even sides around the centre of an image that spans `fraction` of each side, in (0, 1]."""
+    """Return the window of even sides around the centre of an image that spans `fraction` of each side, in (0, 1]."""
     if not 0 < fraction <= 1:
-        raise NerfroError(f"a central crop of {fraction} of the image is impossible; take a fraction in (0, 1]")
+        raise NerfroError(f"a central crop of {fraction} of the image is impossible; give a fraction in (0, 1]")
     if fraction == 1:
         return Window(0, 0, height, width)
     # Half sides are truncated, as in the authors' code, so that the window is symmetric.
@@ -49,7 +49,7 @@ class Cameras:
     """Pinhole cameras of one resolution.
 
     A camera looks along its -z axis, x is right and y is up (OpenGL). Pixel (row i, column j) covers the square from
-    (j, i) to (j + 1, i + 1) of the image plane, so its centre is (j + .5, i + .5) and the image's is (W / 2, H / 2).
+    (j, i) to (j + 1, i + 1) of the image plane, so the centre of the pixel is (j + .5, i + .5).
 
     Attributes:
         camera_to_world: rotation and centre [R | o], world units.
@@ -57,7 +57,7 @@ class Cameras:
         cx, cy: principal point, pixels from the image's left and top edge.
         width, height: resolution, pixels.
         near, far: arc length from the camera's centre at which rays begin and end, world units.
-        distortion: of the lens, see `nerfro.lens.coefficients`; None for an ideal one.
+        distortion: lens distortion, see `nerfro.lens.coefficients`; None for an ideal lens.
     """
 
     camera_to_world: Float[Tensor, "V 3 4"]
@@ -79,11 +79,11 @@ class Cameras:
         return self.camera_to_world.device
 
     def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> Cameras:
-        """The same cameras on another device, or in another precision."""
+        """Move the cameras to a device, or convert to a precision."""
         return self._each(lambda tensor: tensor.to(device, dtype))
 
     def select(self, views: list[int]) -> Cameras:
-        """Some of the cameras, in the order that is asked for."""
+        """Select cameras, in the given order."""
         return self._each(lambda tensor: tensor[views])
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> Cameras:
@@ -91,13 +91,13 @@ class Cameras:
         return replace(self, **changed)
 
     def crop(self, window: Window) -> Cameras:
-        """The cameras of a window of each image: its pixel (0, 0) is pixel (top, left) of these cameras."""
+        """Crop the images to a window; pixel (0, 0) of the result is pixel (top, left) of these cameras."""
         return replace(
             self, cx=self.cx - window.left, cy=self.cy - window.top, width=window.width, height=window.height
         )
 
     def resized(self, width: int, height: int) -> Cameras:
-        """The cameras of the same images in another resolution, in pixels."""
+        """Change the resolution of the images, in pixels."""
         x, y = width / self.width, height / self.height
         return replace(self, width=width, height=height, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y)
 
@@ -108,22 +108,22 @@ class Cameras:
         column: Int[Tensor, "R"] | Float[Tensor, "R"],
         jitter: Float[Tensor, "R 2"] | Float[Tensor, "2"] | None = None,
     ) -> Rays:
-        """Rays through pixels.
+        """Make rays through pixels.
 
         The radius of a pixel's cone is 2 / sqrt(12) of the pixel's width (mip-NeRF, section 3.1: the disc has the
-        variance of the pixel). That width is 1 / fx at unit depth, which lies at distance |d| along the ray
-        d = ((u - cx) / fx, -(v - cy) / fy, -1); at unit distance it is 1 / (fx |d|). A distorting lens changes the
-        pixel's area there, and the radius with its square root.
+        variance of the pixel). The width is 1 / fx at unit depth, at distance |d| along the ray
+        d = ((u - cx) / fx, -(v - cy) / fy, -1), and 1 / (fx |d|) at unit distance. Lens distortion changes the area of
+        the pixel, and the radius with the square root of the area.
 
         Args:
-            view, row, column: of each pixel, on the cameras' device.
-            jitter: place (x, y) in [0, 1) within each pixel that the ray goes through; its centre (.5, .5) by default.
+            view, row, column: indices of each pixel, on the device of the cameras.
+            jitter: position (x, y) of the ray within each pixel, in [0, 1); the centre (.5, .5) by default.
 
         Returns:
             Rays in world space with unit directions.
         """
         fx = self.fx[view]
-        # Not in PyTorch's default type, which Lightning changes for moments while another thread makes rays.
+        # Not in PyTorch's default type, which Lightning changes temporarily while another thread makes rays.
         offset_x, offset_y = (0.5, 0.5) if jitter is None else jitter.to(fx).unbind(-1)
         row, column = row.to(fx), column.to(fx)
         x = (column + offset_x - self.cx[view]) / fx
@@ -137,7 +137,7 @@ class Cameras:
         length = torch.linalg.vector_norm(directions, dim=-1)
         pose = self.camera_to_world[view]
         directions = (pose[..., :3] @ directions[..., None])[..., 0]
-        # Normalised in world space, because a rotation read from a file is one only to the file's digits.
+        # Normalized in world space, because the rotation in a file is rounded.
         return Rays(
             origins=pose[..., 3],
             directions=torch.nn.functional.normalize(directions, dim=-1),
@@ -147,11 +147,11 @@ class Cameras:
         )
 
     def project(self, points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "V P 2"], Float[Tensor, "V P"]]:
-        """Where each camera sees points of the world.
+        """Project points of the world into the images.
 
         Returns:
-            Pixel coordinates (column, row), whole numbers at the pixels' corners, and depth along the optical axis in
-            world units. Points at zero depth or behind the camera have no image: look at the depth first.
+            Pixel coordinates (column, row), integers at the corners of pixels, and depth along the optical axis in
+            world units. Pixel coordinates are invalid at depth 0 or less.
         """
         offset = points - self.camera_to_world[:, None, :, 3]
         right, up, back = (offset @ self.camera_to_world[:, :, :3]).unbind(-1)
@@ -165,18 +165,18 @@ class Cameras:
         return torch.stack([columns, rows], -1), -back
 
     def image_rays(self, view: int) -> Rays:
-        """Rays through all pixel centres of one view, row by row."""
+        """Make rays through all pixel centres of a view, row by row."""
         return self._window_rays(view, Window(0, 0, self.height, self.width))
 
     def tile(self, size: int, draws: Draws) -> Float[Tensor, "T T 3"]:
-        """Unit viewing directions, in world space, of a random window of a random view.
+        """Make unit viewing directions, in world space, of a random window of a random view.
 
         Args:
-            size: side of the window in pixels; the image's shorter side where that is smaller.
-            draws: random numbers that choose view and window.
+            size: side of the window in pixels, at most the shorter side of the image.
+            draws: random numbers for the choice of view and window.
         """
         side = min(size, self.height, self.width)
-        # Drawn on the CPU whatever the cameras' device, so that the host does not wait for it.
+        # Drawn on the CPU, so that the host does not wait for the device of the cameras.
         words = draws.words(torch.zeros(1, dtype=torch.long), 3, "tile")[0].tolist()
         counts = len(self), self.height - side + 1, self.width - side + 1
         view, top, left = (word * count >> 32 for word, count in zip(words, counts, strict=True))

@@ -1,7 +1,7 @@
-"""Several processes that train one model, each on its share of a batch.
+"""Data-parallel training: each process trains on a part of every batch.
 
-They learn what one process would learn from the whole batch: random numbers do not depend on the process
-(`nerfro.draws`), and all processes have equally many pixels, so that the mean of their gradients is that of the batch.
+The result equals training on the whole batch in one process, because random numbers do not depend on the process
+(`nerfro.draws`), and because all processes have equally many pixels, so that gradients can be averaged.
 """
 
 from __future__ import annotations
@@ -11,19 +11,19 @@ from torch import Tensor
 
 
 def rank_and_size() -> tuple[int, int]:
-    """Number of this process, and how many there are; (0, 1) outside of distributed training."""
+    """Return the rank of this process and the number of processes; (0, 1) without distributed training."""
     if dist.is_available() and dist.is_initialized():
         return dist.get_rank(), dist.get_world_size()
     return 0, 1
 
 
 def share_of(num: int, rank: int, size: int) -> slice:
-    """Part of `num` pixels that process `rank` has, where `size` processes share them evenly."""
+    """Return the part of `num` pixels for process `rank` of `size` processes."""
     return slice(rank * num // size, (rank + 1) * num // size)
 
 
 def sum_over_processes(value: Tensor) -> Tensor:
-    """Sum of a tensor without gradient over all processes; every one of them must ask."""
+    """Sum a tensor without gradient over all processes; every process must call this function."""
     if rank_and_size()[1] > 1:
         value = value.clone()
         dist.all_reduce(value)
@@ -31,6 +31,6 @@ def sum_over_processes(value: Tensor) -> Tensor:
 
 
 def leave() -> None:
-    """End the work in common: from here on every process is alone, and may end when it likes."""
+    """Destroy the process group, so that the processes may end at different times."""
     if dist.is_available() and dist.is_initialized():
         dist.destroy_process_group()

@@ -17,9 +17,8 @@ class Draws:
     """Random numbers of one training step.
 
     Each number is a function of the seed, the step, the name of a stream, an index and a dimension (Philox 4x32-10 with
-    the seed as key and the others as counter). There is no state: numbers do not depend on what was drawn before, on
-    the process, on the chunk in which rays are rendered, or on the device. Whoever draws for two purposes names two
-    streams, because the same arguments return the same numbers.
+    the seed as key and the other values as counter). Numbers do not depend on earlier draws, on the process, on the
+    chunk of the ray, or on the device. Equal arguments return equal numbers, so each purpose needs a stream of its own.
 
     Attributes:
         seed: seed of the run, from 0 to 2^64 - 1.
@@ -32,10 +31,10 @@ class Draws:
     ray: Int[Tensor, "R"]
 
     def for_rays(self, ray: Int[Tensor, "P"], num: int, stream: str = "samples") -> Float[Tensor, "P num"]:
-        """Draw uniform numbers in [0, 1) for polylines; those of one ray share their numbers.
+        """Draw uniform numbers in [0, 1) for polylines; the polylines of a ray share the numbers.
 
         Args:
-            ray: number of the ray that each polyline belongs to, `Path.ray`.
+            ray: number of the ray of each polyline, `Path.ray`.
             num: numbers for each ray.
             stream: name of the purpose.
         """
@@ -45,7 +44,7 @@ class Draws:
         """Draw uniform multiples of 2^-24 in [0, 1), in single precision.
 
         Args:
-            index: identity of what the numbers are for, from 0 to 2^32 - 1.
+            index: index of each row of numbers, from 0 to 2^32 - 1.
             num: numbers for each index.
             stream: name of the purpose.
         """
@@ -61,6 +60,6 @@ class Draws:
         return torch.stack(words, -1).flatten(1)[:, :num]
 
     def counters(self, stream: str) -> tuple[int, int, int, int]:
-        """Words of the key, of the step and of the stream, for kernels that draw themselves."""
+        """Return the words of key, step and stream, for kernels that draw numbers."""
         low, high = self.seed & 0xFFFFFFFF, self.seed >> 32 & 0xFFFFFFFF
         return low, high, self.step & 0xFFFFFFFF, zlib.crc32(stream.encode())

@@ -1,4 +1,4 @@
-"""The one exception that a user's mistake turns into."""
+"""Exceptions with messages for users, and lists of names in messages."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ _SHOWN = 3
 
 
 class NerfroError(Exception):
-    """A mistake in the input, told in one line: what was wrong, what is allowed, what to do next.
+    """Invalid input; the message states in one line the wrong value, the allowed values, and the next step.
 
-    Entry points print the message alone and exit with status 1; anything else is a bug and keeps its traceback.
+    Commands print the message and exit with status 1. Any other exception is a bug, and its traceback is printed.
     """
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C, with what to do to go on."""
+    """Ctrl-C; the message states how to resume."""
 
 
 def first_of(names: Sequence[str]) -> str:
-    """The first three names, and how many more there are: a line that lists hundreds is not read."""
+    """Format the first three names, and the number of the others, because long lists are not read."""
     shown = ", ".join(names[:_SHOWN])
     return shown if len(names) <= _SHOWN else f"{shown} and {len(names) - _SHOWN} more"
 
 
 def nearest_of(name: str, names: Sequence[str]) -> str:
-    """What to ask about a name that is none of those there are; or all of them, where none is like it."""
+    """Suggest the most similar of the known names, or list all known names if none is similar."""
     names = sorted(other for other in names if other != "_target_")
     near = difflib.get_close_matches(name, names, n=1)
     return f"did you mean {near[0]}?" if near else f"known: {', '.join(names) or 'none'}"

@@ -1,4 +1,4 @@
-"""`python -m nerfro.evaluate checkpoint=...` or `predictions=DIR references=DIR`: score a model, or any pictures."""
+"""`python -m nerfro.evaluate checkpoint=...` or `predictions=DIR references=DIR`: score a model, or any images."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from nerfro.training.callbacks import Throughput
 from nerfro.training.load import scene_of
 from nerfro.training.run_folder import load_checkpoint
 
-# Options of an evaluation that take the place of those that the run was trained with.
+# Options that replace the options of the run, if given.
 _ADOPTED = (
     "chunk_size", "lpips_backbone", "lpips_vgg_backbone", "refine_steps",
 )  # fmt: skip
@@ -28,7 +28,7 @@ _ADOPTED = (
 
 @entry_point("evaluate", EvaluateConfig)
 def main(config: DictConfig) -> None:
-    """Load, check, render if there is a model, score, print."""
+    """Score the test views of a checkpoint, or a folder of images."""
     require_one_task(config)
     evaluate = _evaluate_folder if config.checkpoint is None else _evaluate_checkpoint
     evaluate(config)
@@ -47,13 +47,14 @@ def _evaluate_checkpoint(config: DictConfig) -> None:
     with own_folder(config, path.parent.parent / f"evaluate_{config.split}") as folder:
         scene = scene_of(checkpoint, trained, device)
         views = scene.views(config.split).checked()
-        # Checkpoints from before there was LPIPS over VGG-16 lack the option.
-        backbones = trained.evaluation.lpips_backbone, trained.evaluation.get("lpips_vgg_backbone")
-        networks, reasons = find_lpips_networks(*backbones)
+        networks, reasons = find_lpips_networks(
+            trained.evaluation.lpips_backbone, trained.evaluation.lpips_vgg_backbone
+        )
         metrics = ImageMetrics(networks, reasons, config.protocol == "8bit", prefix=config.split)
         record(folder, config)
-        steps = trained.evaluation.get("refine_steps", 0)  # which older checkpoints lack
-        result, treated = score_split(scene.renderer, views, metrics, folder, scene.subdivision, steps)
+        result, treated = score_split(
+            scene.renderer, views, metrics, folder, scene.subdivision, trained.evaluation.refine_steps
+        )
         for index, view in enumerate(result.views):
             prediction = load_png(folder / "images" / f"{view.name}.png")
             write_error_sheet(folder, view.name, prediction, views.images[index], networks)
@@ -62,14 +63,14 @@ def _evaluate_checkpoint(config: DictConfig) -> None:
         title = f"{trained.name} on {trained.data.root}, {config.split} views"
         spending = checkpoint["global_step"], spent.seconds, spent.rays_per_second
         report(RunMetrics(result, *spending, treated), title, folder)
-    print(f"pictures and tables: {folder}")
+    print(f"images and tables: {folder}")
 
 
 def _evaluate_folder(config: DictConfig) -> None:
     predictions, references = user_path(config.predictions), user_path(config.references)
     masks = None if config.masks is None else user_path(config.masks)
     pairs = match_folders(predictions, references, masks)
-    for pair in pairs:  # what is damaged, or does not fit its partner, is told before anything is scored
+    for pair in pairs:  # damaged or mismatched images are reported before the scoring starts
         pair.load(config.alpha)
     device = find_device(config.device)
     with own_folder(config, predictions / "scores") as folder:
@@ -78,7 +79,7 @@ def _evaluate_folder(config: DictConfig) -> None:
         record(folder, config)
         result = score_folders(pairs, config.alpha, metrics, networks, folder, device)
         report(RunMetrics(result), f"{predictions} against {references}", folder)
-    print(f"pictures and tables: {folder}")
+    print(f"images and tables: {folder}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Lens distortion: the polynomial and rational models of OpenCV, COLMAP and nerfstudio, and its inverse."""
+"""Lens distortion by the polynomial and rational models of OpenCV, COLMAP and nerfstudio, and the inverse."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-# Newton's method doubles the digits at each step; from the distorted point this is enough for single precision.
+# Newton's method doubles the number of digits in each step; eight steps suffice for single precision.
 _NEWTON_STEPS = 8
-# A step this short, at unit depth, is the last: the next one would be shorter than single precision tells.
+# Length of the last step, at unit depth: the next step would be below single precision.
 _LAST_STEP = 1e-5
 
 
 def coefficients(
     numerator: Sequence[float] = (), tangential: Sequence[float] = (), denominator: Sequence[float] = ()
 ) -> tuple[float, ...] | None:
-    """The nine numbers of the model that `distort` evaluates; None where all are zero.
+    """Collect the nine coefficients for `distort`; returns None if all are zero.
 
     Args:
-        numerator: up to four, of r^2, r^4, r^6 and r^8 (OpenCV's k1, k2, k3; nerfstudio's k1 to k4).
+        numerator: up to four coefficients, of r^2, r^4, r^6 and r^8 (OpenCV's k1, k2, k3; nerfstudio's k1 to k4).
         tangential: p1 and p2, or none.
-        denominator: up to three, of r^2, r^4 and r^6 (OpenCV's k4, k5, k6).
+        denominator: up to three coefficients, of r^2, r^4 and r^6 (OpenCV's k4, k5, k6).
     """
     parts = ((numerator, 4), (tangential, 2), (denominator, 3))
     padded = [float(number) for part, size in parts for number in (*part, *[0.0] * (size - len(part)))]
@@ -30,7 +30,7 @@ def coefficients(
 
 
 def opencv_coefficients(numbers: Sequence[float]) -> tuple[float, ...] | None:
-    """As `coefficients`, from OpenCV's order k1, k2, p1, p2[, k3[, k4, k5, k6]]; none, 4, 5 or 8 numbers."""
+    """Convert 0, 4, 5 or 8 numbers in OpenCV's order k1, k2, p1, p2[, k3[, k4, k5, k6]] to `coefficients`."""
     k = numbers
     return coefficients([*k[:2], *k[4:5]], k[2:4], k[5:8])
 
@@ -38,12 +38,12 @@ def opencv_coefficients(numbers: Sequence[float]) -> tuple[float, ...] | None:
 def distort(
     points: Float[Tensor, "R 2"], lens: Float[Tensor, "R 9"]
 ) -> tuple[Float[Tensor, "R 2"], Float[Tensor, "R 3"]]:
-    """Where the lens images points of the ideal image plane at unit depth, x right and y down (OpenCV, calib3d).
+    """Distort points of the ideal image plane at unit depth, x right and y down (OpenCV, calib3d).
 
     x' = x (1 + k1 r^2 + ...) / (1 + k4 r^2 + ...) + 2 p1 x y + p2 (r^2 + 2 x^2), and y' with p1 and p2 exchanged.
 
     Returns:
-        Distorted points, and their derivatives dx'/dx, dx'/dy = dy'/dx and dy'/dy.
+        Distorted points, and the derivatives dx'/dx, dx'/dy = dy'/dx and dy'/dy.
     """
     x, y = points.unbind(-1)
     k1, k2, k3, k4, p1, p2, q1, q2, q3 = lens.unbind(-1)
@@ -65,11 +65,11 @@ def distort(
 def undistort(
     points: Float[Tensor, "R 2"], lens: Float[Tensor, "R 9"]
 ) -> tuple[Float[Tensor, "R 2"], Float[Tensor, "R"]]:
-    """The ideal points that the lens images at `points`, by Newton's method.
+    """Invert `distort` with Newton's method.
 
     Returns:
-        Ideal points, and the area there for each unit of area in the distorted image. The area is negative, or the
-        point wrong, beyond the radius at which the lens model folds back.
+        Ideal points, and ideal area per unit of area in the distorted image. The area is negative, or the point is
+        wrong, beyond the radius at which the lens model folds back.
     """
     ideal = points
     for _ in range(_NEWTON_STEPS):

@@ -1,4 +1,4 @@
-"""Where the configuration, the local plugins and the embedded data lie, in a checkout and in an installed wheel."""
+"""Paths of configuration, local plugins and embedded data, in a checkout and in an installed wheel."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ from nerfro.errors import NerfroError
 PACKAGE_DIR = Path(__file__).resolve().parent
 ASSETS_DIR = PACKAGE_DIR / "assets"
 
-# The wheel carries conf/ and plugins/ inside the package (see pyproject.toml); a checkout has them beside it.
+# A wheel contains conf/ and plugins/ inside the package (see pyproject.toml), a checkout beside the package.
 _PROJECT_DIR = PACKAGE_DIR / "_project" if (PACKAGE_DIR / "_project").is_dir() else PACKAGE_DIR.parent
 CONF_DIR = _PROJECT_DIR / "conf"
 PLUGINS_DIR = CONF_DIR.parent / "plugins"
@@ -16,7 +16,7 @@ EMBEDDED_PREFIX = "embedded:"
 
 
 def resolve_path(location: str | Path) -> Path:
-    """Turn a configured location into a path; `embedded:torus/mesh.ply` names data that ships with nerfro."""
+    """Convert a location to a path; `embedded:torus/mesh.ply` is a file in the data that nerfro includes."""
     location = str(location)
     if not location.startswith(EMBEDDED_PREFIX):
         return user_path(location)
@@ -30,10 +30,10 @@ def resolve_path(location: str | Path) -> Path:
 
 
 def user_path(location: str | Path) -> Path:
-    """A path that a user gave, `~` and `~name` written out."""
+    """Convert a location from a user to a path, and expand `~` and `~name`."""
     try:
         if "\0" in str(location):
-            raise NerfroError(f"{str(location)!r} holds a zero byte, which no path can; give another")
+            raise NerfroError(f"{str(location)!r} contains a zero byte, which is not allowed in a path; give another")
         return Path(location).expanduser()
     except RuntimeError as error:
-        raise NerfroError(f"{location}: no home folder is known for it; write the path out") from error
+        raise NerfroError(f"{location}: the home folder is unknown; give the full path") from error

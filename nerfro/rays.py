@@ -17,7 +17,7 @@ class Rays:
         origins: camera centres.
         directions: unit viewing directions.
         radii: radius of the pixel's cone at unit distance (mip-NeRF, section 3.1).
-        near, far: arc length from the origin at which the path begins and ends; a bent path never ends in the object.
+        near, far: arc length from the origin at the start and end of the path; a bent path never ends in the object.
     """
 
     origins: Float[Tensor, "R 3"]
@@ -33,13 +33,13 @@ class Rays:
         return Rays(*(tensor[index] for tensor in vars(self).values()))
 
     def followed_by(self, other: Rays) -> Rays:
-        """These rays and after them others."""
+        """Concatenate with other rays."""
         return Rays(*(torch.cat(pair) for pair in zip(vars(self).values(), vars(other).values(), strict=True)))
 
     def to(self, where_or_what: torch.device | str | torch.dtype) -> Rays:
-        """The same rays on another device, or in another precision."""
+        """Move the rays to a device, or convert to a precision."""
         return Rays(*(tensor.to(where_or_what) for tensor in vars(self).values()))
 
     def detach(self) -> Rays:
-        """The same rays without gradients."""
+        """Detach the rays from the graph of gradients."""
         return Rays(*(tensor.detach() for tensor in vars(self).values()))

@@ -16,7 +16,7 @@ from nerfro.capture.preprocess_options import FOUND, MESH
 from nerfro.capture.reconstruct_options import ReconstructConfig, have_poses, read_result, training_options
 from nerfro.capture.stages import Stage, is_older, link_photographs, move_aside
 from nerfro.cli import entry_point
-from nerfro.files.owned import held
+from nerfro.files.folder_lock import lock_folder
 from nerfro.paths import resolve_path, user_path
 from nerfro.training.run_folder import CONFIG_FILE
 
@@ -28,7 +28,7 @@ def main(config: DictConfig) -> None:
     """Run all stages that are not done."""
     overrides = list(HydraConfig.get().overrides.task)
     posed, out = have_poses(config, overrides), user_path(config.out)
-    with held(out, "out"):
+    with lock_folder(out, "out"):
         root = resolve_path(config.data.root) if posed else out
         data = of_groups(("data",), overrides)
         if not posed:

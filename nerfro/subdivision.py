@@ -1,4 +1,4 @@
-"""Rays through pixels, and the division of pixels for which one ray does not stand.
+"""Rays through pixels, and the subdivision of pixels that one ray does not represent.
 
 Axis Q: pixels. Pixels are numbered view * H * W + row * W + column.
 """
@@ -23,26 +23,25 @@ from nerfro.types import Path
 Trace = Callable[[Rays, Int[Tensor, "R"]], Path]  # traces rays of views
 TraceExits = Callable[[Rays, Int[Tensor, "R"]], Float[Tensor, "R 3"]]  # traces their exit directions alone
 
-# From a ray to that of the neighbour, in pixels, along both axes: one pixel on the diagonal, where edges along rows and
-# columns are seen alike.
+# Offset to the neighbouring ray along both axes, in pixels: one pixel along the diagonal, so that edges along rows and
+# columns are detected equally.
 _TO_NEIGHBOUR = math.sqrt(0.5)
 
 
 @checked("subdivision")
 @dataclass
 class Subdivision:
-    """Which pixels get several rays, and how many.
+    """Selection of pixels with several rays, and the number of rays.
 
-    A pixel shows the mean radiance over its square. One ray through the pixel's centre does not stand for that mean
-    where neighbouring rays diverge, at rims and edges of the refractive object, or where the picture has fine detail.
+    A pixel shows the mean radiance over a square. One ray through the centre does not represent the mean if
+    neighbouring rays diverge, as at edges of the refractive object, or if the image has fine detail.
 
     Attributes:
-        side: rays along each side of a divided pixel, which gets side^2 rays; 1 divides none.
-        divergence: divide pixels whose ray leaves in a direction that differs from that of the neighbour's by this many
-            pixel angles 1 / fx or more; 0 divides all.
-        contrast: also divide pixels whose colour differs from that of one of the four pixels around by this much or
-            more (largest difference of a channel, sRGB); in training only where the ray is refracted. None divides no
-            others.
+        side: rays along each side of a divided pixel, which has side^2 rays; 1 divides no pixels.
+        divergence: minimum angle between the exit directions of a pixel's ray and of the neighbouring ray for which
+            the pixel is divided, in pixel angles 1 / fx; 0 divides all pixels.
+        contrast: minimum difference of a channel (sRGB) from one of the four neighbouring pixels for which a pixel is
+            divided as well; in training only for refracted rays. None disables the criterion.
         contrast_start: training step from which `contrast` applies.
     """
 
@@ -54,7 +53,7 @@ class Subdivision:
 
 @dataclass
 class SubdivisionChanges:
-    """Attributes of a `Subdivision` that are replaced; None keeps the value that the run was evaluated with."""
+    """Attributes of a `Subdivision` that are replaced; None keeps the value of the run."""
 
     side: Optional[Side] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     divergence: Optional[NotNegative] = None  # noqa: UP045
@@ -63,14 +62,14 @@ class SubdivisionChanges:
 
 @dataclass(frozen=True)
 class PixelRays:
-    """Rays through pixels, one or several for each; those of pixels that are not divided come first.
+    """Rays through pixels, one or several for each; rays of undivided pixels come first.
 
     Attributes:
         rays: R rays.
-        path: path of each ray; None where nothing has traced it.
-        pixel: row of the pixel that each ray belongs to.
-        part: number of the ray among those of its pixel.
-        diverges: pixels that are divided because neighbouring rays diverge.
+        path: path of each ray; None without tracing.
+        pixel: row of the pixel of each ray.
+        part: number of the ray within the pixel.
+        diverges: pixels that are divided because of divergence.
     """
 
     rays: Rays
@@ -89,17 +88,17 @@ def subdivide(
     contrasts: Callable[[Int[Tensor, "N"]], Float[Tensor, "N"]] | None,
     jitter: Draws | None = None,
 ) -> PixelRays:
-    """Trace rays through pixels, several where one does not stand for the pixel.
+    """Trace rays through pixels, several for pixels that one ray does not represent.
 
     Args:
-        cameras: of all views.
+        cameras: cameras of all views.
         pixels: numbers of the pixels.
-        subdivision: which pixels are divided.
-        trace: traces rays, given the view of each; None traces none, so that no pixel is divided.
-        trace_exits: traces the exit direction of each ray's main polyline; None takes it from `trace`.
-        contrasts: contrast of the pixels in given rows of `pixels`; None divides no pixels for their contrast.
-        jitter: random numbers, with an index for each pixel, that place rays anywhere within their pixel, or their part
-            of it; None places them in its centre.
+        subdivision: criteria for the division of pixels.
+        trace: traces rays, given the view of each ray; None disables tracing and division.
+        trace_exits: traces the exit direction of each ray's main polyline; None uses `trace`.
+        contrasts: contrast of the pixels in given rows of `pixels`; None disables the criterion.
+        jitter: random numbers, with an index for each pixel, for the position of rays within the pixel, or within the
+            part of a pixel; None selects the centres.
     """
     view, num_parts = pixels // (cameras.height * cameras.width), subdivision.side**2
     place = None if jitter is None else jitter.uniform(jitter.ray, 2, "place in pixel")
@@ -132,7 +131,7 @@ def subdivide(
 def pixel_rays(
     cameras: Cameras, pixels: Int[Tensor, "R"], place: Float[Tensor, "R 2"] | Float[Tensor, "2"] | None = None
 ) -> Rays:
-    """Make rays through a place (x, y) in [0, 1) of pixels, by default their centres."""
+    """Make rays through a position (x, y) in [0, 1) of pixels, by default the centres."""
     width, height = cameras.width, cameras.height
     return cameras.rays(pixels // (height * width), pixels // width % height, pixels % width, place)
 
@@ -140,7 +139,7 @@ def pixel_rays(
 def part_rays(
     cameras: Cameras, pixels: Int[Tensor, "Q"], side: int, place: Float[Tensor, "Q K 2"] | None = None
 ) -> Rays:
-    """Make rays through the K = side x side equal parts of pixels, those of each pixel together, at a place of each."""
+    """Make rays through the K = side x side equal parts of each pixel, at a position in each part."""
     ticks = torch.arange(side, device=pixels.device)
     corners = torch.cartesian_prod(ticks, ticks).view(-1, 2)
     places = (corners + (0.5 if place is None else place)) / side
@@ -148,20 +147,20 @@ def part_rays(
 
 
 def neighbour_rays(cameras: Cameras, pixels: Int[Tensor, "R"], place: Float[Tensor, "R 2"] | None = None) -> Rays:
-    """Make rays one pixel away from those of `pixel_rays`, on the diagonal."""
+    """Make the neighbours of the rays of `pixel_rays`, one pixel along the diagonal."""
     centre = torch.full((2,), 0.5, device=pixels.device)
     return pixel_rays(cameras, pixels, (centre if place is None else place) + _TO_NEIGHBOUR)
 
 
 def main_exits(path: Path) -> Float[Tensor, "R 3"]:
-    """Exit direction of the main polyline of each ray."""
+    """Return the exit direction of the main polyline of each ray."""
     return path.first_of_ray(path.exit_directions)
 
 
 def contrast(
     colours: Callable[[Int[Tensor, "R"]], Float[Tensor, "R 3"]], cameras: Cameras, pixels: Int[Tensor, "R"]
 ) -> Float[Tensor, "R"]:
-    """Largest difference of a channel between pixels and the four around them; `colours` gives those of pixels."""
+    """Compute the largest difference of a channel between pixels and their four neighbours."""
     height, width = cameras.height, cameras.width
     row, column = pixels // width % height, pixels % width
     own = colours(pixels)
@@ -175,10 +174,10 @@ def contrast(
 def divergence(
     cameras: Cameras, pixels: Int[Tensor, "R"], exits: Float[Tensor, "R 3"], neighbours: Float[Tensor, "R 3"]
 ) -> Float[Tensor, "R"]:
-    """Angle between the exit directions of rays and of their neighbours, in pixel angles 1 / fx.
+    """Compute the angle between the exit directions of rays and of their neighbours, in pixel angles 1 / fx.
 
-    Straight rays diverge by 1 or less. Where the angle is wide, a pixel shows a mean over directions far apart, which a
-    ray through its centre would teach to one of them, as speckle.
+    Straight rays diverge by at most 1. A pixel of large divergence shows a mean over distant directions; training the
+    background with the central ray alone would cause speckle.
     """
     chord = torch.linalg.vector_norm(exits - neighbours, dim=-1)
     view = pixels // (cameras.height * cameras.width)

@@ -1,4 +1,4 @@
-"""`python -m nerfro.synthesize scene=torus`: ground truth of a synthetic scene, path-traced with Mitsuba 3."""
+"""`python -m nerfro.synthesize scene=torus`: render the ground truth of a synthetic scene with Mitsuba 3."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from nerfro.scenes.synthesis import CAPTURES, SynthesizeConfig, synthesize
 
 @entry_point("synthesize", SynthesizeConfig, CONF_DIR / "synthesize")  # conf/scene would turn `scene=` into a group
 def main(config: DictConfig) -> None:
-    """Render, then say how to train on the result."""
+    """Render the missing images, and print the next command."""
     scene, folder = synthesize(config)
     print(f"done: {folder}")
     if config.scene in CAPTURES:

@@ -21,10 +21,10 @@ _PLOTTED_RAYS = 24
 
 @entry_point("trace", TraceConfig)
 def main(config: DictConfig) -> None:
-    """Read rays, trace them, write where they leave; whatever can be refused is refused before tracing starts."""
+    """Read rays, trace the rays, and write exit positions and directions."""
     out = user_path(config.out)
     if out.suffix != ".npz":
-        raise NerfroError(f"out={out} must end in .npz, for that is what is written")
+        raise NerfroError(f"out={out} is not allowed; the output is a NumPy archive and must end in .npz")
     refuse_existing([out, out.with_suffix(".png")] if config.plot else [out], config.overwrite)
     origins, directions = read_rays(user_path(config.rays))
     sampler = build(config.sampler.path)
@@ -50,11 +50,11 @@ def main(config: DictConfig) -> None:
         f"{len(rays)} rays traced{split}, {int(path.first_of_ray(path.refracted).sum())} met the object; wrote {out}"
     )
     if num_exceeded:
-        rich.print(f"{num_exceeded} paths met the limit of {sampler.max_events} events and go straight on from there")
+        rich.print(f"{num_exceeded} paths reached the limit of {sampler.max_events} events and continue straight")
     if config.plot:
         shown = torch.linspace(0, len(rays) - 1, min(len(rays), _PLOTTED_RAYS)).round().long()
         draw_paths(path.of_rays(shown), medium, out.with_suffix(".png"))
-        rich.print(f"drew {len(shown)} of them in {out.with_suffix('.png')}")
+        rich.print(f"drew {len(shown)} rays in {out.with_suffix('.png')}")
 
 
 if __name__ == "__main__":

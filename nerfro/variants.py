@@ -1,4 +1,4 @@
-"""Modules with one thing changed, and the rest shared with the original."""
+"""Copies of modules with changed attributes, which share all other attributes."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ Module = TypeVar("Module", bound=nn.Module)
 
 
 def variant(module: Module, **changes: object) -> Module:
-    """A module like the given one but for some attributes; it shares all others, and the original stays as it is.
+    """Copy a module with some attributes replaced; the copy shares all other attributes.
 
-    A tensor becomes a buffer, also where the original has a parameter.
+    A tensor becomes a buffer, even if the original has a parameter of the name.
     """
     changed = copy.copy(module)
     for registry in ("_parameters", "_buffers", "_modules"):

@@ -1,1 +1,1 @@
-"""Files on disk: whole or not there, and the formats that no library reads for us."""
+"""Atomic writing, locks, caches, and readers and writers of file formats."""

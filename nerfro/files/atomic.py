@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO
 
 from nerfro.errors import NerfroError
-from nerfro.files.owned import PARTIAL, require_held
+from nerfro.files.folder_lock import PARTIAL, require_lock
 
 
 @contextlib.contextmanager
@@ -29,7 +29,7 @@ def atomic_file(path: Path | str, advice: str = "free some space or choose anoth
     """
     path = Path(path)
     temporary = None
-    require_held(path)
+    require_lock(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         # `tempfile` would make a private file, and the umask, which gives the usual permissions, can only be read by

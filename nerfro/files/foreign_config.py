@@ -1,4 +1,4 @@
-"""Configurations that another run wrote, on this machine or on somebody else's."""
+"""Configurations of runs from this machine or other machines."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from nerfro.errors import NerfroError
 
 
 def foreign_config(text: str, origin: Path) -> DictConfig:
-    """Read a run's configuration as the plain values that nerfro.train writes.
+    """Read the configuration of a run, which nerfro.train writes as plain values.
 
-    Nothing in it is resolved: `${oc.env:...}` would bring this machine's environment into a page that is shared.
+    Interpolations are refused: `${oc.env:...}` would copy the environment of this machine into a shared page.
     """
     try:
         config = OmegaConf.create(text)
     except (yaml.YAMLError, OmegaConfBaseException, ValueError) as error:
         reason = " ".join(str(error).split())
-        raise NerfroError(f"{origin} is no configuration of a run ({reason}); leave the run out") from error
+        raise NerfroError(f"{origin} is not the configuration of a run ({reason}); leave the run out") from error
     if not isinstance(config, DictConfig):
-        raise NerfroError(f"{origin} is no configuration of a run; leave the run out")
-    asks = re.search(r".*\$\{.*", OmegaConf.to_yaml(config))
-    if asks:
-        raise NerfroError(f"{origin} asks for a value from elsewhere ({asks[0].strip()}); write the value itself there")
+        raise NerfroError(f"{origin} is not the configuration of a run; leave the run out")
+    interpolation = re.search(r".*\$\{.*", OmegaConf.to_yaml(config))
+    if interpolation:
+        raise NerfroError(f"{origin} contains an interpolation ({interpolation[0].strip()}); write the value instead")
     return renamed_config(config, origin)

@@ -1,6 +1,6 @@
-"""Lat-long pictures of the sky, and their files.
+"""Lat-long images of the sky, and reading and writing of such files.
 
-World z is up: the top row looks along +z, the middle of the picture along +x, and the azimuth from +x to +y runs to the
+World z is up: the top row looks along +z, the centre of the image along +x, and the azimuth from +x to +y runs to the
 left, so that a viewer inside sees the sky unmirrored. Blender's environment textures use the same convention.
 """
 
@@ -24,7 +24,7 @@ _FORMATS = (".png", ".jpg", ".jpeg", ".hdr", ".exr")
 
 
 def directions(height: int) -> Float[Tensor, "H 2*H 3"]:
-    """Unit directions at the pixels' centres of a lat-long picture."""
+    """Compute the unit directions of the pixel centres of a lat-long image."""
     polar = (torch.arange(height) + 0.5) / height * math.pi
     azimuth = math.pi - (torch.arange(2 * height) + 0.5) / height * math.pi
     polar, azimuth = torch.meshgrid(polar, azimuth, indexing="ij")
@@ -32,22 +32,26 @@ def directions(height: int) -> Float[Tensor, "H 2*H 3"]:
 
 
 def sample(rgb: Float[Tensor, "H W 3"], where: Float[Tensor, "P 3"], width: int) -> Float[Tensor, "P 3"]:
-    """Bilinear lookup in a lat-long picture that was first averaged to at most `width` columns, against aliasing."""
-    picture = rgb.permute(2, 0, 1)[None]
+    """Look up directions bilinearly in a lat-long image, averaged to at most `width` columns against aliasing."""
+    image = rgb.permute(2, 0, 1)[None]
     if rgb.shape[1] > width:
-        picture = torch.nn.functional.interpolate(picture, size=(width // 2, width), mode="area")
-    # One column more on each side closes the seam.
-    picture = torch.cat([picture[..., -1:], picture, picture[..., :1]], dim=-1)
-    columns = picture.shape[-1] - 2
+        image = torch.nn.functional.interpolate(image, size=(width // 2, width), mode="area")
+    # An additional column on each side closes the seam.
+    image = torch.cat([image[..., -1:], image, image[..., :1]], dim=-1)
+    columns = image.shape[-1] - 2
     u = (0.5 - torch.atan2(where[:, 1], where[:, 0]) / (2 * math.pi)) * columns + 1
     v = torch.acos(where[:, 2].clamp(-1, 1)) / math.pi
     grid = torch.stack([u / (columns + 2) * 2 - 1, v * 2 - 1], dim=-1)[None, None]
-    found = torch.nn.functional.grid_sample(picture, grid, padding_mode="border", align_corners=False)
+    found = torch.nn.functional.grid_sample(image, grid, padding_mode="border", align_corners=False)
     return found[0, :, 0].T
 
 
 def load_lat_long(path: Path | str) -> Float[Tensor, "H 2*H 3"]:
-    """Read a lat-long picture as linear radiance; lamps of a .hdr or .exr are as bright as they are."""
+    """Read a lat-long image as linear radiance; .hdr and .exr may exceed 1.
+
+    Raises:
+        NerfroError: the file is missing, damaged, of another format or shape, or has invalid radiance.
+    """
     path = Path(path)
     suffix = _format(path)
     with reading(path, "the sky ", advice="write or copy it again", missing="correct boundary.image"):
@@ -58,14 +62,14 @@ def load_lat_long(path: Path | str) -> Float[Tensor, "H 2*H 3"]:
                 rgb = to_linear(np.array(image.convert("RGB")) / 255)
     height, width = rgb.shape[:2]
     if width != 2 * height:
-        raise NerfroError(f"the sky {path} has {width}x{height} pixels; a lat-long picture is twice as wide as high")
+        raise NerfroError(f"the sky {path} has {width}x{height} pixels; give an image that is twice as wide as high")
     if not (np.isfinite(rgb).all() and (rgb >= 0).all()):
         raise NerfroError(f"the sky {path} has radiance that is negative or not finite; write or copy it again")
     return torch.from_numpy(np.ascontiguousarray(rgb)).float()
 
 
 def save_lat_long(path: Path | str, radiance: Float[Tensor, "H 2*H 3"]) -> None:
-    """Write linear radiance: as 8-bit sRGB, clipped, for .png; as it is for .hdr and .exr."""
+    """Write linear radiance to .hdr or .exr, or clipped 8-bit sRGB to .png."""
     path = Path(path)
     suffix = _format(path)
     if suffix == ".png":

@@ -1,4 +1,4 @@
-"""A large array that is made once, kept in the cache folder, and mapped into memory."""
+"""Large arrays that are computed once, stored in the cache folder, and mapped into memory."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ import numpy as np
 from nerfro.files.atomic import atomic_file
 from nerfro.files.cache import cache_dir, make_room
 
-_CHECKSUM_BYTES = 4  # behind the array
-_BLOCK = 2**26  # bytes that are summed up at once
+_CHECKSUM_BYTES = 4  # after the array
+_BLOCK = 2**26  # bytes per step of the checksum
 
 
 def mapped_array(
     key: str, shape: tuple[int, ...], dtype: np.dtype, parts: Callable[[], Iterable[np.ndarray]]
 ) -> np.ndarray:
-    """An array of which only what is looked at is in memory; what is written to it stays in this process.
+    """Map an array into memory copy-on-write: only accessed pages take memory, and changes stay in this process.
 
     Args:
-        key: hash of all that the array depends on.
-        shape, dtype: of the array.
-        parts: makes its parts in order, along the first axis; called where there is no file yet.
+        key: hash of all inputs of the array.
+        shape, dtype: shape and type of the array.
+        parts: computes the parts of the array in order, along the first axis; called if there is no valid file.
     """
     path = cache_dir() / f"mapped_{key}.npy"
-    with contextlib.suppress(OSError, ValueError, EOFError):  # not there, or damaged
+    with contextlib.suppress(OSError, ValueError, EOFError):  # missing or damaged
         array = np.load(path, mmap_mode="c", allow_pickle=False)
         if array.shape == shape and array.dtype == dtype and _is_whole(array, path):
             os.utime(path)
@@ -47,7 +47,7 @@ def mapped_array(
 
 
 def _is_whole(array: np.ndarray, path: Path) -> bool:
-    """Whether a mapped array is what was written."""
+    """Check the checksum of a mapped array."""
     content, checksum = array.reshape(-1).view(np.uint8), 0
     for start in range(0, len(content), _BLOCK):
         checksum = zlib.crc32(content[start : start + _BLOCK].data, checksum)

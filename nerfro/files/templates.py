@@ -1,4 +1,4 @@
-"""Pages from templates."""
+"""HTML pages from templates."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import jinja2
 
 
 def fill_template(file: Path, **values: object) -> str:
-    """A page of a template, which may include others of its folder; values are escaped, and none may be missing."""
+    """Fill a Jinja template, which may include other files of its folder; values are escaped and required."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(file.parent),
         autoescape=True,

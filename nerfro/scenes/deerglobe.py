@@ -168,7 +168,7 @@ def _snow(directions: np.ndarray) -> np.ndarray:
 
 def build(spacing: float) -> Scene:
     """Return the scene; `spacing` is the distance between neighbouring coloured vertices, world units."""
-    fine = min(max(spacing, 0.0035), 0.006)  # thin parts need a fine mesh whatever the resolution of the pictures
+    fine = min(max(spacing, 0.0035), 0.006)  # thin parts need a fine mesh whatever the resolution of the images
     x, y = PINE
     parts = [
         painted(deer, deer_colours, (-0.31, -0.15, -0.28), (0.42, 0.15, 0.36), fine),

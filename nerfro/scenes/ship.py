@@ -150,7 +150,7 @@ def _sea(directions: np.ndarray) -> np.ndarray:
 def build(spacing: float) -> Scene:
     """Return the scene; `spacing` is the distance between neighbouring coloured vertices, world units."""
     spacing = max(spacing, 0.0035)
-    fine = min(spacing, 0.006)  # thin parts need a fine mesh whatever the resolution of the pictures
+    fine = min(spacing, 0.006)  # thin parts need a fine mesh whatever the resolution of the images
     parts = [
         painted(hull, hull_colours, (-0.55, -0.18, -0.41), (0.55, 0.18, -0.05), fine),
         painted(rigging, rigging_colours, (-0.24, -0.31, -0.19), (0.74, 0.31, 0.52), fine),

@@ -29,7 +29,7 @@ def directions_on_sphere(count: int, seed: int, split: int) -> np.ndarray:
 def look_at_origin(position: np.ndarray) -> np.ndarray:
     """Return the camera-to-world matrix [4, 4] (OpenGL axes: x right, y up, looks along -z) of a camera at `position`.
 
-    World z is up in the picture, except straight above and below the origin, where world y is.
+    World z is up in the image, except directly above and below the origin, where world y is up.
     """
     backward = position / np.linalg.norm(position)
     up = np.array([0.0, 0.0, 1.0]) if abs(backward[2]) < 0.999 else np.array([0.0, 1.0, 0.0])

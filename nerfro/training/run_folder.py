@@ -23,8 +23,8 @@ from torch import Tensor
 
 from nerfro.errors import Interrupted, NerfroError, first_of
 from nerfro.files.atomic import write_atomically
+from nerfro.files.folder_lock import lock_folder, remove_unfinished, require_only
 from nerfro.files.foreign_config import foreign_config
-from nerfro.files.owned import held, remove_unfinished, require_own
 from nerfro.kernels.precision import fast_bfloat16
 from nerfro.paths import PACKAGE_DIR, user_path
 from nerfro.rendering import Renderer
@@ -60,11 +60,11 @@ def own(folder: Path, config: DictConfig) -> Iterator[Path | None]:
     if rank_zero_only.rank != 0:  # type: ignore[attr-defined]  # of several processes the first one has looked
         yield checkpoint
         return
-    with held(folder, "hydra.run.dir"):
+    with lock_folder(folder, "hydra.run.dir"):
         begun = folder if checkpoint is None else checkpoint.parent.parent
         if config.ckpt_path is None or begun.resolve() != folder.resolve():
             advice = "go on with a run (ckpt_path=last) or choose another folder (hydra.run.dir=...)"
-            require_own(folder, (CELL_FILE,), advice)
+            require_only(folder, (CELL_FILE,), advice)
         remove_unfinished(folder)
         try:
             yield checkpoint

@@ -24,7 +24,7 @@ from nerfro.cli import in_one_line
 from nerfro.data.image_files import IMAGE_SUFFIXES
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
-from nerfro.files.owned import held, is_held
+from nerfro.files.folder_lock import is_locked, lock_folder
 from nerfro.paths import EMBEDDED_PREFIX, resolve_path
 from nerfro.registry import build, discover
 from nerfro.scenes import SCENES
@@ -130,9 +130,9 @@ class CellTask:
     def __call__(self, config: DictConfig) -> None:
         discover()  # the worker may be a new process
         folder = Path(HydraConfig.get().runtime.output_dir)
-        if is_held(folder):
+        if is_locked(folder):
             return  # a process that outlived an earlier start of the sweep is at it
-        with held(folder, "hydra.sweep.dir"):
+        with lock_folder(folder, "hydra.sweep.dir"):
             self._run(config, folder)
 
     def _run(self, config: DictConfig, folder: Path) -> None:
@@ -163,7 +163,7 @@ def _record(folder: Path, identity: Identity, state: State, reason: str = "") ->
 
 
 def _look(folder: Path, identity: Identity) -> tuple[State, str]:
-    return (State.RUNNING, "") if is_held(folder) else _recorded(folder, identity)
+    return (State.RUNNING, "") if is_locked(folder) else _recorded(folder, identity)
 
 
 def _recorded(folder: Path, identity: Identity) -> tuple[State, str]:

@@ -20,7 +20,7 @@ import nerfro.training.run_folder
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
-from nerfro.files.owned import held, is_held
+from nerfro.files.folder_lock import is_locked, lock_folder
 from nerfro.training.config import TrainConfig
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 
@@ -50,8 +50,8 @@ def another_process(tmp_path: Path) -> Iterator[Callable[[Path], None]]:
 
     def hold(folder: Path) -> None:
         program = (
-            "import sys, pathlib; from nerfro.files.owned import held\n"
-            f"with held(pathlib.Path({str(folder)!r}), 'out'): print('held', flush=True); sys.stdin.read()"
+            "import sys, pathlib; from nerfro.files.folder_lock import lock_folder\n"
+            f"with lock_folder(pathlib.Path({str(folder)!r}), 'out'): print('held', flush=True); sys.stdin.read()"
         )
         command = [sys.executable, "-c", program]
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -108,7 +108,7 @@ def test_second_process_in_a_folder_is_refused(
     train: Callable[..., Any], another_process: Callable[[Path], None], tmp_path: Path
 ) -> None:
     another_process(tmp_path / "run")
-    assert is_held(tmp_path / "run")
+    assert is_locked(tmp_path / "run")
     finished = train()
     assert finished.code == 1
     assert f"another process is writing to {tmp_path / 'run'}" in finished.err
@@ -121,7 +121,7 @@ def test_folder_that_is_removed_while_training_is_not_made_again(
     monkeypatch.setattr(nerfro.training.run_folder, "require_room", lambda folder, _: shutil.rmtree(folder))
     finished = train()
     assert finished.code == 1
-    assert f"{tmp_path / 'run'} was removed while it was written to" in finished.err
+    assert f"{tmp_path / 'run'} was removed or replaced while nerfro was writing to the folder" in finished.err
     assert not (tmp_path / "run").exists()
 
 
@@ -137,7 +137,7 @@ def test_checkpoint_in_a_removed_folder_is_not_made_again(
     monkeypatch.setattr(nerfro.train.RayDataModule, "train_dataloader", remove)
     finished = train()
     assert finished.code == 1
-    assert "was removed while it was written to" in finished.err
+    assert "was removed or replaced while nerfro was writing to the folder" in finished.err
     assert not (tmp_path / "run").exists()
 
 
@@ -179,10 +179,10 @@ def test_file_in_place_of_the_run_folder_is_told(below: str, train: Callable[...
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_folder_is_held_several_times_over_by_one_process(tmp_path: Path) -> None:
-    with held(tmp_path, "out"):
-        with held(tmp_path, "out"):
-            assert not is_held(tmp_path), "only other processes count"
+def test_folder_is_locked_several_times_over_by_one_process(tmp_path: Path) -> None:
+    with lock_folder(tmp_path, "out"):
+        with lock_folder(tmp_path, "out"):
+            assert not is_locked(tmp_path), "only other processes count"
         write_atomically(tmp_path / "a", "b")
     assert (tmp_path / "a").is_file()
 
@@ -206,7 +206,7 @@ def test_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with (
         pytest.raises(NerfroError, match=r"cannot write to out=.*/file/run: .*; choose another out"),
-        held(tmp_path / "file" / "run", "out"),
+        lock_folder(tmp_path / "file" / "run", "out"),
     ):
         pass
 

@@ -1,4 +1,4 @@
-"""A folder belongs to one run: one process writes to it, and what the run did not make stays as it is."""
+"""Locks of output folders: only one process writes to a folder, and files of other origin are preserved."""
 
 from __future__ import annotations
 
@@ -10,49 +10,53 @@ from filelock import FileLock, Timeout
 
 from nerfro.errors import NerfroError, first_of
 
-_LOCK, PARTIAL = ".lock", ".partial"  # the second ends the names of files that are being written
-_held: dict[Path, int] = {}  # folders of this process, and the inode of each one's lock
+_LOCK, PARTIAL = ".lock", ".partial"  # lock file, and ending of files that are being written
+_locked: dict[Path, int] = {}  # folders that this process has locked, with the inode of each lock file
 
 
 @contextlib.contextmanager
-def held(folder: Path, option: str) -> Iterator[None]:
-    """Hold a folder, made if need be, for this process alone; `option` names it in what the user is told.
+def lock_folder(folder: Path, option: str) -> Iterator[None]:
+    """Lock a folder for this process, and create the folder if needed.
 
-    A process may hold a folder several times over. One in which nothing was made is left as it was.
+    A process may lock a folder several times. A folder without new files at the end is restored to its earlier state.
+
+    Args:
+        folder: folder to lock.
+        option: option that names the folder, for messages.
 
     Raises:
-        NerfroError: another process holds it, or it cannot be written to.
+        NerfroError: another process has locked the folder, or the folder is not writable.
     """
     folder = folder.absolute()
-    new = [path for path in (folder, *folder.parents) if not path.exists()]
+    created = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         before = {path.name for path in folder.iterdir()}
         lock = FileLock(folder / _LOCK, is_singleton=True)
         lock.acquire(blocking=False)
-        _held[folder] = (folder / _LOCK).stat().st_ino
+        _locked[folder] = (folder / _LOCK).stat().st_ino
     except Timeout as error:
         raise NerfroError(
             f"another process is writing to {folder}; wait until it has ended, or choose another {option}"
         ) from error
-    except (OSError, NotImplementedError) as error:  # or a file system that knows no locks
+    except (OSError, NotImplementedError) as error:  # NotImplementedError: a file system without locks
         reason = getattr(error, "strerror", None) or error
         raise NerfroError(f"cannot write to {option}={folder}: {reason}; choose another {option}") from error
     try:
         yield
     finally:
         if lock.lock_counter == 1:
-            del _held[folder]
+            del _locked[folder]
             with contextlib.suppress(OSError):
                 if {path.name for path in folder.iterdir()} - before == {_LOCK}:
                     (folder / _LOCK).unlink()
-                    for path in new:
+                    for path in created:
                         path.rmdir()
         lock.release()
 
 
-def is_held(folder: Path) -> bool:
-    """Whether another process writes to a folder."""
+def is_locked(folder: Path) -> bool:
+    """Check whether another process has locked a folder."""
     if not (folder / _LOCK).exists():
         return False
     try:
@@ -62,29 +66,29 @@ def is_held(folder: Path) -> bool:
         return True
 
 
-def require_held(path: Path) -> None:
-    """Refuse to make a file again in a folder that this process holds and somebody has removed or replaced."""
-    for folder, inode in _held.items():
+def require_lock(path: Path) -> None:
+    """Raise an error if a folder above `path` is locked by this process, but was removed or replaced."""
+    for folder, inode in _locked.items():
         if not path.absolute().is_relative_to(folder):
             continue
         try:
-            gone = (folder / _LOCK).stat().st_ino != inode
+            removed = (folder / _LOCK).stat().st_ino != inode
         except OSError:
-            gone = True
-        if gone:
-            raise NerfroError(f"{folder} was removed while it was written to, so this ends here; start again")
+            removed = True
+        if removed:
+            raise NerfroError(f"{folder} was removed or replaced while nerfro was writing to the folder; start again")
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove what killed processes were writing in a folder; what others write in folders that they hold stays."""
+    """Remove partial files of killed processes, except in subfolders that other processes have locked."""
     for partial in folder.rglob(f".*{PARTIAL}"):
         below = [path for path in partial.parents if path != folder and path.is_relative_to(folder)]
-        if not any(map(is_held, below)):
+        if not any(map(is_locked, below)):
             partial.unlink(missing_ok=True)
 
 
-def require_own(folder: Path, allowed: tuple[str, ...], advice: str) -> None:
-    """Refuse a folder that holds more than `allowed`; hidden files are never written and do not count."""
+def require_only(folder: Path, allowed: tuple[str, ...], advice: str) -> None:
+    """Raise an error if a folder contains other files than `allowed`; hidden files are ignored."""
     found = sorted(path.name for path in folder.iterdir() if not path.name.startswith(".")) if folder.is_dir() else []
     foreign = [name for name in found if name not in allowed]
     if foreign:
