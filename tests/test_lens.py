@@ -107,12 +107,3 @@ def test_radii_follow_the_area_of_the_pixel(cameras):
     area = torch.linalg.cross(across, down).norm(dim=-1) / 4
     expected = 2 / 12**0.5 * area.sqrt() / plane[1:-1, 1:-1].norm(dim=-1)
     torch.testing.assert_close(rays.radii.double().reshape(36, 48)[1:-1, 1:-1], expected, rtol=2e-3, atol=0)
-
-
-def test_projection_by_hand_and_behind_the_camera():
-    pose = torch.eye(4)[None, :3]
-    one = torch.ones(1)
-    camera = Cameras(pose, 100 * one, 100 * one, 32 * one, 24 * one, 64, 48, 0.1, 9.0)
-    pixels, depth = camera.project(torch.tensor([[0.4, 0.2, -4.0], [0.0, 0.0, 3.0]]))
-    torch.testing.assert_close(pixels[0, 0], torch.tensor([42.0, 19.0]))
-    assert depth[0].tolist() == [4.0, -3.0]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -162,11 +160,3 @@ def test_options_out_of_range_are_refused_before_anything_is_written(tmp_path, o
         check_settings(config, SynthesizeConfig)
         synthesize(config)
     assert not (tmp_path / "scene").exists()
-
-
-def test_a_misspelt_option_is_one_line_and_status_one():
-    command = [sys.executable, "-m", "nerfro.synthesize", "resolutoin=12"]
-    result = subprocess.run(command, capture_output=True, text=True, cwd=CONF_DIR.parent)
-    assert result.returncode == 1
-    assert "resolutoin" in result.stderr
-    assert len(result.stderr.strip().splitlines()) == 1

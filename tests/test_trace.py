@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import pytest
 import trimesh
 
 import nerfro.trace
+from tests.conftest import finish
 
 
 @pytest.fixture
@@ -18,15 +18,11 @@ def trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     """Run the entry point in this process on a glass ball; returns what it printed."""
     trimesh.creation.icosphere(4, 0.8).export(tmp_path / "ball.ply")
     monkeypatch.chdir(tmp_path)
+    common = ["medium.mesh=ball.ply", "medium.resolution=64", "medium.cache=false", "rays=rays.npz", "out=out.npz"]
 
     def run(*overrides: str) -> str:
-        common = ["medium.mesh=ball.ply", "medium.resolution=64", "medium.cache=false", "rays=rays.npz", "out=out.npz"]
-        monkeypatch.setattr(sys, "argv", ["nerfro.trace", *common, *overrides])
-        try:
-            nerfro.trace.main()
-        except SystemExit:
-            return capsys.readouterr().err
-        return capsys.readouterr().out
+        done = finish(nerfro.trace.main, [*common, *overrides], monkeypatch, capsys)
+        return done.err if done.code else done.out
 
     return run
 

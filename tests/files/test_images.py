@@ -24,14 +24,9 @@ def test_every_level_survives_a_file(tmp_path: Path) -> None:
     loaded = load_png(tmp_path / "new" / "picture.png")
     assert torch.equal((loaded * 255).round().long(), levels)
     assert torch.equal(loaded, round_to_8bit(loaded))
-
-
-def test_file_holds_what_another_reader_sees(tmp_path: Path) -> None:
-    rgb = torch.rand(7, 9, 3, generator=torch.Generator().manual_seed(0))
-    save_png(tmp_path / "picture.png", rgb)
-    with Image.open(tmp_path / "picture.png") as image:
+    with Image.open(tmp_path / "new" / "picture.png") as image:
         assert image.mode == "RGB"
-        assert np.array_equal(np.asarray(image), np.rint(rgb.numpy() * 255))
+        assert np.array_equal(np.asarray(image), levels)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
