@@ -18,11 +18,13 @@ _MAX_COORDINATE = get_args(Coordinate)[1].at_most  # world units
 _MIN_COSINE_TO_TARGET, _MIN_SHARE_OF_CAMERAS = 0.87, 0.9
 # Rays begin at this fraction of the distance between the target and the nearest camera.
 _NEAR_FRACTION = 0.1
-# A point is in view if the cosine to the optical axis exceeds this value. The quantile at each end counts as outliers.
-_MIN_COSINE_IN_VIEW, _OUTLIER_QUANTILE = 0.7, 0.001
+# Quantile of the distances at each end that counts as outliers.
+_OUTLIER_QUANTILE = 0.001
 
 
-def find_bounds(poses: Float[np.ndarray, "V 3 4"], points: Float[np.ndarray, "P 3"]) -> tuple[float, float]:
+def find_bounds(
+    poses: Float[np.ndarray, "V 3 4"], slopes: Float[np.ndarray, "V 2"], points: Float[np.ndarray, "P 3"]
+) -> tuple[float, float]:
     """Estimate the near and far bounds of all cameras.
 
     With points, the bounds are 0.9 times the distance of the nearest point in any view and 1.1 times the distance of
@@ -31,6 +33,7 @@ def find_bounds(poses: Float[np.ndarray, "V 3 4"], points: Float[np.ndarray, "P 
 
     Args:
         poses: camera-to-world matrices with OpenGL axes, world units.
+        slopes: half the width and height of each image, divided by the focal length.
         points: sparse points in world units; may be empty.
 
     Returns:
@@ -40,7 +43,7 @@ def find_bounds(poses: Float[np.ndarray, "V 3 4"], points: Float[np.ndarray, "P 
         NerfroError: no points are in view and the cameras have no common target.
     """
     centres, forward = poses[:, :, 3], -poses[:, :, 2]
-    distances_in_view = [_distances_in_view(points, *camera) for camera in zip(centres, forward, strict=True)]
+    distances_in_view = [_distances_in_view(points, *camera) for camera in zip(poses, slopes, strict=True)]
     quantiles = [_OUTLIER_QUANTILE, 1 - _OUTLIER_QUANTILE]
     ranges = np.array([np.quantile(each, quantiles) for each in distances_in_view if len(each)])
     if len(ranges):
@@ -68,8 +71,9 @@ def usable_points(points: Float[np.ndarray, "P 3"], file: Path) -> Float[np.ndar
 
 
 def _distances_in_view(
-    points: Float[np.ndarray, "P 3"], centre: Float[np.ndarray, "3"], forward: Float[np.ndarray, "3"]
+    points: Float[np.ndarray, "P 3"], pose: Float[np.ndarray, "3 4"], slope: Float[np.ndarray, "2"]
 ) -> Float[np.ndarray, "Q"]:
-    offsets = points - centre
-    distances = np.linalg.norm(offsets, axis=1)
-    return distances[offsets @ forward > _MIN_COSINE_IN_VIEW * distances]
+    """Compute the distances of the points inside the view frustum; distortion is neglected."""
+    local = (points - pose[:, 3]) @ pose[:, :3]
+    inside = (np.abs(local[:, :2]) < -slope * local[:, 2:]).all(1)
+    return np.linalg.norm(local[inside], axis=1)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from nerfro.allowed import Distance, Factor
 from nerfro.data.base import Frame
-from nerfro.data.bounds import usable_points
-from nerfro.data.colmap_model import ColmapCamera, ColmapModel, read_colmap
+from nerfro.data.bounds import find_bounds, usable_points
+from nerfro.data.colmap_model import ColmapCamera, read_colmap
 from nerfro.data.frames import Every, FrameSet, PosedImages
 from nerfro.data.image_files import Alpha, read_size
 from nerfro.data.lenses import Lens
@@ -30,8 +29,8 @@ class ColmapData(PosedImages):
     resized after the reconstruction.
 
     Args:
-        root, near, far, downscale, alpha, mask_labels: see `PosedImages`. Without `near` and `far`, the bounds are 0.9
-            and 1.1 times the distances of the nearest and the farthest 3-D point.
+        root, near, far, downscale, alpha, mask_labels: see `PosedImages`. Without `near` and `far`, the bounds are
+            estimated from the 3-D points or from the cameras; see `find_bounds`.
         images: folder of the images within the root.
         model: folder of the model within the root. By default, the first model in sparse/0, sparse, colmap/sparse/0 and
             the root is used.
@@ -56,8 +55,12 @@ class ColmapData(PosedImages):
     def read(self, split: str) -> FrameSet:
         folder = self._model_folder()
         model = read_colmap(folder)
-        open_bounds = self.near is None or self.far is None
-        nearest, farthest = _distance_range(model, folder) if open_bounds else (0.0, 0.0)
+        near, far = self.near, self.far
+        if near is None or far is None:
+            poses = np.stack([image.camera_to_world for image in model.images]) * [1.0, -1.0, -1.0, 1.0]
+            cameras = [model.cameras[image.camera] for image in model.images]
+            slopes = np.array([(0.5 * c.width / c.params[0], 0.5 * c.height / c.params[0]) for c in cameras])
+            near, far = find_bounds(poses, slopes, usable_points(model.points, folder))
         images = self.held_out(model.images, self.test_every, split)
         frames = []
         for image in images:
@@ -70,7 +73,7 @@ class ColmapData(PosedImages):
         for image in images:
             camera, where = model.cameras[image.camera], f"{folder}: camera {image.camera}"
             lenses.append(lens_of(camera, where).resized((camera.width, camera.height), size, where))
-        return FrameSet(frames, lenses, "opencv", 0.9 * nearest, 1.1 * farthest)
+        return FrameSet(frames, lenses, "opencv", near, far)
 
     def _model_folder(self) -> Path:
         folders = [self.root / name for name in ((self.model,) if self.model is not None else _MODEL_FOLDERS)]
@@ -92,27 +95,3 @@ def lens_of(camera: ColmapCamera, where: str) -> Lens:
         f"{where} has the model {camera.model}, which is not supported; undistort the images with "
         "`colmap image_undistorter`, or reconstruct with PINHOLE, RADIAL, OPENCV or FULL_OPENCV"
     )
-
-
-def _distance_range(model: ColmapModel, folder: Path) -> tuple[float, float]:
-    """Find the distances of the nearest and the farthest 3-D point in any view, without 0.1 % outliers at each end."""
-    ranges, points = [], usable_points(model.points, folder)
-    for image in model.images:
-        distances = _distances_in_view(points, image.camera_to_world, model.cameras[image.camera])
-        if len(distances) > 0:
-            ranges.append(np.quantile(distances, [0.001, 0.999]))
-    if not ranges:
-        raise NerfroError(f"{folder} has no 3-D points in view to find bounds from; set data.near and data.far")
-    near, far = np.array(ranges).T
-    return float(near.min()), float(far.max())
-
-
-def _distances_in_view(
-    points: Float[np.ndarray, "P 3"], pose: Float[np.ndarray, "3 4"], camera: ColmapCamera
-) -> Float[np.ndarray, "Q"]:
-    """Distances of the points inside the view frustum; distortion is neglected."""
-    local = (points - pose[:, 3]) @ pose[:, :3]
-    local = local[local[:, 2] > 0]
-    slope = 0.5 * np.array([camera.width, camera.height]) / camera.params[0]
-    inside = (np.abs(local[:, :2]) < slope * local[:, 2:]).all(-1)
-    return np.linalg.norm(local[inside], axis=-1)

@@ -211,7 +211,8 @@ def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
 def _camera(model: str, width: int, height: int, params: tuple[float, ...], where: str) -> ColmapCamera:
     if model in _NUM_PARAMS and len(params) != _NUM_PARAMS[model]:
         raise NerfroError(f"{where}: {model} has {_NUM_PARAMS[model]} parameters, not {len(params)}; export it again")
-    if width < 1 or height < 1 or not np.isfinite(params).all():
+    # The first parameter of every model is a focal length.
+    if width < 1 or height < 1 or not np.isfinite(params).all() or min(params[:1], default=1) <= 0:
         raise NerfroError(
             f"{where}: size {width}x{height} and parameters {params} are not valid; export the model again"
         )

@@ -11,7 +11,7 @@ import numpy as np
 from nerfro.allowed import Distance, Factor
 from nerfro.data.bounds import find_bounds, usable_points
 from nerfro.data.frames import SPLITS, Every, FrameSet, PosedImages
-from nerfro.data.image_files import Alpha
+from nerfro.data.image_files import Alpha, read_size
 from nerfro.data.masks import find_mask
 from nerfro.data.transforms import Manifest, find_splits, parse_manifest, read_manifest
 from nerfro.errors import NerfroError
@@ -82,7 +82,9 @@ class NerfstudioData(PosedImages):
         points, file = np.empty((0, 3)), manifest.document.get("ply_file_path")
         if isinstance(file, str) and (self.root / file).is_file():
             points = usable_points(load_points(self.root / file), self.root / file)
-        return find_bounds(np.stack([frame.camera_to_world for frame in manifest.frames]), points)
+        half = 0.5 * np.array(read_size(manifest.frames[0].image)[:2])
+        slopes = half / [(lens.fx, lens.fy) for lens in manifest.lenses()]
+        return find_bounds(np.stack([frame.camera_to_world for frame in manifest.frames]), slopes, points)
 
     def _choose(self, manifest: Manifest, split: str) -> list[int]:
         """Return the indices of the frames of a split."""

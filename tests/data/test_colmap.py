@@ -142,10 +142,17 @@ def test_points_and_poses_beyond_all_coordinates_do_not_give_bounds(write):
         load(root)
 
 
-def test_without_points_bounds_must_be_given(write):
+@pytest.mark.parametrize("focal", [0.0, -FX])
+def test_focal_lengths_that_are_not_positive_are_refused(write, focal):
+    with pytest.raises(NerfroError, match=r"camera 1: size 24x18 and parameters .* are not valid"):
+        load(write(cameras={1: ("PINHOLE", (focal, FY, CX, CY))}), near=None, far=None)
+
+
+def test_without_points_bounds_come_from_the_cameras(write):
     root = write(points=np.zeros((0, 3)))
-    with pytest.raises(NerfroError, match=r"no 3-D points in view to find bounds from; set data\.near and data\.far"):
-        load(root, far=None)
+    cameras = load(root, near=None, far=None).cameras
+    assert 0 < cameras.near < 1  # the cameras look at about the origin from a distance of 3
+    assert 5 < cameras.far < 7
     (root / "sparse/0/points3D.bin").unlink()
     assert len(load(root)) == 4
 
