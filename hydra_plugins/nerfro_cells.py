@@ -75,7 +75,7 @@ class CellSweeper(BasicSweeper):
         assert self.config is not None
         assert self.launcher is not None
         cells = self._cells(arguments)
-        before = [cell.look() for cell in cells]
+        before = [cell.state() for cell in cells]
         wanted = {State.OPEN, State.FAILED} if self._retry_failed else {State.OPEN}
         to_run = [cell for cell, (state, _) in zip(cells, before, strict=True) if state in wanted]
         folder = self.config.hydra.sweep.dir
@@ -86,7 +86,7 @@ class CellSweeper(BasicSweeper):
         if to_run:
             self._launch(to_run)
 
-        ends = [cell.look() for cell in cells]
+        ends = [cell.state() for cell in cells]
         missing = [(cell, end) for cell, end in zip(cells, ends, strict=True) if end[0] is not State.FINISHED]
         print(f"nerfro: sweep {folder}: {len(cells) - len(missing)} of {len(cells)} cells finished")
         for cell, (state, reason) in missing:

@@ -48,6 +48,8 @@ EXIT_BROKEN_PIPE = 141  # exit status of a program that SIGPIPE has ended, in a 
 #   "medium[SdfGrid].smoothing_size": None                the same in old runs for one class, where others keep it
 RENAMED: dict[str, str | None] = {
     "camera.hold_world": "camera.fix_gauge",
+    "loss=nearby": "near_camera",
+    "loss.nearby": "loss.near_camera",
     "batches.hold_back": "batches.num_validation_views",
     "batches.object": "batches.object_fraction",
     "optimizer.boundary_first": "optimizer.boundary_steps",

@@ -18,7 +18,7 @@ from nerfro.evaluation.tables import report
 from nerfro.evaluation.treatments import score_split
 from nerfro.fields.mlp import compile_networks
 from nerfro.subdivision import Subdivision
-from nerfro.training.boundary_first import BoundaryFirst
+from nerfro.training.background_pretraining import BackgroundPretraining
 from nerfro.training.callbacks import StopOnSignal, Throughput
 from nerfro.training.camera_steps import CameraSteps
 from nerfro.training.config import TrainConfig, build_data, build_model
@@ -55,7 +55,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     require_same_run(folder, checkpoint, config, renderer)
     throughput, interruption = Throughput(), StopOnSignal()
     # Cameras move by sky and outlines before the sky is learned.
-    cameras, boundary = CameraSteps(training), BoundaryFirst(config.optimizer.boundary_steps, interruption)
+    cameras, boundary = CameraSteps(training), BackgroundPretraining(config.optimizer.boundary_steps, interruption)
     trainer = make_trainer(config, folder, throughput, [interruption, cameras, boundary, Viewer(config, source, test)])
     batches = traced(batches.share(trainer.global_rank, trainer.world_size), renderer, config)
     datamodule = RayDataModule(batches, validation, config.evaluation.every)
@@ -77,8 +77,8 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     if not trainer.is_global_zero:
         return
     if interruption.received:
-        command = f"hydra.run.dir={folder} ckpt_path=last"
-        print(f"nerfro: interrupted after step {trainer.global_step} and saved; to go on, repeat it with {command}")
+        done = f"interrupted after step {trainer.global_step} and saved"
+        print(f"nerfro: {done}; to resume, repeat the command with hydra.run.dir={folder} ckpt_path=last")
         sys.exit(EXIT_INTERRUPTED)
 
     write_cameras(folder / "cameras.json", renderer.to(device).scene.camera, training)

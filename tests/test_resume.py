@@ -115,7 +115,8 @@ def test_interrupted_run_saves_and_says_how_to_go_on(start: Callable[..., Comman
     assert 4 <= steps <= 8
     folder = tmp_path / "run"
     expected = (
-        f"interrupted after step {steps} and saved; to go on, repeat it with hydra.run.dir={folder} ckpt_path=last"
+        f"interrupted after step {steps} and saved; "
+        f"to resume, repeat the command with hydra.run.dir={folder} ckpt_path=last"
     )
     assert expected in process.printed
     # What the message says works, and goes on from there.
@@ -167,7 +168,7 @@ def test_interrupted_evaluation_says_how_to_go_on(
         finished = train_here(*training, f"hydra.run.dir={run}")
     assert finished.code == 130
     advice = f"hydra.run.dir={run} ckpt_path=last"
-    assert finished.err.splitlines()[-1] == f"nerfro: interrupted; to go on, repeat it with {advice}"
+    assert finished.err.splitlines()[-1] == f"nerfro: interrupted; to resume, repeat the command with {advice}"
     assert not (run / "metrics.json").exists()
     # What the message says works.
     assert train_here(*training, *advice.split()).code == 0
@@ -189,7 +190,7 @@ def test_folder_of_another_run_is_refused_and_kept(
     before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
     finished = train_here(*overrides, "seed=1")
     assert finished.code == 1
-    assert "go on with a run (ckpt_path=last) or choose another folder (hydra.run.dir=...)" in finished.err
+    assert "resume a run (ckpt_path=last) or choose another folder (hydra.run.dir=...)" in finished.err
     assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == before
 
 

@@ -1,4 +1,4 @@
-"""Light that stops where a photograph shows the plain backdrop that it is cut out on."""
+"""Penalty for density in front of a plain backdrop of the photographs."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from nerfro.registry import register
 from nerfro.rendering import Scene
 from nerfro.types import Batch, Rendering
 
-# A level of 255, and what rounding adds.
+# Tolerance of one level of 255, plus rounding errors.
 _NEAR = 1.5 / 255
 
 
 def shows(rgb: Float[Tensor, "*batch 3"], backdrop: Float[Tensor, "3"]) -> Bool[Tensor, "*batch"]:
-    """Which pixels have the backdrop's colour."""
+    """Return which pixels have the colour of the backdrop."""
     return ((rgb - backdrop).abs() < _NEAR).all(-1)
 
 
 @register("loss", "backdrop")
 class Backdrop(Loss):
-    """Mean share of light that stops somewhere on the way, of the rays whose pixels show a plain backdrop.
+    """Penalize the opacity of rays whose pixels show a plain backdrop.
 
-    White before white contradicts no photograph. Without this loss, walls stand where few cameras look, and hide the
-    object from other places. With it, silhouettes carve them away.
+    White density in front of a white backdrop contradicts no photograph. Without this loss, such density remains where
+    few cameras look, and hides the object from other directions.
 
     Args:
-        colour: of the backdrop (sRGB in [0, 1]). By default it is found from the training views; where they have no
-            such backdrop the loss is 0.
+        colour: colour of the backdrop, sRGB in [0, 1]. By default, the colour is derived from the training views; the
+            loss is 0 for views without a plain backdrop.
     """
 
     colour: Float[Tensor, "3"] | None

@@ -1,4 +1,4 @@
-"""What a loss is, and its weight's schedule."""
+"""Base class of losses, and the schedule of their weights."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from nerfro.types import Batch, Rendering
 class Loss(nn.Module, ABC):
     """A term of the training objective.
 
-    Every loss has the settings `loss.NAME.weight`, `start` and `ramp`. They are no parameters of the constructor: the
-    registry sets them, and a subclass overrides their defaults as class attributes.
+    Every loss has the settings `loss.NAME.weight`, `start` and `ramp`. The registry sets these attributes after
+    construction, and subclasses override the defaults as class attributes.
 
     Attributes:
         weight: final weight.
         start: number of optimizer steps during which the weight is zero.
-        ramp: number of steps after that over which the weight grows linearly.
+        ramp: number of steps after `start` during which the weight grows linearly.
     """
 
     SETTINGS: ClassVar = ("weight", "start", "ramp")
@@ -38,4 +38,10 @@ class Loss(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
-        """Unweighted value, averaged over the batch."""
+        """Compute the unweighted loss, averaged over the pixels of the batch.
+
+        Args:
+            renderings: one rendering for each sampling level, the finest last.
+            batch: training pixels and rays.
+            scene: everything that is learned.
+        """

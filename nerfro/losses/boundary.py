@@ -1,4 +1,4 @@
-"""The boundary regulariser."""
+"""Boundary regularizer of the paper."""
 
 from __future__ import annotations
 
@@ -11,19 +11,20 @@ from nerfro.registry import register
 from nerfro.rendering import Scene
 from nerfro.types import Batch, Rendering
 
-# Rays count whose transmittance at the end is above this, as in the paper.
+# Rays count if their final transmittance is above this value, as in the paper.
 _MIN_TRANSMITTANCE = 0.5
 
 
 @register("loss", "boundary")
 class BoundaryRegulariser(Loss):
-    """Where most light passes, the boundary alone shall explain the pixel: |T C'(d) - C|, T > 1/2 (Eqn. lossBD).
+    """Penalize |T C'(d) - C| where the final transmittance T is above 1/2 (paper, Eqn. lossBD).
 
-    The boundary's colour is held fixed, so only the finest level's density learns: it clears fog from the surface.
-    Channels are summed and the sum over rays is divided by their number plus one, as in the authors' code.
+    The background alone should explain such pixels. Only the density of the finest level learns, because the colour of
+    the background is detached; the loss removes fog in front of the surface. Channels are summed, and the sum over
+    rays is divided by the number of rays plus one, as in the authors' code.
 
     Args:
-        refracted_only: count only rays that meet the medium.
+        refracted_only: whether to count only rays that meet the medium.
     """
 
     weight, start = 0.025, 2500
@@ -41,5 +42,5 @@ class BoundaryRegulariser(Loss):
         background = path.per_ray(fine.transmittance[:, None] * fine.boundary_rgb.detach())
         shown = scene.colour_space.to_srgb(batch.per_pixel(background))
         error = (shown - batch.rgb).abs().sum(-1)
-        # Processes average their gradients: each brings its sum as often as there are processes.
+        # Gradients are averaged over processes, so each process multiplies its sum by the number of processes.
         return (error * counts).sum() * rank_and_size()[1] / (sum_over_processes(counts.sum()) + 1)

@@ -1,4 +1,4 @@
-"""The distortion loss, on arc length."""
+"""Distortion loss on arc length."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from nerfro.types import Batch, Rendering
 
 @register("loss", "distortion")
 class Distortion(Loss):
-    """Spread of the last level's weights along each path, which fog has and surfaces have not (mip-NeRF 360, Eqn. 15).
+    """Penalize the spread of the weights of the finest level along each path, such as fog (mip-NeRF 360, Eqn. 15).
 
-    Arc length is measured in units of the path's length, far - near, so that the weight does not depend on the scene's
-    scale; contracted length, where space is contracted, in units of all of it. There what passes all samples counts as
-    well, at infinity: a loss of what is stopped alone would make things transparent.
+    Arc length is measured in units of the length of the path, far - near, so that the loss does not depend on the scale
+    of the scene. If space is contracted, contracted length is measured in units of the total contracted length, and
+    the final transmittance counts as a weight at infinity, because the loss would otherwise favour transparency.
     """
 
     weight = 1e-2
@@ -30,20 +30,20 @@ class Distortion(Loss):
         if (measure := rendering.samples.measure) is not None:
             near, far = torch.zeros_like(near), measure[:, -1:]
             weights, edges = torch.cat([weights, rendering.transmittance[:, None]], -1), torch.cat([measure, far], -1)
-        # A path of no length has no weights either; the clamp only keeps the quotient a number.
+        # Paths of zero length have no weights; the clamp avoids a division by zero.
         edges = (edges - near) / (far - near).clamp(min=1e-6)
         return batch.per_pixel(rendering.path.per_ray(distortion(weights, edges))).mean()
 
 
 def distortion(weights: Float[Tensor, "R N"], edges: Float[Tensor, "R N+1"]) -> Float[Tensor, "R"]:
-    """Integral of w(u) w(v) |u - v| over u and v, for weights spread evenly over their intervals.
+    """Integrate w(u) w(v) |u - v| over u and v, for weights that are constant in their intervals.
 
-    sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 (e_{i+1} - e_i), with interval midpoints m (mip-NeRF 360, Eqn. 15). The
-    double sum takes linear time: midpoints ascend, so it is twice the sum over i of w_i (m_i W_i - M_i), where W_i and
-    M_i are the sums of w_j and w_j m_j over j < i.
+    The integral is sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 (e_{i+1} - e_i), with interval midpoints m (mip-NeRF
+    360, Eqn. 15). Because midpoints ascend, the double sum is twice the sum over i of w_i (m_i W_i - M_i), where W_i
+    and M_i are the sums of w_j and w_j m_j over j < i, and takes linear time.
     """
     midpoints = 0.5 * (edges[:, 1:] + edges[:, :-1])
-    # Distances count, not places: from the middle of the path there is less cancellation between the two sums.
+    # Only distances matter. Positions relative to the mean reduce cancellation between the two sums.
     midpoints = midpoints - midpoints.mean(-1, keepdim=True)
     moments = weights * midpoints
     weights_before = weights.cumsum(-1) - weights

@@ -1,4 +1,4 @@
-"""Light that passes all of the volume."""
+"""Penalty for light that passes the whole volume."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from nerfro.types import Batch, Rendering
 
 @register("loss", "opaque")
 class Opaque(Loss):
-    """Mean square of the transmittance at the end of each ray: where the field is all of space, every ray ends in it.
+    """Penalize the squared final transmittance of each ray, for fields that cover all of space.
 
-    A boundary beyond of any colour would otherwise explain things of that colour, and show through where they stand.
-    The loss is what a background of random grey of that variance would cost on average.
+    Otherwise, a background of constant colour would replace objects of the same colour. The loss equals the mean cost
+    of a background of random grey with unit variance.
     """
 
     weight = 1e-2

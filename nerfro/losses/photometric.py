@@ -1,4 +1,4 @@
-"""The re-rendering error."""
+"""Photometric loss."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from nerfro.types import Batch, Rendering
 
 @register("loss", "photometric")
 class Photometric(Loss):
-    """Mean squared colour error of the last level, plus that of earlier ones (paper, Eqn. lossRGB).
+    """Compute the mean squared colour error of all sampling levels (paper, Eqn. lossRGB).
 
-    The mean is over pixels and channels, as in the authors' code; the paper's norm is three times that.
+    The mean is over pixels and channels, as in the authors' code; the norm in the paper is three times larger.
 
     Args:
-        coarse: factor of the earlier levels' errors; 1 in the paper, 0.1 in mip-NeRF.
+        coarse: factor of the errors of coarser levels; 1 in the paper, 0.1 in mip-NeRF.
     """
 
     def __init__(self, coarse: NotNegative = 1.0) -> None:

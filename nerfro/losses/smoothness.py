@@ -1,4 +1,4 @@
-"""The smoothness of the boundary."""
+"""Smoothness loss of the background."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from nerfro.types import Batch, Exits, Rendering
 
 @register("loss", "smoothness")
 class Smoothness(Loss):
-    """Squared differences of the boundary's colour between neighbouring directions of a tile (Eqn. lossS).
+    """Penalize squared differences of the background colour between neighbouring directions (paper, Eqn. lossS).
 
     Args:
-        tile_size: side in pixels of a random window of a random training view, whose directions are the tile.
+        tile_size: side in pixels of a random window of a random training view, whose viewing directions are compared.
     """
 
     start = 2500
@@ -35,5 +35,5 @@ class Smoothness(Loss):
 
 
 def tile_roughness(rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
-    """Half the mean squared difference between horizontal neighbours plus the same for vertical ones."""
+    """Average the mean squared differences of horizontal and of vertical neighbours."""
     return 0.5 * (rgb[:, 1:] - rgb[:, :-1]).square().mean() + 0.5 * (rgb[1:] - rgb[:-1]).square().mean()

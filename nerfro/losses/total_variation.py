@@ -1,4 +1,4 @@
-"""Total variation of the boundary."""
+"""Total-variation loss of the background."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _NUM_PAIRS = 1024
 
 @register("loss", "total_variation")
 class TotalVariation(Loss):
-    """Absolute difference of the boundary's colour between directions `angle` apart, all over the sphere.
+    """Penalize absolute differences of the background colour between random directions at a fixed angle.
 
-    Unlike `smoothness`, which squares differences, it does not prefer many small steps to one edge (Rudin, Osher and
-    Fatemi, 1992), and it reaches directions in which no training ray leaves.
+    Unlike `smoothness`, which squares differences, the loss does not prefer many small steps to one edge (Rudin, Osher
+    and Fatemi, 1992), and covers the whole sphere, including directions in which no training ray leaves.
 
     Args:
-        angle: between the two directions of a pair, degrees; about a texel of the boundary.
+        angle: angle between the two directions in degrees, about one texel of the background.
     """
 
     weight = 1e-3

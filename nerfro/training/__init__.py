@@ -1,1 +1,1 @@
-"""What happens around a model while it trains: batches, callbacks, logs, and the run's folder."""
+"""Training of models: configuration, batches, Lightning, run folders and sweeps."""

@@ -1,4 +1,4 @@
-"""What happens around training: progress, throughput, interruption, and the record in the checkpoint."""
+"""Callbacks of training: progress, throughput, interruption, and the configuration in checkpoints."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from nerfro.types import Batch
 
 
 class Throughput(Callback):
-    """Counts rays and the seconds spent on training steps, over resumed runs too, and logs `train/rays_per_second`.
+    """Count rays and the seconds of training steps, including resumed runs, and log `train/rays_per_second`.
 
-    Where several processes share a batch, each is taken to have as many rays as this one.
+    All processes are assumed to have the same number of rays.
 
     Attributes:
         num_rays: rays trained on so far.
@@ -67,7 +67,7 @@ _FORM = "{desc} {percentage:3.0f}%|{bar}| "
 
 
 class TrainingProgress(ProgressBar):
-    """One line with the share of the budget (steps or time) that is spent, the ETA, rays/s and the batch's PSNR."""
+    """Show one line with the progress (in steps or time), the remaining time, rays per second and PSNR."""
 
     _UPDATE_SECONDS = 0.5
 
@@ -98,7 +98,7 @@ class TrainingProgress(ProgressBar):
         eta = tqdm.format_interval((1 - done) / rate) if rate > 0 else "?"
         shown = trainer.callback_metrics
         self._bar.n = done
-        # Not tqdm's postfix, which is always led by a comma.
+        # tqdm would add a comma before a postfix.
         self._bar.bar_format = _FORM + (
             f"step {trainer.global_step} ETA {eta} {self._throughput.rays_per_second or 0:,.0f} rays/s "
             f"train PSNR {-10 * math.log10(max(float(outputs['squared_error']), 1e-10)):.2f}"
@@ -117,10 +117,9 @@ class TrainingProgress(ProgressBar):
 
 
 class Agreements:
-    """Choose the steps, about half a second apart, at which several processes exchange what only one of them knows.
+    """Choose the steps, about half a second apart, at which several processes exchange information.
 
-    An exchange makes each process wait for its device and for the other processes. One process needs no exchange, and
-    may ask at every step.
+    An exchange makes each process wait for its device and for the other processes. A single process needs no exchange.
     """
 
     _SECONDS, _MOST_STEPS = 0.5, 1000
@@ -130,7 +129,7 @@ class Agreements:
         self._last: tuple[int, float] | None = None
 
     def due(self, trainer: Trainer) -> bool:
-        """Count a step, and tell whether processes agree at this one; all of them get the same answer."""
+        """Count a step, and return whether processes exchange information; all processes get the same answer."""
         if trainer.world_size == 1:
             return True
         self._step += 1
@@ -147,10 +146,10 @@ class Agreements:
 
 
 class SharedTimer(Timer):
-    """Lightning's timer, with one time for all processes.
+    """Timer of Lightning, with one time for all processes.
 
-    The time of the first process is taken over at each agreement. All learning rates and the end of training depend on
-    it, and parameters of processes with different times would drift apart.
+    All processes use the time of the first process, because learning rates and the end of training depend on the time,
+    and parameters of processes with different times would diverge.
     """
 
     state_key = "Timer"  # type: ignore[assignment]  # as Lightning's in checkpoints
@@ -179,7 +178,7 @@ class SharedTimer(Timer):
 
 
 class Checkpoints(ModelCheckpoint):
-    """Lightning's checkpoints, for which several processes look at the clock together now and then."""
+    """Checkpoints of Lightning, with a common clock for several processes."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -191,12 +190,12 @@ class Checkpoints(ModelCheckpoint):
 
 
 class StopOnSignal(Callback):
-    """Ends training after the current step on Ctrl-C or SIGTERM, so that it can be saved whole and resumed.
+    """End training after the current step on Ctrl-C or SIGTERM, so that a complete checkpoint is saved.
 
-    Several processes end together, within about half a second, whichever of them the signal reached.
+    If any process receives the signal, all processes end within about half a second.
 
     Attributes:
-        received: whether that happened.
+        received: whether a signal has ended training.
     """
 
     def __init__(self) -> None:
@@ -220,7 +219,7 @@ class StopOnSignal(Callback):
         self.stop(trainer)
 
     def stop(self, trainer: Trainer) -> bool:
-        """End training if a signal has arrived; tell whether it ends. Every process asks at the same steps."""
+        """End training if a signal has arrived; returns whether training ends. All processes must call this method."""
         if self._agreements.due(trainer) and trainer.strategy.reduce_boolean_decision(self._signalled, all=False):
             self.received = trainer.should_stop = True
         return self.received
@@ -235,7 +234,7 @@ class StopOnSignal(Callback):
 
 
 class ConfigInCheckpoint(Callback):
-    """Puts the resolved configuration into every checkpoint, so that the file alone tells how to rebuild the model."""
+    """Write the resolved configuration to every checkpoint, so that the file suffices to rebuild the model."""
 
     def __init__(self, config: str) -> None:
         self._config = config

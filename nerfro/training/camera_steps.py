@@ -1,4 +1,4 @@
-"""Steps of the cameras between those of the scene, where `camera=refined`."""
+"""Steps of the training cameras between training steps, for `camera=refined`."""
 
 from __future__ import annotations
 
@@ -18,24 +18,26 @@ from nerfro.geometry.interpolation import misses
 from nerfro.rays import Rays
 from nerfro.rendering import Renderer
 from nerfro.subdivision import pixel_rays
-from nerfro.training.boundary_first import occupied
+from nerfro.training.background_pretraining import occupied_box
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.module import TrainingModule
-from nerfro.training.outlines import meet_masks
+from nerfro.training.outlines import align_to_masks
 from nerfro.training.ray_batches import RayBatches
 
-# Pixels over which differences are taken, at first and at least, and their factor from one step to the next.
-_FIRST_REACH, _LEAST_REACH, _SHRINKING = 2.0, 0.5, 0.85
-# Steps that are taken whole. Of later ones always less is: errors of single steps average out.
-_WHOLE = 10
-# Scale of the robust error (sRGB) for each pixel of reach; and pixels that a camera is moved at most.
-_SCALE, _LONGEST = 0.5, 1.0
-# Pixels that are drawn for each that is looked at, so that there are enough with contrast.
-_DRAWN = 6
+# First and least distance of finite differences in pixels, and its factor from one step to the next.
+_FIRST_DIFFERENCE, _LEAST_DIFFERENCE, _DECAY = 2.0, 0.5, 0.85
+# Number of full steps. The fraction of later steps decreases, so that errors of single steps average out.
+_FULL_STEPS = 10
+# Scale of the robust error (sRGB) per pixel of difference, and maximum motion of a camera in pixels.
+_ERROR_SCALE, _MAX_PIXELS = 0.5, 1.0
+# Candidates that are drawn for each pixel; the candidates with the most contrast are used.
+_NUM_CANDIDATES = 6
 
 
 class CameraSteps(Callback):
-    """Moves the training cameras by sky and outlines before training, and at some steps, with the scene held.
+    """Align the training cameras by background and outlines before training, and refine them at some steps.
+
+    The scene is fixed during these steps.
 
     Args:
         views: training views.
@@ -44,17 +46,17 @@ class CameraSteps(Callback):
     def __init__(self, views: Views) -> None:
         self._views = views
         self._priors: dict[str, PriorInformation] = {}  # by source
-        self._aligned = False  # by sky and outlines; a run that resumes at step 0 does not repeat the alignment
+        self._aligned = False  # a run that resumes at step 0 does not repeat the alignment
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, TrainingModule)
-        scene, box = pl_module.scene, occupied(pl_module.renderer)
+        scene, box = pl_module.scene, occupied_box(pl_module.renderer)
         camera = scene.camera
         if trainer.global_step > 0 or self._aligned or box is None or not isinstance(camera, RefinedCamera):
             return
         batches = cast(RayDataModule, trainer.datamodule).batches  # type: ignore[attr-defined]
         panorama = align(camera, batches.cameras, batches.photographed, lambda rays: misses(box, rays))
-        known = {"panorama": panorama, "outlines": meet_masks(camera, self._views, scene.medium, panorama)}
+        known = {"panorama": panorama, "outlines": align_to_masks(camera, self._views, scene.medium, panorama)}
         self._priors = {name: prior for name, prior in known.items() if prior is not None}
         self._aligned = True
 
@@ -71,12 +73,13 @@ class CameraSteps(Callback):
         if not isinstance(camera, RefinedCamera) or step < camera.start or (step - camera.start) % camera.every:
             return
         data = cast(RayDataModule, trainer.datamodule)  # type: ignore[attr-defined]
-        data.make_anew()
+        data.discard_prefetched()
         before = (step - camera.start) // camera.every
-        reach = max(_LEAST_REACH, _FIRST_REACH * _SHRINKING**before)
-        # Not asked whether errors fall: every camera has painted its own ghost, which holds it where it is.
-        how = Step(reach, _SCALE * reach, _LONGEST, fraction=min(1.0, _WHOLE / (before + 1)), keep_improvements=False)
-        _move(pl_module.renderer, camera, data.batches, step, how, self._priors)
+        difference = max(_LEAST_DIFFERENCE, _FIRST_DIFFERENCE * _DECAY**before)
+        fraction = min(1.0, _FULL_STEPS / (before + 1))
+        # Errors may increase: the scene fits the current cameras, so they are at a local minimum.
+        settings = Step(difference, _ERROR_SCALE * difference, _MAX_PIXELS, fraction, keep_improvements=False)
+        _move(pl_module.renderer, camera, data.batches, step, settings, self._priors)
 
 
 @torch.no_grad()
@@ -85,15 +88,16 @@ def _move(
     camera: RefinedCamera,
     batches: RayBatches,
     step: int,
-    how: Step,
+    settings: Step,
     priors: dict[str, PriorInformation],
 ) -> None:
-    """A step of all cameras by pixels with contrast, drawn anew for each training step.
+    """Take a Gauss-Newton step of all cameras with pixels of high contrast, which are drawn for each training step.
 
-    Where a panorama tells how they are turned, what is seen past the object does not: the sky has learned it from them.
+    If the panorama has aligned the rotations, pixels of the background are not used for rotations, because the
+    background was learned from the same cameras.
     """
-    box = occupied(renderer)
-    candidates = batches.of_each_view(_DRAWN * camera.num_pixels, step)
+    box = occupied_box(renderer)
+    candidates = batches.of_each_view(_NUM_CANDIDATES * camera.num_pixels, step)
     past = None
     if "panorama" in priors and box is not None:
         view = candidates.flatten() // (batches.cameras.height * batches.cameras.width)
@@ -103,4 +107,4 @@ def _move(
     def shown(rays: Rays, view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
         return renderer.scene.colour_space.to_display(renderer.radiance(rays), camera.gains(view))
 
-    gauss_newton_step(camera, batches.cameras, pixels, batches.photographed, shown, how, list(priors.values()))
+    gauss_newton_step(camera, batches.cameras, pixels, batches.photographed, shown, settings, list(priors.values()))

@@ -1,4 +1,4 @@
-"""Checkpoints, written like every other file: whole or not at all, and only where a run still is."""
+"""Atomic writing of checkpoints."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from nerfro.files.atomic import atomic_file
 
 
 class CheckpointFiles(TorchCheckpointIO):
-    """Lightning's checkpoints, of which the old one stays until the new one is whole.
+    """Write checkpoints of Lightning atomically: the old checkpoint stays until the new one is complete.
 
-    Lightning writes to the system's temporary folder. Where that is on another disk, the file is then copied over the
-    old checkpoint, and a process that is killed meanwhile leaves neither.
+    Lightning writes to the temporary folder of the system. If the folder is on another disk, the file is copied over
+    the old checkpoint, and a process that is killed during the copy leaves no checkpoint.
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:

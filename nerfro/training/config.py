@@ -52,12 +52,12 @@ class BatchesConfig:
     # Whether the pixels of a step come from one image or from all images.
     batching: Annotated[str, Literal["single_image", "all_images"]] = "single_image"
     jitter: bool = False  # draw each ray anywhere inside its pixel instead of through its centre
-    # Fraction of the pixels of a step that is drawn from the object's alone, which masks mark; the others are from all.
+    # Fraction of the pixels of a step that is drawn only from the object, according to the masks.
     object_fraction: Annotated[float, Range(at_least=0, at_most=1)] = 0.0
-    # Training views, spread over the cameras' places, that are not trained on: they are the `val` split then.
+    # Number of training views, spread over the positions of the cameras, that are used for validation instead.
     num_validation_views: Natural = 0
     precrop_steps: Natural = 0  # number of first steps that see only the central window of the images
-    precrop_fraction: Annotated[float, Range(more_than=0, at_most=1)] = 0.5  # side of that window
+    precrop_fraction: Annotated[float, Range(more_than=0, at_most=1)] = 0.5  # relative side of the window
     # Which pixels get several rays, in training and in validation.
     subdivision: Subdivision = dataclasses.field(default_factory=lambda: Subdivision(divergence=8.0))
 
@@ -66,7 +66,7 @@ class BatchesConfig:
 class EvaluationConfig:
     """Evaluation of the trained model."""
 
-    split: str = "test"  # of the data
+    split: str = "test"  # split of the data set
     chunk_size: NumRays = 8192  # rays rendered in one chunk; bounds the memory
     # File of AlexNet weights; None searches torch's hub cache, then downloads the weights.
     lpips_backbone: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
@@ -76,8 +76,7 @@ class EvaluationConfig:
     # five times as often. 0 switches validation off.
     every: Natural = 500
     subdivision: Subdivision = dataclasses.field(default_factory=Subdivision)  # which pixels get several rays
-    # Steps in which test cameras are refined on the left halves of their photographs, to be scored on the right ones
-    # under a name of their own; 0 for none.
+    # Steps that refine test cameras on the left halves of photographs; the right halves are scored separately.
     refine_steps: Natural = 0
 
 
@@ -157,7 +156,7 @@ class TrainConfig:
     # Checkpoint to resume from, or `last` for the newest checkpoint of this experiment.
     ckpt_path: Optional[str] = None  # noqa: UP045
     viewer: bool = False  # serve an interactive page of the model during training, to browsers on this machine
-    viewer_port: Annotated[int, Range(at_least=0, at_most=65535)] = 8008  # port of that page; 0 selects a free port
+    viewer_port: Annotated[int, Range(at_least=0, at_most=65535)] = 8008  # port of the page; 0 selects a free port
     # Backend of torch.compile for the networks, such as inductor or cudagraphs on a GPU; None does not compile them.
     # Compilation takes a minute or more at the start.
     compile: Optional[str] = None  # noqa: UP045
@@ -227,7 +226,7 @@ def build_model(config: DictConfig, training: Views | None = None) -> Renderer:
     Raises:
         NerfroError: a component cannot be built.
     """
-    build_losses(config.loss, known=False)  # mistakes are told before anything is read
+    build_losses(config.loss, known=False)  # refuse mistakes before data is read
     path_sampler = build(config.sampler.path)
     medium = build(config.medium) if path_sampler.needs_medium else Vacuum()
     settle_content(config, medium, None if training is None else training.cameras)

@@ -1,4 +1,4 @@
-"""A run's trained scene: the one way from a checkpoint to pictures."""
+"""Loading of the trained scene of a run."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from nerfro.viewing.trained_scene import TrainedScene
 
 
 def load(run: str | Path, device: str = "auto", root: str | Path | None = None) -> TrainedScene:
-    """The trained scene of a run.
+    """Load the trained scene of a run.
 
     Args:
         run: folder of the run, or one of its checkpoints.
-        device: `cpu`, `cuda`, or `auto` for a GPU if there is one.
+        device: `cpu`, `cuda`, or `auto` for a GPU if available.
         root: folder of the data, if it has moved since training.
 
     Raises:
-        NerfroError: there is no readable checkpoint, or something that it was trained with is gone.
+        NerfroError: the checkpoint cannot be read, or files of the run are missing.
     """
     discover()
     checkpoint, config = load_checkpoint(checkpoint_of(run))
@@ -36,15 +36,15 @@ def load(run: str | Path, device: str = "auto", root: str | Path | None = None) 
 
 
 def checkpoint_of(run: str | Path) -> Path:
-    """The checkpoint that a run is named by: the file itself, or the last one of a run folder."""
+    """Return the checkpoint of a run: the file itself, or the last checkpoint of a run folder."""
     path = user_path(run)
     return path / LAST_CHECKPOINT if path.is_dir() else path
 
 
 def scene_of(checkpoint: dict[str, Any], config: DictConfig, device: torch.device) -> TrainedScene:
-    """The scene of a checkpoint and its configuration, of which the data and how it is evaluated may have changed."""
+    """Build the scene of a checkpoint from a configuration, whose data and evaluation may differ from training."""
     renderer = restore(checkpoint, config).to(device)
-    corners = [config.content.box_min, config.content.box_max]  # which the model has settled
+    corners = [config.content.box_min, config.content.box_max]  # derived by `build_model`
     content = None if None in corners else torch.tensor([list(corner) for corner in corners])
     return TrainedScene(
         renderer, build_data(config), Subdivision(**config.evaluation.subdivision), config.name, content

@@ -1,4 +1,4 @@
-"""What a run shows while it trains, in TensorBoard and W&B: rates and memory, pictures, and where samples lie."""
+"""Log of a run in TensorBoard and W&B: learning rates, memory, images, and histograms of samples."""
 
 from __future__ import annotations
 
@@ -23,17 +23,16 @@ from nerfro.rendering import Scene
 from nerfro.training.module import TrainingModule
 from nerfro.types import Batch, Exits, Rays, Rendering
 
-_SKY_HEIGHT = 128  # rows of the picture of the sky
-_NUM_RAYS = 128  # at most, for the histograms
-_NUM_PATHS = 12  # of these, in the picture of bent paths
+_SKY_HEIGHT = 128  # rows of the image of the background
+_NUM_RAYS = 128  # largest number of rays for the histograms
+_NUM_PATHS = 12  # number of paths in the plot of paths
 
 
 class TrainingLog(Callback):
-    """Logs settings (Weights & Biases), learning rates, memory, and images whenever a validation view is evaluated.
+    """Log settings (Weights & Biases), learning rates and memory in training, and images of validation views.
 
-    The pictures are the view beside its photograph and the error, its depth and opacity, the sky, and the paths of a
-    few rays through its middle row; the histograms tell at which arc lengths the rays of that row are sampled, for each
-    sampling level.
+    The images are the view with its photograph and the error, depth and opacity, the background, and the paths of a few
+    rays of the middle row. Histograms show the arc lengths of the samples of these rays for each sampling level.
     """
 
     def __init__(self, config: DictConfig) -> None:
@@ -71,30 +70,30 @@ class TrainingLog(Callback):
         with torch.inference_mode():
             renderings: list[Rendering] = renderer(rays)
         maps = torch.cat([outputs["depth"], outputs["opacity"]], 1)[..., None].expand(-1, -1, 3)
-        pictures = {
+        images = {
             "val/prediction_reference_error": _to_8bit(triptych(outputs["prediction"], outputs["target"])),
             "val/depth_opacity": _to_8bit(maps),
             "val/sky": sky(renderer.scene),
         }
         if not isinstance(renderer.scene.medium, Vacuum):
             shown = torch.linspace(0, len(rays) - 1, min(_NUM_PATHS, len(rays))).long().to(rays.origins.device)
-            pictures["val/paths"] = image_of_paths(renderings[-1].path.of_rays(shown), renderer.scene.medium)
+            images["val/paths"] = image_of_paths(renderings[-1].path.of_rays(shown), renderer.scene.medium)
         for logger in loggers:
-            _log_pictures(logger, pictures, trainer.global_step)
+            _log_images(logger, images, trainer.global_step)
             for level, rendering in enumerate(renderings):
-                # Rays that miss the object have their samples in a span of no length at far.
+                # The samples of rays that miss the object have intervals of zero length at far.
                 s = rendering.samples.s[rendering.samples.deltas > 0]
                 if len(s) > 0:
                     _log_histogram(logger, f"samples/arc_length_level_{level}", s, trainer.global_step)
 
 
 def learning_rates(trainer: Trainer) -> dict[str, float]:
-    """Present learning rate of each part of the model that learns (`Renderer.parameter_groups`)."""
+    """Return the current learning rate of each parameter group (`Renderer.parameter_groups`)."""
     return {group["name"]: group["lr"] for group in trainer.optimizers[0].param_groups}
 
 
 def peak_memory(device: torch.device) -> int:
-    """Most bytes that were used so far: by tensors on a GPU, by the whole process on a CPU; 0 where nobody counts."""
+    """Return the peak memory in bytes: of tensors on a GPU, of the process on a CPU; 0 if unknown."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     try:
@@ -102,12 +101,12 @@ def peak_memory(device: torch.device) -> int:
     except ImportError:  # Windows
         return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024  # kilobytes everywhere but there
+    return peak if sys.platform == "darwin" else peak * 1024  # kilobytes on other systems
 
 
 @torch.inference_mode()
 def sky(scene: Scene, height: int = _SKY_HEIGHT) -> UInt8[np.ndarray, "H 2*H 3"]:
-    """The background as a lat-long picture (see files/lat_long.py)."""
+    """Render the background as a lat-long image (see files/lat_long.py)."""
     was_training = scene.boundary.training
     scene.boundary.eval()
     try:
@@ -117,22 +116,22 @@ def sky(scene: Scene, height: int = _SKY_HEIGHT) -> UInt8[np.ndarray, "H 2*H 3"]
 
 
 def _middle_row(cameras: Cameras, view: int) -> Rays:
-    """Rays of at most `_NUM_RAYS` pixels of a view's middle row, evenly spread."""
+    """Return rays of at most `_NUM_RAYS` evenly spaced pixels of the middle row of a view."""
     rays = cameras.image_rays(view)
     first = cameras.height // 2 * cameras.width
     return rays[first : first + cameras.width : -(-cameras.width // _NUM_RAYS)]
 
 
-def _to_8bit(picture: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    return (picture.detach().float().clamp(0, 1) * 255).round().byte().cpu().numpy()
+def _to_8bit(image: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    return (image.detach().float().clamp(0, 1) * 255).round().byte().cpu().numpy()
 
 
-def _log_pictures(logger: Logger, pictures: Mapping[str, UInt8[np.ndarray, "H W 3"]], step: int) -> None:
-    for name, picture in pictures.items():
+def _log_images(logger: Logger, images: Mapping[str, UInt8[np.ndarray, "H W 3"]], step: int) -> None:
+    for name, image in images.items():
         if isinstance(logger, TensorBoardLogger):
-            logger.experiment.add_image(name, picture, step, dataformats="HWC")
+            logger.experiment.add_image(name, image, step, dataformats="HWC")
         elif isinstance(logger, WandbLogger):
-            logger.log_image(name, [picture], step=step)
+            logger.log_image(name, [image], step=step)
 
 
 def _log_histogram(logger: Logger, name: str, values: Tensor, step: int) -> None:

@@ -1,4 +1,4 @@
-"""What a run needs of the memory that there is, told before it starts."""
+"""Estimate of the memory of a run before training."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from nerfro.rays import Rays
 from nerfro.rendering import Renderer
 
 _PROBED_RAYS = 128
-# Of what autograd keeps of as many rays: a step with its backward pass, and an evaluation, in which nothing is kept.
+# Peak memory of a training step and of an evaluation, relative to the tensors that autograd saves for the same rays.
 _STEP, _EVALUATION = 2.0, 0.5
-# Compiled kernels, matrix products' programs, what logging and metrics load, and gaps between blocks.
+# Memory of compiled kernels, programs of matrix products, logging and metrics, and fragmentation.
 _LATER_BYTES = 250e6
 
 
@@ -31,9 +31,9 @@ def require_memory(
 
     Args:
         renderer: moved to `device`, because the implementations for different devices keep different tensors.
-        rays: of a part of a training batch.
-        device: that training uses.
-        share: of a batch's rays that `rays` are.
+        rays: rays of a part of a training batch.
+        device: training device.
+        share: fraction of the rays of a batch that `rays` are.
         pixel_bytes: size of the training pixels, which are copied to a GPU. On the CPU they are already in memory.
 
     Returns:
@@ -47,7 +47,7 @@ def require_memory(
     kept = _kept_bytes(renderer, probed)
     learned = sum(p.nbytes for p in renderer.parameters() if p.requires_grad)
     num_rays = len(rays) / share
-    # Gradients and Adam's two moments beside the weights.
+    # Gradients and the two moments of Adam, in addition to the weights.
     step = 3 * learned + kept * max(_STEP * num_rays, _EVALUATION * renderer.chunk_size)
     # A checkpoint is built in main memory before it is written: the state, and the moments.
     host = _LATER_BYTES + sum(tensor.nbytes for tensor in renderer.state_dict().values()) + 2 * learned
@@ -73,7 +73,7 @@ def _require(needed: float, free: float, where: str, advice: str) -> None:
 
 
 def _kept_bytes(renderer: Renderer, rays: Rays) -> float:
-    """Bytes that autograd keeps of each ray for the backward pass, parameters left out."""
+    """Count the bytes that autograd saves per ray for the backward pass, without parameters."""
     of_model = {tensor.untyped_storage().data_ptr() for tensor in renderer.state_dict().values()}
     kept: dict[int, int] = {}
 
@@ -85,6 +85,6 @@ def _kept_bytes(renderer: Renderer, rays: Rays) -> float:
 
     draws = Draws(0, 0, torch.arange(len(rays), device=rays.near.device))
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        renderings = renderer(rays, draws)  # what is kept lives as long as this does, so that no address occurs twice
+        renderings = renderer(rays, draws)  # saved tensors stay alive, so that no address occurs twice
         del renderings
     return sum(kept.values()) / len(rays)

@@ -73,7 +73,7 @@ class TrainingModule(LightningModule):
         return {"loss": total, "squared_error": error}
 
     def log(self, *args: Any, **kwargs: Any) -> None:
-        """Log a value, in training only in the steps that are written: logging took a tenth of the time of a step."""
+        """Log a value; training steps that are not written skip the call, which takes a tenth of the time of a step."""
         if self._is_logged_step or not self.trainer.training:
             super().log(*args, **kwargs)
 
@@ -85,7 +85,7 @@ class TrainingModule(LightningModule):
         for group in self.trainer.optimizers[0].param_groups:
             waits = self.global_step < self.optimizer_config.start(group["name"])
             group["lr"] = 0.0 if waits else group["initial_lr"] * factor
-        # Not at the end of the step before, which comes after its checkpoint: a resumed run would miss the update.
+        # At the end of the previous step, the update would follow the checkpoint, and a resumed run would miss it.
         if self.global_step > 0:
             self.renderer.point_sampler.after_step(list(self.scene.fields), batch.draws)  # type: ignore[arg-type]
 
@@ -103,10 +103,10 @@ class TrainingModule(LightningModule):
             return None  # one process evaluates, the others wait
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         with torch.autocast(self.device.type, enabled=False):  # directions in half precision would miss their pixels
-            held = data.watched_psnr()
-        self.log("val/psnr", held, prog_bar=True, batch_size=1, rank_zero_only=True)
+            psnr = data.validation_psnr()
+        self.log("val/psnr", psnr, prog_bar=True, batch_size=1, rank_zero_only=True)
         if view < 0:
-            return None  # no picture is due
+            return None  # no image is due
         views = data.validation
         target = views.images[view].to(self.device)
         with torch.autocast(self.device.type, enabled=False):
@@ -118,9 +118,9 @@ class TrainingModule(LightningModule):
 
 
 def training_progress(trainer: Trainer) -> float:
-    """Share of the run's budget that is spent, in [0, 1]: of `max_steps` or of `max_time`, whichever is more.
+    """Return the progress of a run in [0, 1]: the larger of the fractions of `max_steps` and of `max_time`.
 
-    Under `max_time` the schedules end when the time does, so such a run depends on the machine's speed.
+    With `max_time`, schedules depend on the speed of the machine.
     """
     progress = trainer.global_step / trainer.max_steps if trainer.max_steps > 0 else 0.0
     timer = next((c for c in trainer.callbacks if isinstance(c, Timer)), None)  # type: ignore[attr-defined]

@@ -14,13 +14,13 @@ from nerfro.allowed import Natural, NotNegative, Positive, checked
 class OptimizerConfig:
     """Adam with a log-linear learning rate and a sine warm-up (authors' code; mip-NeRF, section 4)."""
 
-    # At the beginning and the end of the run.
+    # Learning rate at the beginning and at the end of the run.
     learning_rate: Positive = 5e-4
     final_learning_rate: Positive = 5e-6
-    # Of the other parts that learn, at the beginning, decaying in proportion; none for the same.
+    # Initial learning rates of other parameter groups, with the same decay; None for the common rate.
     boundary_learning_rate: Optional[Positive] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    medium_learning_rate: Optional[Positive] = None  # noqa: UP045 - of what bends rays: indices
-    absorption_learning_rate: Optional[Positive] = None  # noqa: UP045 - of what absorbs light
+    medium_learning_rate: Optional[Positive] = None  # noqa: UP045 - refractive indices
+    absorption_learning_rate: Optional[Positive] = None  # noqa: UP045 - absorption coefficients
     exposure_learning_rate: Optional[Positive] = None  # noqa: UP045
     medium_start: Natural = 0  # steps before what bends rays learns, so that it is not misled by an unlearned scene
     # Steps before the first in which the boundary alone learns, from rays that miss the content's box; and steps after
@@ -29,20 +29,20 @@ class OptimizerConfig:
     boundary_start: Natural = 0
     warmup_steps: Natural = 2500  # length of the warm-up; 0 for none
     warmup_factor: NotNegative = 0.01  # factor of the learning rate at its first step
-    adam_epsilon: Positive = 1e-8  # of Adam
+    adam_epsilon: Positive = 1e-8  # epsilon of Adam
 
-    def rate(self, part: str) -> float:
-        """Learning rate of a part at the beginning."""
-        own: float | None = getattr(self, f"{part}_learning_rate", None)
+    def rate(self, group: str) -> float:
+        """Return the initial learning rate of a parameter group."""
+        own: float | None = getattr(self, f"{group}_learning_rate", None)
         return self.learning_rate if own is None else own
 
-    def start(self, part: str) -> int:
-        """Step from which a part learns."""
-        return getattr(self, f"{part}_start", 0)
+    def start(self, group: str) -> int:
+        """Return the step at which a parameter group begins to learn."""
+        return getattr(self, f"{group}_start", 0)
 
 
 def learning_rate_factor(step: int, progress: float, config: OptimizerConfig) -> float:
-    """Factor of the initial learning rates: log-linear decay times mip-NeRF's sine warm-up."""
+    """Return the factor of the initial learning rates: log-linear decay times the sine warm-up of mip-NeRF."""
     factor = (config.final_learning_rate / config.learning_rate) ** progress
     if config.warmup_steps > 0:
         ascent = math.sin(0.5 * math.pi * min(step / config.warmup_steps, 1.0))

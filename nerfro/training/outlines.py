@@ -1,4 +1,4 @@
-"""What the photographs' outlines tell of a surface that learns, and of the cameras."""
+"""Alignment of the training cameras to the outlines of masks."""
 
 from __future__ import annotations
 
@@ -14,29 +14,32 @@ from nerfro.data.base import Views
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 
-# Outlines are looked at in pictures of at most so many pixels a side; one is known to about this, pixels.
-_MAX_PIXELS, _KNOWN = 256, 0.25
+# Largest side of the reduced images in which outlines are compared, pixels.
+_MAX_PIXELS = 256
 
 
-def meet_masks(
+def align_to_masks(
     camera: RefinedCamera, views: Views, medium: Medium, panorama: PriorInformation | None
 ) -> PriorInformation | None:
-    """Move cameras until the surface is seen in its masks; what these tell, or none where one of both is missing.
+    """Move cameras so that the outlines of the surface agree with the masks.
 
     Args:
-        camera: what is believed of the cameras; it is changed.
-        views: of them.
-        medium: that has the surface.
-        panorama: what the sky tells.
+        camera: estimated cameras; they are changed.
+        views: training views.
+        medium: medium with the surface.
+        panorama: prior of the camera rotations from the background; None without a panorama.
+
+    Returns:
+        Prior of the cameras from the outlines; None without masks or without a surface.
     """
     if not isinstance(medium, SdfGrid) or not medium.meshes or (silhouettes := mask_silhouettes(views)) is None:
         return None
-    told = [] if panorama is None else [panorama]
-    return meet_outlines(camera, views.cameras, reduced, silhouettes, medium.meshes[0], told)
+    priors = [] if panorama is None else [panorama]
+    return meet_outlines(camera, views.cameras, reduced, silhouettes, medium.meshes[0], priors)
 
 
 def mask_silhouettes(views: Views) -> Silhouettes | None:
-    """What the masks of all views say, in smaller pictures; None where there are none."""
+    """Reduce the masks of all views; None without masks."""
     if views.masks is None:
         return None
     blocks = PixelBlocks(views.cameras, _MAX_PIXELS)
@@ -44,5 +47,5 @@ def mask_silhouettes(views: Views) -> Silhouettes | None:
 
 
 def reduced(cameras: Cameras) -> Cameras:
-    """Cameras of those smaller pictures."""
+    """Return the cameras of the reduced images."""
     return PixelBlocks(cameras, _MAX_PIXELS).cameras(cameras)

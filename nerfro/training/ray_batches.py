@@ -30,12 +30,10 @@ Batching = Literal["single_image", "all_images"]
 
 @checked("batches")
 class RayBatches:
-    """Random training pixels of every step, which depend on the seed and the step alone.
+    """Random training pixels of each step, which depend only on the seed and the step.
 
-    A run that stops and resumes therefore sees the batches that it would have seen.
-
-    The options are those of `training.config.BatchesConfig`. Batches are made on the device of the views' tensors, of
-    their usable pixels.
+    Therefore a resumed run has the same batches as an undisturbed run. Only usable pixels are drawn. See
+    `training.config.BatchesConfig` for the options.
     """
 
     def __init__(
@@ -80,7 +78,7 @@ class RayBatches:
             self._of_object = {window: _of_object(views, batching, window) for window in windows}
 
     def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> RayBatches:
-        """The same sequence with cameras and pixels on another device, its rays in another precision."""
+        """Return the same sequence on another device, with rays in another precision."""
         moved = copy.copy(self)
         moved._cameras, moved._pixels = self._cameras.to(device, dtype), self._pixels.to(device)
         return moved
@@ -93,12 +91,12 @@ class RayBatches:
     def traced(
         self, trace: Trace, trace_exits: TraceExits | None = None, subdivision: Subdivision | None = None
     ) -> RayBatches:
-        """The sequence with the paths of its rays, several for each pixel that `subdivision` divides.
+        """Return the sequence with traced paths, and several rays in pixels that `subdivision` divides.
 
         Args:
-            trace: traces rays, given the view of each.
-            trace_exits: traces the exit direction of each ray's main polyline; None takes it from `trace`.
-            subdivision: which pixels are divided; None divides none.
+            trace: function that traces rays, given the view of each ray.
+            trace_exits: function that traces only exit directions of main polylines; None to use `trace`.
+            subdivision: rule for the subdivision of pixels; None for no subdivision.
         """
         traced = copy.copy(self)
         traced._trace, traced._trace_exits = trace, trace_exits
@@ -106,11 +104,11 @@ class RayBatches:
         return traced
 
     def forget(self) -> None:
-        """Give back the memory of mapped pixels, which are read again when they are asked for."""
+        """Release the memory of mapped pixels, which are read again on demand."""
         self._pixels.forget()
 
     def share(self, rank: int, size: int) -> RayBatches:
-        """The sequence of process `rank` of `size`: an equal part of every batch, in its order."""
+        """Return the sequence of process `rank` of `size`, which has an equal part of every batch."""
         if self.batch_size % size:
             raise NerfroError(
                 f"batches.size={self.batch_size} cannot be shared evenly by {size} processes; take a multiple of {size}"
@@ -120,7 +118,7 @@ class RayBatches:
         return shared
 
     def smaller(self, most: int) -> RayBatches:
-        """A sequence of at most so many pixels a step."""
+        """Return the sequence with at most `most` pixels per step."""
         few = copy.copy(self)
         few.batch_size = min(most, self.batch_size)
         ends = (end * few.batch_size // self.batch_size for end in (self._share.start or 0, self._share.stop))
@@ -128,14 +126,14 @@ class RayBatches:
         return few
 
     def batch(self, step: int) -> Batch:
-        """The batch (or the share) of a step: a function of seed and step alone, on every device the same pixels."""
+        """Make the batch of a step, a function of seed and step with the same pixels on every device."""
         cameras = self._cameras
         height, width = cameras.height, cameras.width
         window = central_window(height, width, 1.0) if step >= self.precrop_steps else self._crop
         generator = np.random.default_rng([self.seed, step])
         view, pixel = self._draw(generator, window)
         row, column = window.top + pixel // window.width, window.left + pixel % window.width
-        # One small copy to the device; the rest is computed there.
+        # Only the pixel numbers are copied to the device.
         pixels = self._to_device(((view * height + row) * width + column)[self._share])
         slot = torch.arange(self.batch_size, device=cameras.device)[self._share]
         draws = Draws(self.seed, step, slot)
@@ -153,7 +151,7 @@ class RayBatches:
         )
 
     def _rays(self, pixels: Int[Tensor, "Q"], draws: Draws, step: int) -> PixelRays:
-        """Rays through pixels, with their paths where there is something that traces them."""
+        """Create rays through pixels, with paths if a trace function is set."""
         contrasts = None
         if step >= self.subdivision.contrast_start:
             contrasts = lambda rows: contrast(self.photographed, self._cameras, pixels[rows])  # noqa: E731
@@ -162,7 +160,7 @@ class RayBatches:
 
     @property
     def num_pixels(self) -> int:
-        """Of all views."""
+        """Number of pixels of all views."""
         return len(self._cameras) * self._cameras.height * self._cameras.width
 
     def missing(
@@ -170,15 +168,15 @@ class RayBatches:
         box: Float[Tensor, "2 3"],
         num_pixels: int,
         step: int,
-        believed: Callable[[Rays, Tensor], Rays] = lambda rays, view: rays,
+        estimated: Callable[[Rays, Tensor], Rays] = lambda rays, view: rays,
     ) -> tuple[Rays, Int[Tensor, "R"], Float[Tensor, "R 3"]]:
-        """Rays through random pixels that miss a box, their views and their colours; alike in all processes.
+        """Draw random pixels whose rays miss a box; returns rays, views and colours, equal in all processes.
 
         Args:
-            box: its corners, world units.
-            num_pixels: that are drawn.
-            step: another one draws others.
-            believed: rays of views as they are believed to be, given those of the data.
+            box: corners of the box, world units.
+            num_pixels: number of pixels to draw; pixels whose rays meet the box are dropped.
+            step: number that selects the random pixels.
+            estimated: function from rays of the data set to rays of the estimated cameras, given the views.
         """
         cameras = self._cameras
         generator = np.random.default_rng([self.seed, step, num_pixels])
@@ -190,12 +188,12 @@ class RayBatches:
             view, pixel = usable.find(generator.integers(usable.starts[-1], size=num_pixels))
             drawn = view * size + pixel
         index = self._to_device(drawn)
-        rays = believed(pixel_rays(cameras, index), index // size)
+        rays = estimated(pixel_rays(cameras, index), index // size)
         beside = misses(box, rays)
         return rays[beside], index[beside] // size, self._pixels[index[beside]]
 
     def of_each_view(self, num_pixels: int, step: int) -> Int[Tensor, "V P"]:
-        """Random usable pixels of every view; another step draws others. A view without any has its first pixel."""
+        """Draw random usable pixels of every view; for a view without usable pixels, the first pixel is returned."""
         cameras = self._cameras
         generator = np.random.default_rng([self.seed, step, num_pixels, len(cameras)])
         size, shape = cameras.height * cameras.width, (len(cameras), num_pixels)
@@ -211,24 +209,24 @@ class RayBatches:
 
     @property
     def cameras(self) -> Cameras:
-        """Of all views, as the data give them."""
+        """Cameras of all views in the data set."""
         return self._cameras
 
     def photographed(self, pixels: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
-        """Colours of pixels, numbered view by view and row by row; sRGB in [0, 1]."""
+        """Return the colours of pixels by number (view, row, column), sRGB in [0, 1]."""
         return self._pixels[pixels]
 
     def _to_device(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self._cameras.device, non_blocking=True)
 
     def _draw(self, generator: np.random.Generator, window: Window) -> tuple[np.ndarray | np.int64, np.ndarray]:
-        """Views and pixels of the window, numbered row by row."""
+        """Draw views, and pixels of the window by number (row, column)."""
         usable = None if self._usable is None else self._usable[window]
         num_pixels = window.height * window.width
         if self.batching == "single_image":
             view = generator.integers(len(self._cameras))
             first, end = (0, num_pixels) if usable is None else usable.starts[view : view + 2]
-            # Floyd's algorithm or a partial shuffle inside: far cheaper than a permutation of all pixels.
+            # `choice` does not permute all pixels and is therefore fast.
             drawn = generator.choice(end - first, self.batch_size, replace=False, shuffle=False)
             return (view, drawn) if usable is None else usable.find(first + drawn)
         if usable is not None:
@@ -238,13 +236,13 @@ class RayBatches:
             pixels = generator.integers(num_pixels, size=self.batch_size)
         if self._of_object is not None:
             of_object, count = self._of_object[window], round(self._object_fraction * self.batch_size)
-            # Spread over the batch, so that processes have the same number each.
+            # Evenly spaced in the batch, so that each process has the same number.
             rows = np.arange(count) * self.batch_size // max(1, count)
             views[rows], pixels[rows] = of_object.find(generator.integers(of_object.starts[-1], size=len(rows)))
         return views, pixels
 
     def _check_usable(self, counts: Int[np.ndarray, "V"], names: list[str]) -> None:
-        """Refuse masks that leave too few pixels to draw a batch from."""
+        """Raise an error if masks leave too few pixels for a batch."""
         precropped = " while precropped" if self.precrop_steps > 0 else ""
         fewest = int(counts.argmin())
         if self.batching == "single_image" and self.batch_size > counts[fewest]:
@@ -257,7 +255,7 @@ class RayBatches:
 
 
 def _of_object(views: Views, batching: Batching, window: Window) -> _Usable:
-    """The pixels of which the object fills more than a half."""
+    """Select the pixels that the object covers by more than half."""
     assert views.masks is not None
     if batching == "single_image":
         raise NerfroError("batches.object_fraction draws from all images at a time; take batches.batching=all_images")
@@ -273,18 +271,18 @@ def _of_object(views: Views, batching: Batching, window: Window) -> _Usable:
 
 
 class _Usable:
-    """The pixels of a window that may be drawn, numbered one view's after another's, kept as bits.
+    """Usable pixels of a window, numbered view by view and stored as bits.
 
     Args:
-        usable: whether each pixel [H, W] may be drawn, of each view.
-        num_views: their number.
-        window: of pixels.
+        usable: mask [H, W] of the usable pixels of each view.
+        num_views: number of views.
+        window: window of pixels.
 
     Attributes:
-        starts: numbers at which those of each view begin, and the end.
+        starts: number of the first usable pixel of each view, and the total number.
     """
 
-    _BLOCK = 64  # bits that are counted together
+    _BLOCK = 64  # bits per stored count
 
     def __init__(self, usable: Iterable[Bool[Tensor, "H W"]], num_views: int, window: Window) -> None:
         num_blocks = -(-window.height * window.width // self._BLOCK)
@@ -298,7 +296,7 @@ class _Usable:
         self.starts: Int[np.ndarray, "V+1"] = np.cumsum([0, *counts.sum(1)])
 
     def find(self, numbers: Int[np.ndarray, "P"]) -> tuple[Int[np.ndarray, "P"], Int[np.ndarray, "P"]]:
-        """View and pixel, row by row of the window, of usable pixels by their numbers."""
+        """Return the views, and the pixels of the window by number (row, column), of usable pixels."""
         block = np.searchsorted(self._before, numbers, side="right") - 1
         view, within = np.divmod(block, self._bits.shape[1])
         counted = np.unpackbits(self._bits[view, within], axis=-1).cumsum(-1, dtype=np.int64)

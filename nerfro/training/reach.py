@@ -1,4 +1,4 @@
-"""Whether the rays of a run meet its field, told before it trains."""
+"""Check before training that rays meet the field."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from nerfro.rays import Rays
 from nerfro.rendering import Renderer
 from nerfro.types import Batch
 
-# A share of rays that may pass the field where nothing else learns what they see.
+# Fraction of rays that may miss the field without a warning if the background does not learn.
 _FEW = 0.1
 
 
 @torch.no_grad()
 def require_reach(renderer: Renderer, batch: Batch) -> None:
-    """Refuse a field that no ray meets; warn where many pass it and see a constant.
+    """Refuse a field that no ray meets; warn if many rays miss the field and see a constant background.
 
     Raises:
-        NerfroError: every ray of the batch passes the field's box, or ends before the object or begins behind it.
+        NerfroError: every ray of the batch misses the box of the field, ends before the object or begins behind it.
     """
     _require_object(renderer, batch.rays)
     field = renderer.scene.fields[0]

@@ -1,4 +1,4 @@
-"""A run's folder: what it records so that the run can be repeated, and where its checkpoints lie."""
+"""Folder of a run: its lock, the records that allow the run to be repeated, and its checkpoints."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from nerfro.training.config import build_model, check_trained
 from nerfro.training.settings import RESUMING, first_difference, settings
 
 LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
-CONFIG_FILE, CELL_FILE = "config.yaml", "cell.json"  # what the run is; what it is in a sweep
+CONFIG_FILE, CELL_FILE = "config.yaml", "cell.json"  # configuration of the run; its state in a sweep
 # Required entries of a checkpoint and their types.
-_PARTS = {
+_REQUIRED_KEYS = {
     "nerfro_config": str,
     "state_dict": dict,
     "optimizer_states": list,
@@ -44,38 +44,39 @@ _PARTS = {
     "global_step": int,
     "loops": dict,
 }
-_SPARE_BYTES = 64 * 2**20  # pictures and logs, beside the checkpoints
+_SPARE_BYTES = 64 * 2**20  # images and logs, in addition to checkpoints
 _PACKAGES = ("nerfro", "torch", "lightning", "hydra-core", "torchmetrics", "numpy", "numba", "trimesh")
 
 
 @contextmanager
 def own(folder: Path, config: DictConfig) -> Iterator[Path | None]:
-    """Hold a run's folder for this process, and say which checkpoint the run goes on from, if it does.
+    """Lock the folder of a run, and yield the checkpoint from which the run resumes, or None.
 
-    A folder is refused that another process writes to, or that holds anything that this run did not make.
+    Raises:
+        NerfroError: another process writes to the folder, or the folder holds files of something else.
     """
     from lightning.pytorch.utilities import rank_zero_only  # loading a run must not import Lightning
 
     checkpoint = find_checkpoint(config.ckpt_path, folder)
-    if rank_zero_only.rank != 0:  # type: ignore[attr-defined]  # of several processes the first one has looked
+    if rank_zero_only.rank != 0:  # type: ignore[attr-defined]  # the first process checks the folder
         yield checkpoint
         return
     with lock_folder(folder, "hydra.run.dir"):
         begun = folder if checkpoint is None else checkpoint.parent.parent
         if config.ckpt_path is None or begun.resolve() != folder.resolve():
-            advice = "go on with a run (ckpt_path=last) or choose another folder (hydra.run.dir=...)"
+            advice = "resume a run (ckpt_path=last) or choose another folder (hydra.run.dir=...)"
             require_only(folder, (CELL_FILE,), advice)
         remove_unfinished(folder)
         try:
             yield checkpoint
         except KeyboardInterrupt:  # before training, or after it
             if (folder / CONFIG_FILE).is_file():
-                raise Interrupted(f"to go on, repeat it with hydra.run.dir={folder} ckpt_path=last") from None
+                raise Interrupted(f"to resume, repeat the command with hydra.run.dir={folder} ckpt_path=last") from None
             raise
 
 
 def begin(folder: Path, config: DictConfig, renderer: Renderer) -> None:
-    """Refuse a disk that is too full, write what repeats the run, and say in a line or two what it is."""
+    """Check the disk space, write the records of a run, and print a summary."""
     require_room(folder, needed_bytes(renderer))
     record(folder, config)
     found = f"{content.describe(config.content)}{backdrop.describe(config)}"
@@ -83,7 +84,7 @@ def begin(folder: Path, config: DictConfig, renderer: Renderer) -> None:
 
 
 def require_room(folder: Path, needed_bytes: int) -> None:
-    """Refuse a disk that is too full for a run."""
+    """Raise an error if the disk is too full for a run."""
     free = shutil.disk_usage(folder).free
     if free < needed_bytes:
         raise NerfroError(
@@ -93,13 +94,13 @@ def require_room(folder: Path, needed_bytes: int) -> None:
 
 
 def needed_bytes(renderer: Renderer) -> int:
-    """What a run writes: weights and Adam's two moments, beside an old checkpoint until the new one is whole."""
+    """Estimate the size of a run: weights and two moments of Adam, in an old and a new checkpoint."""
     weights = sum(parameter.numel() * parameter.element_size() for parameter in renderer.parameters())
     return 2 * 3 * weights + _SPARE_BYTES
 
 
 def record(folder: Path, config: DictConfig) -> None:
-    """Write what repeats the run: config.yaml (resolved), run.json (command, versions, commit) and git.diff."""
+    """Write the records of a run: config.yaml (resolved), run.json (command, versions, commit) and git.diff."""
     write_atomically(folder / CONFIG_FILE, OmegaConf.to_yaml(config, resolve=True))
     commit, diff = _git("rev-parse", "HEAD"), _git("diff", "HEAD")
     facts = {
@@ -120,9 +121,10 @@ def record(folder: Path, config: DictConfig) -> None:
 
 
 def find_checkpoint(ckpt_path: str | None, folder: Path) -> Path | None:
-    """The checkpoint to go on from: a file, or for `last` that of this folder, else the newest beside it.
+    """Find the checkpoint to resume from: a file, or for `last` the checkpoint of this folder or the newest beside it.
 
-    None if there is none to go on from, because `last` names a run that ended before its first checkpoint, too.
+    Returns:
+        The checkpoint; None without `ckpt_path`, or for a run in this folder that ended before its first checkpoint.
     """
     if ckpt_path is None:
         return None
@@ -144,13 +146,13 @@ def find_checkpoint(ckpt_path: str | None, folder: Path) -> Path | None:
 
 
 def load_checkpoint(path: Path) -> tuple[dict[str, Any], DictConfig]:
-    """Read a checkpoint without executing pickled code, and the configuration that it was trained with."""
+    """Read a checkpoint without executing pickled code, and its configuration."""
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        missing = _PARTS.keys() - checkpoint.keys()
+        missing = _REQUIRED_KEYS.keys() - checkpoint.keys()
         if missing:
             raise NerfroError(f"{path} lacks {first_of(sorted(missing))}, so it is no checkpoint of nerfro.train")
-        for name, kind in _PARTS.items():
+        for name, kind in _REQUIRED_KEYS.items():
             if not isinstance(checkpoint[name], kind):
                 raise NerfroError(f"{path} holds a {type(checkpoint[name]).__name__} as {name}; it is damaged")
         require_finite(checkpoint["state_dict"], path)
@@ -194,7 +196,7 @@ def require_optimizer_fits(checkpoint: Mapping[str, Any], renderer: Renderer, pa
 
 
 def restore(checkpoint: dict, config: DictConfig) -> Renderer:
-    """The trained model of a checkpoint."""
+    """Build the trained model of a checkpoint."""
     prefix = "renderer."
     weights = {n.removeprefix(prefix): w for n, w in checkpoint["state_dict"].items() if n.startswith(prefix)}
     if not weights:
@@ -222,7 +224,7 @@ def require_same_run(folder: Path, checkpoint: Path | None, config: DictConfig, 
 
 
 def require_same_configuration(path: Path, trained: DictConfig, wanted: DictConfig) -> None:
-    """Refuse to go on with what has another configuration."""
+    """Raise an error if two configurations differ in settings that change the result."""
     old, new = settings(trained, RESUMING), settings(wanted, RESUMING)
     key = first_difference(old, new)
     if key is not None:
@@ -233,7 +235,7 @@ def require_same_configuration(path: Path, trained: DictConfig, wanted: DictConf
 
 
 def _git(*command: str) -> str | None:
-    """Output of a git command on the checkout that nerfro is imported from; None outside of one."""
+    """Return the output of a git command in the checkout of nerfro; None outside of a checkout."""
     if not (PACKAGE_DIR.parent / ".git").exists():
         return None
     try:
@@ -246,7 +248,7 @@ def _git(*command: str) -> str | None:
 
 
 def _command() -> str:
-    """The command line that repeats this run; for a cell of a sweep, the one that runs it alone."""
+    """Return the command line that repeats this run; for a cell of a sweep, without the other cells."""
     if HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
         # In a launcher's worker this process has another main module and other arguments.
         return shlex.join(["python", "-m", "nerfro.train", *HydraConfig.get().overrides.task])

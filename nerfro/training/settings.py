@@ -1,4 +1,4 @@
-"""Which settings make a run what it is: the one statement that resuming, sweeps and tables go by."""
+"""Roles of settings, which determine resuming, sweeps and tables."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 
 class Role(Enum):
-    """What a setting says about a run; whatever `_NAMED` does not name says what is learned, and how."""
+    """Role of a setting; settings that `_NAMED` does not contain have the role METHOD."""
 
     METHOD = "what is learned, and how"
     SEED = "which random draws"
@@ -37,7 +37,7 @@ _NAMED = {
     "trainer.num_nodes": Role.MACHINE,
     "trainer.strategy": Role.MACHINE,
     "name": Role.WATCHING,
-    "authors": Role.WATCHING,  # only what other settings are taken from
+    "authors": Role.WATCHING,  # used only by other settings
     "evaluation.every": Role.WATCHING,
     "logger": Role.WATCHING,
     "checkpoint": Role.WATCHING,
@@ -48,16 +48,16 @@ _NAMED = {
     "trainer.enable_model_summary": Role.WATCHING,
 }
 
-# A checkpoint can be gone on from where these agree: for longer, on another machine, scored in another way.
+# A run can resume a checkpoint if these settings are equal; budget, machine and scoring may differ.
 RESUMING = frozenset({Role.METHOD, Role.SEED, Role.SCENE})
-# Two cells of a sweep in which these agree have the same result.
+# Two cells of a sweep have the same result if these settings are equal.
 RESULT = RESUMING | {Role.BUDGET, Role.SCORING}
-# Runs in which these agree are one row of a table; scenes are columns, budgets have tables of their own.
+# Runs with equal settings are one row of a table; scenes are columns, and each budget has a table.
 TABLE_ROW = frozenset({Role.METHOD, Role.SCORING})
 
 
 def role(name: str) -> Role:
-    """What a setting says about a run, by its full name such as `trainer.max_steps`."""
+    """Return the role of a setting by its full name, such as `trainer.max_steps`."""
     while name:
         if name in _NAMED:
             return _NAMED[name]
@@ -66,14 +66,14 @@ def role(name: str) -> Role:
 
 
 def settings(config: DictConfig | Mapping[str, Any], roles: frozenset[Role]) -> dict[str, Any]:
-    """The settings of some roles, by their full names: `{"field": {"width": 64}}` becomes `{"field.width": 64}`."""
+    """Return the settings of some roles by full name: `{"field": {"width": 64}}` becomes `{"field.width": 64}`."""
     if isinstance(config, DictConfig):
         config = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
     return {name: value for name, value in _flat(config, "").items() if role(name) in roles}
 
 
 def first_difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> str | None:
-    """The first name, in alphabetical order, that has different values; None if there is none."""
+    """Return the first name in alphabetical order with different values; None if all values are equal."""
     return next((name for name in sorted(old.keys() | new.keys()) if old.get(name) != new.get(name)), None)
 
 

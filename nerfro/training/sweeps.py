@@ -1,6 +1,6 @@
-"""The cells of a sweep, each one training run: which configuration a cell holds, how it ended, and how it is run.
+"""Cells of a sweep, each of which is one training run: configuration, state and execution.
 
-Everything is known from the cell's folder, so that a sweep can be stopped at any moment, by any means, and go on later.
+The state is stored in the folders of the cells, so that a sweep can be stopped at any time and resumed later.
 `hydra_plugins/nerfro_cells.py` plans and launches cells; a launcher's worker runs each of them through `CellTask`.
 """
 
@@ -32,15 +32,15 @@ from nerfro.training.config import TrainConfig
 from nerfro.training.run_folder import CELL_FILE, CONFIG_FILE
 from nerfro.training.settings import RESULT, first_difference, settings
 
-# Larger files of a data folder are told apart by name and size, so that no sweep begins with reading for minutes.
+# Larger data files are identified by name and size, because reading them would take minutes.
 _MAX_HASHED = 64 * 2**20  # bytes
 
-# Tell cells of a sweep apart in their folders' names without being written out as key=value.
+# Overrides that names of folders contain without `key=`.
 _NAMED_BY_THEMSELVES = ("+experiment", "data.root", "seed")
 
 
 class State(str, Enum):
-    """How far a cell has come."""
+    """State of a cell."""
 
     OPEN = "not finished"
     RUNNING = "running in another process"
@@ -51,18 +51,18 @@ class State(str, Enum):
 
 @dataclass(frozen=True)
 class Identity:
-    """What a cell computes: two cells with equal identities have equal results, up to the machine."""
+    """Identity of a cell: cells with equal identities have equal results, except for the machine."""
 
-    settings: Mapping[str, Any]  # of the resolved configuration those that make the result, by their full names
-    data: str  # hash of the files in the data's folder
+    settings: Mapping[str, Any]  # settings that change the result, by full name
+    data: str  # hash of the files in the data folder
 
     @classmethod
     def of(cls, config: DictConfig) -> Identity:
-        """Identity of a run of nerfro.train; of images it reads the names and sizes only."""
+        """Compute the identity of a run; only names and sizes of images are read."""
         return cls(settings(config, RESULT), _hash_of_files(resolve_path(config.data.root)))
 
     def difference(self, record: Mapping[str, Any]) -> str | None:
-        """The first thing in which a cell's record differs from this identity, in words; None if nothing does."""
+        """Describe the first difference between the record of a cell and this identity; None if they are equal."""
         old = settings(record["settings"], RESULT)
         key = first_difference(old, self.settings)
         if key is not None:
@@ -74,18 +74,20 @@ class Identity:
 class Cell:
     """One training run of a sweep."""
 
-    overrides: list[str]  # that make its configuration, its folder included
-    folder: Path  # where it lies
-    identity: Identity | None  # of its configuration and data; None where it is refused
-    refusal: str | None  # why it cannot be run, else None
+    overrides: list[str]  # overrides of the configuration, including the folder
+    folder: Path  # folder of the run
+    identity: Identity | None  # None for a cell that cannot run
+    refusal: str | None  # reason why the cell cannot run, or None
 
-    def look(self) -> tuple[State, str]:
-        """How far it has come, and why it failed or is refused."""
-        return (State.REFUSED, self.refusal or "") if self.identity is None else _look(self.folder, self.identity)
+    def state(self) -> tuple[State, str]:
+        """Return the state, and the reason for a failure or refusal."""
+        return (
+            (State.REFUSED, self.refusal or "") if self.identity is None else _current_state(self.folder, self.identity)
+        )
 
 
 def refusal(config: DictConfig) -> str | None:
-    """Why a cell cannot be run at all, as far as that can be told without work; None if nothing speaks against it."""
+    """Return the reason why a cell cannot run, as far as inexpensive checks find one; None without a reason."""
     try:
         check_names(config)
         check_settings(config, TrainConfig)
@@ -106,12 +108,12 @@ def refusal(config: DictConfig) -> str | None:
 
 
 def scene_name(root: str) -> str:
-    """Last part of a data folder's name."""
+    """Return the last component of the path of a data folder."""
     return Path(str(root).removeprefix(EMBEDDED_PREFIX)).name
 
 
 def folder_name(config: DictConfig, swept: Sequence[str]) -> str:
-    """Name of a cell's folder: experiment, scene and seed, and what else is swept over."""
+    """Compose the name of the folder of a cell: experiment, scene, seed and other swept settings."""
     others = [override for override in swept if override.split("=", 1)[0] not in _NAMED_BY_THEMSELVES]
     short = [f"{key.lstrip('+').rpartition('.')[2]}={value}" for key, _, value in (o.partition("=") for o in others)]
     name = "-".join([config.name, scene_name(config.data.root), f"seed{config.seed}", *short])
@@ -119,9 +121,9 @@ def folder_name(config: DictConfig, swept: Sequence[str]) -> str:
 
 
 class CellTask:
-    """Runs a cell where a launcher has put it, and records how it ended; a failure ends here and not the sweep.
+    """Run a cell and record its state; a failure does not end the sweep.
 
-    A cell that was stopped before goes on from its checkpoint.
+    A cell that was stopped resumes from its checkpoint.
     """
 
     def __init__(self, task: Callable[[DictConfig], None]) -> None:
@@ -131,7 +133,7 @@ class CellTask:
         discover()  # the worker may be a new process
         folder = Path(HydraConfig.get().runtime.output_dir)
         if is_locked(folder):
-            return  # a process that outlived an earlier start of the sweep is at it
+            return  # a process of an earlier start of the sweep runs the cell
         with lock_folder(folder, "hydra.sweep.dir"):
             self._run(config, folder)
 
@@ -144,7 +146,7 @@ class CellTask:
         _record(folder, identity, State.OPEN)
         try:
             self._task(config)
-        except Exception as error:  # whatever it is, the other cells go on
+        except Exception as error:  # the other cells continue after any error
             reason = in_one_line(error)
             print(f"nerfro: {folder.name} failed: {reason}", file=sys.stderr, flush=True)
             _record(folder, identity, State.FAILED, reason)
@@ -162,7 +164,7 @@ def _record(folder: Path, identity: Identity, state: State, reason: str = "") ->
     write_atomically(folder / CELL_FILE, json.dumps(record, indent=2) + "\n")
 
 
-def _look(folder: Path, identity: Identity) -> tuple[State, str]:
+def _current_state(folder: Path, identity: Identity) -> tuple[State, str]:
     return (State.RUNNING, "") if is_locked(folder) else _recorded(folder, identity)
 
 
@@ -185,7 +187,7 @@ def _recorded(folder: Path, identity: Identity) -> tuple[State, str]:
 
 
 def _hash_of_files(root: Path) -> str:
-    """Hash of the names and sizes of all files below a folder, and of the content of those that are no pictures."""
+    """Hash the names and sizes of all files below a folder, and the content of files other than images."""
     digest = hashlib.sha256()
     for file in sorted(_visible_files(root)):
         num_bytes = file.stat().st_size

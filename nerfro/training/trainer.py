@@ -1,4 +1,4 @@
-"""Lightning's Trainer as every run has it."""
+"""Construction of the Trainer of Lightning for a run."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from nerfro.kernels.precision import fast_bfloat16
 from nerfro.registry import build
 from nerfro.training.callbacks import Checkpoints, ConfigInCheckpoint, SharedTimer, Throughput, TrainingProgress
 from nerfro.training.checkpoint_files import CheckpointFiles
-from nerfro.training.data_module import looks_every
+from nerfro.training.data_module import validation_interval
 from nerfro.training.log import TrainingLog
 from nerfro.training.run_folder import CONFIG_FILE, LAST_CHECKPOINT
-from nerfro.training.watched import FallingBehind
+from nerfro.training.validation import OverfittingWarning
 
 
 def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra: list[Callback]) -> pl.Trainer:
-    """Lightning's Trainer with the callbacks that every run has."""
+    """Create the Trainer of a run with its callbacks and loggers."""
     if (config.checkpoint.every_seconds is None) == (config.checkpoint.every_steps is None):
         raise NerfroError("set one of checkpoint.every_seconds and checkpoint.every_steps, and the other to null")
     seconds, every = config.checkpoint.every_seconds, config.evaluation.every
@@ -51,13 +51,13 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
             TrainingProgress(throughput),
             in_checkpoint,
             TrainingLog(config),
-            FallingBehind(),
+            OverfittingWarning(),
             *extra,
         ],
         "plugins": [CheckpointFiles()],
         "logger": [build(node, save_dir=str(folder)) for node in (config.logger or {}).values()],
         "max_epochs": -1,
-        "val_check_interval": looks_every(every) or None,
+        "val_check_interval": validation_interval(every) or None,
         "check_val_every_n_epoch": None,
         "limit_val_batches": 1 if every > 0 else 0,
         "num_sanity_val_steps": 0,
@@ -65,7 +65,7 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
         "precision": lightning_precision(config),
     }
     if config.trainer.get("strategy") == "ddp":
-        # The index grid is a buffer and would be sent around in every step, though all processes have the same one.
+        # Buffers, such as the index grid, are equal in all processes and need no broadcast in every step.
         ours["strategy"] = DDPStrategy(broadcast_buffers=False, find_unused_parameters=False)
     accelerator = training_accelerator(config.trainer.accelerator)
     limit = config.trainer.get("max_time")
@@ -109,7 +109,7 @@ def training_accelerator(name: str) -> str:
 
 
 def lightning_precision(config: DictConfig) -> str:
-    """`trainer.precision` as Lightning names it."""
+    """Convert `trainer.precision` to the name in Lightning."""
     precision: str = config.trainer.precision
     if precision != "fastest":
         return precision
@@ -118,7 +118,7 @@ def lightning_precision(config: DictConfig) -> str:
 
 
 def prepare_process(seed: int) -> None:
-    """Set what this process computes with: the seed, how memory is given back, and what Lightning prints."""
+    """Set the seed, the memory allocator and the messages of Lightning for this process."""
     _quieten_lightning()
     keep_freed_memory()
     pl.seed_everything(seed, verbose=False)
@@ -146,14 +146,14 @@ def fit(
 
 
 def finish_logs(trainer: pl.Trainer) -> None:
-    """End logs that the next job of a sweep would go on with."""
+    """Finish logs, because the next job of a sweep would append to them."""
     for logger in trainer.loggers:
         if isinstance(logger, WandbLogger):
             logger.experiment.finish()
 
 
 def _quieten_lightning() -> None:
-    """Keep Lightning's hints about loaders and hardware from the user: batches are made on the device here."""
+    """Suppress hints of Lightning about data loaders and hardware, which do not apply."""
     for package in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(package).setLevel(logging.WARNING)
     for message in (

@@ -1,4 +1,4 @@
-"""The interactive page of a model while it trains: `viewer=true`."""
+"""Interactive page of a model during training: `viewer=true`."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from nerfro.viewing.live import LivePage
 from nerfro.viewing.server import PageServer
 from nerfro.viewing.trained_scene import TrainedScene
 
-_LOSS_SECONDS = 1.0  # between two points of the curve: on a GPU each waits for the step
+_LOSS_SECONDS = 1.0  # interval between points of the loss curve; on a GPU, each point waits for the step
 
 
 class Viewer(Callback):
-    """Serves the page to this machine if `viewer` is set, fed with the current weights and the losses.
+    """Serve the page to this machine if `viewer` is set, with current weights and losses.
 
-    With several processes the first one serves it.
+    With several processes, the first one serves the page.
 
     Args:
-        config: of the run, see `TrainConfig`.
-        source: the data.
-        views: of the split that is evaluated, whose cameras and photographs are shown.
+        config: configuration of the run, see `TrainConfig`.
+        source: data set.
+        views: views of the evaluated split, whose cameras and photographs the page shows.
     """
 
     def __init__(self, config: DictConfig, source: DataSource, views: Views) -> None:
         self._config, self._source, self._views = config, source, views
         self._server: PageServer | None = None
         self._live: LivePage | None = None
-        self._told = 0.0
+        self._last_loss_time = 0.0
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        # What cannot be shown, or nowhere, is refused before the first step.
+        # Errors of the page and of its port are raised before the first step.
         if self._config.viewer and trainer.is_global_zero:
             assert isinstance(pl_module, TrainingModule)
             bake_surface(pl_module.renderer)
@@ -56,8 +56,8 @@ class Viewer(Callback):
     ) -> None:
         if self._server is None or self._live is None:
             return
-        if time.monotonic() - self._told > _LOSS_SECONDS:
-            self._told = time.monotonic()
+        if time.monotonic() - self._last_loss_time > _LOSS_SECONDS:
+            self._last_loss_time = time.monotonic()
             self._server.add_loss(trainer.global_step, float(outputs["loss"]))
         self._live.update()
 

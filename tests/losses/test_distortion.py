@@ -44,21 +44,6 @@ def test_prefix_sums_equal_the_double_loop(dtype: torch.dtype, tolerance: float)
     torch.testing.assert_close(ours.grad, reference.grad, rtol=tolerance, atol=tolerance)
 
 
-def test_even_weights_have_the_mean_distance_of_a_uniform_density() -> None:
-    # Integral of |u - v| over the unit square: 1/3, however the unit interval is divided.
-    _, edges = random_intervals(4, 9, torch.float64)
-    edges = torch.cat([torch.zeros(4, 1, dtype=torch.float64), edges[:, 1:]], dim=-1)
-    torch.testing.assert_close(distortion(edges.diff(dim=-1), edges), torch.full((4,), 1 / 3, dtype=torch.float64))
-
-
-def test_splitting_an_interval_changes_nothing() -> None:
-    weights, edges = random_intervals(5, 6, torch.float64)
-    middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
-    finer = torch.stack([edges[:, :-1], middle], -1).flatten(1)
-    finer = torch.cat([finer, edges[:, -1:]], dim=-1)
-    torch.testing.assert_close(distortion(weights.repeat_interleave(2, -1) / 2, finer), distortion(weights, edges))
-
-
 def loss(weights: torch.Tensor, s: torch.Tensor, measure: torch.Tensor | None = None) -> torch.Tensor:
     """Of weights on intervals between arc lengths [5, 7], which may have other lengths in contracted space."""
     ends = s[:, [0, -1]]
@@ -92,9 +77,3 @@ def test_what_passes_all_samples_of_all_space_counts_at_infinity() -> None:
     assert float(loss(half, edges, measure=edges)) == pytest.approx(0.375 + 1 / 72, rel=1e-4)
     assert float(loss(half, edges)) == pytest.approx(1 / 72, rel=1e-4)  # a sky stands beyond the path
     assert float(loss(0 * half, edges, measure=edges)) == pytest.approx(0, abs=1e-6)
-
-
-def test_a_single_sharp_sample_has_none() -> None:
-    weights = torch.tensor([[0.0, 1.0, 0.0]])
-    edges = torch.tensor([[0.0, 0.5, 0.5 + 1e-6, 1.0]])
-    assert distortion(weights, edges) < 1e-6

@@ -85,7 +85,7 @@ def test_straight_rays_end_on_the_backdrop(
         *options,
     )
     assert finished.code == 0, finished.err
-    assert ("cut out on (102, 102, 102)" in finished.out) == told
+    assert ("plain backdrop (102, 102, 102)" in finished.out) == told
     config = OmegaConf.load(run / "config.yaml")
     if told:
         assert config.boundary.rgb == pytest.approx([((GREY + 0.055) / 1.055) ** 2.4] * 3, rel=1e-4)

@@ -22,7 +22,7 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.rendering import Renderer, Scene
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.snell import Snell
-from nerfro.training.data_module import OneAhead, RayDataModule, can_trace_ahead
+from nerfro.training.data_module import Prefetcher, RayDataModule, can_prefetch
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Rays
@@ -51,11 +51,11 @@ def running() -> list[str]:
 
 @pytest.fixture
 def ahead():
-    """Makes an OneAhead and ends its thread."""
-    made: list[OneAhead] = []
+    """Makes an Prefetcher and ends its thread."""
+    made: list[Prefetcher] = []
 
-    def make(function) -> OneAhead:
-        made.append(OneAhead(function))
+    def make(function) -> Prefetcher:
+        made.append(Prefetcher(function))
         return made[-1]
 
     yield make
@@ -157,12 +157,12 @@ def test_nothing_is_traced_ahead_where_paths_learn_or_python_is_needed(ball: Sdf
     def model(path_sampler, learns: bool = False) -> Any:
         return Mock(spec=Renderer, path_sampler=path_sampler, scene=Mock(spec=Scene, medium=ball), paths_learn=learns)
 
-    assert can_trace_ahead(model(Snell()))
-    assert not can_trace_ahead(model(Snell(), learns=True))
-    assert not can_trace_ahead(model(Snell("mesh")))
-    assert not can_trace_ahead(model(Eikonal("euler")))
+    assert can_prefetch(model(Snell()))
+    assert not can_prefetch(model(Snell(), learns=True))
+    assert not can_prefetch(model(Snell("mesh")))
+    assert not can_prefetch(model(Eikonal("euler")))
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0}, raising=False)
-    assert not can_trace_ahead(model(Snell())), "one core has nobody who waits"
+    assert not can_prefetch(model(Snell())), "one core has nobody who waits"
 
 
 @pytest.mark.parametrize("learns", [True, False])

@@ -82,14 +82,6 @@ def test_shares_of_several_processes_make_up_the_batch(views, batching):
     assert torch.equal(whole.share(0, 1).batch(4).index, expected.index)
 
 
-def test_masks_that_rule_nothing_out_change_no_batch_of_one_image(views):
-    allowed = replace(views, usable=torch.ones(NUM_VIEWS, HEIGHT, WIDTH, dtype=torch.bool))
-    for step in range(5):
-        batches = [RayBatches(v, 30, seed=3, precrop_steps=2, jitter=True).batch(step) for v in (views, allowed)]
-        assert torch.equal(batches[0].index, batches[1].index)
-        assert torch.equal(batches[0].rays.directions, batches[1].rays.directions)
-
-
 def test_masked_pixels_are_never_drawn_and_all_others_equally_often(masked):
     batches = RayBatches(masked, 96, "all_images", seed=0)
     counts = torch.zeros(NUM_VIEWS * HEIGHT * WIDTH)

@@ -115,16 +115,6 @@ def test_second_process_in_a_folder_is_refused(
     assert not content(tmp_path / "run").keys() - {tmp_path / "run" / ".lock"}
 
 
-def test_folder_that_is_removed_while_training_is_not_made_again(
-    train: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(nerfro.training.run_folder, "require_room", lambda folder, _: shutil.rmtree(folder))
-    finished = train()
-    assert finished.code == 1
-    assert f"{tmp_path / 'run'} was removed or replaced while nerfro was writing to the folder" in finished.err
-    assert not (tmp_path / "run").exists()
-
-
 def test_checkpoint_in_a_removed_folder_is_not_made_again(
     train: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -200,15 +190,6 @@ def test_what_killed_processes_were_writing_goes_and_what_others_write_stays(
         path.write_text("half")
     assert train("ckpt_path=last").code == 0
     assert [path.exists() for path in partial] == [False, False, True]
-
-
-def test_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with (
-        pytest.raises(NerfroError, match=r"cannot write to out=.*/file/run: .*; choose another out"),
-        lock_folder(tmp_path / "file" / "run", "out"),
-    ):
-        pass
 
 
 def test_nothing_foreseen_is_one_line_and_a_file(

@@ -1,4 +1,4 @@
-"""Light that stops close before a camera."""
+"""Penalty for density close to the cameras."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from nerfro.rendering import Scene
 from nerfro.types import Batch, Rendering
 
 
-@register("loss", "nearby")
-class Nearby(Loss):
-    """Mean share of light that stops between the cameras and what they look at, more the closer to the camera.
+@register("loss", "near_camera")
+class NearCamera(Loss):
+    """Penalize density between the cameras and the content, with a weight that decreases with the distance.
 
-    What stops at arc length s counts 1 - s / d, where d is the camera's distance from the middle of the content's box;
-    beyond d it counts nothing. Few rays cross what is close before a camera, so a cloud there that hides all else from
-    other places contradicts no photograph (compare the occlusion loss of FreeNeRF, Yang et al. 2023, Eqn. 8).
+    The weight of a sample at arc length s is max(1 - s / d, 0), where d is the distance of the camera from the centre
+    of the content's box. Few rays cross the space close to a camera, so floating density there, which hides everything
+    else from other directions, contradicts no photograph. The loss is similar to the occlusion loss of FreeNeRF (Yang
+    et al. 2023, Eqn. 8).
 
     Args:
         box_min, box_max: corners of the content's box, world units.

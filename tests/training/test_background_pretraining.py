@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from nerfro.data.blender import BlenderData
-from nerfro.training import boundary_first
+from nerfro.training import background_pretraining
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 
@@ -25,7 +25,7 @@ def weights(
     train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., dict[str, Tensor]]:
     """Weights after a run whose rates are too small to move anything after its first steps."""
-    monkeypatch.setattr(boundary_first, "_SHARE", 1.0)
+    monkeypatch.setattr(background_pretraining, "_SHARE", 1.0)
     still = ["trainer.max_steps=1", "evaluation.every=0", "optimizer.warmup_factor=0", "optimizer.warmup_steps=1000"]
 
     def run(name: str, *overrides: str) -> dict[str, Tensor]:

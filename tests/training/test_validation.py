@@ -1,4 +1,4 @@
-"""Views that are not trained on are looked at, and a run says when they fall behind."""
+"""Validation pixels, and the warning about overfitting."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from nerfro.media.shapes import Ball
 from nerfro.rendering import ColourSpace, Renderer, Scene
 from nerfro.samplers.snell import Snell
 from nerfro.subdivision import Subdivision
-from nerfro.training.data_module import NO_PICTURE, RayDataModule, RotatingView, looks_every
+from nerfro.training.data_module import NO_IMAGE, RayDataModule, RotatingView, validation_interval
 from nerfro.training.ray_batches import RayBatches
-from nerfro.training.watched import FallingBehind, WatchedPixels
+from nerfro.training.validation import OverfittingWarning, ValidationPixels
 from nerfro.types import Rays, mean_per_pixel
 
-LINE = "views that are not trained on fall behind"
+LINE = "the model overfits"
 
 
 @pytest.fixture
@@ -75,15 +75,9 @@ def test_photographs_known_by_heart_are_told_once(learn: Callable[..., Any], noi
     assert held[-1] + 4 < np.mean(training[-10:])
 
 
-def test_a_healthy_run_says_nothing(learn: Callable[..., Any]) -> None:
-    finished = learn()
-    assert finished.code == 0, finished.err
-    assert LINE not in finished.out
-
-
 def judged(looks: list[tuple[float, float]], comparable: bool = True) -> list[int]:
     """At which looks (held-back and training PSNR) something is told."""
-    behind = FallingBehind()
+    behind = OverfittingWarning()
     behind.comparable = comparable
     return [step for step, look in enumerate(looks) if behind.judge(step, *look) is not None]
 
@@ -98,7 +92,7 @@ def judged(looks: list[tuple[float, float]], comparable: bool = True) -> list[in
         ([(8, 9), (20, 21), (24, 27.9), (25, 28.9), (26, 29.9)], []),  # behind, but improving and within 4 dB
     ],
 )
-def test_what_is_behind(looks: list[tuple[float, float]], told: list[int]) -> None:
+def test_what_is_overfitted(looks: list[tuple[float, float]], told: list[int]) -> None:
     assert judged(looks) == told
 
 
@@ -114,22 +108,22 @@ def test_where_cameras_learn_only_a_loss_is_told() -> None:
 def test_cameras_that_learn_are_those_of_training_views_alone(
     learn: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, option: str, comparable: bool
 ) -> None:
-    begun: list[FallingBehind] = []
-    monkeypatch.setattr(FallingBehind, "on_train_end", lambda self, *given: begun.append(self))
+    begun: list[OverfittingWarning] = []
+    monkeypatch.setattr(OverfittingWarning, "on_train_end", lambda self, *given: begun.append(self))
     finished = learn(option, "trainer.max_steps=1")
     assert finished.code == 0, finished.err
     assert [behind.comparable for behind in begun] == [comparable]
 
 
 def test_a_resumed_run_remembers_and_says_nothing_twice() -> None:
-    behind, later = FallingBehind(), FallingBehind()
+    behind, later = OverfittingWarning(), OverfittingWarning()
     assert behind.judge(1, 22, 23) is None
     assert behind.judge(2, 20, 24) is None
     later.load_state_dict(behind.state_dict())
     message = later.judge(3, 20, 25) or ""
-    assert "20.0 dB after 3 steps, 2.0 less than after 1; training pixels have 25.0" in message
+    assert "20.0 dB after 3 steps, 2.0 dB less than after 1; training PSNR is 25.0 dB" in message
     assert "or train for 1 steps" in message
-    again = FallingBehind()
+    again = OverfittingWarning()
     again.load_state_dict(later.state_dict())
     assert again.judge(4, 20, 26) is None
 
@@ -139,7 +133,7 @@ def test_the_same_usable_pixels_are_watched_each_time(tiny_scene: Path) -> None:
     usable = torch.zeros(2, 16, 16, dtype=torch.bool)
     usable[:, 3:7] = True
     masked = replace(views, usable=usable)
-    one, other = WatchedPixels.of(masked), WatchedPixels.of(masked)
+    one, other = ValidationPixels.of(masked), ValidationPixels.of(masked)
     assert torch.equal(one.index, other.index)
     assert len(one.index.unique()) == len(one.index) == usable.sum()
     assert bool(usable.flatten()[one.index].all())
@@ -168,7 +162,7 @@ def test_watched_pixels_have_the_rays_that_training_gives_them(contrast: float |
     batches = RayBatches(views, 256, "single_image")
     trace = lambda rays, view: model.path_sampler(rays, model.scene.medium)  # noqa: E731
     batch = batches.traced(trace, subdivision=Subdivision(2, 8.0, contrast)).batch(0)
-    watched = WatchedPixels.of(views)
+    watched = ValidationPixels.of(views)
     found = watched.rays(model, Subdivision(2, 8.0, contrast))
     trained = rays_of_pixels(batch.rays, batch.index[batch.pixel])
     shown = rays_of_pixels(found.rays, watched.index[found.pixel])
@@ -184,7 +178,7 @@ def test_where_exposures_learn_each_watched_view_has_the_gain_that_suits_it(
 ) -> None:
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val")
     watched, model = (
-        WatchedPixels.of(Views(views.cameras.select([0, 0]), torch.rand(2, 16, 16, 3), None, ["a"])),
+        ValidationPixels.of(Views(views.cameras.select([0, 0]), torch.rand(2, 16, 16, 3), None, ["a"])),
         bending(),
     )
     model.radiance = lambda rays: 0.3 + 0.2 * rays.directions
@@ -205,7 +199,7 @@ def rays_of_pixels(rays: Rays, index: torch.Tensor) -> dict[int, torch.Tensor]:
 def test_many_views_cost_no_more_than_few(tiny_scene: Path) -> None:
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val")
     many = Views(views.cameras.select([0] * 100), torch.rand(100, 16, 16, 3), None, ["a"] * 100)
-    watched = WatchedPixels.of(many)
+    watched = ValidationPixels.of(many)
     seen = (watched.index // 256).unique()
     assert len(watched.index) == 2048
     assert (len(seen), seen[0], seen[-1]) == (32, 0, 99)
@@ -213,7 +207,7 @@ def test_many_views_cost_no_more_than_few(tiny_scene: Path) -> None:
 
 @pytest.mark.parametrize(("every", "looks"), [(0, 0), (1, 1), (4, 1), (11, 2), (500, 100)])
 def test_looks_come_five_times_as_often_as_pictures(every: int, looks: int, tiny_scene: Path) -> None:
-    assert looks_every(every) == looks
+    assert validation_interval(every) == looks
     if not every:
         return
     module = RayDataModule(Mock(spec=RayBatches), BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val"), every)
@@ -221,7 +215,7 @@ def test_looks_come_five_times_as_often_as_pictures(every: int, looks: int, tiny
     for step in range(looks, 10 * every + 1, looks):
         module.trainer = Steps(step)  # type: ignore[assignment]
         (view,) = RotatingView(module)
-        if view != NO_PICTURE:
+        if view != NO_IMAGE:
             shown[step] = view
     assert len(shown) == 10
     assert list(shown.values()) == [1, 0] * 5, "one view after the other"

@@ -8,7 +8,7 @@ from unittest.mock import Mock
 import pytest
 import torch
 
-from nerfro.losses.nearby import Nearby
+from nerfro.losses.near_camera import NearCamera
 from nerfro.rendering import Scene, composite
 from nerfro.testing import example_batch, example_path
 from nerfro.types import Path, Radiance, Rendering, Samples
@@ -25,10 +25,10 @@ def white_fog(path: Path, density: torch.Tensor) -> Rendering:
     return composite(samples, Radiance(density.expand(8, 8), torch.ones(8, 8, 3)), torch.ones(8, 3), path)
 
 
-def loss_around(path: Path) -> Nearby:
+def loss_around(path: Path) -> NearCamera:
     """Of content 4 units before the first camera; all paths are taken to begin there."""
     middle = path.positions[0, 0] + 4 * path.directions[0, 0]
-    return Nearby((middle - 1).tolist(), (middle + 1).tolist())
+    return NearCamera((middle - 1).tolist(), (middle + 1).tolist())
 
 
 def first_camera(path: Path) -> Path:
@@ -39,10 +39,10 @@ def first_camera(path: Path) -> Path:
 def test_white_fog_before_white_clears_where_it_is_near_alone() -> None:
     path = first_camera(example_path(8))
     raw = torch.full((8,), -1.0, requires_grad=True)
-    optimizer, nearby = torch.optim.Adam([raw], lr=0.1), loss_around(path)
+    optimizer, near_camera = torch.optim.Adam([raw], lr=0.1), loss_around(path)
     for _ in range(200):
         rendering = white_fog(path, raw.exp())
-        loss = (1 - rendering.rgb).square().mean() + 0.1 * nearby([rendering], BATCH, SCENE)
+        loss = (1 - rendering.rgb).square().mean() + 0.1 * near_camera([rendering], BATCH, SCENE)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -1,4 +1,4 @@
-"""Views that are not trained on, while others are: what they show, and whether they fall behind."""
+"""Validation during training, and a warning about overfitting."""
 
 from __future__ import annotations
 
@@ -22,27 +22,35 @@ from nerfro.subdivision import PixelRays, Subdivision, contrast, subdivide
 from nerfro.training.module import TrainingModule
 from nerfro.types import Batch, mean_per_pixel
 
-# Pixels that are looked at, of at most so many views: the same ones each time, or their scores could not be compared.
-_NUM_PIXELS, _MOST_VIEWS = 2048, 32
-# What falls behind has lost so many dB of its best while training pixels gained so many, or is so many dB below them.
-# Healthy runs end 0 to 2 dB below, on photographs and on rendered scenes; clouds before the cameras 6 and 9.
-_LOST, _GAINED, _LAG = 1.0, 0.5, 4.0
+# Number of validation pixels, and largest number of their views.
+_NUM_PIXELS, _MAX_VIEWS = 2048, 32
+# A model overfits if validation PSNR is _LOST dB below its maximum while training PSNR has increased by _GAINED dB, or
+# if validation PSNR is _GAP dB below training PSNR. Chosen on photographs and rendered scenes: the gap is 0 to 2 dB for
+# good runs, and 6 to 9 dB with floating density in front of the cameras.
+_LOST, _GAINED, _GAP = 1.0, 0.5, 4.0
 
 
 @dataclass(frozen=True)
-class WatchedPixels:
-    """Some pixels of views that are not trained on; `index` is view * H * W + row * W + column."""
+class ValidationPixels:
+    """Pixels of validation views, the same ones in each validation so that scores can be compared.
+
+    Attributes:
+        cameras: cameras of the validation views.
+        index: numbers of the pixels, view * H * W + row * W + column.
+        rgb: colours in the photographs, sRGB in [0, 1].
+        contrast: contrast to the neighbouring pixels, see `subdivision.contrast`.
+    """
 
     cameras: Cameras
     index: Int[Tensor, "R"]
-    rgb: Float[Tensor, "R 3"]  # sRGB in [0, 1]
-    contrast: Float[Tensor, "R"]  # with the pixels around; see `subdivision.contrast`
+    rgb: Float[Tensor, "R 3"]
+    contrast: Float[Tensor, "R"]
 
     @classmethod
-    def of(cls, views: Views, seed: int = 0) -> WatchedPixels:
-        """Random pixels, equally many of each view, of those that may be trained on where masks say so."""
+    def of(cls, views: Views, seed: int = 0) -> ValidationPixels:
+        """Draw random usable pixels, the same number from each view."""
         generator = np.random.default_rng([seed, 0])
-        chosen = np.unique(np.linspace(0, len(views) - 1, _MOST_VIEWS).round().astype(int)).tolist()
+        chosen = np.unique(np.linspace(0, len(views) - 1, _MAX_VIEWS).round().astype(int)).tolist()
         size, indices, colours, contrasts = views.cameras.height * views.cameras.width, [], [], []
         for view in chosen:
             allowed = np.arange(size)
@@ -51,13 +59,13 @@ class WatchedPixels:
                 allowed = np.flatnonzero(usable) if usable.any() else allowed
             drawn = torch.from_numpy(generator.choice(allowed, min(_NUM_PIXELS // len(chosen), len(allowed)), False))
             indices.append(view * size + drawn)
-            picture = views.images[view].reshape(-1, 3)
-            colours.append(picture[drawn])
-            contrasts.append(contrast(picture.__getitem__, views.cameras, drawn))
+            image = views.images[view].reshape(-1, 3)
+            colours.append(image[drawn])
+            contrasts.append(contrast(image.__getitem__, views.cameras, drawn))
         return cls(views.cameras, *map(torch.cat, (indices, colours, contrasts)))
 
     def rays(self, renderer: Renderer, subdivision: Subdivision) -> PixelRays:
-        """The rays that training gives such pixels."""
+        """Return rays through the pixels, subdivided as in training."""
         contrast = self.contrast.to(renderer.scene.device)
         return subdivide(
             self.cameras.to(renderer.scene.device),
@@ -69,10 +77,10 @@ class WatchedPixels:
         )
 
     def psnr(self, renderer: Renderer, subdivision: Subdivision) -> Float[Tensor, ""]:
-        """Peak signal-to-noise ratio of the model's pixels, dB; learned exposures are replaced by the best gains.
+        """Compute the PSNR of the rendered pixels in dB; learned exposures are replaced by fitted gains of each view.
 
         Args:
-            model: that renders the pixels.
+            renderer: model.
             subdivision: which pixels get several rays.
         """
         found, rgb = self.rays(renderer, subdivision), self.rgb.to(renderer.scene.device)
@@ -86,24 +94,25 @@ class WatchedPixels:
         return _psnr(colour_space.to_display(radiance, gains), rgb)
 
 
-class FallingBehind(Callback):
-    """Says once when pixels of views that are not trained on fall behind those that are.
+class OverfittingWarning(Callback):
+    """Print a warning once if the model overfits.
 
-    That is so if in two looks, one after the other, they have lost 1 dB of their best, while training pixels have
-    gained half a dB since; or if they are 4 dB below them. PSNR of training pixels is that of all batches since the
-    last look.
+    The model overfits if, in two successive validations, validation PSNR is 1 dB below its maximum while training PSNR
+    has increased by 0.5 dB, or if validation PSNR is 4 dB below training PSNR. Training PSNR is averaged over all
+    batches since the last validation.
 
     Attributes:
-        comparable: whether the difference of both tells anything. Where cameras of training views learn, those of other
-            views do not.
-        told: whether it has said so.
+        comparable: whether validation and training PSNR can be compared. If cameras are refined, validation views have
+            less accurate cameras than training views.
+        warned: whether the warning was printed.
     """
 
     def __init__(self) -> None:
         self.comparable = True
-        self._error, self._steps = 0.0, 0  # of batches since the last look: sum of mean squared errors, and how many
-        self._best, self._best_step, self._training_then = -math.inf, 0, -math.inf
-        self._behind = self.told = False
+        # Sum of the mean squared errors of batches since the last validation, and number of batches.
+        self._error, self._steps = 0.0, 0
+        self._best, self._best_step, self._training_at_best = -math.inf, 0, -math.inf
+        self._overfitted = self.warned = False
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, TrainingModule)
@@ -124,31 +133,32 @@ class FallingBehind(Callback):
         if message is not None and trainer.is_global_zero:
             tqdm.write(f"nerfro: {message}")  # above the bar
 
-    def judge(self, step: int, held: float, training: float) -> str | None:
-        """What is to be told after a look, if anything.
+    def judge(self, step: int, validation: float, training: float) -> str | None:
+        """Return the warning after a validation, or None.
 
         Args:
-            step: how many steps are done.
-            held, training: PSNR of pixels of views that are not trained on, and of those that are, dB.
+            step: number of completed steps.
+            validation, training: PSNR of validation pixels and of training pixels, dB.
         """
-        if held > self._best:
-            self._best, self._best_step, self._training_then = held, step, training
-        lost = self._best - held >= _LOST and training - self._training_then >= _GAINED
-        behind = lost or (self.comparable and training - held >= _LAG)
-        told, self._behind = behind and self._behind and not self.told, behind
-        if not told:
+        if validation > self._best:
+            self._best, self._best_step, self._training_at_best = validation, step, training
+        lost = self._best - validation >= _LOST and training - self._training_at_best >= _GAINED
+        overfits = lost or (self.comparable and training - validation >= _GAP)
+        warns, self._overfitted = overfits and self._overfitted and not self.warned, overfits
+        if not warns:
             return None
-        self.told = True
-        fallen = f", {self._best - held:.1f} less than after {self._best_step}" if lost else ""
+        self.warned = True
+        decrease = f", {self._best - validation:.1f} dB less than after {self._best_step}" if lost else ""
         shorter = f", or train for {self._best_step} steps" if lost else ""
         return (
-            f"views that are not trained on fall behind: {held:.1f} dB after {step} steps{fallen}; training pixels "
-            f"have {training:.1f}. Take more photographs, check poses and, of glass, surface and index "
+            f"the model overfits: validation PSNR is {validation:.1f} dB after {step} steps{decrease}; training PSNR "
+            f"is {training:.1f} dB. Take more photographs, check the poses and, for glass, surface and index "
             f"(medium...){shorter}; see docs/real.md, Few photographs"
         )
 
     def state_dict(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in ("_best", "_best_step", "_training_then", "_behind", "told")}
+        names = ("_best", "_best_step", "_training_at_best", "_overfitted", "warned")
+        return {name: getattr(self, name) for name in names}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         vars(self).update(state_dict)

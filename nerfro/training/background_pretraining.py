@@ -1,4 +1,4 @@
-"""What lies beyond the object, learned before the first step: nothing stands before it where rays miss the object."""
+"""Pretraining of the background from rays that miss the object."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Exits
 
-# Pixels that are drawn for a step, at most this share of all; those that see the object are left out.
+# Number of pixels that are drawn in a step, and largest fraction of all pixels. Pixels of the object are not used.
 _NUM_PIXELS, _SHARE = 16384, 0.01
-# A step with fewer pixels beside the object is no step.
-_FEWEST = 64
-# Of the boundary's learning rate, in the first and in the last of these steps.
+# Pretraining ends if fewer of the drawn pixels miss the object.
+_MIN_PIXELS = 64
+# Factor of the learning rate of the background in the first and in the last step.
 _RATES = 25.0, 1.0
 
 
-class BoundaryFirst(Callback):
-    """Lets the boundary learn, for some steps, from rays that miss the boxes of content and object.
+class BackgroundPretraining(Callback):
+    """Pretrain the background for some steps with rays that miss the boxes of content and object.
 
-    Their pixels cost one look-up each and no tracing, and a sky that is known lets the first gradients of the field be
-    about the object. The run's own optimiser does it, so that the boundary's moments are warm as well.
+    Such pixels need one evaluation of the background and no tracing. With a known background, the first gradients of
+    the field depend on the object. The optimizer of the run takes the steps, so that its moments are initialized, too.
 
     Args:
         num_steps: number of steps.
-        interruption: ends these steps as well; a resumed run takes the others.
+        interruption: signal handler, which ends pretraining as well; a resumed run takes the remaining steps.
     """
 
     def __init__(self, num_steps: int, interruption: StopOnSignal) -> None:
@@ -50,10 +50,10 @@ class BoundaryFirst(Callback):
         assert isinstance(pl_module, TrainingModule)
         scene = pl_module.scene
         learning = [parameter for parameter in scene.boundary.parameters() if parameter.requires_grad]
-        box = occupied(pl_module.renderer)
+        box = occupied_box(pl_module.renderer)
         if trainer.global_step > 0 or not learning or box is None:
             return
-        # The views' gains as well: a sky that is the mean of photographs of unlike brightness would hold them back.
+        # Gains learn, too, because a background that averages photographs of different exposures would slow them down.
         learning += [parameter for parameter in scene.camera.parameters() if parameter.requires_grad]
         optimizer = trainer.optimizers[0]
         group = next(group for group in optimizer.param_groups if group["name"] == "boundary")
@@ -64,13 +64,13 @@ class BoundaryFirst(Callback):
             if self._interruption.stop(trainer):
                 break
             rays, view, rgb = batches.missing(box, num_pixels, step, scene.camera)
-            if len(rays) < _FEWEST:
+            if len(rays) < _MIN_PIXELS:
                 break
             group["lr"] = group["initial_lr"] * first * (last / first) ** (step / self._num_steps)
             radiance = scene.boundary(Exits.unbent(rays))
             compared = scene.colour_space.prediction_and_target(radiance, rgb, scene.camera.gains(view))
             loss = torch.nn.functional.mse_loss(*compared)
-            # Not by backward(): gradients of several processes would be waited for.
+            # backward() would wait for gradients of other processes.
             gradients = torch.autograd.grad(loss, learning, allow_unused=True)
             for parameter, gradient in zip(learning, gradients, strict=True):
                 parameter.grad = gradient
@@ -79,8 +79,8 @@ class BoundaryFirst(Callback):
         optimizer.zero_grad()
 
 
-def occupied(renderer: Renderer) -> Float[Tensor, "2 3"] | None:
-    """Corners of the box outside of which there is nothing but the boundary; None where the field fills all space."""
+def occupied_box(renderer: Renderer) -> Float[Tensor, "2 3"] | None:
+    """Return the corners of the box that contains field and object; None if the field covers all of space."""
     field = renderer.scene.fields[0]
     assert isinstance(field, Field)
     if field.bounds is None:
