@@ -80,7 +80,7 @@ class BackgroundPretraining(Callback):
 
 
 def occupied_box(renderer: Renderer) -> Float[Tensor, "2 3"] | None:
-    """Return the corners of the box that contains field and object; None if the field covers all of space."""
+    """Return the corners of the box around field and object; None if the field covers all of space."""
     field = renderer.scene.fields[0]
     assert isinstance(field, Field)
     if field.bounds is None:

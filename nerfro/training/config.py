@@ -113,7 +113,7 @@ class TrainerConfig:
 
 @dataclass
 class AuthorsConfig:
-    """Settings of the authors of the paper for a scene, which `paper_*` and `ablation_euler` refer to."""
+    """Settings of the authors of the paper for a scene, used by `paper_*` and `ablation_euler`."""
 
     # Corners of the index grid, world units, and its vertices along each side.
     box_min: list[float] = dataclasses.field(default_factory=lambda: [-1.5] * 3)
@@ -185,7 +185,7 @@ def check_trained(config: DictConfig, origin: Path) -> DictConfig:
 
 
 def build_data(config: DictConfig) -> DataSource:
-    """Build the data set of a run; training views that are left out for validation are its `val` split."""
+    """Build the data set of a run, with a `val` split of training views if `num_validation_views` is set."""
     source, number = build(config.data), config.batches.num_validation_views
     return WithValidationViews(source, number) if number else source
 
@@ -217,7 +217,7 @@ def build_losses(nodes: DictConfig, known: bool = True) -> dict[str, Loss]:
 
 
 def build_model(config: DictConfig, training: Views | None = None) -> Renderer:
-    """Compose the model of a configuration (see `TrainConfig`); fills in what it leaves to the data.
+    """Compose the model of a configuration, and derive missing settings from the data.
 
     Args:
         config: configuration of the run, see `TrainConfig`; it is changed.

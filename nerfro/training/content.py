@@ -1,4 +1,4 @@
-"""The space that fields cover: the box of the object, or all of space around the point that the cameras face."""
+"""The space of the fields: the box of the object, or all of space around the common point of the optical axes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _PARALLEL = 0.01
 
 @dataclass
 class ContentConfig:
-    """The space that fields and samplers cover."""
+    """Space of fields and samplers."""
 
     # `box`: a box, with the background outside of it. `all`: all of space, contracted outside of a ball, with the
     # background at infinity.
@@ -55,7 +55,7 @@ class ContentConfig:
 
 
 def settle_content(config: DictConfig, medium: Medium, cameras: Cameras | None = None) -> None:
-    """Derive the settings of `config.content` that are None.
+    """Derive the missing settings of `config.content`.
 
     Args:
         config: configuration of a run, see `TrainConfig`; it is changed.
@@ -94,7 +94,7 @@ def describe(content: DictConfig) -> str:
 
 
 def _settle_ball(content: DictConfig, cameras: Cameras) -> None:
-    """Derive the ball that the cameras surround, and the resolution that they can resolve in it."""
+    """Derive the ball between the cameras, and the resolution of the cameras in the ball."""
     poses = cameras.camera_to_world.double().cpu().numpy()
     centres, forward = poses[:, :, 3], -poses[:, :, 2]
     if content.box_min is None:
@@ -133,7 +133,7 @@ def _depth(cameras: Cameras) -> float:
 
 
 def _box(config: DictConfig, medium: Medium) -> Float[np.ndarray, "2 3"] | None:
-    """Return the bounds of the object from the content file, the medium or its mesh; None if there is none of these."""
+    """Return the bounds of the object from the content file, the medium or its mesh; None without any of these."""
     if config.content.box_file is not None:
         centre, half = _read_box(resolve_path(config.content.box_file))
         return np.stack([centre - half, centre + half])

@@ -24,7 +24,7 @@ _LATER_BYTES = 250e6
 def require_memory(
     renderer: Renderer, rays: Rays, device: torch.device, share: float = 1.0, pixel_bytes: int = 0
 ) -> str:
-    """Estimate the peak memory of a run, and refuse a run that does not fit.
+    """Estimate the peak memory of a run, and refuse runs without enough memory.
 
     A few rays are rendered on the device, and the bytes that autograd keeps of them are counted. They grow with the
     number of rays and dominate the total.
@@ -73,7 +73,7 @@ def _require(needed: float, free: float, where: str, advice: str) -> None:
 
 
 def _kept_bytes(renderer: Renderer, rays: Rays) -> float:
-    """Count the bytes that autograd saves per ray for the backward pass, without parameters."""
+    """Count the bytes per ray saved by autograd for the backward pass, without parameters."""
     of_model = {tensor.untyped_storage().data_ptr() for tensor in renderer.state_dict().values()}
     kept: dict[int, int] = {}
 

@@ -20,7 +20,7 @@ from nerfro.types import Batch
 
 
 class TrainingModule(LightningModule):
-    """Train a model, which is a `Renderer` and its `Scene`, on batches of pixels.
+    """Train a model, a `Renderer` with a `Scene`, on batches of pixels.
 
     Args:
         renderer: the model that `model=` chooses.
@@ -42,7 +42,7 @@ class TrainingModule(LightningModule):
 
     @property
     def scene(self) -> Scene:
-        """Everything that is learned about the world."""
+        """All learned parameters of the world."""
         return self.renderer.scene
 
     def setup(self, stage: str) -> None:
@@ -73,7 +73,7 @@ class TrainingModule(LightningModule):
         return {"loss": total, "squared_error": error}
 
     def log(self, *args: Any, **kwargs: Any) -> None:
-        """Log a value; training steps that are not written skip the call, which takes a tenth of the time of a step."""
+        """Log a value, but only in training steps with output, because logging takes a tenth of the time of a step."""
         if self._is_logged_step or not self.trainer.training:
             super().log(*args, **kwargs)
 

@@ -1,4 +1,4 @@
-"""Check before training that rays meet the field."""
+"""Check of the rays before training."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def require_reach(renderer: Renderer, batch: Batch) -> None:
 
 
 def _require_object(renderer: Renderer, rays: Rays) -> None:
-    """Refuse bounds of the rays that leave out the object, for all rays that point at its box."""
+    """Refuse bounds of the rays without the object between them, for all rays towards its box."""
     box = renderer.scene.medium.content_box.to(rays.origins)
     crossings = (box[:, None] - rays.origins) / rays.directions
     enters, leaves = crossings.amin(0).amax(-1), crossings.amax(0).amin(-1)

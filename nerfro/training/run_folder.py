@@ -1,4 +1,4 @@
-"""Folder of a run: its lock, the records that allow the run to be repeated, and its checkpoints."""
+"""Folder of a run: lock, records for repeating the run, and checkpoints."""
 
 from __future__ import annotations
 
@@ -224,7 +224,7 @@ def require_same_run(folder: Path, checkpoint: Path | None, config: DictConfig, 
 
 
 def require_same_configuration(path: Path, trained: DictConfig, wanted: DictConfig) -> None:
-    """Raise an error if two configurations differ in settings that change the result."""
+    """Raise an error if two configurations differ in settings with influence on the result."""
     old, new = settings(trained, RESUMING), settings(wanted, RESUMING)
     key = first_difference(old, new)
     if key is not None:
@@ -248,7 +248,7 @@ def _git(*command: str) -> str | None:
 
 
 def _command() -> str:
-    """Return the command line that repeats this run; for a cell of a sweep, without the other cells."""
+    """Return the command line for repeating this run; for a cell of a sweep, without the other cells."""
     if HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
         # In a launcher's worker this process has another main module and other arguments.
         return shlex.join(["python", "-m", "nerfro.train", *HydraConfig.get().overrides.task])
