@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import replace
@@ -56,7 +57,7 @@ def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None
     """
     if stated is not None:
         mask = root / stated.replace("\\", "/")
-        if not mask.is_file():
+        if not os.path.isfile(mask):  # False for a name that is too long
             raise NerfroError(f"mask {mask} of {image} does not exist; restore it or remove its path from the data set")
         return mask
     candidates = [image.with_name(f"mask_{image.stem}{suffix}") for suffix in _SUFFIXES]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -137,4 +138,5 @@ def _candidates(root: Path, name: str) -> list[Path]:
 
 
 def _existing_image(root: Path, name: str) -> Path | None:
-    return next((path for path in _candidates(root, name) if path.is_file()), None)
+    # Unlike Path.is_file, this function returns False for a name that is too long.
+    return next((path for path in _candidates(root, name) if os.path.isfile(path)), None)
