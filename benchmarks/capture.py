@@ -7,8 +7,10 @@ import json
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
+from nerfro.camera.similarity import motion_between, similarity
 from nerfro.data.transforms import find_splits, read_manifest
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
@@ -42,13 +44,14 @@ def measure(folder: Path, data: Path) -> dict[str, float]:
     names = sorted(found_poses)
     if len(names) < 3:
         raise NerfroError(f"{data} has {len(names)} cameras; three or more can be aligned")
-    true, found = (np.stack([poses[name] for name in names]) for poses in (true_poses, found_poses))
-    scale, turn, shift = similarity(found[:, :, 3], true[:, :, 3])
-    moved = np.concatenate([turn @ found[:, :, :3], (scale * found[:, :, 3] @ turn.T + shift)[..., None]], -1)
-    angles = _angle(true[:, :, :3].transpose(0, 2, 1) @ moved[:, :, :3])
+    true, found = (torch.from_numpy(np.stack([poses[name] for name in names])) for poses in (true_poses, found_poses))
+    weights = torch.ones(len(names), dtype=true.dtype)
+    to_truth = similarity(found, true, 0 * weights, weights)  # by the camera centres alone
+    angles, shifts = (values.numpy() for values in motion_between(to_truth.apply(found), true))
+    true, moved = true.numpy(), to_truth.apply(found).numpy()
     surface = load_mesh(folder / "truth" / "mesh.ply")
     distance = np.linalg.norm(true[:, :, 3] - surface.bounds.mean(0), axis=1)
-    offsets = np.linalg.norm(moved[:, :, 3] - true[:, :, 3], axis=1) / distance
+    offsets = shifts / distance
     pixels = np.linalg.norm(
         _project(surface.vertices[::50], found_lens, moved) - _project(surface.vertices[::50], lens, true), axis=-1
     )
@@ -70,6 +73,7 @@ def measure(folder: Path, data: Path) -> dict[str, float]:
         )
     if (data / "mesh.ply").is_file():
         hull = load_mesh(data / "mesh.ply")
+        scale, turn, shift = (values.numpy() for values in to_truth)
         hull = TriangleMesh((scale * hull.vertices @ turn.T + shift).astype(hull.vertices.dtype), hull.faces)
         figures["hull, intersection over union with the object"] = volume_overlap(hull, surface)
     return figures
@@ -86,18 +90,6 @@ def read_cameras(root: Path) -> tuple[Float[np.ndarray, "3 3"], dict[Path, Float
     return matrix, poses
 
 
-def similarity(
-    points: Float[np.ndarray, "N 3"], targets: Float[np.ndarray, "N 3"]
-) -> tuple[float, Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """Scale, rotation and shift that map points to targets with the least squared error (Umeyama, PAMI 1991)."""
-    centre, aim = points.mean(0), targets.mean(0)
-    left, spread, right = np.linalg.svd((targets - aim).T @ (points - centre))
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    turn = left @ sign @ right
-    scale = float((spread * np.diag(sign)).sum() / ((points - centre) ** 2).sum())
-    return scale, turn, aim - scale * turn @ centre
-
-
 def volume_overlap(first: TriangleMesh, second: TriangleMesh) -> float:
     """Intersection over union of two closed bodies."""
     both = np.concatenate([first.bounds, second.bounds])
@@ -105,12 +97,6 @@ def volume_overlap(first: TriangleMesh, second: TriangleMesh) -> float:
     box = np.stack([both.min(0) - margin, both.max(0) + margin])
     one, other = (occupancy_fraction(mesh, box, _RESOLUTION) > 0.5 for mesh in (first, second))
     return float((one & other).sum() / (one | other).sum())
-
-
-def _angle(rotations: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N"]:
-    """Angle of each rotation in degrees, accurate for small ones."""
-    axis = np.stack([rotations[:, i, j] - rotations[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], -1)
-    return np.degrees(np.arctan2(np.linalg.norm(axis, axis=1), np.trace(rotations, axis1=1, axis2=2) - 1))
 
 
 def _project(

@@ -19,7 +19,6 @@ from nerfro.capture.mask_files import (
     read_outlines,
     read_resized,
     save_mask,
-    stored_size,
 )
 from nerfro.capture.masking import Segmentation, grab, outline_region, propagate
 from nerfro.capture.outline_hull import AGREES
@@ -27,6 +26,7 @@ from nerfro.capture.overrides import is_given, of_groups
 from nerfro.capture.targets import opencv
 from nerfro.cli import entry_point, warn
 from nerfro.data.base import Frame
+from nerfro.data.image_files import read_size
 from nerfro.errors import NerfroError, first_of
 from nerfro.files.images import save_image
 from nerfro.paths import EMBEDDED_PREFIX
@@ -51,7 +51,7 @@ def main(config: DictConfig) -> None:
     size = cameras.width, cameras.height
     done = {view: read_resized(mask, size) for view, mask in kept.items()}
     for view, outline in outlined.items():
-        scaled = np.array(outline, np.float64) * size[0] / stored_size(frames[view])[0]
+        scaled = np.array(outline, np.float64) * size[0] / read_size(frames[view].image)[0]
         done[view] = grab(images[view], *outline_region(scaled, size))
     for view, mask in done.items():
         if not mask.any():

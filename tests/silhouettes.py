@@ -8,7 +8,7 @@ import trimesh
 
 from nerfro.cameras import Cameras
 from nerfro.capture.silhouettes import mesh_silhouettes
-from nerfro.capture.visual_hull import Silhouettes, carve_grid, extract_surface, find_box, remove_strays
+from nerfro.capture.visual_hull import Silhouettes, carve_mesh, find_box
 from nerfro.geometry.mesh import TriangleMesh
 
 
@@ -38,10 +38,18 @@ def photographed_softly(mesh: trimesh.Trimesh, cameras: Cameras, rays: int = 6) 
 
 
 def hull(silhouettes: Silhouettes, resolution: int, wrong_masks: int = 0) -> TriangleMesh:
-    distances, corner, spacing = carve_grid(silhouettes, find_box(silhouettes, wrong_masks), resolution, wrong_masks)
-    remove_strays(distances)
-    return extract_surface(distances, corner, spacing)
+    carved = carve_mesh(silhouettes, find_box(silhouettes, wrong_masks), resolution, wrong_masks)
+    assert carved is not None
+    return carved
 
 
 def volume(mesh: TriangleMesh) -> float:
     return float(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).volume)
+
+
+def odd_shape() -> trimesh.Trimesh:
+    """A body without symmetry: three boxes of different sizes."""
+    boxes = [trimesh.creation.box(size) for size in ((1.2, 0.45, 0.45), (0.4, 0.8, 0.35), (0.35, 0.35, 1.0))]
+    for box, place in zip(boxes, ([0.1, 0, 0], [-0.4, 0.3, 0], [0.6, 0, 0.4]), strict=True):
+        box.apply_translation(place)
+    return trimesh.util.concatenate(boxes)

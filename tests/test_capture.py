@@ -20,9 +20,8 @@ import torch
 from matplotlib.path import Path as Polygon
 from omegaconf import OmegaConf
 from scipy.spatial import ConvexHull
-from scipy.spatial.transform import Rotation
 
-from benchmarks.capture import measure, similarity
+from benchmarks.capture import measure
 from nerfro.capture.boards import tag_detector, twelve_faces
 from nerfro.data.opencv import OpenCVData
 from nerfro.geometry.mesh import load_mesh
@@ -105,16 +104,6 @@ def test_only_what_is_not_on_disk_is_rendered_again(few: Path, tmp_path: Path) -
     assert data.missing(planned) == []
     (tmp_path / "copy" / planned[1].mask_path).unlink()
     assert [picture.image_path for picture in data.missing(planned)] == ["images/photo_001.png"]
-
-
-def test_similarity_undoes_scale_turn_and_shift() -> None:
-    generator = np.random.default_rng(0)
-    points = generator.normal(size=(20, 3))
-    turn = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()
-    scale, found, shift = similarity(points, 0.3 * points @ turn.T + [1.0, 2.0, -3.0])
-    assert scale == pytest.approx(0.3)
-    assert found == pytest.approx(turn)
-    assert shift == pytest.approx([1.0, 2.0, -3.0])
 
 
 @pytest.mark.slow

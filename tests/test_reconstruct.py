@@ -23,7 +23,7 @@ from nerfro.capture import refinement, refinement_report, stages
 from nerfro.capture.overrides import as_overrides
 from nerfro.capture.stages import run_command
 from nerfro.files.images import save_png
-from tests.ball_photographs import RADIUS, SIZE, cameras, photographs, save
+from tests.ball_photographs import mesh, photographs, save, soft_masks
 from tests.conftest import Finished, finish
 
 Reconstruct = Callable[..., Finished]
@@ -238,11 +238,8 @@ def test_posed_photographs_of_a_ball_become_a_scene(
     """All stages but that of poses, each in this process."""
     data, out = tmp_path / "ball", tmp_path / "out"
     save(photographs([1.45]), data)
-    for view in range(len(cameras())):
-        rays = cameras().image_rays(view)
-        from_middle = torch.linalg.cross(rays.origins, rays.directions).norm(dim=-1)
-        share = (0.5 + (RADIUS - from_middle) / (3 / (0.8 * SIZE))).clamp(0, 1)  # of a pixel
-        save_png(data / "masks" / "train" / f"r_{view}.png", share.view(SIZE, SIZE, 1).expand(-1, -1, 3))
+    for view, mask in enumerate(soft_masks(mesh())):
+        save_png(data / "masks" / "train" / f"r_{view}.png", mask[..., None].expand(-1, -1, 3))
 
     def here(command: list[str]) -> int:
         GlobalHydra.instance().clear()
@@ -267,10 +264,14 @@ def test_posed_photographs_of_a_ball_become_a_scene(
              "medium.cache=false", "preprocess=resolution=24", f"train={' '.join(train)}"]  # fmt: skip
     done = reconstruct(*asked)
     assert done.code == 0, done.err
-    assert json.loads((out / "surface" / "index.json").read_text())["ior"] == [pytest.approx(1.45, rel=0.02)]
+    index = json.loads((out / "surface" / "index.json").read_text())
+    assert index["ior"] == [pytest.approx(1.45, rel=0.02)]
+    assert 0 < index["standard_error"][0] < 0.02
+    assert (out / "surface" / "index.png").is_file()
     found = json.loads((out / "surface" / "preprocess.json").read_text())
     assert found["near"] is False
     assert found["doubtful"] == []
+    assert f"medium.ior={index['ior'][0]:.4f}".rstrip("0") in found["options"]
     assert (out / "surface" / "refinement.png").is_file()
     assert json.loads((out / "run" / "metrics.json").read_text())["steps"] == 2
     assert "unknown" in (out / "report" / "report.html").read_text()

@@ -1,1 +1,1 @@
-"""What is believed of the training cameras: rays of a view -> rays."""
+"""Camera models: estimated poses, lens and exposures of the training views."""

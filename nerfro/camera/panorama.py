@@ -195,17 +195,11 @@ def _sample(
     images: Float[Tensor, "V 3 h w"], view: Int[Tensor, "O"], position: Float[Tensor, "O 2"]
 ) -> Float[Tensor, "O 3"]:
     """Interpolate colours linearly at positions (column, row); pixel corners are at whole numbers."""
-    height, width = images.shape[-2:]
-    low = (position - 0.5).floor()
-    offset = position - 0.5 - low
-    column, row = low.long().unbind(-1)
-    colours = images.new_zeros(len(view), 3)
-    for right in (0, 1):
-        for below in (0, 1):
-            weight = (offset[:, 0] if right else 1 - offset[:, 0]) * (offset[:, 1] if below else 1 - offset[:, 1])
-            at = (row + below).clamp(0, height - 1), (column + right).clamp(0, width - 1)
-            colours += weight[:, None] * images[view, :, at[0], at[1]]
-    return colours
+    (height, width), centre = images.shape[-2:], view[:, None] + 0.5
+    size = position.new_tensor([width, height, len(images)])
+    grid = 2 * torch.cat([position, centre], 1) / size - 1  # the views are the third axis of the grid
+    volume = images.transpose(0, 1)[None]
+    return F.grid_sample(volume, grid[None, None, None], padding_mode="border", align_corners=False)[0, :, 0, 0].T
 
 
 def _equations(

@@ -45,17 +45,8 @@ class _Motions(PerView):
     def __init__(self, fix_gauge: bool = True) -> None:
         super().__init__()
         self.fix_gauge = fix_gauge
-        shapes = {
-            "motion": (6,),
-            "poses": (3, 4),
-            "focal": (2,),
-            "distortion": (9,),
-            "units": (6,),
-            "weights": (6,),
-            "of_world": (0, 6),
-        }
-        for name, shape in {**shapes, "focal_unit": ()}.items():
-            self.register_buffer(name, torch.zeros(0, *shape))
+        for name in ("motion", "poses", "focal", "distortion", "units", "weights", "of_world", "focal_unit"):
+            self.register_buffer(name, torch.zeros(0))
 
     def begin(self, cameras: Cameras) -> None:
         poses = cameras.camera_to_world.double().cpu()
@@ -73,8 +64,7 @@ class _Motions(PerView):
             "focal_unit": 1 / pixels[:, 6].square().mean().sqrt()[None],
         }
         for name, tensor in found.items():
-            buffer = getattr(self, name)
-            setattr(self, name, tensor.to(buffer))
+            setattr(self, name, tensor.to(getattr(self, name)))
 
     def forward(self) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 3"]]:
         """Return rotation and translation of each camera, in the given camera axes."""

@@ -1,1 +1,1 @@
-"""From photographs to posed views: calibration targets, poses, masks."""
+"""Reconstruction of lens, poses, masks, surface and refractive index from photographs."""

@@ -17,10 +17,7 @@ from nerfro.files.atomic import write_atomically
 SPLITS = ("train", "val", "test")
 REPORT, PLOT = "calibration.json", "cameras.png"
 FILES = (*(f"transforms_{split}.json" for split in SPLITS), REPORT, PLOT)
-# Size of a drawn camera, as a fraction of the median distance of the cameras from the centre of the scene.
-_CAMERA_SIZE = 0.08
-_MAX_POINTS = 4000
-_CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+_MAX_POINTS = 4000  # in the plot
 
 
 def split_views(names: list[str], every: int) -> dict[str, list[str]]:
@@ -91,9 +88,8 @@ def write_calibrated(
     }
     write_atomically(out / REPORT, json.dumps(report, indent=1) + "\n")
     poses = list(calibration.poses.values())
-    slopes = 0.5 * size[0] / lens.matrix[0, 0], 0.5 * size[1] / lens.matrix[1, 1]
     matrices, errors = np.stack([pose.camera_to_world for pose in poses]), [pose.error for pose in poses]
-    write_atomically(out / PLOT, _draw_cameras(matrices, np.nan_to_num(errors), slopes, quads, points))
+    write_atomically(out / PLOT, _plot_cameras(matrices, np.nan_to_num(errors), quads, points))
     return [*written, str(out / REPORT), str(out / PLOT)]
 
 
@@ -115,70 +111,39 @@ def ray_range(calibration: Calibration, seen: Float[np.ndarray, "P 3"]) -> list[
     return [f"data.near={near:.3g}", f"data.far={far:.3g}"]
 
 
-def _draw_cameras(
+def _plot_cameras(
     poses: Float[np.ndarray, "V 3 4"],
     errors: Float[np.ndarray, "V"],
-    slopes: tuple[float, float],
     quads: Sequence[Float[np.ndarray, "4 3"]],
     points: Float[np.ndarray, "P 3"],
 ) -> bytes:
-    """Plot the cameras as pyramids, coloured by reprojection error, from the side and from above.
+    """Plot the cameras from the side and from above, as arrows along the optical axes.
 
     Args:
         poses: camera-to-world matrices in OpenCV's axes.
-        errors: reprojection errors, in pixels.
-        slopes: half the width and height of the image at unit depth.
+        errors: reprojection errors, in pixels, shown as colours.
         quads: corners of the sheets of the board.
-        points: scene points.
+        points: scene points; outliers are left out.
 
     Returns:
         The plot as a PNG file.
     """
-    from matplotlib import colormaps
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
-    from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-    centres = poses[:, :, 3]
-    seen = np.concatenate([*quads, points]) if quads or len(points) else centres
-    middle = np.median(seen, axis=0)
-    size = _CAMERA_SIZE * float(np.median(np.linalg.norm(centres - middle, axis=1)))
-    norm = Normalize(0, max(0.5, float(errors.max())))
-    colours = colormaps["viridis"](norm(errors))
-    half = np.array(slopes) / max(slopes) * 0.5 * size
-    frame = np.array([[x * half[0], y * half[1], 0.5 * size / max(slopes)] for x, y in _CORNERS])
-    # Outliers among the points of a reconstruction would otherwise determine the limits of the axes.
-    core = [np.quantile(points, (0.02, 0.98), axis=0)] if len(points) else []
-    shown = np.concatenate([centres, *quads, *core])
-    low, high = shown.min(0) - size, shown.max(0) + size
+    if len(points):
+        low, high = np.quantile(points, (0.02, 0.98), axis=0)
+        points = points[((points >= low) & (points <= high)).all(1)][:: -(-len(points) // _MAX_POINTS)]
     figure = Figure(figsize=(13, 6.5), layout="constrained", dpi=110)
-    FigureCanvasAgg(figure)
-    for place, (elevation, azimuth) in enumerate(((22, -60), (90, -90)), 1):
-        axes = figure.add_subplot(1, 2, place, projection="3d")
-        axes.set_proj_type("ortho")
-        axes.view_init(elevation, azimuth)
-        for pose, colour in zip(poses, colours, strict=True):
-            corners = frame @ pose[:, :3].T + pose[:, 3]
-            lines = [(pose[:, 3], corner) for corner in corners]
-            lines += [(corners[i], corners[(i + 1) % 4]) for i in range(4)]
-            axes.add_collection3d(Line3DCollection(lines, colors=colour, linewidths=0.9))
-        if quads:
-            style = {"facecolors": "0.75", "edgecolors": "0.2", "linewidths": 0.6, "alpha": 0.8}
-            axes.add_collection3d(Poly3DCollection(quads, **style))
-        chosen = points[:: -(-len(points) // _MAX_POINTS) or 1]
-        chosen = chosen[((chosen >= low) & (chosen <= high)).all(1)] if len(chosen) else chosen
-        axes.scatter(*chosen.T, s=1, c="0.4")
-        for i, axis in enumerate("xyz"):
-            getattr(axes, f"set_{axis}lim")(low[i], high[i])
-            getattr(axes, f"set_{axis}label")(axis)
-        axes.set_box_aspect(tuple(high - low), zoom=0.95)
-        if elevation == 90:  # from above
-            axes.set_zticks([])
-            axes.set_zlabel("")
-    scale = ScalarMappable(norm, "viridis")
-    figure.colorbar(scale, ax=figure.axes, shrink=0.6, label="reprojection error, pixels (rms)")
+    for axes, (across, up) in zip(figure.subplots(1, 2), ((0, 2), (0, 1)), strict=True):
+        for quad in quads:
+            axes.fill(quad[:, across], quad[:, up], facecolor="0.75", edgecolor="0.2")
+        axes.plot(points[:, across], points[:, up], ".", markersize=1, color="0.4")
+        ends = (poses[:, axis, column] for column in (3, 2) for axis in (across, up))
+        arrows = axes.quiver(*ends, errors, clim=(0, max(0.5, float(errors.max()))), angles="xy", width=0.004)
+        axes.set(xlabel="xyz"[across], ylabel="xyz"[up], aspect="equal")
+        axes.margins(0.1)
+    figure.colorbar(arrows, ax=figure.axes, shrink=0.6, label="reprojection error, pixels (rms)")
     content = io.BytesIO()
-    figure.savefig(content, format="png")
+    FigureCanvasAgg(figure).print_png(content)
     return content.getvalue()

@@ -12,7 +12,7 @@ from nerfro.camera.panorama import align
 from nerfro.camera.pixel_units import object_distances
 from nerfro.camera.refined import RefinedCamera
 from nerfro.camera.similarity import motion_between
-from nerfro.capture.outlines import meet_outlines
+from nerfro.capture.outlines import align_to_outlines
 from nerfro.capture.surface import object_box
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.data.base import Views
@@ -63,7 +63,7 @@ def refine_cameras(
         if not isinstance(mesh, TriangleMesh):
             mesh = mesh(replace(silhouettes, cameras=camera.estimated(views.cameras)), _VOXELS)
         # The first hulls are as inaccurate as the poses, so any distance to the masks is accepted.
-        meet_outlines(camera, views.cameras, lambda cameras: cameras, silhouettes, mesh, [panorama], math.inf)
+        align_to_outlines(camera, views.cameras, lambda cameras: cameras, silhouettes, mesh, [panorama], math.inf)
         if float(((motions.fixed() - before) / motions.units).square().sum(-1).mean().sqrt()) < _CONVERGED:
             break
     turned, shifted = motion_between(views.cameras.camera_to_world, camera.estimated(views.cameras).camera_to_world)

@@ -26,21 +26,12 @@ class Displacement(nn.Module):
         super().__init__()
         self.levels = nn.ParameterList(nn.Parameter(torch.zeros(n, n, n)) for n in levels)
         self.scales = [size * levels[0] / n for n in levels]
-        self._num_axes = len(shape)
-        for level, n in enumerate(levels):
-            for axis, length in enumerate(shape):
-                self.register_buffer(f"_basis_{level}_{axis}", bspline_basis(n, length), persistent=False)
+        self._bases = [[bspline_basis(n, length) for length in shape] for n in levels]
 
     def forward(self) -> Float[Tensor, "X Y Z"]:
         """Evaluate the displacement at all vertices of the grid."""
-        total: Tensor | float = 0.0
-        for level, (values, scale) in enumerate(zip(self.levels, self.scales, strict=True)):
-            values = scale * values
-            for axis in reversed(range(self._num_axes)):
-                basis = self.get_buffer(f"_basis_{level}_{axis}")
-                values = torch.tensordot(values, basis, ([axis], [1])).movedim(-1, axis)
-            total = total + values
-        return total  # type: ignore[return-value]
+        terms = zip(self.scales, self.levels, self._bases, strict=True)
+        return sum(scale * torch.einsum("ijk,xi,yj,zk->xyz", values, *bases) for scale, values, bases in terms)  # type: ignore[return-value]
 
     def roughness(self) -> Float[Tensor, ""]:
         """Return the mean square of second differences between control points, as slopes of the surface."""
@@ -48,5 +39,5 @@ class Displacement(nn.Module):
         return sum(  # type: ignore[return-value]
             (values.diff(n=2, dim=axis) * (coarsest * (len(values) - 3) / len(values))).square().mean()
             for values in self.levels
-            for axis in range(self._num_axes)
+            for axis in range(3)
         )

@@ -149,11 +149,6 @@ def mask_file(frame: Frame) -> Path:
     return frame.image.with_name(f"mask_{frame.image.stem}.png")
 
 
-def stored_size(frame: Frame) -> tuple[int, int]:
-    """Return width and height of the image file of a frame."""
-    return read_size(frame.image)[:2]
-
-
 def read_resized(mask: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
     """Read a mask and resize it to the width and height of the loaded images."""
     coverage = to_unit(read_mask(mask))
@@ -167,7 +162,7 @@ def read_resized(mask: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
 
 def save_mask(frame: Frame, mask: Bool[np.ndarray, "H W"]) -> None:
     """Write the mask of a frame as a black and white image in the size of its image file."""
-    picture, size = Image.fromarray(np.uint8(255 * mask)), stored_size(frame)
+    picture, size = Image.fromarray(np.uint8(255 * mask)), read_size(frame.image)[:2]
     if picture.size != size:
         picture = picture.resize(size, Image.Resampling.BICUBIC).point(lambda level: 255 * (level > 127))
     save_image(mask_file(frame), picture)

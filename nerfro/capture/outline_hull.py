@@ -12,7 +12,7 @@ from nerfro.cameras import Cameras
 from nerfro.capture.pose_conventions import GOOD_OVERLAP, coarse_agreement
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.targets import opencv
-from nerfro.capture.visual_hull import Silhouettes, carve_grid, centre_lines, extract_surface, find_box, remove_strays
+from nerfro.capture.visual_hull import Silhouettes, carve_mesh, centre_lines, find_box
 from nerfro.geometry.lines import nearest_point
 from nerfro.geometry.mesh import TriangleMesh
 
@@ -77,9 +77,7 @@ class OutlineHull:
         wrong = int(_WRONG_FRACTION * len(silhouettes))
         centre = self._centre_from_one_side(silhouettes)
         box = find_box(silhouettes, wrong) if centre is None else _box_around(centre, silhouettes)
-        distances, corner, spacing = carve_grid(silhouettes, box, _VOXELS, wrong)
-        remove_strays(distances)
-        return extract_surface(distances, corner, spacing) if (distances < 0).any() else None
+        return carve_mesh(silhouettes, box, _VOXELS, wrong)
 
     def seen_from(self, view: int, hull: TriangleMesh | None) -> Bool[np.ndarray, "H W"]:
         """Render the silhouette of a hull in the size of the images."""

@@ -1,7 +1,8 @@
-"""Cameras moved until a known surface is seen in the outlines of its masks.
+"""Alignment of cameras by the outlines of the masks of a known surface.
 
-A mask of shares tells its outline to hundredths of a pixel, all around: more of where a camera stands than colours do.
-It hardly tells a turn from a shift across the line of sight; that the sky tells.
+Antialiased masks give outlines with an accuracy of hundredths of a pixel, and determine the pose of a camera more
+accurately than colours do. However, outlines hardly distinguish a rotation from a translation across the line of sight;
+the distant surroundings do (`nerfro.camera.panorama`).
 """
 
 from __future__ import annotations
@@ -21,96 +22,97 @@ from nerfro.geometry.mesh import TriangleMesh
 from nerfro.progress import track
 
 _STEPS = 8
-_LONGEST = 2.0  # pixels that a camera is moved in a step, at most
-# Outlines are known no better than this, pixels; and errors of so many neighbours are one.
-_LEAST, _ALIKE = 0.02, 3.0
-# Cameras are off by about so many pixels, so that what outlines hardly tell stays.
-_GIVEN = 1.0
-# If the surface is still seen farther off its masks, pixels, it is not theirs, or they were drawn by hand.
-_FARTHEST = 0.2
+_MAX_STEP = 2.0  # pixels
+# Accuracy of outlines in pixels, and number of neighbouring contour points with a common error.
+_ACCURACY, _CORRELATED = 0.02, 3.0
+# Standard deviation of the prior of each parameter, in pixels, which fixes parameters that outlines do not determine.
+_PRIOR_DEVIATION = 1.0
+# Largest final distance, in pixels, between the surface and its masks; otherwise mesh and masks differ.
+_MAX_DISTANCE = 0.2
 
 
 @torch.no_grad()
-def meet_outlines(
+def align_to_outlines(
     camera: RefinedCamera,
     cameras: Cameras,
-    reduced: Callable[[Cameras], Cameras],
+    downscaled: Callable[[Cameras], Cameras],
     silhouettes: Silhouettes,
     mesh: TriangleMesh,
-    told: Sequence[PriorInformation] = (),
-    farthest: float = _FARTHEST,
+    priors: Sequence[PriorInformation] = (),
+    max_distance: float = _MAX_DISTANCE,
 ) -> PriorInformation | None:
-    """Move the cameras until the outlines of a surface are those of its masks.
+    """Move the cameras until the contours of a surface meet the outlines of the masks.
 
-    Masks that are too wide everywhere, or too narrow, by the same part of a pixel, do not disturb.
+    A common width by which all masks are too large or too small is eliminated.
 
     Args:
-        camera: what is believed of the cameras; it is changed.
-        cameras: as the data give them.
-        reduced: makes the cameras of the silhouettes of these.
-        silhouettes: of all views.
+        camera: estimated cameras, changed in place.
+        cameras: cameras of the data set.
+        downscaled: conversion of cameras to the size of the silhouettes.
+        silhouettes: silhouettes of all views.
         mesh: the surface.
-        told: what is known of the cameras already.
-        farthest: how far off its masks the surface may be seen in the end, median, pixels.
+        priors: prior information about the cameras.
+        max_distance: largest median distance, in pixels, between the surface and its masks after the alignment.
 
     Returns:
-        What the outlines tell of them; none where the surface is seen farther off. Then cameras stay.
+        The information that the outlines give about the cameras. None if the distance is larger; the cameras are then
+        unchanged.
     """
-    before = camera.position()
-    begun = camera.numbers()
-    given = PriorInformation(begun, torch.eye(len(begun)).to(begun) / _GIVEN**2)
+    before, numbers = camera.position(), camera.numbers()
+    weak = PriorInformation(numbers, torch.eye(len(numbers)).to(numbers) / _PRIOR_DEVIATION**2)
     finder = RimFinder(mesh, silhouettes)
     for step in track("outlines", range(_STEPS + 1)):
-        slopes, error, weights, view = _seen(camera, cameras, reduced, finder)
-        variance = float((weights * error[:, 0].square()).sum() / weights.sum()) + _LEAST**2
+        slopes, error, weights, view = _observations(camera, cameras, downscaled, finder)
+        variance = float((weights * error[:, 0].square()).sum() / weights.sum()) + _ACCURACY**2
         if step < _STEPS:
             matrix, vector = normal_equations(slopes, error, weights, view, len(cameras))
-            matrix, vector = _any_width(matrix, vector)
-            matrix, vector = with_priors(matrix, vector, camera.numbers(), _ALIKE * variance, [*told, given])
+            matrix, vector = _without_width(matrix, vector)
+            matrix, vector = with_priors(matrix, vector, camera.numbers(), _CORRELATED * variance, [*priors, weak])
             motion, lens = camera.split(-torch.linalg.solve(matrix, vector).to(camera.motions.motion))
-            motion = motion * (_LONGEST / motion.norm(dim=-1, keepdim=True).clamp(min=_LONGEST))
-            camera.move(motion, lens)
-    off = float((error - error.median()).abs().median())
-    if off > farthest:
+            camera.move(motion * (_MAX_STEP / motion.norm(dim=-1, keepdim=True).clamp(min=_MAX_STEP)), lens)
+    distance = float((error - error.median()).abs().median())
+    if distance > max_distance:
         camera.move_back(before, worse=torch.ones(len(cameras), dtype=torch.bool), lens=True)
-        print(f"outlines: at best the surface is {off:.2f} pixels off its masks, so they do not tell where cameras are")
+        print(f"outlines: the surface is {distance:.2f} pixels off its masks at best, so the cameras are not aligned")
         return None
     matrix, vector = normal_equations(slopes, error, weights, view, len(cameras), damping=0.0)
-    numbers = camera.numbers()
-    return PriorInformation(numbers, (_any_width(matrix, vector)[0] / (_ALIKE * variance)).to(numbers))
+    information = _without_width(matrix, vector)[0] / (_CORRELATED * variance)
+    return PriorInformation(camera.numbers(), information.to(numbers))
 
 
-def _seen(
+def _observations(
     camera: RefinedCamera,
     cameras: Cameras,
-    reduced: Callable[[Cameras], Cameras],
+    downscaled: Callable[[Cameras], Cameras],
     finder: RimFinder,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Slopes [R, 1, N + 1] and errors [R, 1] of the outlines in pixels of the silhouettes, their weights and views.
+) -> tuple[Float[Tensor, "R 1 N+1"], Float[Tensor, "R 1"], Float[Tensor, "R"], Tensor]:
+    """Compute derivatives, errors, weights and views of the contour points, in pixels of the silhouettes.
 
-    The last slope is that by a width of which all masks are too wide.
+    The last derivative is by the common width of the masks.
     """
-    believed = reduced(camera.estimated(cameras))
-    rims = finder.points(believed)
-    of_views = rims.points.split(torch.bincount(rims.views, minlength=len(cameras)).tolist())
-    place = torch.cat([believed.select([view]).project(points)[0][0] for view, points in enumerate(of_views)])
-    place = place * place.new_tensor([cameras.width / believed.width, cameras.height / believed.height])
+    estimated = downscaled(camera.estimated(cameras))
+    rims = finder.find(estimated)
+    device, views = camera.motions.motion.device, torch.from_numpy(rims.view)
+    points, normals, misfits, weights, widths = (
+        torch.from_numpy(each).float() for each in (rims.points, rims.normal, rims.misfit, rims.weight, rims.width)
+    )
+    of_views = points.split(torch.bincount(views, minlength=len(cameras)).tolist())
+    place = torch.cat([estimated.select([view]).project(each)[0][0] for view, each in enumerate(of_views)])
+    place = place * place.new_tensor([cameras.width / estimated.width, cameras.height / estimated.height])
     pixel = place.floor()
-    rays = cameras.rays(rims.views, pixel[:, 1], pixel[:, 0], place - pixel)
-    # A pixel's ray that moves outwards meets the surface no more: it is seen farther inside the mask's outline.
-    outwards = rims.normals / rims.widths[:, None]
-    distances = (rims.points - believed.camera_to_world[rims.views, :, 3]).norm(dim=-1, keepdim=True)
-    device = camera.motions.motion.device
-    view, by_origin, by_direction = (x.to(device) for x in (rims.views, outwards, distances * outwards))
-    slopes = camera.slopes(rays.to(device), view, by_origin[:, None], by_direction[:, None]).double()
+    rays = cameras.rays(views, pixel[:, 1], pixel[:, 0], place - pixel)
+    # The ray of a fixed pixel that moves outwards misses the surface, as if the mask were larger.
+    outwards = normals / widths[:, None]
+    distances = (points - estimated.camera_to_world[views, :, 3]).norm(dim=-1, keepdim=True)
+    views, by_origin, by_direction = (x.to(device) for x in (views, outwards, distances * outwards))
+    slopes = camera.slopes(rays.to(device), views, by_origin[:, None], by_direction[:, None]).double()
     slopes = torch.cat([slopes, torch.ones_like(slopes[..., :1])], -1)
-    error, weights = (x.to(slopes) for x in (rims.misfits / rims.widths, rims.weights))
-    return slopes, error[:, None], weights, view
+    return slopes, (misfits / widths).to(slopes)[:, None], weights.to(slopes), views
 
 
-def _any_width(
+def _without_width(
     matrix: Float[Tensor, "N N"], vector: Float[Tensor, "N"]
 ) -> tuple[Float[Tensor, "N-1 N-1"], Float[Tensor, "N-1"]]:
-    """Normal equations with the last number whatever fits best (Schur's complement)."""
+    """Eliminate the last parameter from normal equations (Schur complement)."""
     column, last = matrix[:-1, -1], matrix[-1, -1]
     return matrix[:-1, :-1] - torch.outer(column, column) / last, vector[:-1] - column * (vector[-1] / last)

@@ -1,10 +1,9 @@
-"""Observation model of binary masks: the side of the outline on which each pixel centre lies."""
+"""Observation model of binary masks: whether each pixel centre is inside or outside the outline."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from scipy.special import log_ndtr
 
 from nerfro.capture.rims import Rims
@@ -19,7 +18,7 @@ _SOFTNESS = 0.3
 _MIN_SECOND_DERIVATIVE, _MAX_STEP = 1e-3, 0.5
 
 
-def by_pixel_sides(rims: Rims, points: Float[np.ndarray, "K 3"], silhouettes: Silhouettes, off: float) -> Rims:
+def by_pixel_sides(rims: Rims, silhouettes: Silhouettes, error: float) -> Rims:
     """Replace misfits and weights of contour points by those of a probit model of the surrounding pixels.
 
     The outline that is interpolated from a binary mask has an error of 0.15 pixels, which is correlated along the
@@ -32,34 +31,33 @@ def by_pixel_sides(rims: Rims, points: Float[np.ndarray, "K 3"], silhouettes: Si
 
     Args:
         rims: contour points of the surface (see `find_rims`).
-        points: positions of the contour points.
         silhouettes: silhouettes of binary masks.
-        off: mean error of the contours, in pixels; sigma is proportional to it.
+        error: mean error of the contours, in pixels; sigma is proportional to it.
     """
-    sigma = _SOFTNESS * off
-    slope, bend = np.zeros(len(points)), np.zeros(len(points))
-    around = np.stack(np.meshgrid(*2 * [np.arange(_SIDE) - _SIDE // 2 + 1]), -1).reshape(-1, 1, 2)
+    sigma, points = _SOFTNESS * error, rims.points
+    gradient, curvature = np.zeros(len(points)), np.zeros(len(points))
+    neighbours = np.stack(np.meshgrid(*2 * [np.arange(_SIDE) - _SIDE // 2 + 1]), -1).reshape(-1, 1, 2)
     for view in np.unique(rims.view):
-        seen, inside = np.flatnonzero(rims.view == view), (silhouettes.masks[int(view)] > 0.5).numpy()
+        chosen, inside = np.flatnonzero(rims.view == view), (silhouettes.masks[int(view)] > 0.5).numpy()
         camera = silhouettes.cameras.select([int(view)])
         # Projection has single precision, so the image normal is computed from a point some pixels away.
-        outwards = points[seen] + _SIDE * rims.width[seen, None] * rims.normal[seen]
+        outwards = points[chosen] + _SIDE * rims.width[chosen, None] * rims.normal[chosen]
         place, beyond = (
-            camera.project(torch.from_numpy(each).float())[0][0].double().numpy() for each in (points[seen], outwards)
+            camera.project(torch.from_numpy(each).float())[0][0].double().numpy() for each in (points[chosen], outwards)
         )
         normal = (beyond - place) / np.linalg.norm(beyond - place, axis=1, keepdims=True)
-        pixel = np.floor(place - 0.5).astype(np.int64) + around
-        held = pixel.clip(0, np.array(inside.shape[::-1]) - 1)
-        known = (pixel == held).all(-1)
-        column, row = np.moveaxis(held, -1, 0)
+        pixel = np.floor(place - 0.5).astype(np.int64) + neighbours
+        inner = pixel.clip(0, np.array(inside.shape[::-1]) - 1)
+        known = (pixel == inner).all(-1)
+        column, row = np.moveaxis(inner, -1, 0)
         offset = place - (pixel + 0.5)
         depth, along = (offset * normal).sum(-1), offset[..., 0] * normal[:, 1] - offset[..., 1] * normal[:, 0]
         side = np.where(inside[row, column], 1.0, -1.0)
         weight = known * np.exp(-0.5 * (along / _ALONG) ** 2)
-        sure = side * depth / sigma
-        hazard = np.exp(-0.5 * (sure**2 + np.log(2 * np.pi)) - log_ndtr(sure))
-        slope[seen] = sigma * (weight * side * hazard).sum(0)
-        bend[seen] = (weight * hazard * (hazard + sure)).sum(0)
-    misfit = (slope / bend.clip(_MIN_SECOND_DERIVATIVE)).clip(-_MAX_STEP, _MAX_STEP)
-    trusted = 1 / (1 + (rims.misfit / (off * rims.width)) ** 2)
-    return rims._replace(misfit=misfit * rims.width, weight=trusted * bend / _SOFTNESS**2)
+        margin = side * depth / sigma
+        hazard = np.exp(-0.5 * (margin**2 + np.log(2 * np.pi)) - log_ndtr(margin))
+        gradient[chosen] = sigma * (weight * side * hazard).sum(0)
+        curvature[chosen] = (weight * hazard * (hazard + margin)).sum(0)
+    misfit = (gradient / curvature.clip(_MIN_SECOND_DERIVATIVE)).clip(-_MAX_STEP, _MAX_STEP)
+    trust = 1 / (1 + (rims.misfit / (error * rims.width)) ** 2)
+    return rims._replace(misfit=misfit * rims.width, weight=trust * curvature / _SOFTNESS**2)

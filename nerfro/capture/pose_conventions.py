@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.capture.silhouettes import mesh_silhouettes, pixel_stride
-from nerfro.capture.visual_hull import Silhouettes, carve_grid, extract_surface, find_box, remove_strays
+from nerfro.capture.visual_hull import Silhouettes, carve_mesh, find_box
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
 
@@ -55,13 +55,11 @@ def coarse_agreement(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np
     The agreement is 1 minus the number of differing pixels that are not near the outline, relative to the area of the
     mask, clamped at 0. The agreement with an empty hull is 0.
     """
-    box = find_box(silhouettes, wrong_masks)
-    distances, corner, spacing = carve_grid(silhouettes, box, _COARSE_VOXELS, wrong_masks)
-    remove_strays(distances)
-    if not (distances < 0).any():
+    hull = carve_mesh(silhouettes, find_box(silhouettes, wrong_masks), _COARSE_VOXELS, wrong_masks)
+    if hull is None:
         return np.zeros(len(silhouettes))
     stride = pixel_stride(silhouettes.cameras, _COARSE_PIXELS)
-    ours = mesh_silhouettes(extract_surface(distances, corner, spacing), silhouettes.cameras, stride)
+    ours = mesh_silhouettes(hull, silhouettes.cameras, stride)
     outlines = silhouettes.distances[:, ::stride, ::stride]
     differs = (ours != (outlines > 0)) & (outlines.abs() > _SLACK * stride)
     return (1 - differs.sum((1, 2)).double() / (outlines > 0).sum((1, 2)).clamp(min=1)).clamp(min=0).numpy()

@@ -1,22 +1,24 @@
-"""A surface moved until what is seen through it is seen where it is: descent on the photographs' error.
+"""Refinement of a surface by gradient descent on the error of photographs.
 
-Pixels that look through a clear body show its surroundings, in the direction in which their rays leave. The surface
-moves so that these are the directions in which the surroundings have the pixels' colours, by the derivative of the
-exact paths (`samplers.replay`). Three things keep it on the way:
+Pixels inside the silhouette of a clear body show the surroundings in the exit directions of their rays. The surface is
+displaced until the surroundings in the exit directions have the colours of the pixels, with derivatives of the exact
+paths (`samplers.replay`). Three measures make the descent converge:
 
-- Blurred surroundings first. Their slope tells the way over as many degrees as they are blurred.
-- A robust error. Pixels that show opaque things inside have large ones, wherever the surface is, and hardly pull.
-- Outlines. Where a surface is seen from its side, the masks have told where it is, and it stays there.
+- The surroundings are blurred first, because the gradient of a photograph is informative only over the width of its
+  details.
+- The error is robust, because pixels that show opaque objects inside the body have large errors for every surface.
+- The contours of the surface stay in place, because the masks determine the contours.
 
-Photographs of some views are held back and judge: the surface is the one that explains them best. They also say how
-much it is smoothed, before the descent and after it, for a hull is as rough as its voxels.
+The photographs of validation views select the surface, and how much the surface is smoothed before and after the
+descent, because a visual hull is as rough as its voxels.
 """
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -28,12 +30,12 @@ from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.cube_map import texel_directions
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.capture.displacement import Displacement
-from nerfro.capture.record import Record
 from nerfro.capture.rims import RimFinder
 from nerfro.capture.room_picture import RoomPicture, picture_of
 from nerfro.capture.surroundings import Pixels, Room, Surroundings, robust
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import NerfroError
+from nerfro.files.atomic import write_atomically
 from nerfro.files.cache import content_hash
 from nerfro.geometry.interpolation import quadratic_spline, smooth
 from nerfro.geometry.mesh import TriangleMesh
@@ -42,24 +44,32 @@ from nerfro.samplers.snell import Snell
 from nerfro.types import Exits, Path
 from nerfro.variants import variant
 
-_JUDGED = 20_000  # held-back pixels, at most
-# Residuals of linear radiance count half at this.
-_HALF = 0.1
-# Part of the key of a record: raise it when the same inputs lead elsewhere than before.
-_VERSION = 2
-# An outline is known to about this, pixels; weights of outlines and of smoothness.
-_OUTLINE, _OUTLINES, _SMOOTH = 0.25, 0.1, 0.1
-_RIMS = 4000  # points of outlines of a step
+_MAX_VALIDATION_PIXELS = 20_000
+# Residual of linear radiance at which a pixel has half weight.
+_HALF_WEIGHT = 0.1
+# Part of the key of a saved state; raise the number if the same inputs lead to other results.
+_VERSION = 3
+# Standard deviation of contours in pixels, and weights of contours and of roughness. Chosen as in RefinementSettings.
+_CONTOUR_DEVIATION, _CONTOUR_WEIGHT, _ROUGHNESS_WEIGHT = 0.25, 0.1, 0.1
+_NUM_CONTOUR_POINTS = 4000  # in each step
+_VALIDATE_EVERY = 25  # steps
+# A stage ends early if the validation error exceeds the smallest error by this fraction.
+_MAX_INCREASE = 0.03
+# A surface is accepted if the validation error decreases by at least this fraction. A wrong surface also explains some
+# of the reflections, the tint and the interior: errors decreased by 0.012 to 0.11 for better surfaces, and by up to
+# 0.009 for worse ones (docs/capture.md).
+_MIN_GAIN = 0.01
+_BLUR_SAMPLES = 32
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Steps at one pace.
+    """A number of steps with one learning rate schedule.
 
     Attributes:
-        steps: their number.
-        rate: how far the first step moves the surface, see `Displacement`, and an index; it falls along half a cosine.
-        blur: standard deviation of the surroundings' blur at the beginning and at the end, degrees; 0 for none.
+        steps: number of steps.
+        rate: initial learning rate of displacements (see `Displacement`) and indices; follows half a cosine to zero.
+        blur: initial and final standard deviation of the blur of the surroundings, in degrees; 0 for no blur.
     """
 
     steps: int
@@ -69,14 +79,14 @@ class Stage:
 
 @dataclass(frozen=True)
 class RefinementSettings:
-    """How a surface is refined. The defaults were chosen on the wavy body and on `starlamp`, see docs/capture.md.
+    """Settings of the refinement. The defaults were chosen on the wavy body and on `starlamp` (docs/capture.md).
 
     Attributes:
-        stages: of the descent. The first ones are too bold for a surface that is nearly right. They are left when it
-            is worse by a share, and so is whatever is not the best when a stage ends.
-        num_pixels: pixels of a step.
-        levels: control points along each side of the splines that displace the surface.
-        smoothings: standard deviations of the smoothing that is tried, in shares of the object's size.
+        stages: stages of the descent. Each stage starts with the surface of the smallest validation error. The first
+            stages are too coarse for an accurate surface, and end early if the error increases.
+        num_pixels: number of pixels in each step.
+        levels: numbers of control points along each side of the splines that displace the surface.
+        smoothings: standard deviations of the tested smoothings, as fractions of the object's size.
     """
 
     stages: tuple[Stage, ...] = (
@@ -90,23 +100,15 @@ class RefinementSettings:
     smoothings: tuple[float, ...] = (0.005, 0.007, 0.01, 0.014)
 
 
-_WORSE = 0.03
-_JUDGE_EVERY = 25  # steps
-# A surface that makes held-back photographs better by a smaller share is not taken: reflections, tint and what is
-# inside can be explained a little by a wrong surface too. It was 0.012 to 0.11 where the surface became better, and up
-# to 0.009 where it did not.
-_LEAST_GAIN = 0.01
-
-
 @dataclass(frozen=True)
 class Refined:
-    """A surface that was moved.
+    """Result of a refinement.
 
     Attributes:
-        mesh: the surface; the given one itself where none is clearly better.
-        medium: made of it.
-        steps, errors: after which steps it was judged, and the robust error of held-back pixels then: 0 where
-            all is explained, 1 where nothing is. The first is that of the surface as it was.
+        mesh: the refined surface; the given one without a significant improvement.
+        medium: medium of the surface.
+        steps, errors: number of steps and mean robust error of the validation pixels at each validation: 0 for exact
+            colours, 1 for outliers. The first error is that of the given surface.
     """
 
     mesh: TriangleMesh
@@ -126,83 +128,76 @@ def refine_surface(
     record: FilePath | None = None,
     settings: RefinementSettings = RefinementSettings(),
 ) -> Refined:
-    """Move the outer surface of a medium by what photographs show through it.
+    """Refine the outer surface of a medium by the refractions in photographs.
 
     Args:
         mesh: the surface.
-        medium: the bodies, with the indices that they have; white light alone is followed.
-        silhouettes: of the surface; its outlines stay where they are.
-        through: pixels that the object fills.
-        surroundings: what is seen around it, near or far.
-        learn_index: whether the indices are not known for sure, and learned along with the surface.
-        progress: is told the share done.
-        record: file in which the state is kept now and then, and from which a descent on the same pixels that was
-            interrupted goes on; it is removed at the end.
-        settings: of the descent.
+        medium: the bodies with estimated indices; refraction is achromatic.
+        silhouettes: silhouettes of the surface, whose outlines are kept.
+        through: pixels inside the silhouette of the object.
+        surroundings: known surroundings, near or distant.
+        learn_index: whether to refine the indices together with the surface.
+        progress: called with the completed fraction.
+        record: file that stores the state after each stage, from which an interrupted refinement resumes; removed at
+            the end.
+        settings: settings of the descent.
 
     Raises:
-        NerfroError: no pixel shows the surroundings through the object.
+        NerfroError: no pixel shows known surroundings through the object.
     """
     descent = _Descent(mesh, medium, silhouettes, through, surroundings, learn_index, settings)
-    error = descent.judged(medium)
-    picture = _picture(surroundings, mesh, medium)
+    error = descent.validation_error(medium)
+    key = _key(mesh, medium, through, learn_index, settings)
     descent.start, smoothed = descent.smoothed(medium, error)
-    at = _Position(descent.state(), [error, smoothed], [0, 0])
-    kept = Record(record, _key(mesh, medium, through, learn_index, settings))
-    if (found := kept.read()) is not None:
-        at = _Position(**found["at"])
-        descent.go_on(found["descent"])
-    stages = settings.stages
-    total = sum(stage.steps for stage in stages)
-    while at.stage < len(stages):
-        stage = stages[at.stage]
-        done = sum(before.steps for before in stages[: at.stage])
-        while at.step < stage.steps:
-            if at.step % _JUDGE_EVERY == 0:
-                share = at.step / stage.steps
-                sky = _blurred(picture, stage.blur[0] + (stage.blur[1] - stage.blur[0]) * share)
-            descent.step(sky, stage.rate * 0.5 * (1 + math.cos(math.pi * at.step / stage.steps)))
-            at.step += 1
-            progress((done + at.step) / total)
-            if at.step % _JUDGE_EVERY == 0:
-                at.steps.append(at.steps[-1] + _JUDGE_EVERY)
-                at.errors.append(descent.judged(descent.moved()))
-                if at.errors[-1] == min(at.errors):
-                    at.best = descent.state()
-                elif at.errors[-1] > (1 + _WORSE) * min(at.errors):
+    first: dict[str, Any] = {"key": key, "stage": 0, "steps": [0, 0], "errors": [error, smoothed]}
+    state = _load(record, key) or first | {"best": descent.values()}
+    steps, errors, total = state["steps"], state["errors"], sum(stage.steps for stage in settings.stages)
+    for number in range(state["stage"], len(settings.stages)):
+        done = sum(stage.steps for stage in settings.stages[:number])
+        descent.begin(state["best"], seed=number)
+        for step in range(settings.stages[number].steps):
+            descent.step(settings.stages[number], step)
+            progress((done + step + 1) / total)
+            if (step + 1) % _VALIDATE_EVERY == 0:
+                steps.append(steps[-1] + _VALIDATE_EVERY)
+                errors.append(descent.validation_error(descent.medium()))
+                if errors[-1] == min(errors):
+                    state["best"] = descent.values()
+                elif errors[-1] > (1 + _MAX_INCREASE) * min(errors):
                     break
-                kept.write({"at": asdict(at), "descent": descent.record()})
-        descent.set(at.best)
-        at.stage, at.step = at.stage + 1, 0
-    moved, smoothed = descent.smoothed(descent.moved(), min(at.errors))
+        if record is not None:
+            content = io.BytesIO()
+            torch.save(state | {"stage": number + 1}, content)
+            write_atomically(record, content.getvalue())
+    descent.begin(state["best"])
+    refined, smoothed = descent.smoothed(descent.medium(), min(errors))
     progress(1.0)
-    kept.remove()
-    steps, errors = [*at.steps, at.steps[-1]], [*at.errors, smoothed]
-    if smoothed > (1 - _LEAST_GAIN) * error:
+    if record is not None:
+        record.unlink(missing_ok=True)
+    steps, errors = [*steps, steps[-1]], [*errors, smoothed]
+    if smoothed > (1 - _MIN_GAIN) * error:
         return Refined(mesh, medium, steps, errors)
-    return Refined(_onto(mesh, moved), moved, steps, errors)
-
-
-@dataclass
-class _Position:
-    """How far a descent is, and the best of its states; see `Refined` for the others."""
-
-    best: list[Tensor]
-    errors: list[float]
-    steps: list[int]
-    stage: int = 0
-    step: int = 0  # of the stage
+    return Refined(_project_onto(mesh, refined), refined, steps, errors)
 
 
 def _key(mesh: TriangleMesh, medium: SdfGrid, through: Pixels, learn_index: bool, settings: RefinementSettings) -> str:
-    """Hash of what a descent depends on; surroundings are learned from the same photographs."""
+    """Hash the inputs of a descent; the surroundings depend on the same photographs."""
     tensors = medium.box, medium.distances, medium.iors.float(), through.index, through.radiance
     arrays = (tensor.detach().numpy() for tensor in tensors)
     return content_hash(_VERSION, repr(settings), learn_index, mesh.vertices, mesh.faces, *arrays)
 
 
+def _load(file: FilePath | None, key: str) -> dict[str, Any] | None:
+    """Load the state of an interrupted refinement with the same inputs; None without a valid state."""
+    try:
+        state = torch.load(file, weights_only=True) if file is not None else {"key": None}
+        return state if state["key"] == key else None
+    except Exception:  # torch.load raises nearly any exception for a damaged file
+        return None
+
+
 class _Descent:
-    """The surface on its way from a start, and the pixels that teach and judge it."""
+    """Displacements and indices with their optimizer, training pixels and validation pixels."""
 
     def __init__(
         self,
@@ -214,145 +209,130 @@ class _Descent:
         learn_index: bool,
         settings: RefinementSettings,
     ) -> None:
-        self.settings = settings
-        self.given, self.start, self.surroundings = medium, medium, surroundings
+        self.settings, self.given, self.start, self.surroundings = settings, medium, medium, surroundings
         self.iors = nn.Parameter(medium.iors.clone(), requires_grad=learn_index)
-        # Rays that are reflected inside are no help: tiny errors of the surface turn them anywhere.
+        # Rays with internal reflections are left out: small errors of the surface turn them far.
         self.sampler = Snell(max_events=2 * len(medium.iors))
         self.size = float(np.ptp(mesh.bounds, axis=0).max())
         self.offsets = Displacement(tuple(medium.distances.shape[1:]), self.size, settings.levels)
-        self.teachers, validation = through.split()
-        self.judges = validation.some(_JUDGED)
-        self.first_errors: Tensor | None = None
-        self.rims = RimFinder(mesh, silhouettes).points().points
-        cameras = silhouettes.cameras
+        self.learned = [*self.offsets.levels, self.iors]
+        self.training, validation = through.split()
+        self.validation = validation.some(_MAX_VALIDATION_PIXELS)
+        self.initial_errors: Tensor | None = None
+        rims, cameras = RimFinder(mesh, silhouettes).find(), silhouettes.cameras
+        self.rims = torch.from_numpy(rims.points).float()
         middle = torch.from_numpy(mesh.bounds.mean(0)).float()
         distance = (cameras.camera_to_world[:, :, 3] - middle).norm(dim=-1)
-        self.outline = _OUTLINE * float((distance / cameras.fx).mean())
-        self.generator = torch.Generator().manual_seed(0)
-        self.set(self.state())
-
-    def moved(self) -> SdfGrid:
-        """The medium as it is now, without gradients."""
-        with torch.no_grad():
-            return self._moved()
-
-    def state(self) -> list[Tensor]:
-        return [values.detach().clone() for values in self._learned()]
+        self.contour_deviation = _CONTOUR_DEVIATION * float((distance / cameras.fx).mean())
+        boundary = surroundings.boundary
+        self.picture = picture_of(boundary, medium, middle) if isinstance(boundary, Room) else boundary
 
     @torch.no_grad()
-    def set(self, state: list[Tensor]) -> None:
-        """Go on from a state, at rest."""
-        for learned, values in zip(self._learned(), state, strict=True):
-            learned.copy_(values)
-        self.optimizer = torch.optim.Adam(self._learned(), betas=(0.9, 0.99), eps=1e-12)
+    def medium(self) -> SdfGrid:
+        """Return the current medium, without gradients."""
+        return self._medium()
 
-    def record(self) -> dict[str, Any]:
-        """All that changes on the way, in plain values and tensors."""
-        return {
-            "state": self.state(),
-            "optimizer": self.optimizer.state_dict(),
-            "generator": self.generator.get_state(),
-        }
-
-    def go_on(self, record: dict[str, Any]) -> None:
-        """Go on from where `record` was asked."""
-        self.set(record["state"])
-        self.optimizer.load_state_dict(record["optimizer"])
-        self.generator.set_state(record["generator"])
-
-    def _learned(self) -> list[nn.Parameter]:
-        return [*self.offsets.levels, self.iors]
-
-    def _moved(self) -> SdfGrid:
+    def _medium(self) -> SdfGrid:
         return variant(self.start.grown(self.offsets()), iors=1.0 * self.iors)
 
-    def step(self, sky: Boundary, rate: float) -> None:
-        """Follow the slope of the error, with surroundings that are blurred."""
-        self.optimizer.param_groups[0]["lr"] = rate
+    def values(self) -> list[Tensor]:
+        """Return a copy of the learned values."""
+        return [values.detach().clone() for values in self.learned]
+
+    @torch.no_grad()
+    def begin(self, values: list[Tensor], seed: int = 0) -> None:
+        """Set the learned values, and reset optimizer and random numbers."""
+        for learned, each in zip(self.learned, values, strict=True):
+            learned.copy_(each)
+        self.optimizer = torch.optim.Adam(self.learned, betas=(0.9, 0.99), eps=1e-12)
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def step(self, stage: Stage, step: int) -> None:
+        """Make one step of a stage."""
+        done = step / stage.steps
+        if step % _VALIDATE_EVERY == 0:
+            self.blurred = _blurred(self.picture, stage.blur[0] + (stage.blur[1] - stage.blur[0]) * done)
+        self.optimizer.param_groups[0]["lr"] = stage.rate * 0.5 * (1 + math.cos(math.pi * done))
         self.optimizer.zero_grad()
         with torch.enable_grad():
-            self._loss(sky).backward()
+            self._loss().backward()
         self.optimizer.step()
 
-    def _loss(self, sky: Boundary) -> Tensor:
-        medium = self._moved()
-        pixels = self.teachers[torch.randint(len(self.teachers), (self.settings.num_pixels,), generator=self.generator)]
+    def _loss(self) -> Tensor:
+        medium = self._medium()
+        chosen = torch.randint(len(self.training), (self.settings.num_pixels,), generator=self.generator)
+        pixels = self.training[chosen]
         path, usable = self._traced(pixels, medium)
         rays = pixels.rays[usable]
         path = self.sampler.refine(path[usable], rays, medium)
-        residual = sky(path.exits()).clamp(max=1) - pixels.radiance[usable]
-        photometric = robust(residual, _HALF).sum() / max(1, len(rays))
-        rims = self.rims[torch.randint(len(self.rims), (_RIMS,), generator=self.generator)]
-        now, before = (quadratic_spline(each.coefficients[0], each.box, rims)[0] for each in (medium, self.given))
-        left = ((now - before) / self.outline).square()
-        outlines = (left / (1 + left)).mean()
-        return photometric + _OUTLINES * outlines + _SMOOTH * self.offsets.roughness()
+        residual = self.blurred(path.exits()).clamp(max=1) - pixels.radiance[usable]
+        photometric = robust(residual, _HALF_WEIGHT).sum() / max(1, len(rays))
+        rims = self.rims[torch.randint(len(self.rims), (_NUM_CONTOUR_POINTS,), generator=self.generator)]
+        current, given = (quadratic_spline(each.coefficients[0], each.box, rims)[0] for each in (medium, self.given))
+        square = ((current - given) / self.contour_deviation).square()
+        contours = (square / (1 + square)).mean()
+        return photometric + _CONTOUR_WEIGHT * contours + _ROUGHNESS_WEIGHT * self.offsets.roughness()
 
     @torch.no_grad()
     def smoothed(self, medium: SdfGrid, error: float) -> tuple[SdfGrid, float]:
-        """The medium with its outer surface as smooth as the judges like it best, and their error; it has `error`."""
-        distances = medium.distances[0]
-        best = medium
-        for share in self.settings.smoothings:
-            sigma = share * self.size / float(medium.spacing.min())
-            tried = medium.grown(distances - smooth(distances, 2 * math.ceil(3 * sigma) + 1, sigma))
-            if (judged := self.judged(tried)) < error:
-                best, error = tried, judged
+        """Smooth the outer surface as far as the validation error decreases; returns the medium and its error.
+
+        Args:
+            medium: the medium.
+            error: validation error of the medium.
+        """
+        distances, best = medium.distances[0], medium
+        for fraction in self.settings.smoothings:
+            sigma = fraction * self.size / float(medium.spacing.min())
+            candidate = medium.grown(distances - smooth(distances, 2 * math.ceil(3 * sigma) + 1, sigma))
+            if (new := self.validation_error(candidate)) < error:
+                best, error = candidate, new
         return best, error
 
     @torch.no_grad()
-    def judged(self, medium: SdfGrid) -> float:
-        """The robust error of held-back pixels whose light came from known surroundings at first.
+    def validation_error(self, medium: SdfGrid) -> float:
+        """Compute the mean robust error of the validation pixels with known surroundings for the given surface.
 
-        Where it does no more, the first error counts: a surface is neither better nor worse for that.
+        Pixels with unknown surroundings for the new surface keep their initial error, so that visibility of known
+        surroundings changes nothing.
         """
-        trace = self.sampler.trace(self.judges.rays, medium)
+        trace = self.sampler.trace(self.validation.rays, medium)
         radiance, known = self.surroundings.radiance(trace.path.exits())
         known &= ~trace.exceeded & trace.path.refracted
-        errors = robust(radiance - self.judges.radiance, _HALF)
-        if self.first_errors is None:
+        errors = robust(radiance - self.validation.radiance, _HALF_WEIGHT)
+        if self.initial_errors is None:
             if not known.any():
-                raise NerfroError("no pixel shows known surroundings through the object; refine=true cannot help here")
-            self.judges, errors = self.judges[known], errors[known]
-            self.first_errors, known = errors, known[known]
-        return float(torch.where(known, errors, self.first_errors).mean())
+                raise NerfroError("no pixel shows known surroundings through the object; remove refine=true")
+            self.validation, errors = self.validation[known], errors[known]
+            self.initial_errors, known = errors, known[known]
+        return float(torch.where(known, errors, self.initial_errors).mean())
 
+    @torch.no_grad()
     def _traced(self, pixels: Pixels, medium: SdfGrid) -> tuple[Path, Tensor]:
-        """Paths of pixels, and which are bent, end in known surroundings and have sound derivatives."""
-        with torch.no_grad():
-            trace = self.sampler.trace(pixels.rays, medium)
-            known = self.surroundings.known(trace.path.exits())
-            usable = known & ~trace.exceeded & trace.path.refracted & self.sampler.steady(trace.path, medium)
-        return trace.path, usable
-
-
-def _picture(surroundings: Surroundings, mesh: TriangleMesh, medium: SdfGrid) -> EnvironmentMap | RoomPicture:
-    """Surroundings that have a slope, and can be blurred."""
-    boundary = surroundings.boundary
-    if isinstance(boundary, Room):
-        return picture_of(boundary, medium, torch.from_numpy(mesh.bounds.mean(0)).float())
-    return boundary
+        """Trace pixels, and select refracted paths with known surroundings and reliable derivatives."""
+        trace = self.sampler.trace(pixels.rays, medium)
+        usable = self.surroundings.known(trace.path.exits()) & ~trace.exceeded & trace.path.refracted
+        return trace.path, usable & self.sampler.steady(trace.path, medium)
 
 
 @torch.no_grad()
 def _blurred(picture: EnvironmentMap | RoomPicture, degrees: float) -> Boundary:
-    """A picture of surroundings, convolved with a Gaussian of that standard deviation; itself for none."""
+    """Convolve surroundings with a Gaussian of the given standard deviation."""
     if degrees == 0:
         return picture
     sky = picture.colours if isinstance(picture, RoomPicture) else picture
-    count, generator = 32, torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(0)
     directions = texel_directions(max(16, round(135 / degrees)))
     total = torch.zeros_like(directions)
-    for _ in range(count):
+    for _ in range(_BLUR_SAMPLES):
         turned = directions + math.radians(degrees) * torch.randn(3, generator=generator)
         total += sky(Exits(turned / turned.norm(dim=-1, keepdim=True))).clamp(max=1)
-    blurred = EnvironmentMap.of_texels(total / count)
+    blurred = EnvironmentMap.of_texels(total / _BLUR_SAMPLES)
     return RoomPicture(picture.middle, blurred, picture.distances) if isinstance(picture, RoomPicture) else blurred
 
 
-def _onto(mesh: TriangleMesh, medium: SdfGrid) -> TriangleMesh:
-    """The mesh with its vertices moved onto the zero level of a medium's first body, by Newton's steps."""
+def _project_onto(mesh: TriangleMesh, medium: SdfGrid) -> TriangleMesh:
+    """Move the vertices of a mesh onto the zero level of the outer body, by Newton's method."""
     vertices = torch.from_numpy(mesh.vertices).float()
     spacing = float(medium.spacing.min())
     for _ in range(5):

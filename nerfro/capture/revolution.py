@@ -8,7 +8,9 @@ from typing import Literal
 
 import numpy as np
 import torch
+import trimesh
 from jaxtyping import Float
+from skimage.measure import find_contours
 from torch import Tensor
 from torch.func import jacfwd
 from torch.nn import functional
@@ -75,24 +77,14 @@ class Profile:
 
     def mesh(self) -> TriangleMesh:
         """Convert the body to a closed mesh with counter-clockwise faces seen from outside."""
-        axis = self.axis.double().numpy()
+        axis, foot, radii = (values.double().numpy() for values in (self.axis, self.foot, self.radii))
         across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
         across /= np.linalg.norm(across)
-        turn = 2 * np.pi * np.arange(_SECTIONS) / _SECTIONS
-        around = np.cos(turn)[:, None] * across + np.sin(turn)[:, None] * np.cross(axis, across)
-        heights = np.linspace(0, float(self.height), len(self.radii))
-        rings = self.radii.double().numpy()[:, None, None] * around + heights[:, None, None] * axis
-        ends = np.stack([heights[0] * axis, heights[-1] * axis])
-        vertices = np.concatenate([rings.reshape(-1, 3), ends]) + self.foot.double().numpy()
-        here, there = np.arange(_SECTIONS), np.roll(np.arange(_SECTIONS), -1)
-        faces = []
-        for ring in range(len(heights) - 1):
-            a, b = ring * _SECTIONS, (ring + 1) * _SECTIONS
-            faces += [np.stack([a + here, a + there, b + there], 1), np.stack([a + here, b + there, b + here], 1)]
-        last, below, above = (len(heights) - 1) * _SECTIONS, len(vertices) - 2, len(vertices) - 1
-        faces += [np.stack([there, here, np.full_like(here, below)], 1)]
-        faces += [np.stack([last + here, last + there, np.full_like(here, above)], 1)]
-        return TriangleMesh(vertices, np.concatenate(faces))
+        heights = np.linspace(0, float(self.height), len(radii))
+        outline = np.column_stack([np.pad(radii, 1), np.pad(heights, 1, "edge")])
+        body = trimesh.creation.revolve(outline, sections=_SECTIONS)
+        vertices = body.vertices @ np.stack([across, np.cross(axis, across), axis]) + foot
+        return TriangleMesh(vertices, np.asarray(body.faces))
 
 
 def fit_revolution(
@@ -211,18 +203,10 @@ def _rays(
     return rays.origins.float(), rays.directions.float(), width, torch.cat(sides)
 
 
-def _outline_points(values: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "P 2"]:
-    """Find crossings (row, column) of the outline with lines between adjacent pixel centres, away from the frame."""
-    found = []
-    for axis in (0, 1):
-        first, second = (values[:-1], values[1:]) if axis == 0 else (values[:, :-1], values[:, 1:])
-        places = np.argwhere((first > 0) != (second > 0))
-        a, b = (part[tuple(places.T)] for part in (first, second))
-        crossing = places.astype(np.float32)
-        crossing[:, axis] += a / (a - b)
-        found.append(crossing)
-    points = np.concatenate(found)
-    last = np.array(values.shape) - 1 - _FRAME
+def _outline_points(distances: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "P 2"]:
+    """Find points (row, column) of the outline on the lines between adjacent pixel centres, away from the frame."""
+    points = np.concatenate([np.empty((0, 2)), *find_contours(distances, 0)]).astype(np.float32)
+    last = np.array(distances.shape) - 1 - _FRAME
     return points[((points >= _FRAME) & (points <= last)).all(1)]
 
 

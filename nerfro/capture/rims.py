@@ -37,27 +37,12 @@ class Rims(NamedTuple):
     first: Int[np.ndarray, "K"]
     second: Int[np.ndarray, "K"]
     share: Float[np.ndarray, "K"]
+    points: Float[np.ndarray, "K 3"]  # positions of the contour points
     normal: Float[np.ndarray, "K 3"]  # unit, outwards, perpendicular to the line of sight
-    misfit: Float[np.ndarray, "K"]  # world units
-    weight: Float[np.ndarray, "K"]
+    misfit: Float[np.ndarray, "K"]  # outward distance to the outline of the mask, world units
+    weight: Float[np.ndarray, "K"]  # robust weight of the misfit
     width: Float[np.ndarray, "K"]  # width of a pixel at the point, world units
     view: Int[np.ndarray, "K"]
-
-    def points(self, vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "K 3"]:
-        """Compute the positions of the contour points."""
-        share = self.share[:, None]
-        return (1 - share) * vertices[self.first] + share * vertices[self.second]
-
-
-class RimPoints(NamedTuple):
-    """Contour points of a surface as tensors; lengths in world units."""
-
-    points: Float[Tensor, "K 3"]
-    normals: Float[Tensor, "K 3"]  # unit, outwards, perpendicular to the line of sight
-    misfits: Float[Tensor, "K"]  # outward distance to the outline of the mask
-    weights: Float[Tensor, "K"]  # robust weights of the misfits
-    widths: Float[Tensor, "K"]  # width of a pixel at the point
-    views: Int[Tensor, "K"]
 
 
 class RimFinder:
@@ -72,22 +57,10 @@ class RimFinder:
         self._surface = MovingMesh(mesh.faces).surface(mesh.vertices)
         self._silhouettes, self._outlines = silhouettes, outlines_of(silhouettes)
 
-    def points(self, cameras: Cameras | None = None) -> RimPoints:
+    def find(self, cameras: Cameras | None = None) -> Rims:
         """Find the contour points, by default for the cameras of the silhouettes."""
         silhouettes = self._silhouettes if cameras is None else replace(self._silhouettes, cameras=cameras)
-        rims = find_rims(self._surface, silhouettes, self._outlines)
-        return RimPoints(
-            points=_tensor(rims.points(self._surface.vertices)),
-            normals=_tensor(rims.normal),
-            misfits=_tensor(rims.misfit),
-            weights=_tensor(rims.weight),
-            widths=_tensor(rims.width),
-            views=torch.from_numpy(rims.view),
-        )
-
-
-def _tensor(values: np.ndarray) -> Tensor:
-    return torch.from_numpy(values).float()
+        return find_rims(self._surface, silhouettes, self._outlines)
 
 
 def outlines_of(silhouettes: Silhouettes) -> Outlines:
@@ -113,7 +86,7 @@ def find_rims(surface: Surface, silhouettes: Silhouettes, outlines: Outlines) ->
         first, second, share, normal = _turning(surface, eye)
         points = vertices[first] + share[:, None] * (vertices[second] - vertices[first])
         places = torch.from_numpy(points).float()
-        inside, width = (values.double().numpy() for values in silhouettes.depth_inside(view, places)[:2])
+        inside, width = (values.double().numpy() for values in silhouettes.depth_inside(view, places))
         known = np.flatnonzero(np.isfinite(inside))
         if not len(known):
             continue
@@ -123,14 +96,15 @@ def find_rims(surface: Surface, silhouettes: Silhouettes, outlines: Outlines) ->
         order = np.lexsort((inside[known], cell))
         outermost = known[order[np.diff(cell[order], prepend=-1) != 0]]
         of_view = np.full(len(outermost), view)
-        parts.append((*(values[outermost] for values in (first, second, share, normal, inside, width)), of_view))
+        of_points = (first, second, share, points, normal, inside, width)
+        parts.append((*(values[outermost] for values in of_points), of_view))
     if not parts:
         raise NerfroError("no view sees the surface; check that surface, poses and masks belong together")
-    first, second, share, normal, misfit, width, views = (np.concatenate(values) for values in zip(*parts, strict=True))
+    *edges, misfit, width, views = (np.concatenate(values) for values in zip(*parts, strict=True))
     spread = float(np.median(np.abs(misfit))) / _MASK_ACCURACY
     near = np.abs(misfit) < _MAX_MISFIT * max(1.0, spread)
     weight = 1 / (1 + (misfit / (_HALF_WEIGHT * max(_MIN_SCALE, spread))) ** 2)
-    return Rims(*(each[near] for each in (first, second, share, normal, misfit * width, weight, width, views)))
+    return Rims(*(each[near] for each in (*edges, misfit * width, weight, width, views)))
 
 
 def _turning(surface: Surface, eye: Float[np.ndarray, "3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -117,13 +117,13 @@ def fit_surface(
         sides = best.sides._replace(flat=smoothing * best.sides.flat)
         return TriangleMesh(fit.sharpened(vertices, sides, outlines, step), mesh.faces)
     strength, last_steps = smoothing * best.strength, _LAST_STEPS
-    off = fit.binary_mask_error(vertices, outlines)
-    if off is not None:
+    contour_error = fit.binary_mask_error(vertices, outlines)
+    if contour_error is not None:
         strength, last_steps = _PROBIT_STRENGTH * strength, _PROBIT_STEPS
         total += _PROBIT_STEPS - _LAST_STEPS
     steady = strength / best.strength * best.prior.steady * (best.misfit / fit.size) ** 2
     for left in reversed(range(last_steps)):
-        vertices = fit.moved(vertices, outlines, best.prior, strength, steady, off, spread=left > 0)
+        vertices = fit.moved(vertices, outlines, best.prior, strength, steady, contour_error, spread=left > 0)
         step()
     return TriangleMesh(vertices, mesh.faces)
 
@@ -186,8 +186,8 @@ class _Fit:
         if is_antialiased(self.silhouettes.masks.numpy(), self.silhouettes.distances.numpy()):
             return None
         rims = self.rims(vertices, outlines)
-        off = float(np.abs(rims.misfit / rims.width).mean())
-        return off if off < _MAX_PROBIT_ERROR else None
+        contour_error = float(np.abs(rims.misfit / rims.width).mean())
+        return contour_error if contour_error < _MAX_PROBIT_ERROR else None
 
     def moved(
         self,
@@ -196,7 +196,7 @@ class _Fit:
         prior: _Prior,
         strength: float,
         steady: float = 0.0,
-        off: float | None = None,
+        contour_error: float | None = None,
         spread: bool = True,
     ) -> Float[np.ndarray, "V 3"]:
         """Make one least-squares step and return the new vertices.
@@ -207,14 +207,14 @@ class _Fit:
             prior: regularization.
             strength: factor of the area and bending terms.
             steady: weight of changes of curvature, relative to one observation.
-            off: mean contour error in pixels, which selects the probit model of binary masks; None uses distances.
+            contour_error: mean contour error in pixels, for the probit model of binary masks; None uses distances.
             spread: also equalize the triangles by tangential motion. For adjacent small and large triangles, as
                 marching cubes produces, the mean of the neighbours is a poor estimate of curvature.
         """
         surface = self.mesh.surface(vertices)
         normals, rims = surface.normals, find_rims(surface, self.silhouettes, outlines)
-        if off is not None:
-            rims = by_pixel_sides(rims, rims.points(vertices), self.silhouettes, off)
+        if contour_error is not None:
+            rims = by_pixel_sides(rims, self.silhouettes, contour_error)
         num_rims = len(rims.share)
         area = strength * num_rims * prior.area
         bending = strength * num_rims * prior.bending * self.size**2 * (_REDUCED_BENDING if steady else 1)

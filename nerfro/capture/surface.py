@@ -111,7 +111,6 @@ def make_mesh(
     if symmetry is not None:
         with bar("finding the axis") as progress:
             revolution = fit_revolution(mesh, silhouettes, progress)
-    if symmetry is not None:
         mesh = _choose_symmetry(revolution, mesh, silhouettes, symmetry)
     if num_kept < num_parts:
         print(f"kept the largest {num_kept} of {num_parts} separate components")

@@ -54,15 +54,12 @@ class Silhouettes:
     def __len__(self) -> int:
         return len(self.masks)
 
-    def depth_inside(
-        self, view: int, points: Float[Tensor, "P 3"]
-    ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"], Float[Tensor, "P"]]:
+    def depth_inside(self, view: int, points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
         """Compute the distances of points to the outline of one view.
 
         Returns:
-            Signed distance in pixels, positive inside; infinite where the view gives no information, that is behind
-            the camera, and outside a frame that cuts the object. Width of a pixel at the point, in world units.
-            Distance of the projected point from the frame, in pixels.
+            Signed distance in pixels, positive inside; infinite where the view gives no information, which means
+            behind the camera and outside a frame that cuts the object. Width of a pixel at the point, in world units.
         """
         cameras = self.cameras.select([view])
         pixels, depth = (values[0] for values in cameras.project(points))
@@ -76,7 +73,7 @@ class Silhouettes:
         unknown = ~visible | ((outside > 0) & self.cut[view])
         distance = torch.where(outside > 0, distance.clamp(max=0) - outside, distance)
         width = depth / (0.5 * (cameras.fx + cameras.fy))
-        return torch.where(unknown, torch.inf, distance), width, outside
+        return torch.where(unknown, torch.inf, distance), width
 
     def carve(self, points: Float[Tensor, "P 3"], wrong_masks: int = 0) -> Float[Tensor, "P"]:
         """Compute an approximate signed distance to the visual hull with an exact zero level.
@@ -91,7 +88,7 @@ class Silhouettes:
         largest = torch.full((wrong_masks + 1, len(points)), -torch.inf)
         num_seen = torch.zeros(len(points), dtype=torch.int32)
         for view in range(len(self)):
-            inside, width, _ = self.depth_inside(view, points)
+            inside, width = self.depth_inside(view, points)
             known = inside < torch.inf
             num_seen += known
             value = torch.where(known, -inside * width, -torch.inf)
@@ -170,6 +167,15 @@ def carve_grid(
             progress((level + min(start + _CHUNK, len(wanted)) / len(wanted)) / (_LEVELS + 1))
         values[near] = carved
     return values.numpy(), np.asarray(box[0], np.float64), spacing
+
+
+def carve_mesh(
+    silhouettes: Silhouettes, box: Float[np.ndarray, "2 3"], resolution: int, wrong_masks: int = 0
+) -> TriangleMesh | None:
+    """Carve the visual hull without small components (see `carve_grid`); None if the hull is empty."""
+    distances, corner, spacing = carve_grid(silhouettes, box, resolution, wrong_masks)
+    remove_strays(distances)
+    return extract_surface(distances, corner, spacing) if (distances < 0).any() else None
 
 
 def remove_strays(distances: Float[np.ndarray, "X Y Z"], keep: int | None = None) -> tuple[int, int]:

@@ -7,7 +7,7 @@ import torch
 from nerfro.camera.least_squares import PriorInformation
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
-from nerfro.capture.outlines import meet_outlines
+from nerfro.capture.outlines import align_to_outlines
 from nerfro.capture.pixel_blocks import PixelBlocks
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.data.base import Views
@@ -35,7 +35,7 @@ def align_to_masks(
     if not isinstance(medium, SdfGrid) or not medium.meshes or (silhouettes := mask_silhouettes(views)) is None:
         return None
     priors = [] if panorama is None else [panorama]
-    return meet_outlines(camera, views.cameras, reduced, silhouettes, medium.meshes[0], priors)
+    return align_to_outlines(camera, views.cameras, reduced, silhouettes, medium.meshes[0], priors)
 
 
 def mask_silhouettes(views: Views) -> Silhouettes | None:

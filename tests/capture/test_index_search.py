@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import math
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
-import nerfro.preprocess
 from nerfro.capture.index_search import Estimate, find_indices
 from nerfro.capture.surroundings import divide_pixels, learn_surroundings
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
-from tests.ball_photographs import INNER, NUM_VIEWS, SIZE, cameras, mesh, photographs, save, solid
+from tests.ball_photographs import INNER, NUM_VIEWS, SIZE, cameras, mesh, photographs, solid
 
 
 def search(views: Views, num_bodies: int = 1, inner: float = INNER) -> Estimate:
@@ -75,18 +71,3 @@ def test_large_photographs_are_averaged_in_linear_light() -> None:
     torch.testing.assert_close(beside.radiance, torch.full_like(beside.radiance, 0.5))
     # The same directions: the middle of a block of two is the corner between its pixels.
     assert math.isclose(float(beside.cameras.fx[0]), 5 * float(taken.fx[0]), rel_tol=1e-6)
-
-
-def test_preprocess_writes_the_index_and_trains_with_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    save(photographs([1.5]), tmp_path)
-    out = tmp_path / "out"
-    options = [f"data.root={tmp_path}", f"mesh={tmp_path / 'mesh.ply'}", f"out={out}", "data.near=0.5"]
-    monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", *options, "medium.cache=false", "medium.resolution=64"])
-    nerfro.preprocess.main()
-    found = json.loads((out / "index.json").read_text())
-    assert found["ior"] == [pytest.approx(1.5, rel=0.005)]
-    assert 0 < found["standard_error"][0] < 0.02
-    assert (out / "index.png").is_file()
-    assert f"medium.ior={found['ior'][0]:.4f}".rstrip("0") in capsys.readouterr().out

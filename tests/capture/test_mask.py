@@ -51,19 +51,23 @@ def photographs() -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     return views
 
 
-@pytest.fixture
-def capture(tmp_path: Path, photographs: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Path:
-    """The photographs as a data set in OpenCV's format, without masks."""
+def write_capture(root: Path, photographs: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Path:
+    """The photographs as a data set in OpenCV's format, without masks, in three splits."""
     splits: dict[str, list[dict]] = {"train": [], "val": [], "test": []}
-    (tmp_path / "photos").mkdir()
+    (root / "photos").mkdir(parents=True)
     for view, (picture, _, pose) in enumerate(photographs):
-        Image.fromarray(picture).save(tmp_path / "photos" / f"p_{view}.png")
+        Image.fromarray(picture).save(root / "photos" / f"p_{view}.png")
         frame = {"file_path": f"photos/p_{view}.png", "transform_matrix": [*pose.tolist(), [0, 0, 0, 1]]}
         splits["test" if view % 7 == 0 else "val" if view % 7 == 3 else "train"].append(frame)
     matrix = [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
     for split, frames in splits.items():
-        (tmp_path / f"transforms_{split}.json").write_text(json.dumps({"cam_mat": matrix, "frames": frames}))
-    return tmp_path
+        (root / f"transforms_{split}.json").write_text(json.dumps({"cam_mat": matrix, "frames": frames}))
+    return root
+
+
+@pytest.fixture
+def capture(tmp_path: Path, photographs: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Path:
+    return write_capture(tmp_path / "capture", photographs)
 
 
 def box_around(mask: np.ndarray, margin: int) -> list[int]:
@@ -95,11 +99,6 @@ def test_one_box_leads_to_all_masks(capture: Path, photographs: list, command: C
         assert OpenCVData(str(capture)).load(split).masks is not None
     with Image.open(capture / "masks.png") as sheet:
         assert sheet.size[0] > 6 * 220
-
-
-def test_gradients_are_on_after_the_command(capture: Path, command: Callable[..., str]) -> None:
-    assert "no mask to start from" in command("mask", f"data.root={capture}")
-    assert torch.is_grad_enabled()
 
 
 def test_masks_that_exist_are_kept_and_show_the_way(
@@ -154,6 +153,7 @@ def test_a_mask_in_the_corner_is_reported_in_one_line(
 def test_mistakes_are_reported_in_one_line(capture: Path, command: Callable[..., str]) -> None:
     root = f"data.root={capture}"
     assert "no mask to start from" in command("mask", root)
+    assert torch.is_grad_enabled()
     assert "q_1 is not an image of the data set; names of the data set look like photos/p_" in command(
         "mask", root, "outlines={q_1:[1,1,9,9]}"
     )
@@ -161,18 +161,6 @@ def test_mistakes_are_reported_in_one_line(capture: Path, command: Callable[...,
     assert "nothing.json does not exist" in command("mask", root, "outlines=nothing.json")
     assert "is part of nerfro" in command("mask", "data=blender", "data.root=embedded:torus")
     assert not list((capture / "photos").glob("mask_*"))
-
-
-def write_capture(root: Path, photographs: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Path:
-    """All photographs as training views."""
-    (root / "photos").mkdir(parents=True)
-    frames = []
-    for view, (picture, _, pose) in enumerate(photographs):
-        Image.fromarray(picture).save(root / "photos" / f"p_{view}.png")
-        frames.append({"file_path": f"photos/p_{view}.png", "transform_matrix": [*pose.tolist(), [0, 0, 0, 1]]})
-    matrix = [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
-    (root / "transforms_train.json").write_text(json.dumps({"cam_mat": matrix, "frames": frames}))
-    return root
 
 
 def test_a_neighbour_that_looks_from_the_same_place_does_not_lead(

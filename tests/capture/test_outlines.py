@@ -14,7 +14,7 @@ from nerfro.camera.least_squares import PriorInformation
 from nerfro.camera.refined import RefinedCamera
 from nerfro.camera.similarity import motion_between
 from nerfro.cameras import Cameras
-from nerfro.capture.outlines import meet_outlines
+from nerfro.capture.outlines import align_to_outlines
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
@@ -39,7 +39,7 @@ def met(camera: RefinedCamera, given: Cameras, seen: Silhouettes, sure: list[int
     surely[:, sure or []] = 1e6
     information = torch.nn.functional.pad(surely.flatten(), (0, len(camera.numbers()) - surely.numel())).diag()
     known = [PriorInformation(camera.numbers(), information)]
-    told = meet_outlines(camera, given, lambda cameras: cameras, seen, ellipsoid(), known)
+    told = align_to_outlines(camera, given, lambda cameras: cameras, seen, ellipsoid(), known)
     assert told is not None
     return told
 
@@ -72,7 +72,7 @@ def test_cameras_stay_where_the_surface_is_another(capsys: pytest.CaptureFixture
     camera = RefinedCamera()
     camera.begin(TRUE)
     other = TriangleMesh(ellipsoid().vertices[:, [1, 0, 2]], ellipsoid().faces[:, ::-1])
-    assert meet_outlines(camera, TRUE, lambda cameras: cameras, silhouettes(), other) is None
+    assert align_to_outlines(camera, TRUE, lambda cameras: cameras, silhouettes(), other) is None
     assert not bool(camera.motions.motion.any())
     assert "pixels off its masks" in capsys.readouterr().out
 
@@ -82,7 +82,7 @@ def test_masks_of_nothing_are_refused() -> None:
     camera.begin(TRUE)
     nothing = Silhouettes.of(TRUE, torch.zeros(NUM_VIEWS, SIZE, SIZE))
     with pytest.raises(NerfroError, match="belong together"):
-        meet_outlines(camera, TRUE, lambda cameras: cameras, nothing, ellipsoid())
+        align_to_outlines(camera, TRUE, lambda cameras: cameras, nothing, ellipsoid())
 
 
 def test_the_shared_lens_is_found_where_cameras_are_known() -> None:

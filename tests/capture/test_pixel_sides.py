@@ -29,7 +29,7 @@ def seen(radius: float, silhouettes: Silhouettes) -> tuple[Rims, Rims]:
     made = ball(radius)
     surface = MovingMesh(np.asarray(made.faces)).surface(np.asarray(made.vertices))
     rims = find_rims(surface, silhouettes, outlines_of(silhouettes))
-    return rims, by_pixel_sides(rims, rims.points(surface.vertices), silhouettes, 0.16)
+    return rims, by_pixel_sides(rims, silhouettes, 0.16)
 
 
 def pixel(size: int) -> float:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,22 +25,32 @@ from nerfro.capture.targets import Sheet
 from tests.capture.photographs import angle, look_at, photograph
 
 
-@pytest.mark.parametrize("form", ["text", "binary"])
-def test_models_are_imported(form: str, tmp_path: Path, command: Callable[..., str]) -> None:
+def synthesized(folder: Path, camera: tuple[str, list[float]], noise: float, form: str = "text") -> Any:
+    """Write a model of six images and 30 points to a folder; returns the model."""
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs = options.num_cameras_per_rig = 1
-    options.num_frames_per_rig, options.num_points3D, options.camera_params = 6, 30, [1280.0, 512, 384, 0]
+    options.num_frames_per_rig, options.num_points3D = 6, 30
+    options.camera_model_id, options.camera_params = getattr(pycolmap.CameraModelId, camera[0]), camera[1]
     model = pycolmap.synthesize_dataset(options)
     generator = np.random.default_rng(0)
     for point in model.points3D.values():
-        point.xyz = point.xyz + generator.normal(0, 0.004, 3)
-    (tmp_path / "sparse" / "0").mkdir(parents=True)
-    getattr(model, f"write_{form}")(tmp_path / "sparse" / "0")
-    (tmp_path / "images").mkdir()
+        point.xyz = point.xyz + generator.normal(0, noise, 3)
+    folder.mkdir(parents=True)
+    getattr(model, f"write_{form}")(folder)
+    return model
+
+
+def blank(folder: Path, names: Iterable[str], size: tuple[int, int]) -> None:
+    folder.mkdir()
+    for name in names:
+        Image.new("RGB", size).save(folder / name)
+
+
+@pytest.mark.parametrize("form", ["text", "binary"])
+def test_models_are_imported(form: str, tmp_path: Path, command: Callable[..., str]) -> None:
+    model = synthesized(tmp_path / "sparse" / "0", ("SIMPLE_RADIAL", [1280.0, 512, 384, 0]), 0.004, form)
     expected = {}
     for image in model.images.values():
-        # Half the size that was reconstructed.
-        Image.fromarray(np.zeros((384, 512, 3), np.uint8)).save(tmp_path / "images" / image.name)
         pose = image.cam_from_world().matrix()
         squares = []
         for feature in image.points2D:
@@ -47,7 +58,7 @@ def test_models_are_imported(form: str, tmp_path: Path, command: Callable[..., s
                 x, y, z = pose @ [*model.points3D[feature.point3D_id].xyz, 1]
                 squares.append((1280 * x / z + 512 - feature.xy[0]) ** 2 + (1280 * y / z + 384 - feature.xy[1]) ** 2)
         expected[image.name] = pose, 0.5 * np.sqrt(np.mean(squares))
-    Image.fromarray(np.zeros((384, 512, 3), np.uint8)).save(tmp_path / "images" / "blurred.png")
+    blank(tmp_path / "images", [*expected, "blurred.png"], (512, 384))  # half the size that was reconstructed
     printed = command("calibrate", f"images={tmp_path / 'images'}", f"out={tmp_path}", "target=colmap", "test_every=3")
     assert "skipped: blurred.png: no pose from COLMAP" in printed
     report = json.loads((tmp_path / "calibration.json").read_text())
@@ -118,25 +129,6 @@ def test_a_model_is_made_where_there_is_none(tmp_path: Path, command: Callable[.
         assert angle(turns[0], turns[1]) < 0.5
 
 
-def synthesized(folder: Path, camera: tuple[str, list[float]], noise: float) -> list[str]:
-    """A model of six images of 30 points in a folder, and blank images beside it; their names."""
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs = options.num_cameras_per_rig = 1
-    options.num_frames_per_rig, options.num_points3D = 6, 30
-    options.camera_model_id, options.camera_params = getattr(pycolmap.CameraModelId, camera[0]), camera[1]
-    model = pycolmap.synthesize_dataset(options)
-    generator = np.random.default_rng(0)
-    for point in model.points3D.values():
-        point.xyz = point.xyz + generator.normal(0, noise, 3)
-    (folder / "model").mkdir(parents=True)
-    model.write_text(folder / "model")
-    (folder / "images").mkdir()
-    names = [image.name for image in model.images.values()]
-    for name in names:
-        Image.fromarray(np.zeros((768, 1024, 3), np.uint8)).save(folder / "images" / name)
-    return names
-
-
 @pytest.mark.parametrize(
     ("camera", "advised"),
     [(("RADIAL", [1280.0, 512, 384, 0.05, 0.0]), False), (("SIMPLE_PINHOLE", [1280.0, 512, 384]), True)],
@@ -144,7 +136,8 @@ def synthesized(folder: Path, camera: tuple[str, list[float]], noise: float) -> 
 def test_a_model_is_named_and_a_lens_that_distorts_is_not_advised_to(
     camera: tuple[str, list[float]], advised: bool, tmp_path: Path, command: Callable[..., str]
 ) -> None:
-    names = synthesized(tmp_path, camera, 0.02)
+    names = [image.name for image in synthesized(tmp_path / "model", camera, 0.02).images.values()]
+    blank(tmp_path / "images", names, (1024, 768))
     own = [f"images={tmp_path / 'images'}", f"out={tmp_path / 'out'}", "target=colmap"]
     printed = command("calibrate", *own, f"reconstruction={tmp_path / 'model'}", "test_every=3")
     report = json.loads((tmp_path / "out" / "calibration.json").read_text())

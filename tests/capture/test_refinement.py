@@ -97,30 +97,32 @@ def test_a_rough_surface_is_smoothed_as_much_as_its_judges_like() -> None:
     assert found.errors[1] < 0.9 * found.errors[0]
 
 
-def test_an_interrupted_refinement_goes_on(tmp_path: Path) -> None:
+def test_an_interrupted_refinement_resumes_after_the_last_whole_stage(tmp_path: Path) -> None:
     fast = RefinementSettings((Stage(50, 5e-4, (3.0, 1.0)), Stage(25, 1e-4, (0.0, 0.0))), 500, (8, 16))
     start = functools.partial(refined, solid([1.5]), settings=fast)
-    record, told = tmp_path / "state", []
+    record, fractions = tmp_path / "state", []
 
     def interrupted(done: float) -> None:
-        if done > 0.6:
+        fractions.append(done)
+        if done > 0.8:
             raise KeyboardInterrupt
 
     undisturbed = start(learn_index=True)
     with pytest.raises(KeyboardInterrupt):
         start(learn_index=True, record=record, progress=interrupted)
     kept = record.read_bytes()
-    found = start(learn_index=True, record=record, progress=told.append)
-    assert told[0] > 0.3  # not from the beginning
+    fractions.clear()
+    found = start(learn_index=True, record=record, progress=fractions.append)
+    assert fractions[0] == pytest.approx(51 / 75)
     assert found.errors == undisturbed.errors
     assert torch.equal(found.medium.distances, undisturbed.medium.distances)
     assert not record.exists()
-    for other in (kept, b"damaged"):  # of an index that was known, and of nothing
+    for other in (kept, b"damaged"):  # the state of a refinement with another setting, and no state
         record.write_bytes(other)
-        told.clear()
+        fractions.clear()
         with pytest.raises(KeyboardInterrupt):
-            start(record=record, progress=lambda done: (told.append(done), interrupted(done)))
-        assert told[0] < 0.1
+            start(record=record, progress=interrupted)
+        assert fractions[0] < 0.1
 
 
 class PaintedShell(Room):
@@ -166,13 +168,14 @@ def test_a_backdrop_is_the_room_along_every_line() -> None:
 
 @pytest.fixture
 def preprocess(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable:
-    """Refine the ball's mesh by photographs of the dented one; returns the folder, and what was printed."""
+    """Refine the ball's mesh by photographs of another medium; returns the folder, and what was printed."""
 
-    def run(*overrides: str) -> tuple[Path, str]:
-        save(photographs_of(dented()), tmp_path)
+    def run(*overrides: str, medium: SdfGrid | None = None, ior: float | None = 1.5) -> tuple[Path, str]:
+        save(photographs_of(dented() if medium is None else medium), tmp_path)
         out = tmp_path / "out"
         options = [f"data.root={tmp_path}", f"mesh={tmp_path / 'mesh.ply'}", f"out={out}", "data.near=0.5"]
-        options += ["refine=true", "medium.ior=1.5", "medium.cache=false", "medium.resolution=41"]
+        options += ["refine=true", "medium.cache=false", "medium.resolution=41"]
+        options += [] if ior is None else [f"medium.ior={ior}"]
         monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", *options, *overrides])
         nerfro.preprocess.main()
         return out, capsys.readouterr().out
@@ -202,7 +205,9 @@ def test_a_surface_that_cannot_be_refined_stays_as_it_is(preprocess: Callable, m
     assert load_mesh(out / "mesh.ply").vertices.shape == mesh().vertices.shape
 
 
-def test_a_refinement_begins_with_the_index_that_was_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refinement_begins_with_the_index_that_was_found(
+    preprocess: Callable, monkeypatch: pytest.MonkeyPatch
+) -> None:
     begun: list[SdfGrid] = []
 
     def kept(mesh: object, medium: SdfGrid, *_: object) -> Refined:
@@ -210,11 +215,7 @@ def test_a_refinement_begins_with_the_index_that_was_found(tmp_path: Path, monke
         raise NerfroError("enough is known")
 
     monkeypatch.setattr(refinement_report, "refine_surface", kept)
-    save(photographs_of(solid([1.33])), tmp_path)
-    options = [f"data.root={tmp_path}", f"mesh={tmp_path / 'mesh.ply'}", f"out={tmp_path / 'out'}", "data.near=0.5"]
-    options += ["refine=true", "room=false", "medium.cache=false", "medium.resolution=41"]
-    monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", *options])
-    nerfro.preprocess.main()
+    preprocess("room=false", medium=solid([1.33]), ior=None)
     assert begun[0].iors.tolist() == [pytest.approx(1.33, rel=0.005)]
 
 
