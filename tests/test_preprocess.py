@@ -135,7 +135,9 @@ def test_supplied_mesh_is_compared_and_kept(preprocess: Callable[..., str], capt
 
 
 def test_data_without_masks_is_refused(preprocess: Callable[..., str], tiny_scene: Path) -> None:
-    assert "the data set has no masks" in preprocess(f"data.root={tiny_scene}", "overwrite=true")
+    options = f"data.root={tiny_scene}", "overwrite=true"
+    assert "the data set has no masks" in preprocess(*options)
+    assert "the data set has no masks" in preprocess(*options, f"mesh={tiny_scene}/mesh.ply", "refine_cameras=true")
 
 
 @pytest.mark.parametrize(
@@ -183,6 +185,8 @@ def test_options_out_of_range(preprocess: Callable[..., str]) -> None:
     assert "give both box_min and box_max" in preprocess("box_min=[0,0,0]")
     assert "is not a box" in preprocess("box_min=[0,0,0]", "box_max=[1,1,0]")
     assert "add out=FOLDER" in preprocess("data.root=embedded:torus")
+    assert "set medium=object or medium=vessel" in preprocess("refine=true", "medium=object_voxels")
+    assert "needs distant surroundings" in preprocess("refine_cameras=true", "room=true")
 
 
 def test_a_hull_needs_masks_of_some_views_only(preprocess: Callable[..., str], capture: Path) -> None:

@@ -86,13 +86,13 @@ def gauss_newton_step(
     weights = robust_weights(error, step.scale) / (1 + (slopes[..., :6] / _STEEP_SLOPE).square().sum((1, 2)))
     matrix, vector = normal_equations(slopes.double(), error.double(), weights.double(), view, len(cameras))
     variance = (weights[:, None] * error.square()).sum() / (3 * weights.sum()).clamp(min=_TINY)
-    matrix, vector = with_priors(matrix, vector, camera.numbers(), variance, priors)
+    before = camera.numbers()
+    matrix, vector = with_priors(matrix, vector, before, variance, priors)
     motion, lens = camera.split(-torch.linalg.solve(matrix, vector))
     motion, lens = (
         numbers * (step.max_pixels / numbers.norm(dim=-1, keepdim=True).clamp(min=_TINY)).clamp(max=1)
         for numbers in (motion, lens)
     )
-    before = camera.position()
     camera.move(step.fraction * motion.to(angle), step.fraction * lens.to(angle))
     if not step.keep_improvements:
         return

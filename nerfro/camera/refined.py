@@ -170,18 +170,13 @@ class RefinedCamera(Camera):
         return torch.cat([by_motion, torch.stack(by_lens, -1)], -1)
 
     def numbers(self) -> Float[Tensor, "N"]:
-        """Return the parameters of all cameras in pixels, followed by the lens if it is refined."""
-        motion = self.motions.motion.flatten()
-        return motion if self.lens is None else torch.cat([motion, self.lens])
+        """Return a copy of the parameters of all cameras in pixels, followed by the lens if it is refined."""
+        return torch.cat([self.motions.motion.flatten(), *([] if self.lens is None else [self.lens])])
 
     def split(self, numbers: Shaped[Tensor, "N"]) -> tuple[Shaped[Tensor, "V 6"], Shaped[Tensor, "L"]]:
         """Split such parameters into motions of the cameras and lens."""
         num = self.motions.motion.numel()
         return numbers[:num].view(-1, 6), numbers[num:]
-
-    def position(self) -> tuple[Tensor, Tensor | None]:
-        """Return a copy of the parameters for `move_back`."""
-        return self.motions.motion.clone(), None if self.lens is None else self.lens.clone()
 
     def move(self, motion: Float[Tensor, "V 6"], lens: Float[Tensor, "L"]) -> None:
         """Add to the parameters of cameras and lens, in pixels."""
@@ -189,11 +184,12 @@ class RefinedCamera(Camera):
         if self.lens is not None:
             self.lens += lens
 
-    def move_back(self, position: tuple[Tensor, Tensor | None], worse: Bool[Tensor, "V"], lens: bool) -> None:
-        """Restore the parameters of the cameras `worse`, and of the lens if `lens` is true."""
-        self.motions.motion[worse] = position[0][worse]
-        if lens and position[1] is not None:
-            self.lens = position[1]
+    def move_back(self, numbers: Float[Tensor, "N"], worse: Bool[Tensor, "V"], lens: bool) -> None:
+        """Restore earlier parameters (see `numbers`) of the cameras `worse`, and of the lens if `lens` is true."""
+        motion, old_lens = self.split(numbers)
+        self.motions.motion[worse] = motion[worse]
+        if lens and self.lens is not None:
+            self.lens.copy_(old_lens)
 
     def _through_lens(self, local: Float[Tensor, "R 3"], view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
         """Return the directions, in camera axes, of the same pixels through the estimated lens."""

@@ -58,7 +58,7 @@ def align_to_outlines(
         The information that the outlines give about the cameras. None if the distance is larger; the cameras are then
         unchanged.
     """
-    before, numbers = camera.position(), camera.numbers()
+    numbers = camera.numbers()
     weak = PriorInformation(numbers, torch.eye(len(numbers)).to(numbers) / _PRIOR_DEVIATION**2)
     finder = RimFinder(mesh, silhouettes)
     for step in track("outlines", range(_STEPS + 1)):
@@ -72,7 +72,7 @@ def align_to_outlines(
             camera.move(motion * (_MAX_STEP / motion.norm(dim=-1, keepdim=True).clamp(min=_MAX_STEP)), lens)
     distance = float((error - error.median()).abs().median())
     if distance > max_distance:
-        camera.move_back(before, worse=torch.ones(len(cameras), dtype=torch.bool), lens=True)
+        camera.move_back(numbers, worse=torch.ones(len(cameras), dtype=torch.bool), lens=True)
         print(f"outlines: the surface is {distance:.2f} pixels off its masks at best, so the cameras are not aligned")
         return None
     matrix, vector = normal_equations(slopes, error, weights, view, len(cameras), damping=0.0)

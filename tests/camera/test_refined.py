@@ -65,7 +65,7 @@ def test_slopes_are_those_of_central_differences(distortion: tuple[float, ...] |
     for number in range(9):
         ends = []
         for sign in (h, -h):
-            before = made.position()
+            before = made.numbers()
             step = sign * torch.eye(9, dtype=torch.float64)[number]
             made.move(step[:6].expand(NUM_VIEWS, 6), step[6:])
             moved = made(rays, view)
@@ -85,6 +85,18 @@ def test_rays_are_those_of_the_estimated_cameras(distortion: tuple[float, ...] |
         found, expected = made(given.rays(view, row, column), view), estimated.rays(view, row, column)
         torch.testing.assert_close(found.origins, expected.origins)
         torch.testing.assert_close(found.directions, expected.directions, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("lens", [False, True])
+def test_parameters_of_a_prior_stay_when_cameras_move(lens: bool) -> None:
+    made = RefinedCamera(lens=lens).double()
+    made.begin(cameras())
+    before = made.numbers()
+    made.move(torch.ones(NUM_VIEWS, 6, dtype=torch.float64), torch.ones(3, dtype=torch.float64))
+    assert not before.any()
+    assert bool((made.numbers() == 1).all())
+    made.move_back(before, torch.arange(NUM_VIEWS) > 0, lens=True)
+    assert made.numbers().tolist() == [1.0] * 6 + [0.0] * (len(before) - 6)
 
 
 def test_a_motion_that_all_cameras_share_is_taken_out() -> None:

@@ -67,23 +67,3 @@ def test_poses_come_back_with_the_hull(
     before, after = motion_between(TRUE.camera_to_world, moved), motion_between(TRUE.camera_to_world, found)
     for old, new in zip(before, after, strict=True):
         assert float(new.median()) < 0.4 * float(old.median())
-
-
-@pytest.mark.parametrize(
-    ("option", "reason"),
-    [("room=true", "needs distant surroundings"), ("mesh={}/mesh.ply", "has no masks")],
-    ids=["near", "no masks"],
-)
-def test_what_cannot_be_refined_is_refused(
-    option: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    save_photographs(tmp_path, TRUE.camera_to_world)
-    for mask in (tmp_path / "masks" / "train").iterdir():
-        mask.unlink()
-    options = [f"data.root={tmp_path}", f"out={tmp_path / 'out'}", "data.near=0.5", "medium.ior=1.5"]
-    options += ["refine_cameras=true", option.format(tmp_path)]
-    monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", *options])
-    with pytest.raises(SystemExit) as stopped:
-        nerfro.preprocess.main()
-    assert stopped.value.code != 0
-    assert reason in capsys.readouterr().err

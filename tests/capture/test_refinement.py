@@ -217,12 +217,3 @@ def test_a_refinement_begins_with_the_index_that_was_found(
     monkeypatch.setattr(refinement_report, "refine_surface", kept)
     preprocess("room=false", medium=solid([1.33]), ior=None)
     assert begun[0].iors.tolist() == [pytest.approx(1.33, rel=0.005)]
-
-
-def test_what_cannot_be_refined_is_refused_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", f"out={tmp_path}", "refine=true", "medium=object_voxels"])
-    with pytest.raises(SystemExit):
-        nerfro.preprocess.main()
-    assert "set medium=object or medium=vessel" in capsys.readouterr().err
