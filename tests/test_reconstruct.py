@@ -96,6 +96,7 @@ class Pretended:
 @pytest.fixture
 def pretended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pretended:
     made = Pretended(tmp_path / "out")
+    monkeypatch.setattr(stages, "command_of_module", lambda name: [sys.executable, "-m", name])
     monkeypatch.setattr(stages, "run_command", made)
     return made
 
@@ -250,6 +251,7 @@ def test_posed_photographs_of_a_ball_become_a_scene(
             return int(end.code or 0)
         return 0
 
+    monkeypatch.setattr(stages, "command_of_module", lambda name: [sys.executable, "-m", name])
     monkeypatch.setattr(stages, "run_command", here)
     monkeypatch.setattr(nerfro.train, "find_lpips_networks", lambda *files: ({}, {}))
     short = refinement.RefinementSettings((refinement.Stage(20, 1e-4, (3.0, 1.0)),), 1000)

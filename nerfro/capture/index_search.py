@@ -124,6 +124,7 @@ def find_indices(
     progress(1.0)
     num_views = len(counts)
     weights = np.random.default_rng(0).multinomial(num_views, np.full(num_views, 1 / num_views), _NUM_BOOTSTRAP)
+    weights = weights.astype(np.float64)
     standard_errors = _minimum(fine, _mean_errors(sums, counts, weights), axes)[0].std(0)
     names = ["index"] if num_bodies == 1 else [f"index of body {body + 1}" for body in range(num_bodies)]
     depth, known = 1 - errors.min() / search.unrelated, counts.sum() / search.num_pixels

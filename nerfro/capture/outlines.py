@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerfro.camera.least_squares import PriorInformation, normal_equations, with_priors
@@ -85,7 +85,7 @@ def _observations(
     cameras: Cameras,
     downscaled: Callable[[Cameras], Cameras],
     finder: RimFinder,
-) -> tuple[Float[Tensor, "R 1 N+1"], Float[Tensor, "R 1"], Float[Tensor, "R"], Tensor]:
+) -> tuple[Float[Tensor, "R 1 M"], Float[Tensor, "R 1"], Float[Tensor, "R"], Int[Tensor, "R"]]:
     """Compute derivatives, errors, weights and views of the contour points, in pixels of the silhouettes.
 
     The last derivative is by the common width of the masks.
