@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -15,16 +13,22 @@ from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.surface import make_mesh
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.geometry.mesh import TriangleMesh
-from tests.silhouettes import cameras_around
 
 SIZE, VIEWS, SHIFT = 160, 16, np.array([0.05, -0.03, -0.6])
 TURN = trimesh.transformations.rotation_matrix(0.6, [0.5, -0.8, 0.2])[:3, :3]  # of the axis
 
 
 def _cameras() -> Cameras:
-    """Around the axis, 20 degrees above the foot and higher."""
-    cameras = cameras_around(VIEWS, SIZE, focal=2.0, spread=0.65)
-    return replace(cameras, camera_to_world=torch.from_numpy(TURN).float() @ cameras.camera_to_world)
+    """Around the axis, 20 to 50 degrees above the foot."""
+    poses = []
+    for view in range(VIEWS):
+        azimuth, raised = 2 * np.pi * view / VIEWS, np.radians(20 + 30 * (view % 3) / 2)
+        back = np.array([np.cos(raised) * np.cos(azimuth), np.cos(raised) * np.sin(azimuth), np.sin(raised)])
+        right = np.cross([0, 0, 1], back) / np.cos(raised)
+        poses.append(TURN @ np.stack([right, np.cross(back, right), back, 4 * back], 1))
+    ones = torch.ones(VIEWS)
+    to_world = torch.from_numpy(np.stack(poses)).float()
+    return Cameras(to_world, 2 * SIZE * ones, 2 * SIZE * ones, SIZE / 2 * ones, SIZE / 2 * ones, SIZE, SIZE, 0.1, 9.0)
 
 
 def _body(outline: list[list[float]]) -> TriangleMesh:
