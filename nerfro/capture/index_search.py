@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Num
 
 from nerfro.capture.surroundings import Pixels, Room, Surroundings, robust
 from nerfro.errors import NerfroError
@@ -139,7 +139,7 @@ def _grid(steps: int, num_axes: int) -> Float[np.ndarray, "C K"]:
 
 
 def _mean_errors(
-    sums: Float[np.ndarray, "C V"], counts: Float[np.ndarray, "V"], weights: Float[np.ndarray, "B V"] | int = 1
+    sums: Float[np.ndarray, "C V"], counts: Float[np.ndarray, "V"], weights: Num[np.ndarray, "B V"] | int = 1
 ) -> Float[np.ndarray, "B C"]:
     """Average errors that are summed by view over all pixels, optionally for B weightings of the views."""
     weights = np.atleast_2d(weights * np.ones_like(counts))

@@ -151,7 +151,7 @@ def gradient(values: Float[Tensor, "X Y Z"], spacing: Float[Tensor, "3"]) -> Flo
     return torch.stack(parts, -1)
 
 
-def _shifted(values: Float[Tensor, "X Y Z"], axis: int, reach: int) -> list[Float[Tensor, "X Y Z"]]:
+def _shifted(values: Float[Tensor, "X Y Z *C"], axis: int, reach: int) -> list[Float[Tensor, "X Y Z *C"]]:
     """Return the grid shifted by -reach, ..., reach along an axis, with replicated borders."""
     length = values.shape[axis]
     first, last = values.narrow(axis, 0, 1), values.narrow(axis, length - 1, 1)

@@ -48,7 +48,7 @@ class ContractedLength:
         radius: radius of the ball beyond which space is contracted.
     """
 
-    cumulative: Float[Tensor, "P S+1"]
+    cumulative: Float[Tensor, "P V"]
     start_length: Float[Tensor, "P S"]
     closest: Float[Tensor, "P S"]
     impact: Float[Tensor, "P S"]
