@@ -32,7 +32,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 from nerfro.allowed import check_names, check_settings
 from nerfro.errors import NerfroError, nearest_of
 from nerfro.paths import CONF_DIR
-from nerfro.registry import discover
+from nerfro.registry import discover, plugins
 from nerfro.trust import TrustingConfigLoader, leave_current_directory
 
 _NO_MEMORY = re.compile("allocate memory|out of memory")  # messages of torch on a CPU and on a GPU
@@ -72,7 +72,6 @@ RENAMED: dict[str, str | None] = {
     "sampler.points.looks": "sampler.points.update_fraction",
     "sampler.points.trust": "sampler.points.max_bin_alpha",
     "sampler.points.num_shown": "sampler.points.num_samples_evaluation",
-    "trainer.accumulate_grad_batches": None,
     "boundary.direction_degree": None,
     "field.base_resolution": None,
     "field.direction_degree": None,
@@ -217,6 +216,12 @@ def _description(error: Exception) -> str:
 def _unforeseen(error: Exception) -> str:
     """Write the traceback of a bug to a file and return a message with the name of the file."""
     what = f"{type(error).__name__}: {error}".splitlines()[0]
+    foreign = {plugin.cls.__module__ for plugin in plugins()}
+    frames = traceback.walk_tb(error.__traceback__)
+    places = [(frame.f_globals.get("__name__", ""), frame.f_code.co_filename, line) for frame, line in frames]
+    place = next((place for place in reversed(places) if place[0] in foreign), None)
+    if place is not None and not place[0].startswith("nerfro."):
+        return f"{what}; raised in the plugin {place[1]}, line {place[2]} (NERFRO_DEBUG=1 shows the traceback)"
     try:
         with tempfile.NamedTemporaryFile("w", prefix="nerfro_", suffix=".txt", delete=False) as file:
             print(shlex.join(sys.argv), file=file)

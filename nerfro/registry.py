@@ -32,7 +32,9 @@ from nerfro.allowed import check, checked
 from nerfro.errors import NerfroError
 from nerfro.paths import PLUGINS_DIR
 
-KINDS = ("model", "camera", "medium", "sampler/path", "sampler/points", "field", "boundary", "loss", "data")
+KINDS = (
+    "model", "camera", "medium", "sampler/path", "sampler/points", "field", "boundary", "loss", "data", "callbacks",
+)  # fmt: skip
 
 # Packages whose modules register the built-in plugins; `discover` imports them.
 _BUILT_IN = ("camera", "media", "samplers", "fields", "boundaries", "losses", "models", "data")
@@ -47,8 +49,6 @@ _LIGHTNING_TARGETS = frozenset(
         "loggers.TensorBoardLogger",
         "loggers.CSVLogger",
         "loggers.WandbLogger",
-        "callbacks.ModelCheckpoint",
-        "callbacks.LearningRateMonitor",
         "strategies.DDPStrategy",
     )
 )
@@ -114,25 +114,31 @@ def register(kind: str, name: str) -> Callable[[type[Part]], type[Part]]:
     """
     _require_kind(kind)
 
-    def add(cls: type[Part]) -> type[Part]:
-        taken = _plugins.get((kind, name))
-        # A module that is imported again registers the same class twice.
-        if taken is not None and (taken.cls.__module__, taken.cls.__qualname__) != (cls.__module__, cls.__qualname__):
-            raise NerfroError(
-                f"{kind}={name} is registered twice, by {taken.cls.__module__} and {cls.__module__}; rename one of them"
-            )
-        plugin = _make_plugin(kind, name, cls)
-        _plugins[kind, name] = plugin
-        ConfigStore.instance().store(group=kind, name=name, node=plugin.config, provider="nerfro")
+    def wrap(cls: type[Part]) -> type[Part]:
+        add(kind, name, cls)
         return checked(f"{kind}={name}")(cls)
 
-    return add
+    return wrap
+
+
+def add(kind: str, name: str, cls: type) -> None:
+    """Register a class of another package under a name; see `register`."""
+    _require_kind(kind)
+    taken = _plugins.get((kind, name))
+    # A module that is imported again registers the same class twice.
+    if taken is not None and (taken.cls.__module__, taken.cls.__qualname__) != (cls.__module__, cls.__qualname__):
+        raise NerfroError(
+            f"{kind}={name} is registered twice, by {taken.cls.__module__} and {cls.__module__}; rename one of them"
+        )
+    plugin = _make_plugin(kind, name, cls)
+    _plugins[kind, name] = plugin
+    package = f"{kind}.{name}" if kind == "callbacks" else None  # a run may have several
+    ConfigStore.instance().store(group=kind, name=name, node=plugin.config, package=package, provider="nerfro")
 
 
 def plugins(kind: str | None = None) -> list[Plugin]:
     """Return the registered plugins, of one type or of all, sorted by type and name."""
-    if kind is not None:
-        _require_kind(kind)
+    _require_kind(kind or KINDS[0])
     chosen = (p for p in _plugins.values() if kind in (None, p.kind))
     return sorted(chosen, key=lambda p: (KINDS.index(p.kind), p.name))
 
@@ -293,22 +299,18 @@ def _import_plugin(module: str, where: str) -> None:
 
 
 def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
-    constructor = inspect.unwrap(cls.__init__)  # type: ignore[misc]
-    hints = typing.get_type_hints(constructor)
     fields: list[tuple[str, Any, Any]] = []
     parts: set[str] = set()
-    # Classes without their own constructor have no configuration; the signature of nn.Module is generic.
-    own = constructor not in (object.__init__, nn.Module.__init__)
-    for parameter in list(inspect.signature(constructor).parameters.values())[1:] if own else []:
+    allowing: dict[str, Any] = {}
+    for parameter, hint, annotation in _parameters(cls):
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             raise NerfroError(f"{kind}={name}: its constructor takes *{parameter.name}; name every parameter instead")
-        hint = hints.get(parameter.name)
+        allowing[parameter.name] = annotation
         config_type = _config_type(hint)
         if config_type is None:
             parts.add(parameter.name)
-            continue
-        fields.append((parameter.name, config_type, _default(parameter)))
-    allowing = typing.get_type_hints(constructor, include_extras=True)
+        else:
+            fields.append((parameter.name, config_type, _default(parameter)))
     if _settings(cls):
         annotations = typing.get_type_hints(cls, include_extras=True)
         for attribute in _settings(cls):
@@ -319,6 +321,29 @@ def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
     fields.append(("_target_", str, dataclasses.field(default=target)))
     config = dataclasses.make_dataclass(f"{cls.__name__}Config", fields, kw_only=True)
     return Plugin(kind, name, cls, config, allowing, frozenset(parts))
+
+
+def _parameters(cls: type) -> list[tuple[inspect.Parameter, Any, Any]]:
+    """Return the parameters of a constructor with their types, without and with `Annotated`.
+
+    A constructor that takes `**options` has the parameters of the constructor of its base class, too.
+    """
+    found: dict[str, tuple[inspect.Parameter, Any, Any]] = {}
+    for base in inspect.getmro(cls):
+        # Classes without their own constructor have no configuration; the signature of nn.Module is generic.
+        if base in (object, nn.Module):
+            break
+        if "__init__" not in vars(base):
+            continue
+        constructor = inspect.unwrap(base.__init__)  # type: ignore[misc]
+        hints, annotations = (typing.get_type_hints(constructor, include_extras=extras) for extras in (False, True))
+        _, *parameters = inspect.signature(constructor).parameters.values()
+        inherits = any(parameter.kind == parameter.VAR_KEYWORD for parameter in parameters)
+        for parameter in parameters:
+            found.setdefault(parameter.name, (parameter, hints.get(parameter.name), annotations.get(parameter.name)))
+        if not inherits:
+            return [given for given in found.values() if given[0].kind != given[0].VAR_KEYWORD]
+    return list(found.values())
 
 
 def _config_type(hint: Any) -> Any:

@@ -226,6 +226,11 @@ def _check_data(source: DataSource) -> None:
         )
 
 
+def _check_callback(callback: Any) -> None:
+    # Importing Lightning takes seconds, and no other plugin needs Lightning.
+    _require(hasattr(callback, "on_train_batch_end"), "a callback derives from lightning.pytorch.Callback")
+
+
 _CONTRACTS: dict[str, tuple[type, Callable[[Any], None]]] = {
     "camera": (Camera, _check_camera),
     "medium": (Medium, _check_medium),
@@ -236,6 +241,7 @@ _CONTRACTS: dict[str, tuple[type, Callable[[Any], None]]] = {
     "loss": (Loss, _check_loss),
     "model": (Renderer, _check_model),
     "data": (DataSource, _check_data),
+    "callbacks": (object, _check_callback),
 }
 
 

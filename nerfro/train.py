@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from pathlib import Path
 
@@ -21,14 +20,14 @@ from nerfro.subdivision import Subdivision
 from nerfro.training.background_pretraining import BackgroundPretraining
 from nerfro.training.callbacks import StopOnSignal, Throughput
 from nerfro.training.camera_steps import CameraSteps
-from nerfro.training.config import TrainConfig, build_data, build_model
+from nerfro.training.config import TrainConfig, build_data, build_model, shorten
 from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.memory import require_memory
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.reach import require_reach
-from nerfro.training.run_folder import LAST_CHECKPOINT, begin, own, require_same_run
-from nerfro.training.trainer import finish_logs, fit, make_trainer, prepare_process
+from nerfro.training.run_folder import LAST_CHECKPOINT, begin, next_steps, own, require_same_run
+from nerfro.training.trainer import finish_logs, fit, make_trainer, prepare_process, print_profile
 from nerfro.training.viewer import Viewer
 from nerfro.viewing.camera_files import write_cameras
 
@@ -43,12 +42,13 @@ def main(config: DictConfig) -> None:
 
 def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     prepare_process(config.seed)
+    shorten(config)
     source = build_data(config)
     test = source.load(config.evaluation.split).checked()
+    test = test.select(range(len(test))[: config.trainer.limit_test_batches])
     validation = source.load("val").checked() if config.evaluation.every > 0 and "val" in source.splits else None
-    wanted, training = config.batches, source.load("train")
-    precrop, fraction = (wanted.precrop_steps, wanted.precrop_fraction), wanted.object_fraction
-    batches = RayBatches(training, wanted.size, wanted.batching, config.seed, *precrop, wanted.jitter, fraction)
+    training = source.load("train")
+    batches = RayBatches.of(training, config)
     subdivision = Subdivision(**config.evaluation.subdivision)
     lpips = find_lpips_networks(config.evaluation.lpips_backbone, config.evaluation.lpips_vgg_backbone)
     renderer = build_model(config, training)
@@ -58,7 +58,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     cameras, boundary = CameraSteps(training), BackgroundPretraining(config.optimizer.boundary_steps, interruption)
     trainer = make_trainer(config, folder, throughput, [interruption, cameras, boundary, Viewer(config, source, test)])
     batches = traced(batches.share(trainer.global_rank, trainer.world_size), renderer, config)
-    datamodule = RayDataModule(batches, validation, config.evaluation.every)
+    datamodule = RayDataModule(batches, validation, config.evaluation.every, config.trainer.overfit_batches)
     few = batches.smaller(4096)
     first = few.batch(0)
     require_reach(renderer, first)
@@ -73,6 +73,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     fit(trainer, TrainingModule.of(renderer, config), datamodule, checkpoint, throughput)
     trainer.save_checkpoint(folder / LAST_CHECKPOINT)
     finish_logs(trainer)
+    print_profile(folder)
     leave()
     if not trainer.is_global_zero:
         return
@@ -88,11 +89,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     spent = trainer.global_step, throughput.seconds, throughput.rays_per_second
     report(RunMetrics(result, *spent, treated), title, folder)
     print(f"{trainer.global_step} steps in {throughput.seconds:.0f} s, {throughput.rays_per_second or 0:,.0f} rays/s.")
-    print("Look at:")
-    print(f"  {folder}/images/  the pictures; metrics.json, .csv, .md and .tex beside them")
-    written = shlex.quote(f"checkpoint={folder}/checkpoints/last.ckpt")
-    print(f"  python -m nerfro.evaluate {written}  scores it again, or other views")
-    print("  python -m nerfro.dashboard  losses and validation pictures")
+    print(next_steps(folder))
 
 
 if __name__ == "__main__":

@@ -166,7 +166,7 @@ def test_open_mesh_is_accepted_when_asked(
         ("trainer.max_steps=99999999999", ["trainer.max_steps=99999999999 is not allowed"]),
         ("trainer.precision=8", ["trainer.precision='8' is not allowed; choose '32-true'"]),
         ("sampler.path=nothing", ["'nothing' is not a set of settings"]),
-        ("trainer.accumulate_grad_batches=2", ["trainer.accumulate_grad_batches was removed in this release"]),
+        ("trainer.accumulate_grad_batches=2", ["trainer.accumulate_grad_batches=2 has no meaning in nerfro"]),
         ("+trainer.limit_train_batches=0", ["trainer.limit_train_batches is not a setting"]),
         ("checkpoint.every_seconds=-1", ["checkpoint.every_seconds=-1.0 is not allowed"]),
         ("checkpoint.every_seconds=inf", ["checkpoint.every_seconds=inf is not allowed"]),

@@ -17,6 +17,7 @@ from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
 from nerfro.paths import CONF_DIR
+from nerfro.training import lightning_callbacks  # registers callbacks
 from nerfro.registry import KINDS, build, configure, discover, find, plugins, register
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.training.config import TrainConfig, build_losses
@@ -252,7 +253,7 @@ def test_wrong_losses_are_refused(losses: dict[str, object], message: str) -> No
         (["field._target_=os.system"], ["'os.system' is not registered"]),
         (["trainer._target_=os.system"], ["'os.system' is not registered"]),
         (["logger=none", "+logger.x={_target_: os.system, command: 'false'}"], ["'os.system' is not registered"]),
-        (["+trainer.callbacks=[]"], ["trainer.callbacks is not a setting"]),
+        (["trainer.callbacks=[]"], ["trainer.callbacks=[] has no meaning in nerfro: choose callbacks by name"]),
         (["+experiment=nope"], ["Could not find 'experiment/nope'", "ablation_noBD", "refractive"]),
         (["foo"], ["foo is not an option; write key=value"]),
         (["seed=-1"], ["seed=-1 is not allowed; take at least 0 and at most 4294967295"]),

@@ -88,9 +88,12 @@ class CheckpointConfig:
     every_steps: Optional[Count] = None  # noqa: UP045
 
 
+_EPOCHS = "a run has no epochs; set trainer.max_steps, trainer.max_time or evaluation.every"
+
+
 @dataclass
 class TrainerConfig:
-    """The supported arguments of Lightning's Trainer; None selects the default of Lightning."""
+    """The arguments of Lightning's Trainer; None selects the default of Lightning."""
 
     _target_: str = "lightning.pytorch.Trainer"
     accelerator: str = "auto"
@@ -107,8 +110,62 @@ class TrainerConfig:
     deterministic: Any = None
     benchmark: Optional[bool] = None  # noqa: UP045
     detect_anomaly: Optional[bool] = None  # noqa: UP045
-    profiler: Optional[str] = None  # noqa: UP045
+    # Time of each part of a step, on the console and in profile/ of the run folder.
+    profiler: Annotated[Optional[str], Literal["simple", "advanced", "pytorch"]] = None  # noqa: UP045
     enable_model_summary: bool = False
+    enable_progress_bar: bool = True
+    # Without checkpoints during training, an interrupted run still writes one at its end.
+    enable_checkpointing: bool = True
+    min_steps: Optional[Count] = None  # noqa: UP045
+    overfit_batches: Natural = 0  # train on this number of batches, repeated; 0 draws new pixels in every step
+    limit_test_batches: Optional[Count] = None  # noqa: UP045 - number of scored views; None scores all
+    inference_mode: Optional[bool] = None  # noqa: UP045
+    # Train for this number of steps, or for one step if true, and score one view.
+    fast_dev_run: Any = False
+    # Refused with a reason, see `REFUSED_ARGUMENTS`.
+    accumulate_grad_batches: Any = None
+    barebones: Any = None
+    callbacks: Any = None
+    check_val_every_n_epoch: Any = None
+    default_root_dir: Any = None
+    enable_autolog_hparams: Any = None
+    limit_predict_batches: Any = None
+    limit_train_batches: Any = None
+    limit_val_batches: Any = None
+    logger: Any = None
+    max_epochs: Any = None
+    min_epochs: Any = None
+    model_registry: Any = None
+    num_sanity_val_steps: Any = None
+    plugins: Any = None
+    reload_dataloaders_every_n_epochs: Any = None
+    sync_batchnorm: Any = None
+    use_distributed_sampler: Any = None
+    val_check_interval: Any = None
+
+
+# Arguments of Lightning's Trainer that a run cannot support, and what to use instead.
+REFUSED_ARGUMENTS: Mapping[str, str] = {
+    "accumulate_grad_batches": "batches and random numbers depend on the step; set batches.size",
+    "barebones": "a run needs its log and its checkpoints; set logger=none trainer.enable_checkpointing=false",
+    "callbacks": "choose callbacks by name, as in +callbacks=learning_rate_monitor",
+    "check_val_every_n_epoch": _EPOCHS,
+    "default_root_dir": "set hydra.run.dir",
+    "enable_autolog_hparams": "the settings of a run are always written",
+    "limit_predict_batches": "training predicts nothing; see python -m nerfro.render",
+    "limit_train_batches": f"{_EPOCHS}, or trainer.overfit_batches to repeat batches",
+    "limit_val_batches": "validation renders one view at a time; set evaluation.every=0 to switch validation off",
+    "logger": "choose loggers by name, as in logger=wandb",
+    "max_epochs": _EPOCHS,
+    "min_epochs": _EPOCHS,
+    "model_registry": "checkpoints are written to the run folder",
+    "num_sanity_val_steps": "validation is tried in the first steps; set evaluation.every",
+    "plugins": "nerfro's plugins have no access to the trainer's; see docs/plugins.md",
+    "reload_dataloaders_every_n_epochs": _EPOCHS,
+    "sync_batchnorm": "no model has batch normalization",
+    "use_distributed_sampler": "every process draws its own share of the pixels",
+    "val_check_interval": "set evaluation.every",
+}
 
 
 @dataclass
@@ -153,6 +210,9 @@ class TrainConfig:
     checkpoint: CheckpointConfig = dataclasses.field(default_factory=CheckpointConfig)
     trainer: TrainerConfig = dataclasses.field(default_factory=TrainerConfig)
     logger: Any = None  # Lightning loggers, by any name
+    # Settings of each callback, by the registered name of the callback.
+    callbacks: dict[str, Any] = dataclasses.field(default_factory=dict)
+    debug: bool = False  # a run of ten steps that scores one view
     # Checkpoint to resume from, or `last` for the newest checkpoint of this experiment.
     ckpt_path: Optional[str] = None  # noqa: UP045
     viewer: bool = False  # serve an interactive page of the model during training, to browsers on this machine
@@ -182,6 +242,18 @@ def check_trained(config: DictConfig, origin: Path) -> DictConfig:
         reason = " ".join(str(error).split())
         raise NerfroError(f"{origin} has a configuration that nerfro.train does not write: {reason}") from error
     return typed
+
+
+def shorten(config: DictConfig) -> None:
+    """Reduce the run to a few steps and one scored view where `debug` or `trainer.fast_dev_run` asks for it."""
+    fast = config.trainer.fast_dev_run
+    if not (config.debug or fast):
+        return
+    steps = 10 if config.debug else int(fast)
+    config.trainer.max_steps, config.trainer.limit_test_batches = steps, 1
+    config.optimizer.boundary_steps = min(config.optimizer.boundary_steps, steps)
+    config.evaluation.every, config.evaluation.refine_steps = max(1, steps // 2), 0
+    config.evaluation.subdivision.side = 1
 
 
 def build_data(config: DictConfig) -> DataSource:

@@ -40,8 +40,9 @@ class RayDataModule(LightningDataModule):
     its step begins, so that paths depend on the current medium.
     """
 
-    def __init__(self, batches: RayBatches, validation: Views | None, every: int) -> None:
+    def __init__(self, batches: RayBatches, validation: Views | None, every: int, overfit_batches: int = 0) -> None:
         super().__init__()
+        self._overfit_batches = overfit_batches
         self.batches, self.validation, self.every = batches, validation, every
         self.validation_pixels = None if validation is None else ValidationPixels.of(validation)
         self._ahead: Prefetcher | None = None
@@ -71,6 +72,8 @@ class RayDataModule(LightningDataModule):
         assert self.trainer is not None
         if not self.trainer.training:
             return batch  # the number of a validation view, or none
+        if self._overfit_batches:
+            batch %= self._overfit_batches
         if self._ahead is not None:
             return self._ahead(batch)
         with torch.no_grad():

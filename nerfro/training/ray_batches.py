@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
+from omegaconf import DictConfig
 from torch import Tensor
 
 from nerfro.allowed import Count, Natural, Range, checked
@@ -76,6 +77,13 @@ class RayBatches:
             warn("batches.object_fraction: not every training photograph has a mask, so pixels are drawn of all alike")
         elif object_fraction > 0:
             self._of_object = {window: _of_object(views, batching, window) for window in windows}
+
+    @classmethod
+    def of(cls, views: Views, config: DictConfig) -> RayBatches:
+        """Make the batches of a run from its configuration, see `TrainConfig`."""
+        options = config.batches
+        precrop, fraction = (options.precrop_steps, options.precrop_fraction), options.object_fraction
+        return cls(views, options.size, options.batching, config.seed, *precrop, options.jitter, fraction)
 
     def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> RayBatches:
         """Return the same sequence on another device, with rays in another precision."""

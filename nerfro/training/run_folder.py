@@ -83,6 +83,16 @@ def begin(folder: Path, config: DictConfig, renderer: Renderer) -> None:
     print(f"nerfro: {config.name} on {config.data.root} -> {folder}\n{found}", end="", flush=True)
 
 
+def next_steps(folder: Path) -> str:
+    """Return what a user can look at and do after a run."""
+    checkpoint = shlex.quote(f"checkpoint={folder / LAST_CHECKPOINT}")
+    return (
+        f"Look at:\n  {folder}/images/  the rendered views; metrics.json, .csv, .md and .tex are beside\n"
+        f"  python -m nerfro.evaluate {checkpoint}  scores the run again, or other views\n"
+        "  python -m nerfro.dashboard  losses and validation images"
+    )
+
+
 def require_room(folder: Path, needed_bytes: int) -> None:
     """Raise an error if the disk is too full for a run."""
     free = shutil.disk_usage(folder).free

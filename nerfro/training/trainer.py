@@ -6,6 +6,7 @@ import logging
 import warnings
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import lightning.pytorch as pl
 import torch
@@ -13,20 +14,27 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning.pytorch.callbacks import Callback, Timer
 from lightning.pytorch.loggers import WandbLogger
+from lightning.pytorch.profilers import AdvancedProfiler, Profiler, PyTorchProfiler, SimpleProfiler
 from lightning.pytorch.strategies import DDPStrategy
 from omegaconf import DictConfig, OmegaConf
 
+import nerfro.training.lightning_callbacks  # noqa: F401 - registers callbacks
 from nerfro.cli import warn
 from nerfro.errors import NerfroError
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.kernels.precision import fast_bfloat16
-from nerfro.registry import build
+from nerfro.registry import build, create, find
 from nerfro.training.callbacks import Checkpoints, ConfigInCheckpoint, SharedTimer, Throughput, TrainingProgress
 from nerfro.training.checkpoint_files import CheckpointFiles
+from nerfro.training.config import REFUSED_ARGUMENTS
 from nerfro.training.data_module import validation_interval
 from nerfro.training.log import TrainingLog
 from nerfro.training.run_folder import CONFIG_FILE, LAST_CHECKPOINT
 from nerfro.training.validation import OverfittingWarning
+
+# Arguments of the trainer that nerfro itself acts on.
+_OWN = ("profiler", "fast_dev_run", "overfit_batches", "limit_test_batches")
+_PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch": PyTorchProfiler}
 
 
 def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra: list[Callback]) -> pl.Trainer:
@@ -43,12 +51,18 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
         save_on_train_epoch_end=False,
     )
     in_checkpoint = ConfigInCheckpoint(OmegaConf.to_yaml(config, resolve=True))
-    ours = {
+    for name, reason in REFUSED_ARGUMENTS.items():
+        if config.trainer[name] is not None:
+            raise NerfroError(f"trainer.{name}={config.trainer[name]} has no meaning in nerfro: {reason}")
+    chosen = [create(find("callbacks", str(name)), node or {}) for name, node in config.callbacks.items()]
+    ours: dict[str, Any] = {
         "default_root_dir": str(folder),
+        "profiler": _profiler(config.trainer.profiler, folder),
         "callbacks": [
-            checkpoints,
+            *([checkpoints] if config.trainer.enable_checkpointing else []),
             throughput,
-            TrainingProgress(throughput),
+            *([TrainingProgress(throughput)] if config.trainer.enable_progress_bar else []),
+            *chosen,
             in_checkpoint,
             TrainingLog(config),
             OverfittingWarning(),
@@ -71,7 +85,7 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
     limit = config.trainer.get("max_time")
     if isinstance(limit, (int, float)):
         raise NerfroError(f"trainer.max_time={limit} has no unit; write DD:HH:MM:SS, such as 00:00:05:00")
-    given = {name: value for name, value in config.trainer.items() if value is not None}
+    given = {name: value for name, value in config.trainer.items() if value is not None and name not in _OWN}
     trainer = build(given | {"accelerator": accelerator}, **ours)
     trainer.callbacks = [_shared(callback) for callback in trainer.callbacks]
     if trainer.world_size > 1 and HydraConfig.get().mode == RunMode.MULTIRUN:
@@ -81,6 +95,17 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
     if limit is None and trainer.max_steps < 0:
         raise NerfroError("the run would never end; set trainer.max_time (DD:HH:MM:SS), trainer.max_steps, or both")
     return trainer
+
+
+def _profiler(name: str | None, folder: Path) -> Profiler | None:
+    """Build a profiler of Lightning that writes to the run folder."""
+    return None if name is None else _PROFILERS[name](dirpath=folder / "profile", filename=name)
+
+
+def print_profile(folder: Path) -> None:
+    """Print the reports of a profiler, if there is one."""
+    for report in sorted((folder / "profile").glob("*.txt")):
+        print(report.read_text(encoding="utf-8"))
 
 
 def _shared(callback: Callback) -> Callback:

@@ -1,0 +1,143 @@
+"""Arguments of Lightning's Trainer act or are refused with a reason, and callbacks are chosen by name."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+import pytest
+import torch
+
+from nerfro.registry import build, find, register
+from nerfro.testing import check
+from nerfro.training.config import REFUSED_ARGUMENTS, TrainerConfig
+from nerfro.training.ray_batches import RayBatches
+
+CALLBACK = '''
+from lightning.pytorch import Callback
+from nerfro.registry import register
+
+
+@register("callbacks", "step_file")
+class StepFile(Callback):
+    """Write the number of each step to a file."""
+
+    def __init__(self, file: str, every: int = 1) -> None:
+        self.file, self.every = file, every
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+        if trainer.global_step % self.every == 0:
+            with open(self.file, "a") as file:
+                file.write(f"{trainer.global_step} ")
+        if trainer.global_step == 77:
+            raise RuntimeError("seventy-seven")
+'''
+
+
+@pytest.fixture
+def train(train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path) -> Callable[..., Any]:
+    return lambda *options: train_here(*tiny_default_run, f"hydra.run.dir={tmp_path / 'run'}", *options)
+
+
+def test_every_argument_of_lightnings_trainer_is_known() -> None:
+    arguments = set(inspect.signature(pl.Trainer.__init__).parameters) - {"self"}
+    fields = set(TrainerConfig.__dataclass_fields__)
+    assert arguments <= fields
+    assert set(REFUSED_ARGUMENTS) <= arguments
+
+
+def test_arguments_without_a_meaning_are_refused_with_a_reason(train: Callable[..., Any], tmp_path: Path) -> None:
+    refused = train("trainer.max_epochs=3")
+    assert refused.code == 1
+    assert "trainer.max_epochs=3 has no meaning in nerfro: a run has no epochs; set trainer.max_steps" in refused.err
+    assert not (tmp_path / "run" / "config.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "steps"), [(["debug=true"], 10), (["trainer.fast_dev_run=true"], 1), (["trainer.fast_dev_run=3"], 3)]
+)
+def test_short_runs_score_one_view(options: list[str], steps: int, train: Callable[..., Any], tmp_path: Path) -> None:
+    finished = train(*options)
+    assert finished.code == 0, finished.err
+    scores = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert scores["steps"] == steps
+    assert len(scores["views"]) == 1
+    assert (tmp_path / "run" / "images" / "test_000.png").is_file()
+
+
+def test_a_profile_is_printed_and_written(train: Callable[..., Any], tmp_path: Path) -> None:
+    finished = train("trainer.max_steps=2", "trainer.profiler=simple")
+    assert finished.code == 0, finished.err
+    (report,) = (tmp_path / "run" / "profile").glob("*.txt")
+    assert "run_training_batch" in report.read_text()
+    assert "run_training_batch" in finished.out
+
+
+def test_overfitting_repeats_batches(train: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn, batch = [], RayBatches.batch
+
+    def recorded(self: RayBatches, step: int) -> Any:
+        drawn.append(step)
+        return batch(self, step)
+
+    monkeypatch.setattr(RayBatches, "batch", recorded)
+    finished = train("trainer.max_steps=6", "trainer.overfit_batches=2", "evaluation.every=0")
+    assert finished.code == 0, finished.err
+    assert set(drawn) <= {0, 1, 2}  # the thread that traces ahead draws one more
+
+
+def test_runs_without_bar_and_without_checkpoints(train: Callable[..., Any], tmp_path: Path) -> None:
+    finished = train("trainer.max_steps=2", "trainer.enable_progress_bar=false", "trainer.enable_checkpointing=false")
+    assert finished.code == 0, finished.err
+    assert "train PSNR" not in finished.err
+    assert (tmp_path / "run" / "checkpoints" / "last.ckpt").is_file()  # written at the end
+
+
+@pytest.mark.usefixtures("restored_registry")
+def test_callbacks_are_chosen_by_name(
+    train: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins" / "step_file.py").write_text(CALLBACK)
+    monkeypatch.setenv("NERFRO_PLUGINS", str(tmp_path / "plugins"))
+    options = (f"callbacks.step_file.file={tmp_path / 'steps'}", "callbacks.step_file.every=2", "logger=tensorboard")
+    finished = train("trainer.max_steps=4", "+callbacks=[step_file,learning_rate_monitor]", *options)
+    assert finished.code == 0, finished.err
+    assert (tmp_path / "steps").read_text() == "2 4 "
+    check(find("callbacks", "step_file"), {"file": "steps"})
+
+
+@pytest.mark.usefixtures("restored_registry")
+def test_errors_of_a_plugin_name_its_file_and_line(
+    train: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins" / "step_file.py").write_text(CALLBACK.replace("77", "1"))
+    monkeypatch.setenv("NERFRO_PLUGINS", str(tmp_path / "plugins"))
+    finished = train("trainer.max_steps=2", "+callbacks=step_file", f"callbacks.step_file.file={tmp_path / 'steps'}")
+    assert finished.code == 1
+    assert f"raised in the plugin {tmp_path}/plugins/step_file.py, line 19" in finished.err
+    assert "bug of nerfro" not in finished.err
+
+
+@pytest.mark.usefixtures("restored_registry")
+def test_options_of_a_base_class_are_inherited() -> None:
+    from nerfro.samplers.stratified import Stratified
+
+    @register("sampler/points", "sparse")
+    class Sparse(Stratified):
+        """Half the samples."""
+
+        def __init__(self, sparsity: int = 2, **options: Any) -> None:
+            super().__init__(**options)
+            self.num_samples //= sparsity
+
+    plugin = find("sampler/points", "sparse")
+    assert {"sparsity", "num_samples", "offset"} <= {name for name, _, _ in plugin.fields()}
+    sampler = build({"_target_": plugin.target, "sparsity": 4, "num_samples": 32})
+    assert sampler.num_samples == 8
+    assert isinstance(sampler, torch.nn.Module)
