@@ -9,6 +9,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+import nerfro.training.lightning_callbacks  # noqa: F401 - registers callbacks
 from nerfro.cli import errors_in_one_line
 from nerfro.registry import Plugin, discover, find, plugins
 

@@ -20,7 +20,7 @@ from nerfro.subdivision import Subdivision
 from nerfro.training.background_pretraining import BackgroundPretraining
 from nerfro.training.callbacks import StopOnSignal, Throughput
 from nerfro.training.camera_steps import CameraSteps
-from nerfro.training.config import TrainConfig, build_data, build_model, shorten
+from nerfro.training.config import TrainConfig, build_data, build_model, settle_trainer
 from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.memory import require_memory
 from nerfro.training.module import TrainingModule
@@ -42,10 +42,11 @@ def main(config: DictConfig) -> None:
 
 def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     prepare_process(config.seed)
-    shorten(config)
+    settle_trainer(config)
     source = build_data(config)
     test = source.load(config.evaluation.split).checked()
-    test = test.select(range(len(test))[: config.trainer.limit_test_batches])
+    if config.trainer.limit_test_batches is not None:
+        test = test.select(range(len(test))[: config.trainer.limit_test_batches])
     validation = source.load("val").checked() if config.evaluation.every > 0 and "val" in source.splits else None
     training = source.load("train")
     batches = RayBatches.of(training, config)

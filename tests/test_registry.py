@@ -17,7 +17,6 @@ from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
 from nerfro.paths import CONF_DIR
-from nerfro.training import lightning_callbacks  # registers callbacks
 from nerfro.registry import KINDS, build, configure, discover, find, plugins, register
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.training.config import TrainConfig, build_losses

@@ -244,8 +244,15 @@ def check_trained(config: DictConfig, origin: Path) -> DictConfig:
     return typed
 
 
-def shorten(config: DictConfig) -> None:
-    """Reduce the run to a few steps and one scored view where `debug` or `trainer.fast_dev_run` asks for it."""
+def settle_trainer(config: DictConfig) -> None:
+    """Reduce the run to a few steps and one scored view where `debug` or `trainer.fast_dev_run` asks for it.
+
+    Raises:
+        NerfroError: an argument of Lightning's Trainer has no meaning in nerfro.
+    """
+    for name, reason in REFUSED_ARGUMENTS.items():
+        if config.trainer[name] is not None:
+            raise NerfroError(f"trainer.{name}={config.trainer[name]} has no meaning in nerfro: {reason}")
     fast = config.trainer.fast_dev_run
     if not (config.debug or fast):
         return

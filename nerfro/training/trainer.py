@@ -26,7 +26,6 @@ from nerfro.kernels.precision import fast_bfloat16
 from nerfro.registry import build, create, find
 from nerfro.training.callbacks import Checkpoints, ConfigInCheckpoint, SharedTimer, Throughput, TrainingProgress
 from nerfro.training.checkpoint_files import CheckpointFiles
-from nerfro.training.config import REFUSED_ARGUMENTS
 from nerfro.training.data_module import validation_interval
 from nerfro.training.log import TrainingLog
 from nerfro.training.run_folder import CONFIG_FILE, LAST_CHECKPOINT
@@ -51,9 +50,6 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
         save_on_train_epoch_end=False,
     )
     in_checkpoint = ConfigInCheckpoint(OmegaConf.to_yaml(config, resolve=True))
-    for name, reason in REFUSED_ARGUMENTS.items():
-        if config.trainer[name] is not None:
-            raise NerfroError(f"trainer.{name}={config.trainer[name]} has no meaning in nerfro: {reason}")
     chosen = [create(find("callbacks", str(name)), node or {}) for name, node in config.callbacks.items()]
     ours: dict[str, Any] = {
         "default_root_dir": str(folder),

@@ -120,7 +120,7 @@ def test_errors_of_a_plugin_name_its_file_and_line(
     monkeypatch.setenv("NERFRO_PLUGINS", str(tmp_path / "plugins"))
     finished = train("trainer.max_steps=2", "+callbacks=step_file", f"callbacks.step_file.file={tmp_path / 'steps'}")
     assert finished.code == 1
-    assert f"raised in the plugin {tmp_path}/plugins/step_file.py, line 19" in finished.err
+    assert f"raised in the plugin {tmp_path}/plugins/step_file.py, line 18" in finished.err
     assert "bug of nerfro" not in finished.err
 
 
