@@ -140,7 +140,7 @@ def test_open_mesh_is_accepted_when_asked(
         ("evaluation.split=night", ["no split 'night'; it has train, val, test"]),
         ("data.root=embedded:nothing", ["embedded scenes: torus"]),
         ("data.root=/nowhere", ["/nowhere is not a folder"]),
-        ('data.root="~nobody_of_that_name/x"', ["the home folder is unknown", "write the path out"]),
+        ('data.root="~nobody_of_that_name/x"', ["the home folder is unknown", "give the full path"]),
         ("data.root=a(1),b", ["data.root=a(1),b cannot be read", "quote"]),
         ("trainer.max_time=5", ["trainer.max_time=5", "DD:HH:MM:SS"]),
         ("medium.ior=0", ["ior=0.0 is not allowed; take more than 0"]),
