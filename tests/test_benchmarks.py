@@ -17,6 +17,7 @@ from lightning.pytorch.callbacks import timer
 
 import nerfro.train
 from nerfro.viewing import server
+from tests import ball_photographs
 from tests.viewing.test_exports import write
 
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
@@ -55,7 +56,12 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> R
         monkeypatch.setattr(nerfro.train, "find_lpips_networks", lambda *files: ({}, {}))
         monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
         # Benchmarks replace these.
-        for module, attribute in ((timer, "time"), (nerfro.train, "Viewer"), (server, "_WATCHED_SECONDS")):
+        for module, attribute in (
+            (timer, "time"),
+            (nerfro.train, "Viewer"),
+            (server, "_WATCHED_SECONDS"),
+            (ball_photographs, "SIZE"),
+        ):
             monkeypatch.setattr(module, attribute, getattr(module, attribute))
         capfd.readouterr()
         threads, gradients = torch.get_num_threads(), torch.is_grad_enabled()

@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from nerfro.geometry.mesh import load_mesh
 from nerfro.paths import CONF_DIR
 from nerfro.scenes import dataset, dolphin_capture, path_tracer
 from nerfro.scenes.dolphin_capture import AIM, board_to_world
+from nerfro.scenes.scene import Scene
 from nerfro.scenes.synthesis import SynthesizeConfig, synthesize
 
 
@@ -99,7 +101,7 @@ def test_tags_are_photographed_where_the_true_cameras_see_them(few: Path) -> Non
 def test_only_what_is_not_on_disk_is_rendered_again(few: Path, tmp_path: Path) -> None:
     settings = OmegaConf.create(json.loads((few / "truth" / "meta.json").read_text())["settings"])
     shutil.copytree(few, tmp_path / "copy")
-    data = dataset.Photographs(settings, SimpleNamespace(aim=AIM), tmp_path / "copy")
+    data = dataset.Photographs(settings, Mock(spec=Scene, aim=AIM), tmp_path / "copy")
     planned = data.planned()
     assert data.missing(planned) == []
     (tmp_path / "copy" / planned[1].mask_path).unlink()

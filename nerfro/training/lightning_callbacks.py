@@ -13,6 +13,5 @@ for _name, _cls in {
     "device_stats_monitor": callbacks.DeviceStatsMonitor,
     "early_stopping": callbacks.EarlyStopping,
     "learning_rate_monitor": callbacks.LearningRateMonitor,
-    "on_exception_checkpoint": callbacks.OnExceptionCheckpoint,
 }.items():
     add("callbacks", _name, _cls)
