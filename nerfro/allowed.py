@@ -47,10 +47,9 @@ class Range:
     at_most: float | None = None
     less_than: float | None = None
 
-    def __contains__(self, number: object) -> bool:
+    def __contains__(self, number: Any) -> bool:
         return (
             _is_finite(number)
-            and isinstance(number, Real)
             and (self.at_least is None or number >= self.at_least)
             and (self.more_than is None or number > self.more_than)
             and (self.at_most is None or number <= self.at_most)

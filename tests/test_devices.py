@@ -27,6 +27,8 @@ ADAPTIVE = ["sampler.path.integrator=adaptive", "sampler.path.max_steps=60", "sa
 
 # A constant is copied to the device once. Fields are asked for samples in the object alone, whose number must be known.
 ONCE = "kernels/constants.py: constant (tensor)"
+# Triangles are met on the CPU, and the rays travel there and back.
+TO_CPU = {"rays.py: <genexpr> (to)", "samplers/replay.py: <genexpr> (to)"}
 SELECTED = "fields/selection.py: evaluate_selected (nonzero)"
 
 
@@ -35,7 +37,7 @@ SELECTED = "fields/selection.py: evaluate_selected (nonzero)"
     [
         (["refractive", "sampler.path.max_events=2"], {ONCE, SELECTED}),
         (["refractive", "sampler/path=eikonal", "sampler.path.max_steps=60"], {ONCE, SELECTED}),
-        (["refractive", "sampler.path.interface=mesh"], {ONCE, SELECTED}),
+        (["refractive", "sampler.path.interface=mesh"], {ONCE, SELECTED, *TO_CPU}),
         (["refractive_room", "sampler.path.max_events=2"], {ONCE}),
         (["straight"], {ONCE}),
         (["mipnerf"], set()),
