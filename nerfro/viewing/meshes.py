@@ -96,6 +96,9 @@ def inside_mesh(scene: TrainedScene, resolution: int | None, half_depth: float |
     )
 
 
+_VERTICES, _INDICES = 34962, 34963  # ARRAY_BUFFER and ELEMENT_ARRAY_BUFFER (glTF 2.0, section 5.11)
+
+
 def _encode_glb(scene: TrainedScene, glass: list[trimesh.Trimesh], inside: trimesh.Trimesh | None) -> bytes:
     meshes, materials = {}, {}
     for number, (mesh, absorption) in enumerate(zip(glass, absorption_of(scene.renderer.scene), strict=True)):
@@ -108,7 +111,7 @@ def _encode_glb(scene: TrainedScene, glass: list[trimesh.Trimesh], inside: trime
         materials["inside"] = {"extensions": {"KHR_materials_unlit": {}}}
 
     def add_materials(document: dict[str, Any]) -> None:
-        """Add what trimesh does not write: extensions of materials, and colours in floating point."""
+        """Add what trimesh does not write: extensions of materials, targets of buffers, and floating-point colours."""
         document["materials"] = [{"name": name, **material} for name, material in materials.items()]
         document["extensionsUsed"] = sorted(
             {name for material in materials.values() for name in material["extensions"]}
@@ -118,6 +121,9 @@ def _encode_glb(scene: TrainedScene, glass: list[trimesh.Trimesh], inside: trime
             primitive["material"] = list(materials).index(mesh["name"])
             if "_radiance" in primitive["attributes"]:
                 primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_radiance")
+            for accessor in primitive["attributes"].values():
+                document["bufferViews"][document["accessors"][accessor]["bufferView"]]["target"] = _VERTICES
+            document["bufferViews"][document["accessors"][primitive["indices"]]["bufferView"]]["target"] = _INDICES
 
     document = trimesh.Scene()
     for name, mesh in meshes.items():
