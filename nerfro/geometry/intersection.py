@@ -7,11 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.normals import smooth_normals
+from nerfro.geometry.orientation import patches
+
+_TOUCHING = 1e-5  # fraction of the extent; bounding boxes closer to each other count as overlapping
+_SAME_PLANE = 1e-3  # difference of unit normals, and of heights as fractions of the extent, within one plane
 
 
 @dataclass(frozen=True)
@@ -45,12 +50,14 @@ class Triangles:
         body = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
         return cls(torch.cat(corners), torch.cat(normals), torch.from_numpy(body))
 
-    def areas(self, face: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
+    def areas(self, face: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch 3"]:
         """Return normals by the right-hand rule, with a length of twice the area of the triangle."""
-        a, b, c = self.corners[face].unbind(1)
+        a, b, c = self.corners[face].unbind(-2)
         return torch.linalg.cross(b - a, c - a)
 
-    def distance(self, x: Float[Tensor, "R 3"], d: Float[Tensor, "R 3"], face: Int[Tensor, "R"]) -> Float[Tensor, "R"]:
+    def distance(
+        self, x: Float[Tensor, "*#batch 3"], d: Float[Tensor, "*#batch 3"], face: Int[Tensor, "*#batch"]
+    ) -> Float[Tensor, "*#batch"]:
         """Return the distance to a triangle's plane along each ray."""
         normal = self.areas(face)
         return ((self.corners[face, 0] - x) * normal).sum(-1) / (d * normal).sum(-1)
@@ -77,10 +84,60 @@ class MeshIntersector:
                 "ARM), or set sampler.path.interface=sdf"
             ) from error
         self._scene = EmbreeScene()
+        # Embree computes in single precision, which is most accurate around the origin.
+        corners = torch.as_tensor(corners, dtype=torch.float64)
+        self._centre = corners.mean((0, 1))
         # The scene does not keep the mesh alive.
-        self._mesh = EmbreeMesh(self._scene, np.asarray(corners, np.float32))
+        self._mesh = EmbreeMesh(self._scene, (corners - self._centre).float().numpy())
 
     def first_hits(self, x: Float[Tensor, "R 3"], d: Float[Tensor, "R 3"]) -> Int[Tensor, "R"]:
         """Return the first triangle that each ray hits, -1 for none."""
-        hits = self._scene.run(x.float().numpy(), d.float().numpy())
+        hits = self._scene.run((x - self._centre).float().numpy(), d.float().numpy())
         return torch.from_numpy(np.asarray(hits)).long()
+
+
+def _share_plane(tree: cKDTree, planes: Float[np.ndarray, "F 4"]) -> bool:
+    """Return whether a plane, in either orientation, is one of the planes of a search tree."""
+    distances = [tree.query(sign * planes, distance_upper_bound=_SAME_PLANE)[0] for sign in (1, -1)]
+    return bool(np.isfinite(distances).any())
+
+
+class LayeredIntersector:
+    """First hits of rays with each of several layers of triangles.
+
+    Embree finds one triangle where several coincide. Patches (see `patches`) are therefore in different layers if their
+    bounding boxes overlap and some of their triangles are in one plane.
+
+    Args:
+        corners: corners of each triangle, world units.
+        faces: vertex indices of each triangle.
+    """
+
+    def __init__(self, corners: Float[Tensor, "F 3 3"], faces: Int[np.ndarray, "F 3"]) -> None:
+        patch, _ = patches(faces)
+        order = np.argsort(patch, kind="stable")
+        groups = [torch.from_numpy(g) for g in np.split(order, np.flatnonzero(np.diff(patch[order])) + 1)]
+        boxes = torch.stack([torch.stack([corners[g].amin((0, 1)), corners[g].amax((0, 1))]) for g in groups])
+        extent = (boxes[:, 1].amax(0) - boxes[:, 0].amin(0)).max()
+        normals = torch.nn.functional.normalize(torch.linalg.cross(*corners.diff(dim=1).unbind(1)), dim=-1)
+        heights = ((corners.mean(1) - boxes.mean((0, 1))) * normals).sum(-1, keepdim=True) / extent
+        planes = [torch.cat([normals, heights], -1)[group].numpy() for group in groups]
+        trees = [cKDTree(plane) for plane in planes]
+        layers: list[list[int]] = []
+        for number, (low, high) in enumerate(boxes - extent * torch.tensor([[_TOUCHING], [-_TOUCHING]])):
+            for layer in layers:
+                near = ((boxes[layer, 0] <= high) & (boxes[layer, 1] >= low)).all(1)
+                if not any(_share_plane(trees[layer[i]], planes[number]) for i in near.nonzero()[:, 0]):
+                    layer.append(number)
+                    break
+            else:
+                layers.append([number])
+        self.num_layers = len(layers)
+        self._faces = [torch.cat([groups[number] for number in layer]) for layer in layers]
+        self._layers = [MeshIntersector(corners[rows]) for rows in self._faces]
+
+    def first_hits(self, x: Float[Tensor, "R 3"], d: Float[Tensor, "R 3"]) -> Int[Tensor, "R L"]:
+        """Return the first triangle that each ray hits in each layer, -1 for none."""
+        hits = [layer.first_hits(x, d) for layer in self._layers]
+        found = [torch.where(hit >= 0, faces[hit], -1) for hit, faces in zip(hits, self._faces, strict=True)]
+        return torch.stack(found, -1)

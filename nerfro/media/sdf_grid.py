@@ -16,7 +16,7 @@ from nerfro.errors import NerfroError
 from nerfro.files.cache import cached_arrays, content_hash
 from nerfro.geometry.bodies import require_separate
 from nerfro.geometry.interpolation import quadratic_spline, spline_coefficients
-from nerfro.geometry.intersection import MeshIntersector, Triangles
+from nerfro.geometry.intersection import LayeredIntersector, Triangles
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.signed_distance import signed_distance_grid
 from nerfro.kernels.available import require_bytes
@@ -74,7 +74,7 @@ class SdfGrid(Solid):
     distances: Float[Tensor, "K X Y Z"]
     coefficients: Float[Tensor, "K X Y Z"]
     vertices: Float[Tensor, "V 3"]
-    _traced: tuple[Tensor, int, Triangles, MeshIntersector] | None = None
+    _traced: tuple[Tensor, int, Triangles, LayeredIntersector] | None = None
 
     def __init__(
         self,
@@ -169,12 +169,15 @@ class SdfGrid(Solid):
         return super().at_wavelength(wavelength)
 
     @torch.no_grad()
-    def traced_triangles(self) -> tuple[Triangles, MeshIntersector]:
+    def traced_triangles(self) -> tuple[Triangles, LayeredIntersector]:
         """Return the triangles without gradients and their intersector; both are rebuilt when `vertices` change."""
         known = self._traced
         if known is None or known[0] is not self.vertices or known[1] != self.vertices._version:
             triangles = self.triangles()
-            known = self.vertices, self.vertices._version, triangles, MeshIntersector(triangles.corners)
+            starts = np.cumsum([0, *(len(mesh.vertices) for mesh in self.meshes)])
+            faces = [mesh.faces + start for mesh, start in zip(self.meshes, starts, strict=False)]
+            scene = LayeredIntersector(triangles.corners, np.concatenate(faces))
+            known = self.vertices, self.vertices._version, triangles, scene
             self._traced = known
         return known[2:]
 

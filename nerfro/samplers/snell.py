@@ -156,7 +156,7 @@ def trace_interfaces(rays: Rays, medium: Solid, max_events: int, branching: Bran
         _, normals = medium.signed_distances(x + after[:, None] * d)
         normal = normals.gather(1, body[:, None, None].expand(-1, 1, 3))[:, 0]
         normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
-        front.meet(rows, before, after, body, normal)
+        front.meet(rows, before, after, body[:, None], normal)
     return front.finish(rays)
 
 

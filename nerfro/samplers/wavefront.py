@@ -17,7 +17,7 @@ from nerfro.samplers.snell_law import reflectance, refract
 from nerfro.types import Rays
 
 # Attributes of `Wavefront` with one row for each polyline.
-_COLUMNS = ("x", "d", "s", "inside", "triangle", "start", "moving", "ray", "weight", "num_events", "exceeded")
+_COLUMNS = ("x", "d", "s", "inside", "triangles", "start", "moving", "ray", "weight", "num_events", "exceeded")
 
 
 class _Crossing(NamedTuple):
@@ -25,9 +25,9 @@ class _Crossing(NamedTuple):
 
     before: Float[Tensor, "A"]
     after: Float[Tensor, "A"]
-    body: Int[Tensor, "A"]
+    body: Int[Tensor, "A L"]
     normal: Float[Tensor, "A 3"]
-    triangle: Int[Tensor, "A"]
+    triangles: Int[Tensor, "A L"]
     flipped: Bool[Tensor, "A K"]  # whether the far side is inside each surface
     across: Int[Tensor, "A"]  # body on the far side, numbered from 1; 0 for air
     n_before: Float[Tensor, "A"]
@@ -51,12 +51,13 @@ class Wavefront:
         max_events: largest number of refractions and reflections of a polyline.
         branching: which parts of light that is partly reflected are followed.
         offset: distance from a surface at which the search for the next one begins, world units.
+        num_layers: largest number of triangles that a row meets at one distance, L.
 
     Attributes:
         x, d: position in world units and unit direction of each row [P, 3].
         s: arc length from the camera [P].
         inside: whether each row is inside the surface of each body [P, K]; the tracers set the first values.
-        triangle: triangle that each row lies on; -1 for none.
+        triangles: triangles that each row lies on [P, L]; -1 for none.
         start: distance from `x` at which the search for the next surface begins.
         moving: whether each row may meet another surface.
         ray, weight: ray of each row, and its share of the light of this ray.
@@ -72,6 +73,7 @@ class Wavefront:
         max_events: int,
         branching: Branching,
         offset: float = 0.0,
+        num_layers: int = 1,
     ) -> None:
         self.medium, self.box, self.max_events, self.branching, self.offset = medium, box, max_events, branching, offset
         self.indices, self.far = indices_of(medium, box), rays.far
@@ -80,7 +82,8 @@ class Wavefront:
         self.enter, leave = intersect_box(box, self.x, self.d)
         self.moving = (self.enter < leave) & (leave > 0) & (self.enter < rays.far - self.s)
         self.ray = torch.arange(len(rays), device=self.s.device)
-        self.triangle, self.num_events = torch.full_like(self.ray, -1), torch.zeros_like(self.ray)
+        self.triangles = torch.full_like(self.ray[:, None].expand(-1, num_layers), -1)
+        self.num_events = torch.zeros_like(self.ray)
         self.start, self.weight = torch.zeros_like(self.s), torch.ones_like(self.s)
         self.exceeded = torch.zeros_like(self.moving)
         self.inside = self.exceeded[:, None].repeat(1, len(medium.iors))
@@ -102,9 +105,9 @@ class Wavefront:
         rows: Int[Tensor, "A"],
         before: Float[Tensor, "A"],
         after: Float[Tensor, "A"],
-        body: Int[Tensor, "A"],
+        body: Int[Tensor, "A L"],
         normal: Float[Tensor, "A 3"],
-        triangle: Int[Tensor, "A"] | None = None,
+        triangles: Int[Tensor, "A L"] | None = None,
     ) -> None:
         """Refract and reflect rows at the next surface.
 
@@ -112,19 +115,22 @@ class Wavefront:
             rows: rows that meet a surface.
             before, after: distances to points just before and just behind the surface, from which reflected and
                 transmitted light continues.
-            body: body whose surface is met, from 0.
+            body: bodies whose surfaces are met at this distance, from 0; -1 for none. The first is recorded.
             normal: unit normal of either orientation.
-            triangle: triangle that is met; by default none.
+            triangles: triangles that are met, as in `body`; by default none.
         """
-        triangle = torch.full_like(rows, -1) if triangle is None else triangle
+        triangles = torch.full_like(body, -1) if triangles is None else triangles
         inside = self.inside[rows]
-        flipped = inside.scatter(1, body[:, None], ~inside.gather(1, body[:, None]))
+        # Number of crossed surfaces of each body; the first column takes the entries without a surface.
+        num_crossed = rows.new_zeros(len(rows), inside.shape[1] + 1)
+        num_crossed.scatter_add_(1, body + 1, torch.ones_like(body))
+        flipped = inside ^ (num_crossed[:, 1:] % 2 == 1)
         across = self.medium.innermost(flipped)
         n_before, n_after = self.indices[self.medium.innermost(inside)], self.indices[across]
         visible = n_before != n_after
         exceeds = visible & (self.num_events[rows] >= self.max_events)
         self.exceeded[rows], self.moving[rows] = exceeds, ~exceeds
-        met = _Crossing(before, after, body, normal, triangle, flipped, across, n_before, n_after, visible)
+        met = _Crossing(before, after, body, normal, triangles, flipped, across, n_before, n_after, visible)
         rows, met = rows[~exceeds], met.select(~exceeds)
         turned, reflected = refract(self.d[rows], met.normal, met.n_before, met.n_after)
         reflected &= met.visible
@@ -138,10 +144,10 @@ class Wavefront:
         self.x[rows] += length[:, None] * self.d[rows]
         self.s[rows] += length
         self.d[rows] = torch.where(met.visible[:, None], turned, self.d[rows])
-        self.triangle[rows], self.start[rows] = met.triangle, self.offset
+        self.triangles[rows], self.start[rows] = met.triangles, self.offset
         self.num_events[rows] += met.visible
         bent = met.select(met.visible)
-        self.add_vertices(rows[met.visible], bent.body, bent.across, bent.triangle)
+        self.add_vertices(rows[met.visible], bent.body[:, 0], bent.across, bent.triangles[:, 0])
 
     def _split(
         self, rows: Int[Tensor, "A"], share: Float[Tensor, "A"], reflected: Bool[Tensor, "A"]

@@ -267,6 +267,28 @@ def test_paths_through_a_cavity_do_not_depend_on_the_winding_of_triangles(tmp_pa
     assert angle(path.exit_directions, exact)[(heights - 0.45).abs() > 0.02].median() < 0.03
 
 
+def test_water_that_exactly_fills_its_glass_bends_as_in_closed_form(tmp_path: FilePath) -> None:
+    heights = torch.linspace(0.02, 0.8, 40, dtype=torch.float64)
+    water = trimesh.creation.icosphere(4, 0.7)
+    trimesh.util.concatenate([trimesh.creation.icosphere(4, 0.9), water]).export(tmp_path / "glass.ply")
+    water.export(tmp_path / "water.ply")
+    glass, inner = str(tmp_path / "glass.ply"), str(tmp_path / "water.ply")
+    medium = SdfGrid(glass, 1.5, inner_meshes=[inner], inner_iors=[1.33], resolution=48, cache=False)
+    path = Snell("mesh")(beam(heights), medium)
+    assert angle(path.exit_directions, _nested_exit(heights, 0.9, 1.5, 0.7, 1.33)[0]).median() < 0.05
+
+
+@pytest.mark.parametrize("num_plates", [2, 3])
+def test_plates_in_contact_are_one_plate(tmp_path: FilePath, num_plates: int) -> None:
+    plates = [trimesh.creation.box((0.2, 2, 2)).apply_translation((0.2 * i, 0, 0)) for i in range(num_plates)]
+    medium = _mesh_medium(trimesh.util.concatenate(plates), tmp_path)
+    angles = torch.linspace(0, 40, 9, dtype=torch.float64).deg2rad()
+    directions = torch.stack([angles.cos(), angles.sin(), 0 * angles], -1)
+    trace = Snell("mesh").trace(_rays(-2 * directions + torch.tensor([0, 0.01, 0.02]), directions), medium)
+    assert (trace.num_events == 2).all()
+    torch.testing.assert_close(trace.path.exit_directions, directions, atol=1e-6, rtol=0)
+
+
 def test_bodies_of_equal_index_are_one() -> None:
     radius = _points(48).norm(dim=-1)
     heights = torch.linspace(-0.7, 0.7, 15, dtype=torch.float64)
