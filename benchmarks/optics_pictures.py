@@ -1,4 +1,4 @@
-"""The pictures of docs/optics.md: `python benchmarks/optics_pictures.py`, about two minutes."""
+"""The figures of docs/concepts: `python benchmarks/optics_pictures.py`, about two minutes."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """Measure accuracy and speed of tracing: `python benchmarks/tracing.py`, about five minutes on two cores.
 
-Prints the tables of docs/benchmarks.md as Markdown; `--branches` prints only the last table. Errors are measured
-against closed forms or an independent tracer. Speeds are the best of several passes that alternate between samplers.
+Prints the tables of docs/results/benchmarks.md as Markdown; `--branches` prints only the last table. Errors are
+measured against closed forms or an independent tracer. Speeds are the best of several passes that alternate between
+samplers.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How fast training and rendering are, and what a time budget buys. Each part prints Markdown; see docs/benchmarks.md.
+"""How fast training and rendering are, and what a time budget buys. Each part prints Markdown.
 
     python benchmarks/training.py step                        # a step of the paper's recipe, plain and fast
     python benchmarks/training.py curve                       # their losses over 200 steps

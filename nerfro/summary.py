@@ -29,7 +29,7 @@ class SummaryConfig:
     # Folder for the report and the tables (.csv, .md, .tex and .html, one table per budget); without it, only print.
     out: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     report: bool = False  # whether to write `report.html`; the default of `out` is then `outputs/summary`
-    metrics: list[str] = field(default_factory=lambda: ["psnr", "ssim", "lpips"])  # columns, see docs/metrics.md
+    metrics: list[str] = field(default_factory=lambda: ["psnr", "ssim", "lpips"])  # columns of the tables
     region: Annotated[str, Literal["full", "mask", "crop"]] = FULL  # region of the scores: full, mask or crop
     methods: dict[str, str] = field(default_factory=dict)  # titles of experiments, in the order of the rows
     scenes: dict[str, str] = field(default_factory=dict)  # titles of scenes, by the last component of the data folder

@@ -32,7 +32,7 @@ class EvaluateConfig:
     split: str = "test"  # split to render
     root: Optional[str] = None  # folder of the data set, if it has moved since training
     chunk_size: Optional[NumRays] = None  # rays rendered at once, which limits memory; by default as in training
-    # Which pixels get several rays (see docs/experiments.md); by default as in training.
+    # Which pixels get several rays (see docs/concepts/background.md); by default as in training.
     subdivision: SubdivisionChanges = dataclasses.field(default_factory=SubdivisionChanges)
     # Steps that refine test cameras on left image halves, to score right halves; by default as in training.
     refine_steps: Optional[Natural] = None

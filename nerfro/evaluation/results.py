@@ -119,7 +119,7 @@ class RunMetrics:
 
 
 def write_metrics_json(path: Path | str, metrics: RunMetrics) -> None:
-    """Write `metrics.json` atomically; docs/metrics.md describes the format.
+    """Write `metrics.json` atomically; docs/reference/file_formats.md describes the format.
 
     Raises:
         NerfroError: a number is NaN or infinite, which JSON cannot represent, or the file cannot be written.

@@ -35,7 +35,7 @@ AIR = 4
 # spline and the step that brackets the surface.
 BAND = 3.0
 # Cells along each side of the blocks that store a lower bound of the distance, and of the blocks that store whether
-# they may contain a surface. docs/benchmarks.md has times for 3 and 4 cells.
+# they may contain a surface. docs/lab/rendering_speed.md has times for 3 and 4 cells.
 BLOCK, SURFACE_BLOCK = 4, 3
 # A quadratic spline that is extrapolated by half a cell at a corner is a sum of coefficients whose positive weights add
 # up to 2.19 and whose negative weights to -1.19. It is positive if the largest coefficient is less than 1.84 times the

@@ -49,7 +49,7 @@ class RenderConfig:
     sky: Optional[str] = None  # lat-long image that replaces the sky (.hdr, .exr, .png, .jpg)
     # Change from the first frame to the last: medium.ior:1.0:1.6, medium.absorption:0:2, or sky:a.hdr,b.hdr.
     sweep: Optional[str] = None
-    # Pixels with several rays (see docs/experiments.md); by default as in the evaluation of the run.
+    # Pixels with several rays (see docs/concepts/background.md); by default as in the evaluation of the run.
     subdivision: SubdivisionChanges = dataclasses.field(default_factory=SubdivisionChanges)
     chunk_size: Optional[Count] = None  # rays rendered at once, which limits the memory; by default as in training
     out: str = MISSING  # folder of frames and films; an interrupted rendering resumes there

@@ -1,4 +1,4 @@
-"""Paths of equal steps through continuous media against closed forms, at the levels that docs/optics.md states.
+"""Paths of equal steps through continuous media against closed forms, at the levels of docs/results/verification.md.
 
 Positions are within 1e-5 of the scene's size in double precision and 1e-4 in single, with 256 leapfrog steps. The size
 is stated in each test.
