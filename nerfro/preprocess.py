@@ -61,7 +61,7 @@ def main(config: DictConfig) -> None:
     if overlaps is not None and inside:
         draw_overlays(views, mesh, overlaps, inside, request.folder)
     settings |= {"camera": "refined"} if config.refine_cameras else {}
-    conclude(request, settings, found.index_settings, found.is_doubtful, observations.near, views.cameras)
+    conclude(request, settings, found.index_settings, found.is_doubtful, observations.near, views.cameras, mesh)
 
 
 def _reconstruct(

@@ -10,10 +10,11 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from nerfro.capture.calibrated_data import PLOT, REPORT
+from nerfro.capture.hypotheses import Hypothesis, best_hypothesis, hypotheses, trial_options
 from nerfro.capture.overlaps import SHEET
 from nerfro.capture.overrides import as_overrides, is_given, of_groups
 from nerfro.capture.preprocess_options import FOUND, MESH
-from nerfro.capture.reconstruct_options import ReconstructConfig, have_poses, read_result, training_options
+from nerfro.capture.reconstruct_options import ReconstructConfig, common_options, have_poses, read_result
 from nerfro.capture.stages import Stage, is_older, link_photographs, move_aside
 from nerfro.cli import entry_point
 from nerfro.files.folder_lock import lock_folder
@@ -40,7 +41,7 @@ def main(config: DictConfig) -> None:
             options = [*data, *outlines, *shlex.split(config.mask)]
             Stage("mask", options, root / "masks.png", root / "masks.png").run()
         surface = _preprocess(config, [*data, *of_groups(("medium",), overrides)], root, out / "surface")
-        _train(config, overrides, surface, out / "run")
+        _train(config, overrides, surface, out)
         _report(out)
 
 
@@ -63,10 +64,30 @@ def _preprocess(config: DictConfig, options: list[str], root: Path, folder: Path
     return folder
 
 
-def _train(config: DictConfig, overrides: list[str], surface: Path, run: Path) -> None:
-    """Train on the surface, or resume an interrupted training if the surface has not changed."""
-    inputs, started = (surface / FOUND, surface / MESH), run / CONFIG_FILE
-    options = [*training_options(config, overrides, surface / FOUND), *as_overrides({"hydra.run.dir": run})]
+def _train(config: DictConfig, overrides: list[str], surface: Path, out: Path) -> None:
+    """Train under the hypothesis that the validation photographs prefer."""
+    inputs = [surface / FOUND, surface / MESH]
+    found = read_result(surface / FOUND, {"options", "doubtful", "near", "pixels", "up", "width"})
+    common = common_options(config, overrides, found)
+    candidates, best = hypotheses(found, config.medium), None
+    if is_given("experiment", common):
+        best = Hypothesis("given", [*found["options"], *found["doubtful"]])
+    elif config.trial_seconds == 0:
+        best = candidates[1]
+    else:
+        trials = [out / "trials" / hypothesis.folder for hypothesis in candidates]
+        for hypothesis, trial in zip(candidates, trials, strict=True):
+            print(f"\nhypothesis: {hypothesis.name}")
+            _run_training([*hypothesis.options, *common, *trial_options(config.trial_seconds)], inputs, trial)
+        best = best_hypothesis(candidates, trials)
+        inputs += [trial / "metrics.json" for trial in trials]
+    _run_training([*best.options, *common], inputs, out / "run")
+
+
+def _run_training(options: list[str], inputs: list[Path], run: Path) -> None:
+    """Train, or resume an interrupted training if its inputs have not changed."""
+    started = run / CONFIG_FILE
+    options = [*options, *as_overrides({"hydra.run.dir": run})]
     stage = Stage("train", options, run / "metrics.json", run / "images", inputs)
     if started.is_file() and not stage.is_done:
         if is_older(started, inputs):
@@ -77,11 +98,12 @@ def _train(config: DictConfig, overrides: list[str], surface: Path, run: Path) -
 
 
 def _report(out: Path) -> None:
-    page, run = out / "report" / "report.html", out / "run"
-    options = [*as_overrides({"runs": [run], "out": page.parent}), "report=true", "overwrite=true"]
-    Stage("summary", options, page, page, [run / "metrics.json"]).run()
-    export = as_overrides({"checkpoint": run, "what": "page", "out": out / "page.html"})
-    print(f"export an interactive page: {shlex.join(['python', '-m', 'nerfro.export', *export])}")
+    """Write the report and the interactive page."""
+    report, page, run = out / "report" / "report.html", out / "page.html", out / "run"
+    options = [*as_overrides({"runs": [run], "out": report.parent}), "report=true", "overwrite=true"]
+    Stage("summary", options, report, report, [run / "metrics.json"]).run()
+    options = as_overrides({"checkpoint": run, "what": "page", "out": page, "overwrite": True})
+    Stage("export", options, page, page, [run / "metrics.json"]).run()
 
 
 if __name__ == "__main__":

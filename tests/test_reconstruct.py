@@ -20,6 +20,7 @@ from hydra.core.global_hydra import GlobalHydra
 import nerfro.reconstruct
 import nerfro.train
 from nerfro.capture import refinement, refinement_report, stages
+from nerfro.capture.hypotheses import Hypothesis
 from nerfro.capture.overrides import as_overrides
 from nerfro.capture.stages import run_command
 from nerfro.files.images import save_png
@@ -55,6 +56,7 @@ class Pretended:
 
     def __init__(self, out: Path) -> None:
         self.out, self.near, self.doubtful = out, False, []
+        self.psnr = {"straight": 20.0, "unknown": 22.0, "glass": 21.0, "glass_room": 21.0}  # by experiment
         self.ran: list[tuple[str, list[str]]] = []
         self.ends: dict[str, int] = {}
         self._now = time.time() - 1000
@@ -74,7 +76,8 @@ class Pretended:
         name, options = command[2].removeprefix("nerfro."), command[3:]
         self.ran.append((name, options))
         if name == "train":
-            self.write("run/config.yaml")
+            folder = options[-1 - (options[-1] == "ckpt_path=last")].removeprefix(f"hydra.run.dir={self.out}/")
+            self.write(f"{folder}/config.yaml")
         if name in self.ends:
             return self.ends[name]
         if name == "calibrate":
@@ -85,11 +88,17 @@ class Pretended:
         if name == "preprocess":
             found = {"options": ["data=opencv", "medium.ior=1.4"], "doubtful": self.doubtful, "near": self.near}
             self.write("surface/mesh.ply")
-            self.write("surface/preprocess.json", {**found, "pixels": [512, 384]})
+            self.write("surface/preprocess.json", {**found, "pixels": [512, 384], "up": [0, 0, 1], "width": 0.5})
         if name == "train":
-            self.write("run/metrics.json")
+            psnr = next(self.psnr[text.split("=")[1]] for text in options if text.startswith("+experiment="))
+            view = {"name": "val_000", "psnr": psnr, "regions": {"mask": {"psnr": psnr - 2}}}
+            self.write(
+                f"{folder}/metrics.json", {"views": [view], "steps": 1, "train_seconds": 1, "rays_per_second": 1}
+            )
         if name == "summary":
             self.write("report/report.html")
+        if name == "export":
+            self.write("page.html")
         return 0
 
 
@@ -101,7 +110,8 @@ def pretended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pretended:
     return made
 
 
-ALL = ["calibrate", "preprocess", "train", "summary"]
+TRIALS = ["train"] * 3  # straight rays, solid body, empty glass
+ALL = ["calibrate", "preprocess", *TRIALS, "train", "summary", "export"]
 
 
 def test_photographs_pass_all_stages_once(reconstruct: Reconstruct, pretended: Pretended, photos: Path) -> None:
@@ -111,7 +121,7 @@ def test_photographs_pass_all_stages_once(reconstruct: Reconstruct, pretended: P
     assert pretended.names == ALL
     links = sorted(path.relative_to(pretended.out).as_posix() for path in pretended.out.glob("*/IMG*"))
     assert links == [f"{folder}/IMG_{i}.png" for folder in ("images", "masks") for i in range(3)]
-    calibrate, preprocess, train, _ = (options for _, options in pretended.ran)
+    calibrate, preprocess, straight, solid, empty, train, *_ = (options for _, options in pretended.ran)
     assert "target=colmap" in calibrate
     data = ["data=opencv", f"data.root={pretended.out}", "data.near=0.1", "data.far=9"]
     assert preprocess[:5] == [*data, "medium.resolution=64"]
@@ -119,10 +129,18 @@ def test_photographs_pass_all_stages_once(reconstruct: Reconstruct, pretended: P
     assert train == ["+experiment=unknown", "data=opencv", "medium.ior=1.4", "camera.exposure=true", "data.downscale=2",
                      "trainer.max_steps=3", "logger=none", f"hydra.run.dir={pretended.out / 'run'}"]  # fmt: skip
     assert f"python -m nerfro.train {' '.join(train)}" in done.out
+    trials = {"straight_rays": straight, "solid_body": solid, "empty_glass": empty}
+    for folder, trial in trials.items():
+        assert {"evaluation.split=val", "trainer.max_time=00:00:00:40", "camera.exposure=true"} <= set(trial)
+        assert trial[-1] == f"hydra.run.dir={pretended.out / 'trials' / folder}"
+    assert straight[:2] == ["+experiment=straight", "data=opencv"]
+    assert "medium.ior=1.4" not in straight
+    assert solid[: len(train) - 1] == train[:-1]
+    assert {"medium=vessel", "medium.wall=0.01", "medium.liquid_ior=1.0", "medium.ior=1.52"} <= set(empty)
     again = reconstruct(*asked)
     assert again.code == 0, again.err
     assert pretended.names == ALL
-    assert again.out.count(" is kept (delete the file to repeat the stage)") == 4
+    assert again.out.count(" is kept (delete the file to repeat the stage)") == len(ALL)
 
 
 def test_what_changed_is_followed_by_what_is_made_of_it(
@@ -136,21 +154,51 @@ def test_what_changed_is_followed_by_what_is_made_of_it(
     # The training that was there is another one's.
     assert (pretended.out / "run_1" / "metrics.json").is_file()
     assert f"which is kept as {pretended.out / 'run_1'}" in done.out
-    assert "ckpt_path=last" not in pretended.ran[-2][1]
+    assert "ckpt_path=last" not in pretended.ran[-3][1]
     (pretended.out / "report" / "report.html").unlink()
     reconstruct(*asked)
     assert pretended.names == [*ALL, *ALL[1:], "summary"]
 
 
+@pytest.mark.parametrize(
+    ("doubtful", "psnr", "chosen", "printed"),
+    [
+        ([], {"straight": 23.0}, "straight rays", "bent rays do not pay: the surface or the index is not accurate"),
+        ([], {"glass": 23.0}, "empty glass", "training continues with: empty glass"),
+        (["medium.ior=1.0"], {"straight": 23.0}, "straight rays", "the photographs do not determine its index"),
+        (["medium.ior=1.0"], {}, "solid body, water", "training continues with: solid body, water"),
+    ],
+)
+def test_training_continues_with_the_hypothesis_that_the_validation_photographs_prefer(
+    reconstruct: Reconstruct,
+    pretended: Pretended,
+    photos: Path,
+    doubtful: list[str],
+    psnr: dict[str, float],
+    chosen: str,
+    printed: str,
+) -> None:
+    pretended.doubtful = doubtful
+    pretended.psnr |= psnr
+    done = reconstruct(f"images={photos}", f"out={pretended.out}", "trial_seconds=70")
+    assert done.code == 0, done.err
+    assert printed in done.out
+    *trials, train = [options for name, options in pretended.ran if name == "train"]
+    best = next(trial for trial in trials if Hypothesis(chosen, []).folder in trial[-1])
+    assert best[: len(train) - 1] == train[:-1], "the same options as in its trial"
+    assert "trainer.max_time=00:00:01:10" in best
+    assert "medium.ior=1.0" not in [option for trial in trials for option in trial], "an index in doubt is never known"
+
+
 def test_an_interrupted_training_goes_on(reconstruct: Reconstruct, pretended: Pretended, photos: Path) -> None:
     pretended.ends["train"] = 130
-    asked = f"images={photos}", f"out={pretended.out}"
+    asked = f"images={photos}", f"out={pretended.out}", "trial_seconds=0"
     stopped = reconstruct(*asked)
     assert stopped.code == 130
     assert stopped.err == "nerfro: interrupted; train is incomplete; repeat the same command to continue\n"
     pretended.ends.clear()
     assert reconstruct(*asked).code == 0
-    assert pretended.names == ["calibrate", "preprocess", "train", "train", "summary"]
+    assert pretended.names == ["calibrate", "preprocess", "train", "train", "summary", "export"]
     assert "ckpt_path=last" not in pretended.ran[2][1]
     assert pretended.ran[3][1] == [*pretended.ran[2][1], "ckpt_path=last"]
 
@@ -179,12 +227,10 @@ def test_what_was_found_chooses_the_experiment(
     assert pretended.names == ["mask"], "its sheet lies in the data's folder"
     assert "mask failed" in done.err
     done = reconstruct(*asked[:2], *asked[3:], f"out={pretended.out}")
-    assert pretended.names[1:] == ["preprocess", "train", "summary"]
+    assert pretended.names[1:] == ["preprocess", "train", "train", "train", "summary", "export"]
     assert pretended.ran[1][1][:4] == ["data=blender", f"data.root={tiny_scene}", "medium=vessel", "medium.wall=0.1"]
-    train = pretended.ran[2][1]
-    assert train[0] == "+experiment=glass_room"
-    assert train[1:5] == ["data=opencv", "medium.ior=1.4", "medium.ior=1.37", "camera.exposure=true"]
-    assert "training uses the best fit, medium.ior=1.37" in done.out
+    train = pretended.ran[4][1]
+    assert train[:3] == ["+experiment=glass_room", "data=opencv", "medium.ior=1.4"]
 
 
 @pytest.mark.parametrize(
@@ -211,7 +257,9 @@ def test_a_result_that_was_spoilt_is_refused(reconstruct: Reconstruct, pretended
     asked = f"images={photos}", f"out={pretended.out}"
     reconstruct(*asked)
     pretended.write("surface/preprocess.json", {"options": []})
-    assert "lacks one of doubtful, near, options, pixels; delete the file to repeat" in reconstruct(*asked).err
+    assert (
+        "lacks one of doubtful, near, options, pixels, up, width; delete the file to repeat" in reconstruct(*asked).err
+    )
 
 
 def test_paths_are_quoted_for_hydra() -> None:
@@ -226,7 +274,6 @@ def test_a_command_is_left_time_to_save_when_this_process_is_asked_to_end() -> N
     process = subprocess.Popen([sys.executable, "-c", program.format(saving)], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert process.stdout.readline() == "0\n"
-    time.sleep(0.2)
     process.send_signal(signal.SIGINT)  # Ctrl-C would have reached the command too
     process.send_signal(signal.SIGTERM)
     assert process.communicate(timeout=30)[0] == "130\n"
@@ -276,5 +323,8 @@ def test_posed_photographs_of_a_ball_become_a_scene(
     assert f"medium.ior={index['ior'][0]:.4f}".rstrip("0") in found["options"]
     assert (out / "surface" / "refinement.png").is_file()
     assert json.loads((out / "run" / "metrics.json").read_text())["steps"] == 2
-    assert "unknown" in (out / "report" / "report.html").read_text()
-    assert reconstruct(*asked).out.count(" is kept (delete the file to repeat the stage)") == 3
+    assert (out / "report" / "report.html").is_file()
+    assert "training continues with: " in done.out
+    assert (out / "page.html").is_file()
+    # Surface, three trials, training, report and page.
+    assert reconstruct(*asked).out.count(" is kept (delete the file to repeat the stage)") == 7

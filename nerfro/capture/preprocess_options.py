@@ -185,6 +185,7 @@ def conclude(
     index_is_doubtful: bool,
     near: bool | None,
     cameras: Cameras,
+    mesh: TriangleMesh,
 ) -> None:
     """Write preprocess.json with the options for training, and print the result files and the next command.
 
@@ -195,13 +196,18 @@ def conclude(
         index_is_doubtful: whether to leave the indices to the user, because the photographs do not determine them.
         near: whether the surroundings are near; None if unknown.
         cameras: cameras of the photographs.
+        mesh: the surface.
     """
     settings = settings if index_is_doubtful else settings | index
     given = of_groups(("data", "medium"), request.overrides)
     given = [text for text in given if not any(is_given(name, [text]) for name in (*settings, "medium.mesh"))]
     options = [*given, *as_overrides(settings)]
     doubtful = as_overrides(index) if index_is_doubtful else []
-    found = {"options": options, "doubtful": doubtful, "near": near, "pixels": [cameras.width, cameras.height]}
+    found_up = find_up(cameras, mesh)
+    up = [0.0, 0.0, 1.0] if found_up is None else [round(float(x), 4) for x in found_up[0]]
+    across = mesh.vertices - np.outer(mesh.vertices @ np.array(up), up)
+    shape = {"up": up, "width": float(f"{np.ptp(across, axis=0).max():.4g}")}
+    found = {"options": options, "doubtful": doubtful, "near": near, "pixels": [cameras.width, cameras.height], **shape}
     write_atomically(request.folder / FOUND, json.dumps(found, indent=1) + "\n")
     print(f"results: {', '.join(str(file) for file in request.files if file.exists())}")
     if doubtful:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Optional
+from typing import Annotated, Any, Optional
 
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from nerfro.allowed import Count
+from nerfro.allowed import Count, Range
 from nerfro.capture.overrides import is_given
-from nerfro.cli import warn
 from nerfro.data.transforms import read_json
 from nerfro.errors import NerfroError
 
@@ -27,6 +27,8 @@ class ReconstructConfig:
         masks: folder of the masks, `<photograph>.png` or `mask_<photograph>.png`.
         outlines: outlines of the object in some photographs (see `python -m nerfro.mask`).
         out: output folder.
+        trial_seconds: duration of the training that tries each hypothesis about the object on validation photographs
+            (straight rays, solid body, empty glass); 0 trains the solid body without a comparison.
         pixels: maximum length of the longer side of the photographs in training; `data.downscale` has precedence.
         calibrate, mask, preprocess, train: further command-line options of these stages.
     """
@@ -37,6 +39,7 @@ class ReconstructConfig:
     masks: Optional[str] = None  # noqa: UP045
     outlines: Any = None
     out: Optional[str] = None  # noqa: UP045
+    trial_seconds: Annotated[int, Range(at_least=0, at_most=3599)] = 40
     pixels: Count = 256
     calibrate: str = ""
     mask: str = ""
@@ -63,20 +66,15 @@ def have_poses(config: DictConfig, overrides: list[str]) -> bool:
     return posed
 
 
-def training_options(config: DictConfig, overrides: list[str], result: Path) -> list[str]:
-    """Determine the options of the training from the result file of `preprocess`."""
-    found, extra = read_result(result, {"options", "doubtful", "near", "pixels"}), shlex.split(config.train)
-    if found["doubtful"]:
-        warn(
-            f"the photographs do not determine the index; training uses the best fit, {' '.join(found['doubtful'])}: "
-            f"check the plot in {result.parent}"
-        )
-    options = [*found["options"], *found["doubtful"]]
-    if not is_given("experiment", extra):
-        # The materials of a vessel are known. In near surroundings, following all reflections and refining the index
-        # cost more steps than they gain (docs/real.md).
-        distant = "glass" if "wall" in config.medium else "unknown"
-        options.insert(0, f"+experiment={'glass_room' if found['near'] else distant}")
+def common_options(config: DictConfig, overrides: list[str], found: Mapping[str, Any]) -> list[str]:
+    """Determine the options of the training that do not depend on the assumptions about the object.
+
+    Args:
+        config: options of the command.
+        overrides: the command line.
+        found: content of the result file of `preprocess`.
+    """
+    options, extra = [], shlex.split(config.train)
     if not is_given("camera.exposure", extra):
         options.append("camera.exposure=true")  # telephones select an exposure for each photograph
     if not is_given("data.downscale", overrides):

@@ -75,14 +75,20 @@ def is_older(file: Path, others: Iterable[Path]) -> bool:
 
 def run_command(command: list[str]) -> int:
     """Run a command and return the exit status. On SIGTERM or Ctrl-C, wait until the command has saved its work."""
-    process = subprocess.Popen(command)
+    process: subprocess.Popen[bytes] | None = None
+    terminates = False
 
     def forward(number: int, frame: FrameType | None) -> None:
-        if number == signal.SIGTERM:  # the terminal sends Ctrl-C to the command as well
+        nonlocal terminates
+        terminates |= number == signal.SIGTERM  # the terminal sends Ctrl-C to the command as well
+        if terminates and process is not None:
             process.terminate()
 
     previous = {number: signal.signal(number, forward) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
+        process = subprocess.Popen(command)
+        if terminates:  # the signal arrived before the command had started
+            process.terminate()
         return process.wait()
     finally:
         for number, handler in previous.items():

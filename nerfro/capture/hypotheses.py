@@ -1,0 +1,110 @@
+"""Assumptions about a photographed object, and their comparison on validation photographs."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from nerfro.capture.overrides import as_overrides, is_given, of_groups
+from nerfro.evaluation.results import FULL, read_metrics_json
+
+STRAIGHT = "straight rays"
+# Number of training photographs that score the hypotheses.
+_NUM_VALIDATION_VIEWS = 5
+# Indices of water and of soda-lime glass, for photographs that do not determine the index.
+_COMMON_INDICES = {"water": 1.333, "glass": 1.52}
+# Thickness of the wall and of the foot of an ordinary drinking glass, as fractions of its width.
+_WALL, _FOOT = 0.02, 0.06
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """An assumption about the object.
+
+    Attributes:
+        name: name in the table.
+        options: options of `python -m nerfro.train` under this assumption.
+        doubt: why bent rays may not pay, for the message about the result; empty if nothing is known.
+    """
+
+    name: str
+    options: list[str]
+    doubt: str = ""
+
+    @property
+    def folder(self) -> str:
+        """Name of the folder of the trial."""
+        return self.name.replace(" ", "_").replace(",", "")
+
+
+def hypotheses(found: Mapping[str, Any], medium: Mapping[str, Any]) -> list[Hypothesis]:
+    """List the assumptions about the object that the photographs have to decide between.
+
+    Straight rays show an opaque object, and are the baseline of all other hypotheses. A body has the index that
+    `preprocess` found; without a reliable index, the indices of water and of glass are the initial values of a learned
+    index. An empty glass has ordinary dimensions.
+
+    Args:
+        found: content of the result file of `preprocess`.
+        medium: configuration of the medium.
+    """
+    options, near = found["options"], found["near"]
+    straight = Hypothesis(STRAIGHT, ["+experiment=straight", *of_groups(("data", "camera"), options)])
+    if "wall" in medium:  # the materials of a vessel are known
+        return [straight, Hypothesis("vessel", [f"+experiment={'glass_room' if near else 'glass'}", *options])]
+    body = [f"+experiment={'glass_room' if near else 'unknown'}", *options]
+    if not found["doubtful"]:
+        bodies = [Hypothesis("solid body", body)]
+    else:
+        doubt = "the photographs do not determine its index"
+        bodies = [
+            Hypothesis(f"solid body, {name}", [*body, f"medium.ior={index}", "medium.learn_ior=true"], doubt)
+            for name, index in _COMMON_INDICES.items()
+        ]
+    if "shell_voxels" not in medium or is_given("medium", options):
+        return [straight, *bodies]
+    kept = [text for text in options if not is_given("medium.ior", [text])]
+    vessel = {"medium": "vessel", "medium.ior": 1.52, "medium.liquid_ior": 1.0, "medium.up": found["up"]}
+    lengths = {"medium.wall": _WALL * found["width"], "medium.foot": _FOOT * found["width"]}
+    settings = as_overrides(vessel | {name: float(f"{length:.4g}") for name, length in lengths.items()})
+    experiment = f"+experiment={'glass_room' if near else 'glass'}"
+    return [straight, *bodies, Hypothesis("empty glass", [experiment, *kept, *settings])]
+
+
+def trial_options(seconds: int) -> list[str]:
+    """Return the options of a short training that is scored on validation photographs."""
+    minutes, rest = divmod(seconds, 60)
+    return [
+        f"trainer.max_time=00:00:{minutes:02d}:{rest:02d}",
+        f"batches.num_validation_views={_NUM_VALIDATION_VIEWS}",
+        "evaluation.split=val",
+        "evaluation.every=0",
+        "logger=none",
+    ]
+
+
+def best_hypothesis(tried: Sequence[Hypothesis], runs: Sequence[Path]) -> Hypothesis:
+    """Print the scores of the trials, and return the hypothesis with the best mean of picture and object.
+
+    Args:
+        tried: the hypotheses.
+        runs: run folder of the trial of each hypothesis.
+    """
+    scores = []
+    print("\nPSNR of short trainings on validation photographs, in dB:")
+    print(f"  {'hypothesis':<20}{'picture':>9}{'object':>9}")
+    for hypothesis, run in zip(tried, runs, strict=True):
+        result = read_metrics_json(run / "metrics.json").result
+        picture, thing = result.mean("psnr", FULL) or 0.0, result.mean("psnr", "mask")
+        scores.append(picture if thing is None else 0.5 * (picture + thing))
+        print(f"  {hypothesis.name:<20}{picture:>9.2f}{'n/a' if thing is None else f'{thing:.2f}':>9}")
+    best = tried[max(range(len(tried)), key=scores.__getitem__)]
+    print(f"training continues with: {best.name}")
+    if best.name == STRAIGHT:
+        doubts = [hypothesis.doubt for hypothesis in tried if hypothesis.doubt]
+        reason = doubts[0] if doubts else "the surface or the index is not accurate enough, or the object is opaque"
+        print(f"bent rays do not pay: {reason}; to bend them nevertheless, add {shlex.quote('train=+experiment=NAME')}")
+    return best
