@@ -20,7 +20,7 @@ from nerfro.capture.mask_files import (
     read_resized,
     save_mask,
 )
-from nerfro.capture.masking import Segmentation, grab, outline_region, propagate
+from nerfro.capture.masking import Segmentation, box_region, grab, polygon_mask, propagate
 from nerfro.capture.outline_hull import AGREES
 from nerfro.capture.overrides import is_given, of_groups
 from nerfro.capture.targets import opencv
@@ -52,7 +52,11 @@ def main(config: DictConfig) -> None:
     done = {view: read_resized(mask, size) for view, mask in kept.items()}
     for view, outline in outlined.items():
         scaled = np.array(outline, np.float64) * size[0] / read_size(frames[view].image)[0]
-        done[view] = grab(images[view], *outline_region(scaled, size))
+        if scaled.ndim == 2:  # the user's polygon is the mask
+            done[view] = polygon_mask(scaled, size)
+        else:
+            region = box_region(scaled, size)
+            done[view] = grab(images[view], region, region)
     for view, mask in done.items():
         if not mask.any():
             raise NerfroError(f"{frames[view].name}: the outline or mask is empty; draw it around the object")
@@ -73,6 +77,12 @@ def main(config: DictConfig) -> None:
 
 
 def _report(frames: list[Frame], found: Segmentation) -> None:
+    worst = min(found.agreement, key=found.agreement.__getitem__)
+    print(
+        f"{len(found.by_hull)} masks are projections of the {found.shape}, which overlaps by "
+        f"{found.agreement[worst]:.3f} or more with the {len(found.agreement)} given masks "
+        f"(least: {frames[worst].name})"
+    )
     if found.overlaps:
         print("overlap (intersection over union) of GrabCut's mask with the visual hull of the other views:")
     for view in sorted(found.overlaps, key=lambda view: found.overlaps[view]):

@@ -37,8 +37,8 @@ class MaskConfig:
 
     Attributes:
         data: data set (options of the group `data`); the views of all splits get masks.
-        outlines: by image name, a box [left, top, right, bottom] around the object or an approximate polygon
-            [[column, row], ...], in pixels; or a JSON file with such a mapping.
+        outlines: by image name, a box [left, top, right, bottom] around the object, or a polygon [[column, row], ...],
+            which is the mask, in pixels; or a JSON file with such a mapping.
         hull_only: project the visual hull of at least three existing masks into all other views, without segmentation
             by colour.
         overwrite: replace existing masks, starting from the outlines alone. Otherwise existing masks are kept and used.

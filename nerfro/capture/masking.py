@@ -4,22 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy.typing import ArrayLike
 from scipy.ndimage import binary_fill_holes, label
+from skimage.draw import polygon2mask
 
 from nerfro.cameras import Cameras
 from nerfro.capture.outline_hull import AGREES, FEWEST_VIEWS, MAX_SIDE, OutlineHull
 from nerfro.capture.targets import opencv
 from nerfro.errors import NerfroError
+from nerfro.geometry.mesh import TriangleMesh
 
 _ITERATIONS = 5
 # Margin around the region that provides the background colours of GrabCut, as a fraction of the longer side.
 _BACKGROUND_MARGIN = 0.4
 # Fractions of the diameter of a projected hull: how far the object may extend beyond, and depth of the certain core.
 _REACH, _CORE = 0.06, 0.2
+# Largest number of given masks at which a body of revolution and the methods of segmentation are compared.
+_FEW = 12
 # Number of mixture components per region in OpenCV's GrabCut.
 _NUM_COMPONENTS = 5
 
@@ -74,24 +79,25 @@ def grab(
     return _largest_component(mask & possible)
 
 
-def outline_region(
-    outline: ArrayLike, size: tuple[int, int]
-) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
-    """Convert an outline to regions where the object is likely and where the object is possible.
+def box_region(box: ArrayLike, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    """Return the pixels of a box (left, top, right, bottom) in an image of a width and a height, in pixels."""
+    region = np.zeros(size[::-1], bool)
+    left, top, right, bottom = np.rint(np.array(box, np.float64)).astype(int)
+    region[max(0, top) : max(0, bottom), max(0, left) : max(0, right)] = True
+    return region
+
+
+def polygon_mask(polygon: ArrayLike, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    """Return the pixels whose centres lie inside a polygon.
 
     Args:
-        outline: box (left, top, right, bottom) around the object, or vertices (column, row) of a polygon that
-            approximates the object, in pixels.
+        polygon: vertices (column, row), in pixels from the upper left corner of the image.
         size: width and height of the image.
     """
-    region = np.zeros(size[::-1], np.uint8)
-    numbers = np.array(outline, np.float64)
-    if numbers.ndim == 1:
-        left, top, right, bottom = np.rint(numbers).astype(int)
-        region[max(0, top) : max(0, bottom), max(0, left) : max(0, right)] = 1
-        return region > 0, region > 0
-    opencv().fillPoly(region, [np.rint(numbers).astype(np.int32)], 1)
-    return region > 0, _dilate(region > 0, _REACH)
+    return polygon2mask(size[::-1], np.array(polygon, np.float64)[:, ::-1] - 0.5)
+
+
+Shape = Literal["visual hull", "body of revolution"]
 
 
 @dataclass(frozen=True)
@@ -103,11 +109,15 @@ class Segmentation:
         overlaps: by view, intersection over union of GrabCut's mask and the visual hull of the other views.
         by_hull: views whose mask is the projection of the visual hull, because GrabCut disagrees with the hull or was
             not used.
+        shape: shape that the projections show.
+        agreement: by view of a given mask, intersection over union of the mask and this shape.
     """
 
     masks: dict[int, Bool[np.ndarray, "H W"]]
     overlaps: dict[int, float]
     by_hull: list[int]
+    shape: Shape
+    agreement: dict[int, float]
 
 
 def propagate(
@@ -119,11 +129,14 @@ def propagate(
 ) -> Segmentation:
     """Segment the object in all views, starting from given masks of one or more views.
 
-    The reference views are the given ones. If fewer than three masks are given, further reference views are added one
-    by one: GrabCut segments the nearest view from a new direction, guided by the hull of the reference views,
+    If a body of revolution agrees with at least two given masks, its projections are the masks of all other views.
+
+    Otherwise the reference views are the given ones. If fewer than three masks are given, further reference views are
+    added one by one: GrabCut segments the nearest view from a new direction, guided by the hull of the reference views,
     and the view is accepted if the extended hull still agrees with all reference masks. Then every other view is
     segmented by GrabCut, guided by the hull of the reference views. If GrabCut and the hull disagree, the mask of the
-    view is the projection of the hull of all accepted masks.
+    view is the projection of the hull of all accepted masks. GrabCut is not used if the hull of the other given masks
+    predicts the given masks better than GrabCut does, as for clear glass, which has the colours of its background.
 
     Args:
         images: 8-bit sRGB images of all views.
@@ -137,24 +150,25 @@ def propagate(
     """
     wanted = [view for view in range(len(images)) if view not in given]
     outlines = OutlineHull(cameras, given)
-    if len(given) < FEWEST_VIEWS:
+    body = outlines.revolution() if wanted and 2 <= len(given) <= _FEW else None
+    hull_only = hull_only or body is not None
+    if not hull_only and len(given) < FEWEST_VIEWS:
         _add_reference_views(images, outlines)
-    if wanted and len(outlines) < FEWEST_VIEWS:
+    if body is None and wanted and len(outlines) < FEWEST_VIEWS:
         raise NerfroError(
             f"{len(outlines)} of {len(images)} views agree on a shape, {FEWEST_VIEWS} are needed, because the outlined "
             "object is not found in other images by its colours; outline the whole object in more views from all "
             "sides, or provide masks"
         )
-    common = outlines.hull()
+    common = outlines.hull() if body is None else body
     if wanted and common is None:
         raise NerfroError("the visual hull of the given masks is empty; correct the masks or the poses")
+    if not hull_only and FEWEST_VIEWS < len(given) <= _FEW:
+        hull_only = _hull_predicts_better(images, outlines, given)
     found, overlaps = {}, {}
     for view in wanted if not hull_only else []:
-        region = outlines.seen_from(view, outlines.hull(without=view) if view in outlines else common)
-        core = _distance(region) > _CORE * _diameter(region)
-        cut = grab(images[view], region, _dilate(region, _REACH), core)
-        either = (cut | region).sum()
-        overlaps[view] = float((cut & region).sum() / either) if either else 1.0
+        region, cut = _guided(images[view], outlines, view, common)
+        overlaps[view] = _overlap(cut, region)
         if overlaps[view] >= AGREES:
             found[view] = cut
         progress()
@@ -162,7 +176,35 @@ def propagate(
     hull = OutlineHull(cameras, {**given, **found}).hull() if found else common
     for view in by_hull:
         found[view] = outlines.seen_from(view, hull)
-    return Segmentation({**given, **found}, overlaps, by_hull)
+    agreement = {view: _overlap(mask, outlines.seen_from(view, hull)) for view, mask in given.items()}
+    shape: Shape = "visual hull" if body is None else "body of revolution"
+    return Segmentation({**given, **found}, overlaps, by_hull, shape, agreement)
+
+
+def _guided(
+    image: UInt8[np.ndarray, "H W 3"], outlines: OutlineHull, view: int, hull: TriangleMesh | None
+) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
+    """Return the projection of the hull of all other views, and the mask of GrabCut that starts from the projection."""
+    region = outlines.seen_from(view, outlines.hull(without=view) if view in outlines else hull)
+    core = _distance(region) > _CORE * _diameter(region)
+    return region, grab(image, region, _dilate(region, _REACH), core)
+
+
+def _hull_predicts_better(
+    images: Sequence[UInt8[np.ndarray, "H W 3"]], outlines: OutlineHull, given: Mapping[int, Bool[np.ndarray, "H W"]]
+) -> bool:
+    """Test whether the hull of the other given masks predicts each given mask better than GrabCut in the mean."""
+    gains = []
+    for view, mask in given.items():
+        region, cut = _guided(images[view], outlines, view, None)
+        gains.append(_overlap(region, mask) - _overlap(cut, mask))
+    return float(np.mean(gains)) > 0
+
+
+def _overlap(one: Bool[np.ndarray, "H W"], other: Bool[np.ndarray, "H W"]) -> float:
+    """Compute the intersection over union of two masks; 1 for empty masks."""
+    either = (one | other).sum()
+    return float((one & other).sum() / either) if either else 1.0
 
 
 def _add_reference_views(images: Sequence[UInt8[np.ndarray, "H W 3"]], outlines: OutlineHull) -> None:

@@ -9,9 +9,11 @@ import torch
 from jaxtyping import Bool, Float
 
 from nerfro.cameras import Cameras
-from nerfro.capture.pose_conventions import GOOD_OVERLAP, coarse_agreement
+from nerfro.capture.pose_conventions import GOOD_OVERLAP, coarse_agreement, overlap
+from nerfro.capture.revolution import fit_revolution
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.targets import opencv
+from nerfro.capture.upright import camera_up
 from nerfro.capture.visual_hull import Silhouettes, carve_mesh, centre_lines, find_box
 from nerfro.geometry.lines import nearest_point
 from nerfro.geometry.mesh import TriangleMesh
@@ -27,6 +29,10 @@ _WRONG_FRACTION = 0.1
 # Smallest angle, in degrees, between the directions of different views; and the angle within which all views look from
 # one side, so that the rays through the centroids of the masks do not determine the depth of the object.
 _MIN_VIEW_ANGLE, _ONE_SIDE = 25.0, 15.0
+# Smallest intersection over union of a body of revolution and each of its masks, which may be drawn by hand.
+_SYMMETRIC = 0.94
+# A view may reduce the overlap of the hull with any initial mask by at most so much, together with all added views.
+_MAX_LOSS = 0.03
 # Enlargement of the box if all views look from one side.
 _DEPTH_MARGIN = 1.6
 
@@ -46,6 +52,8 @@ class OutlineHull:
         self._outlines: dict[int, Silhouettes] = {}
         for view, mask in masks.items():
             self.add(view, mask)
+        self._initial = list(self._outlines)
+        self._initial_overlaps: Float[np.ndarray, "V"] | None = None  # computed before the first view is added
 
     def __len__(self) -> int:
         return len(self._outlines)
@@ -61,15 +69,40 @@ class OutlineHull:
             self._outlines[view] = Silhouettes.of(self.cameras.select([view]), torch.from_numpy(coverage[None]))
 
     def add_if_agreed(self, view: int, mask: Bool[np.ndarray, "H W"]) -> bool:
-        """Add the silhouette of a view if the extended hull agrees with all masks; returns whether it was added."""
+        """Add the silhouette of a view if the extended hull agrees with all masks; returns whether it was added.
+
+        A mask that lacks a part of the object removes this part from the hull, and thereby from all other masks. The
+        hull must therefore keep its overlap with the initial masks.
+        """
+        if self._initial_overlaps is None:
+            self._initial_overlaps = self._overlaps(self.hull())
         self.add(view, mask)
         if view not in self:
             return False
         silhouettes = self._silhouettes()
         agreement = coarse_agreement(silhouettes, int(_WRONG_FRACTION * len(silhouettes)))
-        if agreement.min() < GOOD_OVERLAP:
+        agrees = agreement.min() >= GOOD_OVERLAP
+        if not agrees or (self._overlaps(self.hull()) < self._initial_overlaps - _MAX_LOSS).any():
             del self._outlines[view]
         return view in self
+
+    def revolution(self) -> TriangleMesh | None:
+        """Fit a body of revolution to the initial masks; None if these do not agree with one."""
+        hull = self.hull()
+        up = camera_up(self.cameras)
+        if hull is None or up is None:
+            return None
+        # The hull of few views says less about the axis than the cameras and the centres of the masks do.
+        silhouettes = self._silhouettes()
+        body = fit_revolution(hull, silhouettes, axis=(nearest_point(*centre_lines(silhouettes)), up))
+        return body if body is not None and self._overlaps(body).min() >= _SYMMETRIC else None
+
+    def _overlaps(self, hull: TriangleMesh | None) -> Float[np.ndarray, "V"]:
+        """Compute the intersection over union of the silhouette of a hull with each initial mask."""
+        if hull is None:
+            return np.zeros(len(self._initial))
+        parts = [self._outlines[view] for view in self._initial]
+        return np.array([overlap(hull, part, MAX_SIDE)[0] for part in parts])
 
     def hull(self, without: int | None = None) -> TriangleMesh | None:
         """Compute the hull of all views, optionally without one; None if the hull is empty."""

@@ -24,6 +24,9 @@ Symmetry = Literal["axis", "auto"]
 
 # Number of radii along the axis, and of vertices around the axis.
 _KNOTS, _SECTIONS = 72, 160
+# Quantile of the distances of vertices from the axis that gives the initial radius at a height: vertices on end faces
+# lie nearer to the axis than the outline, and corners of the hull of few views lie farther away.
+_OUTER_QUANTILE, _INNER_QUANTILE = 0.8, 0.1
 _END = 4  # knots at each end whose initial radii are extrapolated, because the visual hull is inaccurate there
 # Samples per mask: points on the outline, and pixels inside and outside at distances in this range, in pixels.
 _OUTLINE_POINTS, _SIDE_POINTS, _NEAR, _FAR = 100, 40, 3.0, 40.0
@@ -88,7 +91,10 @@ class Profile:
 
 
 def fit_revolution(
-    mesh: TriangleMesh, silhouettes: Silhouettes, progress: Callable[[float], None] = lambda share: None
+    mesh: TriangleMesh,
+    silhouettes: Silhouettes,
+    progress: Callable[[float], None] = lambda share: None,
+    axis: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None = None,
 ) -> TriangleMesh | None:
     """Fit a body of revolution to the outlines of the masks.
 
@@ -100,11 +106,14 @@ def fit_revolution(
         mesh: initial surface.
         silhouettes: silhouettes of the object.
         progress: called with the completed fraction.
+        axis: a point on the initial axis and the unit direction of the axis; None takes the axis around which the
+            initial surface is most circular. With a given axis, the initial radii are those of the largest body of
+            revolution inside the initial surface, because the visual hull of few views is much wider than the object.
 
     Returns:
         The fitted body; None if the initial surface has no axis.
     """
-    start = _initial_profile(mesh)
+    start = _initial_profile(mesh) if axis is None else _profile_around(mesh, *axis, _INNER_QUANTILE)[1]
     if start is None:
         return None
     origins, directions, width, side = _rays(silhouettes)
@@ -156,21 +165,37 @@ def _initial_profile(mesh: TriangleMesh) -> Profile | None:
         for _ in range(2):  # centre the mesh perpendicular to the axis
             across = vertices - middle - ((vertices - middle) @ axis)[:, None] * axis
             middle = middle + across.mean(0)
-        across = vertices - middle - ((vertices - middle) @ axis)[:, None] * axis
-        along, radius = (vertices - middle) @ axis, np.linalg.norm(across, axis=1)
-        low, high = along.min(), along.max()
-        number = ((along - low) / (high - low) * (_KNOTS - 1)).round().astype(np.int64)
-        # Vertices on the end faces lie nearer to the axis than the outline, hence the quantile.
-        outer = np.array(
-            [np.quantile(radius[number == k], 0.8) if (number == k).any() else np.nan for k in range(_KNOTS)]
-        )
-        known = np.isfinite(outer)
-        outer = np.interp(np.arange(_KNOTS), np.flatnonzero(known), outer[known])
-        outer[:_END], outer[-_END:] = outer[_END], outer[-_END - 1]
-        spread = np.abs(radius - outer[number])[(number > _END) & (number < _KNOTS - _END)].mean() / outer.mean()
-        foot, along_axis, radii = (torch.from_numpy(part).float() for part in (middle + low * axis, axis, outer))
-        found.append((float(spread), Profile(foot, along_axis, torch.tensor(float(high - low)), radii)))
+        found.append(_profile_around(mesh, middle, axis, _OUTER_QUANTILE))
     return min(found, key=lambda each: each[0])[1] if found else None
+
+
+def _profile_around(
+    mesh: TriangleMesh, middle: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"], quantile: float
+) -> tuple[float, Profile]:
+    """Measure the radii of a mesh around an axis.
+
+    Args:
+        mesh: surface.
+        middle: point on the axis.
+        axis: unit direction.
+        quantile: quantile of the distances of vertices from the axis at each height.
+
+    Returns:
+        Mean deviation from a body of revolution, relative to the mean radius, and the body.
+    """
+    offset = mesh.vertices - middle
+    along = offset @ axis
+    radius, low, high = np.linalg.norm(offset - along[:, None] * axis, axis=1), along.min(), along.max()
+    number = ((along - low) / (high - low) * (_KNOTS - 1)).round().astype(np.int64)
+    radii = np.array(
+        [np.quantile(radius[number == k], quantile) if (number == k).any() else np.nan for k in range(_KNOTS)]
+    )
+    known = np.isfinite(radii)
+    radii = np.interp(np.arange(_KNOTS), np.flatnonzero(known), radii[known])
+    radii[:_END], radii[-_END:] = radii[_END], radii[-_END - 1]
+    spread = np.abs(radius - radii[number])[(number > _END) & (number < _KNOTS - _END)].mean() / radii.mean()
+    foot, direction, outline = (torch.from_numpy(part).float() for part in (middle + low * axis, axis, radii))
+    return float(spread), Profile(foot, direction, torch.tensor(float(high - low)), outline)
 
 
 def _rays(
