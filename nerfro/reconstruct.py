@@ -16,7 +16,10 @@ from nerfro.capture.overrides import as_overrides, is_given, of_groups
 from nerfro.capture.preprocess_options import FOUND, MESH
 from nerfro.capture.reconstruct_options import ReconstructConfig, common_options, have_poses, read_result
 from nerfro.capture.stages import Stage, is_older, link_photographs, move_aside
+from nerfro.capture.video import extract_frames
 from nerfro.cli import entry_point
+from nerfro.data.frames import list_images
+from nerfro.errors import NerfroError
 from nerfro.files.folder_lock import lock_folder
 from nerfro.paths import resolve_path, user_path
 from nerfro.training.run_folder import CONFIG_FILE
@@ -47,7 +50,19 @@ def main(config: DictConfig) -> None:
 
 def _calibrate(config: DictConfig, data: list[str], out: Path) -> list[str]:
     """Estimate the poses of the photographs, and return the options of the resulting data set."""
-    link_photographs(user_path(config.images), None if config.masks is None else user_path(config.masks), out)
+    if config.video is None:
+        photographs = user_path(config.images)
+    else:
+        photographs = out / "frames"
+        if not (out / REPORT).is_file():
+            extract_frames(user_path(config.video), photographs, config.frames)
+    link_photographs(photographs, None if config.masks is None else user_path(config.masks), out)
+    if not config.outlines and not any(file for place in _MASKS for file in out.glob(place)):
+        example = list_images(photographs)[0].stem
+        raise NerfroError(
+            f"the photographs have no masks; draw the outline of the object in two to five images of {photographs} and "
+            f"add outlines={{{example}:[[COLUMN,ROW],...],...}}, or give masks=FOLDER"
+        )
     options = [*as_overrides({"images": out / "images", "out": out}), "target=colmap", "overwrite=true"]
     Stage("calibrate", [*options, *shlex.split(config.calibrate)], out / REPORT, out / PLOT).run()
     ray_range = read_result(out / REPORT, {"options"})["options"]

@@ -41,6 +41,11 @@ def photos(tmp_path: Path) -> Path:
     return tmp_path / "photos"
 
 
+def given(photos: Path) -> tuple[str, str]:
+    """Options of the photographs and of their masks."""
+    return f"images={photos}", f"masks={photos.parent / 'silhouettes'}"
+
+
 @pytest.fixture
 def reconstruct(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Reconstruct:
     return lambda *overrides: finish(nerfro.reconstruct.main, overrides, monkeypatch, capsys)
@@ -180,7 +185,7 @@ def test_training_continues_with_the_hypothesis_that_the_validation_photographs_
 ) -> None:
     pretended.doubtful = doubtful
     pretended.psnr |= psnr
-    done = reconstruct(f"images={photos}", f"out={pretended.out}", "trial_seconds=70")
+    done = reconstruct(*given(photos), f"out={pretended.out}", "trial_seconds=70")
     assert done.code == 0, done.err
     assert printed in done.out
     *trials, train = [options for name, options in pretended.ran if name == "train"]
@@ -192,7 +197,7 @@ def test_training_continues_with_the_hypothesis_that_the_validation_photographs_
 
 def test_an_interrupted_training_goes_on(reconstruct: Reconstruct, pretended: Pretended, photos: Path) -> None:
     pretended.ends["train"] = 130
-    asked = f"images={photos}", f"out={pretended.out}", "trial_seconds=0"
+    asked = *given(photos), f"out={pretended.out}", "trial_seconds=0"
     stopped = reconstruct(*asked)
     assert stopped.code == 130
     assert stopped.err == "nerfro: interrupted; train is incomplete; repeat the same command to continue\n"
@@ -207,14 +212,14 @@ def test_a_stage_that_fails_is_named_and_the_others_wait(
     reconstruct: Reconstruct, pretended: Pretended, photos: Path
 ) -> None:
     pretended.ends["preprocess"] = 1
-    failed = reconstruct(f"images={photos}", f"out={pretended.out}")
+    failed = reconstruct(*given(photos), f"out={pretended.out}")
     assert failed.code == 1
     assert failed.err.startswith("nerfro: error: preprocess failed for the reason in the line above; ")
     assert "set preprocess='OPTIONS'" in failed.err
     assert failed.err.count("\n") == 1
     assert pretended.names == ["calibrate", "preprocess"]
     pretended.ends["preprocess"] = 0
-    assert "preprocess failed" in reconstruct(f"images={photos}", f"out={pretended.out}").err, "no result was written"
+    assert "preprocess failed" in reconstruct(*given(photos), f"out={pretended.out}").err, "no result was written"
     assert pretended.names == ["calibrate", "preprocess", "preprocess"]
 
 
@@ -237,8 +242,11 @@ def test_what_was_found_chooses_the_experiment(
     ("overrides", "told"),
     [
         ((), "set out=FOLDER, and images=PHOTOS"),
-        (("images=PHOTOS", "data.root=PHOTOS"), "images= is for photographs without poses"),
-        (("images=PHOTOS", "data=blender"), "images= is for photographs without poses"),
+        (("images=PHOTOS", "data.root=PHOTOS"), "images= and video= are for photographs without poses"),
+        (("video=PHOTOS", "data=blender"), "images= and video= are for photographs without poses"),
+        (("images=PHOTOS", "video=PHOTOS"), "images= and video= are both given"),
+        (("video=PHOTOS/none.mp4",), "none.mp4 does not exist; give a video file, or images=FOLDER for photographs"),
+        (("images=PHOTOS",), "the photographs have no masks; draw the outline of the object in two to five images of"),
         (("data.root=PHOTOS", "masks=PHOTOS"), "masks= needs images="),
         (("images=PHOTOS", "masks=PHOTOS/none"), "none is not a folder; give the folder of the masks"),
         (("images=PHOTOS/none",), "none is not a folder; it should hold the images"),
@@ -254,7 +262,7 @@ def test_what_contradicts_itself_is_refused(
 
 
 def test_a_result_that_was_spoilt_is_refused(reconstruct: Reconstruct, pretended: Pretended, photos: Path) -> None:
-    asked = f"images={photos}", f"out={pretended.out}"
+    asked = *given(photos), f"out={pretended.out}"
     reconstruct(*asked)
     pretended.write("surface/preprocess.json", {"options": []})
     assert (

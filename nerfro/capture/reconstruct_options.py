@@ -24,6 +24,8 @@ class ReconstructConfig:
         data: data set with poses, instead of `images` (options of the group `data`, passed to all stages).
         medium: medium that is built from the surface (options of the group `medium`).
         images: folder of photographs without poses.
+        video: video instead of photographs; the sharpest of its frames are used.
+        frames: number of frames to take from the video.
         masks: folder of the masks, `<photograph>.png` or `mask_<photograph>.png`.
         outlines: outlines of the object in some photographs (see `python -m nerfro.mask`).
         out: output folder.
@@ -36,6 +38,8 @@ class ReconstructConfig:
     data: Any = MISSING
     medium: Any = MISSING
     images: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    video: Optional[str] = None  # noqa: UP045
+    frames: Annotated[int, Range(at_least=3, at_most=1000)] = 60
     masks: Optional[str] = None  # noqa: UP045
     outlines: Any = None
     out: Optional[str] = None  # noqa: UP045
@@ -53,13 +57,17 @@ def have_poses(config: DictConfig, overrides: list[str]) -> bool:
     Raises:
         NerfroError: options are missing or contradict each other.
     """
-    posed = config.images is None
+    if config.images is not None and config.video is not None:
+        raise NerfroError("images= and video= are both given; give one of the two")
+    posed = config.images is None and config.video is None
     if config.out is None or (posed and OmegaConf.is_missing(config.data, "root")):
-        raise NerfroError("set out=FOLDER, and images=PHOTOS or, for images with poses, data=FORMAT data.root=FOLDER")
+        raise NerfroError(
+            "set out=FOLDER, and images=PHOTOS, video=FILE or, for images with poses, data=FORMAT data.root=FOLDER"
+        )
     if not posed and (is_given("data", overrides) or is_given("data.root", overrides)):
         raise NerfroError(
-            "images= is for photographs without poses, and data= and data.root= are for photographs with poses; give "
-            "one of the two"
+            "images= and video= are for photographs without poses, and data= and data.root= are for photographs with "
+            "poses; give one of the two"
         )
     if posed and config.masks is not None:
         raise NerfroError("masks= needs images=; for a data set with poses, put the masks into the folder data.root=")

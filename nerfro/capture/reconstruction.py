@@ -97,9 +97,11 @@ def reconstruct(images: Sequence[Path], masks: Sequence[Path | None], folder: Pa
         pairs = list(itertools.combinations(range(len(names)), 2)) if order is None else sequential_pairs(order)
         _match(pycolmap, database, [(names[i], names[j]) for i, j in pairs], threads)
         models = _map(pycolmap, database, images, folder, settings, threads)
-        if settings.pairs is None and order is not None and _num_registered(models) < len(images):
-            print(f"{_num_registered(models)} of {len(images)} images have a pose: matching all pairs")
+        if settings.pairs is None and order is not None and len(_registered(models)) < len(images):
+            posed = _registered(models)
+            print(f"{len(posed)} of {len(images)} images have a pose: matching the others with all images")
             left = set(itertools.combinations(range(len(names)), 2)) - {(min(pair), max(pair)) for pair in pairs}
+            left = {pair for pair in left if not {names[pair[0]], names[pair[1]]} <= posed}
             _match(pycolmap, database, [(names[i], names[j]) for i, j in sorted(left)], threads)
             models = _map(pycolmap, database, images, folder, settings, threads)
     if not models:
@@ -204,9 +206,10 @@ def _chunks(items: Sequence[Any], size: int, description: str) -> Iterator[Seque
     return (items[start : start + size] for start in track(description, starts))
 
 
-def _num_registered(models: dict[int, Any]) -> int:
-    """Return the largest number of images with a pose in one model."""
-    return max((model.num_reg_images() for model in models.values()), default=0)
+def _registered(models: dict[int, Any]) -> set[str]:
+    """Return the names of the images with a pose in the largest model."""
+    largest = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+    return set() if largest is None else {image.name for image in largest.images.values() if image.has_pose}
 
 
 def _write_ignored(mask: Path, file: Path) -> None:
