@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from nerfro.capture.calibrated_data import PLOT, REPORT
-from nerfro.capture.hypotheses import Hypothesis, best_hypothesis, hypotheses, trial_options
+from nerfro.capture.hypotheses import STRAIGHT, Hypothesis, hypotheses, trial_options
 from nerfro.capture.overlaps import SHEET
 from nerfro.capture.overrides import as_overrides, is_given, of_groups
 from nerfro.capture.preprocess_options import FOUND, MESH
@@ -20,6 +21,7 @@ from nerfro.capture.video import extract_frames
 from nerfro.cli import entry_point
 from nerfro.data.frames import list_images
 from nerfro.errors import NerfroError
+from nerfro.evaluation.results import FULL, read_metrics_json
 from nerfro.files.folder_lock import lock_folder
 from nerfro.paths import resolve_path, user_path
 from nerfro.training.run_folder import CONFIG_FILE
@@ -94,9 +96,33 @@ def _train(config: DictConfig, overrides: list[str], surface: Path, out: Path) -
         for hypothesis, trial in zip(candidates, trials, strict=True):
             print(f"\nhypothesis: {hypothesis.name}")
             _run_training([*hypothesis.options, *common, *trial_options(config.trial_seconds)], inputs, trial)
-        best = best_hypothesis(candidates, trials)
+        best = _best_hypothesis(candidates, trials)
         inputs += [trial / "metrics.json" for trial in trials]
     _run_training([*best.options, *common], inputs, out / "run")
+
+
+def _best_hypothesis(tried: Sequence[Hypothesis], runs: Sequence[Path]) -> Hypothesis:
+    """Print the scores of the trials, and return the hypothesis with the best mean of picture and object.
+
+    Args:
+        tried: the hypotheses.
+        runs: run folder of the trial of each hypothesis.
+    """
+    scores = []
+    print("\nPSNR of short trainings on validation photographs, in dB:")
+    print(f"  {'hypothesis':<20}{'picture':>9}{'object':>9}")
+    for hypothesis, run in zip(tried, runs, strict=True):
+        result = read_metrics_json(run / "metrics.json").result
+        picture, thing = result.mean("psnr", FULL) or 0.0, result.mean("psnr", "mask")
+        scores.append(picture if thing is None else 0.5 * (picture + thing))
+        print(f"  {hypothesis.name:<20}{picture:>9.2f}{'n/a' if thing is None else f'{thing:.2f}':>9}")
+    best = tried[max(range(len(tried)), key=scores.__getitem__)]
+    print(f"training continues with: {best.name}")
+    if best.name == STRAIGHT:
+        doubts = [hypothesis.doubt for hypothesis in tried if hypothesis.doubt]
+        reason = doubts[0] if doubts else "the surface or the index is not accurate enough, or the object is opaque"
+        print(f"bent rays do not pay: {reason}; to bend them nevertheless, add {shlex.quote('train=+experiment=NAME')}")
+    return best
 
 
 def _run_training(options: list[str], inputs: list[Path], run: Path) -> None:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from nerfro.capture.overrides import as_overrides, is_given, of_groups
-from nerfro.evaluation.results import FULL, read_metrics_json
 
 STRAIGHT = "straight rays"
 # Number of training photographs that score the hypotheses.
@@ -84,27 +81,3 @@ def trial_options(seconds: int) -> list[str]:
         "evaluation.every=0",
         "logger=none",
     ]
-
-
-def best_hypothesis(tried: Sequence[Hypothesis], runs: Sequence[Path]) -> Hypothesis:
-    """Print the scores of the trials, and return the hypothesis with the best mean of picture and object.
-
-    Args:
-        tried: the hypotheses.
-        runs: run folder of the trial of each hypothesis.
-    """
-    scores = []
-    print("\nPSNR of short trainings on validation photographs, in dB:")
-    print(f"  {'hypothesis':<20}{'picture':>9}{'object':>9}")
-    for hypothesis, run in zip(tried, runs, strict=True):
-        result = read_metrics_json(run / "metrics.json").result
-        picture, thing = result.mean("psnr", FULL) or 0.0, result.mean("psnr", "mask")
-        scores.append(picture if thing is None else 0.5 * (picture + thing))
-        print(f"  {hypothesis.name:<20}{picture:>9.2f}{'n/a' if thing is None else f'{thing:.2f}':>9}")
-    best = tried[max(range(len(tried)), key=scores.__getitem__)]
-    print(f"training continues with: {best.name}")
-    if best.name == STRAIGHT:
-        doubts = [hypothesis.doubt for hypothesis in tried if hypothesis.doubt]
-        reason = doubts[0] if doubts else "the surface or the index is not accurate enough, or the object is opaque"
-        print(f"bent rays do not pay: {reason}; to bend them nevertheless, add {shlex.quote('train=+experiment=NAME')}")
-    return best
