@@ -18,16 +18,15 @@ from nerfro.capture.mask_files import (
     mask_sheet,
     read_outlines,
     read_resized,
+    report_masks,
     save_mask,
 )
-from nerfro.capture.masking import Segmentation, box_region, grab, polygon_mask, propagate
-from nerfro.capture.outline_hull import AGREES
+from nerfro.capture.masking import box_region, grab, polygon_mask, propagate
 from nerfro.capture.overrides import is_given, of_groups
 from nerfro.capture.targets import opencv
-from nerfro.cli import entry_point, warn
-from nerfro.data.base import Frame
+from nerfro.cli import entry_point
 from nerfro.data.image_files import read_size
-from nerfro.errors import NerfroError, first_of
+from nerfro.errors import NerfroError
 from nerfro.files.images import save_image
 from nerfro.paths import EMBEDDED_PREFIX
 from nerfro.registry import build
@@ -68,32 +67,12 @@ def main(config: DictConfig) -> None:
     for view in made:
         save_mask(frames[view], found.masks[view])
     save_image(source.root / _SHEET, mask_sheet(images, frames, found))
-    _report(frames, found)
+    report_masks(frames, found)
     print(f"wrote {len(made)} masks beside their images (mask_*.png); check them in {source.root / _SHEET}")
     print("correct wrong masks in a paint program; or delete them, outline one of these views, and repeat the command")
     given = of_groups(("data",), HydraConfig.get().overrides.task)
     given = given if is_given("data", given) else ["data=opencv", *given]
     print(f"next: {shlex.join(['python', '-m', 'nerfro.preprocess', *given, 'medium.ior=1.33'])}")
-
-
-def _report(frames: list[Frame], found: Segmentation) -> None:
-    worst = min(found.agreement, key=found.agreement.__getitem__)
-    print(
-        f"{len(found.by_hull)} masks are projections of the {found.shape}, which overlaps by "
-        f"{found.agreement[worst]:.3f} or more with the {len(found.agreement)} given masks "
-        f"(least: {frames[worst].name})"
-    )
-    if found.overlaps:
-        print("overlap (intersection over union) of GrabCut's mask with the visual hull of the other views:")
-    for view in sorted(found.overlaps, key=lambda view: found.overlaps[view]):
-        taken = " (mask from the hull)" if view in found.by_hull else ""
-        print(f"  {found.overlaps[view]:.4f}  {frames[view].name}{taken}")
-    doubtful = [frames[view].name for view in found.by_hull if view in found.overlaps]
-    if doubtful:
-        warn(
-            f"{len(doubtful)} of {len(frames)} views: GrabCut and the visual hull overlap by less than {AGREES} "
-            f"({first_of(doubtful)}); their masks are projections of the hull and slightly too large: check them first"
-        )
 
 
 if __name__ == "__main__":

@@ -13,8 +13,9 @@ from nerfro.paths import PACKAGE_DIR
 
 # From above to below: a package imports what follows it, and itself.
 ORDER = (
-    "commands", "testing", "report", "training", "viewing", "evaluation", "scenes", "capture", "models", "losses",
-    "rendering", "boundaries", "camera", "samplers", "fields", "media", "data", "geometry", "kernels", "files", "core",
+    "commands", "testing", "pipeline", "report", "training", "viewing", "evaluation", "scenes", "capture", "models",
+    "losses", "rendering", "boundaries", "camera", "samplers", "fields", "media", "data", "geometry", "kernels",
+    "files", "core",
 )  # fmt: skip
 FILES = {
     ".".join(("nerfro", *file.relative_to(PACKAGE_DIR).with_suffix("").parts)).removesuffix(".__init__"): file

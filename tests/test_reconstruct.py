@@ -19,11 +19,12 @@ from hydra.core.global_hydra import GlobalHydra
 
 import nerfro.reconstruct
 import nerfro.train
-from nerfro.capture import refinement, refinement_report, stages
-from nerfro.capture.hypotheses import Hypothesis
+from nerfro.capture import refinement, refinement_report
 from nerfro.capture.overrides import as_overrides
-from nerfro.capture.stages import run_command
 from nerfro.files.images import save_png
+from nerfro.pipeline import stages
+from nerfro.pipeline.hypotheses import Hypothesis
+from nerfro.pipeline.stages import run_command
 from tests.ball_photographs import mesh, photographs, save, soft_masks
 from tests.conftest import Finished, finish
 
@@ -277,7 +278,7 @@ def test_paths_are_quoted_for_hydra() -> None:
 
 def test_a_command_is_left_time_to_save_when_this_process_is_asked_to_end() -> None:
     run = "run_command([sys.executable, '-c', '''{}'''])"
-    program = f"import sys; from nerfro.capture.stages import run_command; print({run})"
+    program = f"import sys; from nerfro.pipeline.stages import run_command; print({run})"
     saving = "import signal,time; signal.signal(15, lambda *_: exit(130)); print(0, flush=True); time.sleep(60)"
     process = subprocess.Popen([sys.executable, "-c", program.format(saving)], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None

@@ -16,12 +16,13 @@ from PIL import Image
 
 from nerfro.cameras import Cameras
 from nerfro.capture.masking import Segmentation
-from nerfro.capture.outline_hull import FEWEST_VIEWS
+from nerfro.capture.outline_hull import AGREES, FEWEST_VIEWS
 from nerfro.capture.targets import opencv
+from nerfro.cli import warn
 from nerfro.data.base import DataSource, Frame
 from nerfro.data.image_files import read_mask, read_size, to_unit
 from nerfro.data.masks import without_masks
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, first_of
 from nerfro.files.drawing import sheet
 from nerfro.files.images import save_image
 from nerfro.files.reading import read_json
@@ -185,3 +186,24 @@ def mask_sheet(
         captions.append(f"{labels.get(view, 'given')}  {frames[view].name[-_NAME_LENGTH:]}")
     legend = "overlap of GrabCut and visual hull; hull: the mask is the projection of the hull; dark: outside the mask"
     return sheet(pictures, captions, _TILE, _COLUMNS, legend)
+
+
+def report_masks(frames: list[Frame], found: Segmentation) -> None:
+    """Print how well the masks agree with the shape of the object, the least certain masks first."""
+    worst = min(found.agreement, key=found.agreement.__getitem__)
+    print(
+        f"{len(found.by_hull)} masks are projections of the {found.shape}, which overlaps by "
+        f"{found.agreement[worst]:.3f} or more with the {len(found.agreement)} given masks "
+        f"(least: {frames[worst].name})"
+    )
+    if found.overlaps:
+        print("overlap (intersection over union) of GrabCut's mask with the visual hull of the other views:")
+    for view in sorted(found.overlaps, key=lambda view: found.overlaps[view]):
+        taken = " (mask from the hull)" if view in found.by_hull else ""
+        print(f"  {found.overlaps[view]:.4f}  {frames[view].name}{taken}")
+    doubtful = [frames[view].name for view in found.by_hull if view in found.overlaps]
+    if doubtful:
+        warn(
+            f"{len(doubtful)} of {len(frames)} views: GrabCut and the visual hull overlap by less than {AGREES} "
+            f"({first_of(doubtful)}); their masks are projections of the hull and slightly too large: check them first"
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import shlex
 import signal
@@ -89,7 +90,11 @@ def run_command(command: list[str]) -> int:
         process = subprocess.Popen(command)
         if terminates:  # the signal arrived before the command had started
             process.terminate()
-        return process.wait()
+        while process.poll() is None:
+            # Without a limit, the second of two signals in quick succession would be handled after the command.
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(timeout=1)
+        return process.returncode
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

@@ -1,0 +1,130 @@
+"""The steps of `nerfro.reconstruct`; each runs a command unless its result is there and newer than its inputs."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from nerfro.capture.calibrated_data import PLOT, REPORT
+from nerfro.capture.overlaps import SHEET
+from nerfro.capture.overrides import as_overrides, is_given
+from nerfro.capture.preprocess_options import FOUND, MESH
+from nerfro.capture.video import extract_frames
+from nerfro.data.frames import list_images
+from nerfro.errors import NerfroError
+from nerfro.evaluation.results import FULL, read_metrics_json
+from nerfro.paths import user_path
+from nerfro.pipeline.hypotheses import STRAIGHT, Hypothesis, hypotheses, trial_options
+from nerfro.pipeline.options import common_options, read_result
+from nerfro.pipeline.stages import Stage, is_older, link_photographs, move_aside
+from nerfro.training.run_folder import CONFIG_FILE
+
+_MASKS = ("masks/*", "masks/*/*", "mask_*", "*/mask_*")  # where loaders search for masks
+
+
+def calibrate(config: DictConfig, data: list[str], out: Path) -> list[str]:
+    """Estimate the poses of the photographs, and return the options of the resulting data set."""
+    if config.video is None:
+        photographs = user_path(config.images)
+    else:
+        photographs = out / "frames"
+        if not (out / REPORT).is_file():
+            extract_frames(user_path(config.video), photographs, config.frames)
+    link_photographs(photographs, None if config.masks is None else user_path(config.masks), out)
+    if not config.outlines and not any(file for place in _MASKS for file in out.glob(place)):
+        example = list_images(photographs)[0].stem
+        raise NerfroError(
+            f"the photographs have no masks; draw the outline of the object in two to five images of {photographs} and "
+            f"add outlines={{{example}:[[COLUMN,ROW],...],...}}, or give masks=FOLDER"
+        )
+    options = [*as_overrides({"images": out / "images", "out": out}), "target=colmap", "overwrite=true"]
+    Stage("calibrate", [*options, *shlex.split(config.calibrate)], out / REPORT, out / PLOT).run()
+    ray_range = read_result(out / REPORT, {"options"})["options"]
+    kept = [text for text in ray_range if not is_given(text.split("=")[0], data)]
+    return [*as_overrides({"data.root": out}), *kept, *data]
+
+
+def segment(config: DictConfig, options: list[str], root: Path) -> None:
+    """Make the missing masks, if outlines are given."""
+    if config.outlines or config.mask:
+        sheet = root / "masks.png"
+        Stage("mask", [*options, *shlex.split(config.mask)], sheet, sheet).run()
+
+
+def preprocess(config: DictConfig, options: list[str], root: Path, folder: Path) -> Path:
+    """Reconstruct surface and index, and return the folder of the results."""
+    inputs = [*root.glob("transforms*.json"), *(file for place in _MASKS for file in root.glob(place))]
+    automatic = [*as_overrides({"out": folder}), "refine=true", "wrong_masks=null", "symmetry=auto", "overwrite=true"]
+    options = [*options, *automatic, *shlex.split(config.preprocess)]
+    Stage("preprocess", options, folder / FOUND, folder / SHEET, inputs).run()
+    return folder
+
+
+def train(config: DictConfig, overrides: list[str], surface: Path, out: Path) -> None:
+    """Train under the hypothesis that the validation photographs prefer."""
+    inputs = [surface / FOUND, surface / MESH]
+    found = read_result(surface / FOUND, {"options", "doubtful", "near", "pixels", "up", "width"})
+    common = common_options(config, overrides, found)
+    candidates, best = hypotheses(found, config.medium), None
+    if is_given("experiment", common):
+        best = Hypothesis("given", [*found["options"], *found["doubtful"]])
+    elif config.trial_seconds == 0:
+        best = candidates[1]
+    else:
+        trials = [out / "trials" / hypothesis.folder for hypothesis in candidates]
+        for hypothesis, trial in zip(candidates, trials, strict=True):
+            print(f"\nhypothesis: {hypothesis.name}")
+            _run_training([*hypothesis.options, *common, *trial_options(config.trial_seconds)], inputs, trial)
+        best = _best_hypothesis(candidates, trials)
+        inputs += [trial / "metrics.json" for trial in trials]
+    _run_training([*best.options, *common], inputs, out / "run")
+
+
+def _best_hypothesis(tried: Sequence[Hypothesis], runs: Sequence[Path]) -> Hypothesis:
+    """Print the scores of the trials, and return the hypothesis with the best mean of picture and object.
+
+    Args:
+        tried: the hypotheses.
+        runs: run folder of the trial of each hypothesis.
+    """
+    scores = []
+    print("\nPSNR of short trainings on validation photographs, in dB:")
+    print(f"  {'hypothesis':<20}{'picture':>9}{'object':>9}")
+    for hypothesis, run in zip(tried, runs, strict=True):
+        result = read_metrics_json(run / "metrics.json").result
+        picture, thing = result.mean("psnr", FULL) or 0.0, result.mean("psnr", "mask")
+        scores.append(picture if thing is None else 0.5 * (picture + thing))
+        print(f"  {hypothesis.name:<20}{picture:>9.2f}{'n/a' if thing is None else f'{thing:.2f}':>9}")
+    best = tried[max(range(len(tried)), key=scores.__getitem__)]
+    print(f"training continues with: {best.name}")
+    if best.name == STRAIGHT:
+        doubts = [hypothesis.doubt for hypothesis in tried if hypothesis.doubt]
+        reason = doubts[0] if doubts else "the surface or the index is not accurate enough, or the object is opaque"
+        print(f"bent rays do not pay: {reason}; to bend them nevertheless, add {shlex.quote('train=+experiment=NAME')}")
+    return best
+
+
+def _run_training(options: list[str], inputs: list[Path], run: Path) -> None:
+    """Train, or resume an interrupted training if its inputs have not changed."""
+    started = run / CONFIG_FILE
+    options = [*options, *as_overrides({"hydra.run.dir": run})]
+    stage = Stage("train", options, run / "metrics.json", run / "images", inputs)
+    if started.is_file() and not stage.is_done:
+        if is_older(started, inputs):
+            print(f"\ntrain: the surface is newer than {run}, which is kept as {move_aside(run)}")
+        else:
+            stage = replace(stage, options=[*options, "ckpt_path=last"])
+    stage.run()
+
+
+def report(out: Path) -> None:
+    """Write the report and the interactive page."""
+    report, page, run = out / "report" / "report.html", out / "page.html", out / "run"
+    options = [*as_overrides({"runs": [run], "out": report.parent}), "report=true", "overwrite=true"]
+    Stage("summary", options, report, report, [run / "metrics.json"]).run()
+    options = as_overrides({"checkpoint": run, "what": "page", "out": page, "overwrite": True})
+    Stage("export", options, page, page, [run / "metrics.json"]).run()
