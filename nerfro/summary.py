@@ -37,6 +37,7 @@ class SummaryConfig:
     view: Any = None  # view of each figure, such as {torus: 3}; by default the view of median score
     # Insets of each figure in pixels, such as {torus: [[top, left, size], ...]}; by default where methods differ most.
     crops: Any = None
+    # Error maps of the report.
     error_map: Annotated[str, Literal["squared_error", "ssim", "lpips", "lpips_vgg", "flip"]] = "squared_error"
     overwrite: bool = False  # whether to replace files in `out`
 

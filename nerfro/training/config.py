@@ -84,8 +84,8 @@ class EvaluationConfig:
 class CheckpointConfig:
     """Interval between checkpoints: in seconds or in steps. Only the latest checkpoint is kept."""
 
-    every_seconds: Optional[Positive] = 60.0  # noqa: UP045
-    every_steps: Optional[Count] = None  # noqa: UP045
+    every_seconds: Optional[Positive] = 60.0  # noqa: UP045 - seconds between two checkpoints
+    every_steps: Optional[Count] = None  # noqa: UP045 - training steps between two checkpoints
 
 
 _EPOCHS = "a run has no epochs; set trainer.max_steps, trainer.max_time or evaluation.every"
@@ -172,13 +172,12 @@ REFUSED_ARGUMENTS: Mapping[str, str] = {
 class AuthorsConfig:
     """Settings of the authors of the paper for a scene, used by `paper_*` and `ablation_euler`."""
 
-    # Corners of the index grid, world units, and its vertices along each side.
+    # Corners of the index grid, world units.
     box_min: list[float] = dataclasses.field(default_factory=lambda: [-1.5] * 3)
     box_max: list[float] = dataclasses.field(default_factory=lambda: [1.5] * 3)
-    resolution: Resolution = 512
-    # Taps and standard deviation (voxels) of the smoothing kernel.
-    smoothing_size: Natural = 9
-    smoothing_sigma: Positive = 1.0
+    resolution: Resolution = 512  # vertices of the index grid along each side
+    smoothing_size: Natural = 9  # taps of the smoothing kernel
+    smoothing_sigma: Positive = 1.0  # standard deviation of the smoothing kernel, voxels
     num_steps: Count = 768  # number of Eikonal steps, N_c x N_e
     boundary_weight: NotNegative = 0.025  # weight of the boundary regularizer
     max_steps: Count = 200_000  # number of training steps

@@ -41,16 +41,16 @@ class ContentConfig:
     # `box`: a box, with the background outside of it. `all`: all of space, contracted outside of a ball, with the
     # background at infinity.
     space: str = "box"
-    # Corners of the box, world units; the ball is centred in it. None takes the bounds of the object, or for the ball
-    # the point that the cameras face.
+    # Lower corner of the box, world units; the ball is centred in the box. None takes the bounds of the object, or for
+    # the ball the point that the cameras face.
     box_min: Optional[list[float]] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    box_max: Optional[list[float]] = None  # noqa: UP045
+    box_max: Optional[list[float]] = None  # noqa: UP045 - upper corner of the box
     # Alternatively, an .npy file with the centre and the half sides of the box [2, 3], as Eikonal Fields stores them.
     box_file: Optional[str] = None  # noqa: UP045
-    # Radius of the ball and arc length of the first samples (world units), and number of cells of the finest grid along
-    # the cube around contracted space. None derives them from the cameras.
+    # Radius of the ball, world units. None derives this and the next settings from the cameras.
     radius: Optional[Positive] = None  # noqa: UP045
-    near: Optional[NotNegative] = None  # noqa: UP045
+    near: Optional[NotNegative] = None  # noqa: UP045 - arc length of the first samples, world units
+    # Number of cells of the finest grid along the cube around contracted space.
     cells: Optional[Count] = None  # noqa: UP045
 
 

@@ -14,18 +14,17 @@ from nerfro.allowed import Natural, NotNegative, Positive, checked
 class OptimizerConfig:
     """Adam with a log-linear learning rate and a sine warm-up (authors' code; mip-NeRF, section 4)."""
 
-    # Learning rate at the beginning and at the end of the run.
-    learning_rate: Positive = 5e-4
-    final_learning_rate: Positive = 5e-6
-    # Initial learning rates of other parameter groups, with the same decay; None for the common rate.
+    learning_rate: Positive = 5e-4  # initial learning rate
+    final_learning_rate: Positive = 5e-6  # learning rate at the end of the run
+    # Initial learning rate of the background, with the same decay; None for the common rate.
     boundary_learning_rate: Optional[Positive] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    medium_learning_rate: Optional[Positive] = None  # noqa: UP045 - refractive indices
-    absorption_learning_rate: Optional[Positive] = None  # noqa: UP045 - absorption coefficients
-    exposure_learning_rate: Optional[Positive] = None  # noqa: UP045
-    medium_start: Natural = 0  # steps before what bends rays learns, so that it is not misled by an unlearned scene
-    # Steps before the first in which the boundary alone learns, from rays that miss the content's box; and steps after
-    # which it learns again, from all rays: a scene that is not learned would be painted on it.
-    boundary_steps: Natural = 0
+    medium_learning_rate: Optional[Positive] = None  # noqa: UP045 - of refractive indices; None for the common rate
+    # Initial learning rate of absorption coefficients; None for the common rate.
+    absorption_learning_rate: Optional[Positive] = None  # noqa: UP045
+    exposure_learning_rate: Optional[Positive] = None  # noqa: UP045 - of exposures; None for the common rate
+    medium_start: Natural = 0  # step at which refractive indices begin to learn, after the scene is roughly known
+    boundary_steps: Natural = 0  # steps that pretrain the background with rays that miss the content's box
+    # Step at which the background resumes learning, from all rays; earlier, it would learn the colours of the content.
     boundary_start: Natural = 0
     warmup_steps: Natural = 2500  # length of the warm-up; 0 for none
     warmup_factor: NotNegative = 0.01  # factor of the learning rate at its first step

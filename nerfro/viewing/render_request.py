@@ -34,13 +34,13 @@ class RenderConfig:
     path: Optional[str] = None  # path around the object: orbit, spiral, arc or dolly; or FILE.json of cameras
     frames: Count = 120  # number of frames of the film
     seconds: Positive = 5.0  # duration of the film
-    # Start of the path: degrees around the object and above, and distance from its centre in world units.
-    azimuth: float = 0.0
-    elevation: Annotated[float, Range(at_least=-90, at_most=90)] = 10.0
-    distance: Optional[Positive] = None  # by default the distance of the photographs
+    azimuth: float = 0.0  # start of the path, degrees around the object
+    elevation: Annotated[float, Range(at_least=-90, at_most=90)] = 10.0  # start of the path, degrees above the object
+    # Distance from the centre of the object at the start, world units; by default that of the photographs.
+    distance: Optional[Positive] = None
     views: Optional[str] = None  # cameras of a split of the data, such as `test`, or one of them, such as `test:3`
-    # Camera of a still image, and the point in the image's centre (by default the object's centre); world units.
-    position: Optional[list[float]] = None
+    position: Optional[list[float]] = None  # position of the camera of a still image, world units
+    # Point in the centre of the still image, world units; by default the centre of the object.
     target: Optional[list[float]] = None
     fov: Optional[Angle] = None  # horizontal field of view, degrees; by default that of the photographs
     resolution: Any = None  # width in pixels, or [width, height]; by default that of the photographs
