@@ -12,20 +12,20 @@ import inspect
 import re
 import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
 
 from nerfro.__main__ import commands
-from nerfro.allowed import Range
+from nerfro.allowed import Range, check_settings
 from nerfro.paths import CONF_DIR
 from nerfro.registry import KINDS, Plugin, discover, plugins
 from nerfro.subdivision import Subdivision, SubdivisionChanges
-from nerfro.training.config import REFUSED_ARGUMENTS, TrainerConfig
+from nerfro.training.config import REFUSED_ARGUMENTS, TrainConfig, TrainerConfig
 
 _TOOLS = re.compile(r"#\s*(noqa|type:).*?(?= - (?!OmegaConf)|#|$)")  # comments for linters
 _CHOOSE = {"loss": "+loss.NAME.weight=0.1", "callbacks": "+callbacks=NAME"}
@@ -54,23 +54,24 @@ def commands_page() -> str:
     ]
     for name, purpose in commands().items():
         text.append(f"## {name}\n\n{_sentence(purpose)}\n")
-        found = _schema(name)
         if name == "train":
             text.append("All settings are listed in [configuration](configuration.md).\n")
-        elif found is not None:
-            text.append(_table(_settings(*found)))
+        elif (found := command_schema(name)) is not None:
+            schema, folder = found
+            yaml = (folder / f"{name}.yaml").read_text(encoding="utf-8")
+            comments = dict(re.findall(r"^(\w+):.*?\s# (.*)$", yaml, re.MULTILINE))
+            text.append(_table(_settings(schema, composed(name), comments)))
     return "\n".join(text)
 
 
 def configuration_page() -> str:
-    schema, composed, _ = _schema("train")  # type: ignore[misc]
     text = [
         "# Configuration of a training\n",
         "Settings of `python -m nerfro.train` with the defaults of `conf/train.yaml`. Options of components, such as "
         "`field.*`, are in [plugins](plugins.md). This page is generated from the configuration.\n",
         "## General\n",
     ]
-    rows = list(_settings(schema, composed, {}))
+    rows = list(_settings(TrainConfig, composed("train"), {}))
     text.append(_table(row for row in rows if "." not in row[0]))
     sections = dict.fromkeys(row[0].split(".")[0] for row in rows if "." in row[0])
     for section in sections:
@@ -124,25 +125,32 @@ def _google_docstring(docstring: str) -> tuple[str, dict[str, str]]:
     return parts[0].strip(), explained
 
 
-def _schema(command: str) -> tuple[type, DictConfig, dict[str, str]] | None:
-    """Return the dataclass, the composed configuration and the comments of the YAML file of a command."""
+def command_schema(command: str) -> tuple[type, Path] | None:
+    """Return the dataclass of the options of a command, and the folder of its YAML file; None without options."""
     module = importlib.import_module(f"nerfro.{command}")
     for node in ast.walk(ast.parse(inspect.getsource(module))):
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "entry_point":
-            schema = getattr(module, ast.unparse(node.args[1]))
-            folder = CONF_DIR if len(node.args) < 3 else eval(ast.unparse(node.args[2]), {"CONF_DIR": CONF_DIR})
-            ConfigStore.instance().store(name=f"{command}_schema", node=schema, provider="nerfro")
-            with initialize_config_dir(str(folder), version_base="1.3"):
-                composed = compose(command)
-            lines = re.findall(
-                r"^(\w+):.*?\s# (.*)$", (folder / f"{command}.yaml").read_text(encoding="utf-8"), re.MULTILINE
-            )
-            return schema, composed, dict(lines)
+            folder = CONF_DIR / command
+            return getattr(module, ast.unparse(node.args[1])), folder if folder.is_dir() else CONF_DIR
     return None
 
 
+def composed(command: str, overrides: Sequence[str] = ()) -> DictConfig:
+    """Compose the configuration of a command as its entry point does."""
+    found = command_schema(command)
+    assert found is not None, f"{command} has no options"
+    schema, folder = found
+    ConfigStore.instance().store(name=f"{command}_schema", node=schema, provider="nerfro")
+    with initialize_config_dir(str(folder), version_base="1.3"):
+        config = compose(command, list(overrides), return_hydra_config=True)
+    with open_dict(config):
+        del config["hydra"]
+    check_settings(config, schema)
+    return config
+
+
 def _settings(
-    schema: type, composed: Any, comments: dict[str, str], prefix: str = ""
+    schema: type, values: Any, comments: dict[str, str], prefix: str = ""
 ) -> Iterator[tuple[str, str, object, str]]:
     """Yield name, type, default and explanation of each setting of a dataclass and of nested dataclasses."""
     hints = get_type_hints(schema, include_extras=True)
@@ -154,14 +162,16 @@ def _settings(
         if field.name.startswith("_") or field.name in refused:
             continue
         if dataclasses.is_dataclass(hint):
-            yield from _settings(hint, composed[field.name], {}, f"{name}.")
+            yield from _settings(hint, values[field.name], {}, f"{name}.")
             continue
-        default = OmegaConf.to_container(composed, resolve=False).get(field.name, field.default)
+        default = OmegaConf.to_container(values, resolve=False).get(field.name, field.default)
         text = comments.get(field.name) or explained.get(field.name, "")
         if schema is TrainerConfig and not text:
             text = "as in `lightning.Trainer`"
-        if field.name in ("data", "camera", "medium", "field", "boundary", "model", "path", "points", "logger"):
-            text, default = "plugin of this type", _choice(default)
+        if hint is Any and isinstance(default, dict):
+            kind = name.replace(".", "/")
+            text = f"component, see [{kind}](plugins.md#{kind.replace('/', '')})" if kind in KINDS else text
+            default = _choice(default)
         if isinstance(default, dict) and default:
             default = ", ".join(default) if field.name == "loss" else default
         yield name, _type(hint), "required" if default == MISSING else default, text
@@ -170,7 +180,7 @@ def _settings(
 def _choice(default: object) -> object:
     """Return the registered name of a component for its configuration."""
     target = default.get("_target_") if isinstance(default, dict) else None
-    return next((plugin.name for plugin in plugins() if plugin.target == target), default and "see conf/")
+    return next((plugin.name for plugin in plugins() if plugin.target == target), "see `conf/`" if default else default)
 
 
 def _field_comments(schema: type) -> dict[str, str]:
@@ -211,7 +221,8 @@ def _type(hint: Any) -> str:
 
 def _table(rows: Any) -> str:
     lines = [
-        f"| `{name}` | {_cell(kind)} | {_default(default)} | {_cell(_sentence(text))} |" for name, kind, default, text in rows
+        f"| `{name}` | {_cell(kind)} | {_default(default)} | {_cell(_sentence(text))} |"
+        for name, kind, default, text in rows
     ]
     return "\n".join(["| option | type | default | meaning |", "|---|---|---|---|", *lines, ""]) if lines else ""
 
@@ -220,7 +231,7 @@ def _default(value: object) -> str:
     if value is None:
         return "null"
     text = str(value).lower() if isinstance(value, bool) else str(value)
-    return text if value == "required" else f"`{_cell(text)}`" if text else ""
+    return text if value in ("required", "see `conf/`") else f"`{_cell(text)}`" if text else "empty"
 
 
 def _cell(text: str) -> str:

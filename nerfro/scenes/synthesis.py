@@ -24,9 +24,9 @@ CAPTURES = ("dolphin_capture",)
 class ViewCounts:
     """Number of views per split."""
 
-    train: Count = MISSING
-    val: Count = MISSING
-    test: Count = MISSING
+    train: Count = MISSING  # number of training views
+    val: Count = MISSING  # number of validation views
+    test: Count = MISSING  # number of test views
 
 
 @dataclass

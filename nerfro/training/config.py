@@ -172,8 +172,9 @@ REFUSED_ARGUMENTS: Mapping[str, str] = {
 class AuthorsConfig:
     """Settings of the authors of the paper for a scene, used by `paper_*` and `ablation_euler`."""
 
-    # Corners of the index grid, world units.
+    # Lower corner of the index grid, world units.
     box_min: list[float] = dataclasses.field(default_factory=lambda: [-1.5] * 3)
+    # Upper corner of the index grid, world units.
     box_max: list[float] = dataclasses.field(default_factory=lambda: [1.5] * 3)
     resolution: Resolution = 512  # vertices of the index grid along each side
     smoothing_size: Natural = 9  # taps of the smoothing kernel
