@@ -58,7 +58,7 @@ def test_plugins_of_the_guide_train_where_rays_split(
     assert "2 steps in" in finished.out
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/sharing.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/guides/export_and_share.md"])
 def test_code_that_uses_a_run_executes(
     page: str, train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
 ) -> None:

@@ -40,7 +40,7 @@ def write_calibrated(
     points: Float[np.ndarray, "P 3"],
     options: list[str],
 ) -> list[str]:
-    """Write the data set (see docs/data.md), calibration.json and cameras.png.
+    """Write the data set (see docs/guides/data_formats.md), calibration.json and cameras.png.
 
     Args:
         out: folder of the data set.

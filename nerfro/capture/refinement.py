@@ -57,7 +57,7 @@ _VALIDATE_EVERY = 25  # steps
 _MAX_INCREASE = 0.03
 # A surface is accepted if the validation error decreases by at least this fraction. A wrong surface also explains some
 # of the reflections, the tint and the interior: errors decreased by 0.012 to 0.11 for better surfaces, and by up to
-# 0.009 for worse ones (docs/capture.md).
+# 0.009 for worse ones (docs/lab/surface_refinement.md).
 _MIN_GAIN = 0.01
 _BLUR_SAMPLES = 32
 
@@ -79,7 +79,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class RefinementSettings:
-    """Settings of the refinement. The defaults were chosen on the wavy body and on `starlamp` (docs/capture.md).
+    """Settings of the refinement. The defaults were chosen on the wavy body and on `starlamp` (docs/lab/surface_refinement.md).
 
     Attributes:
         stages: stages of the descent. Each stage starts with the surface of the smallest validation error. The first

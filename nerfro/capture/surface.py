@@ -44,7 +44,7 @@ def read_silhouettes(views: Views, has_box: bool) -> Silhouettes:
     """
     if views.masks is None:
         raise NerfroError(
-            "the data set has no masks, and the visual hull needs masks; docs/capture.md explains where to put masks "
+            "the data set has no masks, and the visual hull needs masks; docs/guides/masks.md explains where to put masks "
             "and how to make them"
         )
     masks = torch.stack(list(views.masks))

@@ -160,11 +160,11 @@ def list_images(folder: Path) -> list[Path]:
         NerfroError: the folder does not exist or holds no image.
     """
     if not folder.is_dir():
-        raise NerfroError(f"{folder} is not a folder; it should hold the images, see docs/data.md")
+        raise NerfroError(f"{folder} is not a folder; it should hold the images, see docs/guides/data_formats.md")
     images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
     images = [path for path in images if not path.name.startswith(("mask_", "."))]
     if not images:
-        raise NerfroError(f"{folder} holds no image; see docs/data.md")
+        raise NerfroError(f"{folder} holds no image; see docs/guides/data_formats.md")
     return sorted(images)
 
 

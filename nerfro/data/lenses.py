@@ -108,7 +108,7 @@ class Lens:
 
 
 def read_lens(file: Mapping[str, Any], frame: Mapping[str, Any], size: tuple[int, int], where: str) -> Lens:
-    """Read the lens of a frame from the keys of a transforms file; docs/data.md lists the keys.
+    """Read the lens of a frame from the keys of a transforms file; docs/guides/data_formats.md lists the keys.
 
     A key of the frame takes precedence over the file, and a focal length over a field of view.
 

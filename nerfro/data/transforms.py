@@ -56,7 +56,7 @@ def find_splits(root: Path) -> dict[str, Path]:
     found |= {path.stem.removeprefix("transforms_"): path for path in root.glob("transforms_*.json")}
     if not found:
         raise NerfroError(
-            f"data.root={root} holds no transforms_<split>.json; give the folder of a data set, see docs/data.md"
+            f"data.root={root} holds no transforms_<split>.json; give the folder of a data set, see docs/guides/data_formats.md"
         )
     rank = {name: i for i, name in enumerate(SPLITS)}
     return {name: found[name] for name in sorted(found, key=lambda name: (rank.get(name, len(rank)), name))}
@@ -81,7 +81,7 @@ def parse_manifest(path: Path, mask_key: str = "mask_path", skip_missing: bool =
     document = read_json(path, "check its permissions")
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list):
-        raise NerfroError(f"{path} has no list 'frames'; see docs/data.md for the format")
+        raise NerfroError(f"{path} has no list 'frames'; see docs/guides/data_formats.md for the format")
     if not frames:
         raise NerfroError(f"{path} has an empty list 'frames'; a split needs at least one")
     names = [_frame_name(f"{path}: frame {i}", frame) for i, frame in enumerate(frames)]
@@ -106,7 +106,7 @@ def parse_manifest(path: Path, mask_key: str = "mask_path", skip_missing: bool =
 def _frame_name(where: str, entry: object) -> str:
     """Check the types in one entry of `frames`, and return the path of its image."""
     if not isinstance(entry, dict):
-        raise NerfroError(f"{where} is not an object; see docs/data.md for the format")
+        raise NerfroError(f"{where} is not an object; see docs/guides/data_formats.md for the format")
     for key in ("file_path", "transform_matrix"):
         if entry.get(key) is None:
             raise NerfroError(f"{where} has no '{key}'; add it or take the frame out")

@@ -153,7 +153,7 @@ class OverfittingWarning(Callback):
         return (
             f"the model overfits: validation PSNR is {validation:.1f} dB after {step} steps{decrease}; training PSNR "
             f"is {training:.1f} dB. Take more photographs, check the poses and, for glass, surface and index "
-            f"(medium...){shorter}; see docs/real.md, Few photographs"
+            f"(medium...){shorter}; see docs/tutorials/photographs.md, Few photographs"
         )
 
     def state_dict(self) -> dict[str, Any]:

@@ -66,7 +66,7 @@ def test_photographs_known_by_heart_are_told_once(learn: Callable[..., Any], noi
     assert finished.code == 0, finished.err
     told = [line for line in finished.out.splitlines() if LINE in line]
     assert len(told) == 1
-    assert "docs/real.md, Few photographs" in told[0]
+    assert "docs/tutorials/photographs.md, Few photographs" in told[0]
     with (tmp_path / "run" / "csv" / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     held = [float(row["val/psnr"]) for row in rows if row["val/psnr"]]
