@@ -117,7 +117,7 @@ def test_from_photographs_to_a_table(
     capsys: pytest.CaptureFixture[str],
     train_here: Callable,
 ) -> None:
-    """The commands of docs/lab/simulated_capture.md as each prints the next, on fewer and smaller photographs, which are kept."""
+    """The commands of docs/lab/simulated_capture.md as each prints the next, with few small photographs."""
     pytest.importorskip("pyapriltags")
     # Shares of pixels to 1 / 16 are enough for a hull of 48 voxels.
     monkeypatch.setattr(path_tracer, "SILHOUETTE_PLACES", path_tracer.SILHOUETTE_PLACES[::8])

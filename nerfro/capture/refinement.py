@@ -79,7 +79,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class RefinementSettings:
-    """Settings of the refinement. The defaults were chosen on the wavy body and on `starlamp` (docs/lab/surface_refinement.md).
+    """Settings of the refinement. docs/lab/surface_refinement.md describes how the defaults were chosen.
 
     Attributes:
         stages: stages of the descent. Each stage starts with the surface of the smallest validation error. The first

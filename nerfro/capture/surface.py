@@ -44,8 +44,8 @@ def read_silhouettes(views: Views, has_box: bool) -> Silhouettes:
     """
     if views.masks is None:
         raise NerfroError(
-            "the data set has no masks, and the visual hull needs masks; docs/guides/masks.md explains where to put masks "
-            "and how to make them"
+            "the data set has no masks, and the visual hull needs masks; docs/guides/masks.md explains where to put "
+            "masks and how to make them"
         )
     masks = torch.stack(list(views.masks))
     coverage = (masks > 0.5).flatten(1).float().mean(1)

@@ -56,7 +56,8 @@ def find_splits(root: Path) -> dict[str, Path]:
     found |= {path.stem.removeprefix("transforms_"): path for path in root.glob("transforms_*.json")}
     if not found:
         raise NerfroError(
-            f"data.root={root} holds no transforms_<split>.json; give the folder of a data set, see docs/guides/data_formats.md"
+            f"data.root={root} holds no transforms_<split>.json; give the folder of a data set, see "
+            "docs/guides/data_formats.md"
         )
     rank = {name: i for i, name in enumerate(SPLITS)}
     return {name: found[name] for name in sorted(found, key=lambda name: (rank.get(name, len(rank)), name))}
