@@ -95,6 +95,7 @@ COMMAND = re.compile(r"python (?:-m nerfro\.(\w+)|benchmarks/processor_time\.py)
 FLAG = re.compile(r" (?:--cfg \w+|-p \S+|-m|\.\.\.)(?= |$)", re.MULTILINE)
 
 
+@functools.cache
 def entry_points() -> dict[str, tuple[type, tuple[str, ...]]]:
     found = {}
     for file in PACKAGE_DIR.glob("*.py"):
