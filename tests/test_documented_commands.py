@@ -1,0 +1,122 @@
+"""The commands and settings in README and documentation exist."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import re
+import shlex
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
+
+from nerfro.allowed import check_names, check_settings
+from nerfro.cli import _quoted, renamed_override
+from nerfro.paths import CONF_DIR, PACKAGE_DIR
+from nerfro.registry import KINDS, discover, plugins
+
+CHECKOUT = PACKAGE_DIR.parent
+PAGES = {
+    str(file.relative_to(CHECKOUT)): file.read_text(encoding="utf-8")
+    for file in (CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").rglob("*.md")))
+    if file.is_file() and file.parent.name != "lab"  # lab notes record the commands of their time
+}
+pytestmark = pytest.mark.skipif(len(PAGES) < 2, reason="there is no checkout with docs")
+
+BLOCK = re.compile(r"^```\w*\n(.*?)^```", re.DOTALL | re.MULTILINE)
+PLUGIN = re.compile(r"^```python\n# plugins/(\w+\.py)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+COMMAND = re.compile(r"python (?:-m nerfro\.([a-z]+)|benchmarks/processor_time\.py)(?= |$)(.*)", re.MULTILINE)
+FLAG = re.compile(r" (?:--cfg \w+|-p \S+|-m|\.\.\.)(?= |$)", re.MULTILINE)
+# The schema of a command, and its options that are texts.
+ENTRY_POINT = re.compile(r'^@entry_point\("(\w+)", (\w+).*?(?:verbatim=\((.*)\))?\)', re.MULTILINE)
+
+
+@functools.cache
+def entry_points() -> dict[str, tuple[type, tuple[str, ...]]]:
+    found = {}
+    for file in PACKAGE_DIR.glob("*.py"):
+        for command, schema, verbatim in ENTRY_POINT.findall(file.read_text(encoding="utf-8")):
+            cls = getattr(import_module(f"nerfro.{file.stem}"), schema)
+            found[command] = cls, tuple(re.findall(r"\w+", verbatim))
+    return found
+
+
+def commands(page: str) -> Iterator[tuple[str, list[str]]]:
+    """Yield the commands in the blocks of a page with their options."""
+    for block in BLOCK.findall(PAGES[page].replace("\\\n", " ")):
+        for command, options in COMMAND.findall(block):
+            if command != "plugins":
+                yield command or "train", shlex.split(FLAG.sub("", options), comments=True)
+
+
+@functools.cache
+def composed(command: str, choices: tuple[str, ...]) -> DictConfig:
+    """Compose the configuration of a command with options that choose members of groups."""
+    ConfigStore.instance().store(name=f"{command}_schema", node=entry_points()[command][0], provider="nerfro")
+    folder = CONF_DIR if (CONF_DIR / f"{command}.yaml").is_file() else CONF_DIR / command
+    with initialize_config_dir(str(folder), version_base="1.3"):
+        return compose(command, list(choices))
+
+
+def require_valid(command: str, options: list[str]) -> None:
+    """Raise an error unless a command accepts the options. Hydra composes only the choices of groups, to save time."""
+    schema, verbatim = entry_points()[command]
+    assert [renamed_override(option) for option in options] == options, "an old name"
+    # Of a sweep the first value; no patterns, and no launchers, which may not be installed.
+    options = [re.sub(r"^([^=]+=[^,[{]+),[^]}]*$", r"\1", option) for option in options if "(" not in option]
+    options = [_quoted(option, verbatim) for option in options if not re.match("hydra[/.]launcher", option)]
+    choices, settings = [], []
+    for override in OverridesParser.create().parse_overrides(options):
+        key = override.key_or_group
+        is_choice = key in KINDS or (CONF_DIR / key).is_dir() or override.package or key.startswith("hydra.")
+        (choices if is_choice else settings).append(override)
+    config = copy.deepcopy(composed(command, tuple(str(choice.input_line) for choice in choices)))
+    for setting in settings:
+        OmegaConf.update(config, setting.key_or_group, setting.value(), force_add=setting.is_add())
+    check_names(config)
+    check_settings(config, schema)
+
+
+@pytest.fixture
+def documented_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, restored_registry: None) -> None:
+    """Register the plugins that the pages define."""
+    for text in PAGES.values():
+        for name, source in PLUGIN.findall(text):
+            (tmp_path / name).write_text(source)
+    monkeypatch.setenv("NERFRO_PLUGINS", str(tmp_path))
+    discover()
+
+
+@pytest.mark.usefixtures("documented_plugins")
+def test_commands_have_valid_options() -> None:
+    for page in PAGES:
+        for command, options in commands(page):
+            try:
+                require_valid(command, options)
+            except Exception as error:
+                raise AssertionError(f"{page}: python -m nerfro.{command} {shlex.join(options)}") from error
+
+
+def nested_names(config: DictConfig, prefix: str = "") -> Iterator[str]:
+    for key in config:
+        yield f"{prefix}{key}"
+        if not OmegaConf.is_missing(config, key) and isinstance(config[key], DictConfig):
+            yield from nested_names(config[key], f"{prefix}{key}.")
+
+
+@pytest.mark.usefixtures("documented_plugins")
+def test_settings_in_the_text_exist() -> None:
+    known = {name for schema, _ in entry_points().values() for name in nested_names(OmegaConf.structured(schema))}
+    for plugin in plugins():
+        group = plugin.kind.replace("/", ".")
+        known |= {f"{node}.{name}" for name, *_ in plugin.fields() for node in (group, f"{group}.{plugin.name}")}
+    for page, text in PAGES.items():
+        # The keys of `methods` and `scenes` are the user's.
+        used = set(re.findall(r"`\+?((?!hydra|methods|scenes)[a-z_]+(?:\.[a-z0-9_]+)+)=[^`]*`", BLOCK.sub("", text)))
+        assert used - known == set(), page
