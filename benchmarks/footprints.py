@@ -11,7 +11,6 @@ The second form renders test views of a trained run, with lookups of the learned
 from __future__ import annotations
 
 import argparse
-import importlib
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -36,6 +35,7 @@ from nerfro.rays import Rays
 from nerfro.rendering import Renderer
 from nerfro.samplers.snell import Snell
 from nerfro.scenes.skies import lat_long_texture
+from nerfro.scenes.synthesis import find_scene
 from nerfro.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
 from nerfro.types import Exits
 
@@ -135,7 +135,7 @@ def main() -> None:
     if arguments.run is not None:
         trained_run(arguments.run, arguments.views)
         return
-    scene = importlib.import_module(f"nerfro.scenes.{arguments.sky}")
+    scene = find_scene(arguments.sky)
     sky = torch.from_numpy(lat_long_texture(scene.sky, arguments.texture))
     finest = arguments.texture // 2  # texels along a face's side; by default 0.18 degrees
     pyramid = Pyramid(lat_long.sample(sky.float(), cube_map.texel_directions(finest), 4 * finest))

@@ -27,10 +27,14 @@ from nerfro.capture.boards import tag_detector, twelve_faces
 from nerfro.data.opencv import OpenCVData
 from nerfro.geometry.mesh import load_mesh
 from nerfro.paths import CONF_DIR
-from nerfro.scenes import dataset, dolphin_capture, path_tracer
-from nerfro.scenes.dolphin_capture import AIM, board_to_world
+from nerfro.registry import discover
+from nerfro.scenes import path_tracer
 from nerfro.scenes.scene import Scene
 from nerfro.scenes.synthesis import SynthesizeConfig, synthesize
+
+discover()
+photographs = import_module("nerfro_plugins.scenes.photographs")
+dolphin_capture = import_module("nerfro_plugins.scenes.dolphin_capture")
 
 
 def photograph(folder: Path, **options: object) -> Path:
@@ -38,7 +42,7 @@ def photograph(folder: Path, **options: object) -> Path:
     file = OmegaConf.load(CONF_DIR / "synthesize" / "synthesize.yaml")
     plain = {key: file[key] for key in file if key not in ("defaults", "hydra")}
     asked = {"scene": "dolphin_capture", "out": str(folder), **options}
-    return synthesize(OmegaConf.merge(OmegaConf.structured(SynthesizeConfig), plain, asked))[1]
+    return synthesize(OmegaConf.merge(OmegaConf.structured(SynthesizeConfig), plain, asked)).folder
 
 
 def outline_of(points: np.ndarray, height: int, width: int) -> np.ndarray:
@@ -52,7 +56,7 @@ def outline_of(points: np.ndarray, height: int, width: int) -> np.ndarray:
 def _built_quickly() -> Iterator[None]:
     """The scene is built once, its room is blurred and its light noisy: poses and outlines do not depend on these."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dataset, "BAKING_SPP", 8)
+        patch.setattr(photographs, "BAKING_SPP", 8)
         panels = dolphin_capture.room_panels
         patch.setattr(dolphin_capture, "room_panels", lambda spacing: panels(5 * spacing))
         patch.setattr(dolphin_capture, "build", cache(dolphin_capture.build))
@@ -92,7 +96,7 @@ def test_tags_are_photographed_where_the_true_cameras_see_them(few: Path) -> Non
         grey = np.uint8(np.rint(255 * image.mean(-1).numpy()))
         found = tag_detector(board.family).detect(grey)
         assert len(found) > 5
-        places = np.stack([board_to_world(corners[tag.tag_id]).mean(0) for tag in found])
+        places = np.stack([dolphin_capture.board_to_world(corners[tag.tag_id]).mean(0) for tag in found])
         pixels, _ = views.cameras.project(torch.from_numpy(places).float())
         error = np.linalg.norm(pixels[view].numpy() - [tag.corners.mean(0) for tag in found], axis=1)
         assert np.median(error) < 0.3
@@ -101,7 +105,7 @@ def test_tags_are_photographed_where_the_true_cameras_see_them(few: Path) -> Non
 def test_only_what_is_not_on_disk_is_rendered_again(few: Path, tmp_path: Path) -> None:
     settings = OmegaConf.create(json.loads((few / "truth" / "meta.json").read_text())["settings"])
     shutil.copytree(few, tmp_path / "copy")
-    data = dataset.Photographs(settings, Mock(spec=Scene, aim=AIM), tmp_path / "copy")
+    data = photographs.Photographs(settings, Mock(spec=Scene, aim=dolphin_capture.AIM), tmp_path / "copy")
     planned = data.planned()
     assert data.missing(planned) == []
     (tmp_path / "copy" / planned[1].mask_path).unlink()

@@ -103,7 +103,7 @@ def test_sky_picture_is_the_sky_of_the_pictures():
 
 @pytest.mark.usefixtures("mitsuba")
 def test_interrupted_rendering_goes_on_where_it_stopped(tmp_path):
-    _, folder = synthesize(small(tmp_path / "scene"))
+    folder = synthesize(small(tmp_path / "scene")).folder
     pictures = sorted(folder.rglob("r_*.png"))
     assert len(pictures) == 2 * 4
     before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in pictures}
@@ -120,7 +120,7 @@ def test_interrupted_rendering_goes_on_where_it_stopped(tmp_path):
 
 @pytest.mark.usefixtures("mitsuba")
 def test_another_data_set_is_replaced_only_on_request_and_strangers_survive(tmp_path):
-    _, folder = synthesize(small(tmp_path / "scene"))
+    folder = synthesize(small(tmp_path / "scene")).folder
     (folder / "notes.txt").write_text("mine")
     assert (folder / "interior.ply").is_file()
     before = (folder / "train" / "r_000.png").read_bytes()

@@ -1,3 +1,4 @@
 """Synthetic scenes of refractive objects: modelled procedurally, rendered by a path tracer."""
 
-SCENES = ("torus", "ship", "deerglobe", "starlamp")
+SCENES: dict[str, str] = {"torus": "nerfro.scenes.torus"}
+"""Module of each scene, by name; plugins add scenes. `build(spacing)` of the module returns the `Scene`."""

@@ -22,19 +22,14 @@ from nerfro.files import lat_long
 from nerfro.files.atomic import write_atomically
 from nerfro.files.images import save_image
 from nerfro.light import to_srgb
-from nerfro.scenes.baking import bake
 from nerfro.scenes.path_tracer import Pinhole
 from nerfro.scenes.scene import Scene
 from nerfro.scenes.skies import lat_long_texture
-from nerfro.scenes.viewpoints import directions_on_sphere, hand_held, look_at_origin
+from nerfro.scenes.viewpoints import directions_on_sphere, look_at_origin
 
 CAMERA_ANGLE_X = 0.6911112070083618  # field of view of the NeRF synthetic scenes and of the paper's scenes
 CAMERA_DISTANCE = 4.03
 SPLITS = ("train", "val", "test")
-PHOTOGRAPHER_DISTANCE, ELEVATIONS, LAPS = 4.5, (5.0, 68.0), 4
-# Focal length, and offset of the principal point from the centre of the image, relative to the width of the image.
-FOCAL, OFF_CENTRE = 1.18, (0.006, -0.005)
-BAKING_SPP = 256
 
 
 @dataclass(frozen=True)
@@ -68,6 +63,7 @@ class DataSet(ABC):
     FACTS: ClassVar[dict[str, Any]] = {}  # further content of META
     OPTIONS: ClassVar[tuple[str, ...]]  # options that change the images
     NOUN: ClassVar[str]
+    WIDTH: ClassVar[float]  # width of an image in the plane through the object, world units
 
     @property
     @abstractmethod
@@ -85,6 +81,10 @@ class DataSet(ABC):
     @abstractmethod
     def finish(self, planned: list[PlannedImage]) -> None:
         """Write the files that belong to the images; the cameras come last and mark the data set as complete."""
+
+    @abstractmethod
+    def next_command(self) -> str:
+        """Return what to do with the data set, with the command."""
 
     def lit(self) -> Scene:
         """Return the scene as the renderer receives the scene."""
@@ -120,7 +120,7 @@ class DataSet(ABC):
         versions |= {"python": platform.python_version(), "variant": mitsuba.variant()}
         meta = {"scene": self.config.scene, "ior": self.scene.ior, "tint": list(self.scene.tint)}
         meta |= {"absorption": list(self.scene.absorption), **self.FACTS}
-        _write_json(self.folder / self.META, {**meta, "settings": settings, "versions": versions})
+        write_json(self.folder / self.META, {**meta, "settings": settings, "versions": versions})
 
     def missing(self, planned: list[PlannedImage]) -> list[PlannedImage]:
         """Return the images without file or mask."""
@@ -143,6 +143,7 @@ class Views(DataSet):
     FACTS: ClassVar[dict[str, Any]] = {"box": ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5)), "near": 2.0, "far": 6.0}
     OPTIONS = ("resolution", "spp", "test_spp", "views", "fresnel", "seed")
     NOUN = "views"
+    WIDTH = CAMERA_DISTANCE * CAMERA_ANGLE_X
 
     @property
     def camera(self) -> Pinhole:
@@ -160,14 +161,14 @@ class Views(DataSet):
         return planned
 
     def write(self, image: PlannedImage, radiance: np.ndarray, coverage: np.ndarray) -> None:
-        _write_image(self.folder / image.mask_path, coverage)
-        _write_image(self.folder / image.image_path, to_srgb(radiance))
+        write_image(self.folder / image.mask_path, coverage)
+        write_image(self.folder / image.image_path, to_srgb(radiance))
 
     def finish(self, planned: list[PlannedImage]) -> None:
         assert self.scene.sky is not None
         sky = lat_long_texture(self.scene.sky, self.config.sky_height)
         self.scene.glass.save(self.folder / "mesh.ply")
-        _write_image(self.folder / "sky.png", to_srgb(sky))
+        write_image(self.folder / "sky.png", to_srgb(sky))
         if self.config.extras:
             self.scene.interior.save(self.folder / "interior.ply")
             lat_long.save_lat_long(self.folder / "sky.exr", torch.from_numpy(sky))
@@ -182,63 +183,11 @@ class Views(DataSet):
                 if view.image_path.startswith(f"{split}/")
             ]
             content = {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}
-            _write_json(self.folder / f"transforms_{split}.json", content)
+            write_json(self.folder / f"transforms_{split}.json", content)
 
-
-class Photographs(DataSet):
-    """Photographs and masks without poses, as from a real capture; the true poses and surfaces are in `truth/`."""
-
-    META = "truth/meta.json"
-    FILES = (
-        *("images/photo_*.png", "masks/photo_*.png"),
-        *(f"truth/{name}" for name in ("transforms_train.json", "mesh.ply", "interior.ply", "meta.json")),
-    )
-    OPTIONS = ("resolution", "photographs", "spp", "noise", "fresnel", "seed")
-    NOUN = "photographs"
-
-    @property
-    def camera(self) -> Pinhole:
-        width, height = self.config.resolution, self.config.resolution * 3 // 4
-        cx, cy = 0.5 * width + OFF_CENTRE[0] * width, 0.5 * height + OFF_CENTRE[1] * width
-        return Pinhole(width, height, FOCAL * width, cx, cy)
-
-    def lit(self) -> Scene:
-        return bake(self.scene, BAKING_SPP, self.config.variant)
-
-    def planned(self) -> list[PlannedImage]:
-        config = self.config
-        poses = hand_held(config.photographs, config.seed, self.scene.aim, PHOTOGRAPHER_DISTANCE, ELEVATIONS, LAPS)
-        return [
-            PlannedImage(f"images/{name}", f"masks/{name}", pose, config.spp, config.seed * 100_000 + index)
-            for index, pose in enumerate(poses)
-            for name in [f"photo_{index:03d}.png"]
-        ]
-
-    def write(self, image: PlannedImage, radiance: np.ndarray, coverage: np.ndarray) -> None:
-        """Write 8-bit sRGB with noise, and a mask in black and white.
-
-        Noise of constant strength in sRGB approximates the noise of counted photons after encoding.
-        """
-        grain = np.random.default_rng(image.seed).normal(scale=self.config.noise, size=radiance.shape)
-        _write_image(self.folder / image.mask_path, coverage >= 0.5)
-        _write_image(self.folder / image.image_path, to_srgb(np.clip(radiance, 0.0, 1.0)) + grain)
-
-    def finish(self, planned: list[PlannedImage]) -> None:
-        """Write the true surfaces, and the true cameras in the format `opencv`."""
-        camera, truth = self.camera, self.folder / "truth"
-        self.scene.glass.save(truth / "mesh.ply")
-        self.scene.interior.save(truth / "interior.ply")
-        frames = [
-            {
-                "file_path": f"../{photograph.image_path}",
-                "mask_path": f"../{photograph.mask_path}",
-                "transform_matrix": (photograph.pose @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
-            }
-            for photograph in planned
-        ]
-        matrix = [[camera.focal, 0.0, camera.cx], [0.0, camera.focal, camera.cy], [0.0, 0.0, 1.0]]
-        content = {"cam_mat": matrix, "w": camera.width, "h": camera.height, "frames": frames}
-        _write_json(truth / "transforms_train.json", content)
+    def next_command(self) -> str:
+        data = f"data.root={self.folder} medium.mesh={self.folder / 'mesh.ply'} medium.ior={self.scene.ior}"
+        return f"train on it: python -m nerfro.train {data}"
 
 
 def fingerprint(scene: Scene) -> str:
@@ -255,11 +204,11 @@ def fingerprint(scene: Scene) -> str:
     return digest.hexdigest()[:16]
 
 
-def _write_image(path: Path, image: np.ndarray) -> None:
+def write_image(path: Path, image: np.ndarray) -> None:
     """Write sRGB [H, W, 3] or coverage [H, W], clipped to [0, 1], as an 8-bit PNG, or bool [H, W] as a 1-bit PNG."""
     levels = image if image.dtype == bool else np.rint(np.clip(image, 0.0, 1.0) * 255).astype(np.uint8)
     save_image(path, Image.fromarray(levels), optimize=True)
 
 
-def _write_json(path: Path, content: dict[str, Any]) -> None:
+def write_json(path: Path, content: dict[str, Any]) -> None:
     write_atomically(path, json.dumps(content, indent=1) + "\n")

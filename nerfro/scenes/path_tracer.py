@@ -154,22 +154,10 @@ class PathTracer:
             "near_clip": 0.01,
             "far_clip": 100.0,
         }
-        return self._render(sensor, pose, spp, seed)
+        return self.render_sensor(sensor, pose, spp, seed)
 
-    def render_flat(self, to_world: np.ndarray, above: float, spp: int, seed: int) -> np.ndarray:
-        """Return the linear radiance [H, W, 3] of a rectangle along its normal, averaged over pixels.
-
-        Args:
-            to_world: matrix [4, 4] from the square [-1, 1]^2 of x (right) and y (up) to the world; z is the normal.
-            above: distance from the rectangle at which rays begin, world units.
-            spp, seed: as for `render`.
-        """
-        pose = to_world.copy()
-        pose[:3, 3] += above * to_world[:3, 2]
-        sensor = {"type": "orthographic", "near_clip": 0.1 * above, "far_clip": 10.0 * above}
-        return self._render(sensor, pose, spp, seed)
-
-    def _render(self, sensor: dict, pose: np.ndarray, spp: int, seed: int) -> np.ndarray:
+    def render_sensor(self, sensor: dict, pose: np.ndarray, spp: int, seed: int) -> np.ndarray:
+        """Render with a sensor of Mitsuba, given as a dictionary without pose and film; see `render`."""
         mi, camera = self.mitsuba, self.camera
         film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
         film |= {"pixel_format": "rgb", "component_format": "float32"}

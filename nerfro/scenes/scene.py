@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from nerfro.scenes.distance import Colour, Vector
 from nerfro.scenes.skies import Sky
 from nerfro.scenes.surface import Surface
+
+Vector = Sequence[float] | np.ndarray
+"""Three numbers along x, y, z."""
 
 
 @dataclass(frozen=True)
@@ -39,17 +42,6 @@ class Panel:
         columns = [0.5 * self.right, -0.5 * self.down, out / np.linalg.norm(out)]
         matrix[:3] = np.stack([*columns, self.corner + 0.5 * (self.right + self.down)], -1)
         return matrix
-
-
-def painted_panel(
-    corner: Vector, right: Vector, down: Vector, colour: Colour, spacing: float, glows: bool = False
-) -> Panel:
-    """Paint a rectangle with `colour`(points [..., 3]) -> sRGB [..., 3], one pixel every `spacing` world units."""
-    corner, right, down = (np.asarray(vector, np.float64) for vector in (corner, right, down))
-    width, height = (max(2, int(np.ceil(np.linalg.norm(edge) / spacing))) for edge in (right, down))
-    across, along = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
-    points = corner + across[None, :, None] * right + along[:, None, None] * down
-    return Panel(corner, right, down, np.clip(colour(points), 0.0, 1.0).astype(np.float32), glows)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,10 +28,6 @@ class Surface:
     normals: np.ndarray
     colours: np.ndarray | None = None
 
-    def moved(self, offset: Sequence[float] | np.ndarray) -> Surface:
-        """Return the surface translated by `offset` (world units)."""
-        return replace(self, vertices=(self.vertices + np.asarray(offset)).astype(np.float32))
-
     def as_trimesh(self) -> trimesh.Trimesh:
         """Return a trimesh with the same vertices in the same order."""
         colours = None if self.colours is None else np.rint(self.colours * 255).astype(np.uint8)
@@ -42,17 +38,6 @@ class Surface:
     def save(self, path: Path) -> None:
         """Write a binary PLY with normals and, if present, sRGB vertex colours."""
         write_atomically(path, trimesh.exchange.ply.export_ply(self.as_trimesh(), vertex_normal=True))
-
-
-def join(surfaces: Sequence[Surface]) -> Surface:
-    """Join coloured surfaces to one surface."""
-    offsets = np.cumsum([0] + [len(surface.vertices) for surface in surfaces[:-1]])
-    return Surface(
-        vertices=np.concatenate([surface.vertices for surface in surfaces]),
-        faces=np.concatenate([surface.faces + offset for surface, offset in zip(surfaces, offsets, strict=True)]),
-        normals=np.concatenate([surface.normals for surface in surfaces]),
-        colours=np.concatenate([surface.colours for surface in surfaces if surface.colours is not None]),
-    )
 
 
 def rounded_box(half_sides: Sequence[float] | np.ndarray, radius: float, edge_steps: int) -> Surface:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Optional
 
 from omegaconf import MISSING, DictConfig
@@ -13,11 +13,11 @@ from tqdm import tqdm
 from nerfro.allowed import Count, Natural, NotNegative, Positive, Range
 from nerfro.errors import NerfroError
 from nerfro.paths import user_path
-from nerfro.scenes import SCENES, dataset
+from nerfro.registry import discover
+from nerfro.scenes import SCENES
+from nerfro.scenes.dataset import DataSet, Views
 from nerfro.scenes.path_tracer import PathTracer, load_mitsuba
 from nerfro.scenes.scene import Scene
-
-CAPTURES = ("dolphin_capture",)
 
 
 @dataclass
@@ -51,23 +51,31 @@ class SynthesizeConfig:
     overwrite: bool = MISSING
 
 
-def build_scene(name: str, resolution: int) -> Scene:
-    """Model a scene, with colours as fine as half a pixel of images that are `resolution` pixels wide.
+def find_scene(name: str) -> ModuleType:
+    """Import the module of a scene of the package or of a plugin.
 
     Raises:
         NerfroError: the name is unknown.
     """
-    if name not in SCENES + CAPTURES:
-        raise NerfroError(f"unknown scene '{name}'; choose one of {', '.join(SCENES + CAPTURES)}")
-    if name in CAPTURES:
-        pixel = dataset.PHOTOGRAPHER_DISTANCE / (dataset.FOCAL * resolution)
-    else:
-        pixel = dataset.CAMERA_DISTANCE * dataset.CAMERA_ANGLE_X / resolution
-    return importlib.import_module(f"nerfro.scenes.{name}").build(spacing=max(0.5 * pixel, 0.0025))
+    discover()
+    if name not in SCENES:
+        raise NerfroError(f"unknown scene '{name}'; choose one of {', '.join(SCENES)}")
+    return importlib.import_module(SCENES[name])
 
 
-def synthesize(config: DictConfig) -> tuple[Scene, Path]:
-    """Render the missing images of a data set, and return the scene and the folder.
+def data_set_type(scene: ModuleType) -> type[DataSet]:
+    """Return the kind of images that a scene is rendered as, which its module may choose as `DATA_SET`."""
+    return getattr(scene, "DATA_SET", Views)
+
+
+def build_scene(name: str, resolution: int) -> Scene:
+    """Model a scene, with colours as fine as half a pixel of images that are `resolution` pixels wide."""
+    module = find_scene(name)
+    return module.build(spacing=max(0.5 * data_set_type(module).WIDTH / resolution, 0.0025))
+
+
+def synthesize(config: DictConfig) -> DataSet:
+    """Render the missing images of a data set.
 
     Args:
         config: resolved `SynthesizeConfig`.
@@ -81,7 +89,7 @@ def synthesize(config: DictConfig) -> tuple[Scene, Path]:
     ior = scene.ior if config.ior is None else config.ior
     scene = replace(scene, absorption=tuple(config.absorption), ior=ior)
     mitsuba = load_mitsuba(config.variant)  # a missing Mitsuba is reported before files are removed
-    data = (dataset.Photographs if config.scene in CAPTURES else dataset.Views)(config, scene, folder)
+    data = data_set_type(find_scene(config.scene))(config, scene, folder)
     data.prepare(mitsuba)
     planned = data.planned()
     waiting = data.missing(planned)
@@ -95,4 +103,4 @@ def synthesize(config: DictConfig) -> tuple[Scene, Path]:
                 data.write(image, radiance, tracer.silhouette(image.pose))
                 bar.update(image.spp)
     data.finish(planned)
-    return scene, folder
+    return data

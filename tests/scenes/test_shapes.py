@@ -1,16 +1,11 @@
-"""Shapes, distances, viewpoints and skies that the synthetic scenes are made of."""
+"""Shapes, viewpoints and skies that the synthetic scenes are made of."""
 
 from __future__ import annotations
 
-import importlib
-
 import numpy as np
 import pytest
-from matplotlib.path import Path as Polygon
 
 from nerfro.files import lat_long
-from nerfro.light import to_srgb
-from nerfro.scenes import SCENES, distance
 from nerfro.scenes.skies import lat_long_texture
 from nerfro.scenes.surface import rounded_box, sphere, torus_angles
 from nerfro.scenes.viewpoints import directions_on_sphere, look_at_origin
@@ -40,48 +35,6 @@ def test_sphere_and_torus_have_their_volumes():
     ring, angles = torus_angles(0.4, 0.15, spacing=0.015)
     assert_closed_and_outward(ring, 2 * np.pi**2 * 0.4 * 0.15**2, 5e-3)
     assert ((angles >= 0) & (angles < 2 * np.pi)).all()
-
-
-def test_triangulation_lies_on_the_surface_and_faces_outward():
-    centre, radius = np.array([0.1, -0.05, 0.02]), 0.3
-    surface = distance.triangulate(lambda p: distance.ball(p, centre, radius), centre - 0.31, centre + 0.31, 0.02)
-    outward = surface.vertices - centre
-    assert np.linalg.norm(outward, axis=1) == pytest.approx(radius, abs=1e-5)
-    assert surface.normals == pytest.approx(outward / radius, abs=1e-4)
-    assert_closed_and_outward(surface, 4 / 3 * np.pi * radius**3, 1e-2)
-
-
-@pytest.mark.parametrize(
-    "solid",
-    [
-        lambda p: distance.block(p, (0.1, 0, 0), (0.4, 0.3, 0.2), 0.05),
-        lambda p: distance.capsule(p, (-0.2, 0, 0), (0.3, 0.1, 0.2), 0.12, 0.05),
-        lambda p: distance.ellipsoid(p, (0, 0, 0.1), (0.4, 0.2, 0.3)),
-        lambda p: distance.star(p, 0.7, 0.35, 5),
-        lambda p: distance.smooth_union([distance.ball(p, (x, 0, 0), 0.2) for x in (-0.15, 0.15)], 0.1),
-    ],
-    ids=["block", "capsule", "ellipsoid", "star", "smooth_union"],
-)
-def test_distances_never_change_faster_than_the_way_travelled(solid):
-    """The bound that lets `triangulate` skip blocks."""
-    generator = np.random.default_rng(0)
-    points = generator.uniform(-0.8, 0.8, (4000, 3))
-    steps = generator.normal(size=(4000, 3)) * 10.0 ** generator.uniform(-3, 0, (4000, 1))
-    change = np.abs(solid(points + steps) - solid(points))
-    assert (change <= np.linalg.norm(steps, axis=1) * (1 + 1e-9) + 1e-12).all()
-
-
-def test_star_distance_agrees_with_the_polygon_it_stands_for():
-    outer, inner = 0.7, 0.3
-    angle = np.arange(10) * np.pi / 5
-    radius = np.where(np.arange(10) % 2 == 0, outer, inner)
-    corners = np.stack([radius * np.sin(angle), radius * np.cos(angle)], -1)
-    points = np.random.default_rng(1).uniform(-0.9, 0.9, (500, 3))
-    along = np.linspace(0, 1, 400)[:, None, None]
-    outline = (corners * (1 - along) + np.roll(corners, -1, 0) * along).reshape(-1, 2)
-    nearest = np.linalg.norm(points[:, None, [0, 2]] - outline, axis=-1).min(1)
-    inside = Polygon(corners).contains_points(points[:, [0, 2]])
-    assert distance.star(points, outer, inner, 5) == pytest.approx(np.where(inside, -nearest, nearest), abs=2e-3)
 
 
 def test_viewpoints_cover_the_whole_sphere_and_differ_between_splits():
@@ -118,21 +71,3 @@ def test_lat_long_texture_averages_over_each_pixel():
     assert texture[:4] == pytest.approx(1.0)
     assert texture[5:] == pytest.approx(0.0)
     assert texture[4] == pytest.approx(0.5, abs=0.2)  # the horizon runs through the middle of row 4
-
-
-@pytest.mark.parametrize("name", SCENES)
-def test_scene_is_closed_inside_the_box_and_worth_looking_at(name):
-    scene = importlib.import_module(f"nerfro.scenes.{name}").build(spacing=0.02)
-    glass = scene.glass.as_trimesh()
-    assert glass.is_watertight
-    assert glass.volume > 0
-    assert np.abs(scene.glass.vertices).max() < 0.9  # the box of the medium is [-1.5, 1.5]^3
-    sample = scene.interior.vertices[:: max(1, len(scene.interior.vertices) // 500)]
-    assert glass.contains(sample).all()
-    assert scene.interior.as_trimesh().is_watertight
-    assert scene.interior.as_trimesh().volume > 0
-    assert scene.interior.colours.std(0).min() > 0.1
-    sky = lat_long_texture(scene.sky, 32, 1)
-    assert sky.min() >= 0
-    assert sky.max() < 1  # 8-bit pictures never clip
-    assert to_srgb(sky).std((0, 1)).min() > 0.1

@@ -31,12 +31,20 @@ def bake(scene: Scene, spp: int, variant: str = "auto") -> Scene:
     baked = []
     for number, (panel, mean) in enumerate(zip(scene.panels, plain, strict=True)):
         if not panel.glows:
-            light = tracer.render_flat(panel.to_world, _ABOVE, spp, number) / to_linear(mean.image[:1, :1])
+            light = _light(tracer, panel, spp, number) / to_linear(mean.image[:1, :1])
             fine = resize(light, panel.image.shape, order=1, mode="edge", anti_aliasing=False)
             lit = np.clip(fine * to_linear(panel.image), 0.0, 1.0)
             panel = replace(panel, image=to_srgb(lit).astype(np.float32), glows=True)
         baked.append(panel)
     return replace(scene, panels=tuple(baked))
+
+
+def _light(tracer: PathTracer, panel: Panel, spp: int, seed: int) -> np.ndarray:
+    """Return the linear radiance [TEXELS, TEXELS, 3] of a panel along its normal."""
+    pose = panel.to_world
+    pose[:3, 3] += _ABOVE * pose[:3, 2]
+    sensor = {"type": "orthographic", "near_clip": 0.1 * _ABOVE, "far_clip": 10.0 * _ABOVE}
+    return tracer.render_sensor(sensor, pose, spp, seed)
 
 
 def _mean(panel: Panel) -> np.ndarray:

@@ -12,13 +12,11 @@ from dataclasses import replace
 import numpy as np
 from skimage.measure import marching_cubes
 
+from nerfro.scenes.scene import Vector
 from nerfro.scenes.surface import Surface
 
 Distance = Callable[[np.ndarray], np.ndarray]
 Colour = Callable[[np.ndarray], np.ndarray]
-
-Vector = Sequence[float] | np.ndarray
-"""Three numbers along x, y, z."""
 
 _BLOCK = 16  # cells per side of the blocks that are skipped where no surface passes
 
@@ -121,6 +119,22 @@ def painted(distance: Distance, colour: Colour, low: Vector, high: Vector, spaci
     surface = triangulate(distance, low, high, spacing)
     colours = np.clip(colour(surface.vertices.astype(np.float64)), 0.0, 1.0)
     return replace(surface, colours=colours.astype(np.float32))
+
+
+def moved(surface: Surface, offset: Vector) -> Surface:
+    """Translate a surface by `offset` (world units)."""
+    return replace(surface, vertices=(surface.vertices + np.asarray(offset)).astype(np.float32))
+
+
+def join(surfaces: Sequence[Surface]) -> Surface:
+    """Join coloured surfaces to one surface."""
+    offsets = np.cumsum([0] + [len(surface.vertices) for surface in surfaces[:-1]])
+    return Surface(
+        vertices=np.concatenate([surface.vertices for surface in surfaces]),
+        faces=np.concatenate([surface.faces + offset for surface, offset in zip(surfaces, offsets, strict=True)]),
+        normals=np.concatenate([surface.normals for surface in surfaces]),
+        colours=np.concatenate([surface.colours for surface in surfaces if surface.colours is not None]),
+    )
 
 
 def _gradient(distance: Distance, points: np.ndarray, step: float) -> np.ndarray:

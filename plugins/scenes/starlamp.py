@@ -7,10 +7,10 @@ import functools
 import numpy as np
 
 from nerfro.light import to_linear
-from nerfro.scenes import distance
 from nerfro.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
 from nerfro.scenes.scene import Scene
-from nerfro.scenes.surface import join
+
+from . import distance
 
 OUTER, INNER, HALF_DEPTH, ROUNDING = 0.84, 0.44, 0.34, 0.10
 PLANET_RADIUS, RING_RADII = 0.21, (0.27, 0.37)
@@ -144,4 +144,4 @@ def build(spacing: float) -> Scene:
     extent = np.full(3, 1.1 * RING_RADII[1])
     rings = distance.painted(ring, ring_colours, -extent, extent, min(spacing, 0.006))
     glass = distance.triangulate(star_prism, (-OUTER, -HALF_DEPTH, -OUTER), (OUTER, HALF_DEPTH, OUTER), GLASS_SPACING)
-    return Scene(ior=1.5, glass=glass, interior=join([planet, rings]), sky=sky)
+    return Scene(ior=1.5, glass=glass, interior=distance.join([planet, rings]), sky=sky)

@@ -11,11 +11,14 @@ import itertools
 import numpy as np
 
 from nerfro.capture.boards import TagBoard, twelve_faces
-from nerfro.scenes import distance, starlamp
-from nerfro.scenes.distance import Vector, ball, capsule, ellipsoid, mirrored, painted, smooth_union
 from nerfro.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
-from nerfro.scenes.scene import Panel, Scene, painted_panel
-from nerfro.scenes.surface import join
+from nerfro.scenes.scene import Panel, Scene, Vector
+
+from . import distance, starlamp
+from .distance import Colour, ball, capsule, ellipsoid, join, mirrored, moved, painted, smooth_union
+from .photographs import Photographs
+
+DATA_SET = Photographs
 
 WATER = 1.33
 GLOBE_RADIUS, GLOBE_FOOT, GLOBE_ROUNDING, GLOBE_SPACING = 0.62, 0.48, 0.06, 0.012  # foot: depth of the flat below
@@ -129,6 +132,17 @@ def board_panels(board: TagBoard) -> list[Panel]:
     return panels
 
 
+def painted_panel(
+    corner: Vector, right: Vector, down: Vector, colour: Colour, spacing: float, glows: bool = False
+) -> Panel:
+    """Paint a rectangle with `colour`(points [..., 3]) -> sRGB [..., 3], one pixel every `spacing` world units."""
+    corner, right, down = (np.asarray(vector, np.float64) for vector in (corner, right, down))
+    width, height = (max(2, int(np.ceil(np.linalg.norm(edge) / spacing))) for edge in (right, down))
+    across, along = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
+    points = corner + across[None, :, None] * right + along[:, None, None] * down
+    return Panel(corner, right, down, np.clip(colour(points), 0.0, 1.0).astype(np.float32), glows)
+
+
 def wooden(half_side: float, height: float, tone: Vector, seed: int) -> Panel:
     """A level square of planks along x, its middle at `height` above the origin."""
     colour = functools.partial(wood, tone=tone, seed=seed)
@@ -182,8 +196,8 @@ def build(spacing: float) -> Scene:
     top = wooden(0.5 * BOARD_SCALE * 0.27, BLOCK_TOP, (0.80, 0.72, 0.60), 43)
     return Scene(
         ior=WATER,
-        glass=glass.moved(CENTRE),
-        interior=join(parts).moved(CENTRE),
+        glass=moved(glass, CENTRE),
+        interior=moved(join(parts), CENTRE),
         sky=None,
         aim=AIM,
         panels=(*room_panels(coarse), table, top, *board_panels(twelve_faces())),

@@ -1,0 +1,6 @@
+"""Synthetic scenes for benchmarks: `python -m nerfro.synthesize scene=ship`; see docs/scenes.md."""
+
+from nerfro.scenes import SCENES
+
+for name in ("ship", "deerglobe", "starlamp", "dolphin_capture"):
+    SCENES[name] = f"{__name__}.{name}"
