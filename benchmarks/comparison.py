@@ -19,13 +19,15 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from jaxtyping import Float
-from torch import Tensor
+import torch
+from PIL import Image
 
-from nerfro.evaluation.image_grid import ImageRow, image_grid, most_different_crop
+from nerfro.evaluation.crops import most_different_crop
+from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, squared_error_map
 from nerfro.evaluation.results import METRICS, RunMetrics, read_metrics_json
 from nerfro.evaluation.tables import Column, Row, Table, to_markdown
-from nerfro.files.images import load_png, save_png
+from nerfro.files.drawing import magma, sheet
+from nerfro.files.images import load_png, save_image
 from nerfro.paths import ASSETS_DIR
 
 METHODS = {
@@ -57,7 +59,7 @@ def main() -> None:
     metrics = {name: read_metrics_json(out / name / "metrics.json") for name in given.rows}
     print(to_markdown(table(metrics)))
     if set(SHOWN) <= metrics.keys():
-        save_png(given.picture, grid(out, metrics))
+        save_image(given.picture, grid(out, metrics))
 
 
 def train(name: str, folder: Path, options: list[str]) -> None:
@@ -102,16 +104,20 @@ def table(metrics: dict[str, RunMetrics]) -> Table:
     return Table("Embedded torus, 20 test views", "method", columns, tuple(rows), mark="best", notes=tuple(notes))
 
 
-def grid(runs: Path, metrics: dict[str, RunMetrics]) -> Float[Tensor, "H W 3"]:
-    """Draw some test views by the methods of the paper's figure."""
-    rows = []
+def grid(runs: Path, metrics: dict[str, RunMetrics]) -> Image.Image:
+    """Draw some test views by the methods of the paper's figure, the crop in which they differ most, and the errors."""
+    images, captions = [], []
     for view in VIEWS:
         reference = load_png(ASSETS_DIR / "torus" / "test" / f"r_{view:03d}.png")
         predictions = [load_png(runs / name / "images" / f"test_{view:03d}.png") for name in SHOWN]
-        scores = [f"{metrics[name].result.views[view].scores['psnr']:.2f} dB" for name in SHOWN]
         crop = most_different_crop(reference, predictions, 32)
-        rows.append(ImageRow(reference, predictions, captions=scores, crops=[crop]))
-    return image_grid(rows, ["reference", *(METHODS[name] for name in SHOWN)])
+        errors = [magma(squared_error_map(prediction, reference), SQUARED_ERROR_LIMIT) for prediction in predictions]
+        images += [reference, *predictions, *(crop.of(image) for image in (reference, *predictions))]
+        images += [torch.ones_like(reference), *errors]
+        scores = [f"{metrics[name].result.views[view].scores['psnr']:.2f} dB" for name in SHOWN]
+        captions += ["reference", *(METHODS[name] for name in SHOWN), "crop", *scores]
+        captions += ["", *(f"squared error, 0 to {SQUARED_ERROR_LIMIT}" for _ in SHOWN)]
+    return sheet(images, captions, 256, 1 + len(SHOWN))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from nerfro.evaluation.tables import to_rich, write_table
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.paths import user_path
 from nerfro.report.comparison import compare, find_metrics, to_table
-from nerfro.report.page import report_page, table_page
+from nerfro.report.page import report_page
 from nerfro.report.runs import find_runs
 from nerfro.report.views import Selection
 
@@ -26,7 +26,7 @@ class SummaryConfig:
 
     # Run folders, folders that contain these at any depth, or glob patterns.
     runs: Any = field(default_factory=lambda: ["outputs"])
-    # Folder for the report and the tables (.csv, .md, .tex and .html, one table per budget); without it, only print.
+    # Folder for the report and the tables (.csv, .md and .tex, one table per budget); without it, only print.
     out: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     report: bool = False  # whether to write `report.html`; the default of `out` is then `outputs/summary`
     metrics: list[str] = field(default_factory=lambda: ["psnr", "ssim", "lpips"])  # columns of the tables
@@ -34,11 +34,6 @@ class SummaryConfig:
     methods: dict[str, str] = field(default_factory=dict)  # titles of experiments, in the order of the rows
     scenes: dict[str, str] = field(default_factory=dict)  # titles of scenes, by the last component of the data folder
     views: Natural = 8  # number of evenly spread views per scene in the report; 0 for all
-    view: Any = None  # view of each figure, such as {torus: 3}; by default the view of median score
-    # Insets of each figure in pixels, such as {torus: [[top, left, size], ...]}; by default where methods differ most.
-    crops: Any = None
-    # Error maps of the report.
-    error_map: Annotated[str, Literal["squared_error", "ssim", "lpips", "lpips_vgg", "flip"]] = "squared_error"
     overwrite: bool = False  # whether to replace files in `out`
 
 
@@ -46,17 +41,15 @@ class SummaryConfig:
 def main(config: DictConfig) -> None:
     """Read and compare runs, and print and write the result."""
     metrics = find_metrics(config.metrics)
-    selection = Selection.of(config.views, config.view, config.crops, config.error_map, metrics[0], config.region)
     places = list(config.runs) if isinstance(config.runs, ListConfig) else [str(config.runs)]
     runs, unfinished = find_runs(places)
-    selection.check([run.test_set for run in runs])
     comparisons = compare(runs, config.methods, config.scenes)
     tables = {c.budget.file_name: to_table(c, metrics, config.region) for c in comparisons}
 
     folder = "outputs/summary" if config.out is None and config.report else config.out
     out = None if folder is None else user_path(folder)
     if out is not None:
-        names = [name + suffix for name in tables for suffix in (".csv", ".md", ".tex", ".html")]
+        names = [name + suffix for name in tables for suffix in (".csv", ".md", ".tex")]
         written = [*names, "report.html"] if config.report else names
         refuse_existing([out / name for name in written], config.overwrite)
     for table in tables.values():
@@ -67,9 +60,9 @@ def main(config: DictConfig) -> None:
         return
     for name, table in tables.items():
         write_table(table, out / name)
-        write_atomically(out / f"{name}.html", table_page(table))
     print(f"tables: {out}")
     if config.report:
+        selection = Selection(config.views, metrics[0], config.region)
         page = report_page(list(zip(comparisons, tables.values(), strict=True)), unfinished, selection)
         write_atomically(out / "report.html", page)
         print(f"report: {out / 'report.html'}, {len(page) / 2**20:.1f} MiB")

@@ -66,10 +66,10 @@ def runs(tmp_path_factory: pytest.TempPathFactory, tiny_scene: Path) -> Path:
     return root
 
 
-def page(runs: Path, wanted: Selection | None = None, unfinished: tuple[str, ...] = ()) -> str:
+def page(runs: Path, unfinished: tuple[str, ...] = ()) -> str:
     comparisons = compare(find_runs([str(runs)])[0], {}, {})
     compared = [(comparison, to_table(comparison, [PSNR], "full")) for comparison in comparisons]
-    return report_page(compared, unfinished, wanted or Selection.of())
+    return report_page(compared, unfinished, Selection())
 
 
 def test_curves_are_read_by_name_without_empty_broken_or_endless_values(tmp_path: Path) -> None:
@@ -107,7 +107,7 @@ def test_long_logs_are_averaged_and_losses_of_zero_are_not_drawn() -> None:
 def test_figure_shows_the_view_of_the_median_score_and_insets_that_lie_apart(runs: Path) -> None:
     (comparison,) = compare(find_runs([str(runs)])[0], {}, {})
     (scored,) = comparison.scenes
-    pictures = scene_images(comparison, scored, Selection.of(1))
+    pictures = scene_images(comparison, scored, Selection(1))
     # View 1 has twice the noise; of two views the lower score is the lower median.
     assert pictures.figure.index == 1
     assert [view.index for view in pictures.views] == [0, 1]
@@ -115,10 +115,6 @@ def test_figure_shows_the_view_of_the_median_score_and_insets_that_lie_apart(run
     assert first.size == second.size == 4
     assert abs(first.top - second.top) >= 4 or abs(first.left - second.left) >= 4
     assert pictures.methods == dict(enumerate(comparison.methods))
-    wanted = Selection.of(8, {scored.name: 0}, {scored.name: [[1, 2, 5]]})
-    chosen = scene_images(comparison, scored, wanted)
-    assert chosen.figure.index == 0
-    assert [(crop.top, crop.left, crop.size) for crop in chosen.crops] == [(1, 2, 5)]
 
 
 def test_small_pictures_are_embedded_bit_for_bit_and_large_ones_as_jpeg(runs: Path) -> None:
@@ -127,13 +123,6 @@ def test_small_pictures_are_embedded_bit_for_bit_and_large_ones_as_jpeg(runs: Pa
     assert kind == "data:image/png;base64"
     assert np.array_equal(np.array(Image.open(io.BytesIO(base64.b64decode(encoded)))), np.array(Image.open(file)))
     assert embed_image(torch.zeros(8, 300, 3)).startswith("data:image/jpeg;base64,")
-
-
-def test_error_maps_of_another_kind_have_their_own_scale_and_name(runs: Path) -> None:
-    html = page(runs, Selection.of(error_map="flip"))
-    assert "FLIP of bad, view 1" in html
-    assert "≥ 1<" in html
-    assert "≥ 0.05" in page(runs)
 
 
 def test_page_needs_nothing_from_outside_and_its_parts_find_each_other(runs: Path) -> None:
@@ -147,6 +136,7 @@ def test_page_needs_nothing_from_outside_and_its_parts_find_each_other(runs: Pat
     assert len(ids) == len(set(ids))
     assert {link[1:] for link in loaded if link.startswith("#")} <= set(ids)
     assert "good &lt;b&gt;" in html
+    assert "≥ 0.05" in html
     assert "good <b>" not in html
     assert "x has not been evaluated" in html
     assert "<dt>command</dt>" in html
@@ -177,7 +167,7 @@ def test_pictures_of_another_data_set_are_refused(runs: Path, tmp_path: Path, ti
     for run in comparison.runs:
         run.config["data"]["root"] = str(changed)  # type: ignore[index]
     with pytest.raises(NerfroError, match="has changed since these views"):
-        scene_images(comparison, scored, Selection.of())
+        scene_images(comparison, scored, Selection())
 
 
 # What a reader sees at first, after moving the border, and with another view and other sides.

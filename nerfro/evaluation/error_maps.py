@@ -83,6 +83,12 @@ def squared_error_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, 
     return (prediction - target).square().mean(-1)
 
 
+def triptych(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H 3*W 3"]:
+    """Concatenate prediction, reference and squared error for the training log, on the CPU and without text."""
+    error = magma(squared_error_map(prediction, target), SQUARED_ERROR_LIMIT)
+    return torch.cat([prediction.detach().cpu().float().clamp(0, 1), target.detach().cpu().float(), error], dim=1)
+
+
 def error_sheet(
     prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], maps: Sequence[ErrorMap]
 ) -> Float[Tensor, "h w 3"]:

@@ -135,8 +135,11 @@ def write_metrics_json(path: Path | str, metrics: RunMetrics) -> None:
         "notes": dict(result.notes),
         "protocol": result.protocol,
     }
-    _refuse_non_finite(content, "metrics")
-    write_atomically(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
+    try:
+        text = json.dumps(content, indent=2, allow_nan=False)
+    except ValueError as error:
+        raise NerfroError(f"{path}: a score is NaN or infinite, which JSON cannot represent ({error})") from error
+    write_atomically(path, text + "\n")
 
 
 def read_metrics_json(path: Path | str) -> RunMetrics:
@@ -192,14 +195,3 @@ def _number(value: object) -> float | None:
     if value is None or is_number(value):
         return value
     raise TypeError(f"{value!r} is not a number")
-
-
-def _refuse_non_finite(value: object, name: str) -> None:
-    if isinstance(value, float) and not math.isfinite(value):
-        raise NerfroError(f"{name} is {value}, which JSON cannot represent; give a finite number or None")
-    if isinstance(value, dict):
-        for key, item in value.items():
-            _refuse_non_finite(item, f"{name}.{key}")
-    if isinstance(value, list):
-        for index, item in enumerate(value):
-            _refuse_non_finite(item, f"{name}[{index}]")

@@ -12,6 +12,7 @@ from markupsafe import Markup
 from omegaconf import OmegaConf
 
 from nerfro.errors import NerfroError
+from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT
 from nerfro.evaluation.tables import Table, to_html
 from nerfro.files.drawing import magma
 from nerfro.files.templates import fill_template
@@ -87,14 +88,10 @@ def report_page(compared: Sequence[tuple[Comparison, Table]], unfinished: Sequen
         unfinished=unfinished,
         colours=COLOURS,
         error_ramp=embed_image(ramp),
+        error_limit=SQUARED_ERROR_LIMIT,
         png_side=PNG_SIDE,
         jpeg_quality=JPEG_QUALITY,
     )
-
-
-def table_page(table: Table) -> str:
-    """Create a page with a single table."""
-    return fill_template(_TEMPLATES / "table.html.jinja", title=table.title, table=Markup(to_html(table)))
 
 
 def _scenes(prefix: str, comparison: Comparison, selection: Selection) -> list[SceneSection]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -14,11 +13,11 @@ from torch import Tensor
 
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
-from nerfro.evaluation.error_maps import ErrorMap, error_maps
-from nerfro.evaluation.image_grid import Crop, most_different_crop
-from nerfro.evaluation.lpips import LpipsNetwork, find_lpips_networks
+from nerfro.evaluation.crops import Crop, most_different_crop
+from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, squared_error_map
 from nerfro.evaluation.results import FULL, METRICS, Metric, Region, Score
 from nerfro.evaluation.tables import MISSING
+from nerfro.files.drawing import magma
 from nerfro.files.images import data_uri, load_png, to_8bit
 from nerfro.report.comparison import Comparison
 from nerfro.report.runs import EvaluationSet, Run
@@ -36,69 +35,13 @@ class Selection:
 
     Attributes:
         num_views: number of evenly spread views per scene; 0 for all.
-        view: view of the figure, by scene.
-        crops: insets of the figure, by scene.
-        error_map: name of the metric of the error maps.
-        lpips_networks: networks for the error map.
         metric: metric shown below each image.
         region: region of this metric.
     """
 
-    num_views: int
-    view: Mapping[str, int]
-    crops: Mapping[str, tuple[Crop, ...]]
-    error_map: str
-    lpips_networks: Mapping[str, LpipsNetwork]
-    metric: Metric
-    region: Region
-
-    @classmethod
-    def of(
-        cls,
-        num_views: int = 8,
-        view: Any = None,
-        crops: Any = None,
-        error_map: str = "squared_error",
-        metric: Metric = METRICS[0],
-        region: Region = FULL,
-    ) -> Selection:
-        """Convert the options of the user; `view` and `crops` may be None.
-
-        Raises:
-            NerfroError: an option has another form, or the weights for the error map are not available.
-        """
-        networks, reasons = find_lpips_networks() if error_map.startswith("lpips") else ({}, {})
-        if error_map in reasons:
-            raise NerfroError(f"error_map={error_map}: {reasons[error_map]}")
-        try:
-            chosen = {str(scene): int(index) for scene, index in (view or {}).items()}
-            insets = {
-                str(scene): tuple(Crop(*map(int, square)) for square in squares)
-                for scene, squares in (crops or {}).items()
-            }
-        except (AttributeError, TypeError, ValueError) as error:
-            raise NerfroError(
-                f"view={view}, crops={crops} is not in the form view={{SCENE: INDEX}}, "
-                "crops={SCENE: [[TOP, LEFT, SIZE], ...]}; give integers by scene"
-            ) from error
-        return cls(num_views, chosen, insets, error_map, networks, metric, region)
-
-    def check(self, scenes: Sequence[EvaluationSet]) -> None:
-        """Raise an error for views and crops that do not exist in a scene."""
-        named = {scene.name: scene for scene in scenes}
-        for name in (*self.view, *self.crops):
-            if name not in named:
-                raise NerfroError(f"'{name}' is not a scene of these runs; choose from {', '.join(sorted(named))}")
-        for scene in scenes:
-            if not 0 <= self.view.get(scene.name, 0) < scene.num_views:
-                raise NerfroError(
-                    f"view.{scene.name}={self.view[scene.name]} is not a view; give 0 to {scene.num_views - 1}"
-                )
-            for crop in self.crops.get(scene.name, ()):
-                if crop.size < 1 or not crop.inside(scene.height, scene.width):
-                    raise NerfroError(
-                        f"crops.{scene.name}: {crop} exceeds {scene.width} x {scene.height} pixels; choose another crop"
-                    )
+    num_views: int = 8
+    metric: Metric = METRICS[0]
+    region: Region = FULL
 
 
 @dataclass(frozen=True)
@@ -135,8 +78,6 @@ class SceneImages:
         views: views to choose from.
         figure: one of the views, shown as the figure.
         crops: insets of the figure.
-        error_title: title of the error maps.
-        error_limit: error at the end of the colour scale.
         methods: titles of the methods by index; methods without a run on this scene are absent.
         seeds: seeds of the runs that rendered the images.
     """
@@ -146,8 +87,6 @@ class SceneImages:
     views: tuple[View, ...]
     figure: View
     crops: tuple[Crop, ...]
-    error_title: str
-    error_limit: float
     methods: Mapping[int, str]
     seeds: Sequence[int]
 
@@ -166,25 +105,19 @@ def scene_images(comparison: Comparison, test_set: EvaluationSet, selection: Sel
     cameras = references.cameras
     if (len(references), cameras.height, cameras.width) != (test_set.num_views, test_set.height, test_set.width):
         raise NerfroError(f"{test_set.root} has changed since these views were scored; restore the data set")
-    figure = selection.view.get(test_set.name, _median_view(list(runs.values()), selection))
+    figure = _median_view(list(runs.values()), selection)
     count = min(selection.num_views or test_set.num_views, test_set.num_views)
     views = {
         index: _view(index, references.images[index], runs, titles, selection)
         for index in sorted({round(i) for i in np.linspace(0, test_set.num_views - 1, count)} | {figure})
     }
     reference, predictions = references.images[figure], [_prediction(run, figure) for run in runs.values()]
-    error = _error_map(predictions[0], reference, selection)
-    crops = selection.crops.get(test_set.name)
-    if crops is None:
-        crops = _choose_crops(reference, predictions)
     return SceneImages(
         width=test_set.width,
         height=test_set.height,
         views=tuple(views.values()),
         figure=views[figure],
-        crops=crops,
-        error_title=error.title,
-        error_limit=error.limit,
+        crops=_choose_crops(reference, predictions),
         methods=titles,
         seeds=sorted({run.seed for run in runs.values()}),
     )
@@ -212,17 +145,10 @@ def _view(
         image, title = _prediction(run, index), titles[number]
         value = _score(run, index, selection)
         score = f"{metric.title} {MISSING if value is None else f'{value:.{metric.decimals}f}'}"
-        error = _error_map(image, reference, selection)
+        error = magma(squared_error_map(image, reference), SQUARED_ERROR_LIMIT)
         predictions[number] = PageImage(f"{title}, view {index}", score, embed_image(image))
-        errors[number] = PageImage(f"{error.title} of {title}, view {index}", score, embed_image(error.colours()))
+        errors[number] = PageImage(f"squared error of {title}, view {index}", score, embed_image(error))
     return View(index, PageImage(f"reference, view {index}", "", embed_image(reference)), predictions, errors)
-
-
-def _error_map(prediction: Tensor, reference: Tensor, selection: Selection) -> ErrorMap:
-    for found in error_maps(prediction, reference, selection.lpips_networks):
-        if found.name == selection.error_map:
-            return found
-    raise NerfroError(f"images of {list(reference.shape[:2])} pixels are too small for error_map={selection.error_map}")
 
 
 def _prediction(run: Run, index: int) -> Float[Tensor, "H W 3"]:

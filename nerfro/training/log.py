@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from nerfro.cameras import Cameras
-from nerfro.evaluation.image_grid import triptych
+from nerfro.evaluation.error_maps import triptych
 from nerfro.evaluation.path_plot import image_of_paths
 from nerfro.files.lat_long import directions
 from nerfro.media.analytic import Vacuum

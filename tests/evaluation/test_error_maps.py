@@ -3,7 +3,8 @@ import torch
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.error_maps import ErrorMap, error_maps, error_sheet, squared_error_map
+from nerfro.evaluation.crops import Crop, most_different_crop
+from nerfro.evaluation.error_maps import ErrorMap, error_maps, error_sheet, squared_error_map, triptych
 from nerfro.evaluation.flip import flip
 from nerfro.evaluation.lpips import ALEX
 from nerfro.evaluation.metrics import psnr
@@ -85,3 +86,23 @@ def test_sheet_shows_pictures_maps_and_the_ends_of_their_scales() -> None:
     for colour in round_to_8bit(magma(torch.tensor([[0.0, 0.5]]), 0.5))[0]:
         assert (scale - colour).abs().sum(-1).min() < 1e-6
     assert (sheet[22 + 128 :, :256] == 1).all()  # pictures have no scale
+
+
+def test_automatic_crop_finds_where_methods_differ() -> None:
+    reference = torch.rand(24, 32, 3, generator=torch.Generator().manual_seed(0))
+    alike, different = reference + 0.05, reference + 0.05
+    different[10:16, 4:10] += 0.5
+    alike[0:6, 20:26] += 3.0  # a large error that all methods share tells nothing about them
+    different[0:6, 20:26] += 3.0
+    assert most_different_crop(reference, [alike, different], 6) == Crop(top=10, left=4, size=6)
+    assert most_different_crop(reference, [different], 6) == Crop(top=0, left=20, size=6)
+    with pytest.raises(NerfroError, match="crop of 25 pixels"):
+        most_different_crop(reference, [reference], 25)
+
+
+def test_triptych_holds_prediction_reference_and_error() -> None:
+    prediction, target = torch.rand(2, 8, 9, 3, generator=torch.Generator().manual_seed(0))
+    parts = triptych(prediction, target).split(9, dim=1)
+    error = magma(squared_error_map(prediction, target), 0.05)
+    for part, expected in zip(parts, (prediction, target, error), strict=True):
+        torch.testing.assert_close(part, expected)

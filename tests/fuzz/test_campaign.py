@@ -117,7 +117,7 @@ def test_options_of_other_commands(world: World, draw: st.DataObject) -> None:
                   "sampler.path.interface", "near", "far", "rays", "plot", "out", "overwrite"],
         "evaluate": ["split", "root", "chunk_size", "subdivision.side", "subdivision.divergence", "masks", "alpha",
                      "protocol", "device", "lpips_backbone", "predictions", "references", "overwrite"],
-        "summary": ["metrics", "region", "methods", "scenes", "views", "view", "crops", "error_map", "report"],
+        "summary": ["metrics", "region", "methods", "scenes", "views", "report"],
         "preprocess": ["split", "mesh", "resolution", "box_min", "wrong_masks", "keep", "smoothing", "medium.ior",
                        "data.near", "data.downscale"],
         "mask": ["outlines", "overwrite", "data.near", "data.downscale"],
