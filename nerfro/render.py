@@ -13,21 +13,19 @@ from nerfro.viewing.film import find_ffmpeg, write_film
 from nerfro.viewing.frames import FrameRenderer, render_frames
 from nerfro.viewing.layers import LAYERS
 from nerfro.viewing.render_request import RenderConfig, check_request, checkpoints, find_shots, labels, prepared
-from nerfro.viewing.sweep import read_sweep
 
 
-@entry_point("render", RenderConfig, CONF_DIR / "render", verbatim=("sweep",))
+@entry_point("render", RenderConfig, CONF_DIR / "render")
 def main(config: DictConfig) -> None:
     """Check the request, load the scenes, render the missing frames, and encode films."""
     check_request(config)
     keep_freed_memory()
-    sweep = None if config.sweep is None else read_sweep(config.sweep)
     runs = checkpoints(config)
     scenes = [prepared(config, load(run, config.device, config.root)) for run in runs]
     shots = find_shots(config, scenes[0])
-    renderer = FrameRenderer(scenes, labels(config), LAYERS[config.what], sweep)
-    inputs = [*map(checkpoint_of, runs), *([config.sky] if config.sky else []), *(sweep.files if sweep else [])]
-    request = (config.what, config.sweep, renderer.labels, scenes[0].subdivision, *map(file_hash, inputs))
+    renderer = FrameRenderer(scenes, labels(config), LAYERS[config.what])
+    inputs = [*map(checkpoint_of, runs), *([config.sky] if config.sky else [])]
+    request = (config.what, renderer.labels, scenes[0].subdivision, *map(file_hash, inputs))
     folder = user_path(config.out)
     films = config.film if shots.film and config.format == "png" else []
     if "mp4" in films:

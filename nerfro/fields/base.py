@@ -24,11 +24,15 @@ class Field(nn.Module, ABC):
 
     def density(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
         """Evaluate only the density, per world unit, in single precision; density is independent of the direction."""
-        directions = torch.zeros_like(positions)
-        directions[:, 2] = -1
-        s = torch.zeros(len(positions), 1, device=positions.device)
-        samples = Samples(positions[:, None], directions[:, None], s, torch.cat([s, s], dim=1), s[:, 0])
-        return self(samples).density[:, 0].float()
+        return self.at_points(positions, positions.new_tensor([0.0, 0.0, -1.0]).expand_as(positions))[0]
+
+    def at_points(
+        self, positions: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]
+    ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P 3"]]:
+        """Evaluate density and colour at points, seen in unit directions, in single precision."""
+        zeros = torch.zeros(len(positions), 2, device=positions.device)
+        found = self(Samples(positions[:, None], directions[:, None], zeros[:, :1], zeros, zeros[:, 0]))
+        return found.density[:, 0].float(), found.rgb[:, 0].float()
 
     @abstractmethod
     def forward(self, samples: Samples) -> Radiance:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +17,10 @@ from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.cache import save_arrays
 from nerfro.files.lat_long import save_lat_long
+from nerfro.registry import discover
+from nerfro.viewing import PLUGIN_EXPORTS
 from nerfro.viewing.meshes import write_mesh
-from nerfro.viewing.mitsuba_scene import MITSUBA_FILES, write_mitsuba
 from nerfro.viewing.page import make_page
-from nerfro.viewing.points import write_points
 from nerfro.viewing.trained_scene import SKY_HEIGHT, TrainedScene
 from nerfro.viewing.volume import RESOLUTION, sample_field
 
@@ -29,14 +30,13 @@ class ExportConfig:
     """Options of `python -m nerfro.export`."""
 
     checkpoint: str = MISSING  # run folder, or a checkpoint in it
-    what: str = MISSING  # page, mesh, points, sky, volume or mitsuba
+    what: str = MISSING  # page, mesh, sky, volume, or an export of a plugin, such as mitsuba
     out: str = MISSING  # output file; its ending selects the format
     # Grid vertices along the longest side of the volume (default 128), or rows of the sky (default 512).
     resolution: Optional[Count] = None
     # Length, world units, within which dense content absorbs half the light; the surface is extracted at this density.
     # By default a hundredth of the object's longest side.
     half_depth: Optional[Positive] = None
-    count: Count = 200_000  # number of points
     sky: Optional[str] = None  # lat-long image that replaces the sky (.hdr, .exr, .png, .jpg)
     root: Optional[str] = None  # folder of the data, if it has moved since training
     device: str = "auto"  # `cpu`, `cuda`, or `auto` for a GPU if there is one
@@ -68,9 +68,10 @@ def find_export(what: str, out: Path) -> Export:
     Raises:
         NerfroError: the name is unknown, or the file has another ending.
     """
-    if what not in EXPORTS:
-        raise NerfroError(f"what={what} is not known; choose {', '.join(EXPORTS)}")
-    export = EXPORTS[what]
+    discover()
+    if what not in (*EXPORTS, *PLUGIN_EXPORTS):
+        raise NerfroError(f"what={what} is not known; choose {', '.join((*EXPORTS, *PLUGIN_EXPORTS))}")
+    export = EXPORTS[what] if what in EXPORTS else importlib.import_module(PLUGIN_EXPORTS[what]).EXPORT
     if out.suffix.lower() not in export.suffixes:
         raise NerfroError(f"out={out} has another ending than the exported file; it must end in "
                           f"{' or '.join(export.suffixes)}")  # fmt: skip
@@ -97,11 +98,7 @@ def _write_page(scene: TrainedScene, out: Path, config: DictConfig) -> str:
 
 EXPORTS = {
     "page": Export((".html",), _write_page),
-    "mesh": Export((".glb", ".ply"), lambda scene, out, c: write_mesh(scene, out, c.resolution, c.half_depth)),
-    "points": Export((".ply",), lambda scene, out, c: write_points(scene, out, c.count)),
+    "mesh": Export((".glb",), lambda scene, out, c: write_mesh(scene, out, c.resolution, c.half_depth)),
     "sky": Export((".hdr", ".exr", ".png"), _write_sky),
     "volume": Export((".npz",), _write_volume),
-    "mitsuba": Export(
-        (".xml",), lambda scene, out, c: write_mitsuba(scene, out, c.resolution, c.half_depth), MITSUBA_FILES
-    ),
 }

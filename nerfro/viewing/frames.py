@@ -19,7 +19,6 @@ from nerfro.files.drawing import sheet
 from nerfro.files.images import save_image, save_png
 from nerfro.viewing.layers import Layer
 from nerfro.viewing.render_request import Shots
-from nerfro.viewing.sweep import Sweep
 from nerfro.viewing.trained_scene import TrainedScene
 
 _RECORD = "frames.json"
@@ -33,21 +32,18 @@ class FrameRenderer:
         scenes: scenes that are shown side by side.
         labels: label of each scene, for several scenes.
         layer: what each image shows.
-        sweep: change of the scene during the film.
     """
 
     scenes: Sequence[TrainedScene]
     labels: Sequence[str]
     layer: Layer
-    sweep: Sweep | None
 
     def render(self, shots: Shots, frame: int) -> list[tuple[Tensor, Tensor]]:
         """Render a frame of each scene: values in their units, and the sRGB image."""
-        camera, fraction = shots.cameras.select([frame]), frame / max(len(shots.names) - 1, 1)
+        camera = shots.cameras.select([frame])
         images = []
         for scene in self.scenes:
-            changed = scene if self.sweep is None else self.sweep.at(scene, fraction)
-            rendered = self.layer.of(changed).render(camera)
+            rendered = self.layer.of(scene).render(camera)
             images.append((self.layer.values(rendered)[0], self.layer.shown(rendered, camera)[0]))
         return images
 

@@ -1,4 +1,4 @@
-"""Export of glass and dense content as meshes: .glb with glass materials, or .ply with vertex colours."""
+"""Export of glass and dense content as meshes in glTF format, with glass materials."""
 
 from __future__ import annotations
 
@@ -11,33 +11,28 @@ import torch
 import trimesh
 from torch.nn import functional
 from trimesh.exchange.gltf import export_glb
-from trimesh.exchange.ply import export_ply
 
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
-from nerfro.files.images import to_8bit
 from nerfro.geometry.interpolation import trilinear
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.light import to_srgb
 from nerfro.media.solid import Solid
 from nerfro.viewing.changes import absorption_of
 from nerfro.viewing.surface import largest_components, level_set
 from nerfro.viewing.trained_scene import TrainedScene
-from nerfro.viewing.volume import POINTS_AT_ONCE, RESOLUTION, query_field, sample_field
+from nerfro.viewing.volume import POINTS_AT_ONCE, RESOLUTION, sample_field
 
-_GLASS_RGBA = (255, 255, 255, 60)  # translucent white, because .ply has no glass materials
 _HALF_DEPTH = 0.01  # default of half_depth, relative to the longest side of the object
 # The y axis is up in glTF, and the z axis in nerfro.
 _Z_UP_TO_Y_UP = trimesh.transformations.rotation_matrix(-math.pi / 2, [1, 0, 0])
 
 
 def write_mesh(scene: TrainedScene, out: Path, resolution: int | None, half_depth: float | None) -> str:
-    """Write the surfaces of the glass and of the dense content as .glb or .ply; see `inside_mesh` for the options."""
+    """Write the surfaces of the glass and of the dense content as .glb; see `inside_mesh` for the options."""
     glass, inside = glass_meshes(scene), inside_mesh(scene, resolution, half_depth)
     if not glass and inside is None:
         raise NerfroError("the scene has neither glass nor dense content to write; raise half_depth")
-    encode = _encode_glb if out.suffix.lower() == ".glb" else _encode_ply
-    write_atomically(out, encode(scene, glass, inside))
+    write_atomically(out, _encode_glb(scene, glass, inside))
     content = "nothing solid inside" if inside is None else f"{len(inside.faces)} triangles inside"
     return f"{sum(len(mesh.faces) for mesh in glass)} triangles of glass, {content}"
 
@@ -87,7 +82,7 @@ def inside_mesh(scene: TrainedScene, resolution: int | None, half_depth: float |
     normals = -functional.normalize(trilinear(gradients, box, vertices), dim=-1)
     network = scene.renderer.scene
     radiance = [
-        query_field(scene.field, positions.to(network.device), directions)[1].cpu()
+        scene.field.at_points(positions.to(network.device), directions.to(network.device))[1].cpu()
         for positions, directions in zip(vertices.split(POINTS_AT_ONCE), (-normals).split(POINTS_AT_ONCE), strict=True)
     ]
     linear = network.colour_space.to_linear(torch.cat(radiance)).numpy()
@@ -144,17 +139,3 @@ def _glass_material(mesh: trimesh.Trimesh, ior: float, absorption: np.ndarray) -
             "KHR_materials_volume": volume,
         },
     }
-
-
-def _encode_ply(scene: TrainedScene, glass: list[trimesh.Trimesh], inside: trimesh.Trimesh | None) -> bytes:
-    coloured = [_with_colours(mesh, np.tile(_GLASS_RGBA, (len(mesh.vertices), 1))) for mesh in glass]
-    if inside is not None:
-        radiance = torch.from_numpy(np.asarray(inside.vertex_attributes["radiance"]))
-        coloured.append(_with_colours(inside, to_8bit(to_srgb(radiance)).numpy()))
-    return export_ply(trimesh.util.concatenate(coloured), vertex_normal=True)
-
-
-def _with_colours(mesh: trimesh.Trimesh, colours: np.ndarray) -> trimesh.Trimesh:
-    return trimesh.Trimesh(
-        mesh.vertices, mesh.faces, vertex_normals=mesh.vertex_normals, vertex_colors=np.uint8(colours), process=False
-    )

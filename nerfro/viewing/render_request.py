@@ -47,8 +47,6 @@ class RenderConfig:
     # rgb, depth, normals, opacity, exits, glass (nothing inside), inside (no glass), or sky (neither)
     what: Annotated[str, Literal["rgb", "depth", "normals", "opacity", "exits", "glass", "inside", "sky"]] = "rgb"
     sky: Optional[str] = None  # lat-long image that replaces the sky (.hdr, .exr, .png, .jpg)
-    # Change from the first frame to the last: medium.ior:1.0:1.6, medium.absorption:0:2, or sky:a.hdr,b.hdr.
-    sweep: Optional[str] = None
     # Pixels with several rays (see docs/concepts/background.md); by default as in the evaluation of the run.
     subdivision: SubdivisionChanges = dataclasses.field(default_factory=SubdivisionChanges)
     chunk_size: Optional[Count] = None  # rays rendered at once, which limits the memory; by default as in training
@@ -75,12 +73,6 @@ class Shots:
     cameras: Cameras
     names: list[str]
     film: bool
-
-    def over_time(self, frames: int) -> Shots:
-        """Repeat a single camera for a number of frames; several cameras remain as they are."""
-        if len(self.cameras) > 1:
-            return Shots(self.cameras, self.names, True)
-        return Shots(self.cameras.select([0] * frames), _numbered("frame", frames, 4), True)
 
 
 def check_request(config: DictConfig) -> None:
@@ -133,8 +125,7 @@ def find_shots(config: DictConfig, scene: TrainedScene) -> Shots:
     if config.fov is not None:
         focal = torch.full_like(cameras.fx, 0.5 * cameras.width / math.tan(0.5 * math.radians(config.fov)))
         cameras = replace(cameras, fx=focal, fy=focal * cameras.fy / cameras.fx)
-    shots = replace(shots, cameras=_resized(cameras, *_size(config, cameras.width, cameras.height)))
-    return shots if config.sweep is None else shots.over_time(config.frames)
+    return replace(shots, cameras=_resized(cameras, *_size(config, cameras.width, cameras.height)))
 
 
 def _free_cameras(config: DictConfig, scene: TrainedScene) -> Shots:

@@ -9,9 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
-from nerfro.fields.base import Field
 from nerfro.geometry.contraction import contraction_scale, expand
-from nerfro.types import Samples
 from nerfro.viewing.trained_scene import TrainedScene
 
 RESOLUTION = 128
@@ -63,10 +61,9 @@ def sample_field(
     if radius is not None:
         positions = expand(positions, box.mean(0), radius)
         scale = contraction_scale(positions, box.mean(0), radius)
-    down = torch.tensor([0.0, 0.0, -1.0])
     chunks = positions.split(POINTS_AT_ONCE)
     chunks = tqdm(chunks, unit="chunk", desc="sample field", dynamic_ncols=True, disable=not progress)
-    density = torch.cat([query_field(field, chunk.to(device), down.expand_as(chunk))[0].cpu() for chunk in chunks])
+    density = torch.cat([field.density(chunk.to(device)).cpu() for chunk in chunks])
     density = density / scale
     cell = float((sides / (counts - 1)).max())
     visible = (density * cell > MIN_OPTICAL_DEPTH).nonzero()[:, 0]
@@ -74,17 +71,7 @@ def sample_field(
     directions = torch.cat([torch.eye(3), -torch.eye(3)])
     for rows in visible.split(POINTS_AT_ONCE):
         points = positions[rows].to(device)
-        colours = [query_field(field, points, direction.expand_as(points))[1].cpu() for direction in directions]
+        colours = [field.at_points(points, direction.to(points).expand_as(points))[1].cpu() for direction in directions]
         rgb[rows] = torch.stack(colours).mean(0)
     shape = [int(n) for n in counts]
     return Volume(density.view(shape), scene.renderer.scene.colour_space.to_linear(rgb).view(*shape, 3), box, radius)
-
-
-def query_field(
-    field: Field, positions: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]
-) -> tuple[Float[Tensor, "P"], Float[Tensor, "P 3"]]:
-    """Query the density, and the radiance in the colour space of the model, at points in unit viewing directions."""
-    zeros = torch.zeros(len(positions), 2, device=positions.device)
-    directions = directions.to(positions)
-    found = field(Samples(positions[:, None], directions[:, None], zeros[:, :1], zeros, zeros[:, 0]))
-    return found.density[:, 0].float(), found.rgb[:, 0].float()

@@ -87,28 +87,6 @@ def test_glb_passes_khronos_validator(scene: TrainedScene, tmp_path: Path) -> No
     assert validated(tmp_path / "bad.glb")["issues"]["numErrors"] > 0
 
 
-def test_ply_holds_both_with_colours(scene: TrainedScene, tmp_path: Path) -> None:
-    write(scene, "mesh", tmp_path / "ball.ply")
-    loaded = trimesh.load(tmp_path / "ball.ply", process=False)
-    alpha = loaded.visual.vertex_colors[:, 3]
-    glass, inside = loaded.vertices[alpha < 255], loaded.vertices[alpha == 255]
-    np.testing.assert_allclose(np.linalg.norm(glass, axis=1), RADIUS, atol=1e-4)
-    np.testing.assert_allclose(np.linalg.norm(inside - INSIDE_CENTRE, axis=1), INSIDE_RADIUS, atol=CELL)
-    expected = 255 * to_srgb(colour(torch.from_numpy(np.asarray(inside))))
-    np.testing.assert_allclose(loaded.visual.vertex_colors[alpha == 255, :3], expected, atol=1)
-
-
-def test_points_lie_where_things_are_and_not_where_they_seem_to_be(scene: TrainedScene, tmp_path: Path) -> None:
-    assert "500 points" in write(scene, "points", tmp_path / "points.ply", count=500)
-    loaded = trimesh.load(tmp_path / "points.ply")
-    assert len(loaded.vertices) == 500
-    spacing = 4 / 256
-    distances = np.linalg.norm(loaded.vertices - INSIDE_CENTRE, axis=1)
-    assert np.abs(distances - INSIDE_RADIUS).max() < spacing
-    expected = 255 * to_srgb(colour(torch.from_numpy(np.asarray(loaded.vertices))))
-    np.testing.assert_allclose(loaded.colors[:, :3], expected, atol=1)
-
-
 def test_small_components_are_left_out() -> None:
     large, small = trimesh.creation.icosphere(4, 1.0), trimesh.creation.icosphere(0, 0.1).apply_translation([3, 0, 0])
     both = trimesh.util.concatenate([small, large])
@@ -116,11 +94,6 @@ def test_small_components_are_left_out() -> None:
     assert len(kept.faces) == len(large.faces)
     assert np.linalg.norm(kept.vertices, axis=1).max() < 1.01
     assert trimesh.Trimesh(kept.vertices, kept.faces).volume == pytest.approx(large.volume)
-
-
-def test_points_of_nothing_are_refused(scene: TrainedScene, tmp_path: Path) -> None:
-    with pytest.raises(NerfroError, match="no ray of the training cameras loses half its light inside"):
-        write(scene.with_(inside=False), "points", tmp_path / "points.ply", count=1)
 
 
 @pytest.mark.parametrize("suffix", [".hdr", ".exr", ".png"])
@@ -170,7 +143,7 @@ def test_mitsuba_renders_the_same_picture(
     ("what", "name", "message"),
     [
         ("fog", "a.glb", "what=fog is not known; choose page, mesh"),
-        ("mesh", "a.obj", "must end in .glb or .ply"),
+        ("mesh", "a.ply", "must end in .glb"),
         ("volume", "a.vdb", "must end in .npz"),
     ],
 )

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 import trimesh
 from jaxtyping import Float
+from omegaconf import DictConfig
 from trimesh.exchange.ply import export_ply
 
 from nerfro.cameras import Cameras
@@ -20,6 +21,7 @@ from nerfro.files.atomic import write_atomically
 from nerfro.files.deep_images import write_radiance
 from nerfro.scenes.path_tracer import envmap_texture
 from nerfro.viewing.changes import absorption_of
+from nerfro.viewing.exports import Export
 from nerfro.viewing.meshes import glass_meshes, inside_mesh
 from nerfro.viewing.trained_scene import SKY_HEIGHT, TrainedScene
 
@@ -34,18 +36,18 @@ _ELEMENTS = {
 }  # fmt: skip
 
 
-def write_mitsuba(scene: TrainedScene, out: Path, resolution: int | None, half_depth: float | None) -> str:
+def write_mitsuba(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     """Write an .xml scene, with meshes and sky beside the file (`MITSUBA_FILES`).
 
     The glass is a `dielectric`, with partial reflection; the parameter `glass` selects another material, such as
     `transmitting_glass` (see `scenes.glass`) for a model without partial reflection. The content is a light source
-    with the radiance that is seen from outside. The test cameras are the sensors, in their order. For `resolution` and
-    `half_depth` see `meshes.inside_mesh`.
+    with the radiance that is seen from outside. The test cameras are the sensors, in their order. `config` is an
+    `ExportConfig`.
 
     Raises:
         NerfroError: the scene has bodies inside bodies.
     """
-    glass, inside = glass_meshes(scene), inside_mesh(scene, resolution, half_depth)
+    glass, inside = glass_meshes(scene), inside_mesh(scene, config.resolution, config.half_depth)
     if len(glass) > 1:
         raise NerfroError("bodies inside bodies are not written for Mitsuba; write them with what=mesh")
     cameras, absorption = scene.cameras("test").to("cpu"), absorption_of(scene.renderer.scene)
@@ -131,3 +133,6 @@ def _append(parent: ElementTree.Element, name: str, value: Any) -> None:
 
 def _numbers(values: Iterable[float]) -> str:
     return " ".join(f"{value:.9g}" for value in values)
+
+
+EXPORT = Export((".xml",), write_mitsuba, MITSUBA_FILES)

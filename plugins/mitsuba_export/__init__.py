@@ -1,0 +1,5 @@
+"""Export of trained scenes for Mitsuba 3: `python -m nerfro.export what=mitsuba`; see docs/sharing.md."""
+
+from nerfro.viewing import PLUGIN_EXPORTS
+
+PLUGIN_EXPORTS["mitsuba"] = f"{__name__}.scene"
