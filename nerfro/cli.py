@@ -73,6 +73,7 @@ RENAMED: dict[str, str | None] = {
     "sampler.points.trust": "sampler.points.max_bin_alpha",
     "sampler.points.num_shown": "sampler.points.num_samples_evaluation",
     "boundary.direction_degree": None,
+    "content.box_file": None,
     "field.base_resolution": None,
     "field.direction_degree": None,
     "field.normalise": None,

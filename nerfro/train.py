@@ -26,7 +26,7 @@ from nerfro.training.memory import require_memory
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.reach import require_reach
-from nerfro.training.run_folder import LAST_CHECKPOINT, begin, next_steps, own, require_same_run
+from nerfro.training.run_folder import LAST_CHECKPOINT, begin, next_steps, own, require_same_run, resume_advice
 from nerfro.training.trainer import finish_logs, fit, make_trainer, prepare_process, print_profile
 from nerfro.training.viewer import Viewer
 from nerfro.viewing.camera_files import write_cameras
@@ -79,8 +79,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> None:
     if not trainer.is_global_zero:
         return
     if interruption.received:
-        done = f"interrupted after step {trainer.global_step} and saved"
-        print(f"nerfro: {done}; to resume, repeat the command with hydra.run.dir={folder} ckpt_path=last")
+        print(f"nerfro: interrupted after step {trainer.global_step} and saved; {resume_advice(folder)}")
         sys.exit(EXIT_INTERRUPTED)
 
     write_cameras(folder / "cameras.json", renderer.to(device).scene.camera, training)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Optional
 
 import numpy as np
@@ -14,7 +13,6 @@ from omegaconf import DictConfig, OmegaConf
 from nerfro.allowed import Count, NotNegative, Positive
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
-from nerfro.files.reading import load_array
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
@@ -45,8 +43,6 @@ class ContentConfig:
     # the ball the point that the cameras face.
     box_min: Optional[list[float]] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     box_max: Optional[list[float]] = None  # noqa: UP045 - upper corner of the box
-    # Alternatively, an .npy file with the centre and the half sides of the box [2, 3], as Eikonal Fields stores them.
-    box_file: Optional[str] = None  # noqa: UP045
     # Radius of the ball, world units. None derives this and the next settings from the cameras.
     radius: Optional[Positive] = None  # noqa: UP045
     near: Optional[NotNegative] = None  # noqa: UP045 - arc length of the first samples, world units
@@ -133,10 +129,7 @@ def _depth(cameras: Cameras) -> float:
 
 
 def _box(config: DictConfig, medium: Medium) -> Float[np.ndarray, "2 3"] | None:
-    """Return the bounds of the object from the content file, the medium or its mesh; None without any of these."""
-    if config.content.box_file is not None:
-        centre, half = _read_box(resolve_path(config.content.box_file))
-        return np.stack([centre - half, centre + half])
+    """Return the bounds of the object from the medium or its mesh; None without both."""
     if not isinstance(medium, Vacuum):
         return medium.content_box.double().numpy().round(6)
     if "mesh" in config.medium and resolve_path(config.medium.mesh).is_file():
@@ -156,13 +149,3 @@ def _require_no_box(config: DictConfig) -> None:
                 "+experiment=straight, which needs no box, or give content.box_min=[X,Y,Z] content.box_max=[X,Y,Z] "
                 "in world units"
             )
-
-
-def _read_box(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read the centre and the half sides of a box from bounding_box_vals.npy of Eikonal Fields."""
-    values = load_array(path)
-    if values.shape != (2, 3) or not np.isfinite(values).all() or values[1].min() <= 0:
-        raise NerfroError(
-            f"content.box_file={path} must hold the centre and the positive half sides of a box, 2x3 numbers"
-        )
-    return values[0], values[1]

@@ -71,8 +71,13 @@ def own(folder: Path, config: DictConfig) -> Iterator[Path | None]:
             yield checkpoint
         except KeyboardInterrupt:  # before training, or after it
             if (folder / CONFIG_FILE).is_file():
-                raise Interrupted(f"to resume, repeat the command with hydra.run.dir={folder} ckpt_path=last") from None
+                raise Interrupted(resume_advice(folder)) from None
             raise
+
+
+def resume_advice(folder: Path) -> str:
+    """Return how to resume a run."""
+    return f"to resume, repeat the command with hydra.run.dir={folder} ckpt_path=last"
 
 
 def begin(folder: Path, config: DictConfig, renderer: Renderer) -> None:
