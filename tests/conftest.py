@@ -147,6 +147,17 @@ def evaluate_here(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
     return lambda *overrides: finish(nerfro.evaluate.main, ("device=cpu", *overrides), monkeypatch, capsys)
 
 
+def train_in(folder: Path, *overrides: str) -> Path:
+    """Train like `train_here`, for fixtures that several tests share; returns the folder of the run."""
+    import nerfro.train
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(nerfro.train, "find_lpips_networks", lambda *files: ({}, {}))
+        patch.setattr(sys, "argv", ["nerfro.train", *overrides, f"hydra.run.dir={folder}"])
+        nerfro.train.main()
+    return folder
+
+
 def finish(
     main: Callable[[], None],
     overrides: Sequence[str],
@@ -248,3 +259,11 @@ def tiny_default_run(tiny_scene: Path) -> list[str]:
         "trainer.max_time=null",
         "logger=none",
     ]
+
+
+@pytest.fixture(scope="session")
+def trained_run(tiny_default_run: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a finished run of two steps; a test that writes to the folder copies it first."""
+    folder = tmp_path_factory.mktemp("trained") / "run"
+    logged = ["logger=tensorboard", "trainer.log_every_n_steps=1"]
+    return train_in(folder, *tiny_default_run, *logged, "trainer.max_steps=2", "evaluation.every=0")

@@ -77,17 +77,6 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> R
     return run_script
 
 
-@pytest.fixture(scope="module")
-def trained(tiny_scene: Path, tiny_default_run: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a run of three steps."""
-    folder = tmp_path_factory.mktemp("benchmarks") / "run"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(nerfro.train, "find_lpips_networks", lambda *files: ({}, {}))
-        patch.setattr(sys, "argv", ["train", *tiny_default_run, "trainer.max_steps=3", f"hydra.run.dir={folder}"])
-        nerfro.train.main()
-    return folder
-
-
 def test_all_benchmarks_are_run_by_a_test() -> None:
     here = Path(__file__).read_text()
     for file in FOLDER.glob("*.py"):
@@ -111,8 +100,8 @@ def test_training_is_timed_in_every_part(part: tuple, num_rows: int, run: Run) -
     assert len(run("training", *part)) == num_rows
 
 
-def test_rendering_is_timed(run: Run, trained: Path) -> None:
-    assert len(run("training", "view", trained / "checkpoints" / "last.ckpt", "--side", 8, "--turns", 1)) == 10
+def test_rendering_is_timed(run: Run, trained_run: Path) -> None:
+    assert len(run("training", "view", trained_run / "checkpoints" / "last.ckpt", "--side", 8, "--turns", 1)) == 10
 
 
 def test_trainings_with_a_time_budget_are_tabulated(run: Run, tiny_default_run: list[str], tmp_path: Path) -> None:
@@ -157,9 +146,9 @@ def test_pictures_of_optics_are_drawn(run: Run, tmp_path: Path) -> None:
     assert len(list(tmp_path.glob("optics_*.png"))) == 5
 
 
-def test_errors_of_a_run_are_put_into_classes(run: Run, trained: Path) -> None:
-    assert len(run("error_budget", trained, "--views", 1)) == 6
-    assert len(run("footprints", "--run", trained, "--views", 1)) == 3
+def test_errors_of_a_run_are_put_into_classes(run: Run, trained_run: Path) -> None:
+    assert len(run("error_budget", trained_run, "--views", 1)) == 6
+    assert len(run("footprints", "--run", trained_run, "--views", 1)) == 3
 
 
 def test_hulls_and_indices_are_measured(run: Run, tiny_scene: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -183,8 +172,8 @@ def test_the_cost_of_a_viewer_is_measured(run: Run, tiny_default_run: list[str])
     run("viewer", "--seconds", 6, "--warm-up", 0, "--window", 2, "--options", *tiny_default_run)
 
 
-def test_mitsuba_renders_beside_a_run(run: Run, trained: Path, tmp_path: Path) -> None:
+def test_mitsuba_renders_beside_a_run(run: Run, trained_run: Path, tmp_path: Path) -> None:
     pytest.importorskip("mitsuba")
-    write(nerfro.load(trained), "mitsuba", tmp_path / "scene.xml")
-    assert len(run("mitsuba_export", trained, tmp_path / "scene.xml", "--views", 0, "--samples", 1)) == 3
-    assert len(run("new_sky", trained, "--views", 1, "--spp", 1, "--texture", 16)) == 5
+    write(nerfro.load(trained_run), "mitsuba", tmp_path / "scene.xml")
+    assert len(run("mitsuba_export", trained_run, tmp_path / "scene.xml", "--views", 0, "--samples", 1)) == 3
+    assert len(run("new_sky", trained_run, "--views", 1, "--spp", 1, "--texture", 16)) == 5

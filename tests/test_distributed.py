@@ -24,17 +24,18 @@ from nerfro.types import Batch
 
 # Gradients are sums in another order, so they differ in their last bits. Adam divides them by their size, and would
 # make whole steps of what rounding has left of zero.
-SCHEDULE = ["trainer.max_steps=8", "checkpoint.every_steps=3", "checkpoint.every_seconds=null", "evaluation.every=4"]
-PRESETS = {
-    "paper": ["batches.jitter=true", "loss.boundary.start=2", "loss.smoothness.start=3"],
-    "default": [
-        "field.precision=float32",
-        "optimizer.adam_epsilon=1e-8",
-        "evaluation.subdivision.side=1",
-        "loss.total_variation.weight=0.01",
-        "+loss.distortion.weight=0.01",
-    ],
-}
+SHORT = [
+    "trainer.max_steps=8",
+    "checkpoint.every_steps=3",
+    "checkpoint.every_seconds=null",
+    "evaluation.every=4",
+    "batches.jitter=true",
+    "field.precision=float32",
+    "optimizer.adam_epsilon=1e-8",
+    "evaluation.subdivision.side=1",
+    "loss.total_variation.weight=0.01",
+    "+loss.distortion.weight=0.01",
+]
 TWO_PROCESSES = ["trainer.devices=2", "trainer.strategy=ddp"]
 
 # Compares the processes' models in every step, which takes the second one longer, and says which step it is at.
@@ -64,12 +65,9 @@ class Watching(Loss):
 
 
 @pytest.fixture
-def small(tiny_run: list[str], tiny_default_run: list[str]) -> dict[str, list[str]]:
+def small(tiny_default_run: list[str]) -> list[str]:
     """Overrides of short runs that use every random draw."""
-    return {
-        "paper": [*tiny_run, *SCHEDULE, *PRESETS["paper"]],
-        "default": [*tiny_default_run, *SCHEDULE, *PRESETS["default"]],
-    }
+    return [*tiny_default_run, *SHORT]
 
 
 @pytest.fixture
@@ -128,30 +126,13 @@ def require_alike(together: Path, alone: Path) -> None:
 
 
 @pytest.mark.slow
-def test_two_processes_learn_what_one_learns(
-    small: dict[str, list[str]],
-    train_here: Callable[..., Any],
-    start: Callable[..., subprocess.Popen[str]],
-    tmp_path: Path,
-) -> None:
-    together = start("two", *small["paper"])
-    alone = train_here(*small["paper"], f"hydra.run.dir={tmp_path / 'one'}")
-    assert alone.code == 0, alone.err
-    out = finish(together)
-    for line in ("nerfro: refractive on", "8 steps in"):
-        assert out.count(line) == 1, "one process alone speaks"
-    require_alike(tmp_path / "two", tmp_path / "one")
-    assert num_rays(tmp_path / "one") == 8 * 32, "every pixel has one ray there"
-
-
-@pytest.mark.slow
 def test_signal_to_one_process_stops_both_and_both_resume_to_learn_what_one_learns(
-    small: dict[str, list[str]],
+    small: list[str],
     train_here: Callable[..., Any],
     start: Callable[..., subprocess.Popen[str]],
     tmp_path: Path,
 ) -> None:
-    stopped = start("two", *small["default"])
+    stopped = start("two", *small)
     assert stopped.stdout is not None
     lines = []
     for line in stopped.stdout:
@@ -163,12 +144,12 @@ def test_signal_to_one_process_stops_both_and_both_resume_to_learn_what_one_lear
     steps = load_checkpoint(tmp_path / "two" / LAST_CHECKPOINT)[0]["global_step"]
     assert 3 <= steps <= 7, lines
     assert f"nerfro: interrupted after step {steps} and saved" in out
-    out = finish(start("two", *small["default"], "ckpt_path=last"))
+    out = finish(start("two", *small, "ckpt_path=last"))
     for rank in range(2):
         assert f"rank {rank} at step {steps}\n" in out
         assert f"rank {rank} at step {steps - 1}\n" not in out
     assert out.count("nerfro: refractive on") == out.count("8 steps in") == 1, "one process alone speaks"
-    alone = train_here(*small["default"], f"hydra.run.dir={tmp_path / 'one'}")
+    alone = train_here(*small, f"hydra.run.dir={tmp_path / 'one'}")
     assert alone.code == 0, alone.err
     require_alike(tmp_path / "two", tmp_path / "one")
     assert num_rays(tmp_path / "one") > 8 * 32, "some pixels have several rays there"
@@ -176,9 +157,9 @@ def test_signal_to_one_process_stops_both_and_both_resume_to_learn_what_one_lear
 
 @pytest.mark.slow
 def test_time_ends_both_processes_at_one_step(
-    small: dict[str, list[str]], start: Callable[..., subprocess.Popen[str]], tmp_path: Path
+    small: list[str], start: Callable[..., subprocess.Popen[str]], tmp_path: Path
 ) -> None:
-    out = finish(start("two", *small["paper"], "trainer.max_steps=-1", "trainer.max_time=00:00:00:02"))
+    out = finish(start("two", *small, "trainer.max_steps=-1", "trainer.max_time=00:00:00:02"))
     steps = load_checkpoint(tmp_path / "two" / LAST_CHECKPOINT)[0]["global_step"]
     last = {rank: max(int(line.split()[-1]) for line in out.splitlines() if f"rank {rank} at" in line) for rank in "01"}
     assert last == {"0": steps - 1, "1": steps - 1}

@@ -59,16 +59,12 @@ def test_plugins_of_the_guide_train_where_rays_split(
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/guides/export_and_share.md"])
-def test_code_that_uses_a_run_executes(
-    page: str, train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
-) -> None:
-    run = tmp_path / "run"
-    assert train_here(*tiny_default_run, "trainer.max_steps=2", f"hydra.run.dir={run}").code == 0
+def test_code_that_uses_a_run_executes(page: str, trained_run: Path) -> None:
     blocks = [block for block in python_blocks(page) if "import nerfro\n" in block]
     assert blocks
     for block in blocks:
         namespace: dict[str, Any] = {"origins": [[-2.0, 0.0, 0.0]], "directions": [[1.0, 0.0, 0.0]]}
-        source = re.sub(r'"(outputs/refractive/)?RUN"', repr(str(run)), block)
+        source = re.sub(r'"(outputs/refractive/)?RUN"', repr(str(trained_run)), block)
         source = source.replace('"mesh.ply"', '"embedded:torus/mesh.ply"').replace(', sky="dawn.hdr"', "")
         exec(source, namespace)
         assert torch.as_tensor(namespace["bent"].directions).norm(dim=-1) == pytest.approx(1)

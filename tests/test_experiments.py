@@ -14,11 +14,14 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover
-from nerfro.training.config import TrainConfig
+from nerfro.training.config import TrainConfig, build_model
+from nerfro.training.module import TrainingModule
 
 discover()
 
 EXPERIMENTS = sorted(path.stem for path in (CONF_DIR / "experiment").glob("*.yaml"))
+# Each differs from another experiment in a few values.
+ABLATIONS = [name for name in EXPERIMENTS if "ablation_" in name or "_no" in name]
 SCENES = sorted(path.stem for path in (CONF_DIR / "scene").glob("*.yaml"))
 
 # The embedded scene at 16x16 pixels, its ten validation views instead of the test views, and one small batch.
@@ -59,7 +62,7 @@ def shrunk(config: DictConfig) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
+@pytest.mark.parametrize("experiment", [name for name in EXPERIMENTS if name not in ABLATIONS])
 def test_experiment_trains_for_two_steps(experiment: str, train_here: Callable[..., Any], tmp_path: Path) -> None:
     small = shrunk(composed(f"+experiment={experiment}"))
     finished = train_here(f"+experiment={experiment}", *SMALL, *small, f"hydra.run.dir={tmp_path}")
@@ -68,6 +71,13 @@ def test_experiment_trains_for_two_steps(experiment: str, train_here: Callable[.
     assert metrics["steps"] == 2
     assert len(metrics["views"]) == 10
     assert OmegaConf.load(tmp_path / "config.yaml").name == experiment
+
+
+@pytest.mark.parametrize("experiment", ABLATIONS)
+def test_ablation_composes_and_builds(experiment: str) -> None:
+    config = composed(f"+experiment={experiment}", *SMALL, *shrunk(composed(f"+experiment={experiment}")))
+    TrainingModule.of(build_model(config), config)
+    assert config.name == experiment
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)

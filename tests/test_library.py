@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -34,15 +32,9 @@ def test_what_is_not_there_is_an_attribute_error() -> None:
 
 
 def test_a_run_is_loaded_rendered_and_exported(
-    train_here: Callable[..., Any],
-    tiny_default_run: list[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    trained_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = tmp_path / "run"
-    finished = train_here(*tiny_default_run, "trainer.max_steps=3", f"hydra.run.dir={run}")
-    assert finished.code == 0, finished.err
-    scene = nerfro.load(run, device="cpu")
+    scene = nerfro.load(trained_run, device="cpu")
     cameras = scene.cameras("test")
     rgb, depth, opacity, normals, exits, radiance = scene.render(cameras)
     num, height, width = len(cameras), cameras.height, cameras.width
@@ -51,11 +43,11 @@ def test_a_run_is_loaded_rendered_and_exported(
     assert rgb.min() >= 0
     assert rgb.max() <= 1
     for view in range(num):
-        written = load_png(run / "images" / f"test_{view:03d}.png")
+        written = load_png(trained_run / "images" / f"test_{view:03d}.png")
         torch.testing.assert_close(written, rgb[view], atol=0.5 / 255 + 1e-6, rtol=0)
     assert float(scene.ior) == 1.5
     program = (
-        f"import sys, nerfro; scene = nerfro.load({str(run)!r}, device='cpu'); "
+        f"import sys, nerfro; scene = nerfro.load({str(trained_run)!r}, device='cpu'); "
         "scene.render(scene.cameras('test').select([0])); assert 'lightning' not in sys.modules"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
@@ -67,7 +59,9 @@ def test_a_run_is_loaded_rendered_and_exported(
         (nerfro.render, ["path=orbit", "frames=2", "resolution=8", f"out={tmp_path / 'O'}"]),
         (nerfro.export, ["what=sky", "resolution=8", f"out={tmp_path / 'sky.hdr'}"]),
     ):
-        monkeypatch.setattr(sys, "argv", ["-", f"checkpoint={run}/checkpoints/last.ckpt", "device=cpu", *arguments])
+        monkeypatch.setattr(
+            sys, "argv", ["-", f"checkpoint={trained_run}/checkpoints/last.ckpt", "device=cpu", *arguments]
+        )
         command.main()
     for name in ("O/frame_0000.png", "O/frame_0001.png", "O/film.mp4", "sky.hdr"):
         assert (tmp_path / name).stat().st_size > 0

@@ -15,6 +15,7 @@ from PIL import Image
 
 from nerfro.data.blender import BlenderData
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint, restore
+from tests.conftest import train_in
 
 
 @pytest.fixture(scope="module")
@@ -22,13 +23,11 @@ def overrides(tiny_run: list[str]) -> list[str]:
     return [*tiny_run, "trainer.max_steps=6", "evaluation.every=4", "loss.boundary.start=2", "loss.smoothness.start=3"]
 
 
-@pytest.fixture
-def run(train_here: Callable[..., Any], overrides: list[str], tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def run(overrides: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a finished run."""
-    folder = tmp_path / "run"
-    finished = train_here(*overrides, f"hydra.run.dir={folder}", "logger=tensorboard")
-    assert finished.code == 0, finished.err
-    return folder
+    folder = tmp_path_factory.mktemp("train") / "run"
+    return train_in(folder, *overrides, "logger=tensorboard", "trainer.log_every_n_steps=1")
 
 
 def read(path: Path) -> np.ndarray:
@@ -66,30 +65,17 @@ def test_run_writes_metrics_pictures_and_what_repeats_it(run: Path, overrides: l
     assert all(override in facts["command"] for override in overrides if "{" not in override)
 
 
-def test_losses_and_weights_are_logged_by_name(run: Path) -> None:
+def test_every_loss_and_weight_follows_its_schedule_in_the_log(run: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(run / "tensorboard")).Reload()
-    assert "val/psnr" in events.Tags()["scalars"]
-    assert {"val/prediction_reference_error", "val/depth_opacity"} <= set(events.Tags()["images"])
-
-
-def test_every_loss_and_weight_follows_its_schedule_in_the_log(
-    train_here: Callable[..., Any], overrides: list[str], tmp_path: Path
-) -> None:
-    finished = train_here(
-        *overrides, f"hydra.run.dir={tmp_path / 'run'}", "logger=tensorboard", "trainer.log_every_n_steps=1"
-    )
-    assert finished.code == 0, finished.err
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    events = EventAccumulator(str(tmp_path / "run" / "tensorboard")).Reload()
     weights = {name: [event.value for event in events.Scalars(f"weight/{name}")] for name in ("boundary", "smoothness")}
     assert weights["boundary"] == pytest.approx([0, 0] + [0.025] * 4)
     assert weights["smoothness"] == pytest.approx([0, 0, 0] + [1.0] * 3)
     assert len(events.Scalars("loss/photometric")) == 6
     assert [event.step for event in events.Scalars("loss/boundary")] == [2, 3, 4, 5]
-    assert {"train/psnr", "train/rays_per_second", "loss/total"} <= set(events.Tags()["scalars"])
+    assert {"train/psnr", "train/rays_per_second", "loss/total", "val/psnr"} <= set(events.Tags()["scalars"])
+    assert {"val/prediction_reference_error", "val/depth_opacity"} <= set(events.Tags()["images"])
 
 
 def test_numbers_are_written_every_few_steps_and_those_of_one_step_together(
@@ -105,26 +91,16 @@ def test_numbers_are_written_every_few_steps_and_those_of_one_step_together(
         assert [event.step for event in events.Scalars(name)] == [1, 3, 5], name
 
 
-def test_two_runs_of_one_seed_are_equal_and_of_another_are_not(
-    train_here: Callable[..., Any], overrides: list[str], tmp_path: Path
+def test_weights_depend_on_the_seed_and_not_on_validation(
+    run: Path, train_here: Callable[..., Any], overrides: list[str], tmp_path: Path
 ) -> None:
-    weights = []
-    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
-        assert train_here(*overrides, f"hydra.run.dir={tmp_path / name}", f"seed={seed}").code == 0
-        weights.append(load_checkpoint(tmp_path / name / LAST_CHECKPOINT)[0]["state_dict"])
-    assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
-    assert not all(torch.equal(weights[0][key], weights[2][key]) for key in weights[0])
-
-
-def test_looking_at_validation_views_changes_no_weight(
-    train_here: Callable[..., Any], overrides: list[str], tmp_path: Path
-) -> None:
-    weights = []
-    for every in (0, 2):
-        folder = tmp_path / str(every)
-        assert train_here(*overrides, f"hydra.run.dir={folder}", f"evaluation.every={every}").code == 0
+    weights = [load_checkpoint(run / LAST_CHECKPOINT)[0]["state_dict"]]
+    for seed in (0, 1):
+        folder = tmp_path / str(seed)
+        assert train_here(*overrides, f"hydra.run.dir={folder}", f"seed={seed}", "evaluation.every=0").code == 0
         weights.append(load_checkpoint(folder / LAST_CHECKPOINT)[0]["state_dict"])
     assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
+    assert not all(torch.equal(weights[0][key], weights[2][key]) for key in weights[0])
 
 
 def test_training_learns_the_scene(train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path) -> None:

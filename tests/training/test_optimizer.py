@@ -63,23 +63,20 @@ class StoppedClock(Timer):
         return self._duration - self._spent
 
 
-@pytest.mark.parametrize(("step", "progress"), [(0, 0.0), (50, 0.25), (200, 1.0), (300, 1.0)])
-def test_progress_by_steps(step: int, progress: float) -> None:
-    assert training_progress(run(step, 200)) == progress
-
-
-@pytest.mark.parametrize(("spent", "progress"), [(0.0, 0.0), (15.0, 0.25), (60.0, 1.0), (61.0, 1.0)])
-def test_progress_by_time(spent: float, progress: float) -> None:
-    assert training_progress(run(10, -1, StoppedClock(60, spent))) == pytest.approx(progress)
-
-
-def test_progress_is_that_of_the_budget_that_ends_first() -> None:
-    assert training_progress(run(50, 200, StoppedClock(60, 30))) == 0.5
-    assert training_progress(run(150, 200, StoppedClock(60, 30))) == 0.75
-
-
-def test_run_without_a_budget_makes_no_progress() -> None:
-    assert training_progress(run(1000, -1)) == 0
+@pytest.mark.parametrize(
+    ("step", "max_steps", "spent", "progress"),
+    [
+        *[(0, 200, None, 0.0), (50, 200, None, 0.25), (300, 200, None, 1.0)],  # by steps
+        *[(10, -1, 0.0, 0.0), (10, -1, 15.0, 0.25), (10, -1, 61.0, 1.0)],  # by time
+        *[(50, 200, 30.0, 0.5), (150, 200, 30.0, 0.75)],  # by the budget that ends first
+        (1000, -1, None, 0.0),  # without a budget
+    ],
+)
+def test_progress_is_the_spent_share_of_the_budget(
+    step: int, max_steps: int, spent: float | None, progress: float
+) -> None:
+    timer = None if spent is None else StoppedClock(60, spent)
+    assert training_progress(run(step, max_steps, timer)) == pytest.approx(progress)
 
 
 def test_boundary_has_the_fields_rate_unless_given_its_own() -> None:

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 
 
-@pytest.mark.parametrize("precision", ["64-true", "bf16-mixed"])
-@pytest.mark.parametrize("model", ["tiny_default_run", "tiny_run"])
+@pytest.mark.parametrize(("precision", "model"), [("64-true", "tiny_default_run"), ("bf16-mixed", "tiny_run")])
 def test_a_run_ends_with_finite_scores(
     precision: str, model: str, request: pytest.FixtureRequest, train_here: Callable[..., Any], tmp_path: Path
 ) -> None:

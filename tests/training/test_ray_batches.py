@@ -68,26 +68,16 @@ def test_batch_depends_on_seed_and_step_alone(views, batching):
     assert not torch.equal(in_order[0].index, in_order[1].index)
 
 
-@pytest.mark.parametrize("batching", ["single_image", "all_images"])
-def test_shares_of_several_processes_make_up_the_batch(views, batching):
-    whole = RayBatches(views, 30, batching, seed=3, precrop_steps=5, jitter=True)
-    shares = [whole.share(rank, 3).batch(4) for rank in range(3)]
-    assert [len(share.rays) for share in shares] == [10, 10, 10]
-    expected = whole.batch(4)
-    for name in ("index", "rgb"):
-        assert torch.equal(torch.cat([getattr(share, name) for share in shares]), getattr(expected, name))
-    for name in ("origins", "directions"):
-        parts = [getattr(share.rays, name) for share in shares]
-        assert torch.equal(torch.cat(parts), getattr(expected.rays, name))
-    assert torch.equal(whole.share(0, 1).batch(4).index, expected.index)
-
-
-def test_masked_pixels_are_never_drawn_and_all_others_equally_often(masked):
-    batches = RayBatches(masked, 96, "all_images", seed=0)
+@pytest.mark.parametrize(
+    ("given", "batching"), [("views", "single_image"), ("views", "all_images"), ("masked", "all_images")]
+)
+def test_masked_pixels_are_never_drawn_and_all_others_equally_often(given, batching, request):
+    given = request.getfixturevalue(given)
+    batches = RayBatches(given, 96, batching, seed=0)
     counts = torch.zeros(NUM_VIEWS * HEIGHT * WIDTH)
     for step in range(1500):
         counts += torch.bincount(batches.batch(step).index, minlength=len(counts))
-    usable = masked.usable.flatten()
+    usable = torch.ones(len(counts), dtype=torch.bool) if given.usable is None else given.usable.flatten()
     mean = 1500 * 96 / int(usable.sum())
     assert counts[~usable].sum() == 0
     assert (counts[usable] - mean).abs().max() < 6 * mean**0.5
@@ -170,7 +160,9 @@ def test_masks_hold_while_precropped_and_in_every_share(masked, batching, size):
         batch = whole.batch(step)
         shares = [whole.share(rank, size).batch(step) for rank in range(size)]
         assert torch.equal(torch.cat([share.index for share in shares]), batch.index)
-        assert torch.equal(torch.cat([share.rays.directions for share in shares]), batch.rays.directions)
+        for name in ("origins", "directions"):
+            parts = [getattr(share.rays, name) for share in shares]
+            assert torch.equal(torch.cat(parts), getattr(batch.rays, name))
         assert masked.usable.flatten()[batch.index].all()
         _, row, column = place(batch.index).unbind(-1)
         inside = (row >= 3) & (row < 9) & (column >= 4) & (column < 12)
@@ -205,18 +197,6 @@ def test_single_image_draws_different_pixels_of_one_image(views):
         assert len(view.unique()) == 1
         seen.add(int(view[0]))
     assert seen == set(range(NUM_VIEWS))
-
-
-@pytest.mark.parametrize("batching", ["single_image", "all_images"])
-def test_every_pixel_is_drawn_equally_often(views, batching):
-    batches = RayBatches(views, 96, batching, seed=0)
-    counts = torch.zeros(NUM_VIEWS * HEIGHT * WIDTH)
-    for step in range(2000):
-        counts += torch.bincount(batches.batch(step).index, minlength=len(counts))
-    mean = 2000 * 96 / len(counts)
-    # A pixel is drawn 200 +- 14 times either way; six deviations.
-    assert counts.sum() == 2000 * 96
-    assert (counts - mean).abs().max() < 6 * mean**0.5
 
 
 @pytest.mark.parametrize("batching", ["single_image", "all_images"])
