@@ -23,7 +23,6 @@ from omegaconf import OmegaConf
 from scipy.spatial import ConvexHull
 
 from benchmarks.capture import measure
-from nerfro.capture.boards import tag_detector, twelve_faces
 from nerfro.data.opencv import OpenCVData
 from nerfro.geometry.mesh import load_mesh
 from nerfro.paths import CONF_DIR
@@ -86,20 +85,6 @@ def test_masks_are_the_true_surface_in_the_true_cameras(few: Path) -> None:
         expected = outline_of(place, *mask.shape)  # the globe is convex
         assert mask.any()
         assert (mask & expected).sum() / (mask | expected).sum() > 0.99
-
-
-def test_tags_are_photographed_where_the_true_cameras_see_them(few: Path) -> None:
-    views = OpenCVData(str(few / "truth")).load("train")
-    board = twelve_faces()
-    corners = board.tag_corners()
-    for view, image in enumerate(views.images):
-        grey = np.uint8(np.rint(255 * image.mean(-1).numpy()))
-        found = tag_detector(board.family).detect(grey)
-        assert len(found) > 5
-        places = np.stack([dolphin_capture.board_to_world(corners[tag.tag_id]).mean(0) for tag in found])
-        pixels, _ = views.cameras.project(torch.from_numpy(places).float())
-        error = np.linalg.norm(pixels[view].numpy() - [tag.corners.mean(0) for tag in found], axis=1)
-        assert np.median(error) < 0.3
 
 
 def test_only_what_is_not_on_disk_is_rendered_again(few: Path, tmp_path: Path) -> None:

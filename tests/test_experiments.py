@@ -110,19 +110,6 @@ def test_the_papers_eight_scenes_are_there() -> None:
     assert set(SCENES) == {"torus", "ship", "deerglobe", "starlamp", "dolphin", "ball", "glass", "pen"}
 
 
-def test_the_promised_experiments_are_there() -> None:
-    plain = {"refractive", "mipnerf", "mipnerf_sky", "ablation_noH", "ablation_noBD"}
-    paper = {
-        "paper_refractive",
-        "paper_mipnerf",
-        "paper_mipnerf_sky",
-        "paper_ablation_noH",
-        "paper_ablation_noBD",
-        "paper_fast",
-    }
-    assert plain | paper <= set(EXPERIMENTS)
-
-
 def test_experiments_stack() -> None:
     config = composed("+experiment=[ablation_noH,ablation_noBD]")
     assert "num_samples" in config.sampler.points

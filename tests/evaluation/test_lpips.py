@@ -1,4 +1,3 @@
-import builtins
 import functools
 import importlib.util
 import subprocess
@@ -14,7 +13,6 @@ from torch import Tensor
 from nerfro.errors import NerfroError
 from nerfro.evaluation import pretrained
 from nerfro.evaluation.lpips import ALEX, VGG, Backbone, LpipsNetwork, find_lpips_networks, load_lpips_network
-from nerfro.paths import ASSETS_DIR
 
 
 class Reference(NamedTuple):
@@ -120,15 +118,6 @@ def test_heads_are_the_published_ones_to_the_last_bit(backbone: Backbone, tmp_pa
     assert len(published) == 5
     for i in range(5):
         assert torch.equal(network.get_buffer(f"head{i}"), published[f"lin{i}.model.1.weight"])
-
-
-def test_heads_are_read_from_no_other_package(backbone_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    opened, really_open = [], open
-    monkeypatch.setattr(
-        builtins, "open", lambda file, *a, **k: (opened.append(str(file)), really_open(file, *a, **k))[1]
-    )
-    load_lpips_network(ALEX, backbone_file)
-    assert {Path(file) for file in opened} == {backbone_file, ASSETS_DIR / "_lpips" / "heads.npz"}
 
 
 def test_equal_pictures_have_distance_zero(network: LpipsNetwork) -> None:

@@ -113,20 +113,6 @@ def test_refused_connection_is_the_reason_in_one_line() -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_nothing_is_fetched_when_downloads_are_off(site: str, cache: Path) -> None:
-    with pytest.raises(NerfroError, match="no weights; AlexNet is not in the cache of torch: download"):
-        load_weights(Published("AlexNet", f"{site}/{right_name()}"), download=False)
-    assert not cache.exists()
-
-
-def test_damaged_file_is_named(tmp_path: Path) -> None:
-    damaged = tmp_path / "damaged.pth"
-    damaged.write_bytes(weights_file()[:200])
-    with pytest.raises(NerfroError, match=r"damaged\.pth cannot be read") as caught:
-        load_weights(ALEXNET, damaged)
-    assert "\n" not in str(caught.value)
-
-
 @given(text=st.text(max_size=200))
 @example(text="")
 @example(text="(lp0\n.")  # pickles, of the first protocol

@@ -3,22 +3,12 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 from skimage.metrics import structural_similarity
-from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation.ssim import MS_SSIM_MIN_SIZE, ms_ssim, ssim, ssim_map
+from tests.evaluation.test_metrics import pictures
 
 EXPONENTS = np.array([0.0448, 0.2856, 0.3001, 0.2363, 0.1333])  # Wang et al. 2003, table 1
-
-
-def pictures(height: int = 37, width: int = 45, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """A smooth picture with an edge, and the same with noise, a shift and a flat part."""
-    generator = torch.Generator().manual_seed(seed)
-    y, x = torch.meshgrid(torch.linspace(0, 1, height), torch.linspace(0, 1, width), indexing="ij")
-    target = torch.stack([0.5 + 0.4 * torch.sin(9 * x), y, (x > y).float()], dim=-1)
-    prediction = target.roll(1, dims=1) + 0.1 * torch.randn(target.shape, generator=generator)
-    prediction[:15] = 0.5
-    return prediction.clamp(0, 1), target
 
 
 def similarity(prediction: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray]:
@@ -72,7 +62,7 @@ def test_ssim_on_a_mask_is_the_mean_of_the_map_there() -> None:
 
 @pytest.mark.parametrize("masked", [False, True])
 def test_ms_ssim_is_that_of_scikit_images_maps(masked: bool) -> None:
-    prediction, target = pictures(176, 208)
+    prediction, target = pictures(height=176, width=208)
     inside = torch.ones(176, 208, dtype=torch.bool)
     if masked:
         inside[:, :41] = False
@@ -86,7 +76,7 @@ def test_ms_ssim_is_that_of_scikit_images_maps(masked: bool) -> None:
 
 def test_ms_ssim_is_that_of_pytorch_msssim() -> None:
     theirs = pytest.importorskip("pytorch_msssim")
-    prediction, target = pictures(192, 176)
+    prediction, target = pictures(height=192, width=176)
     batches = [image.double().permute(2, 0, 1)[None] for image in (prediction, target)]
     expected = theirs.ms_ssim(*batches, data_range=1.0)
     # Its window is computed in single precision.
@@ -94,15 +84,15 @@ def test_ms_ssim_is_that_of_pytorch_msssim() -> None:
 
 
 def test_ms_ssim_of_equal_pictures_is_one_and_opposite_ones_have_none() -> None:
-    _, target = pictures(200, 190)
+    _, target = pictures(height=200, width=190)
     assert ms_ssim(target, target).item() == pytest.approx(1)
     assert ms_ssim(1 - target, target).item() == 0
 
 
 def test_smallest_pictures_are_those_that_hold_a_window_on_every_scale() -> None:
     assert MS_SSIM_MIN_SIZE == 161
-    assert torch.isfinite(ms_ssim(*pictures(161, 170)))
+    assert torch.isfinite(ms_ssim(*pictures(height=161, width=170)))
     with pytest.raises(NerfroError, match=r"at least 161 x 161 pixels for its five scales, got \[160, 200\]"):
-        ms_ssim(*pictures(160, 200))
+        ms_ssim(*pictures(height=160, width=200))
     with pytest.raises(NerfroError, match="at least 11 x 11"):
         ssim(torch.zeros(10, 40, 3), torch.zeros(10, 40, 3))

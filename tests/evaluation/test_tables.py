@@ -1,7 +1,6 @@
 import csv
 import io
 import re
-from pathlib import Path
 
 import pytest
 import rich.console
@@ -15,7 +14,6 @@ from nerfro.evaluation.tables import (
     to_latex,
     to_markdown,
     to_rich,
-    write_table,
 )
 
 TABLE = Table(
@@ -45,12 +43,6 @@ def on_console(table: Table, styled: bool = False) -> str:
 
 def test_best_follows_the_direction_of_the_column_and_values_that_print_alike_tie() -> None:
     assert best_cells(TABLE) == {(1, 0), (2, 0), (1, 1)}
-
-
-def test_nothing_is_marked_unless_asked_for() -> None:
-    unmarked = Table(TABLE.title, TABLE.label_title, TABLE.columns, TABLE.rows)
-    assert best_cells(unmarked) == set()
-    assert "**2" not in to_markdown(unmarked)
 
 
 def test_csv_reads_back_every_digit() -> None:
@@ -100,12 +92,6 @@ def test_console_shows_every_number_and_the_footnote_in_one_line() -> None:
 
 def test_console_prints_square_brackets_as_they_are() -> None:
     assert "[red]x" in on_console(Table("t", "view", (Column("PSNR"),), (Row("[red]x", (1.0,)),)))
-
-
-def test_all_forms_are_written(tmp_path: Path) -> None:
-    paths = write_table(TABLE, tmp_path / "table.v1")
-    assert [path.name for path in paths] == ["table.v1.csv", "table.v1.md", "table.v1.tex"]
-    assert [path.read_text(encoding="utf-8") for path in paths] == [to_csv(TABLE), to_markdown(TABLE), to_latex(TABLE)]
 
 
 def test_row_that_does_not_fit_the_columns_is_refused() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import threading
-import time
 import weakref
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +16,6 @@ from lightning.pytorch import Trainer
 
 from nerfro.data.blender import BlenderData
 from nerfro.data.pixel_store import PixelStore
-from nerfro.kernels import compilation
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.rendering import Renderer, Scene
 from nerfro.samplers.eikonal import Eikonal
@@ -117,38 +115,6 @@ def test_the_thread_has_one_core_and_leaves_all_others_theirs(ahead) -> None:
         assert seen == [2]
     finally:
         torch.set_num_threads(threads)
-
-
-@pytest.mark.parametrize(("sampler", "num_rays"), [(Snell(), 50_000), (Eikonal(), 10_000)], ids=["snell", "eikonal"])
-def test_python_goes_on_while_the_thread_traces(sampler: Snell | Eikonal, num_rays: int, ahead, ball: SdfGrid) -> None:
-    assert sampler.releases_gil(ball)
-    many = rays(num_rays)
-    sampler(many[:10], ball)
-    spans: list[float] = []
-
-    def make(step: int) -> None:
-        begun = time.perf_counter()
-        sampler(many, ball)
-        spans.append(time.perf_counter() - begun)
-
-    one = ahead(lambda step: make(step) if step == 1 else sampler(many[:10], ball))
-    one(0)
-    longest, last = 0.0, time.perf_counter()
-    while not spans:
-        now = time.perf_counter()
-        longest, last = max(longest, now - last), now
-    assert longest < 0.5 * spans[0]
-
-
-def test_kernels_bend_rays_alike_on_one_core_and_on_several(monkeypatch: pytest.MonkeyPatch, ball: SdfGrid) -> None:
-    for sampler in (Snell(), Eikonal()):
-        paths = []
-        for threads in (1, 2):
-            monkeypatch.setattr(compilation, "num_threads", lambda threads=threads: threads)
-            paths.append(sampler(rays(2000), ball))
-        assert paths[0].refracted.any()
-        torch.testing.assert_close(paths[0].positions, paths[1].positions, rtol=0, atol=1e-6)
-        assert torch.equal(paths[0].refracted, paths[1].refracted)
 
 
 def test_nothing_is_traced_ahead_where_paths_learn_or_python_is_needed(ball: SdfGrid, monkeypatch) -> None:
