@@ -166,18 +166,3 @@ def test_papers_recipe_is_the_authors() -> None:
     assert (config.sampler.points.num_coarse, config.sampler.points.num_fine) == (64, 128)
     assert (config.sampler.path.integrator, config.sampler.path.num_steps) == ("euler", 768)
     assert (config.batches.size, config.trainer.max_steps) == (1024, 200_000)
-
-
-@pytest.mark.slow
-def test_multirun_sweeps_over_the_ablations(
-    tmp_path: Path, tiny_run: list[str], tiny_scene: Path, train_here: Callable[..., Any]
-) -> None:
-    small = [override for override in tiny_run if not override.startswith(("sampler.points", "sampler/points"))]
-    done = train_here(
-        *("-m", "+experiment=glob(ablation_no*)", "trainer.max_steps=2", *small),
-        *(f"hydra.sweep.dir={tmp_path / 'sweep'}", "evaluation.every=0"),
-    )
-    assert done.code == 0, done.err
-    ablations = [name for name in EXPERIMENTS if name.startswith("ablation_no")]
-    runs = sorted(path.parent.name for path in (tmp_path / "sweep").glob("*/metrics.json"))
-    assert runs == sorted(f"{name}-{tiny_scene.name}-seed0" for name in ablations)

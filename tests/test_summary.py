@@ -296,11 +296,6 @@ def test_console_stacks_groups_that_do_not_fit_side_by_side(width: int, blocks: 
     assert "…" not in text
 
 
-def test_spreads_that_do_not_fit_the_columns_are_refused() -> None:
-    with pytest.raises(NerfroError, match="1 values of 'a' for 2 columns"):
-        Table("t", "m", (Column("x"), Column("y")), (Row("a", (1.0, 2.0), (0.1,)),))
-
-
 @pytest.fixture
 def summarise(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
     """Exit code and output of `python -m nerfro.summary`'s main in this process."""

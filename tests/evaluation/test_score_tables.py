@@ -1,10 +1,3 @@
-from pathlib import Path
-
-import pytest
-import torch
-
-from nerfro.evaluation.lpips import find_lpips_networks
-from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import METRICS, EvaluationResult, ViewScores
 from nerfro.evaluation.tables import Row, regions_table, views_table
 
@@ -45,19 +38,6 @@ def test_regions_table_has_their_means_and_what_the_views_did_not_tell() -> None
     table = regions_table(REGIONS, "means")
     assert table.rows == (line("full", 20.5), line("mask", 10.0), line("crop", 15.5))
     assert table.notes == ("crop: n/a: MS-SSIM (crops too small), LPIPS (no network)",)
-
-
-def test_a_first_run_without_networks_tells_why_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    metrics = ImageMetrics({}, find_lpips_networks(download=False)[1])
-    metrics.update(torch.rand(128, 128, 3), torch.rand(128, 128, 3), coverage=torch.ones(128, 128))
-    result = metrics.result()
-    for table in (views_table(result, "t"), regions_table(result, "t")):
-        assert all(any(row.values[j] is not None for row in table.rows) for j in range(len(table.columns)))
-    (note,) = views_table(result, "t").notes
-    assert note == "n/a: MS-SSIM (images below 161 pixels), LPIPS, LPIPS-VGG (no weights)"
-    assert len(note) <= 80
-    assert "https://download.pytorch.org/models/alexnet" in result.notes["lpips"]
 
 
 def test_a_column_with_some_numbers_stays() -> None:

@@ -94,6 +94,7 @@ def test_console_prints_square_brackets_as_they_are() -> None:
     assert "[red]x" in on_console(Table("t", "view", (Column("PSNR"),), (Row("[red]x", (1.0,)),)))
 
 
-def test_row_that_does_not_fit_the_columns_is_refused() -> None:
+@pytest.mark.parametrize("row", [Row("a", (1.0,)), Row("a", (1.0, 2.0), (0.1,))])
+def test_values_and_spreads_that_do_not_fit_the_columns_are_refused(row: Row) -> None:
     with pytest.raises(NerfroError, match="1 values of 'a' for 2 columns"):
-        Table("t", "view", (Column("x"), Column("y")), (Row("a", (1.0,)),))
+        Table("t", "view", (Column("x"), Column("y")), (row,))

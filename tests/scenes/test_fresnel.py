@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from nerfro.scenes import torus
 from nerfro.scenes.glass import PLUGIN
 from nerfro.scenes.path_tracer import PathTracer, Pinhole, load_mitsuba
-from nerfro.scenes.surface import rounded_box, torus_angles
+from nerfro.scenes.surface import rounded_box
 from nerfro.scenes.viewpoints import look_at_origin
+from tests.scenes.empty_glass import empty_glass
 
 pytestmark = pytest.mark.usefixtures("mitsuba")
 
@@ -73,17 +71,8 @@ def test_shares_are_the_same_both_ways_and_total_beyond_the_critical_angle():
 def test_a_slab_transmits_what_infinitely_many_reflections_leave():
     """White in front of the camera, black behind it: T = 2 n / (n^2 + 1) at normal incidence."""
     n = 1.52
-    ring, _ = torus_angles(0.02, 0.005, spacing=0.005)
-    # Far outside the picture, as scenes have an interior.
-    interior = replace(ring, vertices=ring.vertices + np.float32(50), colours=np.ones_like(ring.vertices))
-    scene = replace(
-        torus.build(0.1),
-        glass=rounded_box((1.5, 1.5, 0.05), 0.01, edge_steps=2),
-        interior=interior,
-        ior=n,
-        tint=(1.0, 1.0, 1.0),
-        sky=lambda directions: np.repeat((directions[..., 2:] < 0).astype(float), 3, -1),
-    )
+    slab = rounded_box((1.5, 1.5, 0.05), 0.01, edge_steps=2)
+    scene = empty_glass(slab, lambda directions: np.repeat((directions[..., 2:] < 0).astype(float), 3, -1), ior=n)
     tracer = PathTracer(scene, True, Pinhole.square(0.05, 8))
     picture = tracer.render(look_at_origin(np.array([0.0, 1e-3, 4.0])), spp=1024, seed=0)
     # 65536 paths, each black or white: a standard deviation of 0.001.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -16,12 +15,13 @@ from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball, RoundedBox
 from nerfro.samplers.snell import Snell
-from nerfro.scenes import path_tracer, torus
+from nerfro.scenes import path_tracer
 from nerfro.scenes.path_tracer import PathTracer, Pinhole
-from nerfro.scenes.surface import Surface, rounded_box, sphere, torus_angles
+from nerfro.scenes.surface import Surface, rounded_box, sphere
 from nerfro.scenes.viewpoints import look_at_origin
 from nerfro.subdivision import part_rays
 from nerfro.types import Path, Rays
+from tests.scenes.empty_glass import empty_glass
 
 # Sums over a pixel of a cube converge slowly: an edge sees lamps in many directions.
 SIDE, ANGLE, SPP, PARTS = 12, 0.5, 4096, 16
@@ -48,12 +48,7 @@ def path_traced(
     glass: Surface, ior: float, absorption: tuple[float, float, float] = (0, 0, 0), inner: tuple | None = None
 ) -> Tensor:
     """Linear radiance by Mitsuba; `inner` is the surface and the index of a body inside."""
-    ring, _ = torus_angles(0.02, 0.005, spacing=0.005)
-    # Far outside the picture, as scenes have an interior.
-    interior = replace(ring, vertices=ring.vertices + np.float32(50), colours=np.ones_like(ring.vertices))
-    scene = replace(
-        torus.build(0.1), glass=glass, interior=interior, ior=ior, tint=(1.0,) * 3, absorption=absorption, sky=sky
-    )
+    scene = empty_glass(glass, sky, ior=ior, absorption=absorption)
     tracer = PathTracer(scene, True, Pinhole.square(ANGLE, SIDE))
     if inner is not None:
         mi, (surface, index) = tracer.mitsuba, inner

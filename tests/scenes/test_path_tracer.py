@@ -108,16 +108,6 @@ def test_white_furnace_is_white(white_torus, poses, fresnel, monkeypatch):
 
 
 @pytest.mark.usefixtures("mitsuba")
-def test_tint_counts_on_entry_and_on_exit(white_torus, poses):
-    tint = np.array([0.5, 0.9, 0.7])
-    tracer = PathTracer(replace(white_torus, tint=tuple(tint)), False, Pinhole.square(CAMERA_ANGLE_X, 24))
-    picture, mask = tracer.render(poses[0], spp=16, seed=0), tracer.silhouette(poses[0]) > 0.5
-    inner = mask & np.roll(mask, 1, 0) & np.roll(mask, -1, 0) & np.roll(mask, 1, 1) & np.roll(mask, -1, 1)
-    assert np.median(picture[inner], 0) == pytest.approx(tint**2, abs=1e-3)
-    assert picture[0, 0] == pytest.approx(1.0, abs=1e-4)
-
-
-@pytest.mark.usefixtures("mitsuba")
 def test_background_pixels_show_the_sky_in_the_direction_of_the_pixel(poses):
     """A sky that encodes the direction itself finds a mirrored, turned or shifted camera or sky."""
     ring, _ = torus_angles(0.05, 0.02, spacing=0.01)

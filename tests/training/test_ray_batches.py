@@ -181,24 +181,6 @@ def test_masks_that_leave_too_few_pixels_are_refused(masked):
         RayBatches(replace(masked, usable=border), 2, "all_images", precrop_steps=1)
 
 
-def test_batch_without_equal_shares_is_refused(views):
-    message = "batches.size=30 cannot be shared evenly by 4 processes; take a multiple of 4"
-    with pytest.raises(NerfroError, match=message):
-        RayBatches(views, 30).share(0, 4)
-
-
-def test_single_image_draws_different_pixels_of_one_image(views):
-    batches = RayBatches(views, HEIGHT * WIDTH, "single_image", seed=0)
-    seen = set()
-    for step in range(40):
-        index = batches.batch(step).index
-        view = index // (HEIGHT * WIDTH)
-        assert len(index.unique()) == HEIGHT * WIDTH
-        assert len(view.unique()) == 1
-        seen.add(int(view[0]))
-    assert seen == set(range(NUM_VIEWS))
-
-
 @pytest.mark.parametrize("batching", ["single_image", "all_images"])
 def test_precrop_draws_from_the_middle_and_ends_on_time(views, batching):
     batches = RayBatches(views, 40, batching, seed=0, precrop_steps=30, precrop_fraction=0.5)
