@@ -214,9 +214,8 @@ def shown(folder: Path) -> str:
 
 def device(config: Mapping[str, Any], facts: Mapping[str, Any]) -> str:
     """Return the training device, such as "NVIDIA H200" or "2 CPU threads (x86_64)"."""
-    trainer = config["trainer"]
-    if facts.get("gpu") and trainer["accelerator"] not in ("auto", "cpu"):
-        number = trainer["devices"]
+    if facts.get("gpu"):
+        number = config["trainer"]["devices"]
         return facts["gpu"] if number == 1 else f"{number} x {facts['gpu']}"
     threads = facts["threads"]
     return f"{threads} CPU thread{'s' if threads != 1 else ''} ({facts['machine']})"

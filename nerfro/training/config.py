@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Optional, cast
 
+import torch
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -261,6 +262,11 @@ def settle_trainer(config: DictConfig) -> None:
     config.optimizer.boundary_steps = min(config.optimizer.boundary_steps, steps)
     config.evaluation.every, config.evaluation.refine_steps = max(1, steps // 2), 0
     config.evaluation.subdivision.side = 1
+
+
+def training_device(config: DictConfig) -> str:
+    """Return the kind of device that a run trains on, `cuda` or `cpu`; `trainer.accelerator=auto` means the CPU."""
+    return "cuda" if config.trainer.accelerator in ("gpu", "cuda") and torch.cuda.is_available() else "cpu"
 
 
 def build_data(config: DictConfig) -> DataSource:

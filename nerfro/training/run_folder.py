@@ -29,7 +29,7 @@ from nerfro.kernels.precision import fast_bfloat16
 from nerfro.paths import PACKAGE_DIR, user_path
 from nerfro.rendering import Renderer
 from nerfro.training import backdrop, content
-from nerfro.training.config import build_model, check_trained
+from nerfro.training.config import build_model, check_trained, training_device
 from nerfro.training.settings import RESUMING, first_difference, settings
 
 LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
@@ -117,7 +117,7 @@ def needed_bytes(renderer: Renderer) -> int:
 def record(folder: Path, config: DictConfig) -> None:
     """Write the records of a run: config.yaml (resolved), run.json (command, versions, commit) and git.diff."""
     write_atomically(folder / CONFIG_FILE, OmegaConf.to_yaml(config, resolve=True))
-    commit, diff = _git("rev-parse", "HEAD"), _git("diff", "HEAD")
+    commit, diff, device = _git("rev-parse", "HEAD"), _git("diff", "HEAD"), training_device(config)
     facts = {
         "command": _command(),
         "seed": config.seed,
@@ -126,8 +126,8 @@ def record(folder: Path, config: DictConfig) -> None:
         "python": platform.python_version(),
         "machine": platform.machine(),
         "threads": torch.get_num_threads(),
-        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-        "fast_bfloat16": fast_bfloat16("cuda" if torch.cuda.is_available() else "cpu"),
+        "gpu": torch.cuda.get_device_name() if device == "cuda" else None,
+        "fast_bfloat16": fast_bfloat16(device),
         "versions": {name: _version(name) for name in _PACKAGES},
     }
     write_atomically(folder / "run.json", json.dumps(facts, indent=2) + "\n")

@@ -26,6 +26,7 @@ from nerfro.kernels.precision import fast_bfloat16
 from nerfro.registry import build, create, find
 from nerfro.training.callbacks import Checkpoints, ConfigInCheckpoint, SharedTimer, Throughput, TrainingProgress
 from nerfro.training.checkpoint_files import CheckpointFiles
+from nerfro.training.config import training_device
 from nerfro.training.data_module import validation_interval
 from nerfro.training.log import TrainingLog
 from nerfro.training.run_folder import CONFIG_FILE, LAST_CHECKPOINT
@@ -134,8 +135,7 @@ def lightning_precision(config: DictConfig) -> str:
     precision: str = config.trainer.precision
     if precision != "fastest":
         return precision
-    on_gpu = torch.cuda.is_available() and config.trainer.accelerator in ("gpu", "cuda")
-    return "bf16-mixed" if fast_bfloat16("cuda" if on_gpu else "cpu") else "32-true"
+    return "bf16-mixed" if fast_bfloat16(training_device(config)) else "32-true"
 
 
 def prepare_process(seed: int) -> None:
