@@ -1,4 +1,7 @@
-"""Export of trained scenes for Mitsuba 3: `python -m nerfro.export what=mitsuba`; see docs/sharing.md."""
+"""Export of trained scenes for Mitsuba 3: `python -m nerfro.export what=mitsuba`.
+
+See docs/guides/export_and_share.md.
+"""
 
 from nerfro.viewing import PLUGIN_EXPORTS
 

@@ -1,4 +1,4 @@
-"""Synthetic scenes for benchmarks: `python -m nerfro.synthesize scene=ship`; see docs/scenes.md."""
+"""Synthetic scenes for benchmarks: `python -m nerfro.synthesize scene=ship`; see docs/guides/synthetic_scenes.md."""
 
 from nerfro.scenes import SCENES
 
