@@ -14,7 +14,8 @@ from nerfro.types import Radiance, Samples
 class Field(nn.Module, ABC):
     """Density and colour of a volume; subclasses implement `forward`.
 
-    Positions and densities are in world units, directions are unit vectors, and colours are sRGB.
+    Positions and densities are in world units, and directions are unit vectors. Colours are linear radiance, or sRGB
+    with `model.colour=srgb`.
     """
 
     @property
@@ -36,7 +37,7 @@ class Field(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, samples: Samples) -> Radiance:
-        """Evaluate density (per world unit) and colour (sRGB) at samples.
+        """Evaluate density (per world unit) and colour at samples.
 
         Args:
             samples: R rays with N samples each.
