@@ -12,16 +12,16 @@ import inspect
 import re
 import sys
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
+from omegaconf import MISSING, DictConfig, OmegaConf
 
 from nerfro.__main__ import commands
-from nerfro.allowed import Range, check_settings
+from nerfro.allowed import Range
 from nerfro.paths import CONF_DIR
 from nerfro.registry import KINDS, Plugin, discover, plugins
 from nerfro.subdivision import Subdivision, SubdivisionChanges
@@ -60,7 +60,7 @@ def commands_page() -> str:
             schema, folder = found
             yaml = (folder / f"{name}.yaml").read_text(encoding="utf-8")
             comments = dict(re.findall(r"^(\w+):.*?\s# (.*)$", yaml, re.MULTILINE))
-            text.append(_table(_settings(schema, composed(name), comments)))
+            text.append(_table(_settings(schema, composed(name, schema, folder), comments)))
     return "\n".join(text)
 
 
@@ -71,7 +71,7 @@ def configuration_page() -> str:
         "`field.*`, are in [plugins](plugins.md). This page is generated from the configuration.\n",
         "## General\n",
     ]
-    rows = list(_settings(TrainConfig, composed("train"), {}))
+    rows = list(_settings(TrainConfig, composed("train", TrainConfig, CONF_DIR), {}))
     text.append(_table(row for row in rows if "." not in row[0]))
     sections = dict.fromkeys(row[0].split(".")[0] for row in rows if "." in row[0])
     for section in sections:
@@ -135,18 +135,11 @@ def command_schema(command: str) -> tuple[type, Path] | None:
     return None
 
 
-def composed(command: str, overrides: Sequence[str] = ()) -> DictConfig:
-    """Compose the configuration of a command as its entry point does."""
-    found = command_schema(command)
-    assert found is not None, f"{command} has no options"
-    schema, folder = found
+def composed(command: str, schema: type, folder: Path) -> DictConfig:
+    """Compose the default configuration of a command."""
     ConfigStore.instance().store(name=f"{command}_schema", node=schema, provider="nerfro")
     with initialize_config_dir(str(folder), version_base="1.3"):
-        config = compose(command, list(overrides), return_hydra_config=True)
-    with open_dict(config):
-        del config["hydra"]
-    check_settings(config, schema)
-    return config
+        return compose(command)
 
 
 def _settings(

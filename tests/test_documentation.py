@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import re
+import runpy
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,7 @@ from typing import Any
 import pytest
 import torch
 
+from nerfro.__main__ import commands
 from nerfro.paths import PACKAGE_DIR
 from nerfro.registry import discover, find
 from nerfro.testing import check
@@ -26,7 +29,7 @@ def python_blocks(page: str) -> list[str]:
 def guide_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, restored_registry: None) -> list[str]:
     """Register the plugins of the guide and return the rest of its code."""
     rest = []
-    for block in python_blocks("docs/plugins.md"):
+    for block in [*python_blocks("docs/guides/plugins.md"), *python_blocks("docs/tutorials/first_plugin.md")]:
         file = re.match(r"# plugins/(\w+\.py)\n", block)
         if file is None:
             rest.append(block)
@@ -40,8 +43,9 @@ def guide_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, restored_regi
 def test_plugins_of_the_guide_keep_their_contracts(guide_plugins: list[str]) -> None:
     for kind, name in (("sampler/points", "square_root"), ("loss", "half_transparent"), ("boundary", "horizon")):
         check(find(kind, name))
-    (test,) = guide_plugins
+    test, check_of_tutorial = guide_plugins
     namespace: dict[str, Any] = {}
+    exec(check_of_tutorial, namespace)
     exec(test, namespace)
     namespace["test_square_root_sampler"]()
 
@@ -58,13 +62,28 @@ def test_plugins_of_the_guide_train_where_rays_split(
     assert "2 steps in" in finished.out
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/guides/export_and_share.md"])
-def test_code_that_uses_a_run_executes(page: str, trained_run: Path) -> None:
-    blocks = [block for block in python_blocks(page) if "import nerfro\n" in block]
-    assert blocks
-    for block in blocks:
-        namespace: dict[str, Any] = {"origins": [[-2.0, 0.0, 0.0]], "directions": [[1.0, 0.0, 0.0]]}
-        source = re.sub(r'"(outputs/refractive/)?RUN"', repr(str(trained_run)), block)
+@pytest.mark.parametrize("page", ["README.md", "docs/guides/export_and_share.md", "docs/tutorials/notebook.md"])
+def test_code_that_uses_a_run_executes(page: str, trained_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    namespace: dict[str, Any] = {"origins": [[-2.0, 0.0, 0.0]], "directions": [[1.0, 0.0, 0.0]]}
+    for block in itertools.dropwhile(lambda block: "import nerfro\n" not in block, python_blocks(page)):
+        source = re.sub(r'"((outputs/refractive/)?RUN|outputs/first)"', repr(str(trained_run)), block)
         source = source.replace('"mesh.ply"', '"embedded:torus/mesh.ply"').replace(', sky="dawn.hdr"', "")
         exec(source, namespace)
-        assert torch.as_tensor(namespace["bent"].directions).norm(dim=-1) == pytest.approx(1)
+    assert torch.allclose(torch.as_tensor(namespace["bent"].directions).norm(dim=-1), torch.tensor(1.0))
+
+
+def test_reference_explains_every_option() -> None:
+    pages = runpy.run_path(str(CHECKOUT / "docs" / "reference_pages.py"))["pages"]()
+    assert all(f"## {name}\n" in pages["commands.md"] for name in commands())
+    unexplained = [row for page in pages.values() for row in page.split("\n") if row.startswith("|") and "|  |" in row]
+    assert unexplained == []
+
+
+def test_links_lead_to_files() -> None:
+    generated = {CHECKOUT / "docs" / "reference" / name for name in ("commands.md", "configuration.md", "plugins.md")}
+    for source in [*CHECKOUT.glob("*.md"), *CHECKOUT.glob("docs/**/*.md")]:
+        text = re.sub(r"^```.*?^```", "", source.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+        links = [link for link in re.findall(r"\]\(([^)#\s]+)", text) if "://" not in link]
+        missing = [link for link in links if not (source.parent / link).exists()]
+        assert [link for link in missing if (source.parent / link).resolve() not in generated] == [], source

@@ -161,7 +161,7 @@ REFUSED_ARGUMENTS: Mapping[str, str] = {
     "min_epochs": _EPOCHS,
     "model_registry": "checkpoints are written to the run folder",
     "num_sanity_val_steps": "validation is tried in the first steps; set evaluation.every",
-    "plugins": "nerfro's plugins have no access to the trainer's; see docs/plugins.md",
+    "plugins": "nerfro's plugins have no access to the trainer's; see docs/guides/plugins.md",
     "reload_dataloaders_every_n_epochs": _EPOCHS,
     "sync_batchnorm": "no model has batch normalization",
     "use_distributed_sampler": "every process draws its own share of the pixels",

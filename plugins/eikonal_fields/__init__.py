@@ -2,7 +2,7 @@
 
 A whole method of somebody else, made of registered parts: `medium=index_field`, `sampler/path=box_march` and
 `model=eikonal_fields`; everything else is nerfro's. Use it with `+experiment=eikonal_fields`. What follows the authors'
-code, https://github.com/m-bemana/eikonalfield, and what does not, is told in docs/plugins.md.
+code, https://github.com/m-bemana/eikonalfield, and what does not, is told in docs/guides/plugins.md.
 """
 
 from . import box_march, index_field, model
