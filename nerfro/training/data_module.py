@@ -103,17 +103,18 @@ Made = TypeVar("Made")
 class Prefetcher(Generic[Made]):
     """Make the batch of the next step in a thread. The batches do not depend on the thread.
 
-    The thread uses one core, and kernels release Python and the threads of Numba (`kernels.compilation`).
+    The thread uses one core, and kernels release Python and the threads of Numba (`kernels.compilation`). PyTorch has
+    one thread less meanwhile, because its threads spin while they wait for one that has no core.
     """
 
     def __init__(self, make: Callable[[int], Made]) -> None:
         self._make = make
         self._next: tuple[int, Future[Made]] | None = None
         # PyTorch has a number of threads per thread, and new threads inherit the last one.
-        threads = torch.get_num_threads()
+        self._num_threads = torch.get_num_threads()
         self._thread = ThreadPoolExecutor(1, "paths", lambda: torch.set_num_threads(1))
         self._thread.submit(torch.get_num_threads).result()
-        torch.set_num_threads(threads)
+        torch.set_num_threads(max(1, self._num_threads - 1))
 
     def __call__(self, step: int) -> Made:
         """Return the batch of a step; errors of the thread are raised here."""
@@ -130,8 +131,9 @@ class Prefetcher(Generic[Made]):
             self._next = None
 
     def close(self) -> None:
-        """End the thread."""
+        """End the thread, and return its core to PyTorch."""
         self._thread.shutdown(cancel_futures=True)
+        torch.set_num_threads(self._num_threads)
 
     def _without_gradients(self, step: int) -> Made:
         with torch.no_grad():

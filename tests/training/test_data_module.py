@@ -100,19 +100,15 @@ def test_what_goes_wrong_in_the_thread_is_raised_where_the_batch_is_asked_for(ah
         one(2)
 
 
-def test_the_thread_has_one_core_and_leaves_all_others_theirs(ahead) -> None:
+def test_the_thread_takes_one_core_from_the_others_until_it_ends() -> None:
     threads = torch.get_num_threads()
     try:
-        torch.set_num_threads(2)
-        one = ahead(lambda step: (torch.get_num_threads(), torch.is_grad_enabled()))
-        assert one(0) == (1, False)
+        torch.set_num_threads(3)
+        prefetcher = Prefetcher(lambda step: (torch.get_num_threads(), torch.is_grad_enabled()))
+        assert prefetcher(0) == (1, False)
         assert torch.get_num_threads() == 2
-        assert ahead(lambda step: None) is not None
-        seen: list[int] = []
-        later = threading.Thread(target=lambda: seen.append(torch.get_num_threads()))
-        later.start()
-        later.join()
-        assert seen == [2]
+        prefetcher.close()
+        assert torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(threads)
 
