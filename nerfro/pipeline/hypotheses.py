@@ -8,7 +8,6 @@ from typing import Any
 
 from nerfro.capture.overrides import as_overrides, is_given, of_groups
 
-STRAIGHT = "straight rays"
 # Number of training photographs that score the hypotheses.
 _NUM_VALIDATION_VIEWS = 5
 # Indices of water and of soda-lime glass, for photographs that do not determine the index.
@@ -38,7 +37,7 @@ class Hypothesis:
 
 
 def hypotheses(found: Mapping[str, Any], medium: Mapping[str, Any]) -> list[Hypothesis]:
-    """List the assumptions about the object that the photographs have to decide between.
+    """List the assumptions about the object that the photographs have to decide between, straight rays first.
 
     Straight rays show an opaque object, and are the baseline of all other hypotheses. A body has the index that
     `preprocess` found; without a reliable index, the indices of water and of glass are the initial values of a learned
@@ -49,7 +48,7 @@ def hypotheses(found: Mapping[str, Any], medium: Mapping[str, Any]) -> list[Hypo
         medium: configuration of the medium.
     """
     options, near = found["options"], found["near"]
-    straight = Hypothesis(STRAIGHT, ["+experiment=straight", *of_groups(("data", "camera"), options)])
+    straight = Hypothesis("straight rays", ["+experiment=straight", *of_groups(("data", "camera"), options)])
     if "wall" in medium:  # the materials of a vessel are known
         return [straight, Hypothesis("vessel", [f"+experiment={'glass_room' if near else 'glass'}", *options])]
     body = [f"+experiment={'glass_room' if near else 'unknown'}", *options]
