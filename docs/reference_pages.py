@@ -25,6 +25,7 @@ from nerfro.allowed import Range
 from nerfro.paths import CONF_DIR
 from nerfro.registry import KINDS, Plugin, discover, plugins
 from nerfro.subdivision import Subdivision, SubdivisionChanges
+from nerfro.training import lightning_callbacks  # noqa: F401 - registers callbacks
 from nerfro.training.config import REFUSED_ARGUMENTS, TrainConfig, TrainerConfig
 
 _TOOLS = re.compile(r"#\s*(noqa|type:).*?(?= - (?!OmegaConf)|#|$)")  # comments for linters
@@ -95,12 +96,15 @@ def plugins_page() -> str:
         choose = _CHOOSE.get(kind, f"{kind}=NAME")
         text.append(f"## {kind}\n\nChoose with `{choose}`.\n")
         for plugin in plugins(kind):
-            if plugin.target.startswith("nerfro."):
+            if plugin.target.startswith("nerfro.") or kind == "callbacks":
                 text.append(_plugin(plugin))
     return "\n".join(text)
 
 
 def _plugin(plugin: Plugin) -> str:
+    if not plugin.target.startswith("nerfro."):  # Lightning documents its callbacks in another markup
+        fields = ", ".join(f"`{name}`" for name, *_ in plugin.fields())
+        return f"### {plugin.name}\n\n`{plugin.target}`" + (f" with the options {fields}.\n" if fields else ".\n")
     body, _ = _google_docstring(inspect.getdoc(plugin.cls) or "")
     explained: dict[str, str] = {}
     for base in plugin.cls.__mro__:
