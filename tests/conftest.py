@@ -71,7 +71,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture
 def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Turn off the checks of annotations: for stand-ins, values that functions refuse, and code that is compiled."""
+    """Turn off the checks of annotations: for stand-ins, values that functions refuse, and code that is compiled.
+
+    Whole commands run without the checks, too, because these take a third of their time; `tests/test_experiments.py`
+    trains every experiment with the checks.
+    """
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
@@ -129,7 +133,9 @@ class Finished(NamedTuple):
 
 
 @pytest.fixture
-def train_here(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Finished]:
+def train_here(
+    unchecked: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., Finished]:
     """`python -m nerfro.train`'s main in this process, on the CPU and without looking for LPIPS weights."""
     import nerfro.train
 
@@ -139,7 +145,9 @@ def train_here(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[st
 
 
 @pytest.fixture
-def evaluate_here(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Finished]:
+def evaluate_here(
+    unchecked: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., Finished]:
     """`python -m nerfro.evaluate`'s main in this process, on the CPU and without looking for LPIPS weights."""
     import nerfro.evaluate
 

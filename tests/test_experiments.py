@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jaxtyping
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
@@ -35,6 +36,12 @@ SMALL = [
     "trainer.max_time=null",
     "logger=none",
 ]
+
+
+@pytest.fixture(autouse=True)
+def _checked(train_here: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Turn on the checks of annotations that other trainings do without."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", False)
 
 
 def composed(*overrides: str) -> DictConfig:
