@@ -30,7 +30,6 @@ from nerfro.data.blender import BlenderData
 from nerfro.files import lat_long
 from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.shapes import RoundedBox
 from nerfro.rays import Rays
 from nerfro.rendering import Renderer
 from nerfro.samplers.snell import Snell
@@ -38,6 +37,7 @@ from nerfro.scenes.skies import lat_long_texture
 from nerfro.scenes.synthesis import find_scene
 from nerfro.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
 from nerfro.types import Exits
+from tests.closed_forms import RoundedBox
 
 TRUTH = 16  # rays a side of a pixel
 SIDES = (1, 2, 3, 4, 6, 8)  # rays a side

@@ -19,7 +19,7 @@ from nerfro.files import lat_long
 from nerfro.light import to_srgb
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.shapes import Ball, RoundedBox
+from nerfro.media.shapes import Ball
 from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.paths import ASSETS_DIR
 from nerfro.samplers.eikonal import Eikonal
@@ -27,6 +27,7 @@ from nerfro.samplers.snell import Snell
 from nerfro.subdivision import part_rays
 from nerfro.types import Path as RayPath
 from nerfro.types import Rays
+from tests.closed_forms import RoundedBox
 
 IMAGES = Path(__file__).resolve().parent.parent / "docs" / "images"
 

@@ -22,17 +22,18 @@ from torch import Tensor
 
 from nerfro.cameras import Cameras
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.shapes import Ball, RoundedBox
+from nerfro.media.shapes import Ball
 from nerfro.media.voxel_grid import VoxelGrid
-from nerfro.samplers.compiled import uniform_exit_on_grid
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.snell import Snell
 from nerfro.types import Rays
+from tests.closed_forms import RoundedBox
 
 RADIUS, N_BALL = 0.8, 1.5
 HALF_SIDE, EDGE, N_CUBE = 0.75, 0.08, 1.52
 NEAR, FAR = 2.0, 6.0
 NUM_EULER_STEPS = 768
+EULER = Eikonal("euler", NUM_EULER_STEPS)
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 CHUNK = 8192  # rays at once, as in evaluation
 BINS = (("b/R < .5", 0.0, 0.5), (".5 to .8", 0.5, 0.8), (".8 to .95", 0.8, 0.951))
@@ -93,7 +94,11 @@ def sphere_errors(voxels: VoxelGrid, mesh_ball: SdfGrid, resolution: int, num: i
     analytic = Ball(RADIUS, N_BALL).double()
     exact_grid = SdfGrid.from_distances(grid_distances(analytic, resolution), BOX, [N_BALL], mesh_ball.shell)
     rows: list[tuple[str, Trace, tuple[float, ...] | None]] = [
-        (f"euler, {NUM_EULER_STEPS} steps, {voxels.table.shape[0]}^3 voxels 9/1 (the paper's)", euler(voxels), None),
+        (
+            f"euler, {NUM_EULER_STEPS} steps, {voxels.table.shape[0]}^3 voxels 9/1 (the paper's)",
+            exits(EULER, voxels),
+            None,
+        ),
         (f"eikonal, {resolution}^3 signed distance", exits(Eikonal(), exact_grid), (0.05, 0.15, 1.0)),
         (f"eikonal, {resolution}^3 signed distance of the mesh", exits(Eikonal(), mesh_ball), (0.05, 0.15, 1.0)),
         ("snell, analytic signed distance", exits(Snell(), analytic), (0.001, 0.001, 0.001)),
@@ -168,7 +173,10 @@ def speed(baselines: list[VoxelGrid], solids: dict[str, SdfGrid], side: int) -> 
     rays = view(side).image_rays(0)
     for scene, solid in solids.items():
         rows: list[tuple[str, Trace, float]] = [
-            *((f"euler, {NUM_EULER_STEPS} steps, {grid.table.shape[0]}^3", euler(grid), 0.0) for grid in baselines),
+            *(
+                (f"euler, {NUM_EULER_STEPS} steps, {grid.table.shape[0]}^3", exits(EULER, grid), 0.0)
+                for grid in baselines
+            ),
             ("eikonal", exits(Eikonal(), solid), 10.0),
             ("snell", exits(Snell(), solid), 20.0),
         ]
@@ -218,11 +226,6 @@ def branches(solids: dict[str, SdfGrid], side: int) -> None:
 def exits(sampler: Eikonal | Snell, medium: torch.nn.Module) -> Trace:
     """Exit directions by a sampler."""
     return lambda rays: sampler(rays, medium).exit_directions
-
-
-def euler(voxels: VoxelGrid) -> Trace:
-    """Exit directions by the paper's tracker; only the last vertex is written, which flatters its speed."""
-    return lambda rays: uniform_exit_on_grid(rays, voxels, NUM_EULER_STEPS)
 
 
 def make_rays(origins: np.ndarray, directions: np.ndarray, near: float = NEAR, far: float = FAR) -> Rays:

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 from omegaconf import DictConfig
 
-from nerfro.capture.calibrate_options import CalibrateConfig, check_options, make_target
+from nerfro.capture.boards import TagBoard
+from nerfro.capture.calibrate_options import CalibrateConfig, check_options, make_board
 from nerfro.capture.calibrated_data import FILES, ray_range, relative, split_views, write_calibrated
 from nerfro.capture.calibration import Calibration, calibrate
 from nerfro.capture.model_import import import_model
 from nerfro.capture.photographs import list_photographs, luminance, outside
+from nerfro.capture.printing import print_sheets
 from nerfro.capture.reconstruction import SfmSettings, find_model
-from nerfro.capture.targets import Target, print_sheets
 from nerfro.cli import entry_point, warn
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
@@ -28,32 +29,32 @@ _MAX_ERROR, _MAX_FOCAL_DEVIATION = 0.7, 0.02
 
 @entry_point("calibrate", CalibrateConfig)
 def main(config: DictConfig) -> None:
-    """Detect the target, estimate lens and poses, write the data set, and print the next command."""
-    known = check_options(config)
+    """Detect the board, estimate lens and poses, write the data set, and print the next command."""
+    check_options(config)
     out = user_path(config.out)
-    target = None if config.target == "colmap" else make_target(config)
+    board = None if config.target == "colmap" else make_board(config)
     if config.write_board:
-        _write_board(target, out, config.overwrite)
+        _write_board(board, out, config.overwrite)
         if config.images is None:
             return
     images, size = list_photographs(user_path(config.images))
     # Masks lie where the loader of the data set will look for them.
     masks = [find_mask(out, out / relative(image, out)) for image in images]
     refuse_existing([out / name for name in FILES], config.overwrite)
-    if target is None:
-        settings = SfmSettings(config.lens, known, config.pairs, config.threads)
+    if board is None:
+        settings = SfmSettings(config.lens, config.pairs, config.threads)
         model = find_model(config.reconstruction, images, masks, out / "sparse", settings, config.overwrite)
         calibration, points = import_model(model, images, size)
         quads, seen = [], points
     else:
         sightings = {
-            image.name: outside(target.find(luminance(image)), mask)
-            for image, mask in zip(track(f"detecting {target.feature}", images), masks, strict=True)
+            image.name: outside(board.find(luminance(image)), mask)
+            for image, mask in zip(track("detecting tags", images), masks, strict=True)
         }
-        calibration = calibrate(sightings, size, config.lens, known, target.min_features, target.feature)
-        quads, points = [sheet.corners for sheet in target.sheets()], np.empty((0, 3))
+        calibration = calibrate(sightings, size, config.lens)
+        quads, points = [sheet.corners for sheet in board.sheets()], np.empty((0, 3))
         seen = np.concatenate(quads)
-    _report(calibration, "points" if target is None else target.feature, config.lens == "pinhole" and known is None)
+    _report(calibration, "points" if board is None else "tags", config.lens == "pinhole")
     splits = split_views([image.name for image in images if image.name in calibration.poses], config.test_every)
     reach = ray_range(calibration, seen)
     written = write_calibrated(out, images, size, calibration, splits, config.target, quads, points, reach)
@@ -66,11 +67,11 @@ def main(config: DictConfig) -> None:
     print(f"next: {shlex.join(['python', '-m', *command])}")
 
 
-def _write_board(target: Target | None, out: Path, overwrite: bool) -> None:
-    if target is None:
-        raise NerfroError("target=colmap has no board to write; choose target=apriltag or target=charuco")
+def _write_board(board: TagBoard | None, out: Path, overwrite: bool) -> None:
+    if board is None:
+        raise NerfroError("target=colmap has no board to write; choose target=apriltag")
     refuse_existing([out / "board.pdf"], overwrite)
-    files = print_sheets(target.sheets(), out)
+    files = print_sheets(board.sheets(), out)
     print(f"wrote {files[0]} ({len(files) - 1} pages, in true size if the unit is a metre) and the pages as PNG")
 
 

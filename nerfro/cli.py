@@ -33,7 +33,7 @@ from nerfro.allowed import check_names, check_settings
 from nerfro.errors import NerfroError, nearest_of
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover, plugins
-from nerfro.trust import TrustingConfigLoader, leave_current_directory
+from nerfro.trust import GuardedConfigLoader, leave_current_directory
 
 _NO_MEMORY = re.compile("allocate memory|out of memory")  # messages of torch on a CPU and on a GPU
 EXIT_INTERRUPTED = 130
@@ -122,7 +122,7 @@ def entry_point(
                 ConfigStore.instance().store(name=f"{config_name}_schema", node=schema, provider="nerfro")
                 SourcesRegistry.instance().types["file"] = _RenamingFiles
                 leave_current_directory()
-                hydra._internal.hydra.ConfigLoaderImpl = TrustingConfigLoader  # type: ignore[misc]
+                hydra._internal.hydra.ConfigLoaderImpl = GuardedConfigLoader  # type: ignore[misc]
                 discover()
                 sys.argv[1:] = [_quoted(renamed_override(argument), verbatim) for argument in sys.argv[1:]]
                 try:

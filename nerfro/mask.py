@@ -22,8 +22,8 @@ from nerfro.capture.mask_files import (
     save_mask,
 )
 from nerfro.capture.masking import box_region, grab, polygon_mask, propagate
+from nerfro.capture.opencv import opencv
 from nerfro.capture.overrides import is_given, of_groups
-from nerfro.capture.targets import opencv
 from nerfro.cli import entry_point
 from nerfro.data.image_files import read_size
 from nerfro.errors import NerfroError

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -11,12 +10,11 @@ from hydra.core.hydra_config import HydraConfig
 from jaxtyping import Float
 from omegaconf import DictConfig
 
-from nerfro.capture.camera_refinement import refine_cameras
 from nerfro.capture.medium_search import find_medium
 from nerfro.capture.overlaps import choose_wrong_masks, draw_overlays, report_overlaps
 from nerfro.capture.pose_conventions import require_consistent_poses
-from nerfro.capture.preprocess_options import CAMERAS, MESH, PreprocessConfig, Request, conclude, surface_settings
-from nerfro.capture.refinement_report import refine
+from nerfro.capture.preprocess_options import MESH, PreprocessConfig, Request, conclude, surface_settings
+from nerfro.capture.refinement import refine
 from nerfro.capture.surface import make_mesh, read_silhouettes, surfaces_inside
 from nerfro.capture.surroundings import Observations
 from nerfro.capture.visual_hull import Silhouettes
@@ -27,7 +25,6 @@ from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.paths import resolve_path
 from nerfro.registry import build
-from nerfro.viewing.camera_files import write_cameras
 
 
 @entry_point("preprocess", PreprocessConfig)
@@ -38,8 +35,8 @@ def main(config: DictConfig) -> None:
     request = Request(config, list(HydraConfig.get().overrides.task))
     request.check()
     views, silhouettes, overlaps = masked_views(build(config.data).load("train")), None, None
-    if mesh is None or views.masks is not None or config.refine_cameras:
-        views, mesh, silhouettes, overlaps = _reconstruct(request, views, mesh)
+    if mesh is None or views.masks is not None:
+        mesh, silhouettes, overlaps = _reconstruct(request, views, mesh)
     location = config.mesh or str(request.folder / MESH)
     settings = surface_settings(request, views.cameras, mesh, location)
     observations = Observations(views, mesh, config.room)
@@ -60,38 +57,29 @@ def main(config: DictConfig) -> None:
     inside = surfaces_inside(found.medium)
     if overlaps is not None and inside:
         draw_overlays(views, mesh, overlaps, inside, request.folder)
-    settings |= {"camera": "refined"} if config.refine_cameras else {}
     conclude(request, settings, found.index_settings, found.is_doubtful, observations.near, views.cameras, mesh)
 
 
 def _reconstruct(
     request: Request, views: Views, mesh: TriangleMesh | None
-) -> tuple[Views, TriangleMesh, Silhouettes, Float[np.ndarray, "V"]]:
-    """Carve and fit the surface unless a mesh is given, refine the cameras if requested, and compare with the masks.
+) -> tuple[TriangleMesh, Silhouettes, Float[np.ndarray, "V"]]:
+    """Carve and fit the surface unless a mesh is given, and compare it with the masks.
 
     Returns:
-        The views with refined cameras, the surface, the silhouettes of the masks, and the overlap of the surface with
-        each mask.
+        The surface, the silhouettes of the masks, and the overlap of the surface with each mask.
     """
     config, folder = request.config, request.folder
     silhouettes = read_silhouettes(views, request.box is not None)
     wrong_masks = choose_wrong_masks(silhouettes, config.wrong_masks)
     require_consistent_poses(silhouettes, views.names, wrong_masks)
-
-    def hull(silhouettes: Silhouettes, voxels: int = config.resolution) -> TriangleMesh:
-        return make_mesh(silhouettes, request.box, voxels, wrong_masks, config.keep, config.smoothing, config.symmetry)
-
-    if config.refine_cameras:
-        camera = refine_cameras(views, silhouettes, wrong_masks, hull if mesh is None else mesh)
-        write_cameras(folder / CAMERAS, camera, views)
-        views = replace(views, cameras=camera.estimated(views.cameras))
-        silhouettes = replace(silhouettes, cameras=views.cameras)
-    surface = hull(silhouettes) if mesh is None else mesh
-    if mesh is None:
+    surface = mesh
+    if surface is None:
+        options = config.resolution, wrong_masks, config.keep, config.smoothing, config.symmetry
+        surface = make_mesh(silhouettes, request.box, *options)
         surface.save(folder / MESH)
     # The report is written before the medium is built, because the report shows why a medium refuses a surface.
     overlaps = report_overlaps(views, surface, silhouettes, wrong_masks if mesh is None else None, folder)
-    return views, surface, silhouettes, overlaps
+    return surface, silhouettes, overlaps
 
 
 if __name__ == "__main__":

@@ -44,7 +44,7 @@ def command_of_module(name: str) -> list[str]:
     return [sys.executable, "-c", f"{program}runpy.run_module({name!r}, run_name='__main__', alter_sys=True)"]
 
 
-class TrustingConfigLoader(ConfigLoaderImpl):
+class GuardedConfigLoader(ConfigLoaderImpl):
     """Hydra's composition of a configuration, which refuses foreign classes before Hydra instantiates any.
 
     Hydra builds its callbacks, launcher, sweeper and log handlers from the node `hydra`, and any YAML file can set it.

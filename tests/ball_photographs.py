@@ -21,6 +21,7 @@ from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.snell import Snell
 from nerfro.types import Exits
+from tests.closed_forms import grid_points
 
 SIZE, NUM_VIEWS, RADIUS, INNER = 40, 30, 0.7, 0.35
 SHARES = 5  # pixels of masks are divided by so many, each way
@@ -53,8 +54,7 @@ def sky(directions: Tensor) -> Tensor:
 
 
 def ball(radius: float) -> Tensor:
-    axis = torch.linspace(-0.9, 0.9, 41, dtype=torch.float64)
-    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    points = grid_points(0.9, 41, torch.float64)
     return (points.norm(dim=-1) - radius).float()
 
 

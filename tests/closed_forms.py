@@ -7,8 +7,10 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from nerfro.media.base import Medium
+from nerfro.media.solid import Solid
 from nerfro.types import Rays
 
 Squared = Callable[[Tensor], tuple[Tensor, Tensor]]
@@ -26,6 +28,67 @@ class FunctionMedium(Medium):
         squared, gradient = self.squared(positions)
         n = squared.sqrt()
         return n, gradient / (2 * n[..., None])
+
+
+class Luneburg(Medium):
+    """The Luneburg lens of radius 1, with air around it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("box", torch.tensor([[-1.0] * 3, [1.0] * 3]), persistent=False)
+
+    def forward(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        squared, gradient = luneburg(positions)
+        inside = squared > 1
+        n = torch.where(inside, squared, 1.0).sqrt()
+        return n, torch.where(inside[..., None], gradient / (2 * n[..., None]), 0.0)
+
+
+class RoundedBox(Solid):
+    """A cube around the origin with rounded edges and corners: a smaller cube, grown by the radius of the edges."""
+
+    def __init__(
+        self,
+        half_side: float = 0.75,
+        edge_radius: float = 0.08,
+        ior: float = 1.52,
+        shell: float = 0.002,
+        abbe: list[float] = [],  # noqa: B006 (never changed)
+    ) -> None:
+        super().__init__([ior], shell, abbe=abbe)
+        self.half_side, self.edge_radius = half_side, edge_radius
+        side = 1.05 * half_side + shell
+        self.register_buffer("box", torch.tensor([[-side] * 3, [side] * 3]), persistent=False)
+
+    def signed_distances(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        q = positions.abs() - (self.half_side - self.edge_radius)
+        outward = q.clamp(min=0)
+        outside = torch.linalg.vector_norm(outward, dim=-1, keepdim=True)
+        distance = outside + q.amax(-1, keepdim=True).clamp(max=0) - self.edge_radius
+        nearest_face = functional.one_hot(q.argmax(-1), 3).to(q)
+        direction = torch.where(outside > 0, functional.normalize(outward, dim=-1), nearest_face)
+        return distance, (direction * positions.sign())[..., None, :]
+
+
+class Slab(Solid):
+    """A wide plate across the z axis."""
+
+    def __init__(self, thickness: float = 0.5, ior: float = 1.5, shell: float = 0.002) -> None:
+        super().__init__([ior], shell)
+        self.thickness = thickness
+        corner = torch.tensor([10.0, 10.0, 0.55 * thickness + shell])
+        self.register_buffer("box", torch.stack([-corner, corner]), persistent=False)
+
+    def signed_distances(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        z = positions[..., 2:]
+        normal = torch.cat([torch.zeros_like(positions[..., :2]), z.sign()], -1)
+        return z.abs() - 0.5 * self.thickness, normal[..., None, :]
+
+
+def grid_points(half_side: float, size: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Vertices [X, Y, Z, 3] of a cubic grid around the origin."""
+    axis = torch.linspace(-half_side, half_side, size, dtype=dtype)
+    return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
 
 
 def make_rays(origins: list | Tensor, directions: list | Tensor, near: float, far: float) -> Rays:
@@ -73,17 +136,6 @@ def fibre(x: Tensor) -> tuple[Tensor, Tensor]:
     """n^2 = 1.5^2 (1 - alpha^2 rho^2) around the z axis: ellipses in sigma."""
     across = x * x.new_tensor([1.0, 1.0, 0.0])
     return 2.25 * (1 - FIBRE_ALPHA**2 * across.square().sum(-1)), -2.25 * 2 * FIBRE_ALPHA**2 * across
-
-
-SECH_ALPHA = 1.2
-
-
-def sech_fibre(x: Tensor) -> tuple[Tensor, Tensor]:
-    """n = 1.5 sech(alpha rho) around the z axis: sinh(alpha rho) = sinh(alpha rho0) cos(alpha z)."""
-    across = x * x.new_tensor([1.0, 1.0, 0.0])
-    rho = across.square().sum(-1).sqrt().clamp(min=1e-12)
-    n = 1.5 / torch.cosh(SECH_ALPHA * rho)
-    return n**2, (-2 * SECH_ALPHA * n**2 * torch.tanh(SECH_ALPHA * rho) / rho)[..., None] * across
 
 
 def layered(before: float, after: float, width: float) -> Squared:

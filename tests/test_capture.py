@@ -23,7 +23,7 @@ from omegaconf import OmegaConf
 from scipy.spatial import ConvexHull
 
 from benchmarks.capture import measure
-from nerfro.data.opencv import OpenCVData
+from nerfro.data.blender import OpenCVData
 from nerfro.geometry.mesh import load_mesh
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover

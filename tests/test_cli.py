@@ -28,7 +28,7 @@ from nerfro.paths import CONF_DIR, PACKAGE_DIR, resolve_path, user_path
 from nerfro.registry import KINDS, discover, plugins
 from nerfro.training import callbacks
 from nerfro.training.config import TrainConfig
-from nerfro.trust import TrustingConfigLoader
+from nerfro.trust import GuardedConfigLoader
 from nerfro.types import Batch
 
 
@@ -94,7 +94,7 @@ def test_messages_are_one_line_whatever_files_are_called() -> None:
 
 
 def test_a_configuration_folder_that_does_not_exist_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hydra._internal.hydra.ConfigLoaderImpl", TrustingConfigLoader)
+    monkeypatch.setattr("hydra._internal.hydra.ConfigLoaderImpl", GuardedConfigLoader)
     with (
         initialize_config_dir(str(CONF_DIR), version_base="1.3"),
         pytest.raises(NerfroError, match=r"hydra\.searchpath in command-line: the configuration folder /no/where does"),

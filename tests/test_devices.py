@@ -21,7 +21,7 @@ STEP = 100_000
 
 # Loops end when the last ray has ended, and triangles are met on the CPU.
 TRACING = ("samplers/snell.py", "samplers/eikonal.py", "samplers/polylines.py", "media/sdf_grid.py")
-TRACING += ("samplers/mesh_interfaces.py", "geometry/intersection.py", "samplers/wavefront.py")
+TRACING += ("geometry/intersection.py", "samplers/wavefront.py")
 
 ADAPTIVE = ["sampler.path.integrator=adaptive", "sampler.path.max_steps=60", "sampler.points.draw=arc_length"]
 

@@ -23,7 +23,6 @@ from nerfro.fields.base import Field
 from nerfro.fields.nerf import NerfField
 from nerfro.files import lat_long
 from nerfro.files.images import save_png
-from nerfro.media.analytic import Luneburg
 from nerfro.media.base import Medium
 from nerfro.media.shapes import Ball
 from nerfro.registry import discover, find
@@ -37,6 +36,7 @@ from nerfro.training.module import TrainingModule
 from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.run_folder import load_checkpoint, restore
 from nerfro.types import Exits, Radiance, Samples
+from tests.closed_forms import Luneburg
 
 discover()
 IndexField = find("medium", "index_field").cls

@@ -27,6 +27,7 @@ from nerfro.testing import NUM_RAYS, example_batch, example_components, example_
 from nerfro.training.module import TrainingModule
 from nerfro.training.optimizer import OptimizerConfig
 from nerfro.types import Exits, Path, Radiance
+from tests.closed_forms import grid_points
 
 
 def split_path(of_straight: float) -> Path:
@@ -104,8 +105,7 @@ def test_samples_follow_the_gradients_of_their_path() -> None:
 
 
 def test_bodies_are_counted_along_nested_bodies() -> None:
-    axis = torch.linspace(-1.5, 1.5, 48)
-    radius = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).norm(dim=-1)
+    radius = grid_points(1.5, 48).norm(dim=-1)
     box = torch.tensor([[-1.5] * 3, [1.5] * 3])
     medium = SdfGrid.from_distances(torch.stack([radius - 0.8, radius - 0.5]), box, [1.5, 1.2], 0.02)
     traced = Snell()(example_rays(), medium)

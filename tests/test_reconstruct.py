@@ -19,7 +19,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 import nerfro.reconstruct
 import nerfro.train
-from nerfro.capture import refinement, refinement_report
+from nerfro.capture import refinement
 from nerfro.capture.overrides import as_overrides
 from nerfro.files.images import save_png
 from nerfro.pipeline import stages
@@ -313,7 +313,7 @@ def test_posed_photographs_of_a_ball_become_a_scene(
     monkeypatch.setattr(nerfro.train, "find_lpips_networks", lambda *files: ({}, {}))
     short = refinement.RefinementSettings((refinement.Stage(20, 1e-4, (3.0, 1.0)),), 1000)
     fast = functools.partial(refinement.refine_surface, settings=short)
-    monkeypatch.setattr(refinement_report, "refine_surface", fast)
+    monkeypatch.setattr(refinement, "refine_surface", fast)
     train = ["evaluation.split=train", "evaluation.every=0", "evaluation.subdivision.side=1", "logger=none",
              "trainer.accelerator=cpu", "trainer.max_steps=2", "trainer.max_time=null", "batches.size=64",
              "boundary.resolutions=[4,8]", "field.num_levels=2", "field.log2_table_size=8",
@@ -331,7 +331,7 @@ def test_posed_photographs_of_a_ball_become_a_scene(
     assert found["near"] is False
     assert found["doubtful"] == []
     assert f"medium.ior={index['ior'][0]:.4f}".rstrip("0") in found["options"]
-    assert (out / "surface" / "refinement.png").is_file()
+    assert (out / "surface" / "refinement.json").is_file()
     assert json.loads((out / "run" / "metrics.json").read_text())["steps"] == 2
     assert (out / "report" / "report.html").is_file()
     assert "training continues with: " in done.out

@@ -13,7 +13,7 @@ import torch
 from nerfro.cameras import Cameras
 from nerfro.data.base import Views
 from nerfro.media.analytic import Vacuum
-from nerfro.media.shapes import Ball, RoundedBox
+from nerfro.media.shapes import Ball
 from nerfro.models.refractive import RefractiveModel
 from nerfro.samplers.hierarchical import Hierarchical
 from nerfro.samplers.snell import Snell
@@ -22,6 +22,7 @@ from nerfro.subdivision import Subdivision, contrast, divergence, neighbour_rays
 from nerfro.testing import example_components
 from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Batch
+from tests.closed_forms import RoundedBox
 
 NUM_VIEWS, HEIGHT, WIDTH = 3, 8, 10
 SIDE, FOCAL = 33, 60.0

@@ -15,7 +15,7 @@ from nerfro.errors import NerfroError
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover
 from nerfro.training.config import TrainConfig
-from nerfro.trust import TrustingConfigLoader, command_of_module
+from nerfro.trust import GuardedConfigLoader, command_of_module
 
 discover()
 
@@ -67,7 +67,7 @@ def test_a_stage_imports_nothing_from_the_current_directory(folder: Path) -> Non
     ],
 )
 def test_configuration_files_name_no_foreign_code(hydra: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hydra._internal.hydra.ConfigLoaderImpl", TrustingConfigLoader)
+    monkeypatch.setattr("hydra._internal.hydra.ConfigLoaderImpl", GuardedConfigLoader)
     ConfigStore.instance().store(name="train_schema", node=TrainConfig)
     write_experiment(folder, hydra)
     options = ["+experiment=other", f"hydra.searchpath=[file://{folder}/conf]"]

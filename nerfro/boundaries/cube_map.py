@@ -37,11 +37,6 @@ class CubeLevels:
     def num_texels(self) -> int:
         return sum(self.sizes)
 
-    @property
-    def num_padded(self) -> int:
-        """Number of texels of all faces with a margin of one texel on every side, see `padded_texels`."""
-        return sum(6 * (n + 2) ** 2 for n in self.resolutions)
-
     def __len__(self) -> int:
         return len(self.resolutions)
 

@@ -30,15 +30,10 @@ class Camera(nn.Module, ABC):
         super().__init__()
         self.exposure = Exposure() if exposure else None
 
-    def begin(self, cameras: Cameras, exposures: Float[Tensor, "V"] | None = None) -> None:
-        """Initialize the model for the training views.
-
-        Args:
-            cameras: cameras of the data set.
-            exposures: relative exposure of each view, in any unit, if the files record it.
-        """
+    def begin(self, cameras: Cameras) -> None:
+        """Initialize the model for the training views, given the cameras of the data set."""
         if self.exposure is not None:
-            self.exposure.begin(len(cameras), exposures)
+            self.exposure.begin(len(cameras))
 
     @abstractmethod
     def forward(self, rays: Rays, view: Int[Tensor, "R"]) -> Rays:

@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from nerfro.camera.per_view import PerView
-
 # Number of Gauss-Newton steps that fit a gain.
 _STEPS = 20
+
+
+class PerView(nn.Module):
+    """Module whose tensors are empty until `begin` or the loading of a checkpoint sets the number of views."""
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+        for name, tensor in (*self._parameters.items(), *self._buffers.items()):
+            stored = state_dict.get(prefix + name)
+            if tensor is not None and stored is not None and len(tensor) == 0:
+                tensor.data = stored.new_empty(stored.shape, dtype=tensor.dtype, device=tensor.device)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
 class Exposure(PerView):
@@ -20,25 +30,20 @@ class Exposure(PerView):
     The mean logarithm of the gains is zero, because the overall brightness of the scene is otherwise ambiguous.
     """
 
-    start: Float[Tensor, "V"]
-
     def __init__(self) -> None:
         super().__init__()
         self.log_gain = nn.Parameter(torch.zeros(0, 3))
-        self.register_buffer("start", torch.zeros(0))
 
-    def begin(self, num_views: int, exposures: Float[Tensor, "V"] | None = None) -> None:
-        """Initialize the gains with the relative exposures of the views, or with 1."""
+    def begin(self, num_views: int) -> None:
+        """Initialize the gains with 1."""
         self.log_gain.data = self.log_gain.new_zeros(num_views, 3)
-        self.start = self.start.new_zeros(num_views) if exposures is None else exposures.log().to(self.start)
 
     def forward(self, view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
         return self.gains()[view]
 
     def gains(self) -> Float[Tensor, "V 3"]:
         """Return the gains of all views."""
-        logarithm = self.log_gain + self.start[:, None]
-        return torch.exp(logarithm - logarithm.mean(0))
+        return torch.exp(self.log_gain - self.log_gain.mean(0))
 
     @property
     def spread(self) -> float:

@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 
 from nerfro.allowed import Count, Natural
 from nerfro.camera.base import Camera
-from nerfro.camera.per_view import PerView
+from nerfro.camera.exposure import PerView
 from nerfro.camera.pixel_units import even_weights, object_distances, pixel_motions, without_world, world_motions
 from nerfro.camera.similarity import similarity
 from nerfro.cameras import Cameras
@@ -122,8 +122,8 @@ class RefinedCamera(Camera):
         self.motions = _Motions(fix_gauge)
         self.register_buffer("lens", torch.zeros(3) if lens else None)  # focal length and principal point in pixels
 
-    def begin(self, cameras: Cameras, exposures: Float[Tensor, "V"] | None = None) -> None:
-        super().begin(cameras, exposures)
+    def begin(self, cameras: Cameras) -> None:
+        super().begin(cameras)
         self.motions.begin(cameras)
 
     def forward(self, rays: Rays, view: Int[Tensor, "R"]) -> Rays:

@@ -1,4 +1,4 @@
-"""Geometry and print image of AprilTag boards.
+"""Geometry, print image and detection of AprilTag boards.
 
 A board has a right-handed coordinate frame and a unit of length. A face is a flat sheet of adjacent tags.
 """
@@ -6,11 +6,12 @@ A board has a right-handed coordinate frame and a unit of length. A face is a fl
 from __future__ import annotations
 
 import functools
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from nerfro.errors import NerfroError
 
@@ -25,6 +26,44 @@ class Layout(NamedTuple):
 
 
 LAYOUTS: dict[Family, Layout] = {"tag36h11": Layout(10, 1), "tagStandard41h12": Layout(9, 2)}
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """Points of a board that were detected in one image.
+
+    Attributes:
+        features: number of the tag of each point.
+        points: positions in the frame and unit of the board.
+        pixels: image positions (column, row); integers are corners of pixels.
+    """
+
+    features: Int[np.ndarray, "N"]
+    points: Float[np.ndarray, "N 3"]
+    pixels: Float[np.ndarray, "N 2"]
+
+    def only(self, chosen: Bool[np.ndarray, "N"]) -> Sighting:
+        """Select points by a mask."""
+        return Sighting(self.features[chosen], self.points[chosen], self.pixels[chosen])
+
+    @property
+    def num_features(self) -> int:
+        return len(np.unique(self.features))
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """One printed page of a board.
+
+    Attributes:
+        title: caption of the page.
+        levels: grey levels, from 0 (black) to 255 (white).
+        corners: upper left, upper right, lower right and lower left corner, in the frame and unit of the board.
+    """
+
+    title: str
+    levels: UInt8[np.ndarray, "H W"]
+    corners: Float[np.ndarray, "4 3"]
 
 
 @dataclass(frozen=True)
@@ -69,6 +108,31 @@ class TagBoard:
             for (row, column), number in np.ndenumerate(face.ids)
         }
 
+    def find(self, image: UInt8[np.ndarray, "H W"]) -> Sighting:
+        """Detect the corners of the tags in a grey image."""
+        # The library counts pixels from the corner of the image, as nerfro does, and orders the corners of a tag
+        # anticlockwise from the lower left one.
+        corners = self.tag_corners()
+        tags = [tag for tag in tag_detector(self.family).detect(image) if tag.tag_id in corners]
+        counts = Counter(tag.tag_id for tag in tags)
+        tags = [tag for tag in tags if counts[tag.tag_id] == 1]  # one of two equal tags is a reflection or misread
+        return Sighting(
+            np.repeat(np.array([tag.tag_id for tag in tags], int), 4),
+            np.concatenate([np.empty((0, 3)), *(corners[tag.tag_id] for tag in tags)]),
+            np.concatenate([np.empty((0, 2)), *(tag.corners[::-1] for tag in tags)]),
+        )
+
+    def sheets(self) -> list[Sheet]:
+        """Return the pages to print."""
+        return [
+            Sheet(
+                f"face {number} (tags {face.ids.min()} to {face.ids.max()}), its front towards {face.front}",
+                self.draw(face),
+                self.face_corners(face),
+            )
+            for number, face in enumerate(self.faces)
+        ]
+
     def face_corners(self, face: Face) -> Float[np.ndarray, "4 3"]:
         """Return the corners of a whole sheet: upper left, upper right, lower right, lower left."""
         rows, columns = face.ids.shape
@@ -108,20 +172,19 @@ def twelve_faces(tag: float = 0.05) -> TagBoard:
     return TagBoard("tagStandard41h12", module, tuple(faces))
 
 
-def tag_grid(family: Family, rows: int, columns: int, tag: float) -> TagBoard:
-    """Return a board of tags 0, 1, ... row by row on one sheet in the plane z = 0.
+def tag_grid(rows: int, columns: int, tag: float) -> TagBoard:
+    """Return a board of tags 0, 1, ... of tag36h11, row by row on one sheet in the plane z = 0.
 
     The x axis points to the right of the sheet, the y axis to the top, and the z axis out of the paper.
 
     Args:
-        family: tag family.
         rows, columns: number of tags.
         tag: side of a tag between its detected corners, in the unit of the poses.
     """
-    side, inset = LAYOUTS[family]
+    side, inset = LAYOUTS["tag36h11"]
     module = tag / (side - 2 * inset)
     ids = np.arange(rows * columns).reshape(rows, columns)
-    return TagBoard(family, module, (Face((0, rows * side * module, 0), (1, 0, 0), (0, -1, 0), ids),))
+    return TagBoard("tag36h11", module, (Face((0, rows * side * module, 0), (1, 0, 0), (0, -1, 0), ids),))
 
 
 def draw_tag(family: Family, number: int) -> UInt8[np.ndarray, "S S"]:

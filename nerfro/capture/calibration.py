@@ -1,4 +1,4 @@
-"""Estimation of lens and poses from the points of a known target."""
+"""Estimation of lens and poses from the points of a known board."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from nerfro.capture.targets import Sighting, opencv
+from nerfro.capture.boards import Sighting
+from nerfro.capture.opencv import opencv
 from nerfro.errors import NerfroError
 
 LensModel = Literal["pinhole", "radial", "opencv"]
@@ -17,6 +18,9 @@ LensModel = Literal["pinhole", "radial", "opencv"]
 # deviations and so many pixels. The median of 2-D normal errors is 1.18 standard deviations.
 _OUTLIER_DEVIATIONS, _MIN_OUTLIER_ERROR = 5.0, 1.0
 _ROUNDS = 10
+# Images with fewer tags are skipped; the paper's authors require twelve corners, four for each tag. Fewer images do
+# not determine the lens.
+_MIN_TAGS, _MIN_IMAGES = 3, 3
 # Initial focal length of the paper's authors, in units of the longer side of the image.
 _INITIAL_FOCAL = 1.2
 
@@ -28,7 +32,7 @@ class Intrinsics:
     Attributes:
         matrix: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
         distortion: OpenCV's coefficients k1, k2, p1, p2 and optionally k3, k4, k5, k6; empty for an ideal lens.
-        focal_deviation: standard deviation of fx estimated from the residuals, in pixels; None for a known lens.
+        focal_deviation: standard deviation of fx estimated from the residuals, in pixels; None for a model of COLMAP.
     """
 
     matrix: Float[np.ndarray, "3 3"]
@@ -80,15 +84,8 @@ class Calibration:
         return [*lines, lens + ("" if deviation is None else f"; standard deviation of fx {deviation:.2f}")]
 
 
-def calibrate(
-    sightings: dict[str, Sighting],
-    size: tuple[int, int],
-    model: LensModel,
-    known: Intrinsics | None,
-    min_features: int,
-    feature: str,
-) -> Calibration:
-    """Minimize the reprojection error over all poses and, unless the lens is known, over the lens.
+def calibrate(sightings: dict[str, Sighting], size: tuple[int, int], model: LensModel) -> Calibration:
+    """Minimize the reprojection error over all poses and the lens.
 
     Estimation and removal of outliers alternate until no outliers remain.
 
@@ -96,29 +93,25 @@ def calibrate(
         sightings: detected points by image name.
         size: width and height of the images, in pixels.
         model: distortion coefficients to estimate.
-        known: known lens; None estimates the lens.
-        min_features: images with fewer features are skipped.
-        feature: noun in the plural for messages.
 
     Raises:
-        NerfroError: too few images have enough features, or the lens cannot be estimated.
+        NerfroError: too few images have enough tags, or the lens cannot be estimated.
     """
     skipped: dict[str, str] = {}
     num_outliers = dict.fromkeys(sightings, 0)
-    current, min_images = dict(sightings), 3 if known is None else 1
+    current = dict(sightings)
     for _ in range(_ROUNDS):
-        kept = {name: sighting for name, sighting in current.items() if sighting.num_features >= min_features}
+        kept = {name: sighting for name, sighting in current.items() if sighting.num_features >= _MIN_TAGS}
         for name, sighting in current.items():
             if name not in kept:
                 removed = f" ({num_outliers[name]} points removed as outliers)" if num_outliers[name] else ""
-                skipped[name] = f"{sighting.num_features} {feature} found, {min_features} needed{removed}"
-        if len(kept) < min_images:
+                skipped[name] = f"{sighting.num_features} tags found, {_MIN_TAGS} needed{removed}"
+        if len(kept) < _MIN_IMAGES:
             raise NerfroError(
-                f"{len(kept)} of {len(sightings)} images show at least {min_features} {feature} of the target, "
-                f"{min_images} are needed; check board=, family= and dictionary=, and that the target is sharp and "
-                "large enough in the images"
+                f"{len(kept)} of {len(sightings)} images show at least {_MIN_TAGS} tags of the board, {_MIN_IMAGES} "
+                "are needed; check board=, and that the board is sharp and large enough in the images"
             )
-        intrinsics, extrinsics = _estimate(list(kept.values()), size, model, known)
+        intrinsics, extrinsics = _estimate(list(kept.values()), size, model)
         located = dict(zip(kept, extrinsics, strict=True))
         errors = {name: _errors(sighting, intrinsics, *located[name]) for name, sighting in kept.items()}
         deviation = float(np.median(np.concatenate(list(errors.values())))) / 1.18
@@ -148,12 +141,10 @@ def _outliers(sighting: Sighting, errors: Float[np.ndarray, "N"], limit: float) 
 
 
 def _estimate(
-    sightings: list[Sighting], size: tuple[int, int], model: LensModel, known: Intrinsics | None
+    sightings: list[Sighting], size: tuple[int, int], model: LensModel
 ) -> tuple[Intrinsics, list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]]]:
     """Estimate the lens, and for each image the rotation vector and translation from world to camera."""
     cv2 = opencv()
-    if known is not None:
-        return known, [_pose(sighting, known) for sighting in sightings]
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
     if model != "opencv":
         flags |= cv2.CALIB_ZERO_TANGENT_DIST
@@ -170,22 +161,10 @@ def _estimate(
         flags=flags,
     )
     if not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1]) <= 0:
-        raise NerfroError(
-            "the lens cannot be estimated from these images; photograph the target from more directions, "
-            "or give intrinsics=[fx,fy,cx,cy]"
-        )
+        raise NerfroError("the lens cannot be estimated from these images; photograph the board from more directions")
     coefficients = () if model == "pinhole" else tuple(map(float, np.ravel(distortion)[:4]))
     extrinsics = [(np.ravel(r), np.ravel(t)) for r, t in zip(rotations, translations, strict=True)]
     return Intrinsics(np.asarray(matrix), coefficients, float(np.ravel(deviations)[0])), extrinsics
-
-
-def _pose(sighting: Sighting, known: Intrinsics) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    cv2 = opencv()
-    lens = known.matrix, np.array(known.distortion) if known.distortion else None
-    # SQPnP finds the global minimum of an algebraic cost, for flat targets as well; the refinement minimizes pixels.
-    _, rotation, translation = cv2.solvePnP(sighting.points, sighting.pixels, *lens, flags=cv2.SOLVEPNP_SQPNP)
-    rotation, translation = cv2.solvePnPRefineLM(sighting.points, sighting.pixels, *lens, rotation, translation)
-    return np.ravel(rotation), np.ravel(translation)
 
 
 def _errors(

@@ -16,8 +16,8 @@ from PIL import Image
 
 from nerfro.cameras import Cameras
 from nerfro.capture.masking import Segmentation
+from nerfro.capture.opencv import opencv
 from nerfro.capture.outline_hull import AGREES, FEWEST_VIEWS
-from nerfro.capture.targets import opencv
 from nerfro.cli import warn
 from nerfro.data.base import DataSource, Frame
 from nerfro.data.image_files import read_mask, read_size, to_unit

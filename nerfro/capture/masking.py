@@ -13,8 +13,8 @@ from scipy.ndimage import binary_fill_holes, label
 from skimage.draw import polygon2mask
 
 from nerfro.cameras import Cameras
+from nerfro.capture.opencv import opencv
 from nerfro.capture.outline_hull import AGREES, FEWEST_VIEWS, MAX_SIDE, OutlineHull
-from nerfro.capture.targets import opencv
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
 

@@ -1,4 +1,4 @@
-"""Import of lens and poses from a COLMAP model, with a check for weakly connected groups of images."""
+"""Import of lens and poses from a COLMAP model."""
 
 from __future__ import annotations
 
@@ -7,21 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
-from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from nerfro.capture.calibration import Calibration, Intrinsics, Pose
-from nerfro.cli import warn
 from nerfro.data.colmap import lens_of
 from nerfro.data.colmap_model import read_colmap
 from nerfro.data.lenses import Lens, check_lenses
-from nerfro.errors import NerfroError, first_of
-
-# The pose of a group of cameras relative to the others is doubtful if the group shares fewer points with the others, or
-# fewer than this fraction of the points that one of its cameras usually sees.
-_MIN_SHARED_POINTS, _MIN_SHARED_FRACTION = 30, 0.1
-# Number of weakest links of the spanning tree that are tested.
-_NUM_LINKS = 8
+from nerfro.errors import NerfroError
 
 
 def import_model(folder: Path, images: Sequence[Path], size: tuple[int, int]) -> tuple[Calibration, Any]:
@@ -56,61 +47,13 @@ def import_model(folder: Path, images: Sequence[Path], size: tuple[int, int]) ->
     camera, where = parsed.cameras[numbers.pop()], f"{folder}: the camera"
     lens = lens_of(camera, where).resized((camera.width, camera.height), size, where)
     check_lenses([lens], [where], size)
-    reconstruction = pycolmap.Reconstruction(folder)
-    _warn_of_loose_groups(reconstruction)
-    errors = _reprojection_errors(reconstruction, size[0] / camera.width)
+    errors = _reprojection_errors(pycolmap.Reconstruction(folder), size[0] / camera.width)
     poses = {}
     for image in registered:
         error, num_points = errors[image.name]
         poses[image.name] = Pose(image.camera_to_world, num_points, error)
     skipped = {image.name: "no pose from COLMAP" for image in images if image.name not in poses}
     return Calibration(_intrinsics(lens), poses, skipped, 0), parsed.points
-
-
-def loosest_group(seen: Bool[np.ndarray, "V P"]) -> tuple[list[int], int]:
-    """Find the group of cameras that shares the fewest points with all others.
-
-    Candidates are made by cutting the weakest links of the maximum spanning tree of shared points.
-
-    Args:
-        seen: whether each camera sees each point.
-
-    Returns:
-        The smaller of the two groups, as camera numbers, and the number of shared points.
-    """
-    shared = seen.astype(np.int32) @ seen.T.astype(np.int32)
-    np.fill_diagonal(shared, 0)
-    tree = minimum_spanning_tree(1 / np.maximum(shared, 1e-3)).tocoo()
-    links = np.argsort(-tree.data)[:_NUM_LINKS]
-    cuts = []
-    for link in links:
-        rest = tree.copy()
-        rest.data[link] = 0
-        rest.eliminate_zeros()
-        _, side = connected_components(rest, directed=False)
-        group = side == (np.bincount(side).argmin())
-        cuts.append((int((seen[group].any(0) & seen[~group].any(0)).sum()), np.flatnonzero(group).tolist()))
-    count, chosen = min(cuts)
-    return chosen, count
-
-
-def _warn_of_loose_groups(reconstruction: Any) -> None:
-    """Warn of a group of images that few points connect: repeating patterns can match images of different places."""
-    images = [image for image in reconstruction.images.values() if image.has_pose]
-    if len(images) < 2 or not reconstruction.points3D:
-        return
-    column = {number: place for place, number in enumerate(reconstruction.points3D)}
-    seen = np.zeros((len(images), len(column)), bool)
-    for row, image in enumerate(images):
-        seen[row, [column[f.point3D_id] for f in image.points2D if f.has_point3D()]] = True
-    group, shared = loosest_group(seen)
-    if shared < max(_MIN_SHARED_POINTS, _MIN_SHARED_FRACTION * float(np.median(seen[group].sum(1)))):
-        names = first_of(sorted(images[place].name for place in group))
-        warn(
-            f"{names}: only {shared} points connect these to the other {len(images) - len(group)} images, so their "
-            "poses may be wrong, for example because of a repeating pattern; look at cameras.png, photograph views "
-            "between the two groups, or repeat the reconstruction with pairs=sequential"
-        )
 
 
 def _reprojection_errors(reconstruction: Any, scale: float) -> dict[str, tuple[float, int]]:

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Bool, Float
 
 from nerfro.cameras import Cameras
+from nerfro.capture.opencv import opencv
 from nerfro.capture.pose_conventions import GOOD_OVERLAP, coarse_agreement, overlap
 from nerfro.capture.revolution import fit_revolution
 from nerfro.capture.silhouettes import mesh_silhouettes
-from nerfro.capture.targets import opencv
 from nerfro.capture.upright import camera_up
 from nerfro.capture.visual_hull import Silhouettes, carve_mesh, centre_lines, find_box
 from nerfro.geometry.lines import nearest_point

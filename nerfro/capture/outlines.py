@@ -39,7 +39,6 @@ def align_to_outlines(
     silhouettes: Silhouettes,
     mesh: TriangleMesh,
     priors: Sequence[PriorInformation] = (),
-    max_distance: float = _MAX_DISTANCE,
 ) -> PriorInformation | None:
     """Move the cameras until the contours of a surface meet the outlines of the masks.
 
@@ -52,11 +51,10 @@ def align_to_outlines(
         silhouettes: silhouettes of all views.
         mesh: the surface.
         priors: prior information about the cameras.
-        max_distance: largest median distance, in pixels, between the surface and its masks after the alignment.
 
     Returns:
-        The information that the outlines give about the cameras. None if the distance is larger; the cameras are then
-        unchanged.
+        The information that the outlines give about the cameras. None if the surface does not fit its masks; the
+        cameras are then unchanged.
     """
     numbers = camera.numbers()
     weak = PriorInformation(numbers, torch.eye(len(numbers)).to(numbers) / _PRIOR_DEVIATION**2)
@@ -71,7 +69,7 @@ def align_to_outlines(
             motion, lens = camera.split(-torch.linalg.solve(matrix, vector).to(camera.motions.motion))
             camera.move(motion * (_MAX_STEP / motion.norm(dim=-1, keepdim=True).clamp(min=_MAX_STEP)), lens)
     distance = float((error - error.median()).abs().median())
-    if distance > max_distance:
+    if distance > _MAX_DISTANCE:
         camera.move_back(numbers, worse=torch.ones(len(cameras), dtype=torch.bool), lens=True)
         print(f"outlines: the surface is {distance:.2f} pixels off its masks at best, so the cameras are not aligned")
         return None

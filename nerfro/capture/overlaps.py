@@ -6,20 +6,28 @@ import json
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
-from nerfro.capture.overlays import contact_sheet
 from nerfro.capture.pose_conventions import GOOD_OVERLAP, better_wrong_masks, overlap
+from nerfro.capture.silhouettes import mesh_silhouettes, pixel_stride
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.cli import warn
 from nerfro.data.base import Views
 from nerfro.errors import first_of
 from nerfro.files.atomic import write_atomically
+from nerfro.files.drawing import sheet
 from nerfro.files.images import save_image
 from nerfro.geometry.mesh import TriangleMesh
 
 SHEET, REPORT = "overlays.png", "overlaps.json"
-_MAX_PIXELS = 256
+_MAX_PIXELS = 256  # per side; larger images are subsampled
+_MAX_VIEWS, _COLUMNS = 48, 8
+_WIDTH = 192  # width of a tile, in pixels
+_NAME_LENGTH = 16  # number of last characters of a name that fit below a tile
+_BOTH, _MASK_ONLY, _SURFACE_ONLY = (60, 190, 90), (235, 60, 45), (40, 110, 240)
+_OUTLINES = {"yellow": (255, 215, 0), "white": (255, 255, 255)}  # colours of the first and of further inner bodies
 
 
 def choose_wrong_masks(silhouettes: Silhouettes, wrong_masks: int | None) -> int:
@@ -65,13 +73,6 @@ def report_overlaps(
     return overlaps
 
 
-def draw_overlays(
-    views: Views, mesh: TriangleMesh, overlaps: Float[np.ndarray, "V"], inside: list[TriangleMesh], folder: Path
-) -> None:
-    """Write the contact sheet of the overlaps, with the outlines of inner bodies (see `contact_sheet`)."""
-    save_image(folder / SHEET, contact_sheet(views, mesh, overlaps, _MAX_PIXELS, inside))
-
-
 def _warn_of_bad(
     overlaps: Float[np.ndarray, "V"], names: list[str], silhouettes: Silhouettes, wrong_masks: int | None
 ) -> None:
@@ -84,3 +85,54 @@ def _warn_of_bad(
         f"overlap below {GOOD_OVERLAP}: {first_of(bad)}; look at {SHEET}, and correct the masks or poses of these "
         f"views{advice}"
     )
+
+
+def draw_overlays(
+    views: Views, mesh: TriangleMesh, overlaps: Float[np.ndarray, "V"], inside: list[TriangleMesh], folder: Path
+) -> None:
+    """Write a contact sheet of the views with the smallest overlap, the worst first.
+
+    Green pixels belong to mask and silhouette, red ones to the mask alone, blue ones to the silhouette alone.
+
+    Args:
+        views: views with masks.
+        mesh: the surface.
+        overlaps: intersection over union by view.
+        inside: inner bodies, drawn as outlines.
+        folder: output folder.
+    """
+    assert views.masks is not None
+    stride = pixel_stride(views.cameras, _MAX_PIXELS)
+    chosen = np.argsort(overlaps, kind="stable")[:_MAX_VIEWS].tolist()
+    pictures, captions = [], []
+    cameras = views.cameras.select(chosen)
+    outlines = [_outlines(mesh_silhouettes(body, cameras, stride)) for body in inside]
+    for place, (view, ours) in enumerate(zip(chosen, mesh_silhouettes(mesh, cameras, stride), strict=True)):
+        theirs = views.masks[view][::stride, ::stride] > 0.5
+        picture = _tinted(views.images[view][::stride, ::stride], ours, theirs)
+        for body, outline in enumerate(outlines):
+            picture[outline[place]] = torch.tensor(list(_OUTLINES.values())[min(body, 1)]) / 255
+        pictures.append(picture)
+        captions.append(f"{overlaps[view]:.3f}  {views.names[view][-_NAME_LENGTH:]}")
+    colours = [f"{colour}: body {body + 2}" for body, colour in zip(range(len(inside)), _OUTLINES, strict=False)]
+    legend = ", ".join(["green: both, red: mask only, blue: surface only", *colours])
+    legend += f"; worst {len(chosen)} of {len(views)} views"
+    save_image(folder / SHEET, sheet(pictures, captions, _WIDTH, _COLUMNS, legend))
+
+
+def _outlines(silhouettes: Bool[Tensor, "V h w"]) -> Bool[Tensor, "V h w"]:
+    """Select the pixels of silhouettes that touch a pixel outside."""
+    others = torch.nn.functional.max_pool2d((~silhouettes[:, None]).float(), 3, 1, 1)[:, 0]
+    return silhouettes & (others > 0)
+
+
+def _tinted(image: Tensor, ours: Tensor, theirs: Tensor) -> Tensor:
+    grey = image.mean(-1, keepdim=True).expand(*image.shape)
+    picture = grey.clone()
+    for where, colour, strength in (
+        (ours & theirs, _BOTH, 0.35),
+        (theirs & ~ours, _MASK_ONLY, 0.85),
+        (ours & ~theirs, _SURFACE_ONLY, 0.85),
+    ):
+        picture[where] = (1 - strength) * grey[where] + strength * torch.tensor(colour) / 255
+    return picture.clamp(0, 1)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from nerfro.capture.targets import Sighting
+from nerfro.capture.boards import Sighting
 from nerfro.data.frames import list_images
 from nerfro.data.image_files import read_mask, read_rgb, to_unit
 from nerfro.errors import NerfroError

@@ -16,10 +16,8 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 
 from nerfro.allowed import Count, Natural, NotNegative, Range, corners_of_box
 from nerfro.cameras import Cameras
-from nerfro.capture.index_report import CURVE, INDEX
 from nerfro.capture.overlaps import REPORT, SHEET
 from nerfro.capture.overrides import as_overrides, is_given, of_groups
-from nerfro.capture.refinement_report import FIGURES, PICTURES
 from nerfro.capture.revolution import Symmetry
 from nerfro.capture.upright import find_up
 from nerfro.errors import NerfroError
@@ -29,7 +27,8 @@ from nerfro.media.base import Medium
 from nerfro.paths import EMBEDDED_PREFIX, resolve_path, user_path
 from nerfro.registry import build
 
-MESH, CAMERAS, FOUND = "mesh.ply", "cameras.json", "preprocess.json"
+MESH, FOUND = "mesh.ply", "preprocess.json"
+INDEX, CURVE, FIGURES = "index.json", "index.png", "refinement.json"
 # Margin of the index grid around the object, as a fraction of the object's size.
 _MARGIN = 0.15
 
@@ -42,8 +41,6 @@ class PreprocessConfig:
         data: data set (options of the group `data`); the training views are used.
         medium: medium that is built from the surface (options of the group `medium`).
         refine: after the search for the index, refine the surface until its refractions match the photographs.
-        refine_cameras: refine the poses together with the hull, by the distant surroundings and the outlines of the
-            masks.
         mesh: known surface, which is compared with the masks; replaces the hull.
         room: whether the surroundings are near, for the search of the index; by default the photographs decide.
         out: output folder; by default data.root.
@@ -61,7 +58,6 @@ class PreprocessConfig:
     data: Any = MISSING
     medium: Any = MISSING
     refine: bool = False
-    refine_cameras: bool = False
     mesh: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     room: Optional[bool] = None  # noqa: UP045
     out: Optional[str] = None  # noqa: UP045
@@ -109,9 +105,8 @@ class Request:
         config = self.config
         names = [MESH] if config.mesh is None or config.refine else []
         names += [SHEET, REPORT]
-        names += [CAMERAS] if config.refine_cameras else []
         names += [INDEX, CURVE] if self.searches_index else []
-        names += [FIGURES, PICTURES] if config.refine else []
+        names += [FIGURES] if config.refine else []
         return [self.folder / name for name in [*names, FOUND]]
 
     def check(self) -> None:
@@ -127,8 +122,6 @@ class Request:
             corners_of_box(config.box_min, config.box_max)
         if config.refine and "shell_voxels" not in config.medium:
             raise NerfroError("refine=true needs a distance grid; set medium=object or medium=vessel")
-        if config.refine_cameras and config.room:
-            raise NerfroError("refine_cameras=true needs distant surroundings; remove room=true or refine_cameras=true")
         if config.out is None and str(config.data.root).startswith(EMBEDDED_PREFIX):
             raise NerfroError(f"data.root={config.data.root} is part of nerfro and read-only; add out=FOLDER")
         refuse_existing(self.files, config.overwrite)

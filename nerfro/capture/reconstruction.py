@@ -16,7 +16,7 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 from tqdm import tqdm
 
-from nerfro.capture.calibration import Intrinsics, LensModel
+from nerfro.capture.calibration import LensModel
 from nerfro.capture.model_import import require_pycolmap
 from nerfro.data.image_files import read_mask, to_unit
 from nerfro.errors import NerfroError
@@ -46,14 +46,12 @@ class SfmSettings:
 
     Attributes:
         lens: distortion coefficients to estimate.
-        known: known lens, which stays fixed; None estimates the lens.
         pairs: pairs of images to match. None matches in sequence if the file names are numbered, and all pairs if
             sequential matching leaves images without a pose.
         threads: number of threads; None uses all cores.
     """
 
     lens: LensModel = "pinhole"
-    known: Intrinsics | None = None
     pairs: Pairs | None = None
     threads: int | None = None
 
@@ -149,10 +147,6 @@ def _extract(
     reader.camera_model, options.num_threads = _CAMERAS[settings.lens], threads
     if any(mask is not None for mask in masks):
         reader.mask_path = masked
-    if settings.known is not None:
-        matrix, distortion = settings.known.matrix, settings.known.distortion
-        numbers = [*matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *(distortion or [0.0] * 4)]
-        reader.camera_model, reader.camera_params = "OPENCV", ",".join(f"{number:.12g}" for number in numbers)
     for chunk in _chunks([image.name for image in images], _IMAGES_PER_CHUNK, "finding features"):
         pycolmap.extract_features(
             scratch / "database.db",
@@ -179,10 +173,7 @@ def _map(
 ) -> dict[int, Any]:
     """Register the images one after the other and write the models to the folder; returns the models by number."""
     options = pycolmap.IncrementalPipelineOptions()
-    if settings.known is not None:
-        options.ba_refine_focal_length = options.ba_refine_extra_params = False
-    else:
-        options.ba_refine_principal_point = False
+    options.ba_refine_principal_point = False
     options.random_seed, options.num_threads = _SEED, threads
     folder.mkdir(parents=True, exist_ok=True)
     with tqdm(total=len(images), desc="registering images", unit="image", dynamic_ncols=True) as progress:

@@ -15,31 +15,33 @@ descent, because a visual hull is as rough as its voxels.
 
 from __future__ import annotations
 
-import io
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path as FilePath
-from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.cube_map import texel_directions
 from nerfro.boundaries.envmap import EnvironmentMap
-from nerfro.capture.displacement import Displacement
+from nerfro.capture.preprocess_options import FIGURES
 from nerfro.capture.rims import RimFinder
 from nerfro.capture.room_picture import RoomPicture, picture_of
-from nerfro.capture.surroundings import Pixels, Room, Surroundings, robust
+from nerfro.capture.silhouettes import mesh_silhouettes
+from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings, robust
 from nerfro.capture.visual_hull import Silhouettes
+from nerfro.cli import warn
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
-from nerfro.files.cache import content_hash
-from nerfro.geometry.interpolation import quadratic_spline, smooth
+from nerfro.geometry.interpolation import bspline_basis, quadratic_spline, smooth
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.sdf_grid import SdfGrid
+from nerfro.progress import bar
 from nerfro.samplers.snell import Snell
 from nerfro.types import Exits, Path
 from nerfro.variants import variant
@@ -47,8 +49,6 @@ from nerfro.variants import variant
 _MAX_VALIDATION_PIXELS = 20_000
 # Residual of linear radiance at which a pixel has half weight.
 _HALF_WEIGHT = 0.1
-# Part of the key of a saved state; raise the number if the same inputs lead to other results.
-_VERSION = 3
 # Standard deviation of contours in pixels, and weights of contours and of roughness. Chosen as in RefinementSettings.
 _CONTOUR_DEVIATION, _CONTOUR_WEIGHT, _ROUGHNESS_WEIGHT = 0.25, 0.1, 0.1
 _NUM_CONTOUR_POINTS = 4000  # in each step
@@ -125,7 +125,6 @@ def refine_surface(
     surroundings: Surroundings,
     learn_index: bool = False,
     progress: Callable[[float], None] = lambda done: None,
-    record: FilePath | None = None,
     settings: RefinementSettings = RefinementSettings(),
 ) -> Refined:
     """Refine the outer surface of a medium by the refractions in photographs.
@@ -138,8 +137,6 @@ def refine_surface(
         surroundings: known surroundings, near or distant.
         learn_index: whether to refine the indices together with the surface.
         progress: called with the completed fraction.
-        record: file that stores the state after each stage, from which an interrupted refinement resumes; removed at
-            the end.
         settings: settings of the descent.
 
     Raises:
@@ -147,53 +144,103 @@ def refine_surface(
     """
     descent = _Descent(mesh, medium, silhouettes, through, surroundings, learn_index, settings)
     error = descent.validation_error(medium)
-    key = _key(mesh, medium, through, learn_index, settings)
     descent.start, smoothed = descent.smoothed(medium, error)
-    first: dict[str, Any] = {"key": key, "stage": 0, "steps": [0, 0], "errors": [error, smoothed]}
-    state = _load(record, key) or first | {"best": descent.values()}
-    steps, errors, total = state["steps"], state["errors"], sum(stage.steps for stage in settings.stages)
-    for number in range(state["stage"], len(settings.stages)):
-        done = sum(stage.steps for stage in settings.stages[:number])
-        descent.begin(state["best"], seed=number)
-        for step in range(settings.stages[number].steps):
-            descent.step(settings.stages[number], step)
+    steps, errors, best = [0, 0], [error, smoothed], descent.values()
+    done, total = 0, sum(stage.steps for stage in settings.stages)
+    for number, stage in enumerate(settings.stages):
+        descent.begin(best, seed=number)
+        for step in range(stage.steps):
+            descent.step(stage, step)
             progress((done + step + 1) / total)
             if (step + 1) % _VALIDATE_EVERY == 0:
                 steps.append(steps[-1] + _VALIDATE_EVERY)
                 errors.append(descent.validation_error(descent.medium()))
                 if errors[-1] == min(errors):
-                    state["best"] = descent.values()
+                    best = descent.values()
                 elif errors[-1] > (1 + _MAX_INCREASE) * min(errors):
                     break
-        if record is not None:
-            content = io.BytesIO()
-            torch.save(state | {"stage": number + 1}, content)
-            write_atomically(record, content.getvalue())
-    descent.begin(state["best"])
+        done += stage.steps
+    descent.begin(best)
     refined, smoothed = descent.smoothed(descent.medium(), min(errors))
     progress(1.0)
-    if record is not None:
-        record.unlink(missing_ok=True)
     steps, errors = [*steps, steps[-1]], [*errors, smoothed]
     if smoothed > (1 - _MIN_GAIN) * error:
         return Refined(mesh, medium, steps, errors)
     return Refined(_project_onto(mesh, refined), refined, steps, errors)
 
 
-def _key(mesh: TriangleMesh, medium: SdfGrid, through: Pixels, learn_index: bool, settings: RefinementSettings) -> str:
-    """Hash the inputs of a descent; the surroundings depend on the same photographs."""
-    tensors = medium.box, medium.distances, medium.iors.float(), through.index, through.radiance
-    arrays = (tensor.detach().numpy() for tensor in tensors)
-    return content_hash(_VERSION, repr(settings), learn_index, mesh.vertices, mesh.faces, *arrays)
+def refine(
+    observations: Observations,
+    mesh: TriangleMesh,
+    medium: SdfGrid,
+    silhouettes: Silhouettes | None,
+    learn_index: bool,
+    folder: FilePath,
+) -> TriangleMesh:
+    """Refine a surface with a progress bar, write refinement.json, and print the improvement.
 
+    Args:
+        observations: observations of the object and its surroundings.
+        mesh, medium, learn_index: see `refine_surface`.
+        silhouettes: silhouettes of the masks; None uses projections of the mesh.
+        folder: output folder.
 
-def _load(file: FilePath | None, key: str) -> dict[str, Any] | None:
-    """Load the state of an interrupted refinement with the same inputs; None without a valid state."""
+    Returns:
+        The refined surface; the given one without a significant improvement, or if the refinement is impossible.
+    """
+    through, surroundings, cameras = observations.through, observations.surroundings, observations.views.cameras
+    if silhouettes is None:
+        silhouettes = Silhouettes.of(cameras, mesh_silhouettes(mesh, cameras, 1).float())
     try:
-        state = torch.load(file, weights_only=True) if file is not None else {"key": None}
-        return state if state["key"] == key else None
-    except Exception:  # torch.load raises nearly any exception for a damaged file
-        return None
+        with bar("surface") as progress:
+            refined = refine_surface(mesh, medium, silhouettes, through, surroundings, learn_index, progress)
+    except NerfroError as reason:  # keep the results of the other steps
+        warn(f"surface unchanged: {reason}")
+        return mesh
+    before, after = refined.errors[0], min(refined.errors)
+    change = f"validation error {before:.4f} -> {after:.4f} (0 exact, 1 unrelated)"
+    if refined.mesh is mesh:
+        print(f"surface unchanged: {change}, which is no significant improvement")
+    else:
+        moved = float(torch.from_numpy(refined.mesh.vertices - mesh.vertices).norm(dim=-1).median())
+        print(f"surface refined: {change}; median displacement {moved:.2g} world units")
+    figures = {"steps": refined.steps, "held_back_error": [round(error, 5) for error in refined.errors]}
+    write_atomically(folder / FIGURES, json.dumps(figures, indent=1) + "\n")
+    return refined.mesh
+
+
+class Displacement(nn.Module):
+    """Outward displacement of a surface in world units: a sum of cubic B-splines on grids over a box.
+
+    The learned coefficients have no unit. A coefficient of 1 moves the surface by the object's size on the coarsest
+    grid, and by less on finer ones in proportion to the distance of their control points. One learning rate therefore
+    changes the slope of the surface alike on all levels.
+
+    Args:
+        shape: number of vertices of the grid at which the displacement is evaluated, along x, y and z.
+        size: size of the object, world units.
+        levels: control points along each side of the splines, the coarsest grid first.
+    """
+
+    def __init__(self, shape: tuple[int, ...], size: float, levels: tuple[int, ...]) -> None:
+        super().__init__()
+        self.levels = nn.ParameterList(nn.Parameter(torch.zeros(n, n, n)) for n in levels)
+        self.scales = [size * levels[0] / n for n in levels]
+        self._bases = [[bspline_basis(n, length) for length in shape] for n in levels]
+
+    def forward(self) -> Float[Tensor, "X Y Z"]:
+        """Evaluate the displacement at all vertices of the grid."""
+        terms = zip(self.scales, self.levels, self._bases, strict=True)
+        return sum(scale * torch.einsum("ijk,xi,yj,zk->xyz", values, *bases) for scale, values, bases in terms)  # type: ignore[return-value]
+
+    def roughness(self) -> Float[Tensor, ""]:
+        """Return the mean square of second differences between control points, as slopes of the surface."""
+        coarsest = len(self.levels[0])
+        return sum(  # type: ignore[return-value]
+            (values.diff(n=2, dim=axis) * (coarsest * (len(values) - 3) / len(values))).square().mean()
+            for values in self.levels
+            for axis in range(3)
+        )
 
 
 class _Descent:

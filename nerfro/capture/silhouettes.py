@@ -1,15 +1,15 @@
-"""Outlines of masks with subpixel accuracy, and silhouettes of meshes."""
+"""Outlines of masks with subpixel accuracy, silhouettes of meshes, and downscaling of images."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.special import ndtri
 from torch import Tensor
 
-from nerfro.cameras import Cameras
+from nerfro.cameras import Cameras, Window
 from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh
 
@@ -81,6 +81,29 @@ def frame_pixels(masks: Float[Tensor, "V H W"]) -> Bool[Tensor, "V P"]:
 def pixel_stride(cameras: Cameras, max_pixels: int) -> int:
     """Return the subsampling stride for which an image has at most `max_pixels` per side."""
     return -(-max(cameras.width, cameras.height) // max_pixels)
+
+
+class PixelBlocks:
+    """Downscaling of images by averaging square blocks; incomplete blocks at the right and bottom are cropped.
+
+    Args:
+        cameras: cameras of the images.
+        max_pixels: maximum length of the longer side after downscaling.
+    """
+
+    def __init__(self, cameras: Cameras, max_pixels: int) -> None:
+        self._stride = pixel_stride(cameras, max_pixels)
+        self.height, self.width = cameras.height // self._stride, cameras.width // self._stride
+        self._window = Window(0, 0, self.height * self._stride, self.width * self._stride)
+
+    def cameras(self, cameras: Cameras) -> Cameras:
+        """Return the cameras of the downscaled images."""
+        return cameras.crop(self._window).resized(self.width, self.height)
+
+    def mean(self, image: Shaped[Tensor, "H W *C"]) -> Float[Tensor, "h w *C"]:
+        """Average an image over each block."""
+        blocks = self._window.cut(image.float()[None])[0].unflatten(1, (self.width, self._stride))
+        return blocks.unflatten(0, (self.height, self._stride)).mean((1, 3))
 
 
 def mesh_silhouettes(mesh: TriangleMesh, cameras: Cameras, stride: int) -> Bool[Tensor, "V h w"]:

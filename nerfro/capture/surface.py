@@ -100,7 +100,7 @@ def make_mesh(
         symmetry: also fit a body of revolution. `auto` uses this body if its overlap with the masks is at least as
             large, `axis` also if the overlap is slightly smaller.
     """
-    box = object_box(silhouettes, wrong_masks) if corners is None else corners
+    box = _object_box(silhouettes, wrong_masks) if corners is None else corners
     with bar("carving") as progress:
         distances, corner, spacing = carve_grid(silhouettes, box, resolution, wrong_masks, progress)
     num_parts, num_kept = remove_strays(distances, keep)
@@ -151,7 +151,7 @@ def surfaces_inside(medium: Medium) -> list[TriangleMesh]:
     return [extract_surface(distances, low, spacing) for distances in of_bodies if (distances < 0).any()]
 
 
-def object_box(silhouettes: Silhouettes, wrong_masks: int) -> Float[np.ndarray, "2 3"]:
+def _object_box(silhouettes: Silhouettes, wrong_masks: int) -> Float[np.ndarray, "2 3"]:
     """Estimate the bounding box of the object, with a margin, from a coarse visual hull.
 
     A box that cuts the hull is enlarged; if no enlargement contains the hull, the initial box is used.

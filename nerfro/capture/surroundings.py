@@ -17,8 +17,7 @@ from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.cube_map import project
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.cameras import Cameras
-from nerfro.capture.pixel_blocks import PixelBlocks
-from nerfro.capture.silhouettes import mesh_silhouettes
+from nerfro.capture.silhouettes import PixelBlocks, mesh_silhouettes
 from nerfro.data.base import Views
 from nerfro.draws import Draws
 from nerfro.errors import NerfroError

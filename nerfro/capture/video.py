@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from nerfro.capture.targets import opencv
+from nerfro.capture.opencv import opencv
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.progress import track

@@ -1,10 +1,11 @@
-"""Data format of the synthetic NeRF scenes (Blender)."""
+"""Data formats with a transforms file per split: the synthetic NeRF scenes (Blender), and the captures of the paper."""
 
 from __future__ import annotations
 
-from nerfro.allowed import Distance, Factor
+from typing import Annotated, Any
+
+from nerfro.allowed import Distance, Range
 from nerfro.data.frames import FrameSet, PosedImages
-from nerfro.data.image_files import Alpha
 from nerfro.data.transforms import find_splits, read_manifest
 from nerfro.registry import register
 
@@ -17,16 +18,8 @@ class BlenderData(PosedImages):
     distributed with nerfro. `PosedImages` describes the options.
     """
 
-    def __init__(
-        self,
-        root: str = "embedded:torus",
-        near: Distance = 2.0,
-        far: Distance = 6.0,
-        downscale: Factor = 1,
-        alpha: Alpha = "drop",
-        mask_labels: list[int] | None = None,
-    ) -> None:
-        super().__init__(root, near, far, downscale, alpha, mask_labels)
+    def __init__(self, root: str = "embedded:torus", near: Distance = 2.0, far: Distance = 6.0, **options: Any) -> None:
+        super().__init__(root, near, far, **options)
 
     @property
     def splits(self) -> list[str]:
@@ -35,3 +28,36 @@ class BlenderData(PosedImages):
     def read(self, split: str) -> FrameSet:
         manifest = read_manifest(self.root, split)
         return FrameSet(manifest.frames, manifest.lenses(), "opengl")
+
+
+@register("data", "opencv")
+class OpenCVData(PosedImages):
+    """Read the format of the paper's captured scenes: `transforms_{train,val,test}.json` with one 3x3 camera matrix.
+
+    Poses have OpenCV camera axes. The centre of pixel (column, row) is at (column + 0.5, row + 0.5), as in the code of
+    the paper's authors.
+
+    Args:
+        options: see `PosedImages`.
+        eval_crop: fraction of each side that is kept around the centre, for the images of every split except train.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        near: Distance = 0.2,
+        far: Distance = 12.0,
+        eval_crop: Annotated[float, Range(more_than=0, at_most=1)] = 1.0,
+        **options: Any,
+    ) -> None:
+        super().__init__(root, near, far, **options)
+        self.eval_crop = eval_crop
+
+    @property
+    def splits(self) -> list[str]:
+        return list(find_splits(self.root))
+
+    def read(self, split: str) -> FrameSet:
+        manifest = read_manifest(self.root, split)
+        crop = 1.0 if split == "train" else self.eval_crop
+        return FrameSet(manifest.frames, manifest.lenses(), "opencv", crop=crop)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from nerfro.allowed import Distance, Factor
 from nerfro.data.base import Frame
 from nerfro.data.bounds import find_bounds, usable_points
 from nerfro.data.colmap_model import ColmapCamera, read_colmap
 from nerfro.data.frames import Every, FrameSet, PosedImages
-from nerfro.data.image_files import Alpha, read_size
+from nerfro.data.image_files import read_size
 from nerfro.data.lenses import Lens
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
@@ -29,8 +29,9 @@ class ColmapData(PosedImages):
     resized after the reconstruction.
 
     Args:
-        root, near, far, downscale, alpha, mask_labels: see `PosedImages`. Without `near` and `far`, the bounds are
-            estimated from the 3-D points or from the cameras; see `find_bounds`.
+        near, far: bounds of the rays, arc lengths in world units; by default estimated from the 3-D points or from the
+            cameras, see `find_bounds`.
+        options: see `PosedImages`.
         images: folder of the images within the root.
         model: folder of the model within the root. By default, the first model in sparse/0, sparse, colmap/sparse/0 and
             the root is used.
@@ -40,16 +41,12 @@ class ColmapData(PosedImages):
     def __init__(
         self,
         root: str,
-        near: Distance | None = None,
-        far: Distance | None = None,
-        downscale: Factor = 1,
-        alpha: Alpha = "drop",
-        mask_labels: list[int] | None = None,
         images: str = "images",
         model: str | None = None,
         test_every: Every = 8,
+        **options: Any,
     ) -> None:
-        super().__init__(root, near, far, downscale, alpha, mask_labels)
+        super().__init__(root, **options)
         self.images, self.model, self.test_every = images, model, test_every
 
     def read(self, split: str) -> FrameSet:

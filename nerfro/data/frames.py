@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from nerfro.allowed import Coordinate, Range, check
+from nerfro.allowed import Coordinate, Distance, Factor, Range, check, checked
 from nerfro.cameras import Cameras, central_window
 from nerfro.data.base import DataSource, Frame, Views
 from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb
@@ -52,12 +52,13 @@ class FrameSet:
     usable: Sequence[Path | None] = ()
 
 
+@checked("data")
 class PosedImages(DataSource):
     """Base class of the built-in data formats. A format implements `read` and, if it defines splits, `splits`.
 
     Args:
         root: folder of the data set.
-        near, far: bounds of the rays, arc lengths in world units; None to use the bounds of the data set.
+        near, far: bounds of the rays, arc lengths in world units; None for the bounds of the data set.
         downscale: downscaling factor of each side, any number from 1. Each pixel becomes the mean of the area that it
             covers, and the intrinsics are scaled accordingly.
         alpha: `drop` ignores transparency; `white` and `black` composite the images over this colour.
@@ -71,11 +72,11 @@ class PosedImages(DataSource):
     def __init__(
         self,
         root: str,
-        near: float | None,
-        far: float | None,
-        downscale: float,
-        alpha: Alpha,
-        mask_labels: list[int] | None,
+        near: Distance | None = None,
+        far: Distance | None = None,
+        downscale: Factor = 1,
+        alpha: Alpha = "drop",
+        mask_labels: list[int] | None = None,
     ) -> None:
         _check_bounds(near, far)
         self.root = resolve_path(root)

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
-from nerfro.allowed import Distance, Factor
 from nerfro.data.base import Frame
 from nerfro.data.frames import Every, FrameSet, PosedImages, list_images
-from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha
+from nerfro.data.image_files import IMAGE_SUFFIXES
 from nerfro.data.lenses import Lens
 from nerfro.errors import NerfroError
 from nerfro.files.reading import load_arrays, parse_matrix
@@ -31,8 +30,8 @@ class IdrData(PosedImages):
     principal point is shifted by half a pixel.
 
     Args:
-        root, near, far, downscale, alpha, mask_labels: see `PosedImages`. Without `near` and `far`, the bounds enclose
-            the unit sphere in all views.
+        near, far: bounds of the rays, arc lengths; by default, these enclose the unit sphere in all views.
+        options: see `PosedImages`.
         cameras: name of the file with the matrices.
         world: `sphere` for the frame in which the object lies inside the unit sphere, or `file` for the world of
             `world_mat`, which requires `near` and `far`.
@@ -42,17 +41,13 @@ class IdrData(PosedImages):
     def __init__(
         self,
         root: str,
-        near: Distance | None = None,
-        far: Distance | None = None,
-        downscale: Factor = 1,
-        alpha: Alpha = "drop",
-        mask_labels: list[int] | None = None,
         cameras: str = "cameras_sphere.npz",
         world: Literal["sphere", "file"] = "sphere",
         test_every: Every = 8,
+        **options: Any,
     ) -> None:
-        super().__init__(root, near, far, downscale, alpha, mask_labels)
-        if world == "file" and (near is None or far is None):
+        super().__init__(root, **options)
+        if world == "file" and (self.near is None or self.far is None):
             raise NerfroError("data.world=file needs data.near and data.far; set both, in units of this world")
         self.cameras, self.world, self.test_every = cameras, world, test_every
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
-from PIL import ExifTags, Image
+from PIL import Image
 from scipy.sparse import csr_array
 
 from nerfro.errors import NerfroError
@@ -48,24 +48,6 @@ def read_size(path: Path) -> tuple[int, int, int]:
     """Read width, height and bits per channel from the header of an image file."""
     with open_image(path, whole=False) as (image, bits):
         return *image.size, bits
-
-
-def read_exposure(path: Path) -> tuple[float | None, float | None, float | None]:
-    """Read exposure time in seconds, f-number and ISO sensitivity from EXIF data; None for a missing value."""
-    with open_image(path, whole=False) as (image, _):
-        tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
-    named = ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings
-    time, number, sensitivity = (_positive(tags.get(tag)) for tag in named)
-    return time, number, sensitivity
-
-
-def _positive(value: object) -> float | None:
-    """Convert an EXIF value to a positive number, or None if it is missing or invalid."""
-    try:
-        number = float(value[0] if isinstance(value, tuple) else value)  # type: ignore[arg-type]
-    except (TypeError, ValueError, ZeroDivisionError, IndexError):
-        return None
-    return number if 0 < number < float("inf") else None
 
 
 def _read_8bit(image: Image.Image, bits: int) -> UInt8[np.ndarray, "H W C"]:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.allowed import Distance, Factor
 from nerfro.data.base import Frame
 from nerfro.data.frames import Every, FrameSet, PosedImages, check_pose, list_images, require_root
-from nerfro.data.image_files import Alpha, read_size
+from nerfro.data.image_files import read_size
 from nerfro.data.lenses import Lens
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
@@ -31,11 +30,11 @@ class LlffData(PosedImages):
     """Read the LLFF format: images/ and poses_bounds.npy, which has one row of 17 numbers per image, sorted by name.
 
     Args:
-        root, downscale, alpha, mask_labels: see `PosedImages`.
         near: arc length at which rays begin, in units of the chosen frame. The default is 0.9 times the nearest depth
             in the file.
         far: arc length at which rays end. The default is the arc length to the farthest depth in the file (at most 2
             for `frame=eikonal`, as in Eikonal Fields) in the corner of the image.
+        options: see `PosedImages`.
         images: folder of the images within the root, such as images_8. The intrinsics are scaled to the image size.
         frame: world frame. `file` keeps the world of the file; `llff` scales by 1 / (0.75 nearest depth) and recentres;
             `eikonal` scales by 1 / (farthest - nearest depth), recentres and spherifies, as Eikonal Fields does.
@@ -47,17 +46,13 @@ class LlffData(PosedImages):
     def __init__(
         self,
         root: str,
-        near: Distance | None = None,
-        far: Distance | None = None,
-        downscale: Factor = 1,
-        alpha: Alpha = "drop",
-        mask_labels: list[int] | None = None,
         images: str = "images",
         frame: Literal["llff", "eikonal", "file"] = "llff",
         video: str | None = None,
         test_every: Every = 8,
+        **options: Any,
     ) -> None:
-        super().__init__(root, near, far, downscale, alpha, mask_labels)
+        super().__init__(root, **options)
         self.images, self.frame, self.video, self.test_every = images, frame, video, test_every
 
     def read(self, split: str) -> FrameSet:

@@ -110,15 +110,10 @@ def masked_views(views: Views) -> Views:
     chosen = [i for i, frame in enumerate(views.frames) if frame.mask is not None]
     if views.masks is not None or not chosen or not isinstance(views.images, LazyImages):
         return views
-    frames = [views.frames[i] for i in chosen]
-    files = [frame.image for frame in frames]
-    found, size = [frame.mask for frame in frames], views.images.size[::-1]
-    masks = find_masks(files, found, views.images.downscale, size, views.mask_labels)
-    assert masks is not None
-    images = replace(views.images, files=files)
-    if images.window is not None:
-        masks = masks.cut(images.window)
-    return Views(views.cameras.select(chosen), images, masks, [views.names[i] for i in chosen], frames=frames)
+    some, images = views.select(chosen), views.images
+    files, masks = zip(*((frame.image, frame.mask) for frame in some.frames), strict=True)
+    found = find_masks(files, masks, images.downscale, images.size[::-1], views.mask_labels)
+    return replace(some, masks=found if found is None or images.window is None else found.cut(images.window))
 
 
 def find_usable(

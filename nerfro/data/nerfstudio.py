@@ -8,10 +8,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from nerfro.allowed import Distance, Factor
 from nerfro.data.bounds import find_bounds, usable_points
 from nerfro.data.frames import SPLITS, Every, FrameSet, PosedImages
-from nerfro.data.image_files import Alpha, read_size
+from nerfro.data.image_files import read_size
 from nerfro.data.masks import find_mask
 from nerfro.data.transforms import Manifest, find_splits, parse_manifest, read_manifest
 from nerfro.errors import NerfroError
@@ -30,8 +29,9 @@ class NerfstudioData(PosedImages):
     (black), which are not used for training. The silhouette of the refractive object is `object_mask_path`.
 
     Args:
-        root, near, far, downscale, alpha, mask_labels: see `PosedImages`. Without `near` and `far`, the bounds are
-            estimated from the sparse points (`ply_file_path`) or from the cameras; see `find_bounds`.
+        near, far: bounds of the rays, arc lengths in world units; by default estimated from the sparse points
+            (`ply_file_path`) or from the cameras, see `find_bounds`.
+        options: see `PosedImages`.
         missing: whether to `skip` frames whose image does not exist, with a warning, or to `refuse` the data set.
         test_every: every n-th frame by name, from the first, belongs to val and test, unless the file has the lists
             {train,val,test}_filenames.
@@ -40,15 +40,11 @@ class NerfstudioData(PosedImages):
     def __init__(
         self,
         root: str,
-        near: Distance | None = None,
-        far: Distance | None = None,
-        downscale: Factor = 1,
-        alpha: Alpha = "drop",
-        mask_labels: list[int] | None = None,
         missing: Literal["skip", "refuse"] = "skip",
         test_every: Every = 10,
+        **options: Any,
     ) -> None:
-        super().__init__(root, near, far, downscale, alpha, mask_labels)
+        super().__init__(root, **options)
         self.skip_missing, self.test_every = missing == "skip", test_every
 
     @property

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.allowed import Distance, Factor
+from nerfro.allowed import Distance
 from nerfro.data.base import Frame, Views
 from nerfro.data.frames import SPLITS, FrameSet, PosedImages, check_pose
-from nerfro.data.image_files import Alpha, read_size
+from nerfro.data.image_files import read_size
 from nerfro.data.lenses import Lens
 from nerfro.errors import NerfroError
 from nerfro.files.reading import parse_matrix
@@ -38,21 +38,13 @@ class RefRefData(PosedImages):
     Args:
         root: folder that contains the .parquet files of the scene at any depth.
         scene: name of the scene, such as cube_smcvx_ampoule. It may be omitted if the folder holds one scene.
-        near, far, downscale, alpha, mask_labels: see `PosedImages`. The default of `far` is the greatest distance
-            between any camera and any corner of RefRef's scene box, whose side is 14.6.
+        far: arc length at which rays end; by default the greatest distance between any camera and any corner of
+            RefRef's scene box, whose side is 14.6.
+        options: see `PosedImages`.
     """
 
-    def __init__(
-        self,
-        root: str,
-        scene: str | None = None,
-        near: Distance = 0.2,
-        far: Distance | None = None,
-        downscale: Factor = 1,
-        alpha: Alpha = "drop",
-        mask_labels: list[int] | None = None,
-    ) -> None:
-        super().__init__(root, near, far, downscale, alpha, mask_labels)
+    def __init__(self, root: str, scene: str | None = None, near: Distance = 0.2, **options: Any) -> None:
+        super().__init__(root, near, **options)
         self.scene = scene
 
     def load(self, split: str) -> Views:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.geometry.normals import smooth_normals
+from nerfro.geometry.normals import corner_normals
 from nerfro.geometry.orientation import patches
 
 _TOUCHING = 1e-5  # fraction of the extent; bounding boxes closer to each other count as overlapping
@@ -21,7 +21,7 @@ _SAME_PLANE = 1e-3  # difference of unit normals, and of heights as fractions of
 
 @dataclass(frozen=True)
 class Triangles:
-    """Triangles of several bodies in double precision, differentiable with respect to the vertices.
+    """Triangles of several bodies in double precision.
 
     Attributes:
         corners: corners of each triangle, world units.
@@ -34,21 +34,12 @@ class Triangles:
     body: Int[Tensor, "F"]
 
     @classmethod
-    def of(cls, meshes: list[TriangleMesh], vertices: Float[Tensor, "V 3"] | None = None) -> Triangles:
-        """Collect the triangles of meshes, with smooth normals up to the crease angle.
-
-        Args:
-            meshes: one mesh per body.
-            vertices: vertices of all meshes together that replace the vertices of the meshes, world units.
-        """
-        counts = [len(mesh.vertices) for mesh in meshes]
-        if vertices is None:
-            vertices = torch.from_numpy(np.concatenate([mesh.vertices for mesh in meshes]))
-        parts = vertices.double().cpu().split(counts)
-        corners = [part[torch.from_numpy(mesh.faces)] for mesh, part in zip(meshes, parts, strict=True)]
-        normals = [smooth_normals(mesh, part) for mesh, part in zip(meshes, corners, strict=True)]
+    def of(cls, meshes: list[TriangleMesh]) -> Triangles:
+        """Collect the triangles of meshes, one mesh per body, with smooth normals up to the crease angle."""
+        corners = np.concatenate([mesh.triangles for mesh in meshes])
+        normals = np.concatenate([corner_normals(mesh) for mesh in meshes])
         body = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
-        return cls(torch.cat(corners), torch.cat(normals), torch.from_numpy(body))
+        return cls(*map(torch.from_numpy, (corners, normals, body)))
 
     def areas(self, face: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch 3"]:
         """Return normals by the right-hand rule, with a length of twice the area of the triangle."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -67,14 +68,10 @@ class SdfGrid(Solid):
         meshes: the meshes of the bodies; empty if the medium was made from distances.
         distances: signed distance of each body at the vertices of the grid [K, X, Y, Z], world units.
         coefficients: coefficients of the quadratic B-splines through `distances`.
-        vertices: vertices of all meshes, one mesh after another [V, 3], world units. Make it a parameter to obtain
-            gradients with respect to the triangles.
     """
 
     distances: Float[Tensor, "K X Y Z"]
     coefficients: Float[Tensor, "K X Y Z"]
-    vertices: Float[Tensor, "V 3"]
-    _traced: tuple[Tensor, int, Triangles, LayeredIntersector] | None = None
 
     def __init__(
         self,
@@ -168,22 +165,17 @@ class SdfGrid(Solid):
         self.coarse_clearance, self.coarse_slopes, self.empty_blocks  # noqa: B018 (computed once, and shared by all wavelengths)
         return super().at_wavelength(wavelength)
 
-    @torch.no_grad()
-    def traced_triangles(self) -> tuple[Triangles, LayeredIntersector]:
-        """Return the triangles without gradients and their intersector; both are rebuilt when `vertices` change."""
-        known = self._traced
-        if known is None or known[0] is not self.vertices or known[1] != self.vertices._version:
-            triangles = self.triangles()
-            starts = np.cumsum([0, *(len(mesh.vertices) for mesh in self.meshes)])
-            faces = [mesh.faces + start for mesh, start in zip(self.meshes, starts, strict=False)]
-            scene = LayeredIntersector(triangles.corners, np.concatenate(faces))
-            known = self.vertices, self.vertices._version, triangles, scene
-            self._traced = known
-        return known[2:]
-
+    @cached_property
     def triangles(self) -> Triangles:
-        """Return the triangles of all meshes at the current `vertices`, with gradients."""
-        return Triangles.of(self.meshes, self.vertices)
+        """Triangles of all meshes."""
+        return Triangles.of(self.meshes)
+
+    @cached_property
+    def intersector(self) -> LayeredIntersector:
+        """Intersector of `triangles`."""
+        starts = np.cumsum([0, *(len(mesh.vertices) for mesh in self.meshes)])
+        faces = [mesh.faces + start for mesh, start in zip(self.meshes, starts, strict=False)]
+        return LayeredIntersector(self.triangles.corners, np.concatenate(faces))
 
     @lazy_buffer
     def coarse_clearance(self) -> Float[Tensor, "x y z"]:
@@ -262,8 +254,6 @@ class SdfGrid(Solid):
     def _set(self, distances: Tensor, box: Tensor) -> None:
         # Grids are rebuilt from the mesh at every start and do not belong in checkpoints.
         self.register_buffer("box", box, persistent=False)
-        vertices = np.concatenate([np.empty((0, 3)), *(mesh.vertices for mesh in self.meshes)])
-        self.register_buffer("vertices", torch.from_numpy(vertices), persistent=False)
         coefficients = torch.stack([spline_coefficients(values) for values in distances])
         self.register_buffer("coefficients", coefficients, persistent=False)
         self.register_buffer("distances", distances, persistent=False)

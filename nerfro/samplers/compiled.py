@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from nerfro.kernels.arrays import arrays
@@ -80,46 +80,24 @@ def eikonal_on_grid(
     """Evaluate `samplers.eikonal.march_adaptive` by the compiled kernel."""
     from nerfro.samplers.eikonal_cpu import march_adaptive
 
-    settings = (_for_kernels(medium), step, tolerance, max_steps)
-    vertices, (refracted, exceeded) = _with_enough_vertices(rays, march_adaptive, settings, 3)
-    return _path(rays, vertices, refracted), torch.from_numpy(exceeded)
+    settings = _for_kernels(medium), step, tolerance, max_steps
+    *columns, counts, refracted, exceeded = march_adaptive(*_ray_arrays(rays), *settings, _CAPACITY)
+    width = max(int(counts.max(initial=2)), 2)
+    if width > _CAPACITY:  # trace the rays with more vertices again
+        rows = np.nonzero(counts > _CAPACITY)[0]
+        again = march_adaptive(*_ray_arrays(rays[torch.from_numpy(rows)]), *settings, width)[:3]
+        for i, (short, long) in enumerate(zip(columns, again, strict=True)):
+            columns[i] = np.concatenate([short, np.repeat(short[:, -1:], width - _CAPACITY, axis=1)], axis=1)
+            columns[i][rows] = long
+    return _path(rays, [column[:, :width] for column in columns], refracted), torch.from_numpy(exceeded)
 
 
 def uniform_on_grid(rays: Rays, medium: VoxelGrid, num_steps: int) -> Path:
     """Evaluate `samplers.eikonal.march_uniform` with Euler steps by the compiled kernel."""
     from nerfro.samplers.eikonal_cpu import march_uniform
 
-    *vertices, refracted = march_uniform(*_ray_arrays(rays), _for_kernels(medium), num_steps, True)
+    *vertices, refracted = march_uniform(*_ray_arrays(rays), _for_kernels(medium), num_steps)
     return _path(rays, vertices, refracted)
-
-
-def uniform_exit_on_grid(rays: Rays, medium: VoxelGrid, num_steps: int) -> Float[Tensor, "R 3"]:
-    """Return the exit directions of `uniform_on_grid` without the memory of all vertices."""
-    from nerfro.samplers.eikonal_cpu import march_uniform
-
-    return torch.from_numpy(march_uniform(*_ray_arrays(rays), _for_kernels(medium), num_steps, False)[1][:, 0])
-
-
-def _with_enough_vertices(
-    rays: Rays, kernel: Callable, settings: tuple, num_arrays: int
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Run a kernel, and again for the rays with more vertices than the capacity.
-
-    Returns:
-        The first `num_arrays` results, which have a column for each vertex, and the results after the counts.
-    """
-    of_rays = _ray_arrays(rays)
-    capacity = _CAPACITY
-    results = kernel(*of_rays, *settings, capacity)
-    columns, counts, rest = list(results[:num_arrays]), results[num_arrays], list(results[num_arrays + 1 :])
-    width = max(int(counts.max(initial=2)), 2)
-    if width > capacity:
-        rows = np.nonzero(counts > capacity)[0]
-        again = kernel(*(array[rows] for array in of_rays), *settings, width)[:num_arrays]
-        for i, (short, long) in enumerate(zip(columns, again, strict=True)):
-            columns[i] = np.concatenate([short, np.repeat(short[:, -1:], width - capacity, axis=1)], axis=1)
-            columns[i][rows] = long
-    return [column[:, :width] for column in columns], rest
 
 
 def _ray_arrays(rays: Rays) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -1,13 +1,11 @@
-"""Compiled kernel of the density-grid sampler: one ray after another, without intermediate tensors.
-
-Names of per-segment arrays: `cumulative` is the measure (arc length or contracted length) at which a segment begins,
-`closest` the arc length of the segment's closest approach to the centre, `impact` the distance from the centre there
-(impact parameter), and `start_length` the contracted length from the closest approach to the segment's start.
-"""
+"""Compiled kernel of the density-grid sampler: one ray after another, without intermediate tensors."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from jaxtyping import Float
 from numba import prange
 
 from nerfro.geometry.contraction import FAR, NEAREST
@@ -18,6 +16,15 @@ _BLOCK = 64  # rays that share a thread's scratch memory
 _THIN = 0.05  # optical depth whose fifth power is nothing in single precision
 _DARK = 1e-9  # transmittance behind which nothing is seen
 _EPS = float(np.finfo(np.float32).eps)
+
+
+class Segments(NamedTuple):
+    """The segments of one polyline; `closest`, `impact` and `start_length` are set for contracted space alone."""
+
+    cumulative: Float[np.ndarray, "V"]  # measure (arc length or contracted length) at which the segment begins
+    start_length: Float[np.ndarray, "V"]  # contracted length from the closest approach to the segment's start
+    closest: Float[np.ndarray, "V"]  # arc length of the closest approach to the centre
+    impact: Float[np.ndarray, "V"]  # distance from the centre there (impact parameter)
 
 
 @compiled
@@ -72,8 +79,9 @@ def _world_length(length, impact, radius):
 
 
 @compiled
-def _contracted_segments(positions, directions, s, centre, radius, near, cumulative, start_length, closest, impact):
-    """Fill the per-segment arrays of `samplers.measures.ContractedLength` for one polyline; return its total."""
+def _contracted_segments(positions, directions, s, centre, radius, near, segments):
+    """Fill the segments of `samplers.measures.ContractedLength` for one polyline; return its total."""
+    cumulative, start_length, closest, impact = segments
     total, last = 0.0, len(s) - 1
     for segment in range(last + 1):
         cumulative[segment] = total
@@ -101,13 +109,12 @@ def _even_segments(s, cumulative):
 
 
 @compiled
-def _arc_length(place, segment, cumulative, start_length, closest, impact, radius):
+def _arc_length(place, segment, segments, radius):
     """Convert a value of the measure within a segment to arc length."""
     if radius == 0.0:
         return place
-    return closest[segment] + _world_length(
-        start_length[segment] + place - cumulative[segment], impact[segment], radius
-    )
+    length = segments.start_length[segment] + place - segments.cumulative[segment]
+    return segments.closest[segment] + _world_length(length, segments.impact[segment], radius)
 
 
 @compiled
@@ -158,22 +165,7 @@ def _depths_even(positions, directions, s, first, width, low, flat, per_unit, ce
 
 
 @compiled
-def _depths_contracted(
-    positions,
-    directions,
-    s,
-    centre,
-    radius,
-    cumulative,
-    start_length,
-    closest,
-    impact,
-    width,
-    flat,
-    per_unit,
-    cells,
-    depths,
-):
+def _depths_contracted(positions, directions, s, centre, radius, segments, width, flat, per_unit, cells, depths):
     """Compute the optical depth of each bin of contracted length, by the density at its midpoint.
 
     Outside the ball of radius R, a point of a line with impact parameter a is a tan(phi) away from the closest
@@ -181,6 +173,7 @@ def _depths_contracted(
     (2 - R cos(phi) / a) R (e cos(phi) + d sin(phi)), where d is the line's direction and e the unit vector from the
     centre to the closest approach. Therefore one rotation leads from bin to bin, without a square root or a tangent.
     """
+    cumulative, start_length, closest, impact = segments
     segment, turned_segment, turned_side, cosine, sine, by_cosine, by_sine = 0, -1, 0, 0.0, 0.0, 0.0, 0.0
     x0, y0, z0, within, a = 0.0, 0.0, 0.0, 0.0, 0.0
     half = 2.0 * radius
@@ -274,7 +267,7 @@ def draw(
     for block in prange((num_rays + _BLOCK - 1) // _BLOCK):
         scratch, weights = np.empty((4, num_vertices)), np.empty(num_bins, np.float32)
         u = np.empty(num_edges, np.float32)
-        cumulative, start_length, closest, impact = scratch[0], scratch[1], scratch[2], scratch[3]
+        segments = Segments(scratch[0], scratch[1], scratch[2], scratch[3])
         centre, per_unit = np.empty(3), np.empty(3)
         for axis in range(3):
             centre[axis] = 0.5 * (low[axis] + high[axis])
@@ -282,24 +275,13 @@ def draw(
         for ray in range(block * _BLOCK, min((block + 1) * _BLOCK, num_rays)):
             if radius > 0.0:
                 first = 0.0
-                last = _contracted_segments(
-                    positions[ray],
-                    directions[ray],
-                    s[ray],
-                    centre,
-                    radius,
-                    near,
-                    cumulative,
-                    start_length,
-                    closest,
-                    impact,
-                )
+                last = _contracted_segments(positions[ray], directions[ray], s[ray], centre, radius, near, segments)
             else:
                 first, last = _span(positions[ray], directions[ray], s[ray], low, high)
-                _even_segments(s[ray], cumulative)
+                _even_segments(s[ray], segments.cumulative)
             width = (last - first) / num_bins
             if width == 0.0:  # most rays of a picture miss the object
-                segment = _segment(cumulative, 0, last)
+                segment = _segment(segments.cumulative, 0, last)
                 for axis in range(3):
                     slope = directions[ray, segment, axis]
                     points[ray, :, axis] = positions[ray, segment, axis] + (last - s[ray, segment]) * slope
@@ -309,8 +291,8 @@ def draw(
                 continue
             if radius > 0.0:
                 _depths_contracted(
-                    positions[ray], directions[ray], s[ray], centre, radius, cumulative, start_length, closest, impact,
-                    width, flat, per_unit, cells, weights,
+                    positions[ray], directions[ray], s[ray], centre, radius, segments, width, flat, per_unit, cells,
+                    weights,
                 )  # fmt: skip
             else:
                 _depths_even(positions[ray], directions[ray], s[ray], first, width, low, flat, per_unit, cells, weights)
@@ -342,12 +324,12 @@ def draw(
                 inside = min(max((u[edge] - below) / share, 0.0), 1.0)
                 place = np.float32(first + (index + inside) * width)
                 measure[ray, edge] = place
-                edge_segment = _segment(cumulative, edge_segment, place)
-                edges[ray, edge] = _arc_length(place, edge_segment, cumulative, start_length, closest, impact, radius)
+                edge_segment = _segment(segments.cumulative, edge_segment, place)
+                edges[ray, edge] = _arc_length(place, edge_segment, segments, radius)
                 if edge > 0:
                     middle = 0.5 * (before + place)
-                    segment = _segment(cumulative, segment, middle)
-                    at = _arc_length(middle, segment, cumulative, start_length, closest, impact, radius)
+                    segment = _segment(segments.cumulative, segment, middle)
+                    at = _arc_length(middle, segment, segments, radius)
                     middles[ray, edge - 1] = at
                     ahead = at - s[ray, segment]
                     dx, dy, dz = directions[ray, segment, 0], directions[ray, segment, 1], directions[ray, segment, 2]

@@ -59,10 +59,7 @@ def _kick(h, px, py, pz, vx, vy, vz, n, gx, gy, gz):
 
 @compiled
 def _march_ray_uniformly(voxels, origin, direction, near, far, num_steps, row):
-    """Trace one ray by `integrators.euler` and write its vertices, or only the last one if the row has one place.
-
-    Returns whether the index varied along the path.
-    """
+    """Trace one ray by `integrators.euler` and write its vertices; returns whether the index varied along the path."""
     table, low, inverse_spacing = voxels.values, voxels.low, voxels.inverse_spacing
     positions, directions, lengths = row
     vx, vy, vz = float(direction[0]), float(direction[1]), float(direction[2])
@@ -71,13 +68,10 @@ def _march_ray_uniformly(voxels, origin, direction, near, far, num_steps, row):
     ds = (far - s) / (num_steps - 1)
     n, gx, gy, gz = voxel_index(table, low, inverse_spacing, x, y, z)
     vx, vy, vz = n * vx, n * vy, n * vz
-    keep_all = len(lengths) == num_steps
     bent = False
     for step in range(num_steps):
-        if keep_all or step == num_steps - 1:
-            norm = math.sqrt(vx * vx + vy * vy + vz * vz)
-            slot = step if keep_all else 0
-            put_vertex(positions, directions, lengths, slot, x, y, z, vx / norm, vy / norm, vz / norm, s)
+        norm = math.sqrt(vx * vx + vy * vy + vz * vz)
+        put_vertex(positions, directions, lengths, step, x, y, z, vx / norm, vy / norm, vz / norm, s)
         bent = bent or gx != 0.0 or gy != 0.0 or gz != 0.0
         if step == num_steps - 1:
             break
@@ -91,19 +85,17 @@ def _march_ray_uniformly(voxels, origin, direction, near, far, num_steps, row):
 
 
 @compiled_parallel
-def march_uniform(origins, directions, near, far, voxels, num_steps, keep_all):
+def march_uniform(origins, directions, near, far, voxels, num_steps):
     """Trace rays through a voxel grid by Euler steps of equal arc length.
 
     Returns:
-        positions [R, V, 3], directions [R, V, 3], s [R, V]: V is the number of steps, or 1 for only the last vertex if
-            not `keep_all`.
+        positions [R, V, 3], directions [R, V, 3], s [R, V]: V is the number of steps.
         refracted [R]: whether the index varied along the path.
     """
     num_rays = origins.shape[0]
-    kept = num_steps if keep_all else 1
-    out_positions = np.empty((num_rays, kept, 3), origins.dtype)
-    out_directions = np.empty((num_rays, kept, 3), origins.dtype)
-    out_s = np.empty((num_rays, kept), origins.dtype)
+    out_positions = np.empty((num_rays, num_steps, 3), origins.dtype)
+    out_directions = np.empty((num_rays, num_steps, 3), origins.dtype)
+    out_s = np.empty((num_rays, num_steps), origins.dtype)
     refracted = np.empty(num_rays, np.bool_)
     for ray in prange(num_rays):
         row = (out_positions[ray], out_directions[ray], out_s[ray])

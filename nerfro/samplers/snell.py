@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from nerfro.allowed import Positive, Range, Share
 from nerfro.errors import NerfroError
@@ -19,11 +20,9 @@ from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
 from nerfro.registry import register
-from nerfro.samplers.bands import refined_in_bands, traced_in_bands
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.branching import ONE_PATH, Branching
 from nerfro.samplers.compiled import snell_on_grid
-from nerfro.samplers.mesh_interfaces import snell_on_mesh
 from nerfro.samplers.polylines import SnellTrace
 from nerfro.samplers.replay import meet_solid, meet_triangles, replay, smallest_cosine
 from nerfro.samplers.straight import straight_path
@@ -31,6 +30,9 @@ from nerfro.samplers.wavefront import Wavefront
 from nerfro.types import Path, Rays
 
 _ROOT_ITERATIONS = 60
+# The search for the next triangle begins at this share of the box's diagonal from the last one, beyond the rounding
+# errors of Embree's single precision.
+_SEARCH_OFFSET = 1e-6
 # Training uses no derivatives of paths whose `smallest_cosine` is below this value.
 _STEADY = 0.15
 
@@ -79,17 +81,17 @@ class Snell(PathSampler):
         return self.trace(rays, medium, replace(self.branching, main_only=True)).path
 
     def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
-        """Return the path with gradients with respect to rays, indices and surfaces; see `samplers.replay`.
+        """Return the path with gradients with respect to rays, indices and distance grids; see `samplers.replay`.
 
         Gradients are unbounded at grazing and critical angles; omit paths whose `smallest_cosine` is below 0.15.
         """
         if isinstance(medium, Solid) and medium.disperses:
-            return refined_in_bands(path, rays, self._at_wavelengths(medium), self._refine)
+            return _refined_in_bands(path, rays, self._at_wavelengths(medium), self._refine)
         return self._refine(path, rays, medium)
 
     def _refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
         if self.interface == "mesh" and isinstance(medium, SdfGrid):
-            meet = meet_triangles(medium.triangles(), path.triangle)
+            meet = meet_triangles(medium.triangles, path.triangle)
         elif isinstance(medium, Solid):
             meet = meet_solid(medium, path.surface)
         else:
@@ -99,7 +101,7 @@ class Snell(PathSampler):
     def _at_wavelengths(self, medium: Solid) -> list[Solid]:
         """Return the medium at each wavelength."""
         if self.interface == "mesh" and isinstance(medium, SdfGrid):
-            medium.traced_triangles()  # created once, before the variants share them
+            medium.intersector  # noqa: B018 (created once, before the variants share it)
         return [medium.at_wavelength(wavelength) for wavelength in self.wavelengths]
 
     def steady(self, path: Path, medium: Medium) -> Bool[Tensor, "P"]:
@@ -117,7 +119,7 @@ class Snell(PathSampler):
         if not isinstance(medium, Solid):
             raise NerfroError("sampler/path=snell needs a medium with a surface; take medium=sdf_grid, or path=eikonal")
         if medium.disperses:
-            return traced_in_bands(rays, self._at_wavelengths(medium), self._trace)
+            return _traced_in_bands(rays, self._at_wavelengths(medium), self._trace)
         return self._trace(rays, medium, branching)
 
     def _trace(self, rays: Rays, medium: Solid, branching: Branching | None = None) -> SnellTrace:
@@ -125,10 +127,82 @@ class Snell(PathSampler):
         if self.interface == "mesh":
             if not isinstance(medium, SdfGrid) or not medium.meshes:
                 raise NerfroError("sampler.path.interface=mesh needs a medium made of a mesh; take medium=sdf_grid")
-            return snell_on_mesh(rays, medium, self.max_events, branching)
+            return _trace_triangles(rays, medium, self.max_events, branching)
         if isinstance(medium, SdfGrid) and rays.origins.device.type == "cpu":
             return snell_on_grid(rays, medium, MIN_SEARCH_STEP, self.max_events, branching)
         return trace_interfaces(rays, medium, self.max_events, branching)
+
+
+def _traced_in_bands(rays: Rays, media: Sequence[Solid], trace: Callable[[Rays, Solid], SnellTrace]) -> SnellTrace:
+    """Trace rays at each wavelength; rays that miss the object have one polyline with light of all colours.
+
+    Args:
+        rays: camera rays.
+        media: bodies with the indices at each wavelength: the bands of red, then of green, then of blue.
+        trace: function that traces rays at one wavelength.
+    """
+    first = trace(rays, media[0])
+    bent = first.path.refracted
+    rows = first.path.ray[bent].unique_consecutive()
+    traces = [first, *(trace(rays[rows], medium) for medium in media[1:])]
+    path = Path.joined([trace.path for trace in traces])
+    of_rays = [first.path.ray, *(rows[trace.path.ray] for trace in traces[1:])]
+    band = torch.cat([torch.full_like(ray, number) for number, ray in enumerate(of_rays)])
+    num_bands = len(media) // 3
+    # Straight polylines have all colours.
+    colours = one_hot(torch.div(band, num_bands, rounding_mode="floor"), 3).to(path.s) / num_bands
+    colours = torch.where(path.refracted[:, None], colours, 1.0)
+    ray = torch.cat(of_rays)
+    order = ray.argsort(stable=True)
+    path = replace(path, throughput=path.throughput * colours, band=band, splits=True)
+    path = replace(path[order], ray=ray[order])
+    num_events, exceeded = (
+        torch.cat([getattr(traced, name) for traced in traces])[order] for name in ("num_events", "exceeded")
+    )
+    return SnellTrace(path, num_events, exceeded)
+
+
+def _refined_in_bands(
+    path: Path, rays: Rays, media: Sequence[Solid], refine: Callable[[Path, Rays, Solid], Path]
+) -> Path:
+    """Refine the polylines of each band in the medium at its wavelength; see `_traced_in_bands` for the arguments."""
+    rows = [(path.band == band).nonzero()[:, 0] for band in range(len(media))]
+    refined = [refine(path[some], rays[path.ray[some]], medium) for some, medium in zip(rows, media, strict=True)]
+    return replace(Path.joined(refined)[torch.cat(rows).argsort()], ray=path.ray)
+
+
+def _trace_triangles(rays: Rays, medium: SdfGrid, max_events: int, branching: Branching) -> SnellTrace:
+    """Trace rays from triangle to triangle of meshes, on the CPU and in double precision.
+
+    The number of crossings of its surface determines whether a ray is inside a body; the orientation of triangles does
+    not matter. Signed distances determine which rays begin inside.
+    """
+    triangles, scene = medium.triangles, medium.intersector
+    box = medium.box.double().cpu()
+    offset = _SEARCH_OFFSET * float(torch.linalg.vector_norm(box[1] - box[0]))
+    front = Wavefront(rays.to("cpu").to(torch.float64), medium, box, max_events, branching, offset, scene.num_layers)
+    within = (front.moving & (front.enter < 0)).nonzero()[:, 0]
+    if len(within):
+        front.inside[within] = (medium.signed_distances(front.x[within].to(medium.box))[0] < 0).cpu()
+    front.add_vertices(front.ray)
+    while len(rows := front.moving.nonzero()[:, 0]):
+        faces = scene.first_hits(front.x[rows] + front.start[rows, None] * front.d[rows], front.d[rows])
+        hit = (faces >= 0).any(1)
+        front.moving[rows] = hit
+        rows, faces = rows[hit], faces[hit]
+        # A straight line meets a plane once, so finding a triangle of the last vertex again is a rounding error.
+        again = ((faces[:, :, None] == front.triangles[rows][:, None]) & (faces >= 0)[:, :, None]).any((1, 2))
+        front.start[rows[again]] += offset
+        rows, faces = rows[~again], faces[~again]
+        lengths = triangles.distance(front.x[rows, None], front.d[rows, None], faces).clamp(min=0)
+        lengths, order = torch.where(faces >= 0, lengths, torch.inf).sort(1)
+        faces, length = faces.gather(1, order), lengths[:, 0]
+        # All triangles at one distance count, because the ray continues behind them.
+        faces = torch.where(lengths <= length[:, None] + offset, faces, -1)
+        body = torch.where(faces >= 0, triangles.body[faces], -1)
+        normal = triangles.normal(front.x[rows] + length[:, None] * front.d[rows], faces[:, 0])
+        front.meet(rows, length, length, body, normal, faces)
+    return front.finish(rays)
 
 
 def trace_interfaces(rays: Rays, medium: Solid, max_events: int, branching: Branching = ONE_PATH) -> SnellTrace:

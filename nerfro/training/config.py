@@ -24,7 +24,6 @@ from nerfro.allowed import (
     corners_of_box,
 )
 from nerfro.data.base import DataSource, Views
-from nerfro.data.exposure import exif_exposures
 from nerfro.data.validation_views import WithValidationViews
 from nerfro.errors import NerfroError
 from nerfro.losses.base import Loss
@@ -318,8 +317,7 @@ def build_model(config: DictConfig, training: Views | None = None) -> Renderer:
     camera = build(config.camera)
     if training is not None:
         settle_backdrop(config, training.images)
-        exposures = None if camera.exposure is None else exif_exposures([f.image for f in training.frames])
-        camera.begin(training.cameras, exposures)
+        camera.begin(training.cameras)
     components = Components(
         medium=medium,
         path_sampler=path_sampler,

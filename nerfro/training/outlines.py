@@ -8,7 +8,7 @@ from nerfro.camera.least_squares import PriorInformation
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
 from nerfro.capture.outlines import align_to_outlines
-from nerfro.capture.pixel_blocks import PixelBlocks
+from nerfro.capture.silhouettes import PixelBlocks
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.data.base import Views
 from nerfro.media.base import Medium

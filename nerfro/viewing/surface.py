@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.geometry.intersection import Triangles
-from nerfro.geometry.mesh import TriangleMesh, merge_vertices
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.normals import corner_normals
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
@@ -32,18 +32,8 @@ def surface_of(medium: Medium, triangles: bool) -> list[TriangleMesh]:
             "train with medium=sdf_grid"
         )
     if triangles and isinstance(medium, SdfGrid):
-        return _meshes(medium.triangles())
+        return [TriangleMesh(mesh.vertices, mesh.faces, corner_normals(mesh)) for mesh in medium.meshes]
     return [_zero_level(medium, body, values) for body, values in enumerate(_distances(medium))]
-
-
-def _meshes(triangles: Triangles) -> list[TriangleMesh]:
-    meshes = []
-    for body in triangles.body.unique():
-        chosen = triangles.body == body
-        corners, normals = triangles.corners[chosen].numpy(), triangles.normals[chosen].numpy()
-        faces = np.arange(3 * len(corners)).reshape(-1, 3)
-        meshes.append(merge_vertices(corners.reshape(-1, 3), faces, normals))
-    return meshes
 
 
 def _zero_level(medium: Solid, body: int, values: Float[Tensor, "X Y Z"]) -> TriangleMesh:

@@ -1,4 +1,4 @@
-"""Gains of photographs: nothing on average, started from what files tell, seen by every loss."""
+"""Gains of photographs: nothing on average, seen by every loss."""
 
 from __future__ import annotations
 
@@ -22,14 +22,6 @@ def test_gains_are_one_on_average_whatever_is_learned() -> None:
     assert torch.equal(exposure.gains(), torch.ones(5, 3))
     torch.nn.init.normal_(exposure.log_gain, mean=3.0)
     torch.testing.assert_close(exposure.gains().log().mean(0), torch.zeros(3), rtol=0, atol=1e-6)
-
-
-def test_gains_start_from_the_exposures_that_files_tell() -> None:
-    exposure = Exposure()
-    exposure.begin(3, torch.tensor([0.02, 0.04, 0.16], dtype=torch.float64))
-    gains = exposure(torch.tensor([1, 0, 2]))
-    torch.testing.assert_close(gains[0] / gains[1], torch.full((3,), 2.0))
-    torch.testing.assert_close(gains[2] / gains[1], torch.full((3,), 8.0))
 
 
 def test_a_group_of_its_own_learns_gains_and_bends_no_ray() -> None:

@@ -192,7 +192,7 @@ def test_a_similarity_is_found_again() -> None:
 def test_weights_of_any_number_of_views_are_read_back() -> None:
     given = cameras(LENSES[1])
     made = RefinedCamera(lens=True, exposure=True).double()
-    made.begin(given, torch.arange(1, NUM_VIEWS + 1).double())
+    made.begin(given)
     with torch.no_grad():
         made.motions.motion.normal_()
         made.exposure.log_gain.normal_()

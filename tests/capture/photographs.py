@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from nerfro.capture.targets import Sheet
+from nerfro.capture.boards import Sheet
 from nerfro.light import to_linear, to_srgb
 
 _SAMPLES = 3  # per pixel and side

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerfro.capture.boards import draw_tag, tag_grid, twelve_faces
-from nerfro.capture.targets import TagTarget, print_sheets
+from nerfro.capture.printing import print_sheets
 from nerfro.errors import NerfroError
 
 
@@ -43,7 +43,7 @@ def test_sheets_face_outwards() -> None:
 
 
 def test_a_grids_tags_lie_as_printed() -> None:
-    corners = tag_grid("tag36h11", 2, 3, 0.08).tag_corners()
+    corners = tag_grid(2, 3, 0.08).tag_corners()
     np.testing.assert_allclose(corners[0], [[0.01, 0.19, 0], [0.09, 0.19, 0], [0.09, 0.11, 0], [0.01, 0.11, 0]])
     np.testing.assert_allclose(corners[5] - corners[0], np.tile([0.2, -0.1, 0], (4, 1)), atol=1e-12)
 
@@ -63,10 +63,10 @@ def test_tags_are_those_of_opencv() -> None:
 def test_detected_corners_are_those_of_the_drawing() -> None:
     cv2 = pytest.importorskip("cv2")
     pytest.importorskip("pyapriltags")
-    for board in (twelve_faces(), tag_grid("tag36h11", 3, 4, 0.05)):
+    for board in (twelve_faces(), tag_grid(3, 4, 0.05)):
         face = board.faces[-1]
         drawn = np.pad(board.draw(face, 12), 36, constant_values=255)
-        sighting = TagTarget(board).find(cv2.GaussianBlur(drawn, (0, 0), 1.0))
+        sighting = board.find(cv2.GaussianBlur(drawn, (0, 0), 1.0))
         assert sorted(set(sighting.features)) == sorted(face.ids.ravel())
         offset = sighting.points - np.array(face.origin)
         expected = 36 + 12 * np.stack([offset @ face.right, offset @ face.down], 1) / board.module
@@ -75,5 +75,5 @@ def test_detected_corners_are_those_of_the_drawing() -> None:
 
 def test_a_board_in_millimetres_is_refused_before_it_is_drawn(tmp_path: Path) -> None:
     with pytest.raises(NerfroError, match=r"the limit is 3 m; give size= in metres"):
-        print_sheets(TagTarget(twelve_faces(30.0)).sheets(), tmp_path)
+        print_sheets(twelve_faces(30.0).sheets(), tmp_path)
     assert not list(tmp_path.iterdir())

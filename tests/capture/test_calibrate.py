@@ -14,28 +14,26 @@ from PIL import Image
 pytest.importorskip("cv2")
 pytest.importorskip("pyapriltags")
 
-from nerfro.capture.boards import tag_grid, twelve_faces
-from nerfro.capture.calibration import Intrinsics, calibrate
+from nerfro.capture.boards import Sighting, TagBoard, tag_grid, twelve_faces
+from nerfro.capture.calibration import calibrate
 from nerfro.capture.photographs import luminance
-from nerfro.capture.targets import CharucoTarget, Sighting, TagTarget, Target
-from nerfro.data.opencv import OpenCVData
+from nerfro.data.blender import OpenCVData
 from tests.capture.photographs import angle, around, photograph
 
 SIZE = (640, 480)
 MATRIX = np.array([[700.0, 0, 324.0], [0, 707.0, 236.0], [0, 0, 1]])
 NUM_VIEWS = 7
-TARGETS = {
-    "twelve": (["board=twelve_faces"], lambda: TagTarget(twelve_faces()), 1.7),
-    "grid": (["board=grid", "columns=4", "rows=5"], lambda: TagTarget(tag_grid("tag36h11", 5, 4, 0.05)), 1.5),
-    "charuco": (["target=charuco"], lambda: CharucoTarget(5, 7, 0.04, 0.02, "6X6_250"), 1.5),
+BOARDS = {
+    "twelve": (["board=twelve_faces"], twelve_faces, 1.7),
+    "grid": (["board=grid", "columns=4", "rows=5"], lambda: tag_grid(5, 4, 0.05), 1.5),
 }
 
 
-def take(folder: Path, target: Target, distance: float) -> dict[str, np.ndarray]:
+def take(folder: Path, board: TagBoard, distance: float) -> dict[str, np.ndarray]:
     """Photographs p_0, p_2, ... of the board, and p_1, p_3 of an empty wall; the poses of those with the board."""
     generator = np.random.default_rng(3)
     folder.mkdir()
-    sheets = target.sheets()
+    sheets = board.sheets()
     truth = {}
     for view, pose in enumerate(around(sheets, NUM_VIEWS, distance, generator)):
         truth[f"p_{2 * view}.png"] = pose
@@ -45,9 +43,9 @@ def take(folder: Path, target: Target, distance: float) -> dict[str, np.ndarray]
     return truth
 
 
-@pytest.mark.parametrize("kind", TARGETS)
+@pytest.mark.parametrize("kind", BOARDS)
 def test_lens_and_poses_are_recovered(kind: str, tmp_path: Path, command: Callable[..., str]) -> None:
-    options, make, distance = TARGETS[kind]
+    options, make, distance = BOARDS[kind]
     truth = take(tmp_path / "photos", make(), distance)
     out = tmp_path / "data"
     printed = command("calibrate", f"images={tmp_path / 'photos'}", f"out={out}", "test_every=4", *options)
@@ -84,11 +82,11 @@ def test_lens_and_poses_are_recovered(kind: str, tmp_path: Path, command: Callab
 
 def test_tags_look_no_larger_than_they_are(tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
-    target = TagTarget(twelve_faces())
+    board = twelve_faces()
     outward = []
-    for pose in around(target.sheets(), 3, 1.7, generator):
-        Image.fromarray(photograph(target.sheets(), MATRIX, pose, SIZE, generator)).save(tmp_path / "p.png")
-        sighting = target.find(luminance(tmp_path / "p.png"))
+    for pose in around(board.sheets(), 3, 1.7, generator):
+        Image.fromarray(photograph(board.sheets(), MATRIX, pose, SIZE, generator)).save(tmp_path / "p.png")
+        sighting = board.find(luminance(tmp_path / "p.png"))
         seen = (sighting.points - pose[:, 3]) @ pose[:, :3] @ MATRIX.T
         true = (seen[:, :2] / seen[:, 2:]).reshape(-1, 4, 2)
         away = true - true.mean(1, keepdims=True)
@@ -98,14 +96,14 @@ def test_tags_look_no_larger_than_they_are(tmp_path: Path) -> None:
     assert abs(np.median(np.concatenate(outward))) < 0.05
 
 
-def sightings_of(target: TagTarget, distortion: tuple[float, ...] = ()) -> tuple[dict[str, Sighting], list[np.ndarray]]:
+def sightings_of(board: TagBoard, distortion: tuple[float, ...] = ()) -> tuple[dict[str, Sighting], list[np.ndarray]]:
     """Noisy projections of all tags that face the camera, without pictures."""
     import cv2
 
     generator = np.random.default_rng(0)
-    poses = around(target.sheets(), 8, 1.7, generator)
-    points = np.concatenate(list(target.corners.values()))
-    features = np.repeat(list(target.corners), 4)
+    poses = around(board.sheets(), 8, 1.7, generator)
+    corners = board.tag_corners()
+    points, features = np.concatenate(list(corners.values())), np.repeat(list(corners), 4)
     sightings = {}
     for view, pose in enumerate(poses):
         rotation = pose[:, :3].T
@@ -117,11 +115,11 @@ def sightings_of(target: TagTarget, distortion: tuple[float, ...] = ()) -> tuple
 
 
 def test_wrong_tags_are_taken_out() -> None:
-    target = TagTarget(twelve_faces())
-    sightings, poses = sightings_of(target)
+    board = twelve_faces()
+    sightings, poses = sightings_of(board)
     sightings["v2"].pixels[40:48] += [25, -40]  # two tags, seen through the glass
     sightings["v5"].pixels[4:8] += [3, 2]
-    found = calibrate(sightings, SIZE, "pinhole", None, 3, "tags")
+    found = calibrate(sightings, SIZE, "pinhole")
     assert found.num_outliers == 12
     for view, pose in enumerate(poses):
         assert angle(found.poses[f"v{view}"].camera_to_world, pose) < 0.05
@@ -131,28 +129,24 @@ def test_wrong_tags_are_taken_out() -> None:
     assert found.intrinsics.focal_deviation < 1
 
 
-def test_distortion_is_estimated_and_given_lenses_are_kept() -> None:
-    target = TagTarget(tag_grid("tag36h11", 6, 6, 0.05))
+def test_distortion_is_estimated() -> None:
     truth = (-0.15, 0.05, 0.001, -0.002)
-    sightings, poses = sightings_of(target, truth)
-    found = calibrate(sightings, SIZE, "opencv", None, 3, "tags").intrinsics
-    np.testing.assert_allclose(found.distortion, truth, atol=0.02)
-    pinhole = calibrate(sightings, SIZE, "pinhole", None, 3, "tags")
-    given = calibrate(sightings, SIZE, "pinhole", Intrinsics(MATRIX, truth), 3, "tags")
+    sightings, poses = sightings_of(tag_grid(6, 6, 0.05), truth)
+    found, pinhole = (calibrate(sightings, SIZE, model) for model in ("opencv", "pinhole"))
+    np.testing.assert_allclose(found.intrinsics.distortion, truth, atol=0.02)
     for view, pose in enumerate(poses):
-        one = given.poses[f"v{view}"]
-        assert angle(one.camera_to_world, pose) < 0.05
+        one = found.poses[f"v{view}"]
+        assert angle(one.camera_to_world, pose) < 0.2
         assert one.error < 0.2 < pinhole.poses[f"v{view}"].error
-    assert given.intrinsics.matrix is MATRIX
 
 
 def test_tags_inside_the_objects_mask_do_not_count(tmp_path: Path, command: Callable[..., str]) -> None:
-    board = ["board=grid", "columns=4", "rows=5", "intrinsics=[700,707,324,236]"]
-    truth = take(tmp_path / "photos", TARGETS["grid"][1](), 1.5)
+    options = ["board=grid", "columns=4", "rows=5"]
+    truth = take(tmp_path / "photos", BOARDS["grid"][1](), 1.5)
     mask = np.zeros(SIZE[::-1], np.uint8)
     mask[100:380, 200:440] = 255
     Image.fromarray(mask).save(tmp_path / "photos" / "mask_p_0.png")
-    command("calibrate", f"images={tmp_path / 'photos'}", f"out={tmp_path}", *board)
+    command("calibrate", f"images={tmp_path / 'photos'}", f"out={tmp_path}", *options)
     images = json.loads((tmp_path / "calibration.json").read_text())["images"]
     assert set(images) == set(truth)
     counts = {name: image["features"] for name, image in images.items()}
@@ -160,7 +154,7 @@ def test_tags_inside_the_objects_mask_do_not_count(tmp_path: Path, command: Call
 
 
 def test_masks_of_photographs_behind_a_link_are_found(tmp_path: Path, command: Callable[..., str]) -> None:
-    options, make, distance = TARGETS["grid"]
+    options, make, distance = BOARDS["grid"]
     names = take(tmp_path / "elsewhere", make(), distance)
     data = tmp_path / "data"
     (data / "masks").mkdir(parents=True)
@@ -177,11 +171,11 @@ def test_boards_are_printed_in_their_size(tmp_path: Path, command: Callable[...,
     assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
     pages = sorted(tmp_path.glob("board_*.png"))
     assert len(pages) == 12
-    target = TagTarget(twelve_faces(0.03))
+    board = twelve_faces(0.03)
     with Image.open(pages[8]) as page:
         per_metre = page.info["dpi"][0] / 0.0254
         levels = np.uint8(np.asarray(page.convert("L")))
-    sighting = target.find(levels)
+    sighting = board.find(levels)
     assert sorted(set(sighting.features)) == list(range(72, 81))
     sides = np.linalg.norm(sighting.pixels[0::4] - sighting.pixels[1::4], axis=1) / per_metre
     np.testing.assert_allclose(sides, 0.03, rtol=0.005)
@@ -198,9 +192,7 @@ def test_mistakes_are_reported_in_one_line(tmp_path: Path, command: Callable[...
     assert "set out=" in command("calibrate", f"images={photos}")
     assert "set images=" in command("calibrate", f"out={tmp_path}")
     assert "0 of 3 images show at least 3 tags" in command("calibrate", *common)
-    assert "set board=grid" in command("calibrate", *common, "family=tag36h11")
-    assert "dictionary=9X9 does not exist" in command("calibrate", *common, "target=charuco", "dictionary=9X9")
-    assert "do not describe a lens" in command("calibrate", *common, "intrinsics=[700,700,32]")
+    assert "set board=grid" in command("calibrate", *common, "columns=3")
     assert "give size= in metres" in command("calibrate", f"out={tmp_path}", "write_board=true", "size=30")
     assert "no tag 587" in command("calibrate", *common, "write_board=true", "board=grid", "columns=30", "rows=30")
     (tmp_path / "cameras.png").write_bytes(b"mine")

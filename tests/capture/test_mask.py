@@ -16,7 +16,7 @@ pytest.importorskip("cv2")
 
 from nerfro.cameras import Cameras
 from nerfro.capture.masking import polygon_mask, propagate
-from nerfro.data.opencv import OpenCVData
+from nerfro.data.blender import OpenCVData
 from tests.capture.photographs import look_at
 
 WIDTH, HEIGHT, FOCAL, NUM_VIEWS = 96, 72, 115.0, 14

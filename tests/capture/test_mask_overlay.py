@@ -14,8 +14,7 @@ from PIL import Image
 from nerfro.capture.pose_conventions import overlap
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.data.base import Views
-from nerfro.data.blender import BlenderData
-from nerfro.data.opencv import OpenCVData
+from nerfro.data.blender import BlenderData, OpenCVData
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.paths import resolve_path
 from tests.capture.photographs import look_at

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,10 +17,9 @@ pytest.importorskip("pycolmap")
 
 import pycolmap
 
-from nerfro.capture import model_import, reconstruction
-from nerfro.capture.model_import import loosest_group
+from nerfro.capture import reconstruction
+from nerfro.capture.boards import Sheet
 from nerfro.capture.reconstruction import numeric_order, sequential_pairs
-from nerfro.capture.targets import Sheet
 from tests.capture.photographs import angle, look_at, photograph
 
 
@@ -164,29 +162,3 @@ def test_a_sequence_is_matched_with_its_neighbours_and_ever_fewer_beyond() -> No
     assert len(pairs) == len(set(pairs)) == sum(40 - stride for stride in (*range(1, 11), 16, 32))
     assert {abs(i - j) for i, j in pairs} == {*range(1, 11), 16, 32}
     assert sequential_pairs([2, 0, 1]) == [(2, 0), (0, 1), (2, 1)]
-
-
-@pytest.mark.parametrize(("bridges", "warned"), [(12, True), (200, False)])
-def test_groups_that_hang_together_by_few_points_are_named(
-    bridges: int, warned: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    generator = np.random.default_rng(0)
-    seen = np.zeros((10, 800 + bridges), bool)
-    seen[:6, :500] = generator.random((6, 500)) < 0.5
-    seen[6:, 500:800] = generator.random((4, 300)) < 0.5
-    seen[5:7, 800:] = True
-    if warned:
-        assert loosest_group(seen) == ([6, 7, 8, 9], bridges)
-    images = [
-        SimpleNamespace(
-            name=f"p_{i}",
-            has_pose=True,
-            points2D=[SimpleNamespace(point3D_id=int(p), has_point3D=lambda: True) for p in np.flatnonzero(row)],
-        )
-        for i, row in enumerate(seen)
-    ]
-    model = SimpleNamespace(images=dict(enumerate(images)), points3D=dict.fromkeys(range(seen.shape[1])))
-    model_import._warn_of_loose_groups(model)
-    told = capsys.readouterr().out
-    assert ("p_6, p_7, p_8 and 1 more: only 12 points connect these" in told) == warned
-    assert warned == bool(told)

@@ -17,13 +17,12 @@ from scipy.spatial.transform import Rotation
 
 from nerfro.data import refref
 from nerfro.data.base import DataSource, Views
-from nerfro.data.blender import BlenderData
+from nerfro.data.blender import BlenderData, OpenCVData
 from nerfro.data.colmap import ColmapData
 from nerfro.data.colmap_model import CAMERA_MODELS
 from nerfro.data.idr import IdrData
 from nerfro.data.llff import LlffData
 from nerfro.data.nerfstudio import NerfstudioData
-from nerfro.data.opencv import OpenCVData
 from nerfro.data.refref import RefRefData
 
 from .photographs import (

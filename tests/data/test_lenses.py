@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from nerfro.camera.base import Camera
-from nerfro.data.blender import BlenderData
+from nerfro.data.blender import BlenderData, OpenCVData
 from nerfro.data.lenses import Lens, check_lenses, read_lens
 from nerfro.data.nerfstudio import NerfstudioData
-from nerfro.data.opencv import OpenCVData
 from nerfro.errors import NerfroError
 from nerfro.lens import coefficients, opencv_coefficients
 from nerfro.viewing.camera_files import write_cameras

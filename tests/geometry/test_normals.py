@@ -15,10 +15,10 @@ def _mesh(shape: trimesh.Trimesh) -> TriangleMesh:
 
 def test_normals_of_an_irregular_sphere_are_exact() -> None:
     # Max's weights are exact when a vertex and its neighbours lie on one sphere, however unevenly.
-    points = trimesh.creation.icosphere(2).vertices + 0.04 * np.random.default_rng(0).normal(size=(162, 3))
+    points = trimesh.creation.icosphere(3).vertices + 0.02 * np.random.default_rng(0).normal(size=(642, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     mesh = _mesh(trimesh.convex.convex_hull(points))
-    normals = corner_normals(mesh, crease_degrees=180.0)
+    normals = corner_normals(mesh)
     np.testing.assert_allclose(normals, mesh.triangles, atol=1e-9)
 
 
@@ -29,19 +29,13 @@ def test_large_flat_faces_decide_the_normals_at_their_rims() -> None:
     ]
     mesh = _mesh(trimesh.convex.convex_hull(np.array(corners)).subdivide().subdivide())
     top = np.isclose(mesh.triangles[..., 2], 0.92).all(1)
-    normals = corner_normals(mesh, crease_degrees=45.0)
+    normals = corner_normals(mesh)
     tilt = np.degrees(np.arccos(normals[top][..., 2].clip(-1, 1)))
     assert tilt.max() < 2.0
 
 
 def test_creases_split_normals() -> None:
     mesh = _mesh(trimesh.creation.box(extents=[1.0, 1.0, 1.0]))
-    normals = corner_normals(mesh, crease_degrees=30.0)
+    normals = corner_normals(mesh)
     flat = np.cross(mesh.triangles[:, 1] - mesh.triangles[:, 0], mesh.triangles[:, 2] - mesh.triangles[:, 0])
     np.testing.assert_allclose(normals, np.repeat(flat[:, None], 3, axis=1), atol=1e-12)
-
-
-def test_a_mesh_with_no_crease_limit_averages_around_corners() -> None:
-    mesh = _mesh(trimesh.creation.box(extents=[1.0, 1.0, 1.0]))
-    normals = corner_normals(mesh, crease_degrees=180.0)
-    np.testing.assert_allclose(np.abs((normals * mesh.triangles).sum(-1)), np.sqrt(0.75), rtol=0.05)

@@ -15,13 +15,13 @@ from nerfro.fields.nerf import NerfField
 from nerfro.losses.boundary import BoundaryRegulariser
 from nerfro.losses.photometric import Photometric
 from nerfro.losses.smoothness import Smoothness, tile_roughness
-from nerfro.media.analytic import Luneburg
 from nerfro.models.refractive import RefractiveModel
 from nerfro.registry import create, find
 from nerfro.rendering import Components, Renderer
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.hierarchical import Hierarchical
 from nerfro.testing import NUM_RAYS, example_batch, example_rendering
+from tests.closed_forms import Luneburg
 
 
 @pytest.fixture(scope="module")

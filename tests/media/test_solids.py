@@ -10,18 +10,17 @@ import torch
 import trimesh
 
 from nerfro.errors import NerfroError
-from nerfro.media.analytic import Luneburg, Vacuum
+from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SURFACE_BLOCK, SdfGrid
-from nerfro.media.shapes import Ball, RoundedBox, Slab
-from nerfro.media.solid import Solid
+from nerfro.media.shapes import Ball
+from tests.closed_forms import Luneburg, RoundedBox, Slab, grid_points
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 
 
 def _nested_balls(size: int = 48) -> SdfGrid:
-    axis = torch.linspace(-1.5, 1.5, size)
-    radius = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).norm(dim=-1)
+    radius = grid_points(1.5, size).norm(dim=-1)
     return SdfGrid.from_distances(torch.stack([radius - 0.9, radius - 0.5]), BOX, [1.5, 1.33], 0.1)
 
 
@@ -60,22 +59,6 @@ def test_gradient_is_the_derivative_of_the_index(medium: Medium) -> None:
         torch.testing.assert_close(gradient, automatic, rtol=1e-4, atol=1e-4)
     else:
         assert (gradient == 0).all()
-
-
-@pytest.mark.parametrize("solid", [Ball(), RoundedBox(), Slab()], ids=lambda solid: type(solid).__name__)
-def test_gradient_of_a_distance_has_unit_length(solid: Solid) -> None:
-    positions = torch.randn(200, 3)
-    _, normals = solid.signed_distances(positions)
-    torch.testing.assert_close(normals.norm(dim=-1), torch.ones(200, 1))
-
-
-def test_rounded_box_has_its_faces_edges_and_corners_where_they_belong() -> None:
-    a, r = 0.75, 0.08
-    diagonal = (a - r) + r / 2**0.5
-    corner = (a - r) + r / 3**0.5
-    on_surface = torch.tensor([[a, 0.1, -0.2], [0.3, -a, 0.3], [diagonal, diagonal, 0.0], [-corner, corner, corner]])
-    phi, _ = RoundedBox(a, r).signed_distances(on_surface)
-    torch.testing.assert_close(phi[:, 0], torch.zeros(4), atol=1e-6, rtol=0)
 
 
 def test_the_innermost_body_decides_the_index() -> None:

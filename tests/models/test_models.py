@@ -11,7 +11,6 @@ from torch import Tensor
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.skybox import Skybox
 from nerfro.fields.nerf import NerfField
-from nerfro.media.analytic import Luneburg
 from nerfro.models.mip_nerf import MipNerfModel
 from nerfro.models.refractive import RefractiveModel
 from nerfro.rendering import Components
@@ -22,6 +21,7 @@ from nerfro.testing import example_rays
 from nerfro.training.module import TrainingModule
 from nerfro.training.optimizer import OptimizerConfig
 from nerfro.types import Exits
+from tests.closed_forms import Luneburg
 
 
 class Compass(Boundary):

@@ -13,14 +13,14 @@ from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.shapes import Ball, RoundedBox, Slab
+from nerfro.media.shapes import Ball
 from nerfro.media.solid import Solid
 from nerfro.samplers import compiled
 from nerfro.samplers.replay import smallest_cosine
 from nerfro.samplers.snell import Snell, trace_interfaces
 from nerfro.samplers.snell_law import reflectance
 from nerfro.types import Path, Rays
-from tests.closed_forms import beam, make_rays, random_rays
+from tests.closed_forms import RoundedBox, Slab, beam, grid_points, make_rays, random_rays
 from tests.samplers.nested import NestedBalls, nested_mesh
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
@@ -28,8 +28,7 @@ _rays = functools.partial(random_rays, width=1.6, seed=2, far=6)
 
 
 def _nested_grid(size: int = 40) -> SdfGrid:
-    axis = torch.linspace(-1.5, 1.5, size)
-    p = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    p = grid_points(1.5, size)
     centre = torch.tensor([0.2, 0.1, 0])
     return SdfGrid.from_distances(
         torch.stack([p.norm(dim=-1) - 0.8, (p - centre).norm(dim=-1) - 0.4]), BOX, [1.5, 1.2], 0.02

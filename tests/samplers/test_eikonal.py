@@ -8,14 +8,13 @@ import pytest
 import torch
 
 from nerfro.errors import NerfroError
-from nerfro.media.analytic import Luneburg
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.shapes import Ball, RoundedBox, Slab
+from nerfro.media.shapes import Ball
 from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.samplers.eikonal import Eikonal, march_adaptive, march_uniform
 from nerfro.samplers.integrators import Integrator, euler, leapfrog
-from tests.closed_forms import FunctionMedium, angle, make_rays, random_rays
+from tests.closed_forms import FunctionMedium, Luneburg, RoundedBox, Slab, angle, grid_points, make_rays, random_rays
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 
@@ -120,8 +119,7 @@ def test_limit_of_steps_lets_rays_go_straight_on() -> None:
 
 
 def _grids() -> tuple[VoxelGrid, SdfGrid]:
-    axis = torch.linspace(-1.5, 1.5, 40)
-    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    points = grid_points(1.5, 40)
     radius = points.norm(dim=-1)
     voxels = VoxelGrid.from_occupancy((radius < 0.8).float(), BOX, 1.5, 5, 1.0)
     return voxels, SdfGrid.from_distances(torch.stack([radius - 0.9, radius - 0.4]), BOX, [1.5, 1.2], 0.02)

@@ -1,4 +1,4 @@
-"""Derivatives of paths: closed forms, autodiff against central differences, and an adjoint that stores no states.
+"""Derivatives of paths: closed forms, and autodiff against central differences.
 
 The samplers themselves trace without gradients; these are properties of the plain functions they are made of.
 """
@@ -12,12 +12,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfro.geometry.interpolation import quadratic_spline, spline_coefficients
 from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.samplers.eikonal import march_uniform
-from nerfro.samplers.integrators import Integrator, RayState, euler, kick_drift_kick, leapfrog
+from nerfro.samplers.integrators import Integrator, euler, leapfrog
 from nerfro.samplers.snell_law import refract
-from tests.closed_forms import FunctionMedium, Squared, blurred_ball, make_rays
+from tests.closed_forms import FunctionMedium, Squared, blurred_ball, grid_points, make_rays
 
 ONES = torch.ones(1, dtype=torch.float64)
 
@@ -112,8 +111,7 @@ def test_autodiff_agrees_with_central_differences(
 
 def test_a_voxel_grid_gets_the_gradient_of_central_differences() -> None:
     box = _double(-1.5, -1.5, -1.5, 1.5, 1.5, 1.5).reshape(2, 3)
-    axis = torch.linspace(-1.5, 1.5, 16, dtype=torch.float64)
-    radius = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).norm(dim=-1)
+    radius = grid_points(1.5, 16, torch.float64).norm(dim=-1)
     medium = VoxelGrid.from_occupancy((radius < 0.9).double(), box, 1.3, 5, 1.0)
     rays = make_rays([[-1.4, 0.3, 0.1]], [[1, 0.1, 0.05]], 0, 2.5)
     table = medium.table
@@ -139,77 +137,3 @@ def test_gradients_are_finite_where_the_index_is_constant(integrator: Integrator
     path = march_uniform(make_rays([[0, 0, 0]], [[1, 2, 2]], 0, 2), medium, integrator, 9)
     (gradient,) = torch.autograd.grad(path.exit_positions.sum() + path.exit_directions.sum(), index)
     assert float(gradient) == pytest.approx(0, abs=1e-12)  # the index of everywhere bends nothing
-
-
-# --- the adjoint of steps of fixed dsigma ---
-
-
-def _spline_medium(coefficients: Tensor, box: Tensor) -> FunctionMedium:
-    """n^2 as a quadratic B-spline, whose second derivatives exist."""
-    return FunctionMedium(lambda x: quadratic_spline(coefficients, box, x))
-
-
-def _spline_weights(x: Tensor, box: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
-    """B-spline weights of all grid vertices at one point with gradient and Hessian: [N], [N, 3], [N, 3, 3].
-
-    Written down anew: the spline's pieces are 3/4 - t^2 for |t| < 1/2 and (3/2 - |t|)^2 / 2 for |t| < 3/2.
-    """
-    scale = (size - 1) / (box[1] - box[0])
-    t = (x - box[0])[:, None] * scale[:, None] - torch.arange(size, dtype=x.dtype)
-    near, outer = t.abs() < 0.5, (t.abs() >= 0.5) & (t.abs() < 1.5)
-    rest = 1.5 - t.abs()
-    value = torch.where(near, 0.75 - t * t, 0.0) + torch.where(outer, 0.5 * rest**2, 0.0)
-    slope = (torch.where(near, -2 * t, 0.0) - torch.where(outer, rest * t.sign(), 0.0)) * scale[:, None]
-    bend = (torch.where(near, -2.0, 0.0) + torch.where(outer, 1.0, 0.0)) * scale[:, None] ** 2
-    jets = (value, slope, bend)
-
-    def product(orders: tuple[int, int, int]) -> Tensor:
-        a, b, c = (jets[order][axis] for axis, order in enumerate(orders))
-        return (a[:, None, None] * b[None, :, None] * c[None, None, :]).reshape(-1)
-
-    def counted(*axes: int) -> tuple[int, int, int]:
-        return axes.count(0), axes.count(1), axes.count(2)
-
-    gradient = torch.stack([product(counted(i)) for i in range(3)], -1)
-    hessian = torch.stack([torch.stack([product(counted(i, j)) for j in range(3)], -1) for i in range(3)], -2)
-    return product((0, 0, 0)), gradient, hessian
-
-
-def test_adjoint_run_backwards_deposits_what_autodiff_finds() -> None:
-    """With dsigma fixed, x' = p, p' = grad(n^2) / 2: mu' = -lam, lam' = -(grad grad n^2 / 2) mu, and a vertex of the
-    grid receives the integral of mu . grad w / 2. States are not stored but run backwards."""
-    size, dsigma, num_steps = 10, 0.02, 45
-    box = _double(-1, -1, -1, 1, 1, 1).reshape(2, 3)
-    axis = torch.linspace(-1, 1, size, dtype=torch.float64)
-    p = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
-    values = 2 - p.square().sum(-1) + 0.2 * torch.sin(3 * p[..., 0] + 2 * p[..., 1])
-    coefficients = spline_coefficients(values).requires_grad_()
-    medium, h = _spline_medium(coefficients, box), torch.full((1,), dsigma, dtype=torch.float64)
-    x0 = _double(-0.6, 0.2, 0.1)[None]
-    v0 = (_double(0.96, 0.28, 0)[None] * medium(x0)[0][:, None]).detach()  # the start does not depend on the grid
-    lam, mu = _double(0.3, 0.7, -0.4), _double(1, -2, 3)
-
-    state = RayState(x0, v0, *medium(x0))
-    for _ in range(num_steps):
-        state = kick_drift_kick(state, h, medium)
-    assert state.positions.abs().max() < 0.8
-    loss = state.positions[0] @ lam + state.velocities[0] @ mu
-    (expected,) = torch.autograd.grad(loss, coefficients)
-
-    with torch.no_grad():
-        deposit = torch.zeros(size**3, dtype=torch.float64)
-        back = RayState(state.positions, -state.velocities, state.n, state.gradients)
-
-        def kick(position: Tensor, lam: Tensor, mu: Tensor) -> Tensor:
-            _, gradient, hessian = _spline_weights(position, box, size)
-            deposit.add_(0.5 * (gradient @ (0.5 * dsigma * mu)))
-            return lam + 0.5 * torch.einsum("v,vij,j->i", coefficients.flatten(), hessian, 0.5 * dsigma * mu)
-
-        for _ in range(num_steps):
-            lam = kick(back.positions[0], lam, mu)
-            mu = mu + dsigma * lam
-            back = kick_drift_kick(back, h, medium)
-            lam = kick(back.positions[0], lam, mu)
-    torch.testing.assert_close(back.positions, x0, atol=1e-12, rtol=0)
-    torch.testing.assert_close(deposit.reshape(expected.shape), expected, atol=1e-11, rtol=0)
-    assert expected.abs().max() > 0.01

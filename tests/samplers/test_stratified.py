@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from nerfro.errors import NerfroError
-from nerfro.media.analytic import Luneburg
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.straight import straight_path
 from nerfro.samplers.stratified import LAST_DELTA, Stratified
 from nerfro.testing import example_draws, example_rays
 from nerfro.types import Path
+from tests.closed_forms import Luneburg
 
 NUM_VERTICES = 48
 

@@ -13,7 +13,7 @@ from nerfro.cameras import Cameras
 from nerfro.evaluation.metrics import psnr
 from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.shapes import Ball, RoundedBox
+from nerfro.media.shapes import Ball
 from nerfro.samplers.snell import Snell
 from nerfro.scenes import path_tracer
 from nerfro.scenes.path_tracer import PathTracer, Pinhole
@@ -21,6 +21,7 @@ from nerfro.scenes.surface import Surface, rounded_box, sphere
 from nerfro.scenes.viewpoints import look_at_origin
 from nerfro.subdivision import part_rays
 from nerfro.types import Path, Rays
+from tests.closed_forms import RoundedBox, grid_points
 from tests.scenes.empty_glass import empty_glass
 
 # Sums over a pixel of a cube converge slowly: an edge sees lamps in many directions.
@@ -69,8 +70,7 @@ def path_traced(
 def on_grid(what: str, **glass: list[float] | bool) -> SdfGrid:
     """The ball or the cube on a grid, for the compiled kernel."""
     shape = Ball(0.7) if what == "ball" else RoundedBox(0.55, 0.2)
-    axis = torch.linspace(-0.9, 0.9, 96)
-    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    points = grid_points(0.9, 96)
     return SdfGrid.from_distances(shape.signed_distances(points)[0].movedim(-1, 0), BOX, [1.5], 0.02, **glass)
 
 

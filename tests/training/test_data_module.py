@@ -24,13 +24,13 @@ from nerfro.training.data_module import Prefetcher, RayDataModule, can_prefetch
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Rays
+from tests.closed_forms import grid_points
 from tests.pretended_gpu import GPU, PretendedGpu
 
 
 @pytest.fixture(scope="module")
 def ball() -> SdfGrid:
-    axis = torch.linspace(-1.5, 1.5, 40)
-    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    points = grid_points(1.5, 40)
     box = torch.tensor([[-1.5] * 3, [1.5] * 3])
     return SdfGrid.from_distances(points.norm(dim=-1)[None] - 0.8, box, [1.5], 0.01)
 

@@ -24,7 +24,6 @@ from nerfro.fields.base import Field
 from nerfro.files import lat_long
 from nerfro.files.deep_images import write_radiance
 from nerfro.light import to_linear
-from nerfro.media.analytic import Luneburg
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.paths import resolve_path
 from nerfro.samplers.density_grid import DensityGridSampler
@@ -36,6 +35,7 @@ from nerfro.variants import variant
 from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.page import make_page
 from nerfro.viewing.trained_scene import TrainedScene
+from tests.closed_forms import Luneburg
 from tests.media.vessels import spherical_vessel
 from tests.viewing.browser import Browser, needs_chromium
 from tests.viewing.conftest import IOR, RADIUS, sky_of
@@ -85,7 +85,7 @@ def glass_cube(scene: TrainedScene) -> TrainedScene:
     medium = SdfGrid.from_distances(torch.stack([outer.distances[0], bubble]), box, [1.5, 1.05], outer.shell)
     sky = EnvironmentMap([128], str(resolve_path("embedded:torus/sky.png")))
     return TrainedScene(
-        with_changed_scene(scene.renderer, medium=medium, boundary=sky), BlenderData("embedded:torus", 2.0, 6.0, 2)
+        with_changed_scene(scene.renderer, medium=medium, boundary=sky), BlenderData("embedded:torus", downscale=2)
     )
 
 
@@ -104,7 +104,7 @@ def test_a_vessel_agrees_with_nerfro(scene: TrainedScene, tmp_path: Path) -> Non
     vessel = spherical_vessel(tmp_path, level=0.9, resolution=64)
     sky = EnvironmentMap([128], str(resolve_path("embedded:torus/sky.png")))
     vessel_scene = TrainedScene(
-        with_changed_scene(scene.renderer, medium=vessel, boundary=sky), BlenderData("embedded:torus", 2.0, 6.0, 2)
+        with_changed_scene(scene.renderer, medium=vessel, boundary=sky), BlenderData("embedded:torus", downscale=2)
     )
     # A liquid of the wall's index must change the picture, and air has no index to change.
     code = f"""(() => {{ {SHOT}
