@@ -181,10 +181,20 @@ def build(node: object, **parts: object) -> Any:
         except (InstantiationException, OmegaConfBaseException) as error:
             cause = error.__cause__ or error
             raise NerfroError(f"{target}: {_first_line(cause)}; check this object's fields in conf/") from error
-    plugin = next((p for p in _plugins.values() if p.target == target), None)
+    plugin = _of_target(str(target))
     if plugin is None:
         raise NerfroError(f"'{target}' is not registered; `python -m nerfro.plugins` lists the registered classes")
     return create(plugin, node, **{name: parts[name] for name in plugin.parts if name in parts})
+
+
+def _of_target(target: str) -> Plugin | None:
+    """Find the registered class that a configuration names; runs of earlier releases may name its former module."""
+    exact = [plugin for plugin in _plugins.values() if plugin.target == target]
+    name = target.rpartition(".")[2]
+    former = [plugin for plugin in _plugins.values() if plugin.target.rpartition(".")[2] == name]
+    if not exact and target.startswith("nerfro.") and len(former) == 1:
+        return former[0]
+    return exact[0] if exact else None
 
 
 def create(plugin: Plugin, node: DictConfig | Mapping[str, object], **parts: object) -> Any:

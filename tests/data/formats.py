@@ -7,6 +7,7 @@ import json
 import struct
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +16,12 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from nerfro.data import refref
 from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData, OpenCVData
 from nerfro.data.colmap import ColmapData
 from nerfro.data.colmap_model import CAMERA_MODELS
-from nerfro.data.idr import IdrData
-from nerfro.data.llff import LlffData
 from nerfro.data.nerfstudio import NerfstudioData
-from nerfro.data.refref import RefRefData
+from nerfro.registry import discover
 
 from .photographs import (
     CX,
@@ -39,6 +37,9 @@ from .photographs import (
     save_picture,
     world_to_camera,
 )
+
+discover()
+idr, llff, refref = (import_module(f"nerfro_plugins.data_formats.{name}") for name in ("idr", "llff", "refref"))
 
 TRAIN, TEST = (1, 2, 4, 5), (0, 3)
 IDEAL = (FX, FX, WIDTH / 2, HEIGHT / 2)
@@ -249,9 +250,9 @@ FORMATS = {
     "opencv": Format(OpenCVData, write_opencv, lens={"k": K[:3], "p": P}),
     "nerfstudio": Format(NerfstudioData, write_nerfstudio, THIRD, lens={"k": K, "p": P}),
     "colmap": Format(ColmapData, write_colmap, THIRD, lens=BROWN),
-    "llff": Format(LlffData, write_llff, {"frame": "file"} | THIRD, lens={"lens": IDEAL}),
-    "idr": Format(IdrData, write_idr, THIRD),
-    "refref": Format(RefRefData, write_refref, train=[1, 2], test=[4, 5], lens={"lens": REFREF_LENS}),
+    "llff": Format(llff.LlffData, write_llff, {"frame": "file"} | THIRD, lens={"lens": IDEAL}),
+    "idr": Format(idr.IdrData, write_idr, THIRD),
+    "refref": Format(refref.RefRefData, write_refref, train=[1, 2], test=[4, 5], lens={"lens": REFREF_LENS}),
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,15 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nerfro.data.base import Views
-from nerfro.data.idr import IdrData, decompose
 from nerfro.errors import NerfroError
+from nerfro.registry import discover
 
 from .formats import SCALE, SHIFT, write_idr
 from .photographs import CX, CY, FX, FY, POINTS
+
+discover()
+idr = import_module("nerfro_plugins.data_formats.idr")
+IdrData, decompose = idr.IdrData, idr.decompose
 
 # Pixel centres are whole numbers in these files.
 K = np.array([[FX, 0, CX - 0.5], [0, FY, CY - 0.5], [0, 0, 1]])

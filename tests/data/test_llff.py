@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,16 @@ import pytest
 import torch
 
 from nerfro.data.base import Views
-from nerfro.data.llff import LlffData, frame_transform, map_poses, read_poses_bounds
 from nerfro.errors import NerfroError
+from nerfro.registry import build, discover
 
 from .formats import FAR, IDEAL, NEAR, write_llff
 from .photographs import FX, HEIGHT, POINTS, WIDTH, check_views, project
+
+discover()
+llff = import_module("nerfro_plugins.data_formats.llff")
+LlffData, frame_transform = llff.LlffData, llff.frame_transform
+map_poses, read_poses_bounds = llff.map_poses, llff.read_poses_bounds
 
 
 @pytest.fixture
@@ -141,3 +147,10 @@ def test_parallel_cameras_have_no_sphere():
     with pytest.raises(NerfroError, match="all optical axes are parallel"):
         frame_transform(poses, np.array([[1.0, 2.0]] * 4), "eikonal")
     assert np.isfinite(frame_transform(poses, np.array([[1.0, 2.0]] * 4), "llff")).all()
+
+
+def test_configurations_of_earlier_releases_name_the_former_module(write: Callable[..., Path]) -> None:
+    source = build({"_target_": "nerfro.data.llff.LlffData", "root": str(write()), "frame": "file"})
+    assert isinstance(source, LlffData)
+    with pytest.raises(NerfroError, match=r"'other\.data\.LlffData' is not registered"):
+        build({"_target_": "other.data.LlffData", "root": "."})

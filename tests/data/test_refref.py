@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
+from importlib import import_module
 
 import numpy as np
 import pytest
 
-from nerfro.data.refref import RefRefData
 from nerfro.errors import NerfroError
+from nerfro.registry import discover
 
 from .formats import REFREF_LENS, few_refref_views, write_refref  # noqa: F401
 from .photographs import check_views
+
+discover()
+refref = import_module("nerfro_plugins.data_formats.refref")
+RefRefData = refref.RefRefData
 
 pytestmark = pytest.mark.usefixtures("few_refref_views")
 pytest.importorskip("pyarrow")
