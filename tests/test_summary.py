@@ -18,8 +18,8 @@ from nerfro.errors import NerfroError
 from nerfro.evaluation.results import METRICS, EvaluationResult, RunMetrics, ViewScores, write_metrics_json
 from nerfro.evaluation.tables import Column, Row, Table, to_csv, to_html, to_latex, to_markdown, to_rich
 from nerfro.files.images import save_png
-from nerfro.report.comparison import compare, differing, find_metrics, to_table
-from nerfro.report.runs import duration, find_runs
+from nerfro.report.comparison import compare, find_metrics, to_table
+from nerfro.report.runs import find_runs
 from nerfro.training.run_folder import record
 from tests.conftest import finish
 
@@ -135,13 +135,6 @@ def test_runs_of_one_name_that_differ_in_a_field_are_different_methods(tmp_path:
     assert labels["a (field=NerfField, field.width=64)"][::3] == (25.0, 20.0)
 
 
-def test_fields_of_a_part_count_only_among_parts_of_one_class() -> None:
-    base = {"s._target_": "A", "s.n": 1, "t": 0}
-    assert differing([base, dict(base)]) == set()
-    assert differing([base, {"s._target_": "B", "s.m": 1, "t": 0}]) == {"s._target_"}
-    assert differing([base, {**base, "s.n": 2}, {**base, "t": 1}]) == {"s.n", "t"}
-
-
 def test_of_repeated_runs_the_newest_counts_and_the_others_are_named(tmp_path: Path) -> None:
     for name, psnr, age in (("old", 20.0, 100), ("new", 25.0, 0), ("older", 22.0, 200)):
         folder = write_run(tmp_path / name, "a", psnr)
@@ -200,33 +193,6 @@ def test_places_are_folders_and_globs_and_runs_without_scores_are_named(tmp_path
     assert find_runs([str(tmp_path)])[1][1] == f"{tmp_path / 'd'} is omitted: it failed: no space left"
     with pytest.raises(NerfroError, match="nowhere does not exist"):
         find_runs([str(tmp_path / "nowhere")])
-
-
-@pytest.mark.parametrize(
-    ("file", "content"),
-    [
-        ("config.yaml", "name: a"),
-        ("config.yaml", "{[: not yaml"),
-        ("config.yaml", ""),
-        ("run.json", "{"),
-        ("run.json", "null"),
-        ("run.json", "{}"),
-        ("metrics.json", ""),
-        ("metrics.json", "{}"),
-        ("images/test_000.png", ""),
-    ],
-)
-def test_a_damaged_run_is_named_in_one_line(tmp_path: Path, file: str, content: str) -> None:
-    folder = write_run(tmp_path / "a", "a", 20.0)
-    (folder / file).write_text(content)
-    with pytest.raises(NerfroError) as error:
-        find_runs([str(tmp_path)])
-    assert str(folder) in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-def test_durations_in_words() -> None:
-    assert [duration(s) for s in (20, 240, 5400, 0.2)] == ["20 s", "4 min", "1 h 30 min", "0 s"]
 
 
 MEDALS = Table(
