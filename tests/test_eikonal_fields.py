@@ -16,7 +16,6 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from nerfro.boundaries.constant import ConstantBoundary
-from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
@@ -35,7 +34,7 @@ from nerfro.training.config import build_model
 from nerfro.training.module import TrainingModule
 from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.run_folder import load_checkpoint, restore
-from nerfro.types import Exits, Radiance, Samples
+from nerfro.types import Radiance, Samples
 from tests.closed_forms import Luneburg
 
 discover()
@@ -54,12 +53,6 @@ def random_index_field(**fields: Any) -> Medium:
 
 
 # The medium.
-
-
-def test_untrained_index_is_one_everywhere() -> None:
-    n, gradient = IndexField()(torch.rand(100, 3) * 3 - 1.5)
-    assert torch.equal(n, torch.ones(100))
-    assert torch.equal(gradient, torch.zeros(100, 3))
 
 
 def test_gradient_is_the_derivative_of_the_index_within_the_bounds() -> None:
@@ -221,20 +214,6 @@ def test_sharp_grids_show_what_the_field_and_the_boundary_show() -> None:
     torch.testing.assert_close(from_grids[past], from_fields[past], atol=1e-4, rtol=0)
 
 
-def test_grids_get_sharper_level_by_level() -> None:
-    model = make_model(blur=2.0, num_levels=3)
-    model.scene.boundary = EnvironmentMap([16])
-    torch.nn.init.normal_(model.scene.boundary.texels)
-    directions = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
-    errors = []
-    for level in range(3):
-        model.sharpen(level)
-        with torch.no_grad():
-            error = model._blurred.sky_towards(directions) - model.scene.boundary(Exits(directions))
-        errors.append(float(error.square().mean()))
-    assert errors[0] > errors[1] > errors[2]
-
-
 def test_impossible_shares_are_refused() -> None:
     with pytest.raises(NerfroError, match="leave the rest of 1 to the interior"):
         make_model(scene_share=0.8, index_share=0.4)
@@ -261,12 +240,6 @@ def test_the_three_stages_train_from_the_command_line(
     assert int(checkpoint["state_dict"]["renderer.stage"]) == INTERIOR
     assert checkpoint["state_dict"]["renderer.scene.medium.last.weight"].abs().max() > 0  # zero before training
     assert json.loads((tmp_path / "metrics.json").read_text())["steps"] == 9
-
-
-def test_scene_files_compose_with_the_experiment(tiny_scene: Path, train_here: Callable[..., Any]) -> None:
-    finished = train_here("+scene=torus", "+experiment=eikonal_fields", *tiny(tiny_scene), "--cfg", "job")
-    assert finished.code == 0, finished.err
-    assert "mesh: ${data.root}/mesh.ply" in finished.out
 
 
 def tiny(root: Path) -> list[str]:
