@@ -212,12 +212,6 @@ def test_checkpoint_of_another_configuration_is_refused(change: dict, message: s
         require_same_configuration(tmp_path / "a.ckpt", trained, OmegaConf.merge(trained, change))
 
 
-def test_budget_and_name_may_change_between_runs(tmp_path: Path) -> None:
-    trained = OmegaConf.create({"seed": 0, "name": "a", "trainer": {"max_steps": 5}, "evaluation": {"every": 0}})
-    wanted = OmegaConf.merge(trained, {"name": "b", "trainer": {"max_steps": 9}, "evaluation": {"every": 3}})
-    require_same_configuration(tmp_path / "a.ckpt", trained, wanted)
-
-
 def test_damaged_checkpoints_are_refused_in_one_line(tmp_path: Path) -> None:
     whole = tmp_path / "whole.ckpt"
     parts = {"state_dict": {"weight": torch.zeros(100)}, "callbacks": {}, "loops": {}, "global_step": 0}
