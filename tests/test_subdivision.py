@@ -102,18 +102,6 @@ def test_divergence_behind_a_ball_is_that_of_its_deviation(above: Cameras) -> No
     np.testing.assert_allclose(angles.numpy(), expected, atol=0.01 * FOCAL)
 
 
-def test_rim_of_a_cube_diverges_and_its_face_does_not(above: Cameras) -> None:
-    divergent = (diverging(above, Snell(), CUBE) >= 8.0).view(SIDE, SIDE)
-    # Half the top face's side in pixels; the rim lies there.
-    rim = 0.6 * FOCAL / (4.0 - 0.6)
-    offsets = (torch.arange(SIDE) + 0.5 - SIDE / 2).abs()
-    away, along = torch.maximum(offsets[:, None], offsets), torch.minimum(offsets[:, None], offsets)
-    assert not divergent[away < rim - 3].any()
-    assert not divergent[away > rim + 2].any()
-    beside_rim = ((away - rim).abs() < 0.8) & (along < rim - 2)  # corners apart, which are rounded twice
-    assert divergent[beside_rim].float().mean() > 0.5
-
-
 def batches_of(views: Views, subdivision: Subdivision, size: int = 64, jitter: bool = False) -> RayBatches:
     batches = RayBatches(views, size, "all_images", seed=3, jitter=jitter)
     return batches.traced(through_cube, subdivision=subdivision)
@@ -197,12 +185,6 @@ def test_contrast_is_the_largest_step_to_a_neighbour(cameras: Cameras) -> None:
                 step = (images[:, r, c] - images[:, row, column]).abs().amax(-1)
                 expected[:, row, column] = torch.maximum(expected[:, row, column], step)
     assert torch.equal(contrast(lambda some: flat[some], cameras, pixels), expected.flatten())
-
-
-def test_where_nothing_bends_no_pixel_is_divided(views: Views) -> None:
-    straight = lambda rays, view: Straight()(rays, Vacuum())  # noqa: E731
-    batches = RayBatches(views, 50).traced(straight, subdivision=Subdivision(2, 1.1))
-    assert torch.equal(batches.batch(0).pixel, torch.arange(50))
 
 
 def test_batches_and_renderings_do_not_depend_on_the_process_or_the_chunk(views: Views) -> None:
