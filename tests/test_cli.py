@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
 import os
-import re
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Optional, get_type_hints
-from unittest.mock import Mock
 
 import pytest
 import yaml
@@ -18,18 +13,15 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
-from lightning.pytorch import LightningModule, Trainer
 from omegaconf import OmegaConf
 
 from nerfro.cli import RENAMED, _flags_first, _RenamingFiles, in_one_line, renamed_override
 from nerfro.errors import NerfroError
 from nerfro.files.foreign_config import foreign_config
-from nerfro.paths import CONF_DIR, PACKAGE_DIR, resolve_path, user_path
-from nerfro.registry import KINDS, discover, plugins
-from nerfro.training import callbacks
+from nerfro.paths import CONF_DIR, resolve_path, user_path
+from nerfro.registry import discover, plugins
 from nerfro.training.config import TrainConfig
 from nerfro.trust import GuardedConfigLoader
-from nerfro.types import Batch
 
 
 @pytest.mark.parametrize("num_lines", [1, 10_000])  # less and more than a pipe's buffer
@@ -76,19 +68,6 @@ def test_flags_may_stand_anywhere() -> None:
         _flags_first(["--sed"])
 
 
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        (["--resolve"], "--resolve needs --cfg"),
-        (["--config-dir"], "expected one argument"),
-        (["--cfg", "nothing"], "invalid choice: 'nothing'"),
-    ],
-)
-def test_flags_that_cannot_be_used_are_refused(flags: list[str], message: str) -> None:
-    with pytest.raises(NerfroError, match=message):
-        _flags_first(flags)
-
-
 def test_messages_are_one_line_whatever_files_are_called() -> None:
     assert in_one_line(NerfroError("a\nb\x1b.png does not exist")) == "a\\nb\\x1b.png does not exist"
 
@@ -125,46 +104,6 @@ def test_paths_that_cannot_be_are_refused(location: str) -> None:
 def test_what_is_not_embedded_is_refused(location: str) -> None:
     with pytest.raises(NerfroError, match="embedded scenes: torus"):
         resolve_path(location)
-
-
-def test_progress_begins_with_the_step(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(callbacks, "training_progress", lambda trainer: trainer.done)
-    trainer, module = Mock(spec=Trainer, done=0.0, global_step=250), Mock(spec=LightningModule)
-    trainer.callback_metrics = {"val/psnr": 19.0}
-    progress = callbacks.TrainingProgress(callbacks.Throughput())
-    progress.on_train_start(trainer, module)
-    trainer.done = 0.25
-    progress.on_train_batch_end(trainer, module, {"squared_error": 0.01}, Mock(spec=Batch), 0)
-    progress.on_train_end(trainer, module)
-    last = capsys.readouterr().err.split("\r")[-1].strip()
-    assert last.startswith("train  25%|")
-    assert "| step 250 ETA " in last
-    assert last.endswith("0 rays/s train PSNR 20.00 val PSNR 19.00")
-
-
-@pytest.mark.parametrize("module", sorted(path.stem for path in PACKAGE_DIR.glob("*.py")))
-def test_no_option_is_called_like_a_group_of_options(module: str) -> None:
-    """Hydra would take `model=FOLDER` for the choice of a group's member."""
-    source = (PACKAGE_DIR / f"{module}.py").read_text(encoding="utf-8")
-    found = re.search(r'@entry_point\("\w+", (\w+)\)', source)
-    if found is None:
-        pytest.skip("no command that sees conf/")
-    hints = get_type_hints(getattr(importlib.import_module(f"nerfro.{module}"), found[1]))
-    groups = {path.name for path in CONF_DIR.iterdir() if path.is_dir()} | set(KINDS)
-    values = {name for name, hint in hints.items() if hint in (str, Optional[str], int, float, bool)}  # noqa: UP045
-    assert values & groups == set()
-
-
-@dataclass
-class Weight:
-    weight: float = 1.0
-
-
-def test_an_integer_that_no_float_holds_is_named() -> None:
-    config = OmegaConf.structured(Weight)
-    with pytest.raises(OverflowError) as caught:
-        config.weight = 10**400
-    assert in_one_line(caught.value) == "weight is too large; take a number that a float can hold"
 
 
 OLD_NAMES = {
