@@ -146,25 +146,6 @@ def test_evaluation_never_replaces_an_earlier_one_unasked(run: Path, evaluate_he
     assert evaluate_here(checkpoint, "split=val", "overwrite=true").code == 0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["split=night"], "has no split 'night'; it has train, val, test"),
-        (["chunk_size=0"], "chunk_size=0 is not allowed; take at least 1"),
-        (["root=/nowhere"], "data.root=/nowhere is not a folder"),
-        (["chekpoint=x"], "chekpoint is not a setting; did you mean checkpoint?"),
-        (["device=tpu9"], "device=tpu9 cannot be used; choose cpu, cuda or auto"),
-    ],
-)
-def test_evaluation_refuses_in_one_line(
-    arguments: list[str], message: str, run: Path, evaluate_here: Callable[..., Any], tmp_path: Path
-) -> None:
-    code, _, errors = evaluate_here(f"checkpoint={run / LAST_CHECKPOINT}", f"out={tmp_path / 'out'}", *arguments)
-    assert code == 1
-    assert message in errors.strip().splitlines()[-1]
-    assert not (tmp_path / "out").exists()
-
-
 def test_evaluation_without_a_checkpoint_asks_for_one(evaluate_here: Callable[..., Any]) -> None:
     code, _, errors = evaluate_here()
     assert code == 1
