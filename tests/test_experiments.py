@@ -87,14 +87,6 @@ def test_ablation_composes_and_builds(experiment: str) -> None:
     assert config.name == experiment
 
 
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_first_line_of_an_experiment_says_what_it_shows(experiment: str) -> None:
-    lines = (CONF_DIR / "experiment" / f"{experiment}.yaml").read_text().splitlines()
-    assert lines[0] == "# @package _global_"
-    assert lines[1].startswith("# ")
-    assert len(lines[1]) > 20
-
-
 @pytest.mark.parametrize("scene", SCENES)
 def test_scene_composes_with_every_papers_experiment(scene: str) -> None:
     own = OmegaConf.load(CONF_DIR / "scene" / f"{scene}.yaml")
