@@ -16,7 +16,7 @@ from nerfro.samplers.snell import Snell
 from nerfro.samplers.stepfun import volume_weights
 from nerfro.samplers.straight import Straight, straight_path
 from nerfro.samplers.stratified import Stratified
-from nerfro.testing import NUM_RAYS, example_path, example_rays, example_rendering, example_samples
+from nerfro.testing import NUM_RAYS, example_path, example_rays, example_samples
 from nerfro.types import Path, Radiance, Samples
 from tests.closed_forms import beam
 
@@ -35,12 +35,6 @@ def test_extreme_densities_stay_finite_and_have_finite_gradients(density: float)
     (weights[:, 0].sum() + transmittance.sum()).backward()
     assert raw.grad is not None
     assert raw.grad.isfinite().all()
-
-
-def test_constant_density_attenuates_exponentially() -> None:
-    deltas = torch.rand(3, 20, dtype=torch.float64)
-    _, transmittance = volume_weights(torch.full_like(deltas, 0.7), deltas)
-    torch.testing.assert_close(transmittance, torch.exp(-0.7 * deltas.sum(-1)))
 
 
 def test_a_dense_ball_of_glass_absorbs_along_its_chords() -> None:
@@ -72,14 +66,6 @@ def test_compositing_equals_a_slow_loop() -> None:
         assert rendering.transmittance[ray] == pytest.approx(transmittance, abs=1e-5)
 
 
-def test_empty_volume_shows_the_boundary() -> None:
-    samples, boundary = example_samples(), torch.rand(NUM_RAYS, 3)
-    empty = Radiance(torch.zeros_like(samples.s), torch.ones_like(samples.positions))
-    rendering = composite(samples, empty, boundary, example_path())
-    torch.testing.assert_close(rendering.rgb, boundary)
-    torch.testing.assert_close(rendering.depth, rendering.path.far)
-
-
 def test_opaque_wall_hides_the_boundary_and_gives_its_depth() -> None:
     samples = example_samples()
     density = torch.where(torch.arange(16) == 5, 1e6, 0.0).expand_as(samples.s)
@@ -95,11 +81,6 @@ def test_half_precision_radiance_is_summed_in_single_precision() -> None:
     radiance = smooth_radiance(samples)
     half = Radiance(radiance.density.bfloat16(), radiance.rgb.bfloat16())
     assert composite(samples, half, torch.zeros(NUM_RAYS, 3).bfloat16(), example_path()).rgb.dtype == torch.float32
-
-
-def test_opacity_is_what_does_not_pass() -> None:
-    rendering = example_rendering()
-    torch.testing.assert_close(rendering.opacity, 1 - rendering.transmittance)
 
 
 @pytest.mark.parametrize("integrator", ["adaptive", "euler"])
