@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from nerfro.registry import discover, find
 from nerfro.samplers.eikonal import Eikonal
@@ -16,28 +15,6 @@ from tests.ball_photographs import photographs, save
 from tests.closed_forms import make_rays
 
 FIELDS = {"width": 8, "depth": 2, "skip": 0}
-
-
-def test_a_medium_with_parameters_learns_in_the_refractive_model(
-    train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path
-) -> None:
-    options = [option for option in tiny_run if not option.startswith(("medium", "trainer.max_steps"))]
-    options += [
-        "medium=index_field",
-        "medium.mesh=${data.root}/mesh.ply",
-        *(f"medium.{k}={v}" for k, v in FIELDS.items()),
-    ]
-    options += ["loss.boundary.weight=0", "optimizer.medium_learning_rate=0.01"]
-    weights = []
-    for steps in (1, 4):
-        folder = tmp_path / f"run{steps}"
-        done = train_here(*options, f"trainer.max_steps={steps}", f"hydra.run.dir={folder}")
-        assert done.code == 0, done.err
-        state = load_checkpoint(folder / "checkpoints" / "last.ckpt")[0]["state_dict"]
-        weights.append(
-            torch.cat([value.flatten() for name, value in state.items() if name.startswith("renderer.scene.medium.")])
-        )
-    assert (weights[0] - weights[1]).abs().max() > 1e-4
 
 
 def test_a_medium_of_constant_index_learns_from_adaptive_paths() -> None:
