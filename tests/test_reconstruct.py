@@ -20,7 +20,6 @@ from hydra.core.global_hydra import GlobalHydra
 import nerfro.reconstruct
 import nerfro.train
 from nerfro.capture import refinement
-from nerfro.capture.overrides import as_overrides
 from nerfro.files.images import save_png
 from nerfro.pipeline import stages
 from nerfro.pipeline.hypotheses import Hypothesis
@@ -270,11 +269,6 @@ def test_a_result_that_was_spoilt_is_refused(reconstruct: Reconstruct, pretended
     assert (
         "lacks one of doubtful, near, options, pixels, up, width; delete the file to repeat" in reconstruct(*asked).err
     )
-
-
-def test_paths_are_quoted_for_hydra() -> None:
-    settings = {"out": Path("a/b_c.d"), "runs": ['a, "b', 1.5], "medium.mesh": "my scene/mesh.ply"}
-    assert as_overrides(settings) == ["out=a/b_c.d", 'runs=["a, \\"b",1.5]', 'medium.mesh="my scene/mesh.ply"']
 
 
 def test_a_command_is_left_time_to_save_when_this_process_is_asked_to_end() -> None:
