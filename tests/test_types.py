@@ -22,10 +22,3 @@ def test_span_holds_just_what_is_inside_the_box() -> None:
         seen = s[ray][inside[ray]]
         assert abs(seen.min() - first[ray]) < 2e-3
         assert abs(seen.max() - last[ray]) < 2e-3
-
-
-def test_span_of_a_path_that_misses_the_box_is_empty() -> None:
-    path = example_path(16)
-    first, last = path.span(BOX + 20)
-    torch.testing.assert_close(first, path.far)
-    torch.testing.assert_close(last, path.far)
