@@ -61,11 +61,6 @@ def test_a_damaged_configuration_does_not_end_the_dashboard(content: str, output
     assert run_name(folder, outputs) == "sweeps/seeds/mipnerf-ship-seed1"
 
 
-def test_logs_of_other_programs_keep_their_folder(tmp_path: Path) -> None:
-    (tmp_path / "theirs" / "tensorboard").mkdir(parents=True)
-    assert run_name(tmp_path / "theirs", tmp_path) == "theirs"
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
