@@ -56,11 +56,6 @@ def test_a_ray_is_the_sum_of_its_polylines_weighted_by_throughput() -> None:
     torch.testing.assert_close(both, expected)
 
 
-def test_one_polyline_a_ray_is_the_same_bit_for_bit_however_it_is_said() -> None:
-    path = example_path()
-    assert torch.equal(rendered(replace(path, splits=True)), rendered(path))
-
-
 def test_opacity_and_depth_are_those_of_rays() -> None:
     path = split_path(0.25)
     samples = Stratified(8)(path, None)
