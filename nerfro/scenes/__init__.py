@@ -1,4 +1,4 @@
-"""Synthetic scenes of refractive objects: modelled procedurally, rendered by a path tracer."""
+"""Synthetic scenes of refractive objects: modelled procedurally by plugins, rendered by a path tracer."""
 
-SCENES: dict[str, str] = {"torus": "nerfro.scenes.torus"}
+SCENES: dict[str, str] = {}
 """Module of each scene, by name; plugins add scenes. `build(spacing)` of the module returns the `Scene`."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerfro.scenes.skies import Sky
+from nerfro.scenes.sky import Sky
 from nerfro.scenes.surface import Surface
 
 Vector = Sequence[float] | np.ndarray

@@ -2,5 +2,5 @@
 
 from nerfro.scenes import SCENES
 
-for name in ("ship", "deerglobe", "starlamp", "dolphin_capture"):
+for name in ("torus", "ship", "deerglobe", "starlamp", "dolphin_capture"):
     SCENES[name] = f"{__name__}.{name}"

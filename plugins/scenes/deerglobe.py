@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from nerfro.light import to_linear
-from nerfro.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
 from nerfro.scenes.scene import Scene
-from nerfro.scenes.skies import azimuth, elevation, skyline
 from nerfro.scenes.surface import sphere
 
 from .distance import ball, capsule, ellipsoid, join, mirrored, painted, smooth_union
+from .patterns import chosen, fractal_noise, hashed, mix, smoothstep
+from .skies import azimuth, elevation, skyline
 
 GLASS_RADIUS, GLASS_SUBDIVISIONS = 0.80, 6
 MOUND_CENTRE, MOUND_RADIUS, MOUND_TOP = np.array([0.0, 0.0, 0.0]), 0.56, -0.24

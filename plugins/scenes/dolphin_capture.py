@@ -11,11 +11,11 @@ import itertools
 import numpy as np
 
 from nerfro.capture.boards import TagBoard, twelve_faces
-from nerfro.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
 from nerfro.scenes.scene import Panel, Scene, Vector
 
 from . import distance, starlamp
 from .distance import Colour, ball, capsule, ellipsoid, join, mirrored, moved, painted, smooth_union
+from .patterns import chosen, fractal_noise, hashed, mix, smoothstep
 from .photographs import Photographs
 
 DATA_SET = Photographs

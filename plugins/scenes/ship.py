@@ -7,12 +7,12 @@ import functools
 import numpy as np
 
 from nerfro.light import to_linear
-from nerfro.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
 from nerfro.scenes.scene import Scene
-from nerfro.scenes.skies import azimuth, clouds, elevation, skyline
 from nerfro.scenes.surface import rounded_box
 
 from .distance import ball, block, capsule, join, painted
+from .patterns import chosen, fractal_noise, hashed, mix, smoothstep
+from .skies import azimuth, clouds, elevation, skyline
 
 HALF_SIDES, EDGE_RADIUS = (0.80, 0.50, 0.66), 0.07
 TINT = (0.86, 0.98, 0.90)

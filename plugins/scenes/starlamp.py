@@ -7,10 +7,10 @@ import functools
 import numpy as np
 
 from nerfro.light import to_linear
-from nerfro.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
 from nerfro.scenes.scene import Scene
 
 from . import distance
+from .patterns import chosen, fractal_noise, hashed, mix, smoothstep
 
 OUTER, INNER, HALF_DEPTH, ROUNDING = 0.84, 0.44, 0.34, 0.10
 PLANET_RADIUS, RING_RADII = 0.21, (0.27, 0.37)

@@ -14,10 +14,10 @@ from nerfro.scenes.llvm import newest, version_in_name
 # Old libraries of this machine; Dr.Jit accepts LLVM 15, but aborts the process when it compiles with it.
 OLD = sorted(str(file) for file in Path("/usr/lib").glob("*/libLLVM*.so.*") if (version_in_name(file) or 99) < 16)
 RENDER = """
-from nerfro.scenes import torus
 from nerfro.scenes.path_tracer import PathTracer, Pinhole
+from nerfro.scenes.synthesis import find_scene
 from nerfro.scenes.viewpoints import look_at_origin
-tracer = PathTracer(torus.build(0.3), False, Pinhole.square(0.7, 2))
+tracer = PathTracer(find_scene("torus").build(0.3), False, Pinhole.square(0.7, 2))
 print(tracer.mitsuba.variant(), tracer.render(look_at_origin([0, 0.1, 4]), spp=1, seed=0).mean() > 0)
 """
 

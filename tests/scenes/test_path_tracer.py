@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from nerfro.errors import NerfroError
-from nerfro.scenes import path_tracer, torus
+from nerfro.scenes import path_tracer
 from nerfro.scenes.dataset import CAMERA_ANGLE_X, CAMERA_DISTANCE
 from nerfro.scenes.path_tracer import PathTracer, Pinhole, load_mitsuba
 from nerfro.scenes.surface import rounded_box, sphere, torus_angles
+from nerfro.scenes.synthesis import find_scene
 from nerfro.scenes.viewpoints import directions_on_sphere, look_at_origin
 
 IOR = 1.5
@@ -26,7 +27,7 @@ def white(directions):
 @pytest.fixture(scope="module")
 def white_torus():
     """The torus scene as a furnace: everything that scatters has albedo 1, light comes equally from everywhere."""
-    scene = torus.build(spacing=0.03)
+    scene = find_scene("torus").build(spacing=0.03)
     return replace(scene, sky=white, interior=replace(scene.interior, colours=np.ones_like(scene.interior.vertices)))
 
 
@@ -113,7 +114,10 @@ def test_background_pixels_show_the_sky_in_the_direction_of_the_pixel(poses):
     ring, _ = torus_angles(0.05, 0.02, spacing=0.01)
     tiny = replace(ring, colours=np.ones_like(ring.vertices))
     scene = replace(
-        torus.build(0.1), glass=sphere(0.1, 3), interior=tiny, sky=lambda directions: 0.5 + 0.5 * directions
+        find_scene("torus").build(0.1),
+        glass=sphere(0.1, 3),
+        interior=tiny,
+        sky=lambda directions: 0.5 + 0.5 * directions,
     )
     tracer = PathTracer(scene, False, Pinhole.square(CAMERA_ANGLE_X, 16))
     for pose in poses:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerfro.files import lat_long
-from nerfro.scenes.skies import lat_long_texture
+from nerfro.scenes.sky import lat_long_texture
 from nerfro.scenes.surface import rounded_box, sphere, torus_angles
 from nerfro.scenes.viewpoints import directions_on_sphere, look_at_origin
 

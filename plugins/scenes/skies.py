@@ -1,20 +1,13 @@
-"""Procedural surroundings at infinity: layers painted as functions of direction, and their lat-long textures.
+"""Procedural surroundings at infinity: layers painted as functions of direction.
 
-Directions are unit vectors in a z-up world. Layers return sRGB colours, which a person judges by eye. A sky returns
-linear radiance of at most 1, so that 8-bit images never clip.
+Directions are unit vectors in a z-up world. Layers return sRGB colours, which a person judges by eye.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
-from nerfro.files import lat_long
-from nerfro.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
-
-Sky = Callable[[np.ndarray], np.ndarray]
-"""Maps unit directions [..., 3] to linear radiance [..., 3] in [0, 1]."""
+from .patterns import chosen, fractal_noise, hashed, mix, smoothstep
 
 
 def azimuth(directions: np.ndarray) -> np.ndarray:
@@ -68,14 +61,3 @@ def skyline(
     covered = (height < roof + gable) & (height >= 0)
     above_roof = height > roof
     return np.where(above_roof[..., None], np.array([0.55, 0.24, 0.18]), colour), covered.astype(np.float64)
-
-
-def lat_long_texture(sky: Sky, height: int, supersampling: int = 2) -> np.ndarray:
-    """Return the sky as a float32 lat-long image [H, 2H, 3] of linear radiance, averaged over each pixel."""
-    k = supersampling
-    texture = np.empty((height, 2 * height, 3), np.float32)
-    fine = lat_long.directions(k * height).numpy()
-    for row in range(height):  # by rows, because the intermediate arrays of a 4k sky exceed the memory
-        band = sky(fine[k * row : k * (row + 1)])
-        texture[row] = band.reshape(k, 2 * height, k, 3).mean((0, 2))
-    return texture

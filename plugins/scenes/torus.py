@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from nerfro.light import to_linear
-from nerfro.scenes.patterns import chosen, hashed, mix, smoothstep
 from nerfro.scenes.scene import Scene
-from nerfro.scenes.skies import clouds, elevation, skyline
 from nerfro.scenes.surface import rounded_box, torus_angles
+
+from .patterns import chosen, hashed, mix, smoothstep
+from .skies import clouds, elevation, skyline
 
 HALF_SIDE, EDGE_RADIUS = 0.75, 0.08
 MAJOR_RADIUS, MINOR_RADIUS = 0.38, 0.16
