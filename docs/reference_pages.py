@@ -96,19 +96,20 @@ def plugins_page() -> str:
         choose = _CHOOSE.get(kind, f"{kind}=NAME")
         text.append(f"## {kind}\n\nChoose with `{choose}`.\n")
         for plugin in plugins(kind):
-            if plugin.target.startswith("nerfro.") or kind == "callbacks":
+            if ".example_" not in plugin.target:  # templates
                 text.append(_plugin(plugin))
     return "\n".join(text)
 
 
 def _plugin(plugin: Plugin) -> str:
-    if not plugin.target.startswith("nerfro."):  # Lightning documents its callbacks in another markup
+    if plugin.target.startswith("lightning."):  # Lightning documents its callbacks in another markup
         fields = ", ".join(f"`{name}`" for name, *_ in plugin.fields())
         return f"### {plugin.name}\n\n`{plugin.target}`" + (f" with the options {fields}.\n" if fields else ".\n")
     body, _ = _google_docstring(inspect.getdoc(plugin.cls) or "")
     explained: dict[str, str] = {}
     for base in plugin.cls.__mro__:
-        explained = _google_docstring(inspect.cleandoc(base.__doc__ or ""))[1] | explained
+        for documented in (vars(base).get("__init__"), base):
+            explained = _google_docstring(inspect.cleandoc(documented.__doc__ or ""))[1] | explained
     prefix = plugin.kind.replace("/", ".") + ("." if plugin.kind not in _CHOOSE else f".{plugin.name}.")
     rows = [
         (prefix + name, _type(plugin.hints[name]), default, explained.get(name, ""))
