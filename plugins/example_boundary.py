@@ -14,7 +14,7 @@ from nerfro.types import Exits
 
 @register("boundary", "gradient_sky")
 class GradientSky(Boundary):
-    """Two learned radiances, blended by the height of the direction.
+    """Blend two learned radiances by the height of the direction.
 
     Args:
         up: axis that points up, 0, 1 or 2.

@@ -14,7 +14,7 @@ from nerfro.types import Batch, Rendering
 
 @register("loss", "opacity_entropy")
 class OpacityEntropy(Loss):
-    """Entropy of the finest level's opacity: rays shall either pass or be stopped, not be dimmed by fog."""
+    """Penalize the entropy of the opacity at the finest level, such that rays pass or stop but are not dimmed."""
 
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         # `opacity` sums the polylines of each ray, and `per_pixel` averages the rays of each pixel.

@@ -1,6 +1,6 @@
 """Template: a point sampler of your own in one file. Use it with `sampler/points=logarithmic`.
 
-Copy this file, rename the class and the registered name, and change `forward`. Nothing else needs to know.
+Copy this file, rename the class and the registered name, and change `forward`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _GROWTH = 4.0  # ratio of the last spacing to the first
 
 @register("sampler/points", "logarithmic")
 class LogarithmicSampler(PointSampler):
-    """Samples whose spacing grows with distance: denser where a pixel's footprint is small.
+    """Draw samples with a spacing that grows with the distance, as the footprint of a pixel does.
 
     Args:
         num_samples: number of samples on each path.

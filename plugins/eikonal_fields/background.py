@@ -1,4 +1,4 @@
-"""What is seen around the box, as grids that are blurred first and sharpened level by level."""
+"""Surroundings of the box on grids, which are blurred at first and sharpened level by level."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _POINTS_AT_ONCE = 65536
 
 @dataclass(frozen=True)
 class Background:
-    """Radiance outside a box and the boundary, on grids; lookups are differentiable in position and direction.
+    """Radiance outside a box, and the background, on grids that are differentiable in position and direction.
 
     Attributes:
         radiance: rgb and density at the vertices over `box`.
@@ -44,15 +44,15 @@ class Background:
         hidden: Float[Tensor, "2 3"],
         resolution: int,
     ) -> Background:
-        """Ask a field and a boundary at the vertices of grids.
+        """Evaluate a field and a boundary model at the vertices of grids.
 
-        The field's colour is the mean over the six axis directions.
+        The colour of the field is the mean over the six axis directions.
 
         Args:
-            field, boundary: what is seen.
-            box: where the field is asked, world units.
-            hidden: box in which nothing of it is kept.
-            resolution: vertices a side.
+            field, boundary: field and boundary model of the scene.
+            box: box of the grid of the field, world units.
+            hidden: box inside of which the grid is empty.
+            resolution: vertices along each side.
         """
         vertices = _vertices(box, resolution)
         radiance = vertices.new_zeros(len(vertices), 4)
@@ -66,17 +66,17 @@ class Background:
         return cls(radiance.view(*sides, 4), box, sky.view(*sides, 3))
 
     def blurred(self, sigma: float) -> Background:
-        """Both grids convolved with a Gaussian of this standard deviation, in voxels."""
+        """Convolve both grids with a Gaussian of standard deviation `sigma`, voxels."""
         size = 2 * math.ceil(3 * sigma) + 1
         return Background(smooth(self.radiance, size, sigma), self.box, smooth(self.sky, size, sigma))
 
     def radiance_at(self, samples: Samples) -> Radiance:
-        """Density and colour at samples."""
+        """Look up density and colour at samples."""
         values = trilinear(self.radiance, self.box, samples.positions)
         return Radiance(values[..., 3], values[..., :3])
 
     def sky_towards(self, directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
-        """Colour of the boundary in unit directions."""
+        """Look up the colour of the background in unit directions."""
         cube = torch.tensor([[-_SKY_SIDE] * 3, [_SKY_SIDE] * 3], device=directions.device)
         return trilinear(self.sky, cube, directions)
 

@@ -1,4 +1,4 @@
-"""Bent paths that gradients flow through."""
+"""Differentiable tracing of bent paths."""
 
 from __future__ import annotations
 
@@ -19,19 +19,20 @@ from nerfro.types import Path, Rays
 
 @register("sampler/path", "box_march")
 class BoxMarch(PathSampler):
-    """Equal steps of the Eikonal equation inside the medium's box, straight outside; differentiable.
+    """Trace rays by equal steps of the Eikonal equation inside the medium's box, and straight outside.
 
-    The steps together are as long as the box's diagonal; a ray that is still inside goes straight on.
+    Gradients flow through all steps. The total length of the steps is the diagonal of the box; afterwards, a ray inside
+    the box continues straight.
     """
 
     def __init__(self, num_steps: int = 32) -> None:
-        """Choose how to step.
+        """Set the number of steps.
 
         Args:
-            num_steps: through the box.
+            num_steps: number of steps inside the box.
 
         Raises:
-            NerfroError: there is none.
+            NerfroError: the number is less than 1.
         """
         super().__init__()
         if num_steps < 1:
@@ -57,7 +58,7 @@ class BoxMarch(PathSampler):
         )
 
     def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
-        """The path traced again, for `forward` lets gradients through."""
+        """Trace the path again; `forward` has gradients."""
         return self(rays, medium)
 
     def _march(self, rays: Rays, entry: Float[Tensor, "R"], medium: Medium) -> Path:
@@ -81,10 +82,10 @@ class BoxMarch(PathSampler):
 
 
 def unit_speed(state: RayState, ds: Float[Tensor, "R"], index: Index) -> RayState:
-    """Kick, drift, kick: x + ds v / |v| between two halves of v + ds grad n; second order, one look-up a step.
+    """Take a kick-drift-kick step: x + ds v / |v| between two halves of v + ds grad n; second order, one lookup.
 
-    As in the authors' code the index's gradient alone is asked, so that a constant in the index does not show. Their
-    explicit Euler step costs the same, but its error is made up for by a wrong index.
+    As in the authors' code, only the gradient of the index acts, so a constant in the index has no effect. An explicit
+    Euler step costs the same, but a wrong index would compensate the integration error.
     """
     x, v, _, g = state
     half = v + 0.5 * ds[:, None] * g

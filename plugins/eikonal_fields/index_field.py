@@ -1,4 +1,4 @@
-"""The refractive index as a network that is learned inside a box."""
+"""A learned refractive index inside a box."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _BETA = 5.0
 
 @register("medium", "index_field")
 class IndexField(Medium):
-    """A refractive index that is learned: an MLP of encoded positions inside a box, n = 1 at the start.
+    """Represent the refractive index inside a box by an MLP of encoded positions, with n = 1 initially.
 
-    A window W, 1 within the content's bounds and falling to 0 in a margin around them, weights the network's gradient,
-    as in the authors' code: the box itself does not refract, whatever the network says at its faces. Images then tell
-    the index up to a constant, which is chosen so that n = 1 on average over 26 points of the box's faces.
+    As in the authors' code, a window multiplies the gradient of the network. It is 1 within the bounds of the content
+    and decreases to 0 in a margin, so that the faces of the box do not refract. Images then determine the index up to a
+    constant. The constant is chosen such that n = 1 on average over 26 points on the faces of the box.
 
-    The gradient is pushed forward through the layers beside the value, so that one ordinary backward pass trains both.
+    Value and gradient are both propagated forward through the layers, so that one backward pass trains both.
     """
 
     box: Float[Tensor, "2 3"]
@@ -51,13 +51,13 @@ class IndexField(Medium):
         """Make an untrained field.
 
         Args:
-            mesh: surface of which the bounds alone are taken; none for `box_min` and `box_max`.
-            box_min, box_max: corners of the content's bounds, world units.
-            margin: width of the window around the bounds, as a share of their longest side.
-            width, depth: of the MLP.
-            skip: layer, counted from 1, to whose output the encoding is concatenated again.
-            octaves: of the positional encoding; half the bounds' longest side counts as one.
-            ior: not used, for it is learned; scene files set it for the media that are told it.
+            mesh: surface whose bounds are the bounds of the content; None for `box_min` and `box_max`.
+            box_min, box_max: corners of the bounds of the content, world units.
+            margin: width of the window around the bounds, as a fraction of the longest side.
+            width, depth: width and number of hidden layers of the MLP.
+            skip: layer, counted from 1, after which the encoding is concatenated again.
+            octaves: number of octaves of the positional encoding; half the longest side has the length 1.
+            ior: ignored, because the index is learned. Scene files set the index for other media.
 
         Raises:
             NerfroError: the box is empty, or a number is out of range.
@@ -96,13 +96,13 @@ class IndexField(Medium):
 
     @property
     def content_box(self) -> Float[Tensor, "2 3"]:
-        """The content's bounds, without the margin."""
+        """Bounds of the content, without the margin."""
         return self.bounds
 
     def forward(
         self, positions: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-        """Refractive index and its gradient; the network is asked only inside the box."""
+        """Evaluate the refractive index and the gradient; the network is evaluated only inside the box."""
         flat = positions.reshape(-1, 3)
         index = inside_box(flat, *self.box).nonzero().squeeze(1)
         chosen = flat[index]
@@ -114,7 +114,7 @@ class IndexField(Medium):
         return n.view(positions.shape[:-1]), gradients.view(positions.shape)
 
     def _network(self, positions: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P"], Float[Tensor, "P 3"]]:
-        """Index up to a constant, and its gradient."""
+        """Evaluate the index up to a constant, and the gradient."""
         encoded = self._encode(positions)
         state = encoded
         for i, layer in enumerate(self.layers, start=1):
@@ -125,7 +125,7 @@ class IndexField(Medium):
         return state[:, 0], state[:, 1:] / self.scale
 
     def _encode(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P 4 F"]:
-        """Positional encoding, and its derivative along each axis of the unit frame."""
+        """Compute the positional encoding and the derivatives along the axes of the unit frame."""
         unit = ((positions - self.bounds.mean(0)) / self.scale).to(self.frequencies)
         angles = (unit[:, None] * self.frequencies[:, None]).flatten(1)
         rates = self.frequencies.repeat_interleave(3)
@@ -136,14 +136,14 @@ class IndexField(Medium):
         return torch.cat([value[:, None], slope[:, None] * axes], 1)
 
     def _window(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
-        """Product of a cubic step for each axis."""
+        """Compute the window, a product of one cubic step per axis."""
         depth = 0.5 * (self.box[1] - self.box[0]) - (positions - self.bounds.mean(0)).abs()
         t = (depth / self.fade).clamp(0, 1)
         return (t * t * (3 - 2 * t)).prod(-1)
 
 
 class _Dual(nn.Linear):
-    """A layer for a value and its three derivatives, to which the bias adds nothing; Glorot-uniform, bias zero."""
+    """Linear layer for a value and three derivatives, which have no bias; weights are Glorot-uniform initially."""
 
     def reset_parameters(self) -> None:
         nn.init.xavier_uniform_(self.weight)
@@ -155,6 +155,6 @@ class _Dual(nn.Linear):
 
 
 def _softplus(state: Float[Tensor, "P 4 O"]) -> Float[Tensor, "P 4 O"]:
-    """The activation for a value and its three derivatives."""
+    """Apply softplus to a value and three derivatives."""
     value, slopes = state[:, :1], state[:, 1:]
     return torch.cat([F.softplus(value, _BETA), torch.sigmoid(_BETA * value) * slopes], 1)

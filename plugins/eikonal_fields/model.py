@@ -1,4 +1,4 @@
-"""The method's three stages as one model."""
+"""The three stages of Eikonal Fields as one model."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Ask = Callable[[Samples], Radiance]
 
 
 class Stage(IntEnum):
-    """What is being learned."""
+    """Stage of the training."""
 
     SCENE = 0
     INDEX = 1
@@ -33,17 +33,17 @@ class Stage(IntEnum):
 
 @register("model", "eikonal_fields")
 class EikonalFields(Renderer):
-    """Eikonal Fields: the scene along straight rays, then the index in a box, then what is inside it.
+    """Learn the scene along straight rays, then the index inside a box, then the radiance inside the box.
 
-    1. Scene: a radiance field and the boundary, on straight rays.
-    2. Index: what the first stage found inside the medium's box is dropped and what lies around it is frozen, as grids
-       that are blurred first and sharpened level by level. The medium learns to bend the rays that cross the box.
-    3. Interior: paths are frozen too, and a second radiance field learns what is inside the box.
+    1. Scene: a radiance field and the background, on straight rays.
+    2. Index: the radiance inside the medium's box is dropped. The radiance outside is frozen on grids, which are blurry
+       at first and sharpened level by level. The medium learns to bend the rays through the box.
+    3. Interior: the paths are frozen as well, and a second radiance field learns the inside of the box.
 
-    A stage ends with its share of the run's budget, in steps or time, and the learning rates decay anew in each.
+    Each stage takes a fraction of the budget of the run, in steps or time, and the learning rates decay in each stage.
 
     Attributes:
-        stage: see `Stage`; part of checkpoints.
+        stage: current `Stage`; part of checkpoints.
         interior: radiance field of the third stage.
     """
 
@@ -66,12 +66,12 @@ class EikonalFields(Renderer):
         """Compose the model.
 
         Args:
-            components: that it is composed of; its medium has parameters.
-            scene_share, index_share: of the budget for the first two stages; the third has the rest.
+            components: components of the model; the medium has parameters.
+            scene_share, index_share: fractions of the budget for the first two stages; the third has the rest.
             box_min, box_max: corners of the box in which radiance is sampled, world units.
-            resolution: vertices a side of the grids of the second stage.
-            blur: standard deviation of the first level's blur, voxels; halved at each level.
-            num_levels: of blur, for equal shares of the second stage.
+            resolution: vertices along each side of the grids of the second stage.
+            blur: standard deviation of the blur at the first level, voxels; each level halves the value.
+            num_levels: number of levels of blur, for equal fractions of the second stage.
 
         Raises:
             NerfroError: a number is out of range.
@@ -97,7 +97,7 @@ class EikonalFields(Renderer):
         self._level = -1
 
     def stage_at(self, progress: float) -> tuple[Stage, float]:
-        """The stage at a share of the budget, and the share of that stage that is done."""
+        """Return the stage at a fraction of the budget, and the completed fraction of the stage."""
         if progress < self.scene_share:
             return Stage.SCENE, progress / self.scene_share
         progress -= self.scene_share
@@ -116,7 +116,7 @@ class EikonalFields(Renderer):
         return done
 
     def sharpen(self, level: int) -> None:
-        """Blur what is seen around the box as it is at a level of the second stage."""
+        """Blur the surroundings of the box for a level of the second stage."""
         if self._sharp is None:
             scene = self.scene
             (field,) = scene.fields
@@ -135,7 +135,7 @@ class EikonalFields(Renderer):
         return {**super().parameter_groups(), "interior": list(self.interior.parameters())}
 
     def trace(self, rays: Rays, path: Path | None = None) -> Path:
-        """Paths of rays as the present stage sees them, traced anew: what bends them is learned, or was."""
+        """Trace rays according to the current stage, because the medium changes during training."""
         stage = Stage(int(self.stage))
         if stage == Stage.SCENE:
             return straight_path(rays)
@@ -165,7 +165,7 @@ class EikonalFields(Renderer):
 
 
 def radiance_where(field: Field | Ask, samples: Samples, selected: Bool[Tensor, "R N"]) -> Radiance:
-    """Ask a field at the selected samples alone; elsewhere density and colour are zero."""
+    """Evaluate a field only at the selected samples; density and colour are zero elsewhere."""
     ray, i = selected.nonzero(as_tuple=True)
     chosen = Samples(
         samples.positions[ray, i][:, None],
