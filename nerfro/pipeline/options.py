@@ -10,7 +10,7 @@ from typing import Annotated, Any, Optional
 
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from nerfro.allowed import Count, Range
+from nerfro.allowed import Count, Natural, Range
 from nerfro.capture.overrides import is_given
 from nerfro.data.transforms import read_json
 from nerfro.errors import NerfroError
@@ -29,8 +29,8 @@ class ReconstructConfig:
         masks: folder of the masks, `<photograph>.png` or `mask_<photograph>.png`.
         outlines: outlines of the object in some photographs (see `python -m nerfro.mask`).
         out: output folder.
-        trial_seconds: duration of the training that tries each hypothesis about the object on validation photographs
-            (straight rays, solid body, empty glass); 0 trains the solid body without a comparison.
+        trial_steps: number of steps of the training that tries each hypothesis about the object on validation
+            photographs (straight rays, solid body, empty glass); 0 trains the solid body without a comparison.
         pixels: maximum length of the longer side of the photographs in training; `data.downscale` has precedence.
         calibrate, mask, preprocess, train: further command-line options of these stages.
     """
@@ -43,7 +43,7 @@ class ReconstructConfig:
     masks: Optional[str] = None  # noqa: UP045
     outlines: Any = None
     out: Optional[str] = None  # noqa: UP045
-    trial_seconds: Annotated[int, Range(at_least=0, at_most=3599)] = 40
+    trial_steps: Natural = 600
     pixels: Count = 256
     calibrate: str = ""
     mask: str = ""

@@ -18,7 +18,7 @@ from nerfro.data.frames import list_images
 from nerfro.errors import NerfroError
 from nerfro.evaluation.results import FULL, read_metrics_json
 from nerfro.paths import user_path
-from nerfro.pipeline.hypotheses import Hypothesis, hypotheses, trial_options
+from nerfro.pipeline.hypotheses import Hypothesis, hypotheses
 from nerfro.pipeline.options import common_options, read_result
 from nerfro.pipeline.stages import Stage, is_older, link_photographs, move_aside
 from nerfro.training.run_folder import CONFIG_FILE
@@ -75,13 +75,13 @@ def train(config: DictConfig, overrides: list[str], surface: Path, out: Path) ->
     candidates, best = hypotheses(found, config.medium), None
     if is_given("experiment", common):
         best = Hypothesis("given", [*found["options"], *found["doubtful"]])
-    elif config.trial_seconds == 0:
+    elif config.trial_steps == 0:
         best = candidates[1]
     else:
         trials = [out / "trials" / hypothesis.folder for hypothesis in candidates]
         for hypothesis, trial in zip(candidates, trials, strict=True):
             print(f"\nhypothesis: {hypothesis.name}")
-            _run_training([*hypothesis.options, *common, *trial_options(config.trial_seconds)], inputs, trial)
+            _run_training([*hypothesis.options, *common, *hypothesis.trial_options(config.trial_steps)], inputs, trial)
         best = _best_hypothesis(candidates, trials)
         inputs += [trial / "metrics.json" for trial in trials]
     _run_training([*best.options, *common], inputs, out / "run")
