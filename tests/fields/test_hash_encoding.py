@@ -92,16 +92,6 @@ def test_gradients_are_those_of_differences() -> None:
     assert torch.autograd.gradcheck(lambda p, t: hash_encoding.hash_encode(p, t, levels), (positions, table))
 
 
-def test_only_gradients_that_are_asked_for_are_computed(monkeypatch: pytest.MonkeyPatch) -> None:
-    done = []
-    for name in ("_backward", "_backward_to_positions"):
-        monkeypatch.setattr(kernels, name, lambda *arrays, name=name: done.append(name))
-    for positions, table in ((False, True), (True, False)):
-        inputs = random_positions(9).requires_grad_(positions), random_table().requires_grad_(table)
-        kernels.hash_encode(*inputs, LEVELS).sum().backward()
-    assert done == ["_backward", "_backward_to_positions"]
-
-
 def test_positions_learn_after_a_picture_was_rendered() -> None:
     # Tensors made in inference mode, as pictures are, cannot be saved for a gradient, and constants are kept.
     constant.cache_clear()
@@ -110,14 +100,6 @@ def test_positions_learn_after_a_picture_was_rendered() -> None:
         hash_encoding.hash_encode(positions, random_table(), LEVELS)
     hash_encoding.hash_encode(positions, random_table(), LEVELS).sum().backward()
     assert positions.grad.any()
-
-
-def test_kernels_accept_an_empty_list() -> None:
-    table = random_table().requires_grad_()
-    encoded = kernels.hash_encode(torch.zeros(0, 3), table, LEVELS)
-    assert encoded.shape == (0, 10)
-    encoded.sum().backward()
-    assert torch.equal(table.grad, torch.zeros_like(table))
 
 
 def test_gradient_does_not_depend_on_the_number_of_threads() -> None:

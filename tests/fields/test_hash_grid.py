@@ -146,23 +146,6 @@ def test_one_direction_band_makes_colour_independent_of_direction() -> None:
     assert torch.equal(field(samples).rgb, field(turned).rgb)
 
 
-def test_field_learns_a_coloured_ball() -> None:
-    # Density and colour of a ball of radius 0.6 from samples alone; a constant answer has an error of about 0.2.
-    torch.manual_seed(0)
-    field = HashGridField(num_levels=6, finest_resolution=32, log2_table_size=12)
-    optimiser = torch.optim.Adam(field.parameters(), lr=1e-2, eps=1e-15)
-    for _ in range(150):
-        positions = 2 * torch.rand(2048, 3) - 1
-        ball = (positions.norm(dim=-1) < 0.6).float()
-        density, rgb = field.decode(positions, torch.nn.functional.normalize(torch.randn(2048, 3), dim=-1))
-        alpha = 1 - torch.exp(-density)
-        loss = (alpha - ball).square().mean() + (ball[:, None] * (rgb - (positions + 1) / 2).square()).mean()
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-    assert loss < 0.02
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -98,12 +98,6 @@ def test_nerf_field_with_a_box_equals_one_without_inside_and_is_empty_outside() 
     torch.testing.assert_close(radiance.rgb, expected.rgb * kept[..., None])
 
 
-@pytest.mark.parametrize("box_max", [[1.0, 0.0, 1.0], [1.0, 1.0]])
-def test_nerf_field_refuses_an_empty_box(box_max: list[float]) -> None:
-    with pytest.raises(NerfroError, match="is not a box"):
-        NerfField(box_min=[0.0, 0.0, 0.0], box_max=box_max)
-
-
 @pytest.mark.usefixtures("unchecked")  # the compiler cannot trace the checks
 def test_compiled_networks_equal_plain_ones_and_keep_their_weights_names() -> None:
     plain, compiled = (

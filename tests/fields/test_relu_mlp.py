@@ -51,15 +51,6 @@ def test_inputs_side_by_side_of_which_one_learns() -> None:
     torch.testing.assert_close(mine, theirs)
 
 
-def test_nothing_is_computed_for_weights_that_do_not_learn(monkeypatch: pytest.MonkeyPatch) -> None:
-    mlp = layers(5, 8, 3).requires_grad_(False)
-    inputs = torch.randn(20, 5, requires_grad=True)
-    monkeypatch.delattr("nerfro.fields.relu_mlp._product_of_columns")
-    (mine,) = torch.autograd.grad(relu_mlp(inputs, weights(mlp), torch.float32).sum(), inputs)
-    (theirs,) = torch.autograd.grad(mlp(inputs).sum(), inputs)
-    torch.testing.assert_close(mine, theirs)
-
-
 def test_points_of_several_blocks_equal_a_sequential() -> None:
     mlp = layers(6, 8, 3)
     inputs = torch.randn(2 * 16384 + 700, 6, requires_grad=True)
@@ -91,11 +82,3 @@ def test_ever_different_numbers_of_points_make_few_shapes_of_products() -> None:
         for count in torch.randint(1, 50000, (40,), generator=generator).tolist():
             relu_mlp(torch.randn(count, 4, requires_grad=True), weights(mlp), torch.float32).sum().backward()
     assert len(products.shapes) <= 6 * 8  # two products forward and four backward, of eight numbers of rows each
-
-
-def test_inputs_without_gradient_and_no_points() -> None:
-    mlp = layers(4, 6, 2)
-    result = relu_mlp(torch.zeros(0, 4), weights(mlp), torch.float32)
-    result.sum().backward()
-    assert result.shape == (0, 2)
-    assert all(torch.equal(w.grad, torch.zeros_like(w)) for w in weights(mlp))

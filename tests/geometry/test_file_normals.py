@@ -17,15 +17,6 @@ from nerfro.samplers.bend import bend
 TORUS_CUBE = "embedded:torus/mesh.ply"
 
 
-def test_normals_of_the_file_are_taken_and_averages_are_not(tmp_path: Path) -> None:
-    ball = trimesh.creation.icosphere(2)
-    exact = np.asarray(ball.vertices)
-    trimesh.Trimesh(ball.vertices, ball.faces, vertex_normals=exact, process=False).export(tmp_path / "ball.ply")
-    mesh = load_mesh(tmp_path / "ball.ply")
-    corners = mesh.vertices[mesh.faces]
-    np.testing.assert_allclose(corner_normals(mesh), corners, atol=1e-6)
-
-
 def _write(path: Path, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> Path:
     trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False).export(path)
     return path

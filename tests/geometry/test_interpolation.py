@@ -51,16 +51,6 @@ def test_spline_gradient_is_that_of_its_value() -> None:
     torch.testing.assert_close(gradient, automatic)
 
 
-def test_spline_gradient_is_continuous_across_cells() -> None:
-    coefficients = torch.rand(6, 7, 8, dtype=torch.float64)
-    # Cells of a quadratic spline meet halfway between the vertices.
-    spacing = (BOX[1] - BOX[0]) / (torch.tensor([6, 7, 8]) - 1)
-    border = BOX[0] + spacing * torch.tensor([2.5, 2.3, 3.4])
-    step = torch.tensor([1e-9, 0, 0], dtype=torch.float64)
-    _, gradients = quadratic_spline(coefficients, BOX, torch.stack([border - step, border + step]))
-    torch.testing.assert_close(gradients[0], gradients[1], atol=1e-6, rtol=0)
-
-
 def test_spline_of_smooth_values_has_order_three() -> None:
     points = _inner_points(200)
 

@@ -62,7 +62,3 @@ def test_distance_to_a_set_is_the_least_of_all_distances() -> None:
     grid = np.stack(np.meshgrid(*(np.arange(n) for n in members.shape), indexing="ij"), -1) * spacing
     brute = np.linalg.norm(grid[..., None, :] - points, axis=-1).min(-1)
     np.testing.assert_allclose(distance_to_set(members, spacing), brute, rtol=1e-6)
-
-
-def test_distance_to_nothing_is_infinite() -> None:
-    assert np.isinf(distance_to_set(np.zeros((3, 4, 5), bool), np.ones(3))).all()

@@ -14,8 +14,7 @@ from nerfro.errors import NerfroError
 from nerfro.geometry.lids import find_lid
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media.vessel import SdfVessel
-from nerfro.samplers.eikonal import Eikonal
-from nerfro.samplers.snell import Snell, trace_interfaces
+from nerfro.samplers.snell import Snell
 from nerfro.variants import variant
 from nerfro.viewing.surface import surface_of
 from tests.closed_forms import angle, make_rays
@@ -60,25 +59,6 @@ def test_rays_through_a_half_full_spherical_vessel_leave_as_formulas_say(tmp_pat
     # Where the liquid meets the wall, and after several total reflections, errors multiply.
     assert errors.quantile(0.95) < 0.1
     assert errors.median() < 0.02
-
-
-def test_both_tracers_follow_the_same_paths(tmp_path: Path) -> None:
-    vessel = spherical_vessel(tmp_path, level=0.9, resolution=64)
-    origins, directions = (torch.from_numpy(values) for values in _rays_at_the_ball(60))
-    rays = make_rays(origins, directions, 0.5, 9.0)
-    compiled, plain = Snell().trace(rays, vessel), trace_interfaces(rays, vessel.double(), 16)
-    agree = compiled.num_events == plain[1]
-    assert agree.float().mean() > 0.95
-    assert angle(compiled.path.exit_directions.double(), plain[0].exit_directions)[agree].quantile(0.95) < 0.05
-
-
-def test_the_eikonal_equation_sees_the_same_vessel(tmp_path: Path) -> None:
-    vessel = spherical_vessel(tmp_path, level=0.9, resolution=64, shell_voxels=0.02)
-    origins, directions = (torch.from_numpy(values) for values in _rays_at_the_ball(100))
-    rays = make_rays(origins, directions, 0.5, 9.0)
-    sharp = Snell().trace(rays, vessel)
-    shells = Eikonal()(rays, vessel).exit_directions
-    assert angle(shells.double(), sharp.path.exit_directions.double()).quantile(0.7) < 0.5
 
 
 def _glass(folder: Path, **options: object) -> SdfVessel:

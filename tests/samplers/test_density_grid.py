@@ -111,13 +111,6 @@ def test_grid_remembers_the_field_it_looked_at() -> None:
     torch.testing.assert_close(remembered, DenseBall().density(points)[away])
 
 
-def test_grid_travels_with_the_checkpoint() -> None:
-    sampler = trained_sampler()
-    restored = DensityGridSampler(num_samples=16, num_bins=64, resolution=32)
-    restored.load_state_dict(sampler.state_dict())
-    assert torch.equal(restored.density, sampler.density)
-
-
 def split_in_two(shares: tuple[float, float]) -> Path:
     """Each of 64 rays as two equal polylines with shares of its light."""
     path = example_path(64)

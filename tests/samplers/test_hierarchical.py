@@ -66,20 +66,6 @@ def test_union_holds_every_coarse_sample_and_is_sorted() -> None:
     assert ((fine.s[:, None] - coarse.samples.s[..., None]).abs().min(-1).values == 0).all()
 
 
-def test_fine_samples_lie_on_the_bent_path() -> None:
-    path = example_path()
-    sampler = Hierarchical(16, 24)
-    fine = sampler(path, render(path, sampler, torch.rand(16)), example_draws())
-    start, end = path.positions[:, None, :-1], path.positions[:, None, 1:]
-    # Distance to the nearest segment of the polyline, by brute force.
-    # Rows with fewer vertices repeat their last one; such a segment is a point.
-    squared = (end - start).square().sum(-1).clamp(min=1e-12)
-    along = ((fine.positions[:, :, None] - start) * (end - start)).sum(-1) / squared
-    nearest = start + along.clamp(0, 1)[..., None] * (end - start)
-    distance = (fine.positions[:, :, None] - nearest).norm(dim=-1).min(-1).values
-    assert distance.max() <= 1e-5
-
-
 def test_padding_reaches_bins_without_weight() -> None:
     path = straight_path(example_rays())
     sampler = Hierarchical(16, 64, union=False, padding=0.1)

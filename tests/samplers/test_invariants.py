@@ -13,9 +13,9 @@ from nerfro.media.shapes import Ball
 from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.rendering import composite
 from nerfro.samplers.base import PathSampler, PointSampler
-from nerfro.samplers.eikonal import Eikonal, march_uniform
+from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.hierarchical import Hierarchical
-from nerfro.samplers.integrators import RayState, euler, kick_drift_kick, leapfrog
+from nerfro.samplers.integrators import RayState, kick_drift_kick, leapfrog
 from nerfro.samplers.snell import Snell
 from nerfro.samplers.straight import Straight
 from nerfro.samplers.stratified import Stratified
@@ -29,7 +29,6 @@ from tests.closed_forms import (
     fisheye,
     grid_points,
     luneburg,
-    make_rays,
 )
 
 SMOOTH = [luneburg, fisheye, fibre]
@@ -100,26 +99,6 @@ def test_velocity_keeps_the_length_n_and_radial_media_the_moment(squared: Square
         # v is n times the direction: n r sin(phi), by Bouguer.
         now = torch.linalg.cross(state.positions, state.velocities)
         torch.testing.assert_close(now, moment, atol=1e-4, rtol=0)
-
-
-def test_euler_drifts_where_leapfrog_does_not() -> None:
-    rays, medium = make_rays([[-1.2, 0.6, 0.1]], [[1, 0.1, 0]], 0, 2.4), FunctionMedium(fisheye)
-    drift = {}
-    for integrator in (euler, leapfrog):
-        path = march_uniform(rays, medium, integrator, 257)
-        n, _ = medium(path.exit_positions)
-        before = torch.linalg.cross(path.positions[:, 0], rays.directions) * medium(path.positions[:, 0])[0]
-        after = torch.linalg.cross(path.exit_positions, path.exit_directions) * n
-        drift[integrator] = float((after - before).norm())
-    assert drift[euler] > 100 * drift[leapfrog]
-
-
-def test_reversed_path_returns_to_its_start() -> None:
-    medium = FunctionMedium(luneburg)
-    out = march_uniform(make_rays([[-0.9, 0.3, 0.1]], [[1, 0.2, 0]], 0, 1.5), medium, leapfrog, 400)
-    back = march_uniform(make_rays(out.exit_positions, -out.exit_directions, 0, 1.5), medium, leapfrog, 400)
-    torch.testing.assert_close(back.exit_positions, out.positions[:, 0], atol=1e-5, rtol=0)
-    torch.testing.assert_close(back.exit_directions, -out.directions[:, 0], atol=1e-5, rtol=0)
 
 
 # --- where n = 1 ---

@@ -56,12 +56,6 @@ def test_samples_stay_inside_at_both_ends_of_u() -> None:
     assert (s <= edges[:, -1:]).all()
 
 
-def test_ascending_u_gives_ascending_samples() -> None:
-    edges, weights = random_step_function(50, 40)
-    s = invert_cdf(edges.float(), weights.float(), spread_uniform(_paths(50), 128, example_draws(50)))
-    assert (s.diff(dim=1) >= -1e-6).all()
-
-
 def test_ray_without_weight_is_sampled_uniformly() -> None:
     edges = torch.tensor([[2.0, 3, 4, 5, 6]])
     u = torch.linspace(0, 0.999, 50)[None]
