@@ -54,22 +54,6 @@ def test_texel_centres_look_themselves_up() -> None:
     torch.testing.assert_close(found, texels, rtol=0, atol=1e-5)
 
 
-def test_padding_repeats_the_neighbouring_faces_outermost_texels() -> None:
-    # Independent of the construction: across an edge, the neighbour of a texel is the nearest one on another face.
-    n = 5
-    centres, padded = cube_map.texel_directions(n), cube_map.padded_texels(n)
-    assert torch.equal(padded[:, 1:-1, 1:-1].flatten(), torch.arange(6 * n * n, dtype=torch.int32))
-    face_of = torch.arange(6 * n * n) // (n * n)
-    edges = [(padded[:, 1, 1:-1], padded[:, 0, 1:-1]), (padded[:, -2, 1:-1], padded[:, -1, 1:-1])]
-    edges += [(padded[:, 1:-1, 1], padded[:, 1:-1, 0]), (padded[:, 1:-1, -2], padded[:, 1:-1, -1])]
-    for inner, outer in edges:
-        for own, neighbour in zip(inner.flatten().tolist(), outer.flatten().tolist(), strict=True):
-            closeness = centres @ centres[own]
-            best = closeness[face_of != face_of[own]].max()
-            assert face_of[own] != face_of[neighbour]
-            assert closeness[neighbour] > best - 1e-5
-
-
 @pytest.mark.parametrize("lookup", [cube_map.lookup, kernels.lookup])
 def test_lookup_is_continuous_across_seams_and_corners(lookup) -> None:
     # Great circles through edges and corners of the cube: values at most 1e-4 rad apart differ by no jump.
@@ -114,23 +98,3 @@ def test_gradients_are_those_of_differences() -> None:
         return cube_map.lookup(*cube_map.project(d), texels, PADDED, LEVELS)
 
     assert torch.autograd.gradcheck(sky, directions)
-
-
-def test_only_gradients_that_are_asked_for_are_computed(monkeypatch: pytest.MonkeyPatch) -> None:
-    done = []
-    for name in ("_backward", "_backward_to_coordinates"):
-        monkeypatch.setattr(kernels, name, lambda *arrays, name=name: done.append(name))
-    for places, texels in ((False, True), (True, False)):
-        face, coordinates = cube_map.project(random_directions(9))
-        inputs = coordinates.requires_grad_(places), random_texels().requires_grad_(texels)
-        kernels.lookup(face, *inputs, PADDED, LEVELS).sum().backward()
-    assert done == ["_backward", "_backward_to_coordinates"]
-
-
-def test_texels_have_similar_solid_angles() -> None:
-    # Count random directions by texel: the largest and smallest solid angle differ by less than 1.42 (sqrt 2).
-    n = 4
-    face, coordinates = cube_map.project(random_directions(600_000))
-    column, row = ((coordinates + 1) / 2 * n).long().clamp(0, n - 1).unbind(-1)
-    counts = torch.bincount((face * n + row) * n + column, minlength=6 * n * n).view(6, -1).sum(0).float()
-    assert counts.max() / counts.min() < 1.42

@@ -33,10 +33,6 @@ def test_it_starts_grey() -> None:
     assert torch.allclose(EnvironmentMap()(Exits(random_directions(10))), torch.full((10, 3), 0.25))
 
 
-def test_any_batch_shape_is_kept() -> None:
-    assert EnvironmentMap([4])(Exits(random_directions(12).view(3, 2, 2, 3))).shape == (3, 2, 2, 3)
-
-
 def test_compiled_and_plain_colours_agree() -> None:
     boundary = EnvironmentMap([4, 8])
     torch.nn.init.normal_(boundary.texels)
@@ -108,12 +104,6 @@ def test_sky_survives_a_file(tmp_path: Path, suffix: str, tolerance: float) -> N
     assert (restored(Exits(directions)) - smooth_sky(directions)).abs().max() < tolerance
 
 
-def test_sky_survives_openexr(tmp_path: Path) -> None:
-    lat_long.save_lat_long(tmp_path / "sky.exr", smooth_sky(lat_long.directions(16)))
-    restored = lat_long.load_lat_long(tmp_path / "sky.exr")
-    torch.testing.assert_close(restored, smooth_sky(lat_long.directions(16)), rtol=0, atol=1e-3)
-
-
 def test_a_finer_picture_is_averaged_not_sampled() -> None:
     # One-pixel stripes are far below the texture's resolution: every texel must become their mean.
     stripes = torch.zeros(256, 512, 3)
@@ -122,13 +112,6 @@ def test_a_finer_picture_is_averaged_not_sampled() -> None:
     boundary.set_lat_long(stripes)
     colours = boundary(Exits(cube_map.texel_directions(4)))
     torch.testing.assert_close(colours, torch.full_like(colours, 0.4), rtol=0, atol=0.01)
-
-
-def test_state_restores_the_sky() -> None:
-    boundary, other = EnvironmentMap([4, 8]), EnvironmentMap([4, 8])
-    torch.nn.init.normal_(boundary.texels)
-    other.load_state_dict(boundary.state_dict())
-    assert torch.equal(boundary.to_lat_long(8), other.to_lat_long(8))
 
 
 def test_bad_settings_and_files_are_refused(tmp_path: Path) -> None:
