@@ -39,14 +39,6 @@ def test_diverged_picture_is_refused_and_overwrites_nothing(tmp_path: Path, bad:
     assert load_png(tmp_path / "picture.png").max() == 0
 
 
-@pytest.mark.usefixtures("unchecked")
-def test_tensor_that_is_no_colour_picture_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(NerfroError, match=r"\[H, W, 3\], got \[3, 8, 8\]"):
-        save_png(tmp_path / "picture.png", torch.rand(3, 8, 8))
-    with pytest.raises(NerfroError, match="divide levels by 255"):
-        save_png(tmp_path / "picture.png", torch.zeros(8, 8, 3, dtype=torch.uint8))
-
-
 def test_unreadable_pictures_are_named(tmp_path: Path) -> None:
     with pytest.raises(NerfroError, match=r"missing\.png does not exist"):
         load_png(tmp_path / "missing.png")

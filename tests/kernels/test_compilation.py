@@ -12,7 +12,7 @@ import pytest
 
 import nerfro.fields.hash_encoding_cpu  # noqa: F401  # whose sources are listed
 from nerfro.kernels import compilation
-from nerfro.kernels.compilation import compiled, compiled_parallel, imported_sources
+from nerfro.kernels.compilation import compiled, compiled_parallel
 
 
 def _square(x: float) -> float:
@@ -64,10 +64,3 @@ def test_a_kernel_is_compiled_again_where_a_constant_of_another_file_has_changed
         (package / "numbers.py").write_text(f"FACTOR = {factor}\n")
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=100)
         assert done.stdout == f"{3 * factor}\n", done.stderr
-
-
-def test_sources_of_kernels_hold_all_that_their_module_imports_and_no_more() -> None:
-    sources = imported_sources("nerfro.fields.hash_encoding_cpu")
-    assert {"nerfro.fields.hash_encoding_cpu", "nerfro.fields.hash_encoding", compilation.__name__} <= sources.keys()
-    assert b"HASH_Y, HASH_Z = " in sources["nerfro.fields.hash_encoding"]
-    assert "nerfro.samplers.snell_cpu" not in sources

@@ -10,7 +10,6 @@ from torch import Tensor
 from nerfro.errors import NerfroError
 from nerfro.fields import relu_mlp
 from nerfro.fields.hash_grid import HashGridField
-from nerfro.kernels.precision import fast_bfloat16
 from nerfro.training.trainer import lightning_precision
 
 
@@ -47,7 +46,3 @@ def test_the_trainer_takes_the_fastest_where_it_is_told_to(has_units: bool) -> N
     assert named("fastest") == ("bf16-mixed" if has_units else "32-true")
     assert named("bf16-mixed") == "bf16-mixed"
     assert named("32-true") == "32-true"
-
-
-def test_devices_that_nobody_knows_multiply_in_float32() -> None:
-    assert not fast_bfloat16("mps")

@@ -69,13 +69,6 @@ def test_rendering_is_as_in_evaluation_and_leaves_the_mode_as_it_was(training: b
     assert not first.radiance.requires_grad
 
 
-def test_an_error_while_rendering_leaves_the_mode_as_it_was(parts: Components) -> None:
-    model = RefractiveModel(replace(parts, point_sampler=Stratified(7, draw="vertices"))).train()
-    with pytest.raises(Exception, match="needs a multiple of 7"):
-        model.render(example_rays())
-    assert model.training
-
-
 def test_chunks_bound_how_many_rays_are_rendered_at_once(parts: Components, monkeypatch: pytest.MonkeyPatch) -> None:
     model, sizes = RefractiveModel(parts).eval(), []
     whole = model(example_rays())  # 24 rays
@@ -96,11 +89,3 @@ def test_optimizer_gives_the_boundary_its_own_rate(parts: Components) -> None:
     assert {rates[id(p)] for p in model.scene.fields.parameters()} == {1e-3}
     assert {rates[id(p)] for p in model.scene.boundary.parameters()} == {1e-2}
     assert len(rates) == len(list(model.parameters())), "every weight is learned"
-
-
-def test_model_whose_boundary_has_no_weights_can_be_optimised(parts: Components) -> None:
-    assert set(RefractiveModel(replace(parts, boundary=Compass())).parameter_groups()) == {"fields"}
-
-
-def test_index_grid_does_not_burden_the_checkpoint(parts: Components) -> None:
-    assert not [name for name in RefractiveModel(parts).state_dict() if "medium" in name]
