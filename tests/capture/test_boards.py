@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from nerfro.capture.boards import draw_tag, tag_grid, twelve_faces
-from nerfro.capture.printing import print_sheets
-from nerfro.errors import NerfroError
 
 
 def test_positions_are_those_of_the_authors() -> None:
@@ -71,9 +67,3 @@ def test_detected_corners_are_those_of_the_drawing() -> None:
         offset = sighting.points - np.array(face.origin)
         expected = 36 + 12 * np.stack([offset @ face.right, offset @ face.down], 1) / board.module
         np.testing.assert_allclose(sighting.pixels, expected, atol=0.5)
-
-
-def test_a_board_in_millimetres_is_refused_before_it_is_drawn(tmp_path: Path) -> None:
-    with pytest.raises(NerfroError, match=r"the limit is 3 m; give size= in metres"):
-        print_sheets(twelve_faces(30.0).sheets(), tmp_path)
-    assert not list(tmp_path.iterdir())

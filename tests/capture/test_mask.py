@@ -163,21 +163,6 @@ def test_a_polygon_covers_the_pixels_whose_centres_it_contains() -> None:
     assert np.array_equal(polygon_mask(square, (9, 6)), expected)
 
 
-@pytest.mark.parametrize("rows", [slice(0, 12), slice(60, 72)])
-@pytest.mark.parametrize("columns", [slice(0, 12), slice(84, 96)])
-def test_a_mask_in_the_corner_is_reported_in_one_line(
-    rows: slice, columns: slice, capture: Path, command: Callable[..., str]
-) -> None:
-    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
-    mask[rows, columns] = 255
-    Image.fromarray(mask).save(capture / "photos" / "mask_p_1.png")
-    printed = command("mask", f"data.root={capture}")
-    assert (
-        "the outlined object is not found in other images by its colours; outline the whole object" in printed
-        or "check them in" in printed
-    )
-
-
 def test_mistakes_are_reported_in_one_line(capture: Path, command: Callable[..., str]) -> None:
     root = f"data.root={capture}"
     assert "no mask to start from" in command("mask", root)

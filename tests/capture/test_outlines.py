@@ -12,7 +12,6 @@ import trimesh
 from benchmarks.cameras import disturbed
 from nerfro.camera.least_squares import PriorInformation
 from nerfro.camera.refined import RefinedCamera
-from nerfro.camera.similarity import motion_between
 from nerfro.cameras import Cameras
 from nerfro.capture.outlines import align_to_outlines
 from nerfro.capture.visual_hull import Silhouettes
@@ -57,15 +56,6 @@ def test_disturbed_cameras_see_the_surface_where_it_is(too_wide: float) -> None:
     camera, seen = RefinedCamera(), silhouettes()
     met(camera, given, replace(seen, distances=seen.distances + too_wide))
     assert pixels_off(camera.estimated(given)) < 0.15 * pixels_off(given)
-
-
-def test_shifts_are_found_where_turns_are_known() -> None:
-    given = replace(TRUE, camera_to_world=disturbed(TRUE, 0.0, 0.01, 0).float())
-    camera = RefinedCamera()
-    met(camera, given, silhouettes(), [0, 1, 2])
-    before = motion_between(TRUE.camera_to_world, given.camera_to_world)[1]
-    after = motion_between(TRUE.camera_to_world, camera.estimated(given).camera_to_world)[1]
-    assert float(after.median()) < 0.15 * float(before.median())
 
 
 def test_cameras_stay_where_the_surface_is_another(capsys: pytest.CaptureFixture[str]) -> None:

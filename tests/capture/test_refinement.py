@@ -112,16 +112,6 @@ class PaintedShell(Room):
         return sky((exits.positions + away[:, None] * exits.directions) / self.RADIUS), away
 
 
-def test_a_dent_is_found_by_near_surroundings() -> None:
-    room = PaintedShell()
-    beside, through = divide_pixels(photographs_of(dented(), around=room), mesh())
-    silhouettes = Silhouettes.of(cameras(), mesh_silhouettes(mesh(), cameras(), 1).float())
-    around = Surroundings(room, None, 0.0, beside.radiance)
-    before = solid([1.5])
-    found = refine_surface(mesh(), before, silhouettes, through, around, settings=SHORT)
-    assert degrees_off(found.medium) < 0.4 * degrees_off(before)
-
-
 def test_a_backdrop_is_the_room_along_every_line() -> None:
     room = PaintedShell()
     middle = torch.tensor([0.1, -0.2, 0.05])

@@ -131,36 +131,6 @@ def test_body_that_reaches_the_box_is_closed_there() -> None:
     assert mesh.bounds[0] == pytest.approx([2.25, 2.75, 3.75])
 
 
-def test_fit_flattens_what_no_camera_looked_along() -> None:
-    box = trimesh.creation.box((1.2, 1.2, 1.2))
-    silhouettes = photographed(box, cameras_around(20, 48))
-    carved = hull(silhouettes, 32)
-    fitted = fit_surface(carved, silhouettes)
-    assert fitted.is_closed
-
-    def tilt(mesh: TriangleMesh) -> float:
-        """Mean angle of the middle of the sides to the axes, degrees."""
-        centre = mesh.triangles.mean(1)
-        middle = np.sort(np.abs(centre), axis=1)[:, 1] < 0.4
-        normals = np.cross(*np.diff(mesh.triangles[middle], axis=1).swapaxes(0, 1))
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        return float(np.degrees(np.arccos(np.abs(normals).max(1).clip(max=1))).mean())
-
-    assert tilt(fitted) < 0.35 * tilt(carved)
-    assert overlap(fitted, silhouettes, 64).min() > 0.95
-    assert volume(fitted) == pytest.approx(1.2**3, rel=0.03)
-
-
-@pytest.mark.parametrize("pixels", [64, 160])
-def test_fit_leaves_a_ball_in_its_outlines_however_many_pixels_it_fills(pixels: int) -> None:
-    silhouettes = photographed(trimesh.creation.icosphere(5, 0.7), cameras_around(20, pixels))
-    fitted = fit_surface(hull(silhouettes, 32), silhouettes)
-    radii = np.linalg.norm(fitted.vertices, axis=1)
-    assert radii.mean() == pytest.approx(0.7, rel=0.006)
-    assert radii.std() < 0.008
-    assert overlap(fitted, silhouettes, 64).min() > 0.97
-
-
 def test_fit_is_smooth_though_marching_cubes_triangles_are_not_alike() -> None:
     silhouettes = photographed_softly(trimesh.creation.icosphere(5, 0.7), cameras_around(24, 48))
     fitted = fit_surface(hull(silhouettes, 32), silhouettes)
