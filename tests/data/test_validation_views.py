@@ -14,7 +14,6 @@ import nerfro
 from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
 from nerfro.data.validation_views import WithValidationViews, spread
-from nerfro.errors import NerfroError
 from nerfro.training.ray_batches import RayBatches
 
 
@@ -97,9 +96,3 @@ def test_numbers_that_cannot_be_held_back_are_refused_in_one_line(
     assert finished.code == 1
     assert message in finished.err
     assert finished.err.count("\n") == 1
-
-
-def test_holding_back_all_is_refused(tiny_scene: Path) -> None:
-    for split in ("train", "val"):
-        with pytest.raises(NerfroError, match="leaves no view"):
-            WithValidationViews(BlenderData(str(tiny_scene)), 4).load(split)
