@@ -15,9 +15,3 @@ def test_auto_trains_on_the_cpu_and_says_so_where_there_is_a_gpu(
         monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
         assert training_accelerator("auto") == "cpu"
         assert capsys.readouterr().out.count("trainer.accelerator=gpu") == int(there)
-
-
-def test_a_named_accelerator_is_used(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    assert training_accelerator("gpu") == "gpu"
-    assert not capsys.readouterr().out

@@ -42,18 +42,6 @@ def test_the_boundary_alone_has_learned_before_the_first_step(weights: Callable[
     assert changed == {"renderer.scene.boundary.texels"}
 
 
-def test_a_run_that_goes_on_does_not_learn_it_again(
-    weights: Callable[..., dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    weights("run", "optimizer.boundary_steps=5")
-
-    def never(*given: object) -> None:
-        raise AssertionError("pixels beside the object were asked for")
-
-    monkeypatch.setattr(RayBatches, "missing", never)
-    weights("run", "optimizer.boundary_steps=5", "ckpt_path=last", "trainer.max_steps=2")
-
-
 def test_rays_that_miss_a_box_have_their_own_colours(tiny_scene: Path) -> None:
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
     batches = RayBatches(views, 16, "all_images")

@@ -40,12 +40,6 @@ def test_what_autograd_keeps_is_counted_and_grows_with_the_network() -> None:
     assert memory._kept_bytes(model_of(64), rays[:4]) == pytest.approx(kept[0], rel=0.1)
 
 
-def test_counting_draws_no_random_numbers() -> None:
-    model, before = model_of(16), torch.get_rng_state()
-    require_memory(model, example_rays(), torch.device("cpu"))
-    assert torch.equal(torch.get_rng_state(), before)
-
-
 def test_run_that_does_not_fit_is_refused_with_what_to_change(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "available_bytes", lambda: 1e6)
     with pytest.raises(NerfroError, match=r"needs about \d.* kB are for each ray: take a smaller batches\.size"):

@@ -41,10 +41,6 @@ def test_warm_up_rises_as_a_quarter_of_a_sine() -> None:
     assert learning_rate_factor(1000, 0.5, constant) == 1
 
 
-def test_without_warm_up_the_first_step_has_the_full_rate() -> None:
-    assert learning_rate_factor(0, 0.0, OptimizerConfig(warmup_steps=0)) == 1
-
-
 def run(step: int, max_steps: int, timer: Timer | None = None) -> Any:
     return Mock(spec=Trainer, global_step=step, max_steps=max_steps, callbacks=[] if timer is None else [timer])
 

@@ -218,14 +218,6 @@ def test_jittered_rays_stay_inside_their_pixels_and_fill_them(views):
     assert torch.allclose(offset.std(0), torch.tensor(12**-0.5), atol=0.02)
 
 
-def test_making_a_batch_never_waits_for_the_device(views):
-    batches = RayBatches(views, 30, seed=0, precrop_steps=1, jitter=True)
-    there = batches.to("meta")
-    assert there.batch(0).rgb.device.type == "meta"
-    assert there.batch(1).rays.radii.device.type == "meta"
-    assert batches.batch(0).rgb.device.type == "cpu"
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -256,14 +248,6 @@ def test_batches_hold_all_polylines_of_their_rays(views):
     assert len(again.ray) > 1.5 * len(batch.rays)
     for name in ("ray", "exit_directions", "throughput"):
         torch.testing.assert_close(getattr(batch.path, name), getattr(again, name))
-
-
-def test_smaller_sequence_has_its_share_of_a_process(views):
-    batches = RayBatches(views, 40, "all_images", seed=3)
-    assert len(batches.smaller(100).batch(0).rays) == 40
-    assert len(batches.smaller(10).batch(0).rays) == 10
-    assert [len(batches.share(rank, 2).smaller(10).batch(0).rays) for rank in range(2)] == [5, 5]
-    assert len(batches.batch(0).rays) == 40, "the sequence itself stays"
 
 
 @pytest.mark.parametrize("jitter", [False, True])

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover
 from nerfro.training.config import TrainConfig
-from nerfro.training.settings import _NAMED, RESULT, RESUMING, TABLE_ROW, Role, first_difference, role, settings
+from nerfro.training.settings import _NAMED, RESUMING, Role, first_difference, role, settings
 
 
 def test_every_setting_that_is_named_exists() -> None:
@@ -41,12 +41,6 @@ def test_every_setting_that_is_named_exists() -> None:
 )
 def test_the_longest_name_decides(name: str, expected: Role) -> None:
     assert role(name) is expected
-
-
-def test_what_agrees_for_a_result_agrees_for_resuming_and_in_a_row() -> None:
-    assert RESUMING < RESULT
-    assert TABLE_ROW < RESULT
-    assert not RESULT & {Role.MACHINE, Role.WATCHING}
 
 
 def test_settings_are_flat_and_their_first_difference_is_named() -> None:

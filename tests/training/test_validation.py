@@ -191,15 +191,6 @@ def rays_of_pixels(rays: Rays, index: torch.Tensor) -> dict[int, torch.Tensor]:
     return {pixel: rays.directions[index == pixel] for pixel in index.tolist()}
 
 
-def test_many_views_cost_no_more_than_few(tiny_scene: Path) -> None:
-    views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val")
-    many = Views(views.cameras.select([0] * 100), torch.rand(100, 16, 16, 3), None, ["a"] * 100)
-    watched = ValidationPixels.of(many)
-    seen = (watched.index // 256).unique()
-    assert len(watched.index) == 2048
-    assert (len(seen), seen[0], seen[-1]) == (32, 0, 99)
-
-
 @pytest.mark.parametrize(("every", "looks"), [(0, 0), (1, 1), (4, 1), (11, 2), (500, 100)])
 def test_looks_come_five_times_as_often_as_pictures(every: int, looks: int, tiny_scene: Path) -> None:
     assert validation_interval(every) == looks
