@@ -8,7 +8,7 @@ import torch
 
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.types import Exits
-from nerfro.viewing.baking import _occupied_bricks, bake_sky, cube_directions
+from nerfro.viewing.baking import bake_sky, cube_directions
 
 
 def gl_face(direction: np.ndarray) -> tuple[int, float, float]:
@@ -43,14 +43,3 @@ def test_sky_is_the_boundary() -> None:
     found = (upper * 2 + (rest >> [0, 1, 2] & 1)) * 2.0 ** ((rest >> 3) - 24)
     radiance = boundary(Exits(cube_directions(8))).detach().view(6, 8, 8, 3).numpy()
     assert (np.abs(found - radiance) <= radiance.max(-1, keepdims=True) / 500).all()
-
-
-def test_bricks_hold_all_that_interpolation_reads() -> None:
-    levels = np.zeros((18, 9, 9), np.uint8)
-    levels[9, 0, 8] = 1
-    bricks = _occupied_bricks(levels)
-    assert bricks.shape == (3, 1, 1)
-    # Seventeen cells in three parts: that of vertices 5.67 to 11.33 alone holds cells beside vertex 9.
-    assert bricks[:, 0, 0].tolist() == [0, 1, 0]
-    levels[6] = 1
-    assert _occupied_bricks(levels)[:, 0, 0].tolist() == [1, 1, 0]

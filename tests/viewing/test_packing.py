@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerfro.viewing.packing import pack, shared_exponent, two_bytes
+from nerfro.viewing.packing import pack, shared_exponent
 
 
 def unpacked(uri: str, shape: tuple[int, int, int]) -> np.ndarray:
@@ -32,12 +32,6 @@ def test_pack_keeps_every_byte(shape: tuple[int, ...]) -> None:
     found = unpacked(pack(voxels), shape[:3])
     np.testing.assert_array_equal(found[..., : shape[3]], voxels)
     assert not found[..., shape[3] :].any()
-
-
-def test_two_bytes_hold_whole_numbers() -> None:
-    steps = np.array([-32767, -1, 0, 1, 300, 32767])
-    upper, lower = two_bytes(steps).astype(int).T
-    np.testing.assert_array_equal(upper * 256 + lower - 32768, steps)
 
 
 def test_shared_exponent_is_as_near_as_nine_bits_are() -> None:

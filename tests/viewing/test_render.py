@@ -89,14 +89,6 @@ def test_an_interrupted_rendering_goes_on_and_another_is_not_mixed_in(render: Ca
     assert not np.array_equal(read("O/frame_0001.png"), whole)
 
 
-def test_test_views_are_those_of_the_scene(render: Callable[..., tuple[int, str]], scene: TrainedScene) -> None:
-    assert render("views=test", "resolution=null")[0] == 0
-    ours = scene.render(scene.cameras(), Subdivision()).rgb
-    for view in range(3):
-        np.testing.assert_allclose(read(f"O/test_{view:03d}.png"), 255 * ours[view], atol=0.51)
-    assert not Path("O/film.mp4").exists()
-
-
 def test_a_still_from_numbers_shows_what_lies_there(render: Callable[..., tuple[int, str]]) -> None:
     assert render("position=[0,0,5]", "target=[0,0,0]", "fov=10", "what=inside", "resolution=8")[0] == 0
     # The ball's top is at z = 0.35, and its colour is 0.4 + 0.5 of the place.

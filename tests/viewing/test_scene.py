@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -77,12 +76,6 @@ def test_without_glass_things_lie_where_straight_rays_meet_them(scene: TrainedSc
     assert not rendered.normals.any()
 
 
-def test_glass_of_the_index_of_air_is_no_glass(scene: TrainedScene) -> None:
-    camera = scene.cameras().select([1])
-    air, nothing = scene.with_(ior=1.0).render(camera), scene.with_(glass=False).render(camera)
-    torch.testing.assert_close(air.rgb, nothing.rgb, atol=1e-5, rtol=0)
-
-
 def test_a_changed_scene_leaves_the_first_as_it_was(scene: TrainedScene) -> None:
     camera = scene.cameras().select([0])
     before = scene.render(camera).rgb
@@ -145,24 +138,6 @@ def test_rays_that_pass_the_object_are_not_sampled_and_look_the_same(
     for one, other in zip(skipped, whole, strict=True):
         torch.testing.assert_close(one, other, atol=1e-6, rtol=1e-5)
     assert (skipped.opacity > 0.9).any()
-
-
-def test_all_rays_are_sampled_where_a_field_has_no_bounds(scene: TrainedScene) -> None:
-    rays = scene.cameras().image_rays(0)
-    path = scene.renderer.trace(rays)
-    assert scene.renderer._may_meet(rays, path).all()
-    bounded = with_changed_scene(scene.renderer, fields=torch.nn.ModuleList([Bounded()]))
-    assert not bounded._may_meet(rays, path).all()
-    both = with_changed_scene(scene.renderer, fields=torch.nn.ModuleList([Bounded(), scene.field]))
-    assert both._may_meet(rays, path).all()
-
-
-def test_the_surface_is_that_of_the_ball_with_its_normals(scene: TrainedScene) -> None:
-    (mesh,) = scene.surface
-    assert mesh.is_closed
-    assert abs(torch.from_numpy(mesh.vertices).norm(dim=-1) - RADIUS).max() < 1e-4
-    cosine = (torch.from_numpy(mesh.normals) * torch.from_numpy(mesh.triangles) / RADIUS).sum(-1)
-    assert float(cosine.min()) > math.cos(math.radians(0.1))
 
 
 @pytest.mark.parametrize(
