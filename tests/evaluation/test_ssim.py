@@ -74,6 +74,15 @@ def test_ms_ssim_is_that_of_scikit_images_maps(masked: bool) -> None:
         assert ms_ssim(prediction, target).item() == pytest.approx(expected, abs=1e-6)
 
 
+def test_ms_ssim_is_that_of_pytorch_msssim() -> None:
+    theirs = pytest.importorskip("pytorch_msssim")
+    prediction, target = pictures(height=192, width=176)
+    batches = [image.double().permute(2, 0, 1)[None] for image in (prediction, target)]
+    expected = theirs.ms_ssim(*batches, data_range=1.0)
+    # Its window is computed in single precision.
+    assert ms_ssim(prediction, target).item() == pytest.approx(expected.item(), abs=2e-5)
+
+
 def test_ms_ssim_of_equal_pictures_is_one_and_opposite_ones_have_none() -> None:
     _, target = pictures(height=200, width=190)
     assert ms_ssim(target, target).item() == pytest.approx(1)
