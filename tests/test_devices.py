@@ -36,7 +36,6 @@ SELECTED = "fields/selection.py: evaluate_selected (nonzero)"
     ("experiment", "waits"),
     [
         (["refractive", "sampler.path.max_events=2"], {ONCE, SELECTED}),
-        (["refractive", "sampler/path=eikonal", "sampler.path.max_steps=60"], {ONCE, SELECTED}),
         (["refractive", "sampler.path.interface=mesh"], {ONCE, SELECTED, *TO_CPU}),
         (["refractive_room", "sampler.path.max_events=2"], {ONCE}),
         (["straight"], {ONCE}),

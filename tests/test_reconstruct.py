@@ -244,12 +244,10 @@ def test_what_was_found_chooses_the_experiment(
     [
         ((), "set out=FOLDER, and images=PHOTOS"),
         (("images=PHOTOS", "data.root=PHOTOS"), "images= and video= are for photographs without poses"),
-        (("video=PHOTOS", "data=blender"), "images= and video= are for photographs without poses"),
         (("images=PHOTOS", "video=PHOTOS"), "images= and video= are both given"),
         (("video=PHOTOS/none.mp4",), "none.mp4 does not exist; give a video file, or images=FOLDER for photographs"),
         (("images=PHOTOS",), "the photographs have no masks; draw the outline of the object in two to five images of"),
         (("data.root=PHOTOS", "masks=PHOTOS"), "masks= needs images="),
-        (("images=PHOTOS", "masks=PHOTOS/none"), "none is not a folder; give the folder of the masks"),
         (("images=PHOTOS/none",), "none is not a folder; it should hold the images"),
     ],
 )
