@@ -66,10 +66,9 @@ def degrees_off(medium: SdfGrid, num_views: int = 6) -> float:
     return float(torch.rad2deg(torch.cat(errors)).median())
 
 
-@pytest.mark.parametrize("ior", [None, 1.49])
-def test_a_dent_is_found(ior: float | None) -> None:
-    before = solid([ior or 1.5])
-    found = refined(before, learn_index=ior is not None)
+def test_a_dent_is_found_though_the_index_is_off() -> None:
+    before = solid([1.49])
+    found = refined(before, learn_index=True)
     assert degrees_off(found.medium) < 0.4 * degrees_off(before)
     assert min(found.errors) < 0.6 * found.errors[0]
     # The mesh is the medium's surface, dented where the ball was.
