@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import linecache
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +19,10 @@ NOTEBOOKS = sorted((PACKAGE_DIR.parent / "docs" / "notebooks").glob("*.ipynb"))
 
 @pytest.mark.skipif(not NOTEBOOKS, reason="there is no checkout with docs")
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook_runs(
-    notebook: Path,
-    train_here: Callable[..., Any],
-    tiny_default_run: list[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_notebook_runs(notebook: Path, trained_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import matplotlib.pyplot as plt
 
-    run = tmp_path / "run"
-    assert train_here(*tiny_default_run, "trainer.max_steps=2", f"hydra.run.dir={run}").code == 0
-    monkeypatch.setenv("NERFRO_RUN", str(run))
+    monkeypatch.setenv("NERFRO_RUN", str(trained_run))
     monkeypatch.setenv("MPLBACKEND", "agg")
     monkeypatch.chdir(tmp_path)
     plt.switch_backend("agg")
