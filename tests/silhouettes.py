@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import torch
 import trimesh
+from matplotlib.path import Path as Polygon
+from scipy.spatial import ConvexHull
 
 from nerfro.cameras import Cameras
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.visual_hull import Silhouettes, carve_mesh, find_box
+from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh
 
 
@@ -41,6 +44,26 @@ def hull(silhouettes: Silhouettes, resolution: int, wrong_masks: int = 0) -> Tri
     carved = carve_mesh(silhouettes, find_box(silhouettes, wrong_masks), resolution, wrong_masks)
     assert carved is not None
     return carved
+
+
+def outline_of(points: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Pixels whose centres lie in the convex hull of points of the picture."""
+    centres = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
+    outline = Polygon(points[ConvexHull(points).vertices])
+    return outline.contains_points(centres.reshape(-1, 2)).reshape(height, width)
+
+
+def overlaps_of_convex_body(views: Views, vertices: np.ndarray) -> list[float]:
+    """Intersection over union of each mask with the hull of the vertices that its camera sees."""
+    assert views.masks is not None
+    pixels, depth = views.cameras.project(torch.from_numpy(vertices).float())
+    assert (depth > 0).all()
+    overlaps = []
+    for place, mask in zip(pixels.numpy(), views.masks, strict=True):
+        seen = mask.numpy() > 0.5
+        expected = outline_of(place, *seen.shape)
+        overlaps.append((seen & expected).sum() / (seen | expected).sum())
+    return overlaps
 
 
 def volume(mesh: TriangleMesh) -> float:
