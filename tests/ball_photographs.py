@@ -88,13 +88,13 @@ def mesh() -> TriangleMesh:
 
 
 def save(views: Views, root: Path) -> None:
-    """Write a split `train` in Blender format, and the ball's mesh."""
+    """Write a split `train` in Blender format, and the mesh of the larger ball."""
     frames = []
     for view, image in enumerate(views.images):
         save_png(root / "train" / f"r_{view}.png", image)
         pose = torch.eye(4)
         pose[:3] = views.cameras.camera_to_world[view]
         frames.append({"file_path": f"./train/r_{view}", "transform_matrix": pose.tolist()})
-    angle = 2 * math.atan(0.5 * SIZE / float(views.cameras.fx[0]))
+    angle = 2 * math.atan(0.5 * views.cameras.width / float(views.cameras.fx[0]))
     (root / "transforms_train.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
     mesh().save(root / "mesh.ply")

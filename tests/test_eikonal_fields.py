@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from nerfro.boundaries.constant import ConstantBoundary
-from nerfro.cameras import Cameras
+from nerfro.data.base import Views
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.fields.nerf import NerfField
@@ -35,7 +34,9 @@ from nerfro.training.module import TrainingModule
 from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.run_folder import load_checkpoint, restore
 from nerfro.types import Radiance, Samples
+from tests.ball_photographs import save
 from tests.closed_forms import Luneburg
+from tests.silhouettes import cameras_around
 
 discover()
 IndexField = find("medium", "index_field").cls
@@ -274,7 +275,8 @@ def test_the_index_of_a_homogeneous_ball_is_recovered(train_here: Callable[..., 
 
     The ball's surface is a shell in which the index rises smoothly, because a smooth field cannot be sharp.
     """
-    write_ball_scene(tmp_path / "ball")
+    save(ball_scene(), tmp_path / "ball")
+    save_png(tmp_path / "sky.png", ball_sky(lat_long.directions(128)))
     side = RADIUS + SHELL
     finished = train_here(
         "+experiment=eikonal_fields",
@@ -282,6 +284,9 @@ def test_the_index_of_a_homogeneous_ball_is_recovered(train_here: Callable[..., 
         "medium={mesh: null, width: 24, depth: 3, octaves: 3}",
         f"medium.box_min=[-{side},-{side},-{side}]",
         f"medium.box_max=[{side},{side},{side}]",
+        "data.near=2",
+        "data.far=6",
+        "evaluation.split=train",
         "sampler.path.num_steps=24",
         "boundary.resolutions=[64]",
         f"boundary.image={tmp_path / 'sky.png'}",
@@ -312,23 +317,11 @@ def ball_sky(directions: Tensor) -> Tensor:
     return colour + 0.1 * torch.sin(5 * directions @ waves.roll(1, 0).T)
 
 
-def write_ball_scene(root: Path) -> None:
-    """A Blender-format folder of a ball before `ball_sky`, and that sky as a picture beside the folder."""
-    size, num_views, half_width = 20, 12, 0.2
-    save_png(root.parent / "sky.png", ball_sky(lat_long.directions(128)))
-    origins = 3 * torch.nn.functional.normalize(torch.randn(num_views, 3), dim=-1)
-    back = torch.nn.functional.normalize(origins, dim=-1)
-    right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([[0.1, 0.3, 1.0]]), back), dim=-1)
-    poses = torch.stack([right, torch.linalg.cross(back, right), back, origins], -1)
-    focal = torch.full((num_views,), 0.5 * size / half_width)
-    centre = torch.full((num_views,), 0.5 * size)
-    cameras = Cameras(poses, focal, focal, centre, centre, size, size, near=2.0, far=6.0)
-    for split, views in (("train", range(num_views)), ("test", range(1))):
-        frames = []
-        for view in views:
-            path = Eikonal()(cameras.image_rays(view), Ball(RADIUS, IOR, SHELL))
-            save_png(root / split / f"r_{view}.png", ball_sky(path.exit_directions).view(size, size, 3))
-            pose = [*poses[view].tolist(), [0, 0, 0, 1]]
-            frames.append({"file_path": f"./{split}/r_{view}", "transform_matrix": pose})
-        document = {"camera_angle_x": 2 * math.atan(half_width), "frames": frames}
-        (root / f"transforms_{split}.json").write_text(json.dumps(document))
+def ball_scene() -> Views:
+    """Photographs of a ball before `ball_sky`."""
+    cameras = cameras_around(12, 20, distance=3.0, focal=2.5)
+    images = []
+    for view in range(len(cameras)):
+        path = Eikonal()(cameras.image_rays(view), Ball(RADIUS, IOR, SHELL))
+        images.append(ball_sky(path.exit_directions).view(20, 20, 3))
+    return Views(cameras, torch.stack(images), None, [str(view) for view in range(len(cameras))])
