@@ -67,14 +67,6 @@ def test_short_runs_score_one_view(options: list[str], steps: int, train: Callab
     assert (tmp_path / "run" / "images" / "test_000.png").is_file()
 
 
-def test_a_profile_is_printed_and_written(train: Callable[..., Any], tmp_path: Path) -> None:
-    finished = train("trainer.max_steps=2", "trainer.profiler=simple")
-    assert finished.code == 0, finished.err
-    (report,) = (tmp_path / "run" / "profile").glob("*.txt")
-    assert "run_training_batch" in report.read_text()
-    assert "run_training_batch" in finished.out
-
-
 def test_overfitting_repeats_batches(train: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
     drawn, batch = [], RayBatches.batch
 
@@ -88,11 +80,17 @@ def test_overfitting_repeats_batches(train: Callable[..., Any], monkeypatch: pyt
     assert set(drawn) <= {0, 1, 2}  # the thread that traces ahead draws one more
 
 
-def test_runs_without_bar_and_without_checkpoints(train: Callable[..., Any], tmp_path: Path) -> None:
-    finished = train("trainer.max_steps=2", "trainer.enable_progress_bar=false", "trainer.enable_checkpointing=false")
+def test_a_run_is_profiled_and_has_neither_bar_nor_checkpoints_on_its_way(
+    train: Callable[..., Any], tmp_path: Path
+) -> None:
+    quiet = ["trainer.enable_progress_bar=false", "trainer.enable_checkpointing=false"]
+    finished = train("trainer.max_steps=2", "trainer.profiler=simple", *quiet)
     assert finished.code == 0, finished.err
     assert "train PSNR" not in finished.err
     assert (tmp_path / "run" / "checkpoints" / "last.ckpt").is_file()  # written at the end
+    (report,) = (tmp_path / "run" / "profile").glob("*.txt")
+    assert "run_training_batch" in report.read_text()
+    assert "run_training_batch" in finished.out
 
 
 @pytest.mark.usefixtures("restored_registry")
