@@ -24,11 +24,12 @@ from PIL import Image
 
 from nerfro.evaluation.crops import most_different_crop
 from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, squared_error_map
-from nerfro.evaluation.results import METRICS, RunMetrics, read_metrics_json
+from nerfro.evaluation.results import RunMetrics, read_metrics_json
 from nerfro.evaluation.tables import Column, Row, Table, to_markdown
 from nerfro.files.drawing import magma, sheet
 from nerfro.files.images import load_png, save_image
 from nerfro.paths import ASSETS_DIR
+from nerfro.report.comparison import find_metrics
 
 METHODS = {
     "mipnerf": "mip-NeRF",
@@ -89,17 +90,17 @@ def one_core(core: int | None) -> Iterator[None]:
 
 def table(metrics: dict[str, RunMetrics]) -> Table:
     """Tabulate mean scores, optimizer steps and rays per second by the clock."""
-    shown = [metric for metric in METRICS if metric.name in ("psnr", "ssim", "lpips")]
+    shown = find_metrics(["psnr", "ssim", "lpips"])
     columns = (
-        *(Column(metric.title, metric.better, metric.decimals) for metric in shown),
+        *(Column(metric.title, metric.better, metric.decimals) for metric in shown.values()),
         Column("steps", None, 0),
         Column("rays/s", None, 0),
     )
     rows = [
-        Row(METHODS[name], (*(run.result.mean(metric.name) for metric in shown), run.steps, run.rays_per_second))
+        Row(METHODS[name], (*(run.result.mean(metric) for metric in shown), run.steps, run.rays_per_second))
         for name, run in metrics.items()
     ]
-    reasons = [(metric, run.result.notes.get(metric.name)) for metric in shown for run in metrics.values()]
+    reasons = [(metric, run.result.notes.get(name)) for name, metric in shown.items() for run in metrics.values()]
     notes = dict.fromkeys(f"{metric.title} n/a: {reason}" for metric, reason in reasons if reason is not None)
     return Table("Embedded torus, 20 test views", "method", columns, tuple(rows), mark="best", notes=tuple(notes))
 

@@ -93,8 +93,8 @@ def plugins_page() -> str:
         "`python -m nerfro.plugins` prints the same list, including your own plugins.\n",
     ]
     for kind in KINDS:
-        choose = _CHOOSE.get(kind, f"{kind}=NAME")
-        text.append(f"## {kind}\n\nChoose with `{choose}`.\n")
+        choose = f"Choose with `{_CHOOSE.get(kind, f'{kind}=NAME')}`."
+        text.append(f"## {kind}\n\n{'Every metric is scored.' if kind == 'metric' else choose}\n")
         for plugin in plugins(kind):
             if ".example_" not in plugin.target:  # templates
                 text.append(_plugin(plugin))

@@ -128,7 +128,7 @@ def check_names(config: DictConfig, prefix: str = "", groups: Sequence[str] = ()
         config: the configuration.
         prefix: full name of the node, with a dot at the end.
         groups: names of configuration groups, which the error message may suggest.
-        also: further names that the root may have.
+        also: further names that the root may have; nodes with these names are not checked.
 
     Raises:
         NerfroError: a name is unknown.
@@ -139,7 +139,9 @@ def check_names(config: DictConfig, prefix: str = "", groups: Sequence[str] = ()
         name = str(key)
         if fields is not None and name not in (*fields, *also):
             raise NerfroError(f"{prefix}{name} is not a setting; {nearest_of(name, [*fields, *groups])}")
-        if isinstance(node, DictConfig) and not (node._is_none() or node._is_missing() or node._is_interpolation()):
+        if not isinstance(node, DictConfig) or name in also:
+            continue
+        if not (node._is_none() or node._is_missing() or node._is_interpolation()):
             check_names(node, f"{prefix}{name}.")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
 import errno
 import functools
@@ -14,7 +15,7 @@ import tempfile
 import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NoReturn, cast
+from typing import ClassVar, NoReturn, cast
 
 import hydra
 import hydra._internal.hydra
@@ -24,9 +25,11 @@ from hydra._internal.sources_registry import SourcesRegistry
 from hydra._internal.utils import get_args_parser
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, OverrideParseException
 from hydra.plugins.config_source import ConfigResult
-from omegaconf import DictConfig, OmegaConf
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf, flag_override
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from nerfro.allowed import check_names, check_settings
@@ -89,8 +92,12 @@ RENAMED: dict[str, str | None] = {
 
 
 def entry_point(
-    config_name: str, schema: type, config_dir: Path = CONF_DIR, verbatim: tuple[str, ...] = ()
-) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
+    config_name: str,
+    schema: type,
+    config_dir: Path = CONF_DIR,
+    verbatim: tuple[str, ...] = (),
+    check: Callable[[DictConfig], None] | None = None,
+) -> Callable[[Callable[[DictConfig], float | None]], Callable[[], None]]:
     """Decorate the main function of a command, which receives a checked configuration.
 
     The defaults list of the YAML file must begin with `<config_name>_schema`. Otherwise Hydra does not refuse misspelt
@@ -101,17 +108,27 @@ def entry_point(
         schema: dataclass of the root.
         config_dir: conf/, or a folder in it for a command that must not see the groups of conf/.
         verbatim: keys whose values are texts that may contain commas and equals signs, which Hydra would parse.
+        check: further check of the configuration.
     """
 
-    def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
+    def decorate(task: Callable[[DictConfig], float | None]) -> Callable[[], None]:
+        def check_all(config: DictConfig) -> None:
+            check_configuration(config, schema, config_dir)
+            if check is not None:
+                check(config)
+
         @functools.wraps(task)
-        def job(config: DictConfig) -> None:
-            with errors_in_one_line():  # here too, because Hydra prints a line of its own for errors of the job
-                check_names(config, groups=[path.name for path in config_dir.iterdir() if path.is_dir()])
-                # Hydra adds the group `env`, which its dataclass lacks.
-                check_names(cast(DictConfig, HydraConfig.get()), "hydra.", also=["env"])
-                check_settings(config, schema)
-                task(config)
+        def job(config: DictConfig) -> float | None:
+            if HydraConfig.get().mode != RunMode.MULTIRUN:
+                with errors_in_one_line():  # here too, because Hydra prints a line of its own for errors of the job
+                    return task(config)
+            discover()  # the process may be a launcher's worker
+            try:
+                return task(config)
+            except Exception as error:  # Hydra's sweepers continue with the other jobs
+                line = f"{Path(HydraConfig.get().runtime.output_dir).name}: {in_one_line(error)}"
+                print(f"nerfro: error: {line}", file=sys.stderr, flush=True)
+                raise NerfroError(line) from None
 
         @functools.wraps(task)
         def run() -> None:
@@ -122,7 +139,8 @@ def entry_point(
                 ConfigStore.instance().store(name=f"{config_name}_schema", node=schema, provider="nerfro")
                 SourcesRegistry.instance().types["file"] = _RenamingFiles
                 leave_current_directory()
-                hydra._internal.hydra.ConfigLoaderImpl = GuardedConfigLoader  # type: ignore[misc]
+                _ConfigLoader.check_job = staticmethod(check_all)
+                hydra._internal.hydra.ConfigLoaderImpl = _ConfigLoader  # type: ignore[misc]
                 discover()
                 sys.argv[1:] = [_quoted(renamed_override(argument), verbatim) for argument in sys.argv[1:]]
                 try:
@@ -142,6 +160,16 @@ def entry_point(
         return run
 
     return decorate
+
+
+def check_configuration(config: DictConfig, schema: type, config_dir: Path) -> None:
+    """Refuse settings whose names or values the dataclass of a command does not allow.
+
+    Raises:
+        NerfroError: a setting is not allowed.
+    """
+    check_names(config, groups=[path.name for path in config_dir.iterdir() if path.is_dir()])
+    check_settings(config, schema)
 
 
 def _flags_first(arguments: list[str]) -> list[str]:
@@ -285,6 +313,33 @@ def renamed_config(config: DictConfig, origin: Path) -> DictConfig:
     if found:
         warn(f"{origin} has old names of settings, which can be read for one more release: {', '.join(found)}")
     return config
+
+
+class _ConfigLoader(GuardedConfigLoader):
+    """Composition of a configuration, also of each job of a sweep, with the checks of the command."""
+
+    check_job: ClassVar[Callable[[DictConfig], None]]
+
+    def check(self, config: DictConfig) -> None:
+        # Hydra adds the group `env`, and the options of plugins of other packages are theirs to check.
+        check_names(config.hydra, "hydra.", also=["env", "sweeper", "launcher"])
+        job = copy.deepcopy(config)
+        with flag_override(job, ["struct", "readonly"], False):
+            del job["hydra"]
+        type(self).check_job(job)
+
+    def load_sweep_config(self, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
+        """Compose the configuration of a job; its `hydra.job.override_dirname` names what differs between jobs."""
+        overrides = [renamed_override(override) for override in sweep_overrides]
+        config = super().load_sweep_config(master_config, overrides)
+        excluded = config.hydra.job.config.override_dirname.exclude_keys
+        given = OverridesParser.create().parse_overrides(list(master_config.hydra.overrides.task))
+        # As sweepers write them: `debug=true` becomes `debug=True`.
+        common = {f"{o.get_key_element()}={o.get_value_element_as_str()}" for o in given if not o.is_sweep_override()}
+        swept = (override.partition("=") for override in overrides if override not in common)
+        parts = [f"-{key.lstrip('+').rpartition('.')[2]}={value}" for key, _, value in swept if key not in excluded]
+        config.hydra.job.override_dirname = re.sub(r"[^\w.=+-]+", "_", "".join(parts)).rstrip("_")
+        return config
 
 
 class _RenamingFiles(FileConfigSource):

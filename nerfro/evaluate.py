@@ -59,7 +59,8 @@ def _evaluate_checkpoint(config: DictConfig) -> None:
             prediction = load_png(folder / "images" / f"{view.name}.png")
             write_error_sheet(folder, view.name, prediction, views.images[index], networks)
         spent = Throughput()
-        spent.load_state_dict(checkpoint["callbacks"]["Throughput"])
+        if "Throughput" in checkpoint["callbacks"]:  # absent if another Trainer has trained the module
+            spent.load_state_dict(checkpoint["callbacks"]["Throughput"])
         title = f"{trained.name} on {trained.data.root}, {config.split} views"
         spending = checkpoint["global_step"], spent.seconds, spent.rays_per_second
         report(RunMetrics(result, *spending, treated), title, folder)

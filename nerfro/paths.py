@@ -29,6 +29,11 @@ def resolve_path(location: str | Path) -> Path:
     return ASSETS_DIR / name
 
 
+def scene_name(root: str | Path) -> str:
+    """Return the name of the scene in a data folder: the last component of its path."""
+    return Path(str(root).removeprefix(EMBEDDED_PREFIX)).name
+
+
 def user_path(location: str | Path) -> Path:
     """Convert a location from a user to a path, and expand `~` and `~name`."""
     try:

@@ -34,10 +34,13 @@ from nerfro.paths import PLUGINS_DIR
 
 KINDS = (
     "model", "camera", "medium", "sampler/path", "sampler/points", "field", "boundary", "loss", "data", "callbacks",
+    "metric",
 )  # fmt: skip
 
-# Packages whose modules register the built-in plugins; `discover` imports them.
-_BUILT_IN = ("camera", "media", "samplers", "fields", "boundaries", "losses", "models", "data")
+# Modules that register the built-in plugins, alone or in the modules of a package; `discover` imports them.
+_BUILT_IN = (
+    "camera", "media", "samplers", "fields", "boundaries", "losses", "models", "data", "evaluation.image_metrics",
+)  # fmt: skip
 _LOCAL_PACKAGE = "nerfro_plugins"
 _ENTRY_POINTS = "nerfro.plugins"
 
@@ -165,11 +168,7 @@ def build(node: object, **parts: object) -> Any:
     Raises:
         NerfroError: the class is not registered, or the configuration does not fit it.
     """
-    if not isinstance(node, Mapping):
-        raise NerfroError(
-            f"'{node}' is not a set of settings; choose an option with a slash, as in sampler/path=eikonal"
-        )
-    node = node if isinstance(node, DictConfig) else OmegaConf.create(dict(node))
+    node = _settings_of(node)
     target = node.get("_target_")
     if target in _LIGHTNING_TARGETS:
         try:
@@ -181,10 +180,40 @@ def build(node: object, **parts: object) -> Any:
         except (InstantiationException, OmegaConfBaseException) as error:
             cause = error.__cause__ or error
             raise NerfroError(f"{target}: {_first_line(cause)}; check this object's fields in conf/") from error
-    plugin = _of_target(str(target))
+    plugin = _plugin_of(node)
+    return create(plugin, node, **{name: parts[name] for name in plugin.parts if name in parts})
+
+
+def check_node(node: object) -> type:
+    """Check the node of a plugin, and return its class; the values of interpolations may not be known yet.
+
+    Raises:
+        NerfroError: as `build`.
+    """
+    node = _settings_of(node)
+    plugin = _plugin_of(node)
+    known = {str(key): node[key] for key in node if not OmegaConf.is_interpolation(node, str(key))}
+    if len(known) == len(node):
+        configure(plugin, node)
+    else:
+        check(f"{plugin.kind}={plugin.name}: ", plugin.hints, known)
+    return plugin.cls
+
+
+def _settings_of(node: object) -> DictConfig:
+    if not isinstance(node, Mapping):
+        raise NerfroError(
+            f"'{node}' is not a set of settings; choose an option with a slash, as in sampler/path=eikonal"
+        )
+    return node if isinstance(node, DictConfig) else OmegaConf.create(dict(node))
+
+
+def _plugin_of(node: DictConfig) -> Plugin:
+    target = str(node.get("_target_"))
+    plugin = _of_target(target)
     if plugin is None:
         raise NerfroError(f"'{target}' is not registered; `python -m nerfro.plugins` lists the registered classes")
-    return create(plugin, node, **{name: parts[name] for name in plugin.parts if name in parts})
+    return plugin
 
 
 def _of_target(target: str) -> Plugin | None:
@@ -273,7 +302,7 @@ def discover(plugins_dir: Path = PLUGINS_DIR) -> None:
 
 
 def _import_all(package: str) -> None:
-    for module in pkgutil.iter_modules(importlib.import_module(package).__path__, f"{package}."):
+    for module in pkgutil.iter_modules(getattr(importlib.import_module(package), "__path__", []), f"{package}."):
         importlib.import_module(module.name)
 
 

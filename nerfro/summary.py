@@ -29,7 +29,8 @@ class SummaryConfig:
     # Folder for the report and the tables (.csv, .md and .tex, one table per budget); without it, only print.
     out: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     report: bool = False  # whether to write `report.html`; the default of `out` is then `outputs/summary`
-    metrics: list[str] = field(default_factory=lambda: ["psnr", "ssim", "lpips"])  # columns of the tables
+    # Columns of the tables; by default psnr, ssim, lpips and the metrics of plugins.
+    metrics: Optional[list[str]] = None  # noqa: UP045
     region: Annotated[str, Literal["full", "mask", "crop"]] = FULL  # region of the scores: full, mask or crop
     methods: dict[str, str] = field(default_factory=dict)  # titles of experiments, in the order of the rows
     scenes: dict[str, str] = field(default_factory=dict)  # titles of scenes, by the last component of the data folder
@@ -62,7 +63,7 @@ def main(config: DictConfig) -> None:
         write_table(table, out / name)
     print(f"tables: {out}")
     if config.report:
-        selection = Selection(config.views, metrics[0], config.region)
+        selection = Selection(config.views, next(iter(metrics)), config.region)
         page = report_page(list(zip(comparisons, tables.values(), strict=True)), unfinished, selection)
         write_atomically(out / "report.html", page)
         print(f"report: {out / 'report.html'}, {len(page) / 2**20:.1f} MiB")

@@ -6,6 +6,7 @@ a broken contract. For plugins with required fields, give the values of these fi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -17,6 +18,7 @@ from nerfro.camera.base import Camera
 from nerfro.cameras import Cameras
 from nerfro.data.base import DataSource
 from nerfro.draws import Draws
+from nerfro.evaluation.image_metrics import ImageMetric
 from nerfro.fields.base import Field
 from nerfro.fields.nerf import NerfField
 from nerfro.losses.base import Loss
@@ -226,6 +228,18 @@ def _check_data(source: DataSource) -> None:
         )
 
 
+def _check_metric(metric: ImageMetric) -> None:
+    if metric.missing is not None:
+        return
+    size = max(metric.min_size, 16)
+    target = torch.linspace(0, 1, size * size * 3).view(size, size, 3)
+    equal, different = metric(target, target), metric(target.flip(0), target)
+    _require(equal.shape == () and bool(equal.isfinite()), "a metric returns a finite scalar")
+    _require(bool(equal > different) == (metric.better == "higher"), "equal images score better than different ones")
+    masked = metric.score(target.flip(0), target, torch.ones(size, size, dtype=torch.bool))
+    _require(math.isclose(masked, float(different), abs_tol=0.05), "a mask of all pixels does not change the score")
+
+
 def _check_callback(callback: Any) -> None:
     # Importing Lightning takes seconds, and no other plugin needs Lightning.
     _require(hasattr(callback, "on_train_batch_end"), "a callback derives from lightning.pytorch.Callback")
@@ -242,6 +256,7 @@ _CONTRACTS: dict[str, tuple[type, Callable[[Any], None]]] = {
     "model": (Renderer, _check_model),
     "data": (DataSource, _check_data),
     "callbacks": (object, _check_callback),
+    "metric": (ImageMetric, _check_metric),
 }
 
 

@@ -6,6 +6,7 @@ directory, and configuration files of other people are not.
 
 from __future__ import annotations
 
+import re
 import sys
 import warnings
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ from pathlib import Path
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import CachingConfigRepository
 from hydra.core.override_parser.types import Override
+from hydra.core.plugins import Plugins
 from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig
 from omegaconf.errors import OmegaConfBaseException
@@ -21,8 +23,9 @@ from omegaconf.errors import OmegaConfBaseException
 from nerfro.errors import NerfroError
 from nerfro.paths import PACKAGE_DIR
 
-# Classes that the node `hydra` of a configuration may name. The module `logging` takes factories from `()` and `class`.
-_TARGETS = ("hydra_plugins.", "hydra._internal.core_plugins.", "hydra.experimental.callbacks.", "optuna.samplers.")
+# Classes that the node `hydra` of a configuration may name, beside the installed plugins of Hydra. The module `logging`
+# takes factories from `()` and `class`.
+_TARGETS = re.compile(r"hydra\.experimental\.callbacks\.\w+|optuna\.samplers\.\w+Sampler")
 _HANDLERS = ("logging.", "colorlog.")
 _STREAMS = ("ext://sys.stdout", "ext://sys.stderr")
 
@@ -63,7 +66,12 @@ class GuardedConfigLoader(ConfigLoaderImpl):
             raise NerfroError(
                 f"{key}={value} is not allowed; choose a launcher, sweeper or callback of Hydra by its name"
             )
+        if run_mode == RunMode.RUN:  # jobs of a sweep are composed one by one
+            self.check(config)
         return config
+
+    def check(self, config: DictConfig) -> None:
+        """Refuse a configuration that a job cannot use; by default, none."""
 
     def _parse_overrides_and_create_caching_repo(
         self, config_name: str | None, overrides: list[str]
@@ -94,7 +102,10 @@ def _foreign(node: DictConfig | ListConfig, path: str) -> Iterator[tuple[str, ob
 
 def _is_allowed(key: object, value: str) -> bool:
     if key == "_target_":
-        return value.startswith(_TARGETS)
+        hydra_plugins = {f"{cls.__module__}.{cls.__name__}" for cls in Plugins.instance().discover()}
+        return value in hydra_plugins or _TARGETS.fullmatch(value) is not None
+    if key == "custom_search_space":  # a function that Optuna's sweeper would import and call
+        return False
     if key in ("class", "()"):
         return value.startswith(_HANDLERS)
     return not value.startswith("ext://") or value in _STREAMS

@@ -110,6 +110,12 @@ class Path:
         together = {name: torch.cat(values) for name, values in columns.items()}
         return cls(splits=splits, absorption=absorption, **together)
 
+    def __repr__(self) -> str:
+        polylines, vertices = self.s.shape
+        ends = f", s from {self.near.min():.3g} to {self.far.max():.3g}" if polylines else ""
+        refracted = int(self.refracted.sum())
+        return f"Path({self.num_rays} rays, {polylines} polylines of {vertices} vertices, {refracted} refracted{ends})"
+
     @property
     def absorbs(self) -> bool:
         """Whether the path may cross absorbing bodies."""

@@ -26,9 +26,11 @@ def test_importing_nerfro_imports_nothing_heavy() -> None:
 
 
 def test_what_is_not_there_is_an_attribute_error() -> None:
-    with pytest.raises(AttributeError, match="has no attribute 'lod'"):
+    with pytest.raises(AttributeError, match="No nerfro attribute lod"):
         _ = nerfro.lod
-    assert {"TrainedScene", "bend", "load"} <= set(nerfro.__all__)
+    assert {"TrainedScene", "bend", "load"} <= set(nerfro.__all__) <= {*dir(nerfro), "__version__"}
+    for name in nerfro.__all__:
+        assert getattr(nerfro, name) is not None
 
 
 def test_a_run_is_loaded_rendered_and_exported(

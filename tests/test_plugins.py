@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import os
 import shutil
 import subprocess
@@ -9,13 +11,18 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 import nerfro.plugins
 import nerfro.registry
+import nerfro.summary
+from nerfro.data.blender import BlenderData
 from nerfro.errors import NerfroError
 from nerfro.paths import PLUGINS_DIR
 from nerfro.registry import KINDS, discover, find, plugins
+from tests.conftest import Finished, finish
 
 discover()
 
@@ -125,11 +132,78 @@ def test_missing_plugin_folder_is_refused(tmp_path: Path, monkeypatch: pytest.Mo
         discover()
 
 
-def test_templates_are_registered() -> None:
-    templates = {path.stem for path in PLUGINS_DIR.glob("example_*.py")}
-    modules = {plugin.cls.__module__.removeprefix("nerfro_plugins.") for plugin in plugins()}
-    assert templates
-    assert templates <= modules
+# Overrides that use each template.
+TEMPLATES = {
+    "example_boundary": ["boundary=gradient_sky"],
+    "example_data": ["data=numpy_views"],
+    "example_field": ["field=blobs"],
+    "example_loss": ["+loss.opacity_entropy.weight=0.1"],
+    "example_medium": ["medium=gradient_rod", "sampler/path=eikonal"],
+    "example_model": ["model=haze"],
+    "example_path_sampler": ["sampler/path=mirror_floor"],
+    "example_sampler": ["sampler/points=logarithmic", "sampler.points.num_samples=8"],
+    "opt_in/example_callback": ["+callbacks=gradient_norm", "callbacks.gradient_norm.every=1"],
+    "opt_in/example_metric": ["optimized_metric=mean_absolute_error"],
+}
+
+
+@pytest.fixture
+def train_template(
+    train_here: Callable[..., Finished], tiny_run: list[str], tiny_scene: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Callable[..., Finished]:  # fmt: skip
+    """Train two steps with some overrides, and without the tiny settings of components that they replace."""
+    monkeypatch.setenv("NERFRO_PLUGINS", str(PLUGINS_DIR / "opt_in"))
+    discover()
+    (tmp_path / "views").mkdir()
+    shutil.copy(tiny_scene / "mesh.ply", tmp_path / "views")
+    for split in ("train", "test"):
+        views = BlenderData(str(tiny_scene)).load(split)
+        images = np.stack([np.uint8(np.round(255 * image.numpy())) for image in views.images])
+        np.savez(
+            tmp_path / "views" / f"{split}.npz",
+            images=images, poses=views.cameras.camera_to_world.numpy(), focal=views.cameras.fx[0].item(),
+        )  # fmt: skip
+
+    def train(overrides: list[str]) -> Finished:
+        replaced = tuple(f"{override.partition('=')[0].replace('/', '.')}." for override in overrides)
+        kept = [option for option in tiny_run if not option.startswith(replaced)]
+        options = [
+            "trainer.max_steps=2",
+            "evaluation.every=0",
+            "logger=tensorboard",
+            f"hydra.run.dir={tmp_path / 'run'}",
+        ]
+        root = [f"data.root={tmp_path / 'views'}"] if "data=numpy_views" in overrides else []
+        return train_here(*kept, *overrides, *root, *options)
+
+    return train
+
+
+@pytest.mark.parametrize(
+    "template", sorted(str(p.relative_to(PLUGINS_DIR)) for p in PLUGINS_DIR.glob("**/example_*.py"))
+)
+def test_template_trains(template: str, train_template: Callable[..., Finished]) -> None:
+    finished = train_template(TEMPLATES[template.removesuffix(".py")])
+    assert finished.code == 0, finished.err
+    assert "2 steps in" in finished.out
+
+
+def test_metric_of_a_plugin_is_in_tables_files_log_and_report(
+    train_template: Callable[..., Finished], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    trained, run = train_template([]), tmp_path / "run"
+    mean = json.loads((run / "metrics.json").read_text())["test"]["mean_absolute_error"]
+    references = np.load(tmp_path / "views" / "test.npz")["images"]
+    predictions = np.stack([np.asarray(Image.open(file)) for file in sorted((run / "images").glob("*.png"))])
+    assert mean == pytest.approx(np.abs(references / 255 - predictions / 255).mean(), abs=1e-6)
+    assert "MAE ↓" in trained.out
+    with (run / "csv" / "metrics.csv").open() as file:
+        logged = [row["test/mean_absolute_error"] for row in csv.DictReader(file)]
+    assert float(logged[-1]) == pytest.approx(mean)
+    finish(nerfro.summary.main, [f"runs={run}", f"out={tmp_path / 'out'}", "report=true"], monkeypatch, capsys)
+    assert "MAE ↓" in (tmp_path / "out" / "report.html").read_text()
 
 
 # The list.

@@ -19,7 +19,7 @@ from nerfro.errors import NerfroError
 from nerfro.paths import CONF_DIR
 from nerfro.registry import KINDS, build, configure, discover, find, plugins, register
 from nerfro.samplers.eikonal import Eikonal
-from nerfro.training.config import TrainConfig, build_losses
+from nerfro.training.config import TrainConfig, build_losses, check_run
 
 discover()
 
@@ -287,7 +287,7 @@ def train_with_conf(
     conf = tmp_path / "conf"
     shutil.copytree(CONF_DIR, conf)
     unwrapped = nerfro.train.main.__wrapped__
-    monkeypatch.setattr(nerfro.train, "main", entry_point("train", TrainConfig, conf)(unwrapped))
+    monkeypatch.setattr(nerfro.train, "main", entry_point("train", TrainConfig, conf, check=check_run)(unwrapped))
 
     def train(experiment: str, *overrides: str) -> Any:
         (conf / "experiment" / "of_test.yaml").write_text(f"# @package _global_\n{experiment}\n")

@@ -10,37 +10,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from nerfro.errors import NerfroError
+from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import is_number, read_json
 
 Score = float | None  # None if not available; the notes contain the reason
 
-
-@dataclass(frozen=True)
-class Metric:
-    """Description of a metric.
-
-    Attributes:
-        name: key in files and in code.
-        title: heading in tables.
-        better: whether higher or lower values are better.
-        decimals: number of decimals in tables.
-    """
-
-    name: str
-    title: str
-    better: Literal["higher", "lower"]
-    decimals: int
-
-
-METRICS = (
-    Metric("psnr", "PSNR", "higher", 2),
-    Metric("ssim", "SSIM", "higher", 3),
-    Metric("ms_ssim", "MS-SSIM", "higher", 3),
-    Metric("lpips", "LPIPS", "lower", 3),
-    Metric("lpips_vgg", "LPIPS-VGG", "lower", 3),
-    Metric("flip", "FLIP", "lower", 3),
-)
 
 Region = Literal["full", "mask", "crop"]  # see nerfro/evaluation/regions.py
 FULL: Region = "full"
@@ -96,7 +71,25 @@ class EvaluationResult:
 
     def means(self, region: Region = FULL) -> dict[str, Score]:
         """Return the mean of every metric in a region, by name."""
-        return {metric.name: self.mean(metric.name, region) for metric in METRICS}
+        return {name: self.mean(name, region) for name in image_metrics()}
+
+
+def optimized(result: EvaluationResult, name: str) -> float:
+    """Return the mean score that a sweep optimizes.
+
+    Args:
+        result: scores of all views.
+        name: a metric, or `<region>.<metric>`, such as `mask.psnr`.
+
+    Raises:
+        NerfroError: there is no such score.
+    """
+    scores = {f"{region}.{metric}": mean for region in result.regions for metric, mean in result.means(region).items()}
+    score = scores.get(name if "." in name else f"{FULL}.{name}")
+    if score is None:
+        known = ", ".join(key.removeprefix(f"{FULL}.") for key, mean in scores.items() if mean is not None)
+        raise NerfroError(f"optimized_metric={name} was not scored; choose one of {known}")
+    return score
 
 
 @dataclass(frozen=True)
@@ -188,7 +181,7 @@ def _views(rows: list[Any]) -> tuple[ViewScores, ...]:
 
 
 def _scores(row: Mapping[str, Any]) -> dict[str, Score]:
-    return {metric.name: _number(row.get(metric.name)) for metric in METRICS}
+    return {name: _number(row.get(name)) for name in image_metrics()}
 
 
 def _number(value: object) -> float | None:

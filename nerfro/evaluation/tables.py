@@ -18,10 +18,10 @@ import rich.table
 import rich.text
 
 from nerfro.errors import NerfroError
+from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import (
     AS_GIVEN,
     FULL,
-    METRICS,
     EvaluationResult,
     Region,
     RunMetrics,
@@ -140,7 +140,7 @@ class Table:
 
 def views_table(result: EvaluationResult, title: str, region: Region = FULL) -> Table:
     """Tabulate the scores of each view in one region, with means, and notes about missing scores."""
-    scores = {view.name: {m.name: view.score(m.name, region) for m in METRICS} for view in result.views}
+    scores = {view.name: {name: view.score(name, region) for name in image_metrics()} for view in result.views}
     notes = [_mask_note(result) if region != FULL else "", _missing_note(result, region)]
     return _scores_table(title, "view", scores, notes, {"mean": result.means(region)})
 
@@ -345,10 +345,11 @@ def _scores_table(
     summary: Mapping[str, Mapping[str, Score]] | None = None,
 ) -> Table:
     """Tabulate scores by row label and metric. Metrics without any score are omitted, unless no metric has one."""
-    metrics = [m for m in METRICS if any(scores[m.name] is not None for scores in rows.values())] or list(METRICS)
-    columns = tuple(Column(metric.title, metric.better, metric.decimals) for metric in metrics)
+    known = image_metrics()
+    names = [name for name in known if any(scores[name] is not None for scores in rows.values())] or list(known)
+    columns = tuple(Column(known[name].title, known[name].better, known[name].decimals) for name in names)
     body, foot = (
-        tuple(Row(label, tuple(scores[metric.name] for metric in metrics)) for label, scores in part.items())
+        tuple(Row(label, tuple(scores[name] for name in names)) for label, scores in part.items())
         for part in (rows, summary or {})
     )
     return Table(title, label_title, columns, body, foot, notes=tuple(note for note in notes if note))
@@ -361,8 +362,8 @@ def _mask_note(result: EvaluationResult) -> str:
 def _missing_note(result: EvaluationResult, region: Region) -> str:
     """Name the metrics that are missing in a region, with the reasons, in one line."""
     by_reason: dict[str, list[str]] = {}
-    for metric in METRICS:
-        reason = result.notes.get(metric.name if region == FULL else f"{region}.{metric.name}")
+    for name, metric in image_metrics().items():
+        reason = result.notes.get(name if region == FULL else f"{region}.{name}")
         if reason is not None:
             by_reason.setdefault(short(reason), []).append(metric.title)
     missing = ", ".join(f"{', '.join(titles)} ({reason})" for reason, titles in by_reason.items())

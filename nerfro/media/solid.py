@@ -88,6 +88,12 @@ class Solid(Medium):
             self.register_buffer("iors", indices, persistent=False)
         self.shell = float(shell)
 
+    def extra_repr(self) -> str:
+        size = (self.box[1] - self.box[0]).tolist()
+        return (
+            f"ior={[round(n, 4) for n in self.indices.tolist()]}, box of {' x '.join(f'{side:.3g}' for side in size)}"
+        )
+
     @property
     def indices(self) -> Float[Tensor, "K"]:
         return self.iors.detach()

@@ -46,6 +46,14 @@ class Scene(nn.Module):
             raise NerfroError("camera.exposure=true needs linear radiance; take model.colour=linear")
         self.register_buffer("_on_device", torch.empty(0), persistent=False)  # a scene may have no other tensor
 
+    def __repr__(self) -> str:
+        fields = ", ".join(type(field).__name__ for field in self.fields)
+        num_parameters = sum(parameter.numel() for parameter in self.parameters())
+        return (
+            f"Scene(medium={self.medium}, fields=[{fields}], boundary={type(self.boundary).__name__}, "
+            f"camera={type(self.camera).__name__}, {self.colour_space.value}, {num_parameters:,} parameters)"
+        )
+
     @property
     def device(self) -> torch.device:
         """Device of all parameters and buffers."""

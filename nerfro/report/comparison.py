@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.results import FULL, METRICS, Metric, Region
+from nerfro.evaluation.image_metrics import ImageMetric, image_metrics
+from nerfro.evaluation.results import FULL, Region
 from nerfro.evaluation.tables import MISSING, Column, Row, Table, short
 from nerfro.report.runs import Budget, EvaluationSet, Run, shown
 from nerfro.training.settings import TABLE_ROW, settings
@@ -55,26 +56,26 @@ def compare(runs: Sequence[Run], methods: Mapping[str, str], scenes: Mapping[str
     return [_comparison(budget, [r for r in runs if r.budget == budget], methods, scenes) for budget in budgets]
 
 
-def to_table(comparison: Comparison, metrics: Sequence[Metric], region: Region) -> Table:
+def to_table(comparison: Comparison, metrics: Mapping[str, type[ImageMetric]], region: Region) -> Table:
     """Tabulate means and standard deviations over seeds, with medals for the best three methods."""
     columns = [
         Column(metric.title, metric.better, metric.decimals, group=title)
         for title in comparison.scenes.values()
-        for metric in metrics
+        for metric in metrics.values()
     ]
     rows, notes = [], list(comparison.notes)
     for method in comparison.methods:
         cells = [
-            _score(comparison.cells.get((method, scene), ()), metric.name, region)
+            _score(comparison.cells.get((method, scene), ()), name, region)
             for scene in comparison.scenes
-            for metric in metrics
+            for name in metrics
         ]
         rows.append(Row(method, tuple(mean for mean, _ in cells), tuple(spread for _, spread in cells)))
     notes += dict.fromkeys(
         f"{metric.title} {MISSING}: {short(reason)}"
         for run in comparison.runs
-        for metric in metrics
-        if (reason := _reason(run, metric.name, region))
+        for name, metric in metrics.items()
+        if (reason := _reason(run, name, region))
     )
     title = "; ".join(
         [
@@ -87,19 +88,21 @@ def to_table(comparison: Comparison, metrics: Sequence[Metric], region: Region) 
     return Table(title, "method", tuple(columns), tuple(rows), mark=mark, notes=tuple(notes))
 
 
-def find_metrics(names: Sequence[str]) -> list[Metric]:
-    """Return the metrics with the given names.
+def find_metrics(names: Sequence[str] | None = None) -> dict[str, type[ImageMetric]]:
+    """Return the metrics with the given names, in this order; by default PSNR, SSIM, LPIPS and the metrics of plugins.
 
     Raises:
         NerfroError: there is no name, or a name is unknown.
     """
-    known = {metric.name: metric for metric in METRICS}
+    known = image_metrics()
+    if names is None:
+        names = [name for name in known if name not in ("ms_ssim", "lpips_vgg", "flip")]
     if not names:
         raise NerfroError(f"metrics: the list is empty; choose from {', '.join(known)}")
     for name in names:
         if name not in known:
             raise NerfroError(f"metrics: '{name}' is not a metric; choose from {', '.join(known)}")
-    return [known[name] for name in names]
+    return {name: known[name] for name in names}
 
 
 def _comparison(

@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from nerfro.allowed import Range
 from nerfro.errors import NerfroError
 from nerfro.files.foreign_config import foreign_config
-from nerfro.training.sweeps import scene_name
+from nerfro.paths import scene_name
 
 _LOGS = "tensorboard"  # subfolder of a run folder, see conf/logger/tensorboard.yaml
 SEARCH_INTERVAL = 5.0  # seconds between two searches for new runs

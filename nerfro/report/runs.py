@@ -18,10 +18,9 @@ from nerfro.errors import NerfroError, first_of
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
 from nerfro.files.foreign_config import foreign_config
 from nerfro.files.reading import open_image, read_json
-from nerfro.paths import EMBEDDED_PREFIX, user_path
+from nerfro.paths import EMBEDDED_PREFIX, scene_name, user_path
 from nerfro.training.config import check_trained
 from nerfro.training.run_folder import CELL_FILE
-from nerfro.training.sweeps import scene_name
 
 _FACTS = {"command", "machine", "python", "threads", "versions"}  # required keys of run.json
 

@@ -15,7 +15,8 @@ from nerfro.data.base import Views
 from nerfro.errors import NerfroError
 from nerfro.evaluation.crops import Crop, most_different_crop
 from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, squared_error_map
-from nerfro.evaluation.results import FULL, METRICS, Metric, Region, Score
+from nerfro.evaluation.image_metrics import image_metrics
+from nerfro.evaluation.results import FULL, Region, Score
 from nerfro.evaluation.tables import MISSING
 from nerfro.files.drawing import magma
 from nerfro.files.images import data_uri, load_png, to_8bit
@@ -35,12 +36,12 @@ class Selection:
 
     Attributes:
         num_views: number of evenly spread views per scene; 0 for all.
-        metric: metric shown below each image.
+        metric: name of the metric shown below each image.
         region: region of this metric.
     """
 
     num_views: int = 8
-    metric: Metric = METRICS[0]
+    metric: str = "psnr"
     region: Region = FULL
 
 
@@ -133,13 +134,13 @@ def _median_view(runs: Sequence[Run], selection: Selection) -> int:
 
 
 def _score(run: Run, view: int, selection: Selection) -> Score:
-    return run.metrics.result.views[view].score(selection.metric.name, selection.region)
+    return run.metrics.result.views[view].score(selection.metric, selection.region)
 
 
 def _view(
     index: int, reference: Tensor, runs: Mapping[int, Run], titles: Mapping[int, str], selection: Selection
 ) -> View:
-    metric = selection.metric
+    metric = image_metrics()[selection.metric]
     predictions, errors = {}, {}
     for number, run in runs.items():
         image, title = _prediction(run, index), titles[number]

@@ -1,4 +1,4 @@
-"""Exit rays of a glass body, without a scene."""
+"""Exit rays and paths of rays through a medium, without a scene."""
 
 from __future__ import annotations
 
@@ -14,8 +14,11 @@ from torch.nn import functional
 
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import load_mesh
+from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.solid import Solid
 from nerfro.paths import resolve_path
+from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.snell import Snell
 from nerfro.samplers.traced_file import leave_box, make_rays
 
@@ -62,17 +65,48 @@ def bend(
     Raises:
         NerfroError: the mesh cannot be read or is open, or the rays are not [R, 3] finite numbers.
     """
+    starts, towards = _checked_rays(origins, directions)
+    low, high = load_mesh(resolve_path(mesh)).bounds
+    margin = (high - low).max() * _MARGIN / (resolution - 1 - 2 * _MARGIN)
+    low, high = (low - margin).tolist(), (high + margin).tolist()
+    medium = SdfGrid(str(mesh), ior, resolution=resolution, box_min=low, box_max=high)
+    path = Snell(interface)(make_rays(starts, towards, medium, 0.0, None), medium)
+    positions, path_lengths = leave_box(path, medium)
+    return Bent(positions, path.exit_directions, path_lengths, path.refracted)
+
+
+def polylines(
+    medium: Medium, origins: ArrayLike | Tensor, directions: ArrayLike | Tensor, length: float | None = None
+) -> list[np.ndarray]:
+    """Trace rays through a medium, and return the vertices of their paths, for example to plot them.
+
+    Args:
+        medium: bodies, which Snell's law is applied to, or a medium whose index varies continuously.
+        origins, directions: rays [R, 3], world units; directions need not have unit length.
+        length: length of the paths, world units; bent paths end outside of the medium. By default, paths end well
+            beyond the medium.
+
+    Returns:
+        One array of vertices [S, 3] for each ray.
+
+    Raises:
+        NerfroError: the rays are not [R, 3] finite numbers.
+    """
+    rays = make_rays(*_checked_rays(origins, directions), medium, 0.0, length)
+    path = (Snell() if isinstance(medium, Solid) else Eikonal())(rays, medium)
+    vertices = zip(path.positions.cpu().numpy(), path.s.cpu().numpy(), strict=True)
+    # Rows repeat their last vertex.
+    return [positions[np.diff(s, prepend=-1.0) > 0] for positions, s in vertices]
+
+
+def _checked_rays(
+    origins: ArrayLike | Tensor, directions: ArrayLike | Tensor
+) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
+    """Convert rays to tensors with unit directions."""
     starts, towards = (torch.as_tensor(np.asarray(values), dtype=torch.float32) for values in (origins, directions))
     if starts.ndim != 2 or starts.shape[1:] != (3,) or starts.shape != towards.shape or not len(starts):
         raise NerfroError(f"origins {list(starts.shape)} and directions {list(towards.shape)} must both be [R, 3]")
     lengths = torch.linalg.vector_norm(towards, dim=-1)
     if not (torch.isfinite(starts).all() and torch.isfinite(lengths).all() and (lengths > 0).all()):
         raise NerfroError("origins and directions must be finite numbers, and no direction zero; correct them")
-    low, high = load_mesh(resolve_path(mesh)).bounds
-    margin = (high - low).max() * _MARGIN / (resolution - 1 - 2 * _MARGIN)
-    low, high = (low - margin).tolist(), (high + margin).tolist()
-    medium = SdfGrid(str(mesh), ior, resolution=resolution, box_min=low, box_max=high)
-    rays = make_rays(starts, functional.normalize(towards, dim=-1), medium, 0.0, None)
-    path = Snell(interface)(rays, medium)
-    positions, path_lengths = leave_box(path, medium)
-    return Bent(positions, path.exit_directions, path_lengths, path.refracted)
+    return starts, functional.normalize(towards, dim=-1)

@@ -32,13 +32,11 @@ class BackgroundPretraining(Callback):
     the field depend on the object. The optimizer of the run takes the steps, so that its moments are initialized, too.
 
     Args:
-        num_steps: number of steps.
-        interruption: signal handler, which ends pretraining as well; a resumed run takes the remaining steps.
+        num_steps: number of steps. If `StopOnSignal` ends pretraining, a resumed run takes the remaining steps.
     """
 
-    def __init__(self, num_steps: int, interruption: StopOnSignal) -> None:
-        self._num_steps, self._interruption = num_steps, interruption
-        self._num_done = 0
+    def __init__(self, num_steps: int) -> None:
+        self._num_steps, self._num_done = num_steps, 0
 
     def state_dict(self) -> dict[str, Any]:
         return {"num_done": self._num_done}
@@ -60,8 +58,10 @@ class BackgroundPretraining(Callback):
         first, last = _RATES
         batches: RayBatches = trainer.datamodule.batches  # type: ignore[attr-defined]
         num_pixels = min(_NUM_PIXELS, int(_SHARE * batches.num_pixels))
+        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+        interruptions = [callback for callback in callbacks if isinstance(callback, StopOnSignal)]
         for step in track("boundary", range(self._num_done, self._num_steps)):
-            if self._interruption.stop(trainer):
+            if any(interruption.stop(trainer) for interruption in interruptions):
                 break
             rays, view, rgb = batches.missing(box, num_pixels, step, scene.camera)
             if len(rays) < _MIN_PIXELS:

@@ -1,4 +1,4 @@
-"""Callbacks of training: progress, throughput, interruption, and the configuration in checkpoints."""
+"""Callbacks of training: progress, throughput and interruption."""
 
 from __future__ import annotations
 
@@ -231,13 +231,3 @@ class StopOnSignal(Callback):
         for number, handler in self._previous.items():
             signal.signal(number, handler)
         self._previous = {}
-
-
-class ConfigInCheckpoint(Callback):
-    """Write the resolved configuration to every checkpoint, so that the file suffices to rebuild the model."""
-
-    def __init__(self, config: str) -> None:
-        self._config = config
-
-    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        checkpoint["nerfro_config"] = self._config

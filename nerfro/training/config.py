@@ -28,8 +28,10 @@ from nerfro.data.validation_views import WithValidationViews
 from nerfro.errors import NerfroError
 from nerfro.losses.base import Loss
 from nerfro.media.analytic import Vacuum
-from nerfro.registry import build, create, find
+from nerfro.paths import resolve_path, scene_name
+from nerfro.registry import build, check_node, configure, create, find
 from nerfro.rendering import Components, Renderer
+from nerfro.scenes import SCENES
 from nerfro.subdivision import Subdivision
 from nerfro.training.backdrop import settle_backdrop
 from nerfro.training.content import ContentConfig, settle_content
@@ -212,6 +214,8 @@ class TrainConfig:
     logger: Any = None  # Lightning loggers, by any name
     # Settings of each callback, by the registered name of the callback.
     callbacks: dict[str, Any] = dataclasses.field(default_factory=dict)
+    # Score that training returns to sweepers of Hydra: a metric, or `<region>.<metric>`, such as mask.psnr.
+    optimized_metric: str = "psnr"
     debug: bool = False  # a run of ten steps that scores one view
     # Checkpoint to resume from, or `last` for the newest checkpoint of this experiment.
     ckpt_path: Optional[str] = None  # noqa: UP045
@@ -244,22 +248,41 @@ def check_trained(config: DictConfig, origin: Path) -> DictConfig:
     return typed
 
 
-def settle_trainer(config: DictConfig) -> None:
-    """Reduce the run to a few steps and one scored view where `debug` or `trainer.fast_dev_run` asks for it.
+def check_run(config: DictConfig) -> None:
+    """Refuse a configuration that cannot train, as far as this is known without its data.
 
     Raises:
-        NerfroError: an argument of Lightning's Trainer has no meaning in nerfro.
+        NerfroError: a setting has no meaning or contradicts another one, or does not fit its plugin.
     """
     for name, reason in REFUSED_ARGUMENTS.items():
         if config.trainer[name] is not None:
             raise NerfroError(f"trainer.{name}={config.trainer[name]} has no meaning in nerfro: {reason}")
+    limit = config.trainer.max_time
+    if isinstance(limit, (int, float)):
+        raise NerfroError(f"trainer.max_time={limit} has no unit; write DD:HH:MM:SS, such as 00:00:05:00")
+    if limit is None and config.trainer.max_steps < 0 and not (config.debug or config.trainer.fast_dev_run):
+        raise NerfroError("the run would never end; set trainer.max_time (DD:HH:MM:SS), trainer.max_steps, or both")
+    if (config.checkpoint.every_seconds is None) == (config.checkpoint.every_steps is None):
+        raise NerfroError("set one of checkpoint.every_seconds and checkpoint.every_steps, and the other to null")
+    find("metric", config.optimized_metric.rpartition(".")[2])
+    for name, node in config.callbacks.items():
+        configure(find("callbacks", str(name)), node or {})
+    build_losses(config.loss, known=False)
+    for node in (config.data, config.camera, config.sampler.points, config.field, config.boundary, config.model):
+        check_node(node)
+    if check_node(config.sampler.path).needs_medium:  # type: ignore[attr-defined]
+        check_node(config.medium)
+
+
+def settle_trainer(config: DictConfig) -> None:
+    """Reduce the run to a few steps and one scored view where `debug` or `trainer.fast_dev_run` asks for it."""
     fast = config.trainer.fast_dev_run
     if not (config.debug or fast):
         return
     steps = 10 if config.debug else int(fast)
     config.trainer.max_steps, config.trainer.limit_test_batches = steps, 1
     config.optimizer.boundary_steps = min(config.optimizer.boundary_steps, steps)
-    config.evaluation.every, config.evaluation.refine_steps = max(1, steps // 2), 0
+    config.evaluation.every, config.evaluation.refine_steps = steps, 0
     config.evaluation.subdivision.side = 1
 
 
@@ -269,7 +292,17 @@ def training_device(config: DictConfig) -> str:
 
 
 def build_data(config: DictConfig) -> DataSource:
-    """Build the data set of a run, with a `val` split of training views if `num_validation_views` is set."""
+    """Build the data set of a run, with a `val` split of training views if `num_validation_views` is set.
+
+    Raises:
+        NerfroError: there is no data; for a synthetic scene the message names the command that renders the scene.
+    """
+    scene, root = scene_name(config.data.root), resolve_path(config.data.root)
+    if scene in SCENES and not root.exists():
+        small = "resolution=128 spp=256 test_spp=1024 views.val=10 views.test=20"
+        raise NerfroError(
+            f"{root} holds no data yet; run python -m nerfro.synthesize scene={scene} out={root} {small} first"
+        )
     source, number = build(config.data), config.batches.num_validation_views
     return WithValidationViews(source, number) if number else source
 
@@ -310,7 +343,6 @@ def build_model(config: DictConfig, training: Views | None = None) -> Renderer:
     Raises:
         NerfroError: a component cannot be built.
     """
-    build_losses(config.loss, known=False)  # refuse mistakes before data is read
     path_sampler = build(config.sampler.path)
     medium = build(config.medium) if path_sampler.needs_medium else Vacuum()
     settle_content(config, medium, None if training is None else training.cameras)

@@ -40,7 +40,9 @@ class RayDataModule(LightningDataModule):
     its step begins, so that paths depend on the current medium.
     """
 
-    def __init__(self, batches: RayBatches, validation: Views | None, every: int, overfit_batches: int = 0) -> None:
+    def __init__(
+        self, batches: RayBatches, validation: Views | None = None, every: int = 0, overfit_batches: int = 0
+    ) -> None:
         super().__init__()
         self._overfit_batches = overfit_batches
         self.batches, self.validation, self.every = batches, validation, every
@@ -50,7 +52,8 @@ class RayDataModule(LightningDataModule):
     def train_dataloader(self) -> Iterator[int]:
         assert self.trainer is not None  # attached by Lightning
         device, module = self.trainer.strategy.root_device, cast(TrainingModule, self.trainer.lightning_module)
-        self.batches = self.batches.to(device, cast(torch.dtype, module.dtype))
+        shared = self.batches.share(self.trainer.global_rank, self.trainer.world_size)
+        self.batches = shared.to(device, cast(torch.dtype, module.dtype))
         self.end_thread()
         if device.type == "cpu" and can_prefetch(module.renderer):
             self._ahead = Prefetcher(self.batches.batch)

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Timer
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
 from nerfro.errors import NerfroError
 from nerfro.losses.base import Loss
+from nerfro.paths import user_path
+from nerfro.registry import discover
 from nerfro.rendering import Renderer, Scene
 from nerfro.training.config import build_losses
 from nerfro.training.optimizer import OptimizerConfig, learning_rate_factor
+from nerfro.training.run_folder import load_checkpoint, restore
 from nerfro.types import Batch
 
 
@@ -26,19 +30,54 @@ class TrainingModule(LightningModule):
         renderer: the model that `model=` chooses.
         losses: training losses by name.
         optimizer: settings of Adam and of the learning rate schedule.
+        callbacks: callbacks that are a part of the method; every Trainer adds them to its own.
+        configuration: resolved configuration of the run (YAML), which every checkpoint contains.
     """
 
-    def __init__(self, renderer: Renderer, losses: Mapping[str, Loss], optimizer: OptimizerConfig) -> None:
+    def __init__(
+        self,
+        renderer: Renderer,
+        losses: Mapping[str, Loss],
+        optimizer: OptimizerConfig,
+        callbacks: Sequence[Callback] = (),
+        configuration: str | None = None,
+    ) -> None:
         super().__init__()
+        self._callbacks, self._configuration = list(callbacks), configuration
         self.renderer = renderer
         self.losses = nn.ModuleDict(dict(losses))
         self.optimizer_config = optimizer
         self._is_logged_step = True
 
     @classmethod
-    def of(cls, renderer: Renderer, config: DictConfig) -> TrainingModule:
+    def of(cls, renderer: Renderer, config: DictConfig, callbacks: Sequence[Callback] = ()) -> TrainingModule:
         """Train a model with the losses and the optimizer of a run's configuration."""
-        return cls(renderer, build_losses(config.loss), OptimizerConfig(**config.optimizer))
+        configuration = OmegaConf.to_yaml(config, resolve=True)
+        return cls(renderer, build_losses(config.loss), OptimizerConfig(**config.optimizer), callbacks, configuration)
+
+    @classmethod
+    def load_from_checkpoint(  # type: ignore[override]
+        cls, checkpoint_path: str | Path, map_location: str | torch.device = "cpu"
+    ) -> TrainingModule:
+        """Load the module of a checkpoint, from the configuration in the checkpoint.
+
+        Args:
+            checkpoint_path: file of the checkpoint.
+            map_location: device of the module.
+
+        Raises:
+            NerfroError: the checkpoint cannot be read.
+        """
+        discover()
+        checkpoint, config = load_checkpoint(user_path(checkpoint_path))
+        return cls.of(restore(checkpoint, config), config).to(map_location)
+
+    def configure_callbacks(self) -> list[Callback]:
+        return self._callbacks
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        if self._configuration is not None:
+            checkpoint["nerfro_config"] = self._configuration
 
     @property
     def scene(self) -> Scene:

@@ -77,7 +77,12 @@ def own(folder: Path, config: DictConfig) -> Iterator[Path | None]:
 
 def resume_advice(folder: Path) -> str:
     """Return how to resume a run."""
-    return f"to resume, repeat the command with hydra.run.dir={folder} ckpt_path=last"
+    return "to resume, repeat the command" + ("" if in_sweep() else f" with hydra.run.dir={folder} ckpt_path=last")
+
+
+def in_sweep() -> bool:
+    """Check whether the current run is a cell of a sweep."""
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
 def begin(folder: Path, config: DictConfig, renderer: Renderer) -> None:
@@ -91,10 +96,12 @@ def begin(folder: Path, config: DictConfig, renderer: Renderer) -> None:
 def next_steps(folder: Path) -> str:
     """Return what a user can look at and do after a run."""
     checkpoint = shlex.quote(f"checkpoint={folder / LAST_CHECKPOINT}")
+    runs = shlex.quote(f"runs={folder.parent}")
+    table = f"\n  python -m nerfro.summary {runs}  the table of the sweep" if in_sweep() else ""
     return (
         f"Look at:\n  {folder}/images/  the rendered views; metrics.json, .csv, .md and .tex are beside\n"
         f"  python -m nerfro.evaluate {checkpoint}  scores the run again, or other views\n"
-        "  python -m nerfro.dashboard  losses and validation images"
+        f"  python -m nerfro.dashboard  losses and validation images{table}"
     )
 
 
@@ -264,7 +271,7 @@ def _git(*command: str) -> str | None:
 
 def _command() -> str:
     """Return the command line for repeating this run; for a cell of a sweep, without the other cells."""
-    if HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
+    if in_sweep():
         # In a launcher's worker this process has another main module and other arguments.
         return shlex.join(["python", "-m", "nerfro.train", *HydraConfig.get().overrides.task])
     spec = getattr(sys.modules["__main__"], "__spec__", None)

@@ -40,6 +40,7 @@ _NAMED = {
     "authors": Role.WATCHING,  # used only by other settings
     "evaluation.every": Role.WATCHING,
     "logger": Role.WATCHING,
+    "optimized_metric": Role.WATCHING,
     "checkpoint": Role.WATCHING,
     "ckpt_path": Role.WATCHING,
     "viewer": Role.WATCHING,

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import logging
 import warnings
+from collections.abc import Mapping
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
 import torch
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from lightning.pytorch.callbacks import Callback, Timer
 from lightning.pytorch.loggers import WandbLogger
 from lightning.pytorch.profilers import AdvancedProfiler, Profiler, PyTorchProfiler, SimpleProfiler
 from lightning.pytorch.strategies import DDPStrategy
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 import nerfro.training.lightning_callbacks  # noqa: F401 - registers callbacks
 from nerfro.cli import warn
@@ -24,12 +23,12 @@ from nerfro.errors import NerfroError
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.kernels.precision import fast_bfloat16
 from nerfro.registry import build, create, find
-from nerfro.training.callbacks import Checkpoints, ConfigInCheckpoint, SharedTimer, Throughput, TrainingProgress
+from nerfro.training.callbacks import Checkpoints, SharedTimer, Throughput, TrainingProgress
 from nerfro.training.checkpoint_files import CheckpointFiles
 from nerfro.training.config import training_device
 from nerfro.training.data_module import validation_interval
 from nerfro.training.log import TrainingLog
-from nerfro.training.run_folder import CONFIG_FILE, LAST_CHECKPOINT
+from nerfro.training.run_folder import CONFIG_FILE, LAST_CHECKPOINT, in_sweep
 from nerfro.training.validation import OverfittingWarning
 
 # Arguments of the trainer that nerfro itself acts on.
@@ -39,8 +38,6 @@ _PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch":
 
 def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra: list[Callback]) -> pl.Trainer:
     """Create the Trainer of a run with its callbacks and loggers."""
-    if (config.checkpoint.every_seconds is None) == (config.checkpoint.every_steps is None):
-        raise NerfroError("set one of checkpoint.every_seconds and checkpoint.every_steps, and the other to null")
     seconds, every = config.checkpoint.every_seconds, config.evaluation.every
     checkpoints = Checkpoints(
         dirpath=folder / LAST_CHECKPOINT.parent,
@@ -50,7 +47,6 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
         enable_version_counter=False,
         save_on_train_epoch_end=False,
     )
-    in_checkpoint = ConfigInCheckpoint(OmegaConf.to_yaml(config, resolve=True))
     chosen = [create(find("callbacks", str(name)), node or {}) for name, node in config.callbacks.items()]
     ours: dict[str, Any] = {
         "default_root_dir": str(folder),
@@ -60,7 +56,6 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
             throughput,
             *([TrainingProgress(throughput)] if config.trainer.enable_progress_bar else []),
             *chosen,
-            in_checkpoint,
             TrainingLog(config),
             OverfittingWarning(),
             *extra,
@@ -79,18 +74,13 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
         # Buffers, such as the index grid, are equal in all processes and need no broadcast in every step.
         ours["strategy"] = DDPStrategy(broadcast_buffers=False, find_unused_parameters=False)
     accelerator = training_accelerator(config.trainer.accelerator)
-    limit = config.trainer.get("max_time")
-    if isinstance(limit, (int, float)):
-        raise NerfroError(f"trainer.max_time={limit} has no unit; write DD:HH:MM:SS, such as 00:00:05:00")
     given = {name: value for name, value in config.trainer.items() if value is not None and name not in _OWN}
     trainer = build(given | {"accelerator": accelerator}, **ours)
     trainer.callbacks = [_shared(callback) for callback in trainer.callbacks]
-    if trainer.world_size > 1 and HydraConfig.get().mode == RunMode.MULTIRUN:
+    if trainer.world_size > 1 and in_sweep():
         raise NerfroError("a sweep (-m) cannot use several devices; start its runs one by one")
     if trainer.world_size > 1 and config.ckpt_path == "last" and not (folder / CONFIG_FILE).is_file():
         raise NerfroError("several processes could disagree about the last run; name its file in ckpt_path")
-    if limit is None and trainer.max_steps < 0:
-        raise NerfroError("the run would never end; set trainer.max_time (DD:HH:MM:SS), trainer.max_steps, or both")
     return trainer
 
 
@@ -166,9 +156,11 @@ def fit(
         raise NerfroError(f"{checkpoint} cannot be resumed ({reason}); start without ckpt_path") from error
 
 
-def finish_logs(trainer: pl.Trainer) -> None:
-    """Finish logs, because the next job of a sweep would append to them."""
+def finish_logs(trainer: pl.Trainer, scores: Mapping[str, float | None]) -> None:
+    """Log the final scores, and finish logs, because the next job of a sweep would append to them."""
     for logger in trainer.loggers:
+        logger.log_metrics({name: score for name, score in scores.items() if score is not None}, trainer.global_step)
+        logger.finalize("success")
         if isinstance(logger, WandbLogger):
             logger.experiment.finish()
 

@@ -2,15 +2,18 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio
 from torch import Tensor
 
+import nerfro
 from nerfro.errors import NerfroError
 from nerfro.evaluation.flip import flip
+from nerfro.evaluation.image_metrics import MAX_PSNR, psnr
 from nerfro.evaluation.lpips import ALEX
-from nerfro.evaluation.metrics import MAX_PSNR, ImageMetrics, psnr
+from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.regions import mean_over
 from nerfro.evaluation.ssim import ms_ssim, ssim
 from nerfro.files.images import load_png, save_png
@@ -183,7 +186,6 @@ def test_views_are_ordered_by_number_and_repeated_ones_count_once() -> None:
     assert result.views[1].scores["psnr"] != result.views[0].scores["psnr"]
 
 
-@pytest.mark.filterwarnings("ignore:The ``compute`` method")
 def test_reset_forgets_all_views() -> None:
     metrics = ImageMetrics()
     metrics.update(*pictures())
@@ -214,12 +216,13 @@ def test_metrics_refuse_what_is_not_one_image(metric: Callable[..., Tensor], sha
         metric(*2 * [torch.rand(165, 165, 3)], torch.ones(2, 2, dtype=torch.bool))
 
 
-def test_views_scored_by_another_process_are_gathered() -> None:
-    alone, here, there = (ImageMetrics() for _ in range(3))
-    for view in range(3):
-        alone.update(*pictures(view), view=view)
-        (here if view == 1 else there).update(*pictures(view), view=view)
-    # torchmetrics' own way to stand in for a process group: what gathers, and that there is one.
-    here.dist_sync_fn = lambda rows, group: [rows, torch.cat(there.rows)]
-    here.distributed_available_fn = lambda: True
-    assert here.result() == alone.result()
+def test_collection_scores_batches_like_single_images_and_names_its_results() -> None:
+    collection = nerfro.metrics("psnr", "flip")
+    pairs = [pictures(seed) for seed in range(3)]
+    for batch in (pairs[:2], pairs[2:]):
+        collection.update(*(torch.stack(images).permute(0, 3, 1, 2) for images in zip(*batch, strict=True)))
+    expected = {"psnr": np.mean([psnr(*pair) for pair in pairs]), "flip": np.mean([flip(*pair) for pair in pairs])}
+    assert {name: float(score) for name, score in collection.compute().items()} == pytest.approx(expected)
+    assert {name: metric.higher_is_better for name, metric in collection.items()} == {"psnr": True, "flip": False}
+    with pytest.raises(NerfroError, match=r"both must have the same shape \[B, 3, H, W\]"):
+        collection.update(*pairs[0])

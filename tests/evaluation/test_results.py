@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from nerfro.errors import NerfroError
+from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import (
-    METRICS,
     EvaluationResult,
     RunMetrics,
     ViewScores,
@@ -16,7 +16,7 @@ from nerfro.evaluation.results import (
 
 
 def scores(**given: float) -> dict[str, float | None]:
-    return {metric.name: given.get(metric.name) for metric in METRICS}
+    return {name: given.get(name) for name in image_metrics()}
 
 
 def result() -> EvaluationResult:

@@ -1,10 +1,11 @@
-from nerfro.evaluation.results import METRICS, EvaluationResult, ViewScores
+from nerfro.evaluation.image_metrics import image_metrics
+from nerfro.evaluation.results import EvaluationResult, ViewScores
 from nerfro.evaluation.tables import Row, regions_table, views_table
 
 
 def scores(psnr: float | None) -> dict[str, float | None]:
     """PSNR, a FLIP of half, and nothing else."""
-    return {metric.name: {"psnr": psnr, "flip": 0.5}.get(metric.name) for metric in METRICS}
+    return {name: {"psnr": psnr, "flip": 0.5}.get(name) for name in image_metrics()}
 
 
 def line(label: str, psnr: float) -> Row:

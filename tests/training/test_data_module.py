@@ -135,6 +135,7 @@ def test_a_batch_is_made_when_its_step_begins_if_paths_learn(
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1}, raising=False)
     made: list[int] = []
     batches: Any = Mock(spec=RayBatches, batch=lambda step: made.append(step) or step * 10)
+    batches.share = lambda rank, size: batches
     batches.to = lambda device, dtype: batches
     batches.forget = lambda: None
     data = RayDataModule(batches, None, 0)

@@ -50,6 +50,29 @@ def test_every_argument_of_lightnings_trainer_is_known() -> None:
     assert set(REFUSED_ARGUMENTS) <= arguments
 
 
+@pytest.mark.parametrize(
+    "override",
+    [
+        "trainer.max_epochs=3",
+        "trainer.max_time=5",
+        "checkpoint.every_seconds=null",
+        "batches.size=0",
+        "field.width=-1",
+        "+loss.nothing.weight=1",
+        "+callbacks.nothing.every=1",
+        "optimized_metric=beauty",
+    ],
+)
+def test_cfg_refuses_what_training_refuses_in_the_same_line(
+    override: str, train: Callable[..., Any], tmp_path: Path
+) -> None:
+    printed, trained = train(override, "--cfg", "job"), train(override)
+    assert (printed.code, printed.out) == (1, "")
+    assert printed.err == trained.err
+    assert len(printed.err.splitlines()) == 1
+    assert not (tmp_path / "run").exists()
+
+
 def test_arguments_without_a_meaning_are_refused_with_a_reason(train: Callable[..., Any], tmp_path: Path) -> None:
     refused = train("trainer.max_epochs=3")
     assert refused.code == 1

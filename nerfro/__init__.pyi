@@ -1,0 +1,71 @@
+# Public names of nerfro, which `lazy_loader` imports on first access.
+from .boundaries.constant import ConstantBoundary
+from .boundaries.envmap import EnvironmentMap
+from .boundaries.skybox import Skybox
+from .cameras import Cameras
+from .data.blender import BlenderData
+from .data.colmap import ColmapData
+from .data.nerfstudio import NerfstudioData
+from .evaluation.collection import metrics
+from .fields.hash_grid import HashGridField
+from .fields.nerf import NerfField
+from .losses.distortion import Distortion
+from .losses.photometric import Photometric
+from .media.analytic import Luneburg
+from .media.sdf_grid import SdfGrid
+from .media.shapes import Ball, RoundedBox, Slab
+from .models.refractive import RefractiveModel
+from .rays import Rays
+from .rendering.renderer import Components
+from .samplers.bend import bend, polylines
+from .samplers.eikonal import Eikonal
+from .samplers.hierarchical import Hierarchical
+from .samplers.snell import Snell
+from .samplers.straight import Straight
+from .samplers.stratified import Stratified
+from .training.build import build
+from .training.data_module import RayDataModule
+from .training.load import load
+from .training.module import TrainingModule
+from .training.optimizer import OptimizerConfig
+from .training.ray_batches import RayBatches
+from .viewing.trained_scene import TrainedScene
+
+__version__: str
+__all__ = [
+    "Ball",
+    "BlenderData",
+    "Cameras",
+    "ColmapData",
+    "Components",
+    "ConstantBoundary",
+    "Distortion",
+    "Eikonal",
+    "EnvironmentMap",
+    "HashGridField",
+    "Hierarchical",
+    "Luneburg",
+    "NerfField",
+    "NerfstudioData",
+    "OptimizerConfig",
+    "Photometric",
+    "RayBatches",
+    "RayDataModule",
+    "Rays",
+    "RefractiveModel",
+    "RoundedBox",
+    "SdfGrid",
+    "Skybox",
+    "Slab",
+    "Snell",
+    "Straight",
+    "Stratified",
+    "TrainedScene",
+    "TrainingModule",
+    "__version__",
+    "bend",
+    "build",
+    "load",
+    "metrics",
+    "polylines",
+]

@@ -1,0 +1,192 @@
+"""Metrics of two images: the base class of plugins of type `metric`, and the built-in metrics."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import ClassVar, Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from nerfro.evaluation.error_maps import squared_error_map
+from nerfro.evaluation.flip import flip
+from nerfro.evaluation.flip import is_available as flip_available
+from nerfro.evaluation.lpips import ALEX, VGG, LpipsNetwork
+from nerfro.evaluation.regions import mean_over, require_images
+from nerfro.evaluation.ssim import MS_SSIM_MIN_SIZE, WINDOW, ms_ssim, ssim
+from nerfro.registry import create, plugins, register
+
+MAX_PSNR = 100.0  # dB; the infinite PSNR of equal images has no mean and no representation in JSON
+
+# Order in tables; metrics of other packages follow.
+_BUILT_IN = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_vgg", "flip")
+
+
+class ImageMetric(nn.Module, ABC):
+    """Score of a rendered image.
+
+    Attributes:
+        title: heading in tables.
+        better: whether higher or lower scores are better.
+        decimals: number of decimals in tables.
+        min_size: smallest side of an image in pixels; smaller images have no score.
+        missing: reason why the metric is not available on this machine, or None.
+    """
+
+    title: ClassVar[str]
+    better: ClassVar[Literal["higher", "lower"]]
+    decimals: ClassVar[int] = 3
+    min_size: int = 1
+    missing: str | None = None
+
+    @abstractmethod
+    def forward(
+        self,
+        prediction: Float[Tensor, "H W 3"],
+        target: Float[Tensor, "H W 3"],
+        inside: Bool[Tensor, "H W"] | None = None,
+    ) -> Float[Tensor, ""]:
+        """Score one image.
+
+        Args:
+            prediction: rendered image, sRGB in [0, 1].
+            target: reference image, sRGB in [0, 1].
+            inside: mask of the pixels that count; by default, all pixels count.
+
+        Returns:
+            Score; NaN if it is not defined, for example for an empty mask.
+        """
+
+    def score(self, prediction: Tensor, target: Tensor, inside: Tensor | None = None) -> float:
+        """Return the score as a number; NaN if the metric is not available or the image is too small."""
+        if self.missing is not None or min(prediction.shape[:2]) < self.min_size:
+            return math.nan
+        return float(self(prediction, target, inside))
+
+
+def image_metrics() -> dict[str, type[ImageMetric]]:
+    """Return the registered metrics by name, in the order of tables."""
+    found = {plugin.name: plugin.cls for plugin in plugins("metric")}
+    return {name: found.pop(name) for name in _BUILT_IN} | found
+
+
+def build_metrics(
+    lpips_networks: Mapping[str, LpipsNetwork] | None = None, reasons: Mapping[str, str] | None = None
+) -> dict[str, ImageMetric]:
+    """Build all registered metrics, by name in the order of tables.
+
+    Args:
+        lpips_networks: networks by metric, see `find_lpips_networks`.
+        reasons: reason for each missing network, by metric.
+    """
+    parts = {"lpips_networks": lpips_networks, "reasons": reasons}
+    known = {plugin.name: plugin for plugin in plugins("metric")}
+    return {
+        name: create(known[name], {}, **{part: parts[part] for part in known[name].parts & parts.keys()})
+        for name in image_metrics()
+    }
+
+
+def psnr(
+    prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], inside: Bool[Tensor, "H W"] | None = None
+) -> Float[Tensor, ""]:
+    """Compute the peak signal-to-noise ratio, -10 log10(mean squared error); higher is better.
+
+    Args:
+        prediction: rendered image, sRGB in [0, 1].
+        target: reference image, sRGB in [0, 1].
+        inside: mask of the pixels that count; by default, all pixels count.
+
+    Returns:
+        PSNR in dB, at most `MAX_PSNR`, which a mean squared error below 1e-10 reaches; NaN for an empty mask.
+
+    Raises:
+        NerfroError: the sizes of the images differ.
+    """
+    require_images(prediction, target, inside)
+    errors = squared_error_map(prediction.double(), target.double())
+    return (-10 * torch.log10(mean_over(errors, inside))).clamp(max=MAX_PSNR)
+
+
+@register("metric", "psnr")
+class Psnr(ImageMetric):
+    """Peak signal-to-noise ratio, dB."""
+
+    title = "PSNR"
+    better = "higher"
+    decimals = 2
+    forward = staticmethod(psnr)
+
+
+@register("metric", "ssim")
+class Ssim(ImageMetric):
+    """Structural similarity."""
+
+    title = "SSIM"
+    better = "higher"
+    min_size = WINDOW
+    forward = staticmethod(ssim)
+
+
+@register("metric", "ms_ssim")
+class MsSsim(ImageMetric):
+    """Multiscale structural similarity over five scales."""
+
+    title = "MS-SSIM"
+    better = "higher"
+    min_size = MS_SSIM_MIN_SIZE
+    forward = staticmethod(ms_ssim)
+
+
+class _Lpips(ImageMetric):
+    """LPIPS with one of the networks.
+
+    Args:
+        lpips_networks: networks by metric, see `find_lpips_networks`.
+        reasons: reason for each missing network, by metric.
+    """
+
+    better = "lower"
+    name: ClassVar[str]
+
+    def __init__(
+        self, lpips_networks: Mapping[str, LpipsNetwork] | None = None, reasons: Mapping[str, str] | None = None
+    ) -> None:
+        super().__init__()
+        self.network = (lpips_networks or {}).get(self.name)
+        self.missing = None if self.network else (reasons or {}).get(self.name, "no network was given")
+
+    def forward(self, prediction: Tensor, target: Tensor, inside: Tensor | None = None) -> Tensor:
+        assert self.network is not None
+        return self.network(prediction, target, inside)
+
+
+@register("metric", "lpips")
+class Lpips(_Lpips):
+    """Learned perceptual image patch similarity with AlexNet."""
+
+    title = "LPIPS"
+    name = "lpips"
+    min_size = ALEX.min_size
+
+
+@register("metric", "lpips_vgg")
+class LpipsVgg(_Lpips):
+    """Learned perceptual image patch similarity with VGG-16."""
+
+    title = "LPIPS-VGG"
+    name = "lpips_vgg"
+    min_size = VGG.min_size
+
+
+@register("metric", "flip")
+class Flip(ImageMetric):
+    """FLIP, the difference that is visible when flipping between two images."""
+
+    title = "FLIP"
+    better = "lower"
+    missing = None if flip_available() else "the package flip-evaluator is not installed"
+    forward = staticmethod(flip)

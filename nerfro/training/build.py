@@ -1,0 +1,91 @@
+"""Construction of a training from a configuration, for `nerfro.train` and for Python programs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from lightning.pytorch import seed_everything
+from omegaconf import DictConfig
+
+from nerfro.cli import check_configuration, renamed_override
+from nerfro.data.base import DataSource, Views
+from nerfro.paths import CONF_DIR
+from nerfro.registry import discover
+from nerfro.rendering import Renderer
+from nerfro.training.background_pretraining import BackgroundPretraining
+from nerfro.training.camera_steps import CameraSteps
+from nerfro.training.config import TrainConfig, build_data, build_model, check_run, settle_trainer
+from nerfro.training.data_module import RayDataModule, traced
+from nerfro.training.memory import require_memory
+from nerfro.training.module import TrainingModule
+from nerfro.training.ray_batches import RayBatches
+from nerfro.training.reach import require_reach
+
+
+def build(experiment: str | None = None, overrides: Sequence[str] = ()) -> tuple[TrainingModule, RayDataModule]:
+    """Build an experiment for any Trainer of Lightning.
+
+    `lightning.Trainer(max_steps=1000).fit(module, datamodule=data)` trains it. The settings `trainer`, `logger`,
+    `callbacks` and `checkpoint` have no effect. A checkpoint of the Trainer contains the configuration, so that
+    `nerfro.load` and `TrainingModule.load_from_checkpoint` can read it.
+
+    Args:
+        experiment: name of an experiment in conf/experiment; by default, the configuration of `python -m nerfro.train`.
+        overrides: settings as on the command line, such as `["medium.ior=1.5", "field=nerf"]`.
+
+    Returns:
+        The module, which contains the model as `module.renderer`, and the training and validation data.
+
+    Raises:
+        NerfroError: a setting is not allowed, or the data cannot be read.
+    """
+    discover()
+    ConfigStore.instance().store(name="train_schema", node=TrainConfig, provider="nerfro")
+    chosen = [] if experiment is None else [f"+experiment={experiment}"]
+    with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+        config = compose("train", [*chosen, *map(renamed_override, overrides)])
+    check_configuration(config, TrainConfig, CONF_DIR)
+    check_run(config)
+    settle_trainer(config)
+    seed_everything(config.seed, verbose=False)
+    source = build_data(config)
+    return build_training(config, source, source.load("train"))
+
+
+def build_training(config: DictConfig, source: DataSource, training: Views) -> tuple[TrainingModule, RayDataModule]:
+    """Build the module and the data of a run.
+
+    Args:
+        config: configuration of the run, see `TrainConfig`; missing settings are derived from the data.
+        source: data set of the run.
+        training: its training views.
+    """
+    validation = source.load("val").checked() if config.evaluation.every > 0 and "val" in source.splits else None
+    batches = RayBatches.of(training, config)
+    renderer = build_model(config, training)
+    data = RayDataModule(
+        traced(batches, renderer, config), validation, config.evaluation.every, config.trainer.overfit_batches
+    )
+    # Cameras move by background and outlines before the background is learned.
+    callbacks = [CameraSteps(training), BackgroundPretraining(config.optimizer.boundary_steps)]
+    return TrainingModule.of(renderer, config, callbacks), data
+
+
+def check_first_batch(renderer: Renderer, batches: RayBatches, device: torch.device) -> str:
+    """Refuse a run whose rays miss the field, or that needs more memory than is free.
+
+    Args:
+        renderer: the model.
+        batches: batches of this process.
+        device: training device.
+
+    Returns:
+        The estimated memory in one line.
+    """
+    few = batches.smaller(4096)
+    first = few.batch(0)
+    require_reach(renderer, first)
+    return require_memory(renderer, first.rays, device, few.batch_size / batches.batch_size, batches.pixel_bytes)

@@ -1,0 +1,41 @@
+"""Template: a model of your own in one file. Use it with `model=haze`."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor, nn
+
+from nerfro.allowed import Positive
+from nerfro.draws import Draws
+from nerfro.models.refractive import RefractiveModel
+from nerfro.registry import register
+from nerfro.types import Path, Rendering
+
+
+@register("model", "haze")
+class Haze(RefractiveModel):
+    """Refractive model behind a homogeneous haze, whose density and colour are learned.
+
+    Args:
+        density: initial density of the haze, per world unit.
+        options: options of `RefractiveModel`.
+    """
+
+    def __init__(self, density: Positive = 0.01, **options: Any) -> None:
+        super().__init__(**options)
+        self.log_density = nn.Parameter(torch.tensor(density).log())
+        self.colour = nn.Parameter(torch.zeros(3))
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        return super().parameter_groups() | {"haze": [self.log_density, self.colour]}
+
+    def render_path(
+        self, path: Path, draws: Draws | None = None, teaches_background: Bool[Tensor, "R"] | None = None
+    ) -> list[Rendering]:
+        clear = torch.exp(-self.log_density.exp() * path.first_of_ray(path.far - path.near))[:, None]
+        renderings = super().render_path(path, draws, teaches_background)
+        return [dataclasses.replace(r, rgb=clear * r.rgb + (1 - clear) * self.colour.sigmoid()) for r in renderings]
