@@ -24,7 +24,7 @@ from nerfro.report.views import Selection, embed_image, scene_images
 from tests.test_summary import write_run
 from tests.viewing.browser import Browser, needs_chromium
 
-PSNR = find_metrics(["psnr"])[0]
+PSNR = find_metrics(["psnr"])
 CSV = """epoch,loss/photometric,loss/total,step,train/psnr,val/psnr
 0,0.1,0.2,9,10.0,
 0,0.01,0.02,19,20.0,
@@ -59,7 +59,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory, tiny_scene: Path) -> Path:
 
 def page(runs: Path, unfinished: tuple[str, ...] = ()) -> str:
     comparisons = compare(find_runs([str(runs)])[0], {}, {})
-    compared = [(comparison, to_table(comparison, [PSNR], "full")) for comparison in comparisons]
+    compared = [(comparison, to_table(comparison, PSNR, "full")) for comparison in comparisons]
     return report_page(compared, unfinished, Selection())
 
 
