@@ -11,9 +11,8 @@ from .fields.hash_grid import HashGridField
 from .fields.nerf import NerfField
 from .losses.distortion import Distortion
 from .losses.photometric import Photometric
-from .media.analytic import Luneburg
 from .media.sdf_grid import SdfGrid
-from .media.shapes import Ball, RoundedBox, Slab
+from .media.shapes import Ball
 from .models.refractive import RefractiveModel
 from .rays import Rays
 from .rendering.renderer import Components
@@ -44,7 +43,6 @@ __all__ = [
     "EnvironmentMap",
     "HashGridField",
     "Hierarchical",
-    "Luneburg",
     "NerfField",
     "NerfstudioData",
     "OptimizerConfig",
@@ -53,10 +51,8 @@ __all__ = [
     "RayDataModule",
     "Rays",
     "RefractiveModel",
-    "RoundedBox",
     "SdfGrid",
     "Skybox",
-    "Slab",
     "Snell",
     "Straight",
     "Stratified",
