@@ -333,7 +333,8 @@ class _ConfigLoader(GuardedConfigLoader):
         overrides = [renamed_override(override) for override in sweep_overrides]
         config = super().load_sweep_config(master_config, overrides)
         excluded = config.hydra.job.config.override_dirname.exclude_keys
-        given = OverridesParser.create().parse_overrides(list(master_config.hydra.overrides.task))
+        task = cast(list[str], OmegaConf.to_container(master_config.hydra.overrides.task, resolve=False))
+        given = OverridesParser.create().parse_overrides(task)
         # As sweepers write them: `debug=true` becomes `debug=True`.
         common = {f"{o.get_key_element()}={o.get_value_element_as_str()}" for o in given if not o.is_sweep_override()}
         swept = (override.partition("=") for override in overrides if override not in common)

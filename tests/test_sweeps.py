@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import shutil
@@ -11,11 +12,10 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import pytest
 from hydra import compose, initialize_config_dir
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 from omegaconf import DictConfig, OmegaConf
@@ -144,31 +144,35 @@ def test_sweep_file_composes_its_cells(name: str) -> None:
             check_settings(composed(f"{key}={value}"), TrainConfig)
 
 
+SWEEPER = """
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+
+returned = []
+
+
 class RecordingSweeper(BasicSweeper):
-    """Hydra's sweeper, as a package of its own that uses the values that jobs return."""
-
-    __module__ = "hydra_plugins.recording"
-    returned: ClassVar[list[float]] = []
-
-    def sweep(self, arguments: list[str]) -> None:
-        self.returned[:] = [job.return_value for (batch,) in [super().sweep(arguments)] for job in batch]
+    def sweep(self, arguments):
+        (batch,) = super().sweep(arguments)
+        returned[:] = [job.return_value for job in batch]
+"""
 
 
 def test_sweepers_of_other_packages_receive_the_metric_to_optimize(
     sweep: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sweep("trainer.max_steps=0,-1")  # Hydra finds its plugins when it runs
-    Plugins.instance().register(RecordingSweeper)
+    (tmp_path / "site" / "hydra_plugins").mkdir(parents=True)
+    (tmp_path / "site" / "hydra_plugins" / "recording.py").write_text(SWEEPER)
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    recording = importlib.import_module("hydra_plugins.recording")
+    Plugins.instance().register(recording.RecordingSweeper)
     chosen = ["hydra.sweeper._target_=hydra_plugins.recording.RecordingSweeper", "medium.ior=1.4,1.6"]
     assert sweep(*chosen, "optimized_metric=ssim").code == 0
-    before, scores = written(tmp_path / "sweep"), list(RecordingSweeper.returned)
+    before, scores = written(tmp_path / "sweep"), list(recording.returned)
     files = sorted((tmp_path / "sweep").glob("*/metrics.json"))
     assert [file.parent.name.rpartition("-")[2] for file in files] == ["ior=1.4", "ior=1.6"]
     assert scores == [json.loads(file.read_text())["test"]["ssim"] for file in files]
     assert sweep(*chosen, "optimized_metric=ssim").code == 0
-    assert (RecordingSweeper.returned, written(tmp_path / "sweep")) == (scores, before), (
-        "finished cells are not trained"
-    )
+    assert (recording.returned, written(tmp_path / "sweep")) == (scores, before), "finished cells are not trained"
     unknown = sweep("seed=1", "optimized_metric=beauty")
     assert "no metric is called 'beauty'; known: flip, lpips" in unknown.err
 
