@@ -134,13 +134,11 @@ def entry_point(
         def run() -> None:
             # Otherwise Hydra prints its own report and exits.
             os.environ["HYDRA_FULL_ERROR"] = "1"
-            with errors_in_one_line():
+            with errors_in_one_line(), _composed_with(check_all):
                 sys.argv[1:] = _flags_first(sys.argv[1:])
                 ConfigStore.instance().store(name=f"{config_name}_schema", node=schema, provider="nerfro")
                 SourcesRegistry.instance().types["file"] = _RenamingFiles
                 leave_current_directory()
-                _ConfigLoader.check_job = staticmethod(check_all)
-                hydra._internal.hydra.ConfigLoaderImpl = _ConfigLoader  # type: ignore[misc]
                 discover()
                 sys.argv[1:] = [_quoted(renamed_override(argument), verbatim) for argument in sys.argv[1:]]
                 try:
@@ -313,6 +311,18 @@ def renamed_config(config: DictConfig, origin: Path) -> DictConfig:
     if found:
         warn(f"{origin} has old names of settings, which can be read for one more release: {', '.join(found)}")
     return config
+
+
+@contextlib.contextmanager
+def _composed_with(check: Callable[[DictConfig], None]) -> Iterator[None]:
+    """Let Hydra compose configurations with the checks of a command."""
+    before = hydra._internal.hydra.ConfigLoaderImpl
+    _ConfigLoader.check_job = staticmethod(check)
+    hydra._internal.hydra.ConfigLoaderImpl = _ConfigLoader  # type: ignore[misc]
+    try:
+        yield
+    finally:
+        hydra._internal.hydra.ConfigLoaderImpl = before  # type: ignore[misc]
 
 
 class _ConfigLoader(GuardedConfigLoader):

@@ -172,10 +172,7 @@ def build(node: object, **parts: object) -> Any:
     target = node.get("_target_")
     if target in _LIGHTNING_TARGETS:
         try:
-            # Hydra instantiates nested nodes too.
-            for nested in _targets(OmegaConf.to_container(node, resolve=True)):
-                if nested not in _LIGHTNING_TARGETS:
-                    raise NerfroError(f"'{nested}' inside {target} is not registered; remove it")
+            require_lightning(node)
             return instantiate(node, **parts)
         except (InstantiationException, OmegaConfBaseException) as error:
             cause = error.__cause__ or error
@@ -198,6 +195,22 @@ def check_node(node: object) -> type:
     else:
         check(f"{plugin.kind}={plugin.name}: ", plugin.hints, known)
     return plugin.cls
+
+
+def require_lightning(node: object) -> None:
+    """Refuse a node, such as that of a logger, whose class is neither of Lightning nor registered.
+
+    Raises:
+        NerfroError: the class is not allowed.
+    """
+    node = _settings_of(node)
+    target = node.get("_target_")
+    if target not in _LIGHTNING_TARGETS:
+        _plugin_of(node)
+        return
+    for nested in _targets(OmegaConf.to_container(node, resolve=True)):  # Hydra instantiates nested nodes too
+        if nested not in _LIGHTNING_TARGETS:
+            raise NerfroError(f"'{nested}' inside {target} is not registered; remove it")
 
 
 def _settings_of(node: object) -> DictConfig:

@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from torch import nn
 
 import nerfro.registry
+import nerfro.training.lightning_callbacks
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError

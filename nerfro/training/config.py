@@ -29,7 +29,7 @@ from nerfro.errors import NerfroError
 from nerfro.losses.base import Loss
 from nerfro.media.analytic import Vacuum
 from nerfro.paths import resolve_path, scene_name
-from nerfro.registry import build, check_node, configure, create, find
+from nerfro.registry import build, check_node, configure, create, find, require_lightning
 from nerfro.rendering import Components, Renderer
 from nerfro.scenes import SCENES
 from nerfro.subdivision import Subdivision
@@ -257,13 +257,14 @@ def check_run(config: DictConfig) -> None:
     for name, reason in REFUSED_ARGUMENTS.items():
         if config.trainer[name] is not None:
             raise NerfroError(f"trainer.{name}={config.trainer[name]} has no meaning in nerfro: {reason}")
+    OmegaConf.to_container(config, resolve=True)  # an interpolation without a value is an error
     limit = config.trainer.max_time
     if isinstance(limit, (int, float)):
         raise NerfroError(f"trainer.max_time={limit} has no unit; write DD:HH:MM:SS, such as 00:00:05:00")
-    if limit is None and config.trainer.max_steps < 0 and not (config.debug or config.trainer.fast_dev_run):
-        raise NerfroError("the run would never end; set trainer.max_time (DD:HH:MM:SS), trainer.max_steps, or both")
     if (config.checkpoint.every_seconds is None) == (config.checkpoint.every_steps is None):
         raise NerfroError("set one of checkpoint.every_seconds and checkpoint.every_steps, and the other to null")
+    for node in (config.trainer, *(config.logger or {}).values()):
+        require_lightning(node)
     find("metric", config.optimized_metric.rpartition(".")[2])
     for name, node in config.callbacks.items():
         configure(find("callbacks", str(name)), node or {})
@@ -272,6 +273,8 @@ def check_run(config: DictConfig) -> None:
         check_node(node)
     if check_node(config.sampler.path).needs_medium:  # type: ignore[attr-defined]
         check_node(config.medium)
+    if limit is None and config.trainer.max_steps < 0 and not (config.debug or config.trainer.fast_dev_run):
+        raise NerfroError("the run would never end; set trainer.max_time (DD:HH:MM:SS), trainer.max_steps, or both")
 
 
 def settle_trainer(config: DictConfig) -> None:
