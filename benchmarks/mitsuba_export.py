@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 import nerfro
-from nerfro.evaluation.metrics import psnr
+from nerfro.evaluation.image_metrics import psnr
 from nerfro.light import to_srgb
 from nerfro.scenes.path_tracer import load_mitsuba
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nerfro.cameras import Cameras
-from nerfro.evaluation.metrics import psnr
+from nerfro.evaluation.image_metrics import psnr
 from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball

@@ -19,7 +19,7 @@ from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.cameras import Cameras
 from nerfro.data.blender import BlenderData
 from nerfro.errors import NerfroError
-from nerfro.evaluation.metrics import psnr
+from nerfro.evaluation.image_metrics import psnr
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
 from nerfro.files.deep_images import write_radiance

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerfro.evaluation.metrics import psnr
+from nerfro.evaluation.image_metrics import psnr
 from nerfro.files import lat_long
 from nerfro.viewing.page import make_page
 from nerfro.viewing.trained_scene import TrainedScene
