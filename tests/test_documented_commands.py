@@ -68,9 +68,9 @@ def require_valid(command: str, options: list[str]) -> None:
     """Raise an error unless a command accepts the options. Hydra composes only the choices of groups, to save time."""
     schema, verbatim = entry_points()[command]
     assert [renamed_override(option) for option in options] == options, "an old name"
-    # Of a sweep the first value; no patterns, and no launchers and sweepers, which may not be installed.
+    # Of a sweep the first value; no patterns, and no options of Hydra, whose launchers may not be installed.
     options = [re.sub(r"^([^=]+=[^,[{]+),[^]}]*$", r"\1", option) for option in options if "(" not in option]
-    options = [_quoted(option, verbatim) for option in options if not re.match("hydra[/.](launcher|sweeper)", option)]
+    options = [_quoted(option, verbatim) for option in options if not option.startswith("hydra")]
     choices, settings = [], []
     for override in OverridesParser.create().parse_overrides(options):
         key = override.key_or_group
