@@ -62,7 +62,7 @@ class Range:
         return limits or "a finite number"
 
 
-_FURTHEST = 10**6  # world units; the spacing of float32 numbers is 0.06 there
+_FURTHEST = 10**7  # world units, as in georeferenced data
 
 AnyNumber = Annotated[float, None]  # including infinity and NaN
 Count = Annotated[int, Range(at_least=1)]
@@ -169,7 +169,7 @@ def corners_of_box(
 
     Args:
         box_min, box_max: lower and upper corner, world units.
-        bounded: refuse corners farther than 10^6 units from the origin.
+        bounded: refuse corners farther than 10^7 units from the origin.
 
     Raises:
         NerfroError: a corner does not have three numbers, or the lower corner is not below the upper one.

@@ -20,7 +20,10 @@ def main(config: DictConfig) -> None:
     scene = load(config.checkpoint, config.device, config.root)
     if config.sky is not None:
         scene = scene.with_(sky=config.sky)
-    print(f"{export.write(scene, out, config)}; wrote {out}")
+    written = export.write(scene, out, config)
+    if scene.source.origin.any():
+        written += f", in coordinates relative to the point {scene.source.origin.tolist()}"
+    print(f"{written}; wrote {out}")
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
@@ -18,7 +19,9 @@ from nerfro.cameras import Cameras
 from nerfro.draws import Draws
 from nerfro.rays import Rays
 
-__all__ = ["Batch", "Exits", "Path", "Radiance", "Rays", "Rendering", "Samples"]
+__all__ = ["WORLD_ORIGIN", "Batch", "Exits", "Path", "Radiance", "Rays", "Rendering", "Samples"]
+
+WORLD_ORIGIN = np.zeros(3)
 
 
 @dataclass(frozen=True)

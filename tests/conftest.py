@@ -184,10 +184,25 @@ def finish(
     return Finished(code, printed.out, printed.err)
 
 
+UTM = (345678.25, 5234567.5, 120.0)  # typical coordinates of georeferenced data
+
+
+def moved_mesh(mesh: trimesh.Trimesh, place: Sequence[float], file: Path) -> Path:
+    """Write a mesh at another place, with decimals for double precision."""
+    mesh = trimesh.Trimesh(mesh.vertices + place, mesh.faces, process=False)
+    file.write_text(trimesh.exchange.obj.export_obj(mesh, digits=10))
+    return file
+
+
 @pytest.fixture(scope="session")
 def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of `write_tiny_scene`."""
+    return write_tiny_scene(tmp_path_factory.mktemp("scenes") / "tiny_scene")
+
+
+def write_tiny_scene(root: Path) -> Path:
     """A Blender-format folder: a ball in front of a sky that is a linear function of direction, 16x16 pixels."""
-    root = tmp_path_factory.mktemp("tiny_scene")
+    root.mkdir()
     trimesh.creation.icosphere(2, 0.6).export(root / "mesh.ply")
     for split, num_views in (("train", 3), ("val", 2), ("test", 2)):
         (root / split).mkdir()
@@ -246,9 +261,14 @@ def tiny_run(tiny_scene: Path) -> list[str]:
 
 @pytest.fixture(scope="session")
 def tiny_default_run(tiny_scene: Path) -> list[str]:
+    """The overrides of `tiny_default_options` for the tiny scene."""
+    return tiny_default_options(tiny_scene)
+
+
+def tiny_default_options(scene: Path) -> list[str]:
     """Overrides that make a training step of the default experiment take milliseconds."""
     return [
-        f"data.root={tiny_scene}",
+        f"data.root={scene}",
         "medium.resolution=32",
         "medium.cache=false",
         "sampler.points.num_samples=8",

@@ -69,7 +69,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], list[str]]] = {
         lambda root: edit(root / "transforms_train.json", lambda d: d.pop("camera_angle_x")),
         ["camera_angle_x"],
     ),
-    "pose far away": (lambda root: edit(root / "transforms_train.json", put_pose(1e39)), ["r_1", "at least -1000000"]),
+    "pose far away": (lambda root: edit(root / "transforms_train.json", put_pose(1e39)), ["r_1", "at least -10000000"]),
     "pose of 400 digits": (lambda root: edit(root / "transforms_train.json", put_pose(10**400)), ["r_1", "infinite"]),
     "field of view of 400 digits": (
         lambda root: edit(root / "transforms_train.json", lambda d: d.update(camera_angle_x=10**400)),

@@ -17,6 +17,7 @@ import nerfro.export
 import nerfro.render
 from nerfro.errors import NerfroError
 from nerfro.files.images import load_png
+from tests.conftest import UTM, moved_mesh
 
 
 def test_importing_nerfro_imports_nothing_heavy() -> None:
@@ -74,10 +75,20 @@ def test_a_run_is_loaded_rendered_and_exported(
 @pytest.mark.parametrize("interface", ["mesh", "sdf"])
 def test_bending_at_a_ball_is_as_in_closed_form(interface: str, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("NERFRO_CACHE", str(tmp_path / "cache"))
-    trimesh.creation.icosphere(5, 0.8).export(tmp_path / "ball.ply")
-    heights = np.linspace(-0.7, 0.7, 15)
+    ball, heights = trimesh.creation.icosphere(5, 0.8), np.linspace(-0.7, 0.7, 15)
     origins = np.stack([0 * heights - 4, heights, 0 * heights], -1)
-    bent = nerfro.bend(tmp_path / "ball.ply", 1.5, origins, np.tile([[2.0, 0, 0]], (15, 1)), interface, 64)
+    near, *far = (
+        nerfro.bend(
+            moved_mesh(ball, place, tmp_path / "ball.obj"), 1.5, origins + place, np.tile([[2.0, 0, 0]], (15, 1)),
+            interface, 64,
+        )
+        for place in ([0, 0, 0], [1e5, -2e5, 50], UTM)
+    )  # fmt: skip
+    bent = near
+    for place, other in zip(([1e5, -2e5, 50], UTM), far, strict=True):
+        turned = torch.linalg.vector_norm(other.directions - near.directions, dim=-1).max().rad2deg()
+        assert turned < 0.01
+        np.testing.assert_allclose(other.positions - torch.tensor(place), near.positions, atol=1e-4)
     deviation = 2 * (np.arcsin(heights / 0.8) - np.arcsin(heights / 1.2))
     expected = np.stack([np.cos(deviation), -np.sin(deviation), 0 * heights], -1)
     np.testing.assert_allclose(bent.directions.numpy(), expected, atol=5e-3)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 import nerfro.trace
-from tests.conftest import finish
+from tests.conftest import UTM, finish, moved_mesh
 
 
 @pytest.fixture
@@ -27,11 +27,11 @@ def trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     return run
 
 
-def _write_rays(file: Path, num: int = 40) -> tuple[np.ndarray, np.ndarray]:
+def _write_rays(file: Path, place: Sequence[float] = (0, 0, 0), num: int = 40) -> tuple[np.ndarray, np.ndarray]:
     """A beam along +x that the ball covers in part; returns heights and exact exit directions for n = 1.5."""
     heights = np.linspace(-0.95, 0.95, num)
     origins = np.stack([0 * heights - 4, heights, 0 * heights], -1)
-    np.savez(file, origins=origins, directions=np.tile([[1.0, 0.0, 0.0]], (num, 1)))
+    np.savez(file, origins=origins + place, directions=np.tile([[1.0, 0.0, 0.0]], (num, 1)))
     share = np.clip(heights / 0.8, -1, 1)
     deviation = np.where(np.abs(heights) < 0.8, 2 * (np.arcsin(share) - np.arcsin(share / 1.5)), 0)
     return heights, np.stack([np.cos(deviation), -np.sin(deviation), 0 * heights], -1)
@@ -41,10 +41,17 @@ BOX = ["medium.box_min=[-1.5,-1.5,-1.5]", "medium.box_max=[1.5,1.5,1.5]"]
 SAMPLERS = [["sampler/path=snell"], ["sampler.path.interface=mesh"], ["sampler/path=eikonal"]]
 
 
+@pytest.mark.parametrize("place", [(0, 0, 0), UTM], ids=["origin", "utm"])
 @pytest.mark.parametrize("options", SAMPLERS, ids=["snell", "mesh", "eikonal"])
-def test_rays_leave_a_ball_as_in_closed_form(trace: Callable[..., str], tmp_path: Path, options: list[str]) -> None:
-    heights, exact = _write_rays(tmp_path / "rays.npz")
-    assert "40 rays traced" in trace("medium.ior=1.5", *BOX, *options)
+def test_rays_leave_a_ball_as_in_closed_form(
+    trace: Callable[..., str], tmp_path: Path, options: list[str], place: tuple[float, ...]
+) -> None:
+    heights, exact = _write_rays(tmp_path / "rays.npz", place)
+    moved_mesh(trimesh.load(tmp_path / "ball.ply"), place, tmp_path / "ball.obj")
+    box = [
+        f"medium.box_{end}=[{','.join(str(x + side) for x in place)}]" for end, side in (("min", -1.5), ("max", 1.5))
+    ]
+    assert "40 rays traced" in trace("medium.mesh=ball.obj", "medium.ior=1.5", *box, *options)
     with np.load(tmp_path / "out.npz") as out:
         clear = np.abs(np.abs(heights) - 0.8) > 0.01  # the eikonal shell has a width
         assert out["hit"][clear].tolist() == (np.abs(heights) < 0.8)[clear].tolist()
@@ -53,7 +60,7 @@ def test_rays_leave_a_ball_as_in_closed_form(trace: Callable[..., str], tmp_path
         assert np.median(error) < (0.15 if "sampler/path=eikonal" in options else 0.02)
         assert error[np.abs(heights) < 0.7].max() < 0.5
         # Where the box is left, on the line that leaves the ball.
-        np.testing.assert_allclose(np.abs(out["exit_positions"][clear]).max(-1), 1.5, atol=1e-4)
+        np.testing.assert_allclose(np.abs(out["exit_positions"][clear] - place).max(-1), 1.5, atol=1e-4)
         missed = ~out["hit"] & clear
         np.testing.assert_allclose(out["path_lengths"][missed], 5.5, atol=1e-4)
         assert (out["path_lengths"][out["hit"]] > 5.3).all()

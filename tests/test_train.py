@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import trimesh
 from omegaconf import OmegaConf
 from PIL import Image
 
 from nerfro.data.blender import BlenderData
-from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
-from tests.conftest import train_in
+from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint, restore
+from tests.conftest import UTM, moved_mesh, train_in
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +65,26 @@ def test_run_writes_metrics_pictures_and_what_repeats_it(run: Path, overrides: l
     assert facts["seed"] == 0
     assert facts["versions"]["torch"] == torch.__version__
     assert all(override in facts["command"] for override in overrides if "{" not in override)
+
+
+def test_georeferenced_data_train_as_at_the_origin(
+    run: Path, train_here: Callable[..., Any], overrides: list[str], tiny_scene: Path, tmp_path: Path
+) -> None:
+    root = tmp_path / "utm"
+    shutil.copytree(tiny_scene, root)
+    mesh = moved_mesh(trimesh.load(root / "mesh.ply"), UTM, root / "mesh.obj")
+    for file in root.glob("*.json"):
+        document = json.loads(file.read_text())
+        for frame in document["frames"]:
+            for row, shift in zip(frame["transform_matrix"], UTM, strict=False):
+                row[3] += shift
+        file.write_text(json.dumps(document))
+    finished = train_here(*overrides, f"data.root={root}", f"medium.mesh={mesh}", f"hydra.run.dir={tmp_path / 'far'}")
+    assert finished.code == 0, finished.err
+    psnr = [json.loads((folder / "metrics.json").read_text())["test"]["psnr"] for folder in (run, tmp_path / "far")]
+    assert psnr[1] == pytest.approx(psnr[0], abs=0.01)
+    refused = train_here(*overrides, f"data.root={root}", f"hydra.run.dir={tmp_path / 'apart'}")
+    assert "too far from the origin for single precision; subtract this point" in refused.err
 
 
 def test_log_holds_every_loss_and_weight_of_every_second_step_and_images(run: Path) -> None:

@@ -18,6 +18,7 @@ from nerfro.cli import warn
 from nerfro.data.lazy_images import LazyImages
 from nerfro.errors import first_of
 from nerfro.progress import track
+from nerfro.types import WORLD_ORIGIN
 
 
 @dataclass(frozen=True)
@@ -101,9 +102,13 @@ class DataSource(ABC):
 
     Attributes:
         root: folder of the data set.
+        mask_labels: labels of the object in the mask files, see `nerfro.data.image_files.read_mask`.
+        origin: world coordinates of the origin of the positions in `Views`; see `Medium.origin`.
     """
 
     root: Path
+    mask_labels: Sequence[int] | None = None
+    origin: Float[np.ndarray, "3"] = WORLD_ORIGIN
 
     @property
     @abstractmethod
@@ -120,7 +125,8 @@ class DataSource(ABC):
             split: one of `splits`.
 
         Returns:
-            The views, with OpenGL camera axes (x right, y up, viewing direction -z) and lengths in world units.
+            The views, with OpenGL camera axes (x right, y up, viewing direction -z), lengths in world units, and
+            positions relative to `origin`.
 
         Raises:
             NerfroError: the split is unknown, a file is missing or has the wrong size, or a number is not finite.

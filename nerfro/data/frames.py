@@ -28,6 +28,7 @@ SPLITS = ["train", "val", "test"]
 Item = TypeVar("Item")
 
 _ROTATION_TOLERANCE = 1e-3
+_LEAST_PRECISION = 2e-4  # spacing of the coordinates of cameras, relative to the extent of their positions
 
 
 @dataclass(frozen=True)
@@ -123,6 +124,8 @@ class PosedImages(DataSource):
             check_pose(frame.camera_to_world, frame.name, "the pose")
         check_lenses(read.lenses, [frame.name for frame in frames], stored)
         poses = np.stack([frame.camera_to_world for frame in frames])
+        poses[:, :, 3] -= self.origin
+        self._require_precision(poses[:, :, 3])
         if read.axes == "opencv":
             poses = poses * np.array([1.0, -1.0, -1.0, 1.0])
         intrinsics = torch.tensor([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in read.lenses], dtype=torch.float64)
@@ -137,6 +140,19 @@ class PosedImages(DataSource):
             cameras, images = cameras.crop(window), images.cut(window)
             masks, usable = masks and masks.cut(window), usable and usable.cut(window)
         return Views(cameras, images, masks, [frame.name for frame in frames], usable, frames, self.mask_labels)
+
+    def _require_precision(self, centres: Float[np.ndarray, "V 3"]) -> None:
+        """Refuse cameras that are far from the origin compared with the distances between the cameras."""
+        size, spacing = np.ptp(centres, axis=0).max(), float(np.spacing(np.float32(np.abs(centres).max())))
+        if spacing > _LEAST_PRECISION * size > 0:
+            middle = centres.mean(0).round(math.ceil(-math.log10(size))) + self.origin
+            advice = "subtract this point from all positions of cameras, points and mesh"
+            if self.origin.any():
+                advice = f"the object lies near {self.origin.tolist()}, so give mesh and cameras the same coordinates"
+            raise NerfroError(
+                f"the cameras of data.root={self.root} are {size:.3g} world units apart and lie near "
+                f"{middle.tolist()}, too far from the origin for single precision; {advice}"
+            )
 
     def _require_own_masks(self, frames: Sequence[Frame]) -> None:
         """Refuse a mask file that the search finds for several images, of one split or of several."""

@@ -19,7 +19,7 @@ class WithValidationViews(DataSource):
 
     def __init__(self, source: DataSource, number: int) -> None:
         self._source, self._number = source, number
-        self.root = source.root
+        self.root, self.origin = source.root, source.origin
 
     @property
     def splits(self) -> list[str]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from jaxtyping import Float, Int
 from nerfro.allowed import Coordinate, check
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
+from nerfro.files.reading import reading
 from nerfro.geometry.file_normals import informative_normals
 from nerfro.geometry.orientation import area_vectors, inward_faces
 
@@ -39,6 +41,10 @@ class TriangleMesh:
     def bounds(self) -> Float[np.ndarray, "2 3"]:
         return np.stack([self.vertices.min(0), self.vertices.max(0)])
 
+    def relative_to(self, origin: Float[np.ndarray, "3"]) -> TriangleMesh:
+        """Return the mesh in coordinates with another origin."""
+        return replace(self, vertices=self.vertices - origin)
+
     @property
     def is_closed(self) -> bool:
         """Whether every edge belongs to an even number of triangles, so that the inside is defined."""
@@ -55,6 +61,24 @@ class TriangleMesh:
 
 
 _THINNEST = 1e-4  # world units; boxes are stored with six decimals
+# Distance from the origin, in sizes of the object, beyond which rays have coordinates relative to the object. Rays are
+# in single precision, whose relative spacing of 1.2e-7 turns exit directions by up to 0.01 degrees at this distance.
+_FAR = 100
+
+
+def local_origin(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "3"]:
+    """Return the origin of the coordinates in which rays are traced, world units.
+
+    The origin is the origin of the world, unless the object lies far from it, as in georeferenced data.
+
+    Args:
+        points: vertices of the object, or corners of its bounds.
+    """
+    low, high = points.min(0), points.max(0)
+    centre, size = 0.5 * (low + high), float((high - low).max())
+    if not 0 < _FAR * size < np.abs(centre).max():
+        return np.zeros(3)
+    return centre.round(math.ceil(-math.log10(size)))
 
 
 def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
@@ -67,20 +91,15 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
     Raises:
         NerfroError: the file is missing, unreadable, empty, not finite, or has holes that are not accepted.
     """
-    import trimesh
-
-    if not path.is_file():
-        raise NerfroError(f"mesh {path} does not exist; set medium.mesh to a closed triangle mesh (ply, obj, stl, glb)")
-    try:
-        loaded: Any = trimesh.load(path, process=False)
-        if isinstance(loaded, trimesh.Scene):  # several bodies, or one in a format for scenes
-            loaded = loaded.to_mesh()
-    except Exception as error:  # trimesh passes on any exception of the parsers
-        raise NerfroError(f"mesh {path} cannot be read ({error}); export it as ply, obj, stl or glb") from error
+    missing = "set medium.mesh to a closed triangle mesh (ply, obj, stl, glb)"
+    with reading(path, "mesh ", advice="export it as ply, obj, stl or glb", missing=missing):
+        loaded = _parse(path)
     vertices = np.asarray(getattr(loaded, "vertices", ()), np.float64)
     faces = np.asarray(getattr(loaded, "faces", ()), np.int64)
     if len(vertices) == 0 or len(faces) == 0:
         raise NerfroError(f"mesh {path} has no triangles; export a surface instead of a point cloud or an empty scene")
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+        raise NerfroError(f"mesh {path} is not made of triangles of points with three coordinates; export it again")
     if not np.isfinite(vertices).all():
         raise NerfroError(f"mesh {path} has vertices that are not finite; export it again")
     if faces.min() < 0 or faces.max() >= len(vertices):
@@ -95,6 +114,8 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
         )
     # trimesh computes normals on demand; before the first access, the cache holds only normals from the file.
     read = np.asarray(loaded.vertex_normals, np.float64) if "vertex_normals" in loaded._cache else None
+    if read is not None and read.shape != vertices.shape:
+        raise NerfroError(f"mesh {path} has normals of shape {list(read.shape)} for its vertices; export it again")
     if read is not None:
         length = np.linalg.norm(read, axis=-1, keepdims=True)
         read = np.divide(read, length, out=np.zeros(read.shape), where=np.isfinite(length) & (length > 0))[faces]
@@ -123,18 +144,21 @@ def _facing_outwards(mesh: TriangleMesh) -> TriangleMesh:
 
 
 def load_points(path: Path) -> Float[np.ndarray, "P 3"]:
-    """Read the points of a point cloud of any format that trimesh supports.
+    """Read the points of a point cloud, or the vertices of a mesh, of any format that trimesh supports.
 
     Raises:
         NerfroError: the file cannot be read.
     """
+    with reading(path, trouble="has no readable points", advice="export it again, or remove it"):
+        return np.asarray(_parse(path).vertices, np.float64).reshape(-1, 3)
+
+
+def _parse(path: Path) -> Any:
+    """Read a file with trimesh; scenes, which may hold several bodies, become one mesh."""
     import trimesh
 
-    try:
-        loaded: Any = trimesh.load(path, process=False)
-        return np.asarray(loaded.vertices, np.float64).reshape(-1, 3)
-    except Exception as error:  # trimesh passes on any exception of the parsers
-        raise NerfroError(f"{path} has no readable points ({error}); export it again, or remove it") from error
+    loaded: Any = trimesh.load(path, process=False)
+    return loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
 
 
 def merge_vertices(

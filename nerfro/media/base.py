@@ -6,12 +6,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfro.errors import NerfroError
-from nerfro.types import Path
+from nerfro.types import WORLD_ORIGIN, Path
 
 Scalars = Float[Tensor, "*batch"]
 Vectors = Float[Tensor, "*batch 3"]
@@ -45,16 +46,19 @@ class Medium(nn.Module, ABC):
 
     Attributes:
         box: lower and upper corner of the medium [2, 3], world units. Outside of it n = 1 and grad n = 0.
+        origin: world coordinates of the origin of all positions. It differs from zero if the object lies so far from
+            the origin of the world that single precision is not enough.
     """
 
     box: Float[Tensor, "2 3"]
+    origin: Float[np.ndarray, "3"] = WORLD_ORIGIN
 
     @abstractmethod
     def forward(self, positions: Vectors) -> tuple[Scalars, Vectors]:
         """Evaluate the refractive index and its gradient.
 
         Args:
-            positions: points, world coordinates.
+            positions: points, world units, relative to `origin`.
 
         Returns:
             n without unit, and grad n per world unit.

@@ -18,7 +18,7 @@ from nerfro.files.cache import cached_arrays, content_hash
 from nerfro.geometry.bodies import require_separate
 from nerfro.geometry.interpolation import quadratic_spline, spline_coefficients
 from nerfro.geometry.intersection import LayeredIntersector, Triangles
-from nerfro.geometry.mesh import TriangleMesh, load_mesh
+from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin
 from nerfro.geometry.signed_distance import signed_distance_grid
 from nerfro.kernels.available import require_bytes
 from nerfro.kernels.constants import constant
@@ -101,10 +101,12 @@ class SdfGrid(Solid):
         spacing = (box[1] - box[0]) / (resolution - 1)
         shell = shell_voxels * float(spacing.min())
         super().__init__([ior, *inner_iors], shell, absorption, learn_absorption, abbe, learn_ior)
-        self.meshes = meshes
+        for body in meshes:
+            check_margin(body, box, resolution, 2)
+        self.origin = local_origin(meshes[0].vertices)
+        box, self.meshes = box - self.origin, [body.relative_to(self.origin) for body in meshes]
         distances = []
         for body in self.meshes:
-            check_margin(body, box, resolution, 2)
             if body.is_closed:
                 require_separate(body)
             distances.append(cached_distance(body, box, resolution, BAND, cache))

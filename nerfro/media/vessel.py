@@ -13,7 +13,7 @@ from nerfro.allowed import Coordinate, NotNegative, Positive, Resolution
 from nerfro.errors import NerfroError
 from nerfro.geometry.bodies import require_separate
 from nerfro.geometry.lids import find_lid
-from nerfro.geometry.mesh import load_mesh
+from nerfro.geometry.mesh import load_mesh, local_origin
 from nerfro.kernels.available import require_bytes
 from nerfro.media.sdf_grid import AIR, BAND, SdfGrid, cached_distance
 from nerfro.media.solid import Solid
@@ -96,6 +96,8 @@ class SdfVessel(SdfGrid):
         self.meshes = []  # rays are refracted at the distance field, not at triangles
         upwards = _direction(up)
         check_margin(surface, box, resolution, 2)
+        self.origin = local_origin(surface.vertices)
+        box, surface = box - self.origin, surface.relative_to(self.origin)
         if surface.is_closed:
             require_separate(surface)
         self._content_box = torch.from_numpy(surface.bounds).float()

@@ -15,7 +15,7 @@ from nerfro.errors import NerfroError
 from nerfro.files.cache import cached_arrays, content_hash
 from nerfro.geometry.bodies import require_separate
 from nerfro.geometry.interpolation import gradient, smooth, trilinear
-from nerfro.geometry.mesh import TriangleMesh, load_mesh, require_inside
+from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin, require_inside
 from nerfro.geometry.occupancy import occupancy_fraction
 from nerfro.geometry.signed_distance import distance_to_set
 from nerfro.kernels.available import require_bytes
@@ -70,6 +70,8 @@ class VoxelGrid(Medium):
         loaded = load_mesh(resolve_path(mesh), accept_open_mesh)
         # One voxel for the subsamples, one for the central difference, and the radius of the smoothing kernel.
         check_margin(loaded, box, resolution, 2 + smoothing_size // 2)
+        self.origin = local_origin(loaded.vertices)
+        box, loaded = box - self.origin, loaded.relative_to(self.origin)
         if loaded.is_closed:
             require_separate(loaded)
         key = "occupancy_" + content_hash(_VERSION, loaded.vertices, loaded.faces, box, resolution, _SUBSAMPLES)
@@ -222,7 +224,7 @@ def check_margin(mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], resolution: 
 
 def _rounded(corner: Float[np.ndarray, "3"], direction: int) -> str:
     outward = np.floor if direction < 0 else np.ceil
-    return "[" + ",".join(f"{value:g}" for value in outward(corner * 100) / 100) + "]"
+    return "[" + ",".join(f"{value:.12g}" for value in outward(corner * 100) / 100) + "]"
 
 
 def _faces(values: Tensor) -> list[Tensor]:

@@ -30,7 +30,7 @@ class Bent(NamedTuple):
     """Rays where they leave the box around the body, on the CPU.
 
     Attributes:
-        positions: exit positions in world units.
+        positions: exit positions in world units, in the precision of the origins.
         directions: unit exit directions.
         lengths: lengths of the paths from the origins, world units.
         hit: whether each ray met the body.
@@ -72,6 +72,7 @@ def bend(
     medium = SdfGrid(str(mesh), ior, resolution=resolution, box_min=low, box_max=high)
     path = Snell(interface)(make_rays(starts, towards, medium, 0.0, None), medium)
     positions, path_lengths = leave_box(path, medium)
+    positions = (positions + torch.from_numpy(medium.origin)).to(starts)
     return Bent(positions, path.exit_directions, path_lengths, path.refracted)
 
 
@@ -103,7 +104,8 @@ def _checked_rays(
     origins: ArrayLike | Tensor, directions: ArrayLike | Tensor
 ) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
     """Convert rays to tensors with unit directions."""
-    starts, towards = (torch.as_tensor(np.asarray(values), dtype=torch.float32) for values in (origins, directions))
+    starts, towards = (torch.as_tensor(np.asarray(values)) for values in (origins, directions))
+    starts, towards = (values if values.is_floating_point() else values.double() for values in (starts, towards))
     if starts.ndim != 2 or starts.shape[1:] != (3,) or starts.shape != towards.shape or not len(starts):
         raise NerfroError(f"origins {list(starts.shape)} and directions {list(towards.shape)} must both be [R, 3]")
     lengths = torch.linalg.vector_norm(towards, dim=-1)

@@ -52,7 +52,11 @@ class TraceConfig:
 def make_rays(
     origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], medium: Medium, near: float, far: float | None
 ) -> Rays:
-    """Create rays from near to far; without `far`, the paths are long enough to leave the medium's box."""
+    """Create rays in single precision, relative to the medium's origin, from near to far.
+
+    Without `far`, the paths are long enough to leave the medium's box.
+    """
+    origins, directions = (origins - torch.from_numpy(medium.origin)).float(), directions.float()
     if far is None:
         centre, diagonal = medium.box.mean(0), float(torch.linalg.vector_norm(medium.box[1] - medium.box[0]))
         distance = float(torch.linalg.vector_norm(origins - centre, dim=-1).max())
@@ -75,7 +79,7 @@ def leave_box(path: Path, medium: Medium) -> tuple[Float[Tensor, "R 3"], Float[T
 
 
 def read_rays(file: FilePath) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
-    """Read origins and unit directions from a file."""
+    """Read origins and unit directions from a file, in double precision."""
     arrays = load_arrays(file)
     for name in ("origins", "directions"):
         if name not in arrays:
@@ -93,4 +97,4 @@ def read_rays(file: FilePath) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"
     if (np.abs(norms - 1) > 1e-3).any():
         raise NerfroError(f"directions in {file} have lengths from {norms.min():g} to {norms.max():g}; make them 1")
     unit = directions / norms[:, None]
-    return torch.from_numpy(origins.astype(np.float32)), torch.from_numpy(unit.astype(np.float32))
+    return torch.from_numpy(origins), torch.from_numpy(unit)

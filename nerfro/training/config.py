@@ -26,6 +26,7 @@ from nerfro.allowed import (
 from nerfro.data.base import DataSource, Views
 from nerfro.data.validation_views import WithValidationViews
 from nerfro.errors import NerfroError
+from nerfro.geometry.mesh import load_points, local_origin
 from nerfro.losses.base import Loss
 from nerfro.media.analytic import Vacuum
 from nerfro.paths import resolve_path, scene_name
@@ -295,7 +296,9 @@ def training_device(config: DictConfig) -> str:
 
 
 def build_data(config: DictConfig) -> DataSource:
-    """Build the data set of a run, with a `val` split of training views if `num_validation_views` is set.
+    """Build the data set of a run, with the origin of its medium.
+
+    A `val` split is made of training views if `num_validation_views` is set.
 
     Raises:
         NerfroError: there is no data; for a synthetic scene the message names the command that renders the scene.
@@ -307,6 +310,9 @@ def build_data(config: DictConfig) -> DataSource:
             f"{root} holds no data yet; run python -m nerfro.synthesize scene={scene} out={root} {small} first"
         )
     source, number = build(config.data), config.batches.num_validation_views
+    mesh = resolve_path(str(config.medium.mesh)) if "mesh" in config.medium else None
+    if mesh is not None and mesh.is_file():
+        source.origin = local_origin(load_points(mesh))
     return WithValidationViews(source, number) if number else source
 
 

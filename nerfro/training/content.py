@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from nerfro.allowed import Count, NotNegative, Positive
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
-from nerfro.geometry.mesh import load_mesh
+from nerfro.geometry.mesh import load_mesh, local_origin
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.paths import resolve_path
@@ -39,8 +39,8 @@ class ContentConfig:
     # `box`: a box, with the background outside of it. `all`: all of space, contracted outside of a ball, with the
     # background at infinity.
     space: str = "box"
-    # Lower corner of the box, world units; the ball is centred in the box. None takes the bounds of the object, or for
-    # the ball the point that the cameras face.
+    # Lower corner of the box, world units, relative to the origin of the medium; the ball is centred in the box. None
+    # takes the bounds of the object, or for the ball the point that the cameras face.
     box_min: Optional[list[float]] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     box_max: Optional[list[float]] = None  # noqa: UP045 - upper corner of the box
     # Radius of the ball, world units. None derives this and the next settings from the cameras.
@@ -134,7 +134,8 @@ def _box(config: DictConfig, medium: Medium) -> Float[np.ndarray, "2 3"] | None:
         return medium.content_box.double().numpy().round(6)
     if "mesh" in config.medium and resolve_path(config.medium.mesh).is_file():
         # Straight rays need no medium, but the baselines get the same bounds as the refractive model.
-        return load_mesh(resolve_path(config.medium.mesh), accept_open_mesh=True).bounds.round(6)
+        bounds = load_mesh(resolve_path(config.medium.mesh), accept_open_mesh=True).bounds
+        return (bounds - local_origin(bounds)).round(6)
     return None
 
 

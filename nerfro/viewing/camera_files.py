@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from nerfro.camera.base import Camera
 from nerfro.camera.similarity import motion_between
@@ -22,6 +23,7 @@ from nerfro.data.lenses import Lens, check_lenses, read_lens
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import is_number, parse_matrix, read_json
+from nerfro.types import WORLD_ORIGIN
 from nerfro.viewing.camera_paths import CaptureGeometry
 
 # Names of the nine coefficients (`nerfro.lens`) without and with a denominator. OpenCV's rational model has no r^8.
@@ -29,7 +31,7 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _RATIONAL = ("k1", "k2", "k3", "", "p1", "p2", "k4", "k5", "k6")
 
 
-def read_cameras(file: Path, geometry: CaptureGeometry) -> Cameras:
+def read_cameras(file: Path, geometry: CaptureGeometry, origin: Float[np.ndarray, "3"] = WORLD_ORIGIN) -> Cameras:
     """Read the cameras of a file, with poses in the world of the training data.
 
     The file is a camera path of nerfstudio (`camera_path`: poses and vertical fields of view) or a `transforms.json`
@@ -38,6 +40,7 @@ def read_cameras(file: Path, geometry: CaptureGeometry) -> Cameras:
     Args:
         file: JSON file.
         geometry: geometry of the training data; its resolution is the default.
+        origin: world coordinates of the origin of the result.
 
     Raises:
         NerfroError: the file has another format, or a value is missing or invalid.
@@ -70,15 +73,19 @@ def read_cameras(file: Path, geometry: CaptureGeometry) -> Cameras:
     fx, fy, cx, cy = torch.tensor([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in lenses]).unbind(-1)
     distorted = any(lens.distortion is not None for lens in lenses)
     distortion = torch.tensor([lens.distortion or (0.0,) * 9 for lens in lenses]) if distorted else None
-    pose = torch.from_numpy(np.stack(poses)).float()
+    pose = np.stack(poses)
+    pose[:, :, 3] -= origin
     near, far = geometry.camera.near, geometry.camera.far
-    return geometry.with_ray_bounds(Cameras(pose, fx, fy, cx, cy, width, height, near, far, distortion))
+    return geometry.with_ray_bounds(
+        Cameras(torch.from_numpy(pose).float(), fx, fy, cx, cy, width, height, near, far, distortion)
+    )
 
 
-def write_cameras(file: Path, camera: Camera, views: Views) -> None:
+def write_cameras(file: Path, camera: Camera, views: Views, origin: Float[np.ndarray, "3"] = WORLD_ORIGIN) -> None:
     """Write the estimated training cameras as a `transforms.json` for `data=nerfstudio`, if cameras are optimized.
 
-    Each frame also has the motion of its camera (`turned_degrees`, and `shifted` in world units) and its `gain`.
+    Positions of `views` are relative to `origin`. Each frame also has the motion of its camera (`turned_degrees`, and
+    `shifted` in world units) and its `gain`.
     """
     if not camera.moves and camera.exposure is None:
         return
@@ -94,7 +101,9 @@ def write_cameras(file: Path, camera: Camera, views: Views) -> None:
         entry |= {name: float(values[view]) for name, values in lens.items()}
         if estimated.distortion is not None:
             entry |= {name: k for name, k in zip(names, estimated.distortion[view].tolist(), strict=False) if name}
-        entry["transform_matrix"] = [*estimated.camera_to_world[view].tolist(), [0.0, 0.0, 0.0, 1.0]]
+        pose = estimated.camera_to_world[view].double().numpy()
+        pose[:, 3] += origin
+        entry["transform_matrix"] = [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
         entry |= {"turned_degrees": turned[view], "shifted": shifted[view]}
         if gains is not None:
             entry["gain"] = gains[view]

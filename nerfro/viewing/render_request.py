@@ -6,11 +6,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, Optional
 
 import torch
+from jaxtyping import Float
 from omegaconf import MISSING, DictConfig, ListConfig
+from torch import Tensor
 
 from nerfro.allowed import Count, Positive, Range
 from nerfro.cameras import Cameras
@@ -132,14 +135,19 @@ def _free_cameras(config: DictConfig, scene: TrainedScene) -> Shots:
     """Make the camera of a still image, of a path around the object, or of a file."""
     geometry = CaptureGeometry.of(scene.cameras("train"), scene.bounds)
     if config.position is not None:
-        target = geometry.centre if config.target is None else torch.tensor(list(config.target))
-        cameras = geometry.look_at(torch.tensor([list(config.position)]), target)
+        target = geometry.centre if config.target is None else _local(config.target, scene)
+        cameras = geometry.look_at(_local(config.position, scene)[None], target)
     elif config.path in PATHS:
         start = OrbitPosition(config.azimuth, config.elevation, config.distance or geometry.distance)
         cameras = path_cameras(geometry, config.path, start, config.frames)
     else:
-        cameras = read_cameras(user_path(config.path), geometry)
+        cameras = read_cameras(user_path(config.path), geometry, scene.source.origin)
     return Shots(cameras, _numbered("frame", len(cameras), 4), len(cameras) > 1)
+
+
+def _local(point: Sequence[float], scene: TrainedScene) -> Float[Tensor, "3"]:
+    """Return a point in the coordinates of a scene, which may be relative to another origin."""
+    return (torch.tensor(list(point), dtype=torch.float64) - torch.from_numpy(scene.source.origin)).float()
 
 
 def _views(given: str, scene: TrainedScene) -> Shots:
