@@ -20,6 +20,7 @@ from nerfro.subdivision import Subdivision
 from nerfro.training.build import build_training, check_first_batch
 from nerfro.training.callbacks import StopOnSignal, Throughput
 from nerfro.training.config import TrainConfig, build_data, check_run, settle_trainer
+from nerfro.training.mesh_match import require_match
 from nerfro.training.run_folder import LAST_CHECKPOINT, begin, next_steps, own, require_same_run, resume_advice
 from nerfro.training.sweeps import run_cell
 from nerfro.training.trainer import finish_logs, fit, make_trainer, prepare_process, print_profile
@@ -58,6 +59,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     trainer = make_trainer(config, folder, throughput, [interruption, Viewer(config, source, test)])
     batches = datamodule.batches.share(trainer.global_rank, trainer.world_size)
     device = trainer.strategy.root_device
+    require_match(renderer.scene.medium, training)
     memory = check_first_batch(renderer, batches, device)
     del batches  # the data module moves the pixels to the training device
     if trainer.is_global_zero:
@@ -77,7 +79,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
         print(f"nerfro: {done}; {resume_advice(folder)}")
         sys.exit(EXIT_INTERRUPTED)
 
-    write_cameras(folder / "cameras.json", renderer.to(device).scene.camera, training)
+    write_cameras(folder / "cameras.json", renderer.to(device).scene.camera, training, source.origin)
     metrics = ImageMetrics(*lpips, prefix=config.evaluation.split)
     result, treated = score_split(renderer, test, metrics, folder, subdivision, config.evaluation.refine_steps)
     finish_logs(trainer, {f"{config.evaluation.split}/{name}": mean for name, mean in result.means().items()})
