@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ipaddress
 import json
+import re
 import socket
+import sys
 import threading
 import time
 from collections.abc import Sequence
@@ -37,7 +39,7 @@ class PageServer:
 
     def __init__(self, host: str, port: int) -> None:
         try:
-            self._server = ThreadingHTTPServer((host, port), _Handler)
+            self._server = _QuietServer((host, port), _Handler)
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             raise NerfroError(f"{host}:{port} is not available ({reason}); give another port, or port 0") from error
@@ -95,19 +97,32 @@ class PageServer:
         self._server.server_close()
 
 
+class _QuietServer(ThreadingHTTPServer):
+    """A server whose clients may disappear or be slow."""
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print no traceback of a connection that ends early, because the terminal shows the training."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(request, client_address)
+
+
 class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "nerfro", ""
+    timeout = 10.0  # seconds after which the connection of a silent client is closed
 
     def do_GET(self) -> None:
         page: PageServer = self.server.page  # type: ignore[attr-defined]
-        address = urlsplit(self.path)
+        try:
+            address = urlsplit(self.path)
+        except ValueError:  # brackets that are not an IPv6 address
+            address = urlsplit("invalid")
         if not self._is_same_origin():
             self._answer(HTTPStatus.FORBIDDEN, b"open the page by the address that nerfro has printed", "text/plain")
         elif address.path == "/":
             self._answer(HTTPStatus.OK, page.page(), "text/html; charset=utf-8")
         elif address.path == "/state":
             after = parse_qs(address.query).get("after", ["0"])[0]
-            version = int(after) if after.isascii() and after.isdigit() else 0
+            version = int(after) if re.fullmatch(r"[0-9]{1,18}", after) else 0
             self._answer(HTTPStatus.OK, page.state(version), "application/json")
         else:
             self._answer(HTTPStatus.NOT_FOUND, b"this server has only the page at /", "text/plain")

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import http.client
 import json
+import random
+import socket
+import threading
 from collections.abc import Iterator
 
 import pytest
 
-from nerfro.viewing.server import PageServer
+from nerfro.errors import NerfroError
+from nerfro.viewing.server import PageServer, _Handler
 
 
 @pytest.fixture
@@ -66,3 +70,38 @@ def test_other_origins_are_refused(server: PageServer) -> None:
     assert get(server, "/state", Origin=f"http://localhost:{port}")[0] == 200
     assert get(server, "/", Host=f"127.0.0.1:{port}")[0] == 200
     assert get(server, "/", Host=f"[::1]:{port}")[0] == 200
+
+
+def test_taken_port_is_told(server: PageServer) -> None:
+    with pytest.raises(NerfroError, match="is not available"):
+        PageServer("localhost", int(server.url.rpartition(":")[2]))
+
+
+def test_a_thousand_requests_of_any_kind_leave_the_page_as_it_is(
+    server: PageServer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(_Handler, "timeout", 0.5)
+    server.open("<p>page" * 10**5)
+    draw, port = random.Random(0), int(server.url.rpartition(":")[2])
+    paths = ["/", "/state", "/state?after=" + "9" * 6000, "/../etc/passwd", "//[", "/%00", "/" + "a" * 70_000, "*", ""]
+    heads = ["", "Host: evil.example\r\n", f"Host: localhost:{port}\r\nOrigin: null\r\n", f"Host: localhost:{port}\r\n"]
+    clients = []
+    for _ in range(1000):
+        client = socket.create_connection(("localhost", port))
+        method, path, head = draw.choice(["GET", "GET", "POST", "\0"]), draw.choice(paths), draw.choice(heads)
+        request = f"{method} {path} HTTP/1.1\r\n{head}\r\n".encode()
+        client.sendall(request[: draw.choice([len(request), len(request), draw.randrange(len(request))])])
+        if draw.random() < 0.9:
+            client.close()  # often before the answer
+        else:
+            clients.append(client)  # silent until the end
+        if method == "GET" and draw.random() < 0.1:
+            assert get(server, "/") == (200, "<p>page" * 10**5)
+    threads = [thread for thread in threading.enumerate() if "process_request" in thread.name]
+    for thread in threads:
+        thread.join(10)
+        assert not thread.is_alive()
+    for client in clients:
+        client.close()
+    assert get(server, "/") == (200, "<p>page" * 10**5)
+    assert capsys.readouterr().err == ""
