@@ -14,15 +14,20 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import settings
 
 from nerfro.evaluation.request import REQUEST_FILE
 from nerfro.training.run_folder import CONFIG_FILE, LAST_CHECKPOINT, load_checkpoint
 from tests import forked
 from tests.fuzz.world import World
 
-LONG = settings.get_current_profile_name() == "long"
-NUM_KILLS = 50 if LONG else 2  # of each command
+LONG = "NERFRO_LONG_CAMPAIGN" in os.environ
+NUM_KILLS = 25 if LONG else 2  # of each phase of training, and of evaluation
+# Settings that make a phase of training the longest.
+PHASES = {
+    "training": ["optimizer.boundary_steps=0"],
+    "background": ["optimizer.boundary_steps=1500"],
+    "cameras": ["camera=refined", "camera.start=2", "camera.every=3", "optimizer.boundary_steps=100"],
+}
 
 
 @pytest.fixture(scope="module")
@@ -68,9 +73,11 @@ def report(what: str, seconds: float, moments: Counter[str]) -> None:
 
 
 @pytest.mark.slow
-def test_killed_training_that_goes_on_ends_with_the_same_weights(world: World, tmp_path: Path) -> None:
+@pytest.mark.parametrize("phase", PHASES if LONG else ["cameras"])  # which has all three
+def test_killed_training_that_goes_on_ends_with_the_same_weights(phase: str, world: World, tmp_path: Path) -> None:
     draw, num_steps = random.Random(0), 40
     options = [*world.train_options(world.root / "data"), "trainer.max_time=null", f"trainer.max_steps={num_steps}"]
+    options += PHASES[phase]
     options += ["checkpoint={every_steps: 1, every_seconds: null}", "evaluation.subdivision.side=8"]
     log, right = tmp_path / "log", tmp_path / "right" / "run"
     forked.run("train", [*options, f"hydra.run.dir={tmp_path / 'compiles' / 'run'}"], log)
@@ -80,8 +87,9 @@ def test_killed_training_that_goes_on_ends_with_the_same_weights(world: World, t
     moments: Counter[str] = Counter()
     for number in range(NUM_KILLS):
         run = tmp_path / str(number) / "run"
-        # One in ten is killed as it starts, the others once they have a checkpoint.
+        # One in ten is killed as it starts, the others once they have a checkpoint, or in the background's training.
         aim, within = (CONFIG_FILE, 0.2) if number % 10 == 9 else (LAST_CHECKPOINT, 0.9 * seconds)
+        aim = CONFIG_FILE if phase == "background" else aim
         ran = forked.kill("train", [*options, f"hydra.run.dir={run}"], log, run / aim, draw.uniform(0, within))
         moments[moment_of(run, num_steps) if ran else "over"] += 1
         going_on = ["ckpt_path=last"] if (run / CONFIG_FILE).is_file() else []
@@ -92,7 +100,8 @@ def test_killed_training_that_goes_on_ends_with_the_same_weights(world: World, t
             assert all(torch.equal(one, other) for one, other in pairs), f"{part} differs after kill {number}"
         assert pictures(run) == pictures(right)
         assert names(run) == names(right)
-    report("trainings", seconds, moments)
+    moments["training"] += moments.pop("starting", 0) if phase == "background" else 0
+    report(f"trainings ({phase})", seconds, moments)
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ has a status other than zero. It writes to its own folder only, and what existed
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import importlib
 import io
 import json
@@ -18,14 +19,17 @@ import signal
 import sys
 import tempfile
 import time
+import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from unittest import mock
 
 import numpy as np
 
+from nerfro.cli import in_one_line
+from nerfro.errors import NerfroError
 from nerfro.files import cache
 
 SECONDS = 60
@@ -130,6 +134,38 @@ class World:
             return text
         return None
 
+    def trouble_of_reader(self, read: Callable[[], None], what: str) -> str | None:
+        """Run a reader and say what does not hold: it succeeds, or raises an error with a message in one line."""
+        self.tries += 1
+        begun, found = time.monotonic(), None
+        try:
+            with contextlib.ExitStack() as stack:
+                stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
+                stack.enter_context(contextlib.redirect_stderr(io.StringIO()))
+                stack.enter_context(warnings.catch_warnings())
+                stack.enter_context(_alarm(SECONDS))
+                warnings.simplefilter("ignore")
+                read()
+        except NerfroError as error:
+            message = in_one_line(error)
+            found = (
+                f"a line of {len(message)} characters: {message[:200]}"
+                if len(message) > 1010 or "\n" in message
+                else None
+            )
+        except Exception as error:
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            found = f"{type(error).__name__}: {str(error)[:200]} ({place.filename}:{place.lineno})"
+        if time.monotonic() - begun > SECONDS / 2:
+            found = f"took {time.monotonic() - begun:.0f} s"
+        return None if found is None else f"{what}: {found}"
+
+    def clean(self) -> None:
+        """Remove everything that cases have written."""
+        for path in self.root.iterdir():
+            if path.name not in ("data", "run", "cache", "caught", "formats"):
+                shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink()
+
     def _state(self, own: tuple[Path, ...]) -> dict[Path, tuple[int, int] | None]:
         """Every file and folder outside of some, with size and time."""
         ignored = (*own, self.root / "cache")
@@ -164,8 +200,12 @@ def _alarm(seconds: int) -> Iterator[None]:
 
     previous = signal.signal(signal.SIGALRM, end)
     signal.alarm(seconds)
+    faulthandler.dump_traceback_later(
+        2 * seconds, exit=True, file=sys.__stderr__
+    )  # for code that Python cannot interrupt
     try:
         yield
     finally:
         signal.alarm(0)
+        faulthandler.cancel_dump_traceback_later()
         signal.signal(signal.SIGALRM, previous)
