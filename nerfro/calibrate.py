@@ -42,13 +42,13 @@ def main(config: DictConfig) -> None:
     masks = [find_mask(out, out / relative(image, out)) for image in images]
     refuse_existing([out / name for name in FILES], config.overwrite)
     if board is None:
-        settings = SfmSettings(config.lens, config.pairs, config.threads)
+        settings = SfmSettings(config.lens, config.pairs, config.threads, config.mask_labels)
         model = find_model(config.reconstruction, images, masks, out / "sparse", settings, config.overwrite)
         calibration, points = import_model(model, images, size)
         quads, seen = [], points
     else:
         sightings = {
-            image.name: outside(board.find(luminance(image)), mask)
+            image.name: outside(board.find(luminance(image)), mask, config.mask_labels)
             for image, mask in zip(track("detecting tags", images), masks, strict=True)
         }
         calibration = calibrate(sightings, size, config.lens)

@@ -70,7 +70,7 @@ def _evaluate_checkpoint(config: DictConfig) -> None:
 def _evaluate_folder(config: DictConfig) -> None:
     predictions, references = user_path(config.predictions), user_path(config.references)
     masks = None if config.masks is None else user_path(config.masks)
-    pairs = match_folders(predictions, references, masks)
+    pairs = match_folders(predictions, references, masks, config.mask_labels)
     for pair in pairs:  # damaged or mismatched images are reported before the scoring starts
         pair.load(config.alpha)
     device = find_device(config.device)

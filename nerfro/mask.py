@@ -48,7 +48,7 @@ def main(config: DictConfig) -> None:
     check_start(frames, outlined, kept, config.hull_only)
     opencv()  # report a missing package before the long work starts
     size = cameras.width, cameras.height
-    done = {view: read_resized(mask, size) for view, mask in kept.items()}
+    done = {view: read_resized(mask, size, source.mask_labels) for view, mask in kept.items()}
     for view, outline in outlined.items():
         scaled = np.array(outline, np.float64) * size[0] / read_size(frames[view].image)[0]
         if scaled.ndim == 2:  # the user's polygon is the mask

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Optional
 
 from omegaconf import DictConfig
 
-from nerfro.allowed import Count, Positive, Range
+from nerfro.allowed import Count, Natural, Positive, Range
 from nerfro.capture.boards import TagBoard, tag_grid, twelve_faces
 from nerfro.data.frames import Every
 from nerfro.errors import NerfroError
@@ -36,6 +36,7 @@ class CalibrateConfig:
         threads: number of threads of COLMAP; by default one per core.
         lens: distortion coefficients to estimate beside focal lengths and principal point: `pinhole` none, as in the
             paper; `radial` k1 and k2; `opencv` k1, k2, p1 and p2.
+        mask_labels: labels of the object in the masks, as `data.mask_labels`; by default all but the background.
         test_every: every such image by name is a test image, and as many are validation images.
         overwrite: allow replacing existing files.
     """
@@ -52,6 +53,7 @@ class CalibrateConfig:
     pairs: Annotated[Optional[str], Literal["sequential", "all"]] = None  # noqa: UP045
     threads: Optional[Count] = None  # noqa: UP045
     lens: Annotated[str, Literal["pinhole", "radial", "opencv"]] = "pinhole"
+    mask_labels: Optional[list[Natural]] = None  # noqa: UP045
     test_every: Every = 8
     overwrite: bool = False
 

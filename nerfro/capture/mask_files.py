@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -150,9 +150,9 @@ def mask_file(frame: Frame) -> Path:
     return frame.image.with_name(f"mask_{frame.image.stem}.png")
 
 
-def read_resized(mask: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+def read_resized(mask: Path, size: tuple[int, int], labels: Sequence[int] | None) -> Bool[np.ndarray, "H W"]:
     """Read a mask and resize it to the width and height of the loaded images."""
-    coverage = to_unit(read_mask(mask))
+    coverage = to_unit(read_mask(mask, labels))
     height, width = coverage.shape
     if height * size[0] != width * size[1]:
         raise NerfroError(

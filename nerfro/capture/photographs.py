@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -46,10 +47,10 @@ def luminance(image: Path) -> UInt8[np.ndarray, "H W"]:
     return np.uint8(np.rint(255 * np.minimum(light / white, 1.0)))
 
 
-def outside(sighting: Sighting, mask: Path | None) -> Sighting:
+def outside(sighting: Sighting, mask: Path | None, labels: Sequence[int] | None = None) -> Sighting:
     """Remove features that are seen through the object or overlap the mask of the object."""
     if mask is None or len(sighting.points) == 0:
         return sighting
-    inside = to_unit(read_mask(mask)) > 0.5
+    inside = to_unit(read_mask(mask, labels)) > 0.5
     columns, rows = np.clip(sighting.pixels.astype(int), 0, np.array(inside.shape[::-1]) - 1).T
     return sighting.only(~np.isin(sighting.features, sighting.features[inside[rows, columns]]))

@@ -49,11 +49,13 @@ class SfmSettings:
         pairs: pairs of images to match. None matches in sequence if the file names are numbered, and all pairs if
             sequential matching leaves images without a pose.
         threads: number of threads; None uses all cores.
+        mask_labels: labels of the object in the masks, see `nerfro.data.image_files.read_mask`.
     """
 
     lens: LensModel = "pinhole"
     pairs: Pairs | None = None
     threads: int | None = None
+    mask_labels: Sequence[int] | None = None
 
 
 def find_model(
@@ -142,7 +144,7 @@ def _extract(
     masked.mkdir()
     for image, mask in zip(images, masks, strict=True):
         if mask is not None:
-            _write_ignored(mask, masked / f"{image.name}.png")
+            _write_ignored(mask, masked / f"{image.name}.png", settings.mask_labels)
     reader, options = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
     reader.camera_model, options.num_threads = _CAMERAS[settings.lens], threads
     if any(mask is not None for mask in masks):
@@ -203,8 +205,8 @@ def _registered(models: dict[int, Any]) -> set[str]:
     return set() if largest is None else {image.name for image in largest.images.values() if image.has_pose}
 
 
-def _write_ignored(mask: Path, file: Path) -> None:
+def _write_ignored(mask: Path, file: Path, labels: Sequence[int] | None = None) -> None:
     """Write a COLMAP mask, in which features at black pixels are ignored."""
-    inside: Float[np.ndarray, "H W"] = to_unit(read_mask(mask)) > 0.5
+    inside: Float[np.ndarray, "H W"] = to_unit(read_mask(mask, labels)) > 0.5
     margin = max(1, round(_MARGIN * inside.shape[1]))
     Image.fromarray(np.where(binary_dilation(inside, iterations=margin), 0, 255).astype(np.uint8)).save(file)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,12 +25,14 @@ class ImagePair:
         prediction: file of the predicted image.
         reference: file of the reference image.
         mask: file of the object's silhouette, or None to use the transparency of the reference, if any.
+        mask_labels: labels of the object in the mask, see `nerfro.data.image_files.read_mask`.
     """
 
     name: str
     prediction: Path
     reference: Path
     mask: Path | None
+    mask_labels: Sequence[int] | None = None
 
     def load(self, alpha: Alpha) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"], Float[Tensor, "H W"] | None]:
         """Read the images.
@@ -52,7 +54,8 @@ class ImagePair:
                 f"{self.prediction} has {_size(prediction)} pixels but its reference {self.reference} has "
                 f"{_size(reference)}; render both in the same size"
             )
-        masks = find_masks([self.reference], [self.mask], 1, (reference.shape[1], reference.shape[0]))
+        size = reference.shape[1], reference.shape[0]
+        masks = find_masks([self.reference], [self.mask], 1, size, self.mask_labels)
         coverage = None if masks is None else masks[0]
         if coverage is not None and not object_pixels(coverage).any():
             raise NerfroError(
@@ -62,13 +65,16 @@ class ImagePair:
         return prediction, reference, coverage
 
 
-def match_folders(predictions: Path, references: Path, masks: Path | None) -> list[ImagePair]:
+def match_folders(
+    predictions: Path, references: Path, masks: Path | None, labels: Sequence[int] | None = None
+) -> list[ImagePair]:
     """Match the images of two folders by name without extension.
 
     Args:
         predictions: folder of predicted images.
         references: folder of reference images. Files `mask_<name>.png` are masks.
         masks: folder of masks. By default, `find_mask` searches the folder of references.
+        labels: labels of the object in the masks, see `nerfro.data.image_files.read_mask`.
 
     Returns:
         The pairs, sorted by name.
@@ -89,7 +95,7 @@ def match_folders(predictions: Path, references: Path, masks: Path | None) -> li
         where = f"masks={masks}"
     if files:
         _require(truth, files, f"mask in {where}")
-    return [ImagePair(name, predicted[name], truth[name], files.get(name)) for name in sorted(predicted)]
+    return [ImagePair(name, predicted[name], truth[name], files.get(name), labels) for name in sorted(predicted)]
 
 
 def _list_images(folder: Path, option: str) -> dict[str, Path]:

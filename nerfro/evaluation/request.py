@@ -40,6 +40,7 @@ class EvaluateConfig:
     references: Optional[str] = None  # folder of reference images with the same names as `predictions`
     # Folder of masks with the same names; by default the masks beside the references, or their transparency.
     masks: Optional[str] = None
+    mask_labels: Optional[list[Natural]] = None  # labels of the object in the masks; by default all but the background
     # Treatment of transparency in both folders: `drop` ignores it, `white` and `black` composite over this colour.
     alpha: Annotated[str, Literal["drop", "white", "black"]] = "drop"
     # Folder for images and tables; by default beside the folder of checkpoints, or `scores` in `predictions`.
@@ -64,7 +65,7 @@ def require_one_task(config: DictConfig) -> None:
     if config.checkpoint is None:
         task, others = "predictions", ("split", "root", "chunk_size", "subdivision")
     else:
-        task, others = "checkpoint", ("references", "masks", "alpha")
+        task, others = "checkpoint", ("references", "masks", "mask_labels", "alpha")
     default = OmegaConf.structured(EvaluateConfig)
     for name in others:
         if config[name] != default[name]:

@@ -45,6 +45,7 @@ def calibrate(config: DictConfig, data: list[str], out: Path) -> list[str]:
             f"add outlines={{{example}:[[COLUMN,ROW],...],...}}, or give masks=FOLDER"
         )
     options = [*as_overrides({"images": out / "images", "out": out}), "target=colmap", "overwrite=true"]
+    options += [text.removeprefix("data.") for text in data if text.startswith("data.mask_labels=")]
     Stage("calibrate", [*options, *shlex.split(config.calibrate)], out / REPORT, out / PLOT).run()
     ray_range = read_result(out / REPORT, {"options"})["options"]
     kept = [text for text in ray_range if not is_given(text.split("=")[0], data)]

@@ -53,6 +53,10 @@ def test_masks_are_given_or_lie_with_the_references_or_are_their_transparency(
     beside = match_folders(predictions, references, None)
     assert [pair.mask.name for pair in beside] == ["mask_a.png", "mask_b.png"]
     assert beside[0].load("drop")[2].unique().tolist() == [1]
+    write(references / "mask_a.png", channels=1, level=3)
+    assert match_folders(predictions, references, None, [3])[0].load("drop")[2].unique().tolist() == [1]
+    with pytest.raises(NerfroError, match="is empty"):
+        match_folders(predictions, references, None, [2])[0].load("drop")
     for name in ("a", "b"):
         write(tmp_path / "transparent" / f"{name}.png", channels=4, level=153)
     pairs = match_folders(predictions, tmp_path / "transparent", None)
