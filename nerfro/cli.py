@@ -34,11 +34,13 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from nerfro.allowed import check_names, check_settings
 from nerfro.errors import NerfroError, nearest_of
+from nerfro.files.reading import read_text, require_bounded_yaml
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover, plugins
 from nerfro.trust import GuardedConfigLoader, leave_current_directory
 
 _NO_MEMORY = re.compile("allocate memory|out of memory")  # messages of torch on a CPU and on a GPU
+_LONGEST_LINE = 1000  # characters of an error; the middle of longer ones is left out
 EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141  # exit status of a program that SIGPIPE has ended, in a shell
 
@@ -211,8 +213,9 @@ def errors_in_one_line() -> Iterator[None]:
 
 def in_one_line(error: Exception) -> str:
     """Describe an error for the user: a mistake in the input, a missing resource, or a bug of nerfro."""
-    # Names of files may contain line breaks and other control characters.
-    return re.sub(r"[\x00-\x1f\x7f]", lambda character: repr(character[0])[1:-1], _description(error))
+    # Names of files may contain line breaks and other control characters, and values of a file may be long.
+    line = re.sub(r"[\x00-\x1f\x7f]", lambda character: repr(character[0])[1:-1], _description(error))
+    return line if len(line) <= _LONGEST_LINE else f"{line[: _LONGEST_LINE // 2]} ... {line[-_LONGEST_LINE // 4 :]}"
 
 
 def _description(error: Exception) -> str:
@@ -357,6 +360,9 @@ class _RenamingFiles(FileConfigSource):
     """Hydra's source of YAML files, with old names replaced."""
 
     def load_config(self, config_path: str) -> ConfigResult:
+        file = Path(self.path, self._normalize_file_name(config_path))
+        if file.exists():
+            require_bounded_yaml(read_text(file, "correct it, or choose another one"), file)
         result = super().load_config(config_path)
         group = config_path.rpartition("/")[0]
         package = result.header.get("package") or group.replace("/", ".")

@@ -42,7 +42,7 @@ class SummaryConfig:
 def main(config: DictConfig) -> None:
     """Read and compare runs, and print and write the result."""
     metrics = find_metrics(config.metrics)
-    places = list(config.runs) if isinstance(config.runs, ListConfig) else [str(config.runs)]
+    places = [str(place) for place in (config.runs if isinstance(config.runs, ListConfig) else [config.runs])]
     runs, unfinished = find_runs(places)
     comparisons = compare(runs, config.methods, config.scenes)
     tables = {c.budget.file_name: to_table(c, metrics, config.region) for c in comparisons}

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from nerfro.errors import NerfroError
+from nerfro.files.reading import read_text
 
 # Name and number of parameters of each camera model; the index is the model's identifier in binary files.
 CAMERA_MODELS = (
@@ -168,10 +169,7 @@ def _text_rows(
         parsers: one per word; the last parser receives the rest of the line.
         skip: number of lines to skip after each line.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise NerfroError(f"{path} is not a text file; export it again") from error
+    lines = read_text(path, "export it again").splitlines()
     numbered = ((i, line.strip()) for i, line in enumerate(lines, 1) if not line.startswith("#"))
     for i, line in numbered:
         if not line:

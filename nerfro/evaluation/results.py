@@ -14,6 +14,7 @@ from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import is_number, read_json
 
+_TOO_LARGE = 1e15  # scores, steps and times; sums of larger numbers may overflow
 Score = float | None  # None if not available; the notes contain the reason
 
 
@@ -147,6 +148,8 @@ def read_metrics_json(path: Path | str) -> RunMetrics:
     try:
         content = read_json(path, "run nerfro.evaluate on the run again")
         notes, protocol = content.get("notes", {}), content.get("protocol", "8bit")
+        if protocol not in ("8bit", "float") or not all(isinstance(note, str) for note in notes.values()):
+            raise TypeError("its notes or its protocol are damaged")
         result = EvaluationResult(_views(content["views"]), notes, protocol)
         treatments = {
             name: EvaluationResult(_views(treated["views"]), notes, protocol)
@@ -185,6 +188,6 @@ def _scores(row: Mapping[str, Any]) -> dict[str, Score]:
 
 
 def _number(value: object) -> float | None:
-    if value is None or is_number(value):
+    if value is None or (is_number(value) and abs(value) < _TOO_LARGE):
         return value
-    raise TypeError(f"{value!r} is not a number")
+    raise TypeError(f"{str(value)[:20]} is not a number below {_TOO_LARGE:g}")

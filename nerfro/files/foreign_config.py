@@ -11,6 +11,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nerfro.cli import renamed_config
 from nerfro.errors import NerfroError
+from nerfro.files.reading import read_text, require_bounded_yaml
 
 
 def foreign_config(text: str, origin: Path) -> DictConfig:
@@ -18,9 +19,10 @@ def foreign_config(text: str, origin: Path) -> DictConfig:
 
     Interpolations are refused: `${oc.env:...}` would copy the environment of this machine into a shared page.
     """
+    require_bounded_yaml(text, origin)
     try:
         config = OmegaConf.create(text)
-    except (yaml.YAMLError, OmegaConfBaseException, ValueError) as error:
+    except (yaml.YAMLError, OmegaConfBaseException, ValueError, AssertionError) as error:
         reason = " ".join(str(error).split())
         raise NerfroError(f"{origin} is not the configuration of a run ({reason}); leave the run out") from error
     if not isinstance(config, DictConfig):
@@ -29,3 +31,8 @@ def foreign_config(text: str, origin: Path) -> DictConfig:
     if interpolation:
         raise NerfroError(f"{origin} contains an interpolation ({interpolation[0].strip()}); write the value instead")
     return renamed_config(config, origin)
+
+
+def read_foreign_config(path: Path) -> DictConfig:
+    """Read the configuration of a run from a file; see `foreign_config`."""
+    return foreign_config(read_text(path, "repair it, or leave the run out"), path)

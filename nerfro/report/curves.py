@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import csv
 import io
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +13,12 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from nerfro.files.reading import reading
+
 # File of the CSV logger of Lightning, see conf/logger/.
 CURVES_FILE = Path("csv", "metrics.csv")
 FIRST = ("train/psnr", "val/psnr", "loss/total")
+_TOO_LARGE = 1e15  # steps and values that are not drawn
 MAX_POINTS = 200  # maximum number of points per line; a chart has only about 300 pixels
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#a64d86", "#8a6d00", "#2a9fd6", "#444444", "#c2185b")  # by method
 
@@ -62,8 +64,9 @@ def read_curves(folder: Path) -> dict[str, Curve]:
     Unreadable rows are skipped, such as the last row of an interrupted run.
     """
     points: dict[str, dict[int, float]] = {}
-    if (folder / CURVES_FILE).is_file():
-        with (folder / CURVES_FILE).open(newline="", encoding="utf-8") as file:
+    path = folder / CURVES_FILE
+    if path.is_file():
+        with reading(path, advice="remove it"), path.open(newline="", encoding="utf-8", errors="replace") as file:
             for row in csv.DictReader(file):
                 for name, text in row.items():
                     if name and (name in FIRST or name.startswith("loss/")):
@@ -102,9 +105,9 @@ def _thin(steps: np.ndarray, values: np.ndarray) -> Curve:
 
 
 def _number(text: str | None) -> float | None:
-    """Parse a finite number; returns None for any other text."""
+    """Parse a number that can be drawn; returns None for any other text."""
     try:
         value = float(text or "nan")
     except ValueError:
         return None
-    return value if math.isfinite(value) else None
+    return value if abs(value) < _TOO_LARGE else None

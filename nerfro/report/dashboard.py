@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nerfro.allowed import Range
 from nerfro.errors import NerfroError
-from nerfro.files.foreign_config import foreign_config
+from nerfro.files.foreign_config import read_foreign_config
 from nerfro.paths import scene_name
 
 _LOGS = "tensorboard"  # subfolder of a run folder, see conf/logger/tensorboard.yaml
@@ -63,11 +63,10 @@ def run_name(folder: Path, outputs: Path) -> str:
     """Return the run name `experiment/scene/...`, followed by the path within `outputs` without repetitions."""
     rest = folder.relative_to(outputs).parts
     try:
-        path = folder / "config.yaml"
-        config = foreign_config(path.read_text(encoding="utf-8"), path)
+        config = read_foreign_config(folder / "config.yaml")
         name, scene = _as_folder(config.name), _as_folder(scene_name(config.data.root))
     # The folder is not a run of nerfro, or its configuration is incomplete at this moment.
-    except (OSError, UnicodeDecodeError, OmegaConfBaseException, AttributeError, NerfroError):
+    except (OmegaConfBaseException, AttributeError, NerfroError):
         return "/".join(rest) or folder.resolve().name
     repeated = {name, "sweeps"}
     return "/".join([name, scene, *(part.removeprefix(f"{name}-{scene}-") for part in rest if part not in repeated)])

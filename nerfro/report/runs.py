@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,13 +15,19 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nerfro.errors import NerfroError, first_of
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
-from nerfro.files.foreign_config import foreign_config
+from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.reading import open_image, read_json
 from nerfro.paths import EMBEDDED_PREFIX, scene_name, user_path
 from nerfro.training.config import check_trained
 from nerfro.training.run_folder import CELL_FILE
 
-_FACTS = {"command", "machine", "python", "threads", "versions"}  # required keys of run.json
+# Types of the values in run.json.
+_FACTS: dict[str, Any] = {
+    **dict.fromkeys(("command", "machine", "python"), str),
+    **dict.fromkeys(("commit", "gpu"), (str, type(None))),
+    "threads": int,
+    "versions": dict,
+}
 
 
 @dataclass(frozen=True)
@@ -123,6 +128,8 @@ def find_runs(places: Sequence[str]) -> tuple[list[Run], list[str]]:
     """
     folders: set[Path] = set()
     for place in places:
+        if user_path(place).resolve() == Path(user_path(place).anchor):
+            raise NerfroError(f"runs: {place} is a whole file system; give run folders, or folders that contain these")
         matches = [Path(match) for match in glob.glob(str(user_path(place)), recursive=True)]
         if not matches:
             raise NerfroError(
@@ -146,8 +153,8 @@ def find_runs(places: Sequence[str]) -> tuple[list[Run], list[str]]:
 def _why_unfinished(folder: Path) -> str:
     """Return the reason for a run without scores, if a sweep recorded it."""
     try:
-        reason = json.loads((folder / CELL_FILE).read_text(encoding="utf-8"))["reason"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        reason = read_json(folder / CELL_FILE, "")["reason"]
+    except (NerfroError, KeyError, TypeError, IndexError):
         reason = ""
     return f"it failed: {reason}" if reason else "it has no metrics.json, so it has not been evaluated"
 
@@ -157,13 +164,11 @@ def read_run(folder: Path) -> Run:
     metrics = read_metrics_json(folder / "metrics.json")
     try:
         path = folder / "config.yaml"
-        config: Any = OmegaConf.to_container(
-            check_trained(foreign_config(path.read_text(encoding="utf-8"), path), path)
-        )
+        config: Any = OmegaConf.to_container(check_trained(read_foreign_config(path), path))
         facts = read_json(folder / "run.json", "repair it, or omit the run")
-        absent = _FACTS - facts.keys()
-        if absent:
-            raise NerfroError(f"{folder / 'run.json'} lacks {first_of(sorted(absent))}; omit the run")
+        wrong = [name for name, kind in _FACTS.items() if not isinstance(facts.get(name), kind)]
+        if wrong:
+            raise NerfroError(f"{folder / 'run.json'} has no valid {first_of(wrong)}; omit the run")
         data, trainer, root = config["data"], config["trainer"], str(config["data"]["root"])
         view = metrics.result.views[0].name
         with open_image(folder / "images" / f"{view}.png") as (image, _):
@@ -191,7 +196,7 @@ def read_run(folder: Path) -> Run:
     except OSError as error:
         reason = f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}"
         raise NerfroError(f"the run {shown(folder)} cannot be read: {reason}; repair or omit it") from error
-    except (OmegaConfBaseException, KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+    except (OmegaConfBaseException, LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         reason = str(error).strip().split("\n", 1)[0]
         raise NerfroError(
             f"the run {shown(folder)} is not in the format of nerfro.train ({type(error).__name__}: {reason}); omit it"

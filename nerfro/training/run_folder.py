@@ -24,7 +24,8 @@ from torch import Tensor
 from nerfro.errors import Interrupted, NerfroError, first_of
 from nerfro.files.atomic import write_atomically
 from nerfro.files.folder_lock import lock_folder, remove_unfinished, require_only
-from nerfro.files.foreign_config import foreign_config
+from nerfro.files.foreign_config import foreign_config, read_foreign_config
+from nerfro.files.reading import reading
 from nerfro.kernels.precision import fast_bfloat16
 from nerfro.paths import PACKAGE_DIR, user_path
 from nerfro.rendering import Renderer
@@ -169,26 +170,20 @@ def find_checkpoint(ckpt_path: str | None, folder: Path) -> Path | None:
 
 def load_checkpoint(path: Path) -> tuple[dict[str, Any], DictConfig]:
     """Read a checkpoint without executing pickled code, and its configuration."""
-    try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        missing = _REQUIRED_KEYS.keys() - checkpoint.keys()
-        if missing:
-            raise NerfroError(f"{path} lacks {first_of(sorted(missing))}, so it is no checkpoint of nerfro.train")
+    trouble, missing = "is not a readable nerfro checkpoint", f"it is usually RUN/{LAST_CHECKPOINT}"
+    with reading(path, "checkpoint ", trouble, "train the run again", missing):
+        try:
+            checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        except pickle.UnpicklingError as error:  # torch advises to load it nevertheless
+            raise NerfroError(f"checkpoint {path} {trouble} (it holds more than numbers)") from error
+        absent = _REQUIRED_KEYS.keys() - checkpoint.keys()
+        if absent:
+            raise NerfroError(f"{path} lacks {first_of(sorted(absent))}, so it is no checkpoint of nerfro.train")
         for name, kind in _REQUIRED_KEYS.items():
             if not isinstance(checkpoint[name], kind):
                 raise NerfroError(f"{path} holds a {type(checkpoint[name]).__name__} as {name}; it is damaged")
         require_finite(checkpoint["state_dict"], path)
-        config = check_trained(foreign_config(checkpoint["nerfro_config"], path), path)
-    except NerfroError:
-        raise
-    except FileNotFoundError as error:
-        raise NerfroError(f"checkpoint {path} does not exist; it is usually RUN/{LAST_CHECKPOINT}") from error
-    except pickle.UnpicklingError as error:  # torch advises to load it nevertheless
-        raise NerfroError(f"{path} is not a readable nerfro checkpoint (it holds more than numbers)") from error
-    except Exception as error:  # torch.load raises nearly anything on a damaged file
-        reason = str(error).strip().split("\n", 1)[0]
-        raise NerfroError(f"{path} is not a readable nerfro checkpoint ({type(error).__name__}: {reason})") from error
-    return checkpoint, config
+        return checkpoint, check_trained(foreign_config(checkpoint["nerfro_config"], path), path)
 
 
 def require_finite(weights: Mapping[str, Any], path: Path) -> None:
@@ -242,7 +237,7 @@ def require_same_run(folder: Path, checkpoint: Path | None, config: DictConfig, 
         require_same_configuration(checkpoint, trained, config)
         require_optimizer_fits(content, renderer, checkpoint)
     elif config.ckpt_path is not None:
-        require_same_configuration(begun, foreign_config(begun.read_text(encoding="utf-8"), begun), config)
+        require_same_configuration(begun, read_foreign_config(begun), config)
 
 
 def require_same_configuration(path: Path, trained: DictConfig, wanted: DictConfig) -> None:

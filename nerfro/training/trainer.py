@@ -176,5 +176,8 @@ def _quieten_lightning() -> None:
         ".*sync_dist=True.*",  # one process looks at validation views
         ".*broadcast_buffers.* is deprecated.*",  # its successor is not in all versions of torch that are supported
         ".*LeafSpec.* is deprecated.*",
+        # A run that is resumed, in its own folder or in another one.
+        ".*Checkpoint directory .* exists and is not empty.*",
+        ".*The dirpath has changed from .*",
     ):
         warnings.filterwarnings("ignore", message)

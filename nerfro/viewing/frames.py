@@ -17,6 +17,7 @@ from nerfro.files.cache import content_hash
 from nerfro.files.deep_images import write_radiance
 from nerfro.files.drawing import sheet
 from nerfro.files.images import save_image, save_png
+from nerfro.files.reading import read_json
 from nerfro.viewing.layers import Layer
 from nerfro.viewing.render_request import Shots
 from nerfro.viewing.trained_scene import TrainedScene
@@ -80,14 +81,21 @@ def render_frames(
 def _remove_other_frames(folder: Path, files: Sequence[Path], fingerprint: str, overwrite: bool) -> None:
     """Record the request in the folder, and remove frames of another request if `overwrite` is set."""
     record = folder / _RECORD
-    known = json.loads(record.read_text())["request"] if record.is_file() else None
     existing = [file for file in files if file.exists()]
-    if known != fingerprint:
+    if _recorded_request(record) != fingerprint:
         if existing and not overwrite:
             raise NerfroError(f"{existing[0]} belongs to another rendering; give another out=... or overwrite=true")
         for file in existing:
             file.unlink()
     write_atomically(record, json.dumps({"request": fingerprint}) + "\n")
+
+
+def _recorded_request(record: Path) -> object:
+    """Return the fingerprint in a record; None if the record is missing or damaged."""
+    try:
+        return read_json(record, "")["request"]
+    except (NerfroError, KeyError, TypeError, IndexError):
+        return None
 
 
 def _fingerprint(shots: Shots, request: Sequence[object]) -> str:

@@ -18,7 +18,7 @@ from nerfro.data.frames import SPLITS, FrameSet, PosedImages, check_pose
 from nerfro.data.image_files import read_size
 from nerfro.data.lenses import Lens
 from nerfro.errors import NerfroError
-from nerfro.files.reading import parse_matrix
+from nerfro.files.reading import parse_matrix, reading
 from nerfro.registry import register
 
 # Constants of RefRef's refref_dataparser.py: horizontal field of view, half side of the scene box, views per split.
@@ -105,7 +105,7 @@ def _read_rows(files: list[Path], numbers: range, columns: list[str]) -> list[tu
     rows: list[tuple[int, dict[str, Any]]] = []
     offset = 0
     for path in files:
-        try:
+        with reading(path, advice="download it again"):
             table = pyarrow.parquet.ParquetFile(path)
             num_rows = table.metadata.num_rows
             wanted = range(max(numbers.start, offset), min(numbers.stop, offset + num_rows))
@@ -117,9 +117,6 @@ def _read_rows(files: list[Path], numbers: range, columns: list[str]) -> list[tu
                     )
                 part = table.read(columns).slice(wanted.start - offset, len(wanted))
                 rows += zip(wanted, part.to_pylist(), strict=True)
-        except (pyarrow.ArrowException, OSError) as error:
-            reason = str(error).split("\n")[0]
-            raise NerfroError(f"{path} cannot be read ({reason}); download it again") from error
         offset += num_rows
     if not rows:
         raise NerfroError(

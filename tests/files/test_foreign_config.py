@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -25,7 +26,11 @@ HOSTILE = [
 ]
 
 
-@pytest.mark.parametrize("text", [*HOSTILE, "{[: no yaml", "name: !!python/name:os.system", "- 1", "a: 1\na: 2"])
+BOMB = "a: &a [1, 2]\n" + "".join(f"{x}: &{x} [{', '.join([f'*{w}'] * 9)}]\n" for w, x in pairwise("abcdefgh"))
+OTHERS = ["{[: no yaml", "name: !!python/name:os.system", "- 1", "1", "a: 1\na: 2", BOMB, "a: &a [*a]", "[" * 3000]
+
+
+@pytest.mark.parametrize("text", [*HOSTILE, *OTHERS])
 def test_what_a_run_does_not_write_is_refused(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NERFRO_SECRET", "hunter2")
     torch.save({"nerfro_config": text}, tmp_path / "last.ckpt")

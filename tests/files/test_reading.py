@@ -15,8 +15,11 @@ from PIL import Image
 
 from nerfro.data.image_files import read_levels, read_rgb, read_size
 from nerfro.errors import NerfroError
+from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.images import load_png
 from nerfro.files.reading import load_array, load_arrays, read_json
+from nerfro.geometry.mesh import load_mesh
+from nerfro.training.run_folder import load_checkpoint
 
 
 def chunk(kind: bytes, content: bytes) -> bytes:
@@ -63,7 +66,8 @@ def test_images_without_palette_and_of_enormous_size_are_refused(
     assert len(recwarn) == 0
 
 
-READERS = [read_levels, read_size, load_png, load_array, load_arrays, lambda path: read_json(path, "")]
+READERS = [read_levels, read_size, load_png, load_array, load_arrays, lambda path: read_json(path, ""), load_checkpoint,
+           read_foreign_config, load_mesh]  # fmt: skip
 
 
 @pytest.mark.parametrize("read", READERS)

@@ -85,6 +85,9 @@ def test_an_interrupted_rendering_goes_on_and_another_is_not_mixed_in(render: Ca
     code, err = render("path=arc", "frames=3", "azimuth=40")
     assert code == 1
     assert "frame_0000.png belongs to another rendering; give another out=... or overwrite=true" in err
+    for damaged in ("", "{}", "[]", "null"):  # as a record of unknown frames
+        Path("O/frames.json").write_text(damaged)
+        assert "belongs to another rendering" in render("path=arc", "frames=3")[1]
     assert render("path=arc", "frames=3", "azimuth=40", "overwrite=true")[0] == 0
     assert not np.array_equal(read("O/frame_0001.png"), whole)
 
