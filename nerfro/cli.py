@@ -34,10 +34,9 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from nerfro.allowed import check_names, check_settings
 from nerfro.errors import NerfroError, nearest_of
-from nerfro.files.reading import read_text, require_bounded_yaml
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover, plugins
-from nerfro.trust import GuardedConfigLoader, leave_current_directory
+from nerfro.trust import GuardedConfigLoader, leave_current_directory, require_bounded_yaml
 
 _NO_MEMORY = re.compile("allocate memory|out of memory")  # messages of torch on a CPU and on a GPU
 _LONGEST_LINE = 1000  # characters of an error; the middle of longer ones is left out
@@ -361,8 +360,8 @@ class _RenamingFiles(FileConfigSource):
 
     def load_config(self, config_path: str) -> ConfigResult:
         file = Path(self.path, self._normalize_file_name(config_path))
-        if file.exists():
-            require_bounded_yaml(read_text(file, "correct it, or choose another one"), file)
+        if file.is_file():
+            require_bounded_yaml(file.read_text(encoding="utf-8"), file)
         result = super().load_config(config_path)
         group = config_path.rpartition("/")[0]
         package = result.header.get("package") or group.replace("/", ".")

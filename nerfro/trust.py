@@ -6,12 +6,14 @@ directory, and configuration files of other people are not.
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
+import yaml
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import CachingConfigRepository
 from hydra.core.override_parser.types import Override
@@ -27,6 +29,7 @@ from nerfro.paths import PACKAGE_DIR
 # takes factories from `()` and `class`.
 _TARGETS = re.compile(r"hydra\.experimental\.callbacks\.\w+|optuna\.samplers\.\w+Sampler")
 _HANDLERS = ("logging.", "colorlog.")
+MAX_YAML_NODES = 100_000  # values of a YAML document, after aliases are replaced
 _STREAMS = ("ext://sys.stdout", "ext://sys.stderr")
 
 
@@ -109,3 +112,30 @@ def _is_allowed(key: object, value: str) -> bool:
     if key in ("class", "()"):
         return value.startswith(_HANDLERS)
     return not value.startswith("ext://") or value in _STREAMS
+
+
+def require_bounded_yaml(text: str, origin: Path) -> None:
+    """Refuse a YAML document whose anchors expand to more than `MAX_YAML_NODES` nodes, or to infinitely many.
+
+    Raises:
+        NerfroError: it does; syntax errors are left to the parser.
+    """
+    num_nodes: dict[int, float] = {}
+
+    def count(node: yaml.Node) -> float:
+        if id(node) not in num_nodes:
+            num_nodes[id(node)] = math.inf  # of a node that contains itself
+            children = node.value if isinstance(node, yaml.CollectionNode) else []
+            pairs = (child if isinstance(child, tuple) else (child,) for child in children)
+            num_nodes[id(node)] = 1 + sum(count(child) for pair in pairs for child in pair)
+        return num_nodes[id(node)]
+
+    try:
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        too_large = root is not None and count(root) > MAX_YAML_NODES
+    except yaml.YAMLError:
+        return
+    except RecursionError:
+        too_large = True
+    if too_large:
+        raise NerfroError(f"{origin} expands to more than {MAX_YAML_NODES} values, or is nested too deeply; shorten it")

@@ -184,7 +184,7 @@ def finish(
     return Finished(code, printed.out, printed.err)
 
 
-UTM = (345678.25, 5234567.5, 120.0)  # typical coordinates of georeferenced data
+UTM = (345678.0, 5234567.0, 120.0)  # typical coordinates of georeferenced data
 
 
 def moved_mesh(mesh: trimesh.Trimesh, place: Sequence[float], file: Path) -> Path:

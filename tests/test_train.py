@@ -79,7 +79,11 @@ def test_georeferenced_data_train_as_at_the_origin(
             for row, shift in zip(frame["transform_matrix"], UTM, strict=False):
                 row[3] += shift
         file.write_text(json.dumps(document))
-    finished = train_here(*overrides, f"data.root={root}", f"medium.mesh={mesh}", f"hydra.run.dir={tmp_path / 'far'}")
+    box = [
+        f"medium.box_{end}={[x + side for x in UTM]}".replace(" ", "") for end, side in (("min", -1.5), ("max", 1.5))
+    ]
+    far = [f"data.root={root}", f"medium.mesh={mesh}", *box]
+    finished = train_here(*overrides, *far, f"hydra.run.dir={tmp_path / 'far'}")
     assert finished.code == 0, finished.err
     psnr = [json.loads((folder / "metrics.json").read_text())["test"]["psnr"] for folder in (run, tmp_path / "far")]
     assert psnr[1] == pytest.approx(psnr[0], abs=0.01)

@@ -11,7 +11,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nerfro.cli import renamed_config
 from nerfro.errors import NerfroError
-from nerfro.files.reading import read_text, require_bounded_yaml
+from nerfro.files.reading import read_text
+from nerfro.trust import require_bounded_yaml
 
 
 def foreign_config(text: str, origin: Path) -> DictConfig:

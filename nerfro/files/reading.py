@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any, BinaryIO, TypeGuard
 
 import numpy as np
-import yaml
 from jaxtyping import Float
 from PIL import ExifTags, Image, TiffImagePlugin, UnidentifiedImageError
 
@@ -28,7 +27,6 @@ from nerfro.errors import NerfroError
 
 # Pixels of the largest image, 134 million; bytes of the largest JSON document, and of all arrays of a file in memory.
 MAX_PIXELS, MAX_JSON_BYTES, MAX_ARRAY_BYTES = 2**27, 2**27, 2**31
-MAX_YAML_NODES = 100_000  # values of a YAML document, after aliases are replaced
 
 _AGAIN = "copy or export it again"
 # Python's warning filters belong to all threads.
@@ -151,33 +149,6 @@ def read_text(path: Path, advice: str) -> str:
         if path.stat().st_size > MAX_JSON_BYTES:
             raise OSError(f"it is larger than {MAX_JSON_BYTES >> 20} MiB")
         return path.read_text(encoding="utf-8")
-
-
-def require_bounded_yaml(text: str, origin: Path) -> None:
-    """Refuse a YAML document whose anchors expand to more than `MAX_YAML_NODES` nodes, or to infinitely many.
-
-    Raises:
-        NerfroError: it does; syntax errors are left to the parser.
-    """
-    num_nodes: dict[int, float] = {}
-
-    def count(node: yaml.Node) -> float:
-        if id(node) not in num_nodes:
-            num_nodes[id(node)] = math.inf  # of a node that contains itself
-            children = node.value if isinstance(node, yaml.CollectionNode) else []
-            pairs = (child if isinstance(child, tuple) else (child,) for child in children)
-            num_nodes[id(node)] = 1 + sum(count(child) for pair in pairs for child in pair)
-        return num_nodes[id(node)]
-
-    try:
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
-        too_large = root is not None and count(root) > MAX_YAML_NODES
-    except yaml.YAMLError:
-        return
-    except RecursionError:
-        too_large = True
-    if too_large:
-        raise NerfroError(f"{origin} expands to more than {MAX_YAML_NODES} values, or is nested too deeply; shorten it")
 
 
 def parse_matrix(value: object, shapes: tuple[tuple[int, int], ...], where: str) -> Float[np.ndarray, "rows columns"]:

@@ -88,9 +88,9 @@ class _Comparison(NamedTuple):
     world_origin: Float[np.ndarray, "3"]
     intersector: MeshIntersector
     cameras: Cameras
-    origins: Float[Tensor, "V*h*w 3"]
-    directions: Float[Tensor, "V*h*w 3"]
-    masks: Bool[Tensor, "V h*w"]
+    origins: Float[Tensor, "R 3"]
+    directions: Float[Tensor, "R 3"]
+    masks: Bool[Tensor, "V P"]
 
     @classmethod
     def of(cls, mesh: TriangleMesh, views: Views, origin: Float[np.ndarray, "3"]) -> _Comparison | None:
@@ -111,7 +111,7 @@ class _Comparison(NamedTuple):
         origins, directions = (torch.cat([getattr(ray, name) for ray in rays]) for name in ("origins", "directions"))
         return cls(mesh, -origin, intersector, cameras, origins, directions, masks[useful])
 
-    def silhouettes(self, change: _Change) -> Bool[Tensor, "V h*w"]:
+    def silhouettes(self, change: _Change) -> Bool[Tensor, "V P"]:
         """Return the pixels of the changed mesh."""
         inverse = torch.from_numpy(np.linalg.inv(change.matrix))
         origins = (self.origins.double() - torch.from_numpy(change.shift)) @ inverse.T
@@ -160,7 +160,7 @@ class _Comparison(NamedTuple):
             words = [f"scaled by {scale:.3g}"] * (scale != 1) + [turn.description] * bool(turn.description)
             yield _Change(matrix, shift, " and ".join([*words, f"moved by {shift.round(3).tolist()}"]))
 
-    def _middle(self, pixels: Bool[Tensor, "V h*w"]) -> Float[np.ndarray, "3"]:
+    def _middle(self, pixels: Bool[Tensor, "V P"]) -> Float[np.ndarray, "3"]:
         """Return the point nearest to the rays through the centres of some pixels in each view."""
         axes = (pixels[..., None] * self.directions.view(*pixels.shape, 3)).sum(1)
         axes = torch.nn.functional.normalize(axes, dim=-1).double()
