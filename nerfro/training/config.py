@@ -310,9 +310,9 @@ def build_data(config: DictConfig) -> DataSource:
             f"{root} holds no data yet; run python -m nerfro.synthesize scene={scene} out={root} {small} first"
         )
     source, number = build(config.data), config.batches.num_validation_views
-    mesh = resolve_path(str(config.medium.mesh)) if "mesh" in config.medium else None
-    if mesh is not None and mesh.is_file():
-        source.origin = local_origin(load_points(mesh))
+    mesh = OmegaConf.select(config, "medium.mesh")
+    if mesh is not None and (path := resolve_path(str(mesh))).is_file():
+        source.origin = local_origin(load_points(path))
     return WithValidationViews(source, number) if number else source
 
 
