@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from nerfro.data.blender import BlenderData
-from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint, restore
+from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from tests.conftest import UTM, moved_mesh, train_in
 
 

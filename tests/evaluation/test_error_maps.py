@@ -6,8 +6,8 @@ from nerfro.errors import NerfroError
 from nerfro.evaluation.crops import Crop, most_different_crop
 from nerfro.evaluation.error_maps import ErrorMap, error_maps, error_sheet, squared_error_map, triptych
 from nerfro.evaluation.flip import flip
-from nerfro.evaluation.lpips import ALEX
 from nerfro.evaluation.image_metrics import psnr
+from nerfro.evaluation.lpips import ALEX
 from nerfro.evaluation.ssim import ssim
 from nerfro.files.drawing import magma
 from nerfro.files.images import round_to_8bit
