@@ -15,7 +15,7 @@ import tempfile
 import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import ClassVar, NoReturn, cast
+from typing import NoReturn, cast
 
 import hydra
 import hydra._internal.hydra
@@ -23,6 +23,7 @@ import yaml
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra._internal.utils import get_args_parser
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -319,8 +320,7 @@ def renamed_config(config: DictConfig, origin: Path) -> DictConfig:
 def _composed_with(check: Callable[[DictConfig], None]) -> Iterator[None]:
     """Let Hydra compose configurations with the checks of a command."""
     before = hydra._internal.hydra.ConfigLoaderImpl
-    _ConfigLoader.check_job = staticmethod(check)
-    hydra._internal.hydra.ConfigLoaderImpl = _ConfigLoader  # type: ignore[misc]
+    hydra._internal.hydra.ConfigLoaderImpl = functools.partial(_ConfigLoader, check)  # type: ignore[misc, assignment]
     try:
         yield
     finally:
@@ -328,9 +328,14 @@ def _composed_with(check: Callable[[DictConfig], None]) -> Iterator[None]:
 
 
 class _ConfigLoader(GuardedConfigLoader):
-    """Composition of a configuration, also of each job of a sweep, with the checks of the command."""
+    """Composition of a configuration, also of each job of a sweep, with the checks of the command.
 
-    check_job: ClassVar[Callable[[DictConfig], None]]
+    Launchers hand the object to their workers.
+    """
+
+    def __init__(self, check_job: Callable[[DictConfig], None], config_search_path: ConfigSearchPath) -> None:
+        super().__init__(config_search_path)
+        self._check_job = check_job
 
     def check(self, config: DictConfig) -> None:
         # Hydra adds the group `env`, and the options of plugins of other packages are theirs to check.
@@ -338,7 +343,7 @@ class _ConfigLoader(GuardedConfigLoader):
         job = copy.deepcopy(config)
         with flag_override(job, ["struct", "readonly"], False):
             del job["hydra"]
-        type(self).check_job(job)
+        self._check_job(job)
 
     def load_sweep_config(self, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
         """Compose the configuration of a job; its `hydra.job.override_dirname` names what differs between jobs."""

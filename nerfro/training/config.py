@@ -258,7 +258,7 @@ def check_run(config: DictConfig) -> None:
     for name, reason in REFUSED_ARGUMENTS.items():
         if config.trainer[name] is not None:
             raise NerfroError(f"trainer.{name}={config.trainer[name]} has no meaning in nerfro: {reason}")
-    OmegaConf.to_container(config, resolve=True)  # an interpolation without a value is an error
+    OmegaConf.to_container(config.data, resolve=True)  # an interpolation without a value is an error
     limit = config.trainer.max_time
     if isinstance(limit, (int, float)):
         raise NerfroError(f"trainer.max_time={limit} has no unit; write DD:HH:MM:SS, such as 00:00:05:00")

@@ -100,6 +100,8 @@ class PageServer:
 class _QuietServer(ThreadingHTTPServer):
     """A server whose clients may disappear or be slow."""
 
+    request_queue_size = 128  # connections that wait; beyond, the system delays clients by a second or more
+
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Print no traceback of a connection that ends early, because the terminal shows the training."""
         if not isinstance(sys.exc_info()[1], OSError):

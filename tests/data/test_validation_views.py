@@ -91,7 +91,10 @@ def test_numbers_that_cannot_be_held_back_are_refused_in_one_line(
     train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path, value: str, message: str
 ) -> None:
     finished = train_here(
-        *tiny_default_run, f"hydra.run.dir={tmp_path / 'run'}", f"batches.num_validation_views={value}"
+        *tiny_default_run,
+        "trainer.max_steps=1",
+        f"hydra.run.dir={tmp_path / 'run'}",
+        f"batches.num_validation_views={value}",
     )
     assert finished.code == 1
     assert message in finished.err

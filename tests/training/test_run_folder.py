@@ -14,14 +14,12 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-import nerfro.evaluate
-import nerfro.train
-import nerfro.training.run_folder
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.folder_lock import is_locked, lock_folder
 from nerfro.training.config import TrainConfig
+from nerfro.training.data_module import RayDataModule
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 
 
@@ -117,13 +115,13 @@ def test_second_process_in_a_folder_is_refused(
 def test_checkpoint_in_a_removed_folder_is_not_made_again(
     train: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fit = nerfro.train.RayDataModule.train_dataloader
+    fit = RayDataModule.train_dataloader
 
     def remove(module: Any) -> Any:
         shutil.rmtree(tmp_path / "run")
         return fit(module)
 
-    monkeypatch.setattr(nerfro.train.RayDataModule, "train_dataloader", remove)
+    monkeypatch.setattr(RayDataModule, "train_dataloader", remove)
     finished = train()
     assert finished.code == 1
     assert "was removed or replaced while nerfro was writing to the folder" in finished.err
