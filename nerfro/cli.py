@@ -338,6 +338,7 @@ class _ConfigLoader(GuardedConfigLoader):
         self._check_job = check_job
 
     def check(self, config: DictConfig) -> None:
+        discover()  # the process may be a launcher's worker
         # Hydra adds the group `env`, and the options of plugins of other packages are theirs to check.
         check_names(config.hydra, "hydra.", also=["env", "sweeper", "launcher"])
         job = copy.deepcopy(config)
