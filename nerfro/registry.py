@@ -283,7 +283,7 @@ def configure(plugin: Plugin, node: DictConfig | Mapping[str, object]) -> dict[s
         given = OmegaConf.to_container(node, resolve=True) if isinstance(node, DictConfig) else dict(node)
         merged = OmegaConf.merge(OmegaConf.structured(plugin.config), given)
         settled = OmegaConf.to_container(merged, resolve=True, throw_on_missing=True)
-    except OmegaConfBaseException as error:
+    except (OmegaConfBaseException, OverflowError) as error:  # the latter of integers with hundreds of digits
         known = ", ".join(name for name, _, _ in plugin.fields()) or "none"
         raise NerfroError(f"{where}: {_first_line(error)}; its fields: {known}") from error
     values = {str(key): value for key, value in typing.cast(dict, settled).items() if key != "_target_"}

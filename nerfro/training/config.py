@@ -243,7 +243,7 @@ def check_trained(config: DictConfig, origin: Path) -> DictConfig:
         content = typed.content
         if content.box_min is not None or content.box_max is not None:
             corners_of_box(content.box_min or [], content.box_max or [], bounded=False)
-    except (OmegaConfBaseException, NerfroError) as error:
+    except (OmegaConfBaseException, OverflowError, NerfroError) as error:
         reason = " ".join(str(error).split())
         raise NerfroError(f"{origin} has a configuration that nerfro.train does not write: {reason}") from error
     return typed
