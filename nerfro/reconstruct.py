@@ -26,8 +26,8 @@ def main(config: DictConfig) -> None:
         if not is_given("data", data):
             data = ["data=opencv", *data]
         segment(config, [*data, *of_groups(("outlines",), overrides)], root)
-        surface = preprocess(config, [*data, *of_groups(("medium",), overrides)], root, out / "surface")
-        train(config, overrides, surface, out)
+        preprocess(config, [*data, *of_groups(("medium",), overrides)], root, out / "surface")
+        train(config, overrides, out / "surface", out)
         report(out)
 
 

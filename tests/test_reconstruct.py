@@ -51,6 +51,14 @@ def reconstruct(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[s
     return lambda *overrides: finish(nerfro.reconstruct.main, overrides, monkeypatch, capsys)
 
 
+def test_links_to_deleted_photographs_are_removed(photos: Path, tmp_path: Path) -> None:
+    stages.link_photographs(photos, photos.parent / "silhouettes", tmp_path / "out")
+    (photos / "IMG_1.png").unlink()
+    stages.link_photographs(photos, photos.parent / "silhouettes", tmp_path / "out")
+    assert sorted(file.name for file in (tmp_path / "out" / "images").iterdir()) == ["IMG_0.png", "IMG_2.png"]
+    assert len(list((tmp_path / "out" / "masks").iterdir())) == 3
+
+
 class Pretended:
     """Commands that do nothing but write their results, a second after each other by their files' times.
 
@@ -264,9 +272,7 @@ def test_a_result_that_was_spoilt_is_refused(reconstruct: Reconstruct, pretended
     asked = *given(photos), f"out={pretended.out}"
     reconstruct(*asked)
     pretended.write("surface/preprocess.json", {"options": []})
-    assert (
-        "lacks one of doubtful, near, options, pixels, up, width; delete the file to repeat" in reconstruct(*asked).err
-    )
+    assert "lacks one of doubtful, near, options, pixels; delete the file to repeat" in reconstruct(*asked).err
 
 
 def test_a_command_is_left_time_to_save_when_this_process_is_asked_to_end() -> None:

@@ -50,6 +50,7 @@ class OutlineHull:
         self.size = cameras.width, cameras.height
         self.cameras = cameras.resized(round(cameras.width / scale), round(cameras.height / scale))
         self._outlines: dict[int, Silhouettes] = {}
+        self._hulls: dict[int | None, TriangleMesh | None] = {}  # by the view left out; cleared if the views change
         for view, mask in masks.items():
             self.add(view, mask)
         self._initial = list(self._outlines)
@@ -66,6 +67,7 @@ class OutlineHull:
         size = self.cameras.width, self.cameras.height
         coverage = opencv().resize(mask.astype(np.float32), size, interpolation=opencv().INTER_AREA)
         if (coverage > 0.5).any():
+            self._hulls.clear()
             self._outlines[view] = Silhouettes.of(self.cameras.select([view]), torch.from_numpy(coverage[None]))
 
     def add_if_agreed(self, view: int, mask: Bool[np.ndarray, "H W"]) -> bool:
@@ -84,6 +86,7 @@ class OutlineHull:
         agrees = agreement.min() >= GOOD_OVERLAP
         if not agrees or (self._overlaps(self.hull()) < self._initial_overlaps - _MAX_LOSS).any():
             del self._outlines[view]
+            self._hulls.clear()
         return view in self
 
     def revolution(self) -> TriangleMesh | None:
@@ -106,11 +109,13 @@ class OutlineHull:
 
     def hull(self, without: int | None = None) -> TriangleMesh | None:
         """Compute the hull of all views, optionally without one; None if the hull is empty."""
-        silhouettes = self._silhouettes(without)
-        wrong = int(_WRONG_FRACTION * len(silhouettes))
-        centre = self._centre_from_one_side(silhouettes)
-        box = find_box(silhouettes, wrong) if centre is None else _box_around(centre, silhouettes)
-        return carve_mesh(silhouettes, box, _VOXELS, wrong)
+        if without not in self._hulls:
+            silhouettes = self._silhouettes(without)
+            wrong = int(_WRONG_FRACTION * len(silhouettes))
+            centre = self._centre_from_one_side(silhouettes)
+            box = find_box(silhouettes, wrong) if centre is None else _box_around(centre, silhouettes)
+            self._hulls[without] = carve_mesh(silhouettes, box, _VOXELS, wrong)
+        return self._hulls[without]
 
     def seen_from(self, view: int, hull: TriangleMesh | None) -> Bool[np.ndarray, "H W"]:
         """Render the silhouette of a hull in the size of the images."""

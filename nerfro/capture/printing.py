@@ -18,7 +18,7 @@ _MARGIN, _WIDEST = 0.008, 3.0  # metres
 def print_sheets(sheets: list[Sheet], folder: Path) -> list[Path]:
     """Write board.pdf with one page per sheet, and the same pages as board_<number>.png.
 
-    The unit of the target is interpreted as one metre. A page is a sheet with a margin, to be printed at 100 %.
+    The unit of the board is interpreted as one metre. A page is a sheet with a margin, to be printed at 100 %.
     """
     pages, resolution = [], 0.0
     for sheet in sheets:

@@ -96,14 +96,14 @@ def reconstruct(images: Sequence[Path], masks: Sequence[Path | None], folder: Pa
             order = sorted(range(len(names)), key=names.__getitem__)
         pairs = list(itertools.combinations(range(len(names)), 2)) if order is None else sequential_pairs(order)
         _match(pycolmap, database, [(names[i], names[j]) for i, j in pairs], threads)
-        models = _map(pycolmap, database, images, folder, settings, threads)
+        models = _map(pycolmap, database, images, folder, threads)
         if settings.pairs is None and order is not None and len(_registered(models)) < len(images):
             posed = _registered(models)
             print(f"{len(posed)} of {len(images)} images have a pose: matching the others with all images")
             left = set(itertools.combinations(range(len(names)), 2)) - {(min(pair), max(pair)) for pair in pairs}
             left = {pair for pair in left if not {names[pair[0]], names[pair[1]]} <= posed}
             _match(pycolmap, database, [(names[i], names[j]) for i, j in sorted(left)], threads)
-            models = _map(pycolmap, database, images, folder, settings, threads)
+            models = _map(pycolmap, database, images, folder, threads)
     if not models:
         raise NerfroError(
             f"COLMAP finds no poses for the {len(images)} images, because too few features match; photograph with more "
@@ -170,9 +170,7 @@ def _match(pycolmap: Any, database: Path, pairs: Sequence[tuple[str, str]], thre
         pycolmap.match_image_pairs(database, matching_options=options, pairing_options=pairing)
 
 
-def _map(
-    pycolmap: Any, database: Path, images: Sequence[Path], folder: Path, settings: SfmSettings, threads: int
-) -> dict[int, Any]:
+def _map(pycolmap: Any, database: Path, images: Sequence[Path], folder: Path, threads: int) -> dict[int, Any]:
     """Register the images one after the other and write the models to the folder; returns the models by number."""
     options = pycolmap.IncrementalPipelineOptions()
     options.ba_refine_principal_point = False

@@ -25,7 +25,7 @@ def extract_frames(video: Path, folder: Path, count: int) -> list[Path]:
     """Write the sharpest frame of each of `count` equal parts of a video as `frame_NNNNN.jpg`.
 
     The number in the name is the number of the frame in the video. Frames that exist are kept, so that an interrupted
-    extraction resumes.
+    extraction resumes. Frames of another video or of another `count` are deleted.
 
     Args:
         video: file in any format that OpenCV's FFmpeg reads; its rotation is applied.
@@ -47,8 +47,11 @@ def extract_frames(video: Path, folder: Path, count: int) -> list[Path]:
     edges = np.linspace(0, len(sharpness), count + 1).round().astype(int)
     chosen = {int(first + sharpness[first:last].argmax()) for first, last in itertools.pairwise(edges)}
     files = {number: folder / f"frame_{number:05d}.jpg" for number in sorted(chosen)}
-    waiting = {number for number, file in files.items() if not file.is_file()}
     folder.mkdir(parents=True, exist_ok=True)
+    for file in folder.glob("frame_*.jpg"):
+        if file not in files.values() or file.stat().st_mtime_ns < video.stat().st_mtime_ns:
+            file.unlink()
+    waiting = {number for number, file in files.items() if not file.is_file()}
     for number, frame in enumerate(_frames(video) if waiting else ()):
         if number in waiting:
             _, encoded = opencv().imencode(".jpg", frame, [opencv().IMWRITE_JPEG_QUALITY, _QUALITY])
@@ -62,7 +65,9 @@ def extract_frames(video: Path, folder: Path, count: int) -> list[Path]:
 def _sharpness(video: Path) -> Float[np.ndarray, "F"]:
     """Compute the variance of the Laplacian of each frame, which motion blur reduces."""
     cv2, values = opencv(), []
-    total = int(max(0.0, _open(video).get(cv2.CAP_PROP_FRAME_COUNT)))
+    capture = _open(video)
+    total = int(max(0.0, capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+    capture.release()
     for frame in track("finding sharp frames", _frames(video), total=total or None):
         scale = min(1.0, _SHARPNESS_PIXELS / max(frame.shape[:2]))
         size = math.ceil(frame.shape[1] * scale), math.ceil(frame.shape[0] * scale)

@@ -62,7 +62,8 @@ def hypotheses(found: Mapping[str, Any], medium: Mapping[str, Any]) -> list[Hypo
 
     Straight rays show an opaque object, and are the baseline of all other hypotheses. A body has the index that
     `preprocess` found; without a reliable index, the indices of water and of glass are the initial values of a learned
-    index. An empty glass has ordinary dimensions.
+    index. An empty glass has ordinary dimensions, and needs the up direction and the width of the surface, which
+    results of earlier releases lack.
 
     Args:
         found: content of the result file of `preprocess`.
@@ -72,8 +73,9 @@ def hypotheses(found: Mapping[str, Any], medium: Mapping[str, Any]) -> list[Hypo
     straight = Hypothesis(
         "straight rays", ["+experiment=straight", *of_groups(("data", "camera"), options)], speed=_STRAIGHT_SPEED
     )
+    known_materials = f"+experiment={'glass_room' if near else 'glass'}"
     if "wall" in medium:  # the materials of a vessel are known
-        return [straight, Hypothesis("vessel", [f"+experiment={'glass_room' if near else 'glass'}", *options])]
+        return [straight, Hypothesis("vessel", [known_materials, *options])]
     body = [f"+experiment={'glass_room' if near else 'unknown'}", *options]
     if not found["doubtful"]:
         bodies = [Hypothesis("solid body", body)]
@@ -83,11 +85,10 @@ def hypotheses(found: Mapping[str, Any], medium: Mapping[str, Any]) -> list[Hypo
             Hypothesis(f"solid body, {name}", [*body, f"medium.ior={index}", "medium.learn_ior=true"], doubt)
             for name, index in _COMMON_INDICES.items()
         ]
-    if "shell_voxels" not in medium or is_given("medium", options):
+    if "shell_voxels" not in medium or is_given("medium", options) or not {"up", "width"} <= found.keys():
         return [straight, *bodies]
     kept = [text for text in options if not is_given("medium.ior", [text])]
     vessel = {"medium": "vessel", "medium.ior": 1.52, "medium.liquid_ior": 1.0, "medium.up": found["up"]}
     lengths = {"medium.wall": _WALL * found["width"], "medium.foot": _FOOT * found["width"]}
     settings = as_overrides(vessel | {name: float(f"{length:.4g}") for name, length in lengths.items()})
-    experiment = f"+experiment={'glass_room' if near else 'glass'}"
-    return [straight, *bodies, Hypothesis("empty glass", [experiment, *kept, *settings])]
+    return [straight, *bodies, Hypothesis("empty glass", [known_materials, *kept, *settings])]

@@ -109,7 +109,7 @@ def move_aside(folder: Path) -> Path:
 def link_photographs(photographs: Path, masks: Path | None, out: Path) -> None:
     """Link photographs into `out`/images and masks into `out`/masks, so that no result lies among the originals.
 
-    Existing links and files are kept.
+    Existing links and files are kept, except links to deleted files.
 
     Args:
         photographs: folder of the photographs, which may also contain masks (`mask_*`).
@@ -117,6 +117,9 @@ def link_photographs(photographs: Path, masks: Path | None, out: Path) -> None:
         out: folder of the data set.
     """
     list_images(photographs)  # raises an error for a folder without images
+    for link in (*out.glob("images/*"), *out.glob("masks/*")):
+        if not link.exists():
+            link.unlink()
     for folder in (photographs, *([] if masks is None else [masks])):
         if not folder.is_dir():
             raise NerfroError(f"masks={folder} is not a folder; give the folder of the masks of the photographs")
@@ -127,5 +130,4 @@ def link_photographs(photographs: Path, masks: Path | None, out: Path) -> None:
             link = out / ("images" if among_images else "masks") / file.name
             link.parent.mkdir(parents=True, exist_ok=True)
             if not link.exists():
-                link.unlink(missing_ok=True)  # a broken link
                 link.symlink_to(file.resolve())

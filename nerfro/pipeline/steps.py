@@ -59,37 +59,36 @@ def segment(config: DictConfig, options: list[str], root: Path) -> None:
         Stage("mask", [*options, *shlex.split(config.mask)], sheet, sheet).run()
 
 
-def preprocess(config: DictConfig, options: list[str], root: Path, folder: Path) -> Path:
-    """Reconstruct surface and index, and return the folder of the results."""
+def preprocess(config: DictConfig, options: list[str], root: Path, folder: Path) -> None:
+    """Reconstruct surface and index in a folder."""
     inputs = [*root.glob("transforms*.json"), *(file for place in _MASKS for file in root.glob(place))]
     automatic = [*as_overrides({"out": folder}), "refine=true", "wrong_masks=null", "symmetry=auto", "overwrite=true"]
     options = [*options, *automatic, *shlex.split(config.preprocess)]
     Stage("preprocess", options, folder / FOUND, folder / SHEET, inputs).run()
-    return folder
 
 
 def train(config: DictConfig, overrides: list[str], surface: Path, out: Path) -> None:
     """Train under the hypothesis that the validation photographs prefer."""
     inputs = [surface / FOUND, surface / MESH]
-    found = read_result(surface / FOUND, {"options", "doubtful", "near", "pixels", "up", "width"})
+    found = read_result(surface / FOUND, {"options", "doubtful", "near", "pixels"})
     common = common_options(config, overrides, found)
-    candidates, best = hypotheses(found, config.medium), None
     if is_given("experiment", common):
-        best = Hypothesis("given", [*found["options"], *found["doubtful"]])
+        options = [*found["options"], *found["doubtful"]]
     elif config.trial_steps == 0:
-        best = candidates[1]
+        options = hypotheses(found, config.medium)[1].options
     else:
+        candidates = hypotheses(found, config.medium)
         trials = [out / "trials" / hypothesis.folder for hypothesis in candidates]
         for hypothesis, trial in zip(candidates, trials, strict=True):
             print(f"\nhypothesis: {hypothesis.name}")
             _run_training([*hypothesis.options, *common, *hypothesis.trial_options(config.trial_steps)], inputs, trial)
-        best = _best_hypothesis(candidates, trials)
+        options = _best_hypothesis(candidates, trials).options
         inputs += [trial / "metrics.json" for trial in trials]
-    _run_training([*best.options, *common], inputs, out / "run")
+    _run_training([*options, *common], inputs, out / "run")
 
 
 def _best_hypothesis(tried: Sequence[Hypothesis], runs: Sequence[Path]) -> Hypothesis:
-    """Print the scores of the trials, and return the hypothesis with the best mean of picture and object.
+    """Print the scores of the trials, and return the hypothesis with the best mean of image and object.
 
     Bent rays have to be better than straight rays by `_MIN_GAIN`, because straight rays gain more in longer trainings.
 
@@ -99,19 +98,19 @@ def _best_hypothesis(tried: Sequence[Hypothesis], runs: Sequence[Path]) -> Hypot
     """
     scores = []
     print("\nPSNR of short trainings on validation photographs, in dB:")
-    print(f"  {'hypothesis':<20}{'picture':>9}{'object':>9}")
+    print(f"  {'hypothesis':<20}{'image':>9}{'object':>9}")
     for hypothesis, run in zip(tried, runs, strict=True):
         result = read_metrics_json(run / "metrics.json").result
-        picture, thing = result.mean("psnr", FULL) or 0.0, result.mean("psnr", "mask")
-        scores.append(picture if thing is None else 0.5 * (picture + thing))
-        print(f"  {hypothesis.name:<20}{picture:>9.2f}{'n/a' if thing is None else f'{thing:.2f}':>9}")
+        image, thing = result.mean("psnr", FULL) or 0.0, result.mean("psnr", "mask")
+        scores.append(image if thing is None else 0.5 * (image + thing))
+        print(f"  {hypothesis.name:<20}{image:>9.2f}{'n/a' if thing is None else f'{thing:.2f}':>9}")
     bent = max(range(1, len(tried)), key=scores.__getitem__)
     best = tried[bent if scores[bent] >= scores[0] + _MIN_GAIN else 0]
     print(f"training continues with: {best.name}")
     if best is tried[0]:
         doubts = [hypothesis.doubt for hypothesis in tried if hypothesis.doubt]
         reason = doubts[0] if doubts else "the surface or the index is not accurate enough, or the object is opaque"
-        print(f"bent rays do not pay: {reason}; to bend them nevertheless, add {shlex.quote('train=+experiment=NAME')}")
+        print(f"bent rays do not pay: {reason}; to bend them nevertheless, add train=+experiment=NAME")
     return best
 
 

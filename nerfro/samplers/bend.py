@@ -95,8 +95,7 @@ def polylines(
     """
     rays = make_rays(*_checked_rays(origins, directions), medium, 0.0, length)
     path = (Snell() if isinstance(medium, Solid) else Eikonal())(rays, medium)
-    positions = path.positions.cpu().numpy() + medium.origin
-    vertices = zip(positions, path.s.cpu().numpy(), strict=True)
+    vertices = zip(path.positions.numpy() + medium.origin, path.s.numpy(), strict=True)
     # Rows repeat their last vertex.
     return [positions[np.diff(s, prepend=-1.0) > 0] for positions, s in vertices]
 

@@ -69,8 +69,9 @@ def find_export(what: str, out: Path) -> Export:
         NerfroError: the name is unknown, or the file has another ending.
     """
     discover()
-    if what not in (*EXPORTS, *PLUGIN_EXPORTS):
-        raise NerfroError(f"what={what} is not known; choose {', '.join((*EXPORTS, *PLUGIN_EXPORTS))}")
+    names = (*EXPORTS, *PLUGIN_EXPORTS)
+    if what not in names:
+        raise NerfroError(f"what={what} is not known; choose {', '.join(names)}")
     export = EXPORTS[what] if what in EXPORTS else importlib.import_module(PLUGIN_EXPORTS[what]).EXPORT
     if out.suffix.lower() not in export.suffixes:
         raise NerfroError(f"out={out} has another ending than the exported file; it must end in "

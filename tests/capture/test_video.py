@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,19 @@ def test_the_sharpest_frame_of_each_part_is_written(video: Path, tmp_path: Path)
     assert extract_frames(video, tmp_path, 4) == files
     assert files[0].read_bytes() == b"kept"
     assert files[1].read_bytes() == written
+
+
+def test_frames_of_another_extraction_are_deleted(video: Path, tmp_path: Path) -> None:
+    extract_frames(video, tmp_path, 8)
+    (tmp_path / "notes.txt").write_text("of the user")
+    files = extract_frames(video, tmp_path, 4)
+    assert sorted(tmp_path.glob("*.jpg")) == files
+    assert (tmp_path / "notes.txt").is_file()
+    for file in files:  # of an earlier video
+        file.write_bytes(b"earlier")
+        os.utime(file, ns=(0, 0))
+    assert extract_frames(video, tmp_path, 4) == files
+    assert all(cv2.imread(str(file)).shape == (64, 96, 3) for file in files)
 
 
 def test_what_is_no_video_is_refused(video: Path, tmp_path: Path) -> None:
