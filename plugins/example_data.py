@@ -6,6 +6,7 @@ camera to world with OpenGL axes; and `focal`, pixels.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
 from nerfro.allowed import Distance
@@ -41,6 +42,7 @@ class NumpyViews(DataSource):
         num_views, height, width, _ = images.shape
         focal = torch.full((num_views,), float(arrays["focal"]))
         cx, cy = torch.full_like(focal, width / 2), torch.full_like(focal, height / 2)
-        poses = torch.from_numpy(arrays["poses"]).float()
-        cameras = Cameras(poses, focal, focal, cx, cy, width, height, self.near, self.far)
+        poses = arrays["poses"].astype(np.float64)
+        poses[:, :, 3] -= self.origin  # the object may be far from the origin of the world
+        cameras = Cameras(torch.from_numpy(poses).float(), focal, focal, cx, cy, width, height, self.near, self.far)
         return Views(cameras, images, None, [f"view_{view:03d}" for view in range(num_views)])

@@ -76,6 +76,10 @@ class Views:
         names, frames = [self.names[view] for view in chosen], [self.frames[view] for view in chosen if self.frames]
         return replace(self, cameras=self.cameras.select(chosen), names=names, frames=frames, **images)
 
+    def spread(self, most: int) -> list[int]:
+        """Return the indices of up to `most` evenly spread views, in ascending order."""
+        return np.unique(np.linspace(0, len(self) - 1, most).round().astype(int)).tolist()
+
     def checked(self) -> Views:
         """Decode every image and mask once, without storing it, warn of useless masks, and return these views.
 

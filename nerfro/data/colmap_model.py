@@ -18,7 +18,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from nerfro.errors import NerfroError
-from nerfro.files.reading import read_text
+from nerfro.files.reading import MAX_ARRAY_BYTES, read_text
 
 # Name and number of parameters of each camera model; the index is the model's identifier in binary files.
 CAMERA_MODELS = (
@@ -169,7 +169,7 @@ def _text_rows(
         parsers: one per word; the last parser receives the rest of the line.
         skip: number of lines to skip after each line.
     """
-    lines = read_text(path, "export it again").splitlines()
+    lines = read_text(path, "export it again", MAX_ARRAY_BYTES).splitlines()
     numbered = ((i, line.strip()) for i, line in enumerate(lines, 1) if not line.startswith("#"))
     for i, line in numbered:
         if not line:

@@ -143,11 +143,11 @@ def read_json(path: Path, unreadable: str) -> Any:
         return json.loads(content, parse_int=parse_int)
 
 
-def read_text(path: Path, advice: str) -> str:
+def read_text(path: Path, advice: str, most_bytes: int = MAX_JSON_BYTES) -> str:
     """Read a text file in UTF-8; `advice` is the end of the message if this is impossible."""
     with reading(path, advice=advice, missing=advice):
-        if path.stat().st_size > MAX_JSON_BYTES:
-            raise OSError(f"it is larger than {MAX_JSON_BYTES >> 20} MiB")
+        if path.stat().st_size > most_bytes:
+            raise OSError(f"it is larger than {most_bytes >> 20} MiB")
         return path.read_text(encoding="utf-8")
 
 

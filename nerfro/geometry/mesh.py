@@ -81,6 +81,15 @@ def local_origin(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "3"]:
     return centre.round(math.ceil(-math.log10(size)))
 
 
+def origin_of_file(path: Path) -> Float[np.ndarray, "3"]:
+    """Return the `local_origin` of a mesh file; zero for a file without points, which loading the mesh refuses."""
+    try:
+        points = load_points(path)
+    except NerfroError:
+        return np.zeros(3)
+    return local_origin(points) if len(points) else np.zeros(3)
+
+
 def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
     """Read a triangle mesh of any format that trimesh supports (ply, obj, stl, glb, ...) and merge duplicate vertices.
 

@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 
 from nerfro.cli import check_configuration, renamed_override
 from nerfro.data.base import DataSource, Views
+from nerfro.errors import NerfroError
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover
 from nerfro.rendering import Renderer
@@ -62,10 +63,19 @@ def build_training(config: DictConfig, source: DataSource, training: Views) -> t
         config: configuration of the run, see `TrainConfig`; missing settings are derived from the data.
         source: data set of the run.
         training: its training views.
+
+    Raises:
+        NerfroError: medium and data set have different origins.
     """
     validation = source.load("val").checked() if config.evaluation.every > 0 and "val" in source.splits else None
     batches = RayBatches.of(training, config)
     renderer = build_model(config, training)
+    medium = renderer.scene.medium
+    if renderer.path_sampler.needs_medium and (medium.origin != source.origin).any():
+        raise NerfroError(
+            f"{type(medium).__name__} has its origin at {medium.origin.tolist()}, and the data set at "
+            f"{source.origin.tolist()}; a medium with an origin of its own must call its mesh file `mesh`"
+        )
     data = RayDataModule(
         traced(batches, renderer, config), validation, config.evaluation.every, config.trainer.overfit_batches
     )

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Optional, cast
+from typing import Annotated, Any, Literal, Optional, cast, get_args
 
 import torch
 from omegaconf import MISSING, DictConfig, OmegaConf
@@ -26,7 +26,8 @@ from nerfro.allowed import (
 from nerfro.data.base import DataSource, Views
 from nerfro.data.validation_views import WithValidationViews
 from nerfro.errors import NerfroError
-from nerfro.geometry.mesh import load_points, local_origin
+from nerfro.evaluation.results import Region
+from nerfro.geometry.mesh import origin_of_file
 from nerfro.losses.base import Loss
 from nerfro.media.analytic import Vacuum
 from nerfro.paths import resolve_path, scene_name
@@ -266,7 +267,12 @@ def check_run(config: DictConfig) -> None:
         raise NerfroError("set one of checkpoint.every_seconds and checkpoint.every_steps, and the other to null")
     for node in (config.trainer, *(config.logger or {}).values()):
         require_lightning(node)
-    find("metric", config.optimized_metric.rpartition(".")[2])
+    region, _, metric = config.optimized_metric.rpartition(".")
+    find("metric", metric)
+    if region not in ("", *get_args(Region)):
+        raise NerfroError(
+            f"optimized_metric={config.optimized_metric} is not a score; write METRIC, mask.METRIC or crop.METRIC"
+        )
     for name, node in config.callbacks.items():
         configure(find("callbacks", str(name)), node or {})
     build_losses(config.loss, known=False)
@@ -311,8 +317,8 @@ def build_data(config: DictConfig) -> DataSource:
         )
     source, number = build(config.data), config.batches.num_validation_views
     mesh = OmegaConf.select(config, "medium.mesh")
-    if mesh is not None and (path := resolve_path(str(mesh))).is_file():
-        source.origin = local_origin(load_points(path))
+    if mesh is not None:
+        source.origin = origin_of_file(resolve_path(str(mesh)))
     return WithValidationViews(source, number) if number else source
 
 

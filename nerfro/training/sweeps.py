@@ -20,6 +20,7 @@ from nerfro.errors import NerfroError
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
 from nerfro.files.atomic import write_atomically
 from nerfro.files.folder_lock import lock_folder
+from nerfro.files.reading import read_json
 from nerfro.paths import resolve_path, scene_name
 from nerfro.training.run_folder import CELL_FILE, CONFIG_FILE, in_sweep
 from nerfro.training.settings import RESULT, first_difference, settings
@@ -75,13 +76,13 @@ def _record(folder: Path, record: Mapping[str, Any]) -> None:
 def _require_same_cell(folder: Path, identity: Mapping[str, Any]) -> None:
     """Refuse a folder that holds a run with other results."""
     advice = "choose another hydra.sweep.dir or remove the folder"
+    if not (folder / CELL_FILE).exists():
+        raise NerfroError(f"{folder} holds a run that is no cell of a sweep; {advice}")
     try:
-        record = json.loads((folder / CELL_FILE).read_text(encoding="utf-8"))
+        record = read_json(folder / CELL_FILE, advice)
         old, new = settings(record["settings"], RESULT), identity["settings"]
         same_data = record["data"] == identity["data"]
-    except FileNotFoundError as error:
-        raise NerfroError(f"{folder} holds a run that is no cell of a sweep; {advice}") from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (NerfroError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise NerfroError(f"{folder / CELL_FILE} is damaged; {advice}") from error
     key = first_difference(old, new)
     if key is not None:

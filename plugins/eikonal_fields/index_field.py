@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from nerfro.errors import NerfroError
 from nerfro.fields.selection import inside_box
-from nerfro.geometry.mesh import load_mesh
+from nerfro.geometry.mesh import load_mesh, local_origin
 from nerfro.media.base import Medium
 from nerfro.paths import resolve_path
 from nerfro.registry import register
@@ -64,7 +64,9 @@ class IndexField(Medium):
         """
         super().__init__()
         if mesh is not None:
-            bounds = torch.from_numpy(load_mesh(resolve_path(mesh), accept_open_mesh=True).bounds).float()
+            surface = load_mesh(resolve_path(mesh), accept_open_mesh=True)
+            self.origin = local_origin(surface.vertices)
+            bounds = torch.from_numpy(surface.bounds - self.origin).float()
         elif len(box_min) == len(box_max) == 3:
             bounds = torch.tensor([list(box_min), list(box_max)])
         else:
