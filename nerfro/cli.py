@@ -36,7 +36,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 from nerfro.allowed import check_names, check_settings
 from nerfro.errors import NerfroError, nearest_of
 from nerfro.paths import CONF_DIR
-from nerfro.registry import discover, plugins
+from nerfro.registry import MOVED_CLASSES, discover, plugins
 from nerfro.trust import GuardedConfigLoader, leave_current_directory, require_bounded_yaml
 
 _NO_MEMORY = re.compile("allocate memory|out of memory")  # messages of torch on a CPU and on a GPU
@@ -128,6 +128,8 @@ def entry_point(
             try:
                 return task(config)
             except Exception as error:  # Hydra's sweepers continue with the other jobs
+                if os.environ.get("NERFRO_DEBUG"):
+                    raise
                 line = f"{Path(HydraConfig.get().runtime.output_dir).name}: {in_one_line(error)}"
                 print(f"nerfro: error: {line}", file=sys.stderr, flush=True)
                 raise NerfroError(line) from None
@@ -311,6 +313,9 @@ def renamed_override(override: str) -> str:
 def renamed_config(config: DictConfig, origin: Path) -> DictConfig:
     """Replace old names in the configuration of an old run, with one warning, and drop settings that are gone."""
     found = [f"{old} is called {new}" for old, new in RENAMED.items() if _move(config, old, new) and new]
+    data = OmegaConf.select(config, "data")
+    if isinstance(data, DictConfig) and str(data.get("_target_")) in MOVED_CLASSES:
+        data._target_ = MOVED_CLASSES[data._target_]
     if found:
         warn(f"{origin} has old names of settings, which can be read for one more release: {', '.join(found)}")
     return config
@@ -341,10 +346,18 @@ class _ConfigLoader(GuardedConfigLoader):
         discover()  # the process may be a launcher's worker
         # Hydra adds the group `env`, and the options of plugins of other packages are theirs to check.
         check_names(config.hydra, "hydra.", also=["env", "sweeper", "launcher"])
-        job = copy.deepcopy(config)
-        with flag_override(job, ["struct", "readonly"], False):
-            del job["hydra"]
-        self._check_job(job)
+        job, hydra_config = copy.deepcopy(config), HydraConfig.instance()
+        before = hydra_config.cfg
+        try:
+            hydra_config.set_config(job)  # for interpolations such as ${hydra:runtime.cwd}
+            with flag_override(job.hydra, "readonly", False):
+                # Stands for the folder of the job, which Hydra chooses later.
+                job.hydra.runtime.output_dir = job.hydra.run.dir
+            with flag_override(job, ["struct", "readonly"], False):
+                del job["hydra"]
+            self._check_job(job)
+        finally:
+            hydra_config.cfg = before
 
     def load_sweep_config(self, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
         """Compose the configuration of a job; its `hydra.job.override_dirname` names what differs between jobs."""
@@ -366,7 +379,7 @@ class _RenamingFiles(FileConfigSource):
 
     def load_config(self, config_path: str) -> ConfigResult:
         file = Path(self.path, self._normalize_file_name(config_path))
-        if file.is_file():
+        if file.is_file() and not file.is_relative_to(CONF_DIR):
             require_bounded_yaml(file.read_text(encoding="utf-8"), file)
         result = super().load_config(config_path)
         group = config_path.rpartition("/")[0]

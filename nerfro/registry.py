@@ -42,6 +42,11 @@ _BUILT_IN = (
     "camera", "media", "samplers", "fields", "boundaries", "losses", "models", "data", "evaluation.image_metrics",
 )  # fmt: skip
 _LOCAL_PACKAGE = "nerfro_plugins"
+# Former and present places of classes; configurations of earlier releases name the former ones.
+MOVED_CLASSES = {
+    f"nerfro.data.{module}.{name}": f"{_LOCAL_PACKAGE}.data_formats.{module}.{name}"
+    for module, name in (("idr", "IdrData"), ("llff", "LlffData"), ("refref", "RefRefData"))
+} | {"nerfro.data.opencv.OpenCVData": "nerfro.data.blender.OpenCVData"}
 _ENTRY_POINTS = "nerfro.plugins"
 
 # Objects of Lightning that a configuration may name as Hydra's `_target_`, beside registered classes.
@@ -189,10 +194,12 @@ def check_node(node: object) -> type:
     """
     node = _settings_of(node)
     plugin = _plugin_of(node)
-    known = {str(key): node[key] for key in node if not OmegaConf.is_interpolation(node, str(key))}
-    if len(known) == len(node):
+    keys = [str(key) for key in node]
+    if not any(OmegaConf.is_interpolation(node, key) for key in keys):
         configure(plugin, node)
     else:
+        unknown = [key for key in keys if OmegaConf.is_interpolation(node, key) or OmegaConf.is_missing(node, key)]
+        known = {key: node[key] for key in keys if key not in unknown}
         check(f"{plugin.kind}={plugin.name}: ", plugin.hints, known)
     return plugin.cls
 
@@ -223,20 +230,11 @@ def _settings_of(node: object) -> DictConfig:
 
 def _plugin_of(node: DictConfig) -> Plugin:
     target = str(node.get("_target_"))
-    plugin = _of_target(target)
+    place = MOVED_CLASSES.get(target, target)
+    plugin = next((plugin for plugin in _plugins.values() if plugin.target == place), None)
     if plugin is None:
         raise NerfroError(f"'{target}' is not registered; `python -m nerfro.plugins` lists the registered classes")
     return plugin
-
-
-def _of_target(target: str) -> Plugin | None:
-    """Find the registered class that a configuration names; runs of earlier releases may name its former module."""
-    exact = [plugin for plugin in _plugins.values() if plugin.target == target]
-    name = target.rpartition(".")[2]
-    former = [plugin for plugin in _plugins.values() if plugin.target.rpartition(".")[2] == name]
-    if not exact and target.startswith("nerfro.") and len(former) == 1:
-        return former[0]
-    return exact[0] if exact else None
 
 
 def create(plugin: Plugin, node: DictConfig | Mapping[str, object], **parts: object) -> Any:

@@ -74,15 +74,18 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     if not trainer.is_global_zero:
         return None
     if interruption.received:
-        done = f"interrupted after step {trainer.global_step} and saved"
         finish_logs(trainer, {})
-        print(f"nerfro: {done}; {resume_advice(folder)}")
+        print(f"nerfro: interrupted after step {trainer.global_step} and saved; {resume_advice(folder)}")
         sys.exit(EXIT_INTERRUPTED)
 
     write_cameras(folder / "cameras.json", renderer.to(device).scene.camera, training, source.origin)
     metrics = ImageMetrics(*lpips, prefix=config.evaluation.split)
-    result, treated = score_split(renderer, test, metrics, folder, subdivision, config.evaluation.refine_steps)
-    finish_logs(trainer, {f"{config.evaluation.split}/{name}": mean for name, mean in result.means().items()})
+    scores: dict[str, float | None] = {}
+    try:
+        result, treated = score_split(renderer, test, metrics, folder, subdivision, config.evaluation.refine_steps)
+        scores = {f"{config.evaluation.split}/{name}": mean for name, mean in result.means().items()}
+    finally:
+        finish_logs(trainer, scores)
     title = f"{config.name} on {config.data.root}, {config.evaluation.split} views"
     spent = trainer.global_step, throughput.seconds, throughput.rays_per_second
     scored = RunMetrics(result, *spent, treated)

@@ -83,9 +83,14 @@ def squared_error_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, 
     return (prediction - target).square().mean(-1)
 
 
+def squared_error_colours(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+    """Draw the squared error of each pixel in the colours of a fixed scale."""
+    return magma(squared_error_map(prediction, target), SQUARED_ERROR_LIMIT)
+
+
 def triptych(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H 3*W 3"]:
     """Concatenate prediction, reference and squared error for the training log, on the CPU and without text."""
-    error = magma(squared_error_map(prediction, target), SQUARED_ERROR_LIMIT)
+    error = squared_error_colours(prediction, target)
     return torch.cat([prediction.detach().cpu().float().clamp(0, 1), target.detach().cpu().float(), error], dim=1)
 
 

@@ -111,6 +111,7 @@ class ImageMetrics(nn.Module):
             where = {FULL: "images", "mask": "images or masks", "crop": "crops"}[region]
             for name, metric in self.metrics.items():
                 if any(view.score(name, region) is None for view in scored):
-                    reason = metric.missing or f"{where} below {metric.min_size} pixels"
+                    undefined = "it has no value" if metric.min_size <= 1 else f"{where} below {metric.min_size} pixels"
+                    reason = metric.missing or undefined
                     notes[name if region == FULL else f"{region}.{name}"] = reason
         return notes

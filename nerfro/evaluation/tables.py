@@ -166,12 +166,12 @@ def short(reason: str) -> str:
 
 def report(metrics: RunMetrics, title: str, folder: Path) -> None:
     """Write metrics.json and the tables of all regions into a folder, and print the tables of views and means."""
-    write_metrics_json(folder / "metrics.json", metrics)
     result = metrics.result
     for region in result.regions:
         full = region == FULL
         table = views_table(result, title if full else f"{title}, {region}", region)
         write_table(table, folder / ("metrics" if full else f"metrics_{region}"))
+    write_metrics_json(folder / "metrics.json", metrics)  # last, because sweeps take it as the end of the run
     rich.print(to_rich(views_table(result, title)))
     if len(result.regions) > 1:
         rich.print(to_rich(regions_table(result, "means of the full images, of the object's mask, and of the crop")))

@@ -128,7 +128,8 @@ def find_runs(places: Sequence[str]) -> tuple[list[Run], list[str]]:
     """
     folders: set[Path] = set()
     for place in places:
-        if user_path(place).resolve() == Path(user_path(place).anchor):
+        whole = user_path(place).resolve()
+        if whole == Path(whole.anchor):
             raise NerfroError(f"runs: {place} is a whole file system; give run folders, or folders that contain these")
         matches = [Path(match) for match in glob.glob(str(user_path(place)), recursive=True)]
         if not matches:
@@ -218,8 +219,9 @@ def shown(folder: Path) -> str:
 
 def device(config: Mapping[str, Any], facts: Mapping[str, Any]) -> str:
     """Return the training device, such as "NVIDIA H200" or "2 CPU threads (x86_64)"."""
-    if facts.get("gpu"):
-        number = config["trainer"]["devices"]
+    trainer = config["trainer"]
+    if facts.get("gpu") and trainer["accelerator"] not in ("auto", "cpu"):  # `auto` means the CPU
+        number = trainer["devices"]
         return facts["gpu"] if number == 1 else f"{number} x {facts['gpu']}"
     threads = facts["threads"]
     return f"{threads} CPU thread{'s' if threads != 1 else ''} ({facts['machine']})"

@@ -14,11 +14,10 @@ from torch import Tensor
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
 from nerfro.evaluation.crops import Crop, most_different_crop
-from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, squared_error_map
+from nerfro.evaluation.error_maps import squared_error_colours
 from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import FULL, Region, Score
 from nerfro.evaluation.tables import MISSING
-from nerfro.files.drawing import magma
 from nerfro.files.images import data_uri, load_png, to_8bit
 from nerfro.report.comparison import Comparison
 from nerfro.report.runs import EvaluationSet, Run
@@ -146,7 +145,7 @@ def _view(
         image, title = _prediction(run, index), titles[number]
         value = _score(run, index, selection)
         score = f"{metric.title} {MISSING if value is None else f'{value:.{metric.decimals}f}'}"
-        error = magma(squared_error_map(image, reference), SQUARED_ERROR_LIMIT)
+        error = squared_error_colours(image, reference)
         predictions[number] = PageImage(f"{title}, view {index}", score, embed_image(image))
         errors[number] = PageImage(f"squared error of {title}, view {index}", score, embed_image(error))
     return View(index, PageImage(f"reference, view {index}", "", embed_image(reference)), predictions, errors)

@@ -95,16 +95,16 @@ class _Comparison(NamedTuple):
     @classmethod
     def of(cls, mesh: TriangleMesh, views: Views, origin: Float[np.ndarray, "3"]) -> _Comparison | None:
         """Reduce the masks of some views; None if all are empty or full, or without Embree."""
-        chosen = views.select(sorted({round(x) for x in np.linspace(0, len(views) - 1, _NUM_VIEWS)}))
+        chosen = views.select(views.spread(_NUM_VIEWS))
         blocks = PixelBlocks(chosen.cameras, _MAX_PIXELS)
         assert chosen.masks is not None
         masks = torch.stack([blocks.mean(mask).flatten() for mask in chosen.masks]) > 0.5
         useful = (masks.any(1) & ~masks.all(1)).nonzero()[:, 0].tolist()
+        if not useful:
+            return None
         try:
             intersector = MeshIntersector(mesh.triangles)
         except NerfroError:
-            return None
-        if not useful:
             return None
         cameras = blocks.cameras(chosen.cameras).select(useful)
         rays = [cameras.image_rays(view) for view in range(len(cameras))]

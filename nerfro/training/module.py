@@ -61,6 +61,8 @@ class TrainingModule(LightningModule):
     ) -> TrainingModule:
         """Load the module of a checkpoint, from the configuration in the checkpoint.
 
+        The module has no callbacks, so use `nerfro.build` to continue a training.
+
         Args:
             checkpoint_path: file of the checkpoint.
             map_location: device of the module.

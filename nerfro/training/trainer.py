@@ -158,8 +158,10 @@ def fit(
 
 def finish_logs(trainer: pl.Trainer, scores: Mapping[str, float | None]) -> None:
     """Log the final scores, and finish logs, because the next job of a sweep would append to them."""
+    known = {name: score for name, score in scores.items() if score is not None}
     for logger in trainer.loggers:
-        logger.log_metrics({name: score for name, score in scores.items() if score is not None}, trainer.global_step)
+        if known:
+            logger.log_metrics(known, trainer.global_step)
         logger.finalize("success")
         if isinstance(logger, WandbLogger):
             logger.experiment.finish()

@@ -50,7 +50,7 @@ class ValidationPixels:
     def of(cls, views: Views, seed: int = 0) -> ValidationPixels:
         """Draw random usable pixels, the same number from each view."""
         generator = np.random.default_rng([seed, 0])
-        chosen = np.unique(np.linspace(0, len(views) - 1, _MAX_VIEWS).round().astype(int)).tolist()
+        chosen = views.spread(_MAX_VIEWS)
         size, indices, colours, contrasts = views.cameras.height * views.cameras.width, [], [], []
         for view in chosen:
             allowed = np.arange(size)

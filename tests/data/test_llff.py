@@ -13,6 +13,7 @@ import torch
 
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
+from nerfro.files.foreign_config import foreign_config
 from nerfro.registry import build, discover
 
 from .formats import FAR, IDEAL, NEAR, write_llff
@@ -152,5 +153,7 @@ def test_parallel_cameras_have_no_sphere():
 def test_configurations_of_earlier_releases_name_the_former_module(write: Callable[..., Path]) -> None:
     source = build({"_target_": "nerfro.data.llff.LlffData", "root": str(write()), "frame": "file"})
     assert isinstance(source, LlffData)
+    run = foreign_config("data: {_target_: nerfro.data.llff.LlffData}", Path("config.yaml"))
+    assert run.data._target_ == f"{LlffData.__module__}.LlffData"  # as of a new run, which can resume the old one
     with pytest.raises(NerfroError, match=r"'other\.data\.LlffData' is not registered"):
         build({"_target_": "other.data.LlffData", "root": "."})

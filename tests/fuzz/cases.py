@@ -120,11 +120,11 @@ def options_of_other_commands(world: World, draw: random.Random) -> str | None:
         "evaluate": ["split", "root", "chunk_size", "subdivision.side", "subdivision.divergence", "masks", "alpha",
                      "protocol", "device", "lpips_backbone", "predictions", "references", "overwrite"],
         "summary": ["metrics", "region", "methods", "scenes", "views", "report"],
-        "preprocess": ["split", "mesh", "resolution", "box_min", "wrong_masks", "keep", "smoothing", "medium.ior",
-                       "data.near", "data.downscale"],
+        "preprocess": ["mesh", "resolution", "box_min", "wrong_masks", "keep", "smoothing", "medium.ior",
+                       "data.near", "data.downscale", "data.mask_labels"],
         "mask": ["outlines", "overwrite", "data.near", "data.downscale"],
-        "calibrate": ["images", "target", "board", "family", "columns", "rows", "size", "marker", "dictionary", "model",
-                      "lens", "intrinsics", "distortion", "test_every", "write_board"],
+        "calibrate": ["images", "target", "board", "columns", "rows", "size", "lens", "pairs", "threads",
+                      "reconstruction", "mask_labels", "test_every", "write_board"],
         "synthesize": ["scene", "resolution", "spp", "views.train", "photographs", "noise", "sky_height", "variant"],
     }  # fmt: skip
     always = {

@@ -52,13 +52,10 @@ class World:
 
     Attributes:
         root: the folder; `data` and `run` in it are never to change.
-        trained: number of commands that trained or evaluated to the end.
-        tries: number of commands.
     """
 
     def __init__(self, root: Path, data: Path, small: list[str]) -> None:
         self.root, self.small = root, [text for text in small if not text.startswith("data.root=")]
-        self.trained = self.tries = 0
         shutil.copytree(data, root / "data")
         self.caught = root / "caught"  # where an unforeseen error's traceback goes
         self.caught.mkdir()
@@ -103,8 +100,6 @@ class World:
                 code = end.code if isinstance(end.code, int) else int(end.code is not None)
         lines = [line.strip() for line in re.split("[\r\n]", err.getvalue()) if line.strip()]
         lines = [line for line in lines if not _BAR.match(line)]
-        self.tries += 1
-        self.trained += name in ("train", "evaluate") and code == 0
         return Ended(code, lines, out.getvalue(), time.monotonic() - begun)
 
     def trouble(self, name: str, *arguments: str, own: tuple[Path, ...] = ()) -> str | None:
@@ -136,7 +131,6 @@ class World:
 
     def trouble_of_reader(self, read: Callable[[], None], what: str) -> str | None:
         """Run a reader and say what does not hold: it succeeds, or raises an error with a message in one line."""
-        self.tries += 1
         begun, found = time.monotonic(), None
         try:
             with contextlib.ExitStack() as stack:

@@ -61,6 +61,7 @@ def test_every_argument_of_lightnings_trainer_is_known() -> None:
         "+loss.nothing.weight=1",
         "+callbacks.nothing.every=1",
         "optimized_metric=beauty",
+        "optimized_metric=hole.psnr",
     ],
 )
 def test_cfg_refuses_what_training_refuses_in_the_same_line(
@@ -71,6 +72,13 @@ def test_cfg_refuses_what_training_refuses_in_the_same_line(
     assert printed.err == trained.err
     assert len(printed.err.splitlines()) == 1
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("key", ["runtime.cwd", "runtime.output_dir", "job.name"])
+def test_settings_may_refer_to_hydra(key: str, train: Callable[..., Any]) -> None:
+    printed = train("trainer.max_steps=1", f"data.root=${{hydra:{key}}}/data", "--cfg", "job")
+    assert printed.code == 0, printed.err
+    assert f"root: ${{hydra:{key}}}/data" in printed.out
 
 
 def test_arguments_without_a_meaning_are_refused_with_a_reason(train: Callable[..., Any], tmp_path: Path) -> None:
