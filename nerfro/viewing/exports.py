@@ -19,7 +19,6 @@ from nerfro.files.cache import save_arrays
 from nerfro.files.lat_long import save_lat_long
 from nerfro.registry import discover
 from nerfro.viewing import PLUGIN_EXPORTS
-from nerfro.viewing.meshes import write_mesh
 from nerfro.viewing.page import make_page
 from nerfro.viewing.trained_scene import SKY_HEIGHT, TrainedScene
 from nerfro.viewing.volume import RESOLUTION, sample_field
@@ -30,7 +29,7 @@ class ExportConfig:
     """Options of `python -m nerfro.export`."""
 
     checkpoint: str = MISSING  # run folder, or a checkpoint in it
-    what: str = MISSING  # page, mesh, sky, volume, or an export of a plugin, such as mitsuba
+    what: str = MISSING  # page, sky, volume, or an export of a plugin, such as mesh and mitsuba
     out: str = MISSING  # output file; its ending selects the format
     # Grid vertices along the longest side of the volume (default 128), or rows of the sky (default 512).
     resolution: Optional[Count] = None
@@ -99,7 +98,6 @@ def _write_page(scene: TrainedScene, out: Path, config: DictConfig) -> str:
 
 EXPORTS = {
     "page": Export((".html",), _write_page),
-    "mesh": Export((".glb",), lambda scene, out, c: write_mesh(scene, out, c.resolution, c.half_depth)),
     "sky": Export((".hdr", ".exr", ".png"), _write_sky),
     "volume": Export((".npz",), _write_volume),
 }

@@ -15,7 +15,6 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
 
 _ANALYTIC_RESOLUTION = 128  # vertices per side of the grid on which distances in closed form are sampled
-_MIN_COMPONENT = 0.02  # triangles of the smallest component that is kept, relative to the largest component
 
 
 @torch.no_grad()
@@ -74,18 +73,3 @@ def level_set(values: Float[Tensor, "X Y Z"], box: Float[Tensor, "2 3"], level: 
     spacing = (box[1] - box[0]).double().numpy() / (np.array(volume.shape) - 1)
     vertices, faces, _, _ = marching_cubes(volume, level, gradient_direction="ascent")
     return TriangleMesh(vertices * spacing + box[0].double().numpy(), faces.astype(np.int64))
-
-
-def largest_components(mesh: TriangleMesh) -> TriangleMesh:
-    """Remove small separate components, which are artefacts that explain edges and reflections of the glass."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    size = len(mesh.vertices)
-    first, second = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
-    adjacency = coo_array((np.ones(len(first), np.int8), (first, second)), (size, size))
-    _, component = connected_components(adjacency, directed=False)
-    component = component[mesh.faces[:, 0]]
-    counts = np.bincount(component)
-    used, index = np.unique(mesh.faces[counts[component] >= _MIN_COMPONENT * counts.max()], return_inverse=True)
-    return TriangleMesh(mesh.vertices[used], index.reshape(-1, 3))

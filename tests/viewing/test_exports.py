@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 import subprocess
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
@@ -23,7 +24,6 @@ from nerfro.geometry.mesh import TriangleMesh
 from nerfro.light import to_linear, to_srgb
 from nerfro.subdivision import Subdivision
 from nerfro.viewing.exports import ExportConfig, find_export
-from nerfro.viewing.surface import largest_components
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, colour, sky_of
 
@@ -90,6 +90,7 @@ def test_glb_passes_khronos_validator(scene: TrainedScene, tmp_path: Path) -> No
 def test_small_components_are_left_out() -> None:
     large, small = trimesh.creation.icosphere(4, 1.0), trimesh.creation.icosphere(0, 0.1).apply_translation([3, 0, 0])
     both = trimesh.util.concatenate([small, large])
+    largest_components = import_module("nerfro_plugins.mesh_exports.meshes").largest_components
     kept = largest_components(TriangleMesh(np.asarray(both.vertices), np.asarray(both.faces)))
     assert len(kept.faces) == len(large.faces)
     assert np.linalg.norm(kept.vertices, axis=1).max() < 1.01
@@ -142,7 +143,7 @@ def test_mitsuba_renders_the_same_picture(
 @pytest.mark.parametrize(
     ("what", "name", "message"),
     [
-        ("fog", "a.glb", "what=fog is not known; choose page, mesh"),
+        ("fog", "a.glb", "what=fog is not known; choose page, sky"),
         ("mesh", "a.ply", "must end in .glb"),
         ("volume", "a.vdb", "must end in .npz"),
     ],

@@ -22,8 +22,9 @@ from nerfro.files.deep_images import write_radiance
 from nerfro.scenes.path_tracer import envmap_texture
 from nerfro.viewing.changes import absorption_of
 from nerfro.viewing.exports import Export
-from nerfro.viewing.meshes import glass_meshes, inside_mesh
 from nerfro.viewing.trained_scene import SKY_HEIGHT, TrainedScene
+
+from .meshes import glass_meshes, inside_mesh
 
 MITSUBA_FILES = ("_glass.ply", "_inside.ply", "_sky.hdr")  # endings of the files beside the .xml
 _MAX_DEPTH, _SAMPLES = 64, 64

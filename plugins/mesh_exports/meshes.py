@@ -1,0 +1,83 @@
+"""Meshes of the glass and of the dense content of a trained scene."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+import trimesh
+from torch.nn import functional
+
+from nerfro.geometry.bodies import bodies_of
+from nerfro.geometry.interpolation import trilinear
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.media.solid import Solid
+from nerfro.viewing.surface import level_set
+from nerfro.viewing.trained_scene import TrainedScene
+from nerfro.viewing.volume import POINTS_AT_ONCE, RESOLUTION, sample_field
+
+_HALF_DEPTH = 0.01  # default of half_depth, relative to the longest side of the object
+_MIN_COMPONENT = 0.02  # triangles of the smallest component that is kept, relative to the largest component
+
+
+def glass_meshes(scene: TrainedScene) -> list[trimesh.Trimesh]:
+    """Triangulate the surface of each body, with vertex normals; returns an empty list without bodies."""
+    if not isinstance(scene.renderer.scene.medium, Solid):
+        return []
+    return [_with_vertex_normals(mesh) for mesh in scene.surface]
+
+
+def _with_vertex_normals(mesh: TriangleMesh) -> trimesh.Trimesh:
+    """Convert normals of triangle corners to normals of vertices; vertices on creases are duplicated."""
+    assert mesh.normals is not None
+    corners = np.concatenate([mesh.triangles, mesh.normals], -1).reshape(-1, 6).astype(np.float32)
+    unique, index = np.unique(corners, axis=0, return_inverse=True)
+    return trimesh.Trimesh(unique[:, :3], index.reshape(-1, 3), vertex_normals=unique[:, 3:], process=False)
+
+
+@torch.inference_mode()
+def inside_mesh(scene: TrainedScene, resolution: int | None, half_depth: float | None) -> trimesh.Trimesh | None:
+    """Extract the surface of the dense content with marching cubes, with the radiance seen from outside.
+
+    Small separate components are omitted.
+
+    Args:
+        scene: scene whose radiance field is sampled.
+        resolution: grid vertices along the longest side, `RESOLUTION` by default.
+        half_depth: length within which the density of the surface absorbs half the light, world units; by default a
+            hundredth of the object's longest side.
+
+    Returns:
+        Mesh with vertex normals and the vertex attribute `radiance` (linear), or None if no content is dense enough.
+    """
+    volume = sample_field(scene, resolution or RESOLUTION)
+    level = math.log(2) / (half_depth or _HALF_DEPTH * float((scene.bounds[1] - scene.bounds[0]).max()))
+    # The padding closes surfaces at the faces of the box. A logarithm of the density is closer to linear across a
+    # surface than the density.
+    values = functional.pad(volume.density, (1,) * 6).clamp(min=1e-3 * level).log()
+    spacing = (volume.box[1] - volume.box[0]) / (torch.tensor(volume.density.shape) - 1)
+    box = volume.box + torch.stack([-spacing, spacing])
+    if not values.max() > math.log(level):
+        return None
+    mesh = largest_components(level_set(values, box, math.log(level)))
+    vertices = torch.from_numpy(mesh.vertices).float()
+    gradients = torch.stack(torch.gradient(values), -1) / spacing
+    normals = -functional.normalize(trilinear(gradients, box, vertices), dim=-1)
+    network = scene.renderer.scene
+    radiance = [
+        scene.field.at_points(positions.to(network.device), directions.to(network.device))[1].cpu()
+        for positions, directions in zip(vertices.split(POINTS_AT_ONCE), (-normals).split(POINTS_AT_ONCE), strict=True)
+    ]
+    linear = network.colour_space.to_linear(torch.cat(radiance)).numpy()
+    return trimesh.Trimesh(
+        mesh.vertices, mesh.faces, vertex_normals=normals.numpy(), vertex_attributes={"radiance": linear}, process=False
+    )
+
+
+def largest_components(mesh: TriangleMesh) -> TriangleMesh:
+    """Remove small separate components, which are artefacts that explain edges and reflections of the glass."""
+    component = bodies_of(mesh)
+    counts = np.bincount(component)
+    used, index = np.unique(mesh.faces[counts[component] >= _MIN_COMPONENT * counts.max()], return_inverse=True)
+    return TriangleMesh(mesh.vertices[used], index.reshape(-1, 3))
