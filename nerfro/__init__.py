@@ -7,15 +7,24 @@ from typing import Any
 
 import lazy_loader
 
-__version__ = "0.1.0"
-
 # The stub __init__.pyi lists the public names and their modules, which are imported on first access.
 _public, __dir__, _names = lazy_loader.attach_stub(__name__, __file__)
 __all__ = ["__version__", *_names]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return _version()
     if name == "Scene":
         warnings.warn("nerfro.Scene is called nerfro.TrainedScene; the next release removes the old name", stacklevel=2)
         name = "TrainedScene"
     return _public(name)
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version  # importing nerfro should be fast
+
+    try:
+        return version(__name__)
+    except PackageNotFoundError:  # a checkout that is not installed
+        return "0+unknown"

@@ -41,6 +41,13 @@ from nerfro.trust import GuardedConfigLoader, leave_current_directory, require_b
 
 _NO_MEMORY = re.compile("allocate memory|out of memory")  # messages of torch on a CPU and on a GPU
 _LONGEST_LINE = 1000  # characters of an error; the middle of longer ones is left out
+# Options of Hydra that the extras of nerfro install.
+_EXTRAS = {
+    "hydra/launcher/joblib": "launchers",
+    "hydra/launcher/submitit": "launchers",  # submitit_local and submitit_slurm
+    "hydra/launcher/ray": "ray",
+    "hydra/sweeper/optuna": "optuna",
+}
 EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141  # exit status of a program that SIGPIPE has ended, in a shell
 
@@ -234,7 +241,9 @@ def _description(error: Exception) -> str:
     if setting is not None:  # OmegaConf, about an integer of hundreds of digits
         return f"{setting[1]} is too large; take a number that a float can hold"
     if isinstance(error, (HydraException, OmegaConfBaseException)):
-        return " ".join(_messages(error))
+        message = " ".join(_messages(error))
+        extras = [extra for option, extra in _EXTRAS.items() if f"Could not find '{option}" in message]
+        return f"{message}; pip install 'nerfro[{extras[0]}]' adds it" if extras else message
     # Hydra refuses a group without an option (field=null) by a ValueError; any other ValueError is a bug.
     if isinstance(error, ValueError) and str(error).startswith("Config group override"):
         return f"{error}; give the name of an option, as in field=nerf"

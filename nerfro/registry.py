@@ -293,7 +293,8 @@ def discover(plugins_dir: Path = PLUGINS_DIR) -> None:
     """Import all modules that register plugins: built-in, installed and local ones.
 
     Installed plugins are the modules that entry points of group `nerfro.plugins` name. Local plugins are the modules
-    and packages in `plugins_dir` and in the folders of the environment variable `NERFRO_PLUGINS`.
+    and packages in `plugins_dir` and in the folders of the environment variable `NERFRO_PLUGINS`, or in `plugins/` of
+    the current directory if the variable is not set.
 
     Args:
         plugins_dir: folder of local plugins; by default `plugins/` beside conf/.
@@ -307,9 +308,13 @@ def discover(plugins_dir: Path = PLUGINS_DIR) -> None:
         for entry_point in importlib.metadata.entry_points(group=_ENTRY_POINTS):
             _import_plugin(entry_point.value, f"'{entry_point.name}' of an installed package ({entry_point.value})")
         _discovered.add("built-in")
-    extra = os.environ.get("NERFRO_PLUGINS", "")
-    for folder in (plugins_dir, *(Path(p) for p in extra.split(os.pathsep) if p)):
-        _import_folder(folder.resolve())
+    _import_folder(plugins_dir.resolve())
+    folders = os.environ.get("NERFRO_PLUGINS")
+    # A checkout of nerfro contains the plugins that an installed package already has.
+    if folders is None and Path("plugins").is_dir() and not Path("nerfro").is_dir():
+        folders = "plugins"
+    for folder in filter(None, (folders or "").split(os.pathsep)):
+        _import_folder(Path(folder).resolve())
 
 
 def _import_all(package: str) -> None:

@@ -132,6 +132,20 @@ def test_missing_plugin_folder_is_refused(tmp_path: Path, monkeypatch: pytest.Mo
         discover()
 
 
+@pytest.mark.parametrize(("variable", "found"), [(None, True), ("", False)])
+def test_plugins_of_the_current_directory_are_registered_unless_the_environment_replaces_them(
+    variable: str | None, found: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins" / "grey_here.py").write_text(BOUNDARY.format(name="grey_here"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("NERFRO_PLUGINS", raising=False)
+    if variable is not None:
+        monkeypatch.setenv("NERFRO_PLUGINS", variable)
+    discover()
+    assert ("grey_here" in {plugin.name for plugin in plugins("boundary")}) is found
+
+
 # Overrides that use each template.
 TEMPLATES = {
     "example_boundary": ["boundary=gradient_sky"],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, Optional
 
@@ -255,6 +256,11 @@ def test_wrong_losses_are_refused(losses: dict[str, object], message: str) -> No
         (["logger=none", "+logger.x={_target_: os.system, command: 'false'}"], ["'os.system' is not registered"]),
         (["trainer.callbacks=[]"], ["trainer.callbacks=[] has no meaning in nerfro: choose callbacks by name"]),
         (["+experiment=nope"], ["Could not find 'experiment/nope'", "ablation_noBD", "refractive"]),
+        pytest.param(
+            ["hydra/launcher=ray"],
+            ["Could not find 'hydra/launcher/ray'", "pip install 'nerfro[ray]' adds it"],
+            marks=pytest.mark.skipif(find_spec("ray") is not None, reason="the extra is installed"),
+        ),
         (["foo"], ["foo is not an option; write key=value"]),
         (["seed=-1"], ["seed=-1 is not allowed; take at least 0 and at most 4294967295"]),
         (["data.root=${nope}"], ["Interpolation key 'nope' not found"]),

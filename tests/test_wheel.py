@@ -18,6 +18,7 @@ PROJECT = PACKAGE_DIR.parent
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     builders = pytest.importorskip("hatchling.builders.wheel")
+    pytest.importorskip("hatch_vcs")
     if not (PROJECT / "pyproject.toml").is_file():
         pytest.skip("there is no checkout to build a wheel of")
     built = builders.WheelBuilder(str(PROJECT)).build(

@@ -100,7 +100,7 @@ def _read_rows(files: list[Path], numbers: range, columns: list[str]) -> list[tu
         import pyarrow.parquet
     except ImportError as error:
         raise NerfroError(
-            "data=refref reads .parquet files with pyarrow; install it: pip install nerfro[refref]"
+            "data=refref reads .parquet files with pyarrow; install it: pip install 'nerfro[refref]'"
         ) from error
     rows: list[tuple[int, dict[str, Any]]] = []
     offset = 0
