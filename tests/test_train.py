@@ -63,7 +63,7 @@ def test_run_writes_metrics_pictures_and_what_repeats_it(run: Path, overrides: l
     assert config.medium.mesh == f"{tiny_scene}/mesh.ply", "interpolations are resolved"
     facts = json.loads((run / "run.json").read_text())
     assert facts["seed"] == 0
-    assert facts["versions"]["torch"] == torch.__version__
+    assert torch.__version__.startswith(facts["versions"]["torch"])  # the wheel may lack the suffix +cu130
     assert all(override in facts["command"] for override in overrides if "{" not in override)
 
 

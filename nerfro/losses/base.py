@@ -25,7 +25,7 @@ class Loss(nn.Module, ABC):
         ramp: number of steps after `start` during which the weight grows linearly.
     """
 
-    SETTINGS: ClassVar = ("weight", "start", "ramp")
+    SETTINGS: ClassVar[tuple[str, ...]] = ("weight", "start", "ramp")
     weight: NotNegative = 1.0
     start: Natural = 0
     ramp: Natural = 0
