@@ -15,7 +15,7 @@ import tempfile
 import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NoReturn, cast
+from typing import Any, NoReturn, cast
 
 import hydra
 import hydra._internal.hydra
@@ -35,9 +35,9 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from nerfro.allowed import check_names, check_settings
 from nerfro.errors import NerfroError, nearest_of
-from nerfro.paths import CONF_DIR
+from nerfro.paths import CONF_DIR, refuse_root, user_path
 from nerfro.registry import MOVED_CLASSES, discover, plugins
-from nerfro.trust import GuardedConfigLoader, leave_current_directory, require_bounded_yaml
+from nerfro.trust import MAX_YAML_CHARACTERS, GuardedConfigLoader, leave_current_directory, require_bounded_yaml
 
 _NO_MEMORY = re.compile("allocate memory|out of memory")  # messages of torch on a CPU and on a GPU
 _LONGEST_LINE = 1000  # characters of an error; the middle of longer ones is left out
@@ -189,8 +189,8 @@ def _flags_first(arguments: list[str]) -> list[str]:
     flag = next((text for text in others if text.startswith("-")), None)
     if flag is not None:
         raise NerfroError(f"{flag} is not an option; write key=value, or see --help")
-    if known.resolve and not known.cfg:
-        raise NerfroError("--resolve needs --cfg; write --cfg job --resolve to print the resolved configuration")
+    if (known.resolve or known.package) and not known.cfg:
+        raise NerfroError("--resolve and --package need --cfg; write --cfg job --resolve to print the resolved values")
     if known.experimental_rerun is not None:
         raise NerfroError("--experimental-rerun executes code of the file that it reads; use config.yaml of the run")
     overrides = [*known.overrides, *others]
@@ -222,8 +222,12 @@ def errors_in_one_line() -> Iterator[None]:
 
 def in_one_line(error: Exception) -> str:
     """Describe an error for the user: a mistake in the input, a missing resource, or a bug of nerfro."""
-    # Names of files may contain line breaks and other control characters, and values of a file may be long.
-    line = re.sub(r"[\x00-\x1f\x7f]", lambda character: repr(character[0])[1:-1], _description(error))
+    return _in_one_line(_description(error))
+
+
+def _in_one_line(text: str) -> str:
+    """Escape control characters, which names of files may contain, and shorten a line with long values of a file."""
+    line = re.sub(r"[\x00-\x1f\x7f]", lambda character: repr(character[0])[1:-1], text)
     return line if len(line) <= _LONGEST_LINE else f"{line[: _LONGEST_LINE // 2]} ... {line[-_LONGEST_LINE // 4 :]}"
 
 
@@ -244,9 +248,9 @@ def _description(error: Exception) -> str:
         message = " ".join(_messages(error))
         extras = [extra for option, extra in _EXTRAS.items() if f"Could not find '{option}" in message]
         return f"{message}; pip install 'nerfro[{extras[0]}]' adds it" if extras else message
-    # Hydra refuses a group without an option (field=null) by a ValueError; any other ValueError is a bug.
-    if isinstance(error, ValueError) and str(error).startswith("Config group override"):
-        return f"{error}; give the name of an option, as in field=nerf"
+    # Hydra refuses a group without an option (field=null), and flags together, by a ValueError.
+    if isinstance(error, ValueError) and any(place[0].startswith("hydra.") for place in _places(error)[-1:]):
+        return f"{error}; give the name of an option, as in field=nerf, and see --help for the flags"
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return f"no space is left for {error.filename or 'a file'}; free some, or write to another folder"
     if isinstance(error, OSError) and error.errno is not None:
@@ -254,13 +258,17 @@ def _description(error: Exception) -> str:
     return _unforeseen(error)
 
 
+def _places(error: Exception) -> list[tuple[str, str, int]]:
+    """Return module, file and line of each frame of a traceback."""
+    frames = traceback.walk_tb(error.__traceback__)
+    return [(frame.f_globals.get("__name__", ""), frame.f_code.co_filename, line) for frame, line in frames]
+
+
 def _unforeseen(error: Exception) -> str:
     """Write the traceback of a bug to a file and return a message with the name of the file."""
     what = f"{type(error).__name__}: {error}".splitlines()[0]
     foreign = {plugin.cls.__module__ for plugin in plugins()}
-    frames = traceback.walk_tb(error.__traceback__)
-    places = [(frame.f_globals.get("__name__", ""), frame.f_code.co_filename, line) for frame, line in frames]
-    place = next((place for place in reversed(places) if place[0] in foreign), None)
+    place = next((place for place in reversed(_places(error)) if place[0] in foreign), None)
     if place is not None and not place[0].startswith("nerfro."):
         return f"{what}; raised in the plugin {place[1]}, line {place[2]} (NERFRO_DEBUG=1 shows the traceback)"
     try:
@@ -351,6 +359,15 @@ class _ConfigLoader(GuardedConfigLoader):
         super().__init__(config_search_path)
         self._check_job = check_job
 
+    def load_configuration(
+        self, config_name: str | None, overrides: list[str], run_mode: RunMode, *others: Any, **options: Any
+    ) -> DictConfig:
+        config = super().load_configuration(config_name, overrides, run_mode, *others, **options)
+        folder = config.hydra.sweep._get_node("dir")._value()  # not resolved, as in ${now:%Y}
+        if run_mode == RunMode.MULTIRUN and isinstance(folder, str):
+            refuse_root(user_path(folder), "hydra.sweep.dir")
+        return config
+
     def check(self, config: DictConfig) -> None:
         discover()  # the process may be a launcher's worker
         # Hydra adds the group `env`, and the options of plugins of other packages are theirs to check.
@@ -389,7 +406,11 @@ class _RenamingFiles(FileConfigSource):
     def load_config(self, config_path: str) -> ConfigResult:
         file = Path(self.path, self._normalize_file_name(config_path))
         if file.is_file() and not file.is_relative_to(CONF_DIR):
-            require_bounded_yaml(file.read_text(encoding="utf-8"), file)
+            try:
+                with file.open(encoding="utf-8") as stream:
+                    require_bounded_yaml(stream.read(MAX_YAML_CHARACTERS + 1), file)
+            except UnicodeDecodeError as error:
+                raise NerfroError(f"{file} is not a text in UTF-8; save it again with this encoding") from error
         result = super().load_config(config_path)
         group = config_path.rpartition("/")[0]
         package = result.header.get("package") or group.replace("/", ".")
@@ -464,4 +485,4 @@ def _gone(old: str) -> str:
 
 def warn(message: str) -> None:
     """Print a warning about an allowed but suspicious input or result."""
-    print(f"nerfro: warning: {message}")
+    print(f"nerfro: warning: {_in_one_line(message)}")

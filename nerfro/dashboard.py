@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
-from nerfro.paths import user_path
+from nerfro.paths import refuse_root, user_path
 from nerfro.report.dashboard import SEARCH_INTERVAL, DashboardConfig, link_runs, serve
 
 
@@ -19,6 +19,7 @@ from nerfro.report.dashboard import SEARCH_INTERVAL, DashboardConfig, link_runs,
 def main(config: DictConfig) -> None:
     """Serve TensorBoard until Ctrl-C."""
     outputs = user_path(config.outputs)
+    refuse_root(outputs, "outputs")
     if not outputs.is_dir():
         raise NerfroError(f"outputs={outputs} is not a folder; give the folder that contains the run folders")
     with tempfile.TemporaryDirectory(prefix="nerfro_dashboard_") as names:

@@ -1,5 +1,6 @@
 """Paths of configuration, local plugins and embedded data, in a checkout and in an installed wheel."""
 
+import os
 from pathlib import Path
 
 from nerfro.errors import NerfroError
@@ -27,6 +28,13 @@ def resolve_path(location: str | Path) -> Path:
             f"'{location}' is not embedded; embedded scenes: {', '.join(known)}; give a folder of your own instead"
         )
     return ASSETS_DIR / name
+
+
+def refuse_root(path: Path, option: str) -> None:
+    """Refuse the root of a file system, which no command searches or writes to; `option` names the path."""
+    real = os.path.realpath(path)  # Path.resolve raises an error for links in a circle
+    if os.path.dirname(real) == real:
+        raise NerfroError(f"{option}={path} is a whole file system; give a folder below it")
 
 
 def scene_name(root: str | Path) -> str:

@@ -30,6 +30,7 @@ from nerfro.paths import PACKAGE_DIR
 _TARGETS = re.compile(r"hydra\.experimental\.callbacks\.\w+|optuna\.samplers\.\w+Sampler")
 _HANDLERS = ("logging.", "colorlog.")
 MAX_YAML_NODES = 100_000  # values of a YAML document, after aliases are replaced
+MAX_YAML_CHARACTERS = 2**18
 _STREAMS = ("ext://sys.stdout", "ext://sys.stderr")
 
 
@@ -115,7 +116,7 @@ def _is_allowed(key: object, value: str) -> bool:
 
 
 def require_bounded_yaml(text: str, origin: Path) -> None:
-    """Refuse a YAML document whose anchors expand to more than `MAX_YAML_NODES` nodes, or to infinitely many.
+    """Refuse a long YAML document, and one whose anchors expand to more than `MAX_YAML_NODES` nodes.
 
     Raises:
         NerfroError: it does; syntax errors are left to the parser.
@@ -131,11 +132,12 @@ def require_bounded_yaml(text: str, origin: Path) -> None:
         return num_nodes[id(node)]
 
     try:
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
-        too_large = root is not None and count(root) > MAX_YAML_NODES
+        too_large = len(text) > MAX_YAML_CHARACTERS
+        root = None if too_large else yaml.compose(text, Loader=yaml.SafeLoader)
+        too_large = too_large or (root is not None and count(root) > MAX_YAML_NODES)
     except yaml.YAMLError:
         return
     except RecursionError:
         too_large = True
     if too_large:
-        raise NerfroError(f"{origin} expands to more than {MAX_YAML_NODES} values, or is nested too deeply; shorten it")
+        raise NerfroError(f"{origin} is too long, nested too deeply or expands to too many values; shorten it")

@@ -15,7 +15,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 from omegaconf import OmegaConf
 
-from nerfro.cli import RENAMED, _flags_first, _RenamingFiles, in_one_line, renamed_override
+from nerfro.cli import RENAMED, _flags_first, _RenamingFiles, in_one_line, renamed_override, warn
 from nerfro.errors import NerfroError
 from nerfro.files.foreign_config import foreign_config
 from nerfro.paths import CONF_DIR, resolve_path, user_path
@@ -64,12 +64,15 @@ def test_flags_may_stand_anywhere() -> None:
     given = ["seed=1", "--config-dir", "mine", "seed=2", "-m"]
     assert _flags_first(given) == ["--config-dir", "mine", "-m", "seed=1", "seed=2"]
     assert _flags_first(["~seed", "+a=-1"]) == ["~seed", "+a=-1"]
-    with pytest.raises(NerfroError, match="--sed is not an option; write key=value"):
-        _flags_first(["--sed"])
+    for flags, message in ((["--sed"], "--sed is not an option; write key=value"), (["-p", "a"], "need --cfg")):
+        with pytest.raises(NerfroError, match=message):
+            _flags_first(flags)
 
 
-def test_messages_are_one_line_whatever_files_are_called() -> None:
+def test_messages_are_one_line_whatever_files_are_called(capsys: pytest.CaptureFixture[str]) -> None:
     assert in_one_line(NerfroError("a\nb\x1b.png does not exist")) == "a\\nb\\x1b.png does not exist"
+    warn("a\nb.png is skipped")
+    assert capsys.readouterr().out == "nerfro: warning: a\\nb.png is skipped\n"
 
 
 def test_a_configuration_folder_that_does_not_exist_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,6 +94,9 @@ def test_a_file_that_is_no_yaml_is_named_with_the_line(tmp_path: Path) -> None:
         assert line is not None
         assert "\n" not in line
         assert f'"{path}", line' in line
+    path.write_bytes(b"name: \xe9")
+    with pytest.raises(NerfroError, match=r"mine\.yaml is not a text in UTF-8"):
+        _RenamingFiles("mine", f"file://{tmp_path}").load_config("mine")
 
 
 @pytest.mark.parametrize("location", ["~nobody_of_that_name/run", "a\0b"])

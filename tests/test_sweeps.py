@@ -289,6 +289,8 @@ def test_damaged_record_costs_its_own_cell_alone(sweep: Callable[..., Any], tmp_
     [
         ("+batches.foo=1", "batches.foo is not a setting"),
         ("batches.precrop_fraction=nan", "fraction=nan is not allowed"),
+        ("hydra.sweep.dir=/", "hydra.sweep.dir=/ is a whole file system; give a folder below it"),
+        ("hydra.sweep.subdir=/", "hydra.sweep.dir=/ is a whole file system"),
     ],
 )
 def test_settings_of_cells_are_checked(override: str, words: str, sweep: Callable[..., Any], tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from nerfro.data.lazy_images import LazyImages
 from nerfro.data.lenses import Lens, check_lenses
 from nerfro.data.masks import find_mask, find_masks, find_usable
 from nerfro.errors import NerfroError
-from nerfro.paths import resolve_path
+from nerfro.paths import refuse_root, resolve_path
 
 Every = Annotated[int, Range(at_least=2)]  # every n-th view is a test view
 SPLITS = ["train", "val", "test"]
@@ -166,6 +166,7 @@ class PosedImages(DataSource):
 
 
 def _check_bounds(near: float | None, far: float | None) -> None:
+    check("data.", dict.fromkeys(("near", "far"), Distance), {"near": near, "far": far})
     if far is not None and (near or 0.0) >= far:
         raise NerfroError(f"data.near={near} and data.far={far} are not an interval; take 0 <= near < far")
 
@@ -186,7 +187,8 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def require_root(root: Path) -> None:
-    """Raise an error if the folder of a data set does not exist."""
+    """Raise an error if the folder of a data set does not exist, or is a whole file system."""
+    refuse_root(root, "data.root")
     if not root.is_dir():
         raise NerfroError(f"data.root={root} is not a folder; give the folder of the data set")
 

@@ -114,17 +114,18 @@ def read_mask(path: Path, labels: Sequence[int] | None = None) -> Levels:
         # The background is black, or else the first colour.
         background = [0, 0, 0] if (share == 0).any() else palette[:3]
         return (colours != background).any(-1).astype(levels.dtype) * most
-    return (share > 0).astype(levels.dtype) * most if not lossy and _has_labels(share) else share
+    return (share > 0).astype(levels.dtype) * most if _has_labels(share, lossy) else share
 
 
-def _has_labels(levels: Levels) -> bool:
+def _has_labels(levels: Levels, lossy: bool) -> bool:
     """Return whether grey levels are labels, with 0 as the background: there is only one label, or labels fill areas.
 
-    Coverage between 0 and 1 occurs along the outline, where neighbouring pixels differ.
+    Coverage between 0 and 1 occurs along the outline, where neighbouring pixels differ. Lossy compression fills areas
+    with wrong levels.
     """
     present = np.flatnonzero(np.bincount(levels.ravel()))
-    if len(present[present > 0]) == 1:
-        return True
+    if lossy or len(present[present > 0]) == 1:
+        return len(present[present > 0]) == 1
     inner = levels[1:-1, 1:-1]
     partial = (inner > 0) & (inner < np.iinfo(levels.dtype).max)
     if present[0] > 0 or len(present) > _MAX_LABELS or not partial.any():

@@ -22,11 +22,13 @@ from nerfro.lens import coefficients, distort, opencv_coefficients, undistort
 # Perspective lenses in the files of nerfstudio, COLMAP and Blender. They differ in the coefficients that are zero.
 _PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE", "PERSP")
 _MODEL = ("camera_model", "camera_type", "lens_model", "projection", "projection_type")
-# Keys of other projections, and other names of what `_NUMBERS` states.
+# Other projections, which a key may name, or the text of a key about the camera.
+_PROJECTIONS = re.compile("fish_?eye|ortho|equirect|equidist|lat_?long|panoram|omni|spheric|cylind|f_?theta", re.I)
+_STATES_PROJECTION = re.compile("camera|lens|model|projection|type")
+# Keys of other projections, and other names of what `_NUMBERS` states; without underscores, in lower case.
 _OTHER = re.compile(
-    r"fish_?eye|ortho|equirect|lat_?long|panoram|omni|cylind|f_?theta|rolling|skew|^sk_[xy]$|fov|focal|intrinsic|"
-    r"camera_mat|^k$|^k[7-9]$|(?<!un)distort|principal|^f[xy]?$",
-    re.IGNORECASE,
+    rf"{_PROJECTIONS.pattern}|rolling|skew|^sk[xy]$|fov|focal|intrinsic|principal|cameramat|cammatrix|cameraangle|"
+    r"(?<!un)distort|distcoef|pixelaspect|^shift[xy]$|^[cf]l?[xy]?$|^[dkp]\d*$"
 )
 _NUMBER = Annotated[float, Range()]
 _PIXELS = Annotated[float, Range(at_least=1, at_most=10**6)]
@@ -134,7 +136,9 @@ def read_lens(file: Mapping[str, Any], frame: Mapping[str, Any], size: tuple[int
 def _model(level: Mapping[str, Any], where: str) -> str | None:
     """Return the perspective lens that a level names, if any; refuse keys of other projections."""
     for key, value in level.items():
-        if _OTHER.search(key) and key not in _NUMBERS and value not in (None, False, 0, "", []):
+        plain = re.sub(r"[\W_]", "", key).lower()
+        names_other = isinstance(value, str) and _STATES_PROJECTION.search(plain) and _PROJECTIONS.search(value)
+        if (names_other or _OTHER.search(plain)) and key not in _NUMBERS and value not in (None, False, 0, "", []):
             raise NerfroError(
                 f"{where}: {key}={value!r} is not supported; undistort the images, state a perspective lens by fl_x, "
                 "fl_y, cx, cy, k1, k2, k3, p1 and p2, or remove the key if it says nothing about the lens"

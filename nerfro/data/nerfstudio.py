@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import functools
+import os
 from pathlib import PurePosixPath
 from typing import Any, Literal
 
 import numpy as np
 
+from nerfro.allowed import check
 from nerfro.data.bounds import find_bounds, usable_points
 from nerfro.data.frames import SPLITS, Every, FrameSet, PosedImages
 from nerfro.data.image_files import read_size
@@ -76,7 +78,8 @@ class NerfstudioData(PosedImages):
             return self.near, self.far
         manifest = self._manifest("train" if "train" in self.splits else split)
         points, file = np.empty((0, 3)), manifest.document.get("ply_file_path")
-        if isinstance(file, str) and (self.root / file).is_file():
+        check(f"{manifest.path}: ", {"ply_file_path": str}, {"ply_file_path": file})
+        if isinstance(file, str) and os.path.isfile(self.root / file):  # False for a name that is too long
             points = usable_points(load_points(self.root / file), self.root / file)
         half = 0.5 * np.array(read_size(manifest.frames[0].image)[:2])
         slopes = half / [(lens.fx, lens.fy) for lens in manifest.lenses()]

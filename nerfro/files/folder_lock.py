@@ -9,6 +9,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from nerfro.errors import NerfroError, first_of
+from nerfro.paths import refuse_root
 
 _LOCK, PARTIAL = ".lock", ".partial"  # lock file, and ending of files that are being written
 _locked: dict[Path, int] = {}  # folders that this process has locked, with the inode of each lock file
@@ -25,8 +26,9 @@ def lock_folder(folder: Path, option: str) -> Iterator[None]:
         option: option that names the folder, for messages.
 
     Raises:
-        NerfroError: another process has locked the folder, or the folder is not writable.
+        NerfroError: another process has locked the folder, or the folder is not writable, or is a whole file system.
     """
+    refuse_root(folder, option)
     folder = folder.absolute()
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     try:

@@ -144,11 +144,11 @@ def read_json(path: Path, unreadable: str) -> Any:
 
 
 def read_text(path: Path, advice: str, most_bytes: int = MAX_JSON_BYTES) -> str:
-    """Read a text file in UTF-8; `advice` is the end of the message if this is impossible."""
+    """Read a text file in UTF-8, with or without a byte-order mark; `advice` is the end of the error message."""
     with reading(path, advice=advice, missing=advice):
         if path.stat().st_size > most_bytes:
             raise OSError(f"it is larger than {most_bytes >> 20} MiB")
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
 
 
 def parse_matrix(value: object, shapes: tuple[tuple[int, int], ...], where: str) -> Float[np.ndarray, "rows columns"]:

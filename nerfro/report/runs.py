@@ -17,7 +17,7 @@ from nerfro.errors import NerfroError, first_of
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
 from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.reading import open_image, read_json
-from nerfro.paths import EMBEDDED_PREFIX, scene_name, user_path
+from nerfro.paths import EMBEDDED_PREFIX, refuse_root, scene_name, user_path
 from nerfro.training.config import check_trained
 from nerfro.training.run_folder import CELL_FILE
 
@@ -128,9 +128,7 @@ def find_runs(places: Sequence[str]) -> tuple[list[Run], list[str]]:
     """
     folders: set[Path] = set()
     for place in places:
-        whole = user_path(place).resolve()
-        if whole == Path(whole.anchor):
-            raise NerfroError(f"runs: {place} is a whole file system; give run folders, or folders that contain these")
+        refuse_root(user_path(place), "runs")
         matches = [Path(match) for match in glob.glob(str(user_path(place)), recursive=True)]
         if not matches:
             raise NerfroError(

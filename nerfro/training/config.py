@@ -88,7 +88,7 @@ class EvaluationConfig:
 class CheckpointConfig:
     """Interval between checkpoints: in seconds or in steps. Only the latest checkpoint is kept."""
 
-    every_seconds: Optional[Positive] = 60.0  # noqa: UP045 - seconds between two checkpoints
+    every_seconds: Optional[Annotated[float, Range(more_than=0, at_most=10**9)]] = 60.0  # noqa: UP045 - between two checkpoints
     every_steps: Optional[Count] = None  # noqa: UP045 - training steps between two checkpoints
 
 

@@ -34,7 +34,10 @@ def require_reach(renderer: Renderer, batch: Batch) -> None:
     box = f"the field's box from {_rounded(bounds[0])} to {_rounded(bounds[1])}"
     advice = "set content.box_min and content.box_max (or those of field) around what the cameras see"
     if missed == 1:
-        raise NerfroError(f"no ray of the training views meets {box}, and nothing is outside of it; {advice}")
+        raise NerfroError(
+            f"no ray of the training views meets {box}, and nothing is outside of it; check that unit, axes and place "
+            f"of the object are those of the cameras, or {advice}"
+        )
     if missed > _FEW and isinstance(renderer.scene.boundary, ConstantBoundary):
         warn(f"{missed:.0%} of the rays pass {box} and see boundary=constant alone, which learns nothing; {advice}")
 

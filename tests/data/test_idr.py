@@ -74,6 +74,8 @@ def test_decomposition_does_not_depend_on_the_matrix_factor(factor):
             {"world_mat_1": np.array([[9.0, 2, 4, 0], [0, 9, 3, 0], [0, 0, 1, 5], [0, 0, 0, 1]])},
             "must have no skew",
         ),
+        # Of a test view; bounds are estimated from all views.
+        ({"world_mat_0": [[31.0, 0, 12, 1e30], [0, 31, 9, 0], [0, 0, 1, 5], [0, 0, 0, 1]]}, r"data\.far=.*e\+28"),
     ],
 )
 def test_wrong_matrices_are_refused(write, changes, message):

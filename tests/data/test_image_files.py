@@ -156,6 +156,9 @@ def test_empty_masks_and_masks_of_one_label_are_read(save):
     assert (read_mask(save(np.zeros((4, 4), np.uint8))) == 0).all()
     assert (read_mask(save(np.ones((4, 4), np.uint8))) == 1).all()
     np.testing.assert_array_equal(read_mask(save(np.array([[0, 1, 1, 0]], np.uint8))), [[0, 1, 1, 0]])
+    lossless = save(LABELS).with_suffix(".webp")
+    Image.fromarray(120 * LABELS.clip(max=1)).save(lossless, lossless=True)
+    np.testing.assert_array_equal(read_mask(lossless), LABELS > 0)
 
 
 @pytest.mark.parametrize("factor", [1, 1.2, 1.7, 2, 2.5, 3, 4, 5, 6, 11.9, 40])

@@ -130,6 +130,7 @@ def test_wrong_files_are_refused(write):
         (np.where(np.arange(17) == 16, 0.1, rows), "depths must be positive and ascend"),
         (np.where(np.arange(17) == 3, np.nan, rows), "holds NaN or infinite numbers in row 0"),
         (turned, "row 2: the 3x3 part of the pose is not a rotation"),
+        (np.where(np.arange(17) == 16, 1e30, rows), r"data\.far=1.* is not allowed; take at least 0"),
     ):
         np.save(path, content)
         with pytest.raises(NerfroError, match=message):

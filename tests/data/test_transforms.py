@@ -308,11 +308,12 @@ def test_mask_path_of_some_frames_and_of_other_types_is_named(tmp_path: Path) ->
         ({"train_filenames": ["images/x.png"]}, {}, "train_filenames lists 'images/x.png', but no frame has this name"),
         ({}, {"object_mask_path": "gone.png"}, "gone.png of .* does not exist"),
         ({}, {"transform_matrix": [[1, 0], [0, 1]]}, "transform_matrix has shape 2x2"),
+        ({"ply_file_path": 3}, {}, "ply_file_path=3 is not allowed; take text"),
     ],
 )
 def test_wrong_values_are_named(tmp_path: Path, top: dict, frame: dict, message: str) -> None:
     with pytest.raises(NerfroError, match=message):
-        load(write_nerfstudio(tmp_path, seeds=range(3), top=SHARED | top, frame=lambda i: frame))
+        load(write_nerfstudio(tmp_path, seeds=range(3), top=SHARED | top, frame=lambda i: frame), near=None)
 
 
 def test_frames_without_an_image_are_skipped_in_one_line_or_refused(

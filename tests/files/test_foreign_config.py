@@ -27,7 +27,8 @@ HOSTILE = [
 
 
 BOMB = "a: &a [1, 2]\n" + "".join(f"{x}: &{x} [{', '.join([f'*{w}'] * 9)}]\n" for w, x in pairwise("abcdefgh"))
-OTHERS = ["{[: no yaml", "name: !!python/name:os.system", "- 1", "1", "a: 1\na: 2", BOMB, "a: &a [*a]", "[" * 3000]
+LONG = "a: " + 10**6 * "1"
+OTHERS = ["{[: no yaml", "name: !!python/name:os.system", "- 1", "a: 1\na: 2", BOMB, LONG, "a: &a [*a]", "[" * 3000]
 
 
 @pytest.mark.parametrize("text", [*HOSTILE, *OTHERS])

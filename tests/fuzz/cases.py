@@ -440,7 +440,8 @@ def checkpoints(world: World, draw: random.Random) -> str | None:
         node[path[-1]].view(-1)[:1] = draw.choice([math.nan, math.inf, 1e30])
     elif how == "setting":
         config = OmegaConf.create(checkpoint["nerfro_config"])
-        OmegaConf.update(config, draw.choice(settings_of_a_run(world)), draw.choice(WEIRD_JSON), force_add=True)
+        setting, value = draw.choice(settings_of_a_run(world)), draw.choice(WEIRD_JSON)
+        OmegaConf.update(config, setting, value, merge=False, force_add=True)
         checkpoint["nerfro_config"] = OmegaConf.to_yaml(config)
     else:
         node[path[-1]] = draw.choice(WEIRD_OBJECTS)
