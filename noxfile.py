@@ -13,6 +13,7 @@ import nox
 
 PYTHONS = ["3.10", "3.11", "3.12", "3.13"]
 CPU = ("-c", "constraints-cpu.txt")
+PHOTOGRAPHS = Path(__file__).resolve().parent / "nerfro" / "assets" / "torus" / "val"
 # A command that needs the extra, and stops with a message that names it.
 EXTRAS = {
     "synthesize": ["nerfro", "synthesize", "views={train:1,val:1,test:1}", "resolution=8", "spp=1", "test_spp=1"],
@@ -21,7 +22,7 @@ EXTRAS = {
     "optuna": ["nerfro", "train", "hydra/sweeper=optuna", "--cfg", "hydra"],
     "refref": ["nerfro", "train", "data=refref", "data.root=."],
     "video": ["python", "-c", "from nerfro.viewing.film import find_ffmpeg; find_ffmpeg()"],
-    "capture": ["nerfro", "calibrate", "images=.", "target=apriltag"],
+    "capture": ["nerfro", "calibrate", f"images={PHOTOGRAPHS}", "target=apriltag", "out=calibrated"],
 }
 PLUGIN = Path("plugins", "example_sampler.py")
 
