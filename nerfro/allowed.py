@@ -68,6 +68,8 @@ AnyNumber = Annotated[float, None]  # including infinity and NaN
 Count = Annotated[int, Range(at_least=1)]
 NumRays = Annotated[int, Range(at_least=1, at_most=2**22)]  # computed in one chunk
 Side = Annotated[int, Range(at_least=1, at_most=32)]  # number of rays along each side of a pixel
+Depth = Annotated[int, Range(at_least=1, at_most=64)]  # number of layers, levels or octaves
+Width = Annotated[int, Range(at_least=1, at_most=2**13)]  # of layers
 Resolution = Annotated[int, Range(at_least=4, at_most=2048)]  # vertices along each side of a grid
 Natural = Annotated[int, Range(at_least=0)]
 Positive = Annotated[float, Range(more_than=0)]

@@ -144,6 +144,8 @@ def test_open_mesh_is_accepted_when_asked(
         ("batches.precrop_fraction=nan", ["precrop_fraction=nan is not allowed"]),
         ("batches.size=1e12", ["batches.size", "could not be converted to Integer"]),
         ("batches.size=1000000000000", ["batches.size=1000000000000 is not allowed; take at least 1 and at most"]),
+        ("field.depth=99999", ["depth=99999 is not allowed; take at least 1 and at most 64"]),
+        ("boundary.width=99999999", ["width=99999999 is not allowed; take at least 1 and at most 8192"]),
         ("sampler.points.num_coarse=1000000000", ["num_coarse=1000000000 is not allowed"]),
         ("evaluation.subdivision.side=1000000", ["evaluation.subdivision.side=1000000 is not allowed"]),
         ("optimizer.learning_rate=nan", ["optimizer.learning_rate=nan is not allowed"]),

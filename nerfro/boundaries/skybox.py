@@ -5,7 +5,7 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Count
+from nerfro.allowed import Depth, Width
 from nerfro.boundaries.base import Boundary
 from nerfro.fields.encoding import DIRECTION_DEGREE, positional_encoding
 from nerfro.fields.mlp import SkipMLP, glorot_linear, padded_sigmoid
@@ -23,7 +23,7 @@ class Skybox(Boundary):
         width, depth, skip: of the MLP.
     """
 
-    def __init__(self, width: Count = 128, depth: Count = 4, skip: int = 3) -> None:
+    def __init__(self, width: Width = 128, depth: Depth = 4, skip: int = 3) -> None:
         super().__init__()
         self.trunk = SkipMLP(3 * (1 + 2 * DIRECTION_DEGREE), width, depth, skip)
         self.rgb = glorot_linear(self.trunk.num_outputs, 3)

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.allowed import Count, Positive, Range, corners_of_box
+from nerfro.allowed import Count, Depth, Positive, Range, Width, corners_of_box
 from nerfro.fields import hash_encoding
 from nerfro.fields import spherical_harmonics as harmonics
 from nerfro.fields.base import Field
@@ -64,10 +64,10 @@ class HashGridField(Field):
         box_min: Sequence[float] = (-1.0, -1.0, -1.0),
         box_max: Sequence[float] = (1.0, 1.0, 1.0),
         radius: Positive | None = None,
-        num_levels: Count = 12,
+        num_levels: Depth = 12,
         finest_resolution: Count = 256,
         log2_table_size: Annotated[int, Range(at_least=4, at_most=24)] = 15,
-        width: Count = 64,
+        width: Width = 64,
         direction_bands: Annotated[int, Range(at_least=1, at_most=harmonics.MAX_BANDS)] = 4,
         initial_depth: Positive = 0.1,
         shortcut: bool = True,

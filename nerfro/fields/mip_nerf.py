@@ -5,7 +5,7 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Count
+from nerfro.allowed import Depth, Width
 from nerfro.fields.base import Field
 from nerfro.fields.encoding import DIRECTION_DEGREE, integrated_positional_encoding, positional_encoding
 from nerfro.fields.mlp import RadianceMLP
@@ -24,11 +24,11 @@ class MipNerfField(Field):
 
     def __init__(
         self,
-        width: Count = 256,
-        depth: Count = 8,
+        width: Width = 256,
+        depth: Depth = 8,
         skip: int = 5,
-        view_width: Count = 128,
-        position_degree: Count = 16,
+        view_width: Width = 128,
+        position_degree: Depth = 16,
     ) -> None:
         super().__init__()
         self.position_degree = position_degree

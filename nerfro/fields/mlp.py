@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.allowed import Count, checked
+from nerfro.allowed import Depth, Width, checked
 from nerfro.errors import NerfroError
 
 # Colours extend slightly beyond [0, 1], so that black and white need no infinite activation (mip-NeRF's code).
@@ -25,7 +25,7 @@ class SkipMLP(nn.Module):
     Weights are Glorot-uniform and biases are zero, as in the authors' code.
     """
 
-    def __init__(self, num_inputs: int, width: Count, depth: Count, skip: int) -> None:
+    def __init__(self, num_inputs: int, width: Width, depth: Depth, skip: int) -> None:
         super().__init__()
         self.skip = skip
         inputs = [num_inputs] + [width + num_inputs * (i == skip) for i in range(1, depth)]

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from math import inf
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import AnyNumber, Count, Natural, corners_of_box
+from nerfro.allowed import AnyNumber, Depth, Range, Width, corners_of_box
 from nerfro.fields.base import Field
 from nerfro.fields.encoding import DIRECTION_DEGREE, positional_encoding
 from nerfro.fields.mlp import RadianceMLP
@@ -32,11 +33,11 @@ class NerfField(Field):
 
     def __init__(
         self,
-        width: Count = 256,
-        depth: Count = 8,
+        width: Width = 256,
+        depth: Depth = 8,
         skip: int = 5,
-        view_width: Count = 128,
-        position_degree: Natural = 10,
+        view_width: Width = 128,
+        position_degree: Annotated[int, Range(at_least=0, at_most=64)] = 10,
         box_min: list[AnyNumber] = (-inf, -inf, -inf),  # type: ignore[assignment]
         box_max: list[AnyNumber] = (inf, inf, inf),  # type: ignore[assignment]
     ) -> None:

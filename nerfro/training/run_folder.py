@@ -196,15 +196,21 @@ def require_finite(weights: Mapping[str, Any], path: Path) -> None:
 
 
 def require_optimizer_fits(checkpoint: Mapping[str, Any], renderer: Renderer, path: Path) -> None:
-    """Refuse an optimizer state whose moments have other shapes than the learned parameters."""
+    """Refuse an optimizer state that is not of Adam, or whose moments are not finite or have other shapes."""
     groups = renderer.parameter_groups().values()
     shapes = [parameter.shape for parameters in groups for parameter in parameters]
+    defaults = torch.optim.Adam([torch.empty(0)]).defaults
     try:
         (optimizer,) = checkpoint["optimizer_states"]
         fits = all(
             optimizer["state"][number][moment].shape == shapes[number]
+            and optimizer["state"][number][moment].isfinite().all()
             for number in optimizer["state"]
             for moment in ("exp_avg", "exp_avg_sq")
+        ) and all(
+            group[name] == default or (name in ("lr", "eps", "fused") and isinstance(group[name], float | bool))
+            for group in optimizer["param_groups"]
+            for name, default in defaults.items()
         )
     except (AttributeError, IndexError, KeyError, TypeError, ValueError):
         fits = False
