@@ -99,12 +99,15 @@ def test_log_holds_every_loss_and_weight_of_every_second_step_and_images(run: Pa
     def logged(name: str) -> list[tuple[int, float]]:
         return [(event.step, event.value) for event in events.Scalars(name)]
 
-    for name in ("loss/total", "loss/photometric", "train/psnr", "train/rays_per_second", "learning_rate/fields"):
-        assert [step for step, _ in logged(name)] == [1, 3, 5], name
-    assert logged("weight/boundary") == [(1, 0), (3, pytest.approx(0.025)), (5, pytest.approx(0.025))]
-    assert logged("weight/smoothness") == [(1, 0), (3, 1), (5, 1)]
+    rate = "optimizer/learning_rate/fields"
+    for name in ("loss/total", "loss/photometric", "train/psnr", "train/rays_per_second", rate):
+        assert [step for step, _ in logged(name)] == [0, 1, 3, 5], name
+    assert logged("weight/boundary") == [(0, 0), (1, 0), (3, pytest.approx(0.025)), (5, pytest.approx(0.025))]
+    assert logged("weight/smoothness") == [(0, 0), (1, 0), (3, 1), (5, 1)]
     assert [step for step, _ in logged("loss/boundary")] == [3, 5]
     assert "val/psnr" in events.Tags()["scalars"]
+    assert "epoch" not in events.Tags()["scalars"]
+    assert "custom_scalars__config__" in events.Tags()["tensors"]
     assert {"val/prediction_reference_error", "val/depth_opacity"} <= set(events.Tags()["images"])
 
 

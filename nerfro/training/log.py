@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Mapping
 from typing import Any
@@ -26,6 +27,14 @@ from nerfro.types import Batch, Exits, Rays, Rendering
 _SKY_HEIGHT = 128  # rows of the image of the background
 _NUM_RAYS = 128  # largest number of rays for the histograms
 _NUM_PATHS = 12  # number of paths in the plot of paths
+# Charts of TensorBoard's page "Custom Scalars".
+_LAYOUT = {
+    "training": {
+        "PSNR": ["Multiline", ["train/psnr", "val/psnr"]],
+        "losses": ["Multiline", ["loss/.*"]],
+        "weights of losses": ["Multiline", ["weight/.*"]],
+    }
+}
 
 
 class TrainingLog(Callback):
@@ -40,15 +49,22 @@ class TrainingLog(Callback):
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         for logger in trainer.loggers:
+            _omit_epoch(logger)
+            if isinstance(logger, TensorBoardLogger):
+                logger.experiment.add_custom_scalars(_LAYOUT)
             if isinstance(logger, WandbLogger):
                 logger.log_hyperparams(OmegaConf.to_container(self._config, resolve=True))  # type: ignore[arg-type]
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
     ) -> None:
-        for name, rate in learning_rates(trainer).items():
-            pl_module.log(f"learning_rate/{name}", rate)
+        for group in trainer.optimizers[0].param_groups:
+            pl_module.log(f"optimizer/learning_rate/{group['name']}", group["lr"])
         pl_module.log("train/peak_memory_gib", peak_memory(pl_module.device) / 2**30)
+        if trainer.global_step == 1 < trainer.log_every_n_steps:  # type: ignore[attr-defined]
+            first = {name: float(value) for name, value in trainer.callback_metrics.items()}
+            for logger in trainer.loggers:  # Lightning logs at the end of each interval, but not its first step
+                logger.log_metrics(first, 0)
 
     def on_validation_batch_end(
         self,
@@ -84,12 +100,7 @@ class TrainingLog(Callback):
                 # The samples of rays that miss the object have intervals of zero length at far.
                 s = rendering.samples.s[rendering.samples.deltas > 0]
                 if len(s) > 0:
-                    _log_histogram(logger, f"samples/arc_length_level_{level}", s, trainer.global_step)
-
-
-def learning_rates(trainer: Trainer) -> dict[str, float]:
-    """Return the current learning rate of each parameter group (`Renderer.parameter_groups`)."""
-    return {group["name"]: group["lr"] for group in trainer.optimizers[0].param_groups}
+                    _log_histogram(logger, f"val/arc_length_level_{level}", s, trainer.global_step)
 
 
 def peak_memory(device: torch.device) -> int:
@@ -124,6 +135,17 @@ def _middle_row(cameras: Cameras, view: int) -> Rays:
 
 def _to_8bit(image: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
     return (image.detach().float().clamp(0, 1) * 255).round().byte().cpu().numpy()
+
+
+def _omit_epoch(logger: Logger) -> None:
+    """Log no `epoch`, which Lightning adds to all values; a run has a single epoch."""
+    log_metrics = logger.log_metrics
+
+    @functools.wraps(log_metrics)
+    def without_epoch(metrics: dict[str, float], step: int | None = None) -> None:
+        log_metrics({name: value for name, value in metrics.items() if name != "epoch"}, step)
+
+    logger.log_metrics = without_epoch  # type: ignore[method-assign]
 
 
 def _log_images(logger: Logger, images: Mapping[str, UInt8[np.ndarray, "H W 3"]], step: int) -> None:

@@ -120,7 +120,7 @@ class TrainingModule(LightningModule):
 
     def on_train_batch_start(self, batch: Batch, batch_index: int) -> None:
         every: int = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
-        self._is_logged_step = (self.global_step + 1) % every == 0
+        self._is_logged_step = self.global_step == 0 or (self.global_step + 1) % every == 0
         progress = self.renderer.begin_step(training_progress(self.trainer))
         factor = learning_rate_factor(self.global_step, progress, self.optimizer_config)
         for group in self.trainer.optimizers[0].param_groups:
