@@ -53,7 +53,7 @@ def test_plugins_of_the_guide_keep_their_contracts(guide_plugins: list[str]) -> 
 def test_plugins_of_the_guide_train_where_rays_split(
     guide_plugins: list[str], train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
 ) -> None:
-    options = ("sampler/points=square_root", "+loss.half_transparent.weight=0.1", "boundary=horizon")
+    options = ("sampler/points=square_root", "+loss.half_transparent={weight: 0.1, power: 2}", "boundary=horizon")
     finished = train_here(
         *(option for option in tiny_default_run if not option.startswith(("sampler.points", "boundary."))), *options,
         "sampler.path.branches=all", "trainer.max_steps=2", f"hydra.run.dir={tmp_path}/run",

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import nerfro.export
 import nerfro.plugins
 import nerfro.registry
 import nerfro.summary
@@ -148,15 +149,18 @@ def test_plugins_of_the_current_directory_are_registered_unless_the_environment_
 
 # Overrides that use each template.
 TEMPLATES = {
+    "example_body": ["medium=rounded_cube", "sampler/path=snell"],
     "example_boundary": ["boundary=gradient_sky"],
+    "example_camera": ["camera=shifted"],
     "example_data": ["data=numpy_views"],
     "example_field": ["field=blobs"],
     "example_loss": ["+loss.opacity_entropy.weight=0.1"],
-    "example_medium": ["medium=gradient_rod", "sampler/path=eikonal"],
+    "example_medium": ["medium=gradient_rod", "sampler/path=eikonal", "sampler.path.num_steps=64"],
     "example_model": ["model=haze"],
     "example_path_sampler": ["sampler/path=mirror_floor"],
     "example_sampler": ["sampler/points=logarithmic", "sampler.points.num_samples=8"],
     "opt_in/example_callback": ["+callbacks=gradient_norm", "callbacks.gradient_norm.every=1"],
+    "opt_in/example_export": [],
     "opt_in/example_metric": ["optimized_metric=mean_absolute_error"],
 }
 
@@ -166,7 +170,7 @@ def train_template(
     train_here: Callable[..., Finished], tiny_run: list[str], tiny_scene: Path, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> Callable[..., Finished]:  # fmt: skip
-    """Train two steps with some overrides, and without the tiny settings of components that they replace."""
+    """Train twenty steps with some overrides, and without the tiny settings of components that they replace."""
     monkeypatch.setenv("NERFRO_PLUGINS", str(PLUGINS_DIR / "opt_in"))
     discover()
     (tmp_path / "views").mkdir()
@@ -183,7 +187,7 @@ def train_template(
         replaced = tuple(f"{override.partition('=')[0].replace('/', '.')}." for override in overrides)
         kept = [option for option in tiny_run if not option.startswith(replaced)]
         options = [
-            "trainer.max_steps=2",
+            "trainer.max_steps=20",
             "evaluation.every=0",
             "logger=tensorboard",
             f"hydra.run.dir={tmp_path / 'run'}",
@@ -200,7 +204,19 @@ def train_template(
 def test_template_trains(template: str, train_template: Callable[..., Finished]) -> None:
     finished = train_template(TEMPLATES[template.removesuffix(".py")])
     assert finished.code == 0, finished.err
-    assert "2 steps in" in finished.out
+    assert "20 steps in" in finished.out
+
+
+def test_export_of_a_plugin_writes_its_file(
+    trained_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("NERFRO_PLUGINS", str(PLUGINS_DIR / "opt_in"))
+    out = tmp_path / "centres.csv"
+    options = [f"checkpoint={trained_run}", "what=cameras", f"out={out}", "device=cpu"]
+    finished = finish(nerfro.export.main, options, monkeypatch, capsys)
+    assert finished.code == 0, finished.err
+    centres = np.loadtxt(out, delimiter=",", skiprows=1)
+    np.testing.assert_allclose(np.linalg.norm(centres, axis=1), 4, rtol=1e-6)
 
 
 def test_metric_of_a_plugin_is_in_tables_files_log_and_report(
