@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -42,6 +42,7 @@ TWO_PROCESSES = ["trainer.devices=2", "trainer.strategy=ddp"]
 WATCHING_LOSS = '''
 """Watches."""
 import os
+import signal
 import time
 import torch
 import torch.distributed as dist
@@ -60,6 +61,8 @@ class Watching(Loss):
         assert torch.equal(*both), "the models of the two processes differ"
         # One write: print would write the end of the line by itself, after what the other process writes meanwhile.
         os.write(1, f"rank {dist.get_rank()} at step {batch.draws.step}\\n".encode())
+        if os.environ.get("KILLED") == f"rank {dist.get_rank()} at step {batch.draws.step}":
+            os.kill(os.getpid(), signal.SIGKILL)
         return renderings[-1].rgb.sum() * 0
 '''
 
@@ -85,11 +88,16 @@ def start(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
         "TORCH_HOME": str(tmp_path / "torch"),
     }
 
-    def start(name: str, *overrides: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "nerfro.train", *overrides, *TWO_PROCESSES, "+loss.watching.weight=1"]
-        command += [f"hydra.run.dir={tmp_path / name}"]
+    def start(name: str, *overrides: str, launcher: Sequence[str] = (), **variables: str) -> subprocess.Popen[str]:
+        command = [sys.executable, *launcher, "-m", "nerfro.train", *overrides, *TWO_PROCESSES]
+        command += ["+loss.watching.weight=1", f"hydra.run.dir={tmp_path / name}"]
         return subprocess.Popen(
-            command, env=environment, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            command,
+            env=environment | variables,
+            cwd=tmp_path,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
         )
 
     return start
@@ -153,6 +161,23 @@ def test_signal_to_one_process_stops_both_and_both_resume_to_learn_what_one_lear
     assert alone.code == 0, alone.err
     require_alike(tmp_path / "two", tmp_path / "one")
     assert num_rays(tmp_path / "one") > 8 * 32, "some pixels have several rays there"
+
+
+@pytest.mark.slow
+def test_killed_process_ends_the_other_in_one_line_and_torchrun_resumes(
+    small: list[str], start: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    killed = start("two", *small, KILLED="rank 1 at step 5")
+    _, errors = killed.communicate(timeout=300)
+    assert killed.returncode == 1, errors
+    (line,) = (line for line in errors.splitlines() if "error" in line.lower())
+    assert "nerfro: error: another process of this run has ended" in line
+    assert "Traceback" not in errors
+    torchrun = ("-m", "torch.distributed.run", "--nproc-per-node=2")
+    out = finish(start("two", *small, "ckpt_path=last", launcher=torchrun))
+    assert out.count("8 steps in") == 1
+    assert "rank 1 at step 3\n" in out
+    assert "rank 1 at step 2\n" not in out
 
 
 @pytest.mark.slow

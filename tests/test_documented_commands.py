@@ -6,6 +6,7 @@ import copy
 import functools
 import re
 import shlex
+import subprocess
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -31,7 +32,10 @@ pytestmark = pytest.mark.skipif(len(PAGES) < 2, reason="there is no checkout wit
 
 BLOCK = re.compile(r"^```\w*\n(.*?)^```", re.DOTALL | re.MULTILINE)
 PLUGIN = re.compile(r"^```python\n# plugins/(\w+\.py)\n(.*?)^```", re.DOTALL | re.MULTILINE)
-COMMAND = re.compile(r"python (?:-m nerfro\.([a-z]+)|benchmarks/processor_time\.py)(?= |$)(.*)", re.MULTILINE)
+COMMAND = re.compile(
+    r"(?:python |torchrun .*? |=\")(?:-m nerfro\.([a-z]+)|benchmarks/processor_time\.py)(?= |$)(.*)", re.MULTILINE
+)
+JOB_FILE = re.compile(r"^```bash\n(.*?)^```", re.DOTALL | re.MULTILINE)
 FLAG = re.compile(r" (?:--cfg \w+|-p \S+|-m|\.\.\.)(?= |$)", re.MULTILINE)
 # The schema of a command, and its options that are texts.
 ENTRY_POINT = re.compile(r'^@entry_point\("(\w+)", (\w+).*?(?:verbatim=\((.*)\))?\)', re.MULTILINE)
@@ -51,6 +55,7 @@ def commands(page: str) -> Iterator[tuple[str, list[str]]]:
     """Yield the commands in the blocks of a page with their options."""
     for block in BLOCK.findall(PAGES[page].replace("\\\n", " ")):
         for command, options in COMMAND.findall(block):
+            options = options.rstrip('"') if options.count('"') % 2 else options
             if command != "plugins":
                 yield command or "train", shlex.split(FLAG.sub("", options), comments=True)
 
@@ -70,7 +75,7 @@ def require_valid(command: str, options: list[str]) -> None:
     assert [renamed_override(option) for option in options] == options, "an old name"
     # Of a sweep the first value; no patterns, and no options of Hydra, whose launchers may not be installed.
     options = [re.sub(r"^([^=]+=[^,[{]+),[^]}]*$", r"\1", option) for option in options if "(" not in option]
-    options = [_quoted(option, verbatim) for option in options if not option.startswith("hydra")]
+    options = [_quoted(option, verbatim) for option in options if not option.lstrip("+").startswith("hydra")]
     choices, settings = [], []
     for override in OverridesParser.create().parse_overrides(options):
         key = override.key_or_group
@@ -101,6 +106,14 @@ def test_commands_have_valid_options() -> None:
                 require_valid(command, options)
             except Exception as error:
                 raise AssertionError(f"{page}: python -m nerfro.{command} {shlex.join(options)}") from error
+
+
+def test_job_files_are_scripts() -> None:
+    files = [file for text in PAGES.values() for file in JOB_FILE.findall(text)]
+    assert files
+    for file in files:
+        checked = subprocess.run(["bash", "-n"], input=file, capture_output=True, text=True)
+        assert checked.stderr == "", file
 
 
 def nested_names(config: DictConfig, prefix: str = "") -> Iterator[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -28,6 +29,10 @@ from nerfro.training.sweeps import identity_of
 from tests.forked import Command
 
 SWEEPS = sorted(path.stem for path in (CONF_DIR / "sweep").glob("*.yaml"))
+
+# Nobody listens at that proxy: the search for LPIPS weights ends at once.
+_OFFLINE = {"OMP_NUM_THREADS": "1", "https_proxy": "http://127.0.0.1:9"}
+_RAY = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS": "0"}
 
 WAITING_LOSS = '''
 """Waits, and says which step it is at."""
@@ -60,9 +65,9 @@ def start(tmp_path: Path, tiny_run: list[str]) -> Callable[[list[str], str], Com
     plugins.mkdir()
     (plugins / "waiting.py").write_text(WAITING_LOSS)
     options = [*tiny_run, "evaluation.every=0", "+loss.waiting.weight=1", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
-    return lambda overrides, name: Command(
-        "train", ["-m", *options, *overrides], tmp_path / name, NERFRO_PLUGINS=str(plugins)
-    )
+    options += ["trainer.max_steps=20", "checkpoint.every_steps=4", "checkpoint.every_seconds=null"]
+    environment = {**_OFFLINE, **_RAY, "TORCH_HOME": str(tmp_path), "NERFRO_PLUGINS": str(plugins)}
+    return lambda overrides, name: Command("train", ["-m", *options, *overrides], tmp_path / name, **environment)
 
 
 def composed(*overrides: str) -> DictConfig:
@@ -224,8 +229,7 @@ def test_data_that_are_calibrated_anew_are_other_data(name: str, tmp_path: Path)
 def test_stopped_sweep_goes_on_where_it_was(
     how: signal.Signals, start: Callable[[list[str], str], Command], tiny_scene: Path, tmp_path: Path
 ) -> None:
-    overrides = ["seed=0,1,2", "trainer.max_steps=20", "checkpoint.every_steps=4", "checkpoint.every_seconds=null"]
-    first = start(overrides, "first")
+    first = start(["seed=0,1,2"], "first")
     cells = [tmp_path / "sweep" / f"refractive-{scene_name(str(tiny_scene))}-seed{seed}" for seed in range(3)]
     deadline = time.monotonic() + 300
     while not ((cells[0] / "metrics.json").is_file() and (cells[1] / "checkpoints" / "last.ckpt").is_file()):
@@ -240,7 +244,7 @@ def test_stopped_sweep_goes_on_where_it_was(
     assert not cells[2].exists()
     before = written(tmp_path / "sweep")
 
-    log = start(overrides, "second").finished()
+    log = start(["seed=0,1,2"], "second").finished()
     assert before.items() <= written(tmp_path / "sweep").items(), "the finished cell was left alone"
     steps = [int(line.rpartition("at step ")[2]) for line in log.splitlines() if "at step " in line]
     assert steps[0] >= 4, "the second cell went on from its checkpoint"
@@ -248,7 +252,7 @@ def test_stopped_sweep_goes_on_where_it_was(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("launcher", ["joblib", "submitit_local", "ray"])
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
 def test_launchers_run_cells_in_other_processes(
     launcher: str, sweep: Callable[..., Any], tiny_run: list[str], tmp_path: Path
 ) -> None:
@@ -256,12 +260,10 @@ def test_launchers_run_cells_in_other_processes(
     overrides = [f"medium.mesh={tmp_path / 'nowhere.ply'},{'${data.root}/mesh.ply'}", "trainer.max_steps=2"]
     overrides.append(f"hydra/launcher={launcher}")
     command = [sys.executable, "-m", "nerfro.train", "-m", *tiny_run, "evaluation.every=0", *overrides]
-    # Nobody listens at that proxy: the search for LPIPS weights ends at once.
-    unlike = {"OMP_NUM_THREADS": "1", "https_proxy": "http://127.0.0.1:9", "TORCH_HOME": str(tmp_path)}
     done = subprocess.run(
         [*command, f"hydra.sweep.dir={tmp_path / 'sweep'}"],
         cwd=tmp_path,
-        env={**os.environ, **unlike, "RAY_USAGE_STATS_ENABLED": "0"},
+        env={**os.environ, **_OFFLINE, "TORCH_HOME": str(tmp_path)},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -272,6 +274,21 @@ def test_launchers_run_cells_in_other_processes(
     assert f"{tmp_path / 'nowhere.ply'} does not exist" in log
     (run,) = (tmp_path / "sweep").glob("*/run.json")
     assert json.loads(run.read_text())["command"].startswith("python -m nerfro.train data.root=")
+
+
+@pytest.mark.slow
+def test_sweep_on_ray_finishes_although_a_worker_is_killed(
+    start: Callable[[list[str], str], Command], tmp_path: Path
+) -> None:
+    pytest.importorskip("hydra_plugins.hydra_ray_launcher", reason="needs pip install 'nerfro[ray]'")
+    sweep = start(["hydra/launcher=ray", "+hydra.launcher.ray.init.num_cpus=2", "seed=0,1,2,3"], "log")
+    killed = sweep.until(r"pid=(\d+)\S* at step 10$")[1]
+    os.kill(int(killed), signal.SIGKILL)
+    log = sweep.finished()
+    assert len(written(tmp_path / "sweep")) == 4
+    lines = re.findall(r"pid=(\d+)\S* at step (\d+)$", log, re.MULTILINE)
+    assert max(int(step) for pid, step in lines if pid == killed) < 19
+    assert [step for _, step in lines].count("0") == 4, "Ray repeats the cell, which goes on from its checkpoint"
 
 
 def test_damaged_record_costs_its_own_cell_alone(sweep: Callable[..., Any], tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import warnings
 from collections.abc import Mapping
 from datetime import timedelta
@@ -33,6 +34,7 @@ from nerfro.training.validation import OverfittingWarning
 
 # Arguments of the trainer that nerfro itself acts on.
 _OWN = ("profiler", "fast_dev_run", "overfit_batches", "limit_test_batches")
+_LOST_CONNECTION = re.compile("gloo|NCCL|[Cc]onnection (closed|reset)")  # in errors of torch.distributed
 _PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch": PyTorchProfiler}
 
 
@@ -145,11 +147,14 @@ def fit(
     """Train, from a checkpoint if there is one.
 
     Raises:
-        NerfroError: the state of the trainer in the checkpoint cannot be restored.
+        NerfroError: the state of the trainer in the checkpoint cannot be restored, or another process has ended.
     """
     try:
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     except Exception as error:  # Lightning and its callbacks raise many kinds of errors on a damaged state
+        if trainer.world_size > 1 and _LOST_CONNECTION.search(str(error)):
+            reason = "another process of this run has ended; see its messages"
+            raise NerfroError(f"{reason}, and resume with ckpt_path=last") from error
         if checkpoint is None or throughput.has_begun:
             raise
         reason = f"{type(error).__name__}: {error}".partition("\n")[0]
