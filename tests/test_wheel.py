@@ -40,7 +40,7 @@ def test_wheel_holds_every_configuration_plugin_and_asset(wheel: Path) -> None:
         assert files
         assert {f"nerfro/_project/{p.relative_to(PROJECT).as_posix()}" for p in files} <= inside
     assets = [p for p in (PACKAGE_DIR / "assets").rglob("*") if p.is_file()]
-    assert {p.relative_to(PROJECT).as_posix() for p in assets} <= inside
+    assert {"nerfro/py.typed", "nerfro/__init__.pyi", *(p.relative_to(PROJECT).as_posix() for p in assets)} <= inside
     assert not [name for name in inside if name.startswith(("tests/", "outputs/")) or "__pycache__" in name]
 
 

@@ -11,11 +11,15 @@ from typing import Any
 import lightning.pytorch as pl
 import pytest
 import torch
+from omegaconf import OmegaConf
 
+import nerfro.training.trainer
+from nerfro.errors import NerfroError
 from nerfro.registry import build, find, register
 from nerfro.testing import check
-from nerfro.training.config import REFUSED_ARGUMENTS, TrainerConfig
+from nerfro.training.config import REFUSED_ARGUMENTS, TrainConfig, TrainerConfig, check_run
 from nerfro.training.ray_batches import RayBatches
+from nerfro.training.trainer import _OWN
 
 CALLBACK = '''
 from lightning.pytorch import Callback
@@ -81,11 +85,39 @@ def test_settings_may_refer_to_hydra(key: str, train: Callable[..., Any]) -> Non
     assert f"root: ${{hydra:{key}}}/data" in printed.out
 
 
-def test_arguments_without_a_meaning_are_refused_with_a_reason(train: Callable[..., Any], tmp_path: Path) -> None:
-    refused = train("trainer.max_epochs=3")
-    assert refused.code == 1
-    assert "trainer.max_epochs=3 has no meaning in nerfro: a run has no epochs; set trainer.max_steps" in refused.err
-    assert not (tmp_path / "run" / "config.yaml").exists()
+@pytest.mark.parametrize("name", REFUSED_ARGUMENTS)
+def test_arguments_without_a_meaning_are_refused_with_a_reason(name: str) -> None:
+    config = OmegaConf.structured(TrainConfig)
+    config.trainer[name] = 3
+    with pytest.raises(NerfroError) as refused:
+        check_run(config)
+    assert str(refused.value) == f"trainer.{name}=3 has no meaning in nerfro: {REFUSED_ARGUMENTS[name]}"
+
+
+# A value that differs from the default for each argument that a run hands to Lightning's Trainer.
+PASSED = {
+    "accelerator": "cpu", "benchmark": True, "detect_anomaly": True, "deterministic": True, "devices": 1,
+    "enable_checkpointing": False, "enable_model_summary": True, "enable_progress_bar": False,
+    "gradient_clip_algorithm": "value", "gradient_clip_val": 0.5, "inference_mode": False, "log_every_n_steps": 7,
+    "max_steps": 3, "max_time": "00:00:00:09", "min_steps": 2, "num_nodes": 1, "precision": "64-true",
+    "strategy": "auto",
+}  # fmt: skip
+
+
+def test_other_arguments_reach_lightnings_trainer(train: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    class RecordedError(Exception):
+        pass
+
+    def record(node: Any, **ours: Any) -> None:
+        raise RecordedError({**node, **ours})
+
+    monkeypatch.setattr(nerfro.training.trainer, "build", record)
+    monkeypatch.setenv("NERFRO_DEBUG", "1")
+    with pytest.raises(RecordedError) as recorded:
+        train("logger=none", *(f"trainer.{name}={value}" for name, value in PASSED.items()))
+    (arguments,) = recorded.value.args
+    assert PASSED.items() <= arguments.items()
+    assert PASSED.keys() == TrainerConfig.__dataclass_fields__.keys() - {"_target_", *REFUSED_ARGUMENTS, *_OWN}
 
 
 @pytest.mark.parametrize(("options", "steps"), [(["debug=true"], 10), (["trainer.fast_dev_run=3"], 3)])
@@ -111,17 +143,21 @@ def test_overfitting_repeats_batches(train: Callable[..., Any], monkeypatch: pyt
     assert set(drawn) <= {0, 1, 2}  # the thread that traces ahead draws one more
 
 
+@pytest.mark.parametrize(
+    ("profiler", "words"),
+    [("simple", "run_training_batch"), ("advanced", "run_training_batch"), ("pytorch", "Self CPU time total")],
+)
 def test_a_run_is_profiled_and_has_neither_bar_nor_checkpoints_on_its_way(
-    train: Callable[..., Any], tmp_path: Path
+    profiler: str, words: str, train: Callable[..., Any], tmp_path: Path
 ) -> None:
     quiet = ["trainer.enable_progress_bar=false", "trainer.enable_checkpointing=false"]
-    finished = train("trainer.max_steps=2", "trainer.profiler=simple", *quiet)
+    finished = train("trainer.max_steps=2", f"trainer.profiler={profiler}", *quiet)
     assert finished.code == 0, finished.err
     assert "train PSNR" not in finished.err
     assert (tmp_path / "run" / "checkpoints" / "last.ckpt").is_file()  # written at the end
     (report,) = (tmp_path / "run" / "profile").glob("*.txt")
-    assert "run_training_batch" in report.read_text()
-    assert "run_training_batch" in finished.out
+    assert words in report.read_text()
+    assert words in finished.out
 
 
 @pytest.mark.usefixtures("restored_registry")
