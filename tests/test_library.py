@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+import urllib.request
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 
 import nerfro
 import nerfro.export
@@ -39,8 +41,13 @@ def test_a_run_is_loaded_rendered_and_exported(
 ) -> None:
     scene = nerfro.load(trained_run, device="cpu")
     cameras = scene.cameras("test")
-    rgb, depth, opacity, normals, exits, radiance = scene.render(cameras)
+    views = scene.render(cameras)
+    rgb, depth, opacity, normals, exits, radiance = views
     num, height, width = len(cameras), cameras.height, cameras.width
+    assert repr(views) == f"RenderedViews({num} of {width} x {height} pixels)"
+    with urllib.request.urlopen(views._repr_html_().split('"')[1]) as file, Image.open(file) as image:
+        assert image.size == (num * width, height)
+    assert len(repr(scene)) < 300
     assert rgb.shape == normals.shape == exits.shape == radiance.shape == (num, height, width, 3)
     assert depth.shape == opacity.shape == (num, height, width)
     assert rgb.min() >= 0

@@ -30,15 +30,25 @@ from nerfro.types import Exits, Path, Rendering
 
 @dataclass(frozen=True)
 class Components:
-    """Components of a model."""
+    """Components of a model.
 
-    medium: Medium  # refractive index and absorption
-    path_sampler: PathSampler  # turns rays into paths
-    point_sampler: PointSampler  # chooses samples on paths
-    make_field: Callable[[], Field]  # makes a new radiance field
-    boundary: Boundary  # background radiance, from beyond the volume
-    camera: Camera = dataclasses.field(default_factory=GivenCamera)  # estimate of the training cameras
-    chunk_size: int = 8192  # number of rays rendered at once in evaluation, which limits the memory
+    Attributes:
+        medium: refractive index and absorption.
+        path_sampler: turns rays into paths.
+        point_sampler: chooses samples on paths.
+        make_field: makes a new radiance field; a model with several sampling levels has a field for each.
+        boundary: background radiance, from beyond the volume.
+        camera: estimate of the training cameras.
+        chunk_size: number of rays rendered at once in evaluation, which limits the memory.
+    """
+
+    medium: Medium
+    path_sampler: PathSampler
+    point_sampler: PointSampler
+    make_field: Callable[[], Field]
+    boundary: Boundary
+    camera: Camera = dataclasses.field(default_factory=GivenCamera)
+    chunk_size: int = 8192
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from nerfro.errors import NerfroError
 from nerfro.evaluation.render_view import render_view
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
+from nerfro.files.images import data_uri, to_8bit
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.paths import user_path
 from nerfro.rendering import Renderer
@@ -50,6 +51,14 @@ class RenderedViews(NamedTuple):
     exit_directions: Float[Tensor, "V H W 3"]
     radiance: Float[Tensor, "V H W 3"]
 
+    def __repr__(self) -> str:
+        views, height, width, _ = self.rgb.shape
+        return f"RenderedViews({views} of {width} x {height} pixels)"
+
+    def _repr_html_(self) -> str:
+        """Show the images side by side in a notebook."""
+        return f'<img src="{data_uri(to_8bit(torch.cat(list(self.rgb), 1)).numpy(), "PNG")}">'
+
 
 @dataclass(frozen=True)
 class TrainedScene:
@@ -68,6 +77,9 @@ class TrainedScene:
     subdivision: Subdivision = field(default_factory=Subdivision)
     name: str = ""
     content: Float[Tensor, "2 3"] | None = None
+
+    def __repr__(self) -> str:
+        return f"TrainedScene({self.name}, {self.renderer.scene})"
 
     def views(self, split: str = "test") -> Views:
         """Load the cameras, photographs and masks of a split of the data."""
