@@ -33,7 +33,7 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.rays import Rays
 from nerfro.rendering import Renderer
 from nerfro.samplers.snell import Snell
-from nerfro.scenes.sky import lat_long_texture
+from nerfro.scenes.scene import lat_long_texture
 from nerfro.scenes.synthesis import find_scene
 from nerfro.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
 from nerfro.types import Exits

@@ -23,7 +23,7 @@ from nerfro.files.images import save_png
 from nerfro.light import to_srgb
 from nerfro.scenes.dataset import CAMERA_ANGLE_X
 from nerfro.scenes.path_tracer import PathTracer, Pinhole
-from nerfro.scenes.sky import lat_long_texture
+from nerfro.scenes.scene import lat_long_texture
 from nerfro.scenes.synthesis import build_scene
 
 # Opacity of things inside up to which a pixel shows sky alone.

@@ -10,7 +10,7 @@ from hydra.core.hydra_config import HydraConfig
 from jaxtyping import Float
 from omegaconf import DictConfig
 
-from nerfro.capture.medium_search import find_medium
+from nerfro.capture.index_search import find_medium
 from nerfro.capture.overlaps import choose_wrong_masks, draw_overlays, report_overlaps
 from nerfro.capture.pose_conventions import require_consistent_poses
 from nerfro.capture.preprocess_options import MESH, PreprocessConfig, Request, conclude, surface_settings

@@ -10,7 +10,7 @@ import pytest
 from nerfro.light import to_srgb
 from nerfro.registry import discover
 from nerfro.scenes import SCENES
-from nerfro.scenes.sky import lat_long_texture
+from nerfro.scenes.scene import lat_long_texture
 from nerfro.scenes.synthesis import find_scene
 
 discover()

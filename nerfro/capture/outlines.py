@@ -17,10 +17,16 @@ from nerfro.camera.least_squares import PriorInformation, normal_equations, with
 from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
 from nerfro.capture.rims import RimFinder
+from nerfro.capture.silhouettes import PixelBlocks
 from nerfro.capture.visual_hull import Silhouettes
+from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh
+from nerfro.media.base import Medium
+from nerfro.media.sdf_grid import SdfGrid
 from nerfro.progress import track
 
+# Largest side of the reduced images in which outlines are compared, pixels.
+_MAX_PIXELS = 256
 _STEPS = 8
 _MAX_STEP = 2.0  # pixels
 # Accuracy of outlines in pixels, and number of neighbouring contour points with a common error.
@@ -29,6 +35,29 @@ _ACCURACY, _CORRELATED = 0.02, 3.0
 _PRIOR_DEVIATION = 1.0
 # Largest final distance, in pixels, between the surface and its masks; otherwise mesh and masks differ.
 _MAX_DISTANCE = 0.2
+
+
+def align_to_masks(
+    camera: RefinedCamera, views: Views, medium: Medium, panorama: PriorInformation | None
+) -> PriorInformation | None:
+    """Move cameras so that the outlines of the surface agree with the masks.
+
+    Args:
+        camera: estimated cameras; they are changed.
+        views: training views.
+        medium: medium with the surface.
+        panorama: prior of the camera rotations from the background; None without a panorama.
+
+    Returns:
+        Prior of the cameras from the outlines; None without masks or without a surface.
+    """
+    if not isinstance(medium, SdfGrid) or not medium.meshes or views.masks is None:
+        return None
+    blocks = PixelBlocks(views.cameras, _MAX_PIXELS)
+    masks = torch.stack([blocks.mean(mask) for mask in views.masks])
+    silhouettes = Silhouettes.of(blocks.cameras(views.cameras), masks)
+    priors = [] if panorama is None else [panorama]
+    return align_to_outlines(camera, views.cameras, blocks.cameras, silhouettes, medium.meshes[0], priors)
 
 
 @torch.no_grad()

@@ -17,7 +17,7 @@ from nerfro.fields.base import Field
 from nerfro.fields.mlp import radiance
 from nerfro.fields.selection import evaluate_selected, inside_box
 from nerfro.geometry.contraction import contract, contracted_box, contraction_scale
-from nerfro.kernels.precision import fast_bfloat16
+from nerfro.kernels.available import fast_bfloat16
 from nerfro.registry import register
 from nerfro.types import Radiance, Samples
 

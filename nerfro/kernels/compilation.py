@@ -1,4 +1,4 @@
-"""Compilation of kernels and the cache of machine code."""
+"""Compilation of kernels, the cache of machine code, and the arrays that kernels take."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
+from torch import Tensor
 
 from nerfro.files.cache import cache_dir
 from nerfro.kernels.threads import num_threads, parallel_threads
@@ -130,3 +132,8 @@ def _imports(source: bytes) -> Iterator[str]:
         elif isinstance(node, ast.ImportFrom) and node.module is not None:
             yield node.module
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def arrays(*tensors: Tensor) -> list[np.ndarray]:
+    """Return CPU tensors as NumPy arrays without gradients, sharing memory if the tensors are contiguous."""
+    return [tensor.detach().contiguous().numpy() for tensor in tensors]

@@ -80,7 +80,7 @@ def _world_length(length, impact, radius):
 
 @compiled
 def _contracted_segments(positions, directions, s, centre, radius, near, segments):
-    """Fill the segments of `samplers.measures.ContractedLength` for one polyline; return its total."""
+    """Fill the segments of `samplers.density_grid.ContractedLength` for one polyline; return its total."""
     cumulative, start_length, closest, impact = segments
     total, last = 0.0, len(s) - 1
     for segment in range(last + 1):

@@ -23,8 +23,7 @@ from nerfro.files.atomic import write_atomically
 from nerfro.files.images import save_image
 from nerfro.light import to_srgb
 from nerfro.scenes.path_tracer import Pinhole
-from nerfro.scenes.scene import Scene
-from nerfro.scenes.sky import lat_long_texture
+from nerfro.scenes.scene import Scene, lat_long_texture
 from nerfro.scenes.viewpoints import directions_on_sphere, look_at_origin
 
 CAMERA_ANGLE_X = 0.6911112070083618  # field of view of the NeRF synthetic scenes and of the paper's scenes

@@ -14,8 +14,7 @@ from nerfro.errors import NerfroError
 from nerfro.light import to_linear
 from nerfro.scenes import llvm
 from nerfro.scenes.glass import EMBEDDED, PLUGIN, register_materials
-from nerfro.scenes.scene import Panel, Scene
-from nerfro.scenes.sky import Sky
+from nerfro.scenes.scene import Panel, Scene, Sky
 from nerfro.scenes.surface import Surface
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "scalar_rgb")

@@ -13,6 +13,7 @@ from nerfro.camera.gauss_newton import Step, gauss_newton_step, informative_pixe
 from nerfro.camera.least_squares import PriorInformation
 from nerfro.camera.panorama import align
 from nerfro.camera.refined import RefinedCamera
+from nerfro.capture.outlines import align_to_masks
 from nerfro.data.base import Views
 from nerfro.geometry.interpolation import misses
 from nerfro.rays import Rays
@@ -21,7 +22,6 @@ from nerfro.subdivision import pixel_rays
 from nerfro.training.background_pretraining import occupied_box
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.module import TrainingModule
-from nerfro.training.outlines import align_to_masks
 from nerfro.training.ray_batches import RayBatches
 
 # First and least distance of finite differences in pixels, and its factor from one step to the next.

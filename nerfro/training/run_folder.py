@@ -26,7 +26,7 @@ from nerfro.files.atomic import write_atomically
 from nerfro.files.folder_lock import lock_folder, remove_unfinished, require_only
 from nerfro.files.foreign_config import foreign_config, read_foreign_config
 from nerfro.files.reading import reading
-from nerfro.kernels.precision import fast_bfloat16
+from nerfro.kernels.available import fast_bfloat16
 from nerfro.paths import PACKAGE_DIR, user_path
 from nerfro.rendering import Renderer
 from nerfro.training import backdrop, content

@@ -22,7 +22,7 @@ import nerfro.training.lightning_callbacks  # noqa: F401 - registers callbacks
 from nerfro.cli import warn
 from nerfro.errors import NerfroError
 from nerfro.kernels.allocator import keep_freed_memory
-from nerfro.kernels.precision import fast_bfloat16
+from nerfro.kernels.available import fast_bfloat16
 from nerfro.registry import build, create, find
 from nerfro.training.callbacks import Checkpoints, SharedTimer, Throughput, TrainingProgress
 from nerfro.training.checkpoint_files import CheckpointFiles

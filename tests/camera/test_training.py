@@ -18,8 +18,8 @@ from nerfro.camera.similarity import motion_between
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.data.blender import BlenderData
 from nerfro.data.nerfstudio import NerfstudioData
-from nerfro.evaluation.left_halves import refine_on_left
 from nerfro.evaluation.results import read_metrics_json
+from nerfro.evaluation.treatments import refine_on_left
 from nerfro.files.images import save_png
 from nerfro.geometry.mesh import load_mesh
 from nerfro.light import to_linear, to_srgb

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerfro.scenes.sky import lat_long_texture
+from nerfro.scenes.scene import lat_long_texture
 from nerfro.scenes.surface import rounded_box, sphere, torus_angles
 from nerfro.scenes.viewpoints import directions_on_sphere, look_at_origin
 
