@@ -1,7 +1,7 @@
 """Allowed values of parameters and settings, declared by annotations such as `Annotated[int, Range(at_least=1)]`.
 
-A number must be finite unless the annotation is `AnyNumber`. A choice of texts in a configuration dataclass is
-`Annotated[str, Literal["a", "b"]]`, because OmegaConf does not support `Literal`.
+Numbers must be finite, except with the annotation `AnyNumber`. Choices of text in configuration dataclasses have the
+form `Annotated[str, Literal["a", "b"]]`, because OmegaConf does not support `Literal`.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ Distance = Annotated[float, Range(at_least=0, at_most=_FURTHEST)]  # world units
 
 
 def checked(where: str) -> Callable[[type[Class]], type[Class]]:
-    """Decorate a class so that its constructor refuses arguments that its annotations do not allow.
+    """Decorate a class with a constructor that checks all arguments against the annotations.
 
     Args:
         where: start of the error message, such as `medium=ball`.
@@ -103,7 +103,7 @@ def checked(where: str) -> Callable[[type[Class]], type[Class]]:
 
 
 def check_settings(config: DictConfig, schema: type, prefix: str = "") -> None:
-    """Refuse settings that the annotations of a configuration dataclass do not allow, including nested dataclasses.
+    """Check the settings of a configuration, and of nested nodes, against the annotations of a dataclass.
 
     Args:
         config: the configuration.
@@ -122,15 +122,15 @@ def check_settings(config: DictConfig, schema: type, prefix: str = "") -> None:
 
 
 def check_names(config: DictConfig, prefix: str = "", groups: Sequence[str] = (), also: Sequence[str] = ()) -> None:
-    """Refuse settings that the dataclass of a configuration, or of a nested node, does not declare.
+    """Refuse settings without a field in the dataclass of the configuration or of a nested node.
 
-    Hydra adds such settings where an override begins with `+`.
+    Hydra adds undeclared settings for overrides that begin with `+`.
 
     Args:
         config: the configuration.
         prefix: full name of the node, with a dot at the end.
-        groups: names of configuration groups, which the error message may suggest.
-        also: further names that the root may have; nodes with these names are not checked.
+        groups: names of configuration groups for suggestions in the error message.
+        also: further allowed names at the root; nodes with these names are not checked.
 
     Raises:
         NerfroError: a name is unknown.
@@ -148,7 +148,7 @@ def check_names(config: DictConfig, prefix: str = "", groups: Sequence[str] = ()
 
 
 def check(where: str, hints: Mapping[str, Any], values: Mapping[str, Any]) -> None:
-    """Refuse the first value that its annotation does not allow.
+    """Check values against annotations, and refuse the first forbidden value.
 
     Args:
         where: start of the error message.

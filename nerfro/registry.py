@@ -1,8 +1,8 @@
-"""The plugin registry, in which the constructor of a class is its configuration schema.
+"""Registry of plugins; the constructor of a plugin class defines the configuration schema.
 
 `@register(kind, name)` converts the signature of the constructor to a typed dataclass and stores the dataclass in Hydra
-as option `name` of group `kind`. `build(node)` is the only place that instantiates classes from a configuration, and it
-instantiates registered classes alone.
+as option `name` of group `kind`. Only `build(node)` instantiates classes from a configuration, and only registered
+ones.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ KINDS = (
     "metric",
 )  # fmt: skip
 
-# Modules that register the built-in plugins, alone or in the modules of a package; `discover` imports them.
+# Modules and packages with built-in plugins; `discover` imports all of them.
 _BUILT_IN = (
     "camera", "media", "samplers", "fields", "boundaries", "losses", "models", "data", "evaluation.image_metrics",
 )  # fmt: skip
@@ -69,12 +69,12 @@ class Plugin:
     """A registered class and its configuration.
 
     Attributes:
-        kind: plugin type, which is also the configuration group, such as `sampler/path`.
-        name: name of the option in that group, such as `eikonal`.
+        kind: plugin type and configuration group, such as `sampler/path`.
+        name: name of the option in the group, such as `eikonal`.
         cls: the class.
         config: dataclass of the configurable parameters, with `_target_`.
-        hints: annotations of these parameters with their allowed values, see `nerfro.allowed`.
-        parts: constructor parameters that are not configuration; the caller of `build` passes them.
+        hints: annotations of the configurable parameters with allowed values, see `nerfro.allowed`.
+        parts: other constructor parameters; the caller of `build` passes the values.
     """
 
     kind: str
@@ -107,11 +107,11 @@ _discovered: set[str] = set()
 
 
 def register(kind: str, name: str) -> Callable[[type[Part]], type[Part]]:
-    """Decorate a class to make it available as option `name` of a plugin type.
+    """Decorator that registers a class as option `name` of a plugin type.
 
     The signature of the constructor becomes the configuration. Parameters annotated with int, float, bool, str, their
     optional, list and dict forms or `Literal` are configuration. The caller of `build` passes all other parameters.
-    Values that the annotations do not allow are refused (`nerfro.allowed`).
+    Values outside the annotated ranges are refused (`nerfro.allowed`).
 
     Args:
         kind: plugin type, one of `KINDS`.
@@ -133,7 +133,7 @@ def add(kind: str, name: str, cls: type) -> None:
     """Register a class of another package under a name; see `register`."""
     _require_kind(kind)
     taken = _plugins.get((kind, name))
-    # A module that is imported again registers the same class twice.
+    # A second import of a module registers the same class again.
     if taken is not None and (taken.cls.__module__, taken.cls.__qualname__) != (cls.__module__, cls.__qualname__):
         raise NerfroError(
             f"{kind}={name} is registered twice, by {taken.cls.__module__} and {cls.__module__}; rename one of them"
@@ -152,10 +152,10 @@ def plugins(kind: str | None = None) -> list[Plugin]:
 
 
 def find(kind: str, name: str) -> Plugin:
-    """Return the plugin of a type that is registered as `name`.
+    """Return the plugin with a given type and name.
 
     Raises:
-        NerfroError: there is none.
+        NerfroError: no such plugin is registered.
     """
     if (kind, name) not in _plugins:
         known = ", ".join(p.name for p in plugins(kind))
@@ -164,14 +164,14 @@ def find(kind: str, name: str) -> Plugin:
 
 
 def build(node: object, **parts: object) -> Any:
-    """Instantiate the registered class (or Lightning object) that a configuration node names.
+    """Instantiate the registered class (or Lightning object) of a configuration node.
 
     Args:
         node: configuration with `_target_`.
-        parts: objects for constructor parameters that are not configuration; unused ones are ignored.
+        parts: objects for the other constructor parameters; unused objects are ignored.
 
     Raises:
-        NerfroError: the class is not registered, or the configuration does not fit it.
+        NerfroError: the class is not registered, or the configuration does not fit the class.
     """
     node = _settings_of(node)
     target = node.get("_target_")
@@ -187,7 +187,7 @@ def build(node: object, **parts: object) -> Any:
 
 
 def check_node(node: object) -> type:
-    """Check the node of a plugin, and return its class; the values of interpolations may not be known yet.
+    """Check the configuration node of a plugin, except for unresolved interpolations, and return the plugin class.
 
     Raises:
         NerfroError: as `build`.
@@ -205,7 +205,7 @@ def check_node(node: object) -> type:
 
 
 def require_lightning(node: object) -> None:
-    """Refuse a node, such as that of a logger, whose class is neither of Lightning nor registered.
+    """Refuse a configuration node, such as a logger, if the class is neither registered nor an allowed Lightning class.
 
     Raises:
         NerfroError: the class is not allowed.
@@ -238,7 +238,7 @@ def _plugin_of(node: DictConfig) -> Plugin:
 
 
 def create(plugin: Plugin, node: DictConfig | Mapping[str, object], **parts: object) -> Any:
-    """Instantiate a plugin from its configuration node and the parts that its constructor asks for."""
+    """Instantiate a plugin from the configuration node and the other constructor arguments."""
     values = configure(plugin, node)
     attributes = {name: values.pop(name) for name in _settings(plugin.cls)}
     made = plugin.cls(**values, **parts)
@@ -248,7 +248,7 @@ def create(plugin: Plugin, node: DictConfig | Mapping[str, object], **parts: obj
 
 
 def _settings(cls: type) -> tuple[str, ...]:
-    """Names of class attributes that are configuration beside the constructor's parameters, such as a loss's weight."""
+    """Names of configurable class attributes, such as the weight of a loss."""
     return getattr(cls, "SETTINGS", ())
 
 
@@ -270,10 +270,10 @@ def _targets(node: object) -> Iterator[object]:
 
 
 def configure(plugin: Plugin, node: DictConfig | Mapping[str, object]) -> dict[str, Any]:
-    """Check a configuration node against a plugin and return the values of all its configurable parameters.
+    """Check the configuration node of a plugin and return the values of all configurable parameters.
 
     Raises:
-        NerfroError: a parameter is unknown, missing, of the wrong type, or has a value that is not allowed.
+        NerfroError: a parameter is unknown, missing, of the wrong type, or has a forbidden value.
     """
     where = f"{plugin.kind}={plugin.name}"
     try:
@@ -290,11 +290,11 @@ def configure(plugin: Plugin, node: DictConfig | Mapping[str, object]) -> dict[s
 
 
 def discover(plugins_dir: Path = PLUGINS_DIR) -> None:
-    """Import all modules that register plugins: built-in, installed and local ones.
+    """Import all built-in, installed and local plugin modules.
 
-    Installed plugins are the modules that entry points of group `nerfro.plugins` name. Local plugins are the modules
-    and packages in `plugins_dir` and in the folders of the environment variable `NERFRO_PLUGINS`, or in `plugins/` of
-    the current directory if the variable is not set.
+    Entry points of group `nerfro.plugins` name the installed plugins. Local plugins are the modules and packages in
+    `plugins_dir` and in the folders of the environment variable `NERFRO_PLUGINS`, or in `plugins/` of the current
+    directory without this variable.
 
     Args:
         plugins_dir: folder of local plugins; by default `plugins/` beside conf/.
@@ -379,9 +379,9 @@ def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
 
 
 def _parameters(cls: type) -> list[tuple[inspect.Parameter, Any, Any]]:
-    """Return the parameters of a constructor with their types, without and with `Annotated`.
+    """Return the parameters of a constructor with the types, without and with `Annotated`.
 
-    A constructor that takes `**options` has the parameters of the constructor of its base class, too.
+    A constructor with `**options` also has the parameters of the base class constructor.
     """
     found: dict[str, tuple[inspect.Parameter, Any, Any]] = {}
     for base in inspect.getmro(cls):
@@ -402,7 +402,7 @@ def _parameters(cls: type) -> list[tuple[inspect.Parameter, Any, Any]]:
 
 
 def _config_type(hint: Any) -> Any:
-    """Return the annotation as OmegaConf supports it, or None if the parameter is not configuration."""
+    """Convert an annotation to a type supported by OmegaConf; None if the parameter is not configurable."""
     if hint in (int, float, bool, str):
         return hint
     origin, args = get_origin(hint), get_args(hint)

@@ -1,4 +1,4 @@
-"""Restrict what a command executes to nerfro, Hydra, and registered plugins.
+"""Restriction of executed code to nerfro, Hydra, and registered plugins.
 
 The command line, the folder `plugins/` and installed packages are trusted. Data, checkpoints, run folders, the current
 directory, and configuration files of other people are not.
@@ -35,10 +35,10 @@ _STREAMS = ("ext://sys.stdout", "ext://sys.stderr")
 
 
 def leave_current_directory() -> None:
-    """Remove the current directory, which `python -m` puts first, from the module search path.
+    """Remove the current directory from the module search path, where `python -m` inserts the directory first.
 
     Hydra imports every module of a folder `hydra_plugins` on the search path, and the current directory may be a
-    downloaded data set. The directory stays if nerfro itself is imported from there.
+    downloaded data set. The directory stays if nerfro itself is imported from the directory.
     """
     here = Path.cwd().resolve()
     if here != PACKAGE_DIR.parent.resolve():
@@ -46,15 +46,15 @@ def leave_current_directory() -> None:
 
 
 def command_of_module(name: str) -> list[str]:
-    """Return the command line that runs `python -m NAME` without importing from the current directory."""
+    """Return a command line equivalent to `python -m NAME`, but without imports from the current directory."""
     program = f"import runpy, sys; sys.path[0] = {str(PACKAGE_DIR.parent)!r}; "
     return [sys.executable, "-c", f"{program}runpy.run_module({name!r}, run_name='__main__', alter_sys=True)"]
 
 
 class GuardedConfigLoader(ConfigLoaderImpl):
-    """Hydra's composition of a configuration, which refuses foreign classes before Hydra instantiates any.
+    """Hydra's configuration loader with a check that refuses foreign classes before Hydra instantiates any class.
 
-    Hydra builds its callbacks, launcher, sweeper and log handlers from the node `hydra`, and any YAML file can set it.
+    Hydra builds callbacks, launcher, sweeper and log handlers from the node `hydra` of any YAML file.
     """
 
     def load_configuration(
@@ -75,7 +75,7 @@ class GuardedConfigLoader(ConfigLoaderImpl):
         return config
 
     def check(self, config: DictConfig) -> None:
-        """Refuse a configuration that a job cannot use; by default, none."""
+        """Refuse unusable configurations of a job; the default accepts all configurations."""
 
     def _parse_overrides_and_create_caching_repo(
         self, config_name: str | None, overrides: list[str]
@@ -90,7 +90,7 @@ class GuardedConfigLoader(ConfigLoaderImpl):
 
 
 def _foreign(node: DictConfig | ListConfig, path: str) -> Iterator[tuple[str, object]]:
-    """Yield keys and values that would execute code outside of Hydra's own."""
+    """Yield keys and values that would execute code of other packages than Hydra."""
     keys = range(len(node)) if isinstance(node, ListConfig) else list(node)
     for key in keys:
         try:
@@ -119,7 +119,7 @@ def require_bounded_yaml(text: str, origin: Path) -> None:
     """Refuse a long YAML document, and one whose anchors expand to more than `MAX_YAML_NODES` nodes.
 
     Raises:
-        NerfroError: it does; syntax errors are left to the parser.
+        NerfroError: the document is too large; syntax errors are left to the parser.
     """
     num_nodes: dict[int, float] = {}
 

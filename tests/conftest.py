@@ -289,6 +289,31 @@ def tiny_default_options(scene: Path) -> list[str]:
     ]
 
 
+WAITING_LOSS = '''
+"""Waits."""
+import time
+from nerfro.losses.base import Loss
+from nerfro.registry import register
+
+@register("loss", "waiting")
+class Waiting(Loss):
+    """Waits a little in every step, so that there is a moment to interrupt, and says which step it is at."""
+
+    def forward(self, renderings, batch, scene):
+        print(f"at step {batch.draws.step}", flush=True)
+        time.sleep(0.15)
+        return renderings[-1].rgb.sum() * 0
+'''
+
+
+@pytest.fixture
+def waiting_plugins(tmp_path: Path) -> str:
+    """A folder of plugins with a loss that waits."""
+    (folder := tmp_path / "waiting_plugins").mkdir()
+    (folder / "waiting.py").write_text(WAITING_LOSS)
+    return str(folder)
+
+
 @pytest.fixture(scope="session")
 def trained_run(tiny_default_run: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a finished run of two steps; a test that writes to the folder copies it first."""

@@ -31,37 +31,18 @@ from tests.forked import Command
 
 SCHEDULE = ["checkpoint.every_steps=3", "checkpoint.every_seconds=null", "evaluation.every=5", "trainer.max_steps=12"]
 
-# Sleeps in every step, so that there is a moment to interrupt, and says which step it is at.
-SLOW_LOSS = '''
-"""Waits."""
-import sys, time
-import torch
-from nerfro.losses.base import Loss
-from nerfro.registry import register
-
-@register("loss", "waiting")
-class Waiting(Loss):
-    """Waits a little in every step."""
-
-    def forward(self, renderings, batch, scene):
-        print(f"at step {batch.draws.step}", flush=True)
-        time.sleep(0.15)
-        return renderings[-1].rgb.sum() * 0
-'''
-
 
 @pytest.fixture
-def start(tmp_path: Path, tiny_run: list[str], tiny_default_run: list[str]) -> Callable[..., Command]:
+def start(
+    tmp_path: Path, waiting_plugins: str, tiny_run: list[str], tiny_default_run: list[str]
+) -> Callable[..., Command]:
     """Start a training process with a loss that waits; its folder is tmp_path/<name>."""
-    plugins = tmp_path / "slow_plugins"
-    plugins.mkdir()
-    (plugins / "waiting.py").write_text(SLOW_LOSS)
     number = itertools.count()
 
     def start(name: str, *overrides: str, preset: str = "paper") -> Command:
         small = tiny_run if preset == "paper" else tiny_default_run
         options = [*small, *SCHEDULE, "+loss.waiting.weight=1", f"hydra.run.dir={tmp_path / name}", *overrides]
-        return Command("train", options, tmp_path / f"log_{next(number)}", NERFRO_PLUGINS=str(plugins))
+        return Command("train", options, tmp_path / f"log_{next(number)}", NERFRO_PLUGINS=waiting_plugins)
 
     return start
 

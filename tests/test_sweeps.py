@@ -34,22 +34,6 @@ SWEEPS = sorted(path.stem for path in (CONF_DIR / "sweep").glob("*.yaml"))
 _OFFLINE = {"OMP_NUM_THREADS": "1", "https_proxy": "http://127.0.0.1:9"}
 _RAY = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS": "0"}
 
-WAITING_LOSS = '''
-"""Waits, and says which step it is at."""
-import time
-from nerfro.losses.base import Loss
-from nerfro.registry import register
-
-@register("loss", "waiting")
-class Waiting(Loss):
-    """Waits a little in every step."""
-
-    def forward(self, renderings, batch, scene):
-        print(f"at step {batch.draws.step}", flush=True)
-        time.sleep(0.1)
-        return renderings[-1].rgb.sum() * 0
-'''
-
 
 @pytest.fixture
 def sweep(train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path) -> Callable[..., Any]:
@@ -59,14 +43,11 @@ def sweep(train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path) -
 
 
 @pytest.fixture
-def start(tmp_path: Path, tiny_run: list[str]) -> Callable[[list[str], str], Command]:
+def start(tmp_path: Path, waiting_plugins: str, tiny_run: list[str]) -> Callable[[list[str], str], Command]:
     """Start a sweep with a loss that waits in a process, in tmp_path/sweep; what it prints goes to tmp_path/<name>."""
-    plugins = tmp_path / "waiting_plugins"
-    plugins.mkdir()
-    (plugins / "waiting.py").write_text(WAITING_LOSS)
     options = [*tiny_run, "evaluation.every=0", "+loss.waiting.weight=1", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
     options += ["trainer.max_steps=20", "checkpoint.every_steps=4", "checkpoint.every_seconds=null"]
-    environment = {**_OFFLINE, **_RAY, "TORCH_HOME": str(tmp_path), "NERFRO_PLUGINS": str(plugins)}
+    environment = {**_OFFLINE, **_RAY, "TORCH_HOME": str(tmp_path), "NERFRO_PLUGINS": waiting_plugins}
     return lambda overrides, name: Command("train", ["-m", *options, *overrides], tmp_path / name, **environment)
 
 

@@ -16,7 +16,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nerfro.boundaries.cube_map import CubeLevels
-from nerfro.kernels.compilation import arrays, compiled, compiled_parallel
+from nerfro.kernels.arrays import arrays
+from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.threads import num_threads
 
 _ONE = np.float32(1)

@@ -7,7 +7,7 @@ import torchmetrics
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.image_metrics import ImageMetric, build_metrics
+from nerfro.evaluation.image_metrics import ImageMetric, build_metrics, image_metrics
 from nerfro.evaluation.lpips import find_lpips_networks
 from nerfro.registry import discover, find
 
@@ -27,8 +27,7 @@ def metrics(*names: str) -> torchmetrics.MetricCollection:
     discover()
     for name in names:
         find("metric", name)
-    wants_lpips = not names or any(name.startswith("lpips") for name in names)
-    found = build_metrics(*(find_lpips_networks() if wants_lpips else ({}, {})))
+    found = build_metrics(*find_lpips_networks(metrics=names or image_metrics()))
     for name in names:
         if found[name].missing is not None:
             raise NerfroError(f"metric={name} is not available: {found[name].missing}")

@@ -17,7 +17,7 @@ from nerfro.evaluation.flip import is_available as flip_available
 from nerfro.evaluation.lpips import ALEX, VGG, LpipsNetwork
 from nerfro.evaluation.regions import mean_over, require_images
 from nerfro.evaluation.ssim import MS_SSIM_MIN_SIZE, WINDOW, ms_ssim, ssim
-from nerfro.registry import create, plugins, register
+from nerfro.registry import Plugin, create, plugins, register
 
 MAX_PSNR = 100.0  # dB; the infinite PSNR of equal images has no mean and no representation in JSON
 
@@ -69,8 +69,7 @@ class ImageMetric(nn.Module, ABC):
 
 def image_metrics() -> dict[str, type[ImageMetric]]:
     """Return the registered metrics by name, in the order of tables."""
-    found = {plugin.name: plugin.cls for plugin in plugins("metric")}
-    return {name: found.pop(name) for name in _BUILT_IN} | found
+    return {plugin.name: plugin.cls for plugin in _in_order()}
 
 
 def build_metrics(
@@ -83,11 +82,14 @@ def build_metrics(
         reasons: reason for each missing network, by metric.
     """
     parts = {"lpips_networks": lpips_networks, "reasons": reasons}
-    known = {plugin.name: plugin for plugin in plugins("metric")}
     return {
-        name: create(known[name], {}, **{part: parts[part] for part in known[name].parts & parts.keys()})
-        for name in image_metrics()
+        plugin.name: create(plugin, {}, **{part: parts[part] for part in plugin.parts & parts.keys()})
+        for plugin in _in_order()
     }
+
+
+def _in_order() -> list[Plugin]:
+    return sorted(plugins("metric"), key=lambda plugin: (*_BUILT_IN, plugin.name).index(plugin.name))
 
 
 def psnr(

@@ -10,7 +10,7 @@ Source:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -200,7 +200,10 @@ def load_lpips_network(backbone: Backbone, path: Path | str | None = None, downl
 
 
 def find_lpips_networks(
-    alex: Path | str | None = None, vgg: Path | str | None = None, download: bool = True
+    alex: Path | str | None = None,
+    vgg: Path | str | None = None,
+    download: bool = True,
+    metrics: Collection[str] = ("lpips", "lpips_vgg"),
 ) -> tuple[dict[str, LpipsNetwork], dict[str, str]]:
     """Load the networks whose weights are available.
 
@@ -208,6 +211,7 @@ def find_lpips_networks(
         alex: file of AlexNet weights; by default the cache of torch hub, or a download.
         vgg: file of VGG-16 weights; by default the cache of torch hub. The 528 MB are never downloaded automatically.
         download: whether missing AlexNet weights may be downloaded.
+        metrics: metrics whose networks are loaded.
 
     Returns:
         Networks by the name of the metric, `lpips` and `lpips_vgg`, and the reasons for missing networks.
@@ -217,6 +221,8 @@ def find_lpips_networks(
     """
     networks, reasons = {}, {}
     for metric, backbone, path, fetched in (("lpips", ALEX, alex, download), ("lpips_vgg", VGG, vgg, False)):
+        if metric not in metrics:
+            continue
         try:
             networks[metric] = load_lpips_network(backbone, path, fetched)
         except NerfroError as error:

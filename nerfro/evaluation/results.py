@@ -14,7 +14,7 @@ from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import is_number, read_json
 
-_TOO_LARGE = 1e15  # scores, steps and times; sums of larger numbers may overflow
+TOO_LARGE = 1e15  # for scores, steps and times; sums of larger numbers may overflow
 Score = float | None  # None if not available; the notes contain the reason
 
 
@@ -188,6 +188,6 @@ def _scores(row: Mapping[str, Any]) -> dict[str, Score]:
 
 
 def _number(value: object) -> float | None:
-    if value is None or (is_number(value) and abs(value) < _TOO_LARGE):
+    if value is None or (is_number(value) and abs(value) < TOO_LARGE):
         return value
-    raise TypeError(f"{str(value)[:20]} is not a number below {_TOO_LARGE:g}")
+    raise TypeError(f"{str(value)[:20]} is not a number below {TOO_LARGE:g}")

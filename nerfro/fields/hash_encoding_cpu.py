@@ -20,7 +20,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nerfro.fields.hash_encoding import HASH_Y, HASH_Z, NUM_FEATURES, GridLevels
-from nerfro.kernels.compilation import arrays, compiled, compiled_parallel
+from nerfro.kernels.arrays import arrays
+from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.threads import num_threads
 
 _BLOCK = 512

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.kernels.constants import constant
-from nerfro.progress import track
 from nerfro.rays import Rays
 
 
@@ -71,7 +72,7 @@ def spline_coefficients(values: Float[Tensor, "X Y Z"]) -> Float[Tensor, "X Y Z"
     at creases, whereas this approximation has three taps.
     """
     for axis in range(3):
-        before, values, after = _shifted(values, axis, 1)
+        before, after = _neighbours(values, axis)
         values = 1.25 * values - 0.125 * (before + after)
     return values.contiguous()
 
@@ -108,14 +109,11 @@ def quadratic_spline(
 
 def bspline_basis(num_control: int, num_places: int) -> Float[Tensor, "num_places num_control"]:
     """Return cubic B-splines of evenly spaced control points, evaluated from the second to the last but one."""
-    place = torch.linspace(1, num_control - 2, num_places)
-    return cubic_bspline(place[:, None] - torch.arange(num_control))
+    from scipy.interpolate import BSpline  # takes a quarter of a second
 
-
-def cubic_bspline(t: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Evaluate the cubic B-spline of unit spacing around 0."""
-    t = t.abs()
-    return torch.where(t < 1, 2 / 3 - t**2 + t**3 / 2, (2 - t).clamp(min=0) ** 3 / 6)
+    place = np.linspace(1, num_control - 2, num_places)
+    spline = BSpline.basis_element(np.arange(-2.0, 3.0), extrapolate=False)  # NaN outside the knots
+    return torch.from_numpy(np.nan_to_num(spline(place[:, None] - np.arange(num_control)))).float()
 
 
 def smooth(values: Float[Tensor, "X Y Z *C"], size: int, sigma: float) -> Float[Tensor, "X Y Z *C"]:
@@ -131,29 +129,21 @@ def smooth(values: Float[Tensor, "X Y Z *C"], size: int, sigma: float) -> Float[
             f"smoothing_size={size}, smoothing_sigma={sigma} is not a valid kernel; "
             "the size must be odd (or 0 for no smoothing) and sigma positive"
         )
-    taps = torch.exp(-0.5 * ((torch.arange(size, dtype=torch.float64) - size // 2) / sigma) ** 2)
-    weights = (taps / taps.sum()).tolist()
-    for axis in track("smoothing", range(3)):
-        # Sums of shifted grids are much faster than a convolution with a single channel.
-        first, *others = _shifted(values, axis, size // 2)
-        values = weights[0] * first
-        for weight, other in zip(weights[1:], others, strict=True):
-            values.add_(other, alpha=weight)
-    return values
+    smoothed = gaussian_filter(values.detach().cpu().numpy(), sigma, mode="nearest", radius=size // 2, axes=(0, 1, 2))
+    return torch.from_numpy(smoothed).to(values)
 
 
 def gradient(values: Float[Tensor, "X Y Z"], spacing: Float[Tensor, "3"]) -> Float[Tensor, "X Y Z 3"]:
     """Return central differences, (next - previous) / 2h; replicated borders halve the gradient at the border."""
     parts = []
     for axis in range(3):
-        before, _, after = _shifted(values, axis, 1)
+        before, after = _neighbours(values, axis)
         parts.append((after - before) / (2 * spacing[axis]))
     return torch.stack(parts, -1)
 
 
-def _shifted(values: Float[Tensor, "X Y Z *C"], axis: int, reach: int) -> list[Float[Tensor, "X Y Z *C"]]:
-    """Return the grid shifted by -reach, ..., reach along an axis, with replicated borders."""
-    length = values.shape[axis]
-    first, last = values.narrow(axis, 0, 1), values.narrow(axis, length - 1, 1)
-    padded = torch.cat([*[first] * reach, values, *[last] * reach], axis)
-    return [padded.narrow(axis, start, length) for start in range(2 * reach + 1)]
+def _neighbours(values: Float[Tensor, "X Y Z"], axis: int) -> tuple[Float[Tensor, "X Y Z"], Float[Tensor, "X Y Z"]]:
+    """Return the values at the previous and at the next vertex along an axis, with replicated borders."""
+    index = torch.arange(values.shape[axis], device=values.device)
+    last = values.shape[axis] - 1
+    return values.index_select(axis, (index - 1).clamp(min=0)), values.index_select(axis, (index + 1).clamp(max=last))

@@ -1,4 +1,4 @@
-"""Memory that is available to this process, and number formats in which the machine multiplies fast."""
+"""Available memory of this process, and fast number formats of the machine."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from nerfro.errors import NerfroError
 
 
 def require_bytes(num_bytes: float, purpose: str) -> None:
-    """Raise an error if an allocation needs more memory than is available."""
+    """Raise an error if an allocation exceeds the available memory."""
     free = available_bytes()
     if num_bytes > free:
         raise NerfroError(
@@ -22,9 +22,9 @@ def require_bytes(num_bytes: float, purpose: str) -> None:
 
 
 def available_bytes() -> float:
-    """Return the memory that this process can still allocate, within the limits of the system and of control groups.
+    """Return the free memory of this process in bytes, within the limits of the system and of Linux control groups.
 
-    Infinite on systems other than Linux, which do not provide the number.
+    The result is infinite on systems other than Linux, because they do not report the number.
     """
     free = [number_in(Path("/proc/meminfo"), r"MemAvailable:\s+(\d+)", 1024, math.inf)]
     for folder, limit, usage in _control_groups():
@@ -35,7 +35,7 @@ def available_bytes() -> float:
 
 
 def _control_groups() -> Iterator[tuple[Path, str, str]]:
-    """Yield the folders of this process's memory groups and of their parents, with the files of limit and usage."""
+    """Yield the folders of the memory control groups of the process and of all parents, with limit and usage files."""
     try:
         lines = Path("/proc/self/cgroup").read_text().splitlines()
     except OSError:
@@ -55,7 +55,7 @@ def _control_groups() -> Iterator[tuple[Path, str, str]]:
 
 
 def number_in(file: Path, pattern: str, unit: int = 1, default: float = 0) -> float:
-    """Return the first match of a pattern in a system file as a number, or the default if there is none."""
+    """Return the first match of a pattern in a system file as a number, or the default without a match."""
     try:
         found = re.search(pattern, file.read_text(), re.MULTILINE)
     except OSError:

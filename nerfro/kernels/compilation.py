@@ -1,4 +1,4 @@
-"""Compilation of kernels, the cache of machine code, and the arrays that kernels take."""
+"""Compilation of kernels and the cache of machine code."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
-import numpy as np
-from torch import Tensor
 
 from nerfro.files.cache import cache_dir
 from nerfro.kernels.threads import num_threads, parallel_threads
@@ -25,22 +23,22 @@ Function = TypeVar("Function", bound=Callable)
 def compiled(function: Function) -> Function:
     """Compile a function for one thread at the first call, cache the machine code on disk, and release Python's lock.
 
-    The function must not create arrays. Numba then omits reference counts of arrays, which took 30 % of the time of
-    tracing.
+    The function must not create arrays. Numba then omits reference counts of arrays; reference counts took 30 % of the
+    time of tracing.
     """
     return _compile(function, parallel=False, allocates=False)
 
 
 def inlined(function: Function) -> Function:
-    """Compile a function into the kernels that call the function, for code that runs at every step along a ray."""
+    """Compile a function into all calling kernels, for code that runs at every step along a ray."""
     return cast(Function, numba.njit(inline="always")(inspect.unwrap(function)))
 
 
 def compiled_parallel(function: Function) -> Function:
-    """Compile a function with `prange` loops over the cores that PyTorch uses, and cache the machine code on disk.
+    """Compile a function with `prange` loops over the cores of PyTorch, and cache the machine code on disk.
 
-    If PyTorch uses one core in the calling thread, the loops run in that thread. Several threads may then run kernels
-    at the same time; parallel kernels wait for each other.
+    If PyTorch uses one core in the calling thread, the loops run in the calling thread, and several threads can run
+    kernels at the same time. Parallel kernels wait for each other.
     """
     serial, parallel = _compile(function, parallel=False), _compile(function, parallel=True)
 
@@ -90,10 +88,10 @@ def _warn_of_compiling(folder: Path, variable: str, reason: str) -> None:
 
 @functools.cache
 def _fingerprint(module: str) -> str:
-    """Hash the sources that the kernels of a module are compiled from.
+    """Hash all sources behind the kernels of a module.
 
-    Numba compiles a function again if the function's own file has changed. It does not look at files that the
-    function's constants and the functions that it calls come from, and would run outdated machine code.
+    Numba compiles a function again after a change of the file with the function, but not after a change of files with
+    constants or called functions. Without the hash, Numba would run outdated machine code.
     """
     digest = hashlib.sha256()
     for _, source in sorted(imported_sources(module).items()):
@@ -102,14 +100,14 @@ def _fingerprint(module: str) -> str:
 
 
 def imported_sources(module: str) -> dict[str, bytes]:
-    """Read the sources of a module and of all modules of nerfro and of its own package that it imports.
+    """Read the sources of a module and of all imported modules of nerfro and of the same package.
 
     Args:
-        module: dotted name of a module that has been imported, or is being imported.
+        module: dotted name of an imported module; the import may be in progress.
 
     Returns:
-        Sources by the dotted name of their module. Imports within functions and for type checkers do not count, because
-        they cannot reach compiled code.
+        Sources by dotted name of the module, without imports within functions and for type checkers, because such
+        imports cannot reach compiled code.
     """
     packages = {"nerfro", module.partition(".")[0]}
     sources: dict[str, bytes] = {}
@@ -132,8 +130,3 @@ def _imports(source: bytes) -> Iterator[str]:
         elif isinstance(node, ast.ImportFrom) and node.module is not None:
             yield node.module
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
-
-
-def arrays(*tensors: Tensor) -> list[np.ndarray]:
-    """Return CPU tensors as NumPy arrays without gradients, sharing memory if the tensors are contiguous."""
-    return [tensor.detach().contiguous().numpy() for tensor in tensors]

@@ -1,4 +1,4 @@
-"""The base class of media: refractive index in space, and what learns about it."""
+"""Base class of media: the refractive index as a function of position."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ Vectors = Float[Tensor, "*batch 3"]
 
 
 class lazy_buffer:  # noqa: N801 (used like functools.cached_property)
-    """Decorate a method so that its tensor is computed at the first access and kept as a non-persistent buffer.
+    """Decorator for a tensor-valued method: the first access computes the tensor and registers a non-persistent buffer.
 
-    Unlike `functools.cached_property`, the tensor moves to other devices with its module.
+    Unlike with `functools.cached_property`, the tensor moves to other devices together with the module.
     """
 
     def __init__(self, compute: Callable[[Any], Tensor]) -> None:
@@ -41,13 +41,13 @@ _STEPS_PER_DIAGONAL = 512
 class Medium(nn.Module, ABC):
     """Refractive index in space.
 
-    A subclass implements `forward` and sets `box`. It overrides `clearance` and `step_length` where it can tell the
-    Eikonal integrators how far the index is constant and how small their steps must be.
+    Subclasses implement `forward` and set `box`. Subclasses may override `clearance`, the distance of constant index
+    around a point, and `step_length`, the necessary step of the Eikonal integrators.
 
     Attributes:
-        box: lower and upper corner of the medium [2, 3], world units. Outside of it n = 1 and grad n = 0.
-        origin: world coordinates of the origin of all positions. It differs from zero if the object lies so far from
-            the origin of the world that single precision is not enough.
+        box: lower and upper corner of the medium [2, 3], world units. Outside of the box, n = 1 and grad n = 0.
+        origin: world coordinates of the origin of all positions. Objects far from the origin of the world have a
+            separate origin, because single precision would not be enough.
     """
 
     box: Float[Tensor, "2 3"]
@@ -73,7 +73,7 @@ class Medium(nn.Module, ABC):
         """Return the same bodies with other refractive indices.
 
         Raises:
-            NerfroError: the medium is not made of bodies.
+            NerfroError: the medium does not consist of bodies.
         """
         raise NerfroError(f"the index of {type(self).__name__} cannot be changed; take a medium of bodies")
 
@@ -93,23 +93,23 @@ class Medium(nn.Module, ABC):
         return False
 
     def with_absorption(self, path: Path) -> Path:
-        """Return the path with the absorption of the bodies that it crosses."""
+        """Return the path with the absorption of all crossed bodies."""
         return path
 
     def bending_parameters(self) -> list[nn.Parameter]:
-        """Return the learned parameters that paths depend on."""
+        """Return the learned parameters with an influence on paths."""
         return list(self.parameters())
 
     def learned(self) -> dict[str, float]:
-        """Return learned physical quantities by their names in the log."""
+        """Return learned physical quantities by name in the log."""
         return {}
 
     def clearance(self, positions: Vectors) -> Scalars:
-        """Return a distance around each point within which the index is constant, world units; 0 where unknown."""
+        """Return a lower bound of the distance from each point to a varying index, world units; 0 where unknown."""
         return torch.zeros_like(positions[..., 0])
 
     def step_length(self, directions: Vectors, gradients: Vectors) -> Scalars:
-        """Return the arc length of an integration step that resolves the medium, world units.
+        """Return the arc length of an integration step fine enough for the medium, world units.
 
         Args:
             directions: unit directions of rays.

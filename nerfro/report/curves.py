@@ -13,12 +13,12 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from nerfro.evaluation.results import TOO_LARGE
 from nerfro.files.reading import reading
 
 # File of the CSV logger of Lightning, see conf/logger/.
 CURVES_FILE = Path("csv", "metrics.csv")
 FIRST = ("train/psnr", "val/psnr", "loss/total")
-_TOO_LARGE = 1e15  # steps and values that are not drawn
 MAX_POINTS = 200  # maximum number of points per line; a chart has only about 300 pixels
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#a64d86", "#8a6d00", "#2a9fd6", "#444444", "#c2185b")  # by method
 
@@ -110,4 +110,4 @@ def _number(text: str | None) -> float | None:
         value = float(text or "nan")
     except ValueError:
         return None
-    return value if abs(value) < _TOO_LARGE else None
+    return value if abs(value) < TOO_LARGE else None

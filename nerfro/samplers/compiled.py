@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from nerfro.kernels.compilation import arrays
+from nerfro.kernels.arrays import arrays
 from nerfro.samplers.branching import Branching
 from nerfro.samplers.polylines import SnellTrace
 from nerfro.types import Path, Rays

@@ -23,7 +23,7 @@ from nerfro.geometry.contraction import (
     expand,
     world_length,
 )
-from nerfro.kernels.compilation import arrays
+from nerfro.kernels.arrays import arrays
 from nerfro.registry import register
 from nerfro.samplers.base import PointSampler
 from nerfro.samplers.stepfun import invert_cdf, midpoints, spread_uniform, volume_weights

@@ -39,6 +39,9 @@ class _Change(NamedTuple):
     description: str
 
 
+_SAME = _Change(np.eye(3), np.zeros(3), "")
+
+
 @torch.no_grad()
 def require_match(medium: Medium, views: Views) -> None:
     """Compare the silhouettes of the mesh with some masks, and say whether unit, axes or place of the mesh are wrong.
@@ -55,7 +58,7 @@ def require_match(medium: Medium, views: Views) -> None:
     comparison = None
     if isinstance(medium, SdfGrid) and medium.meshes and views.masks is not None:
         comparison = _Comparison.of(medium.meshes[0], views, medium.origin)
-    agreement = 1.0 if comparison is None else comparison.agreement(_Change(np.eye(3), np.zeros(3), ""))
+    agreement = 1.0 if comparison is None else comparison.agreement(_SAME)
     if not inside and agreement >= _DOUBTFUL:
         return
     reason = "" if comparison is None else comparison.explanation()
@@ -151,8 +154,7 @@ class _Comparison(NamedTuple):
         areas = self.masks.sum(1).numpy() * (depths / self.cameras.fx.double().numpy()) ** 2
         scale = float(np.sqrt(areas.mean() / area))
         scale = 1.0 if abs(scale - 1) < 0.1 else scale
-        same = _Change(np.eye(3), np.zeros(3), "")
-        for turn in (same, *turns):
+        for turn in (_SAME, *turns):
             matrix = scale * turn.matrix
             shift = target - matrix @ self.mesh.bounds.mean(0)
             ours = self.silhouettes(_Change(matrix, shift, ""))

@@ -26,12 +26,12 @@ from nerfro.rendering import ColourSpace, Renderer
 from nerfro.types import Exits
 from nerfro.viewing import packing
 from nerfro.viewing.changes import absorption_of
+from nerfro.viewing.surface import distances_on_grid
 from nerfro.viewing.volume import MIN_OPTICAL_DEPTH, Volume
 
 # Distances are stored up to this many cells from the surface, where the B-spline of the surface reads them. Farther
 # away, rays advance by the clearance of the blocks.
 _BAND = 3.5
-_ANALYTIC_RESOLUTION = 128  # vertices per side of the grid of a medium in closed form
 _SKY_SIZE = 256  # texels per side of the cube map, unless the background is a texture
 _MAX_OPTICAL_DEPTH = 30.0  # of one cell
 _BRICK = 8  # voxels per side of the bricks that are skipped if they are empty
@@ -99,11 +99,8 @@ def bake_surface(renderer: Renderer) -> Baked:
 
 def _on_grid(medium: Solid) -> SdfGrid:
     """Sample the signed distances of a medium in closed form on a grid."""
-    axes = (torch.linspace(float(low), float(high), _ANALYTIC_RESOLUTION) for low, high in medium.box.T)
-    positions = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).to(medium.box)
-    with torch.no_grad():
-        distances = torch.stack([medium.signed_distances(plane)[0] for plane in positions]).movedim(-1, 0)
-    return SdfGrid.from_distances(distances.contiguous(), medium.box, medium.indices.tolist(), medium.shell)
+    distances = distances_on_grid(medium).to(medium.box)
+    return SdfGrid.from_distances(distances, medium.box, medium.indices.tolist(), medium.shell)
 
 
 @torch.inference_mode()

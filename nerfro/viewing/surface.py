@@ -32,7 +32,7 @@ def surface_of(medium: Medium, triangles: bool) -> list[TriangleMesh]:
         )
     if triangles and isinstance(medium, SdfGrid):
         return [TriangleMesh(mesh.vertices, mesh.faces, corner_normals(mesh)) for mesh in medium.meshes]
-    return [_zero_level(medium, body, values) for body, values in enumerate(_distances(medium))]
+    return [_zero_level(medium, body, values) for body, values in enumerate(distances_on_grid(medium))]
 
 
 def _zero_level(medium: Solid, body: int, values: Float[Tensor, "X Y Z"]) -> TriangleMesh:
@@ -48,12 +48,14 @@ def _zero_level(medium: Solid, body: int, values: Float[Tensor, "X Y Z"]) -> Tri
     return TriangleMesh(vertices.double().cpu().numpy(), mesh.faces, normals[mesh.faces])
 
 
-def _distances(medium: Solid) -> Float[Tensor, "K X Y Z"]:
+@torch.no_grad()
+def distances_on_grid(medium: Solid) -> Float[Tensor, "K X Y Z"]:
+    """Sample `Solid.regions` at the vertices of a grid over the box of the medium, on the CPU."""
     counts = medium.coefficients.shape[1:] if isinstance(medium, SdfGrid) else [_ANALYTIC_RESOLUTION] * 3
     box = medium.box.cpu()
     axes = [torch.linspace(float(low), float(high), n) for low, high, n in zip(*box, counts, strict=True)]
     slabs = [medium.regions(torch.cartesian_prod(x[None], *axes[1:]).to(medium.box))[0].cpu() for x in axes[0]]
-    return torch.stack(slabs).view(*counts, -1).movedim(-1, 0)
+    return torch.stack(slabs).view(*counts, -1).movedim(-1, 0).contiguous()
 
 
 def level_set(values: Float[Tensor, "X Y Z"], box: Float[Tensor, "2 3"], level: float) -> TriangleMesh:

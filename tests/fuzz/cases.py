@@ -211,26 +211,15 @@ def save_mesh(draw: random.Random, file: Path) -> None:
             faces = np.delete(faces, face, 0)
         else:
             faces = np.concatenate([faces, faces[face : face + 1]])
-    rows = [f"{x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices]
-    if draw.random() < 0.5:
-        rows += [f"3 {a} {b} {c}" for a, b, c in faces]
-        numbers = "property float x\nproperty float y\nproperty float z"
-        head = f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\n{numbers}\nelement face {len(faces)}\n"
-        file.write_text("\n".join([f"{head}property list uchar int vertex_indices\nend_header", *rows, ""]))
-    else:
-        file = file.with_suffix(".obj")
-        file.write_text("\n".join([f"v {row}" for row in rows] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]))
+    trimesh.Trimesh(vertices, faces, process=False).export(file)
     if draw.randint(0, 3) == 0:
         file.write_bytes(damaged(draw, file.read_bytes()))
-    if file.suffix == ".obj":
-        file.rename(file.with_suffix(".ply")) if draw.randint(0, 9) == 0 else None
 
 
 def meshes(world: World, draw: random.Random) -> str | None:
     out = fresh(world, "out")
     out.mkdir()
-    save_mesh(draw, out / "mesh.ply")
-    file = next(path for path in out.iterdir() if path.suffix in (".ply", ".obj"))
+    save_mesh(draw, file := out / draw.choice(["mesh.ply", "mesh.obj"]))
     np.savez(out / "rays.npz", **rays_through_ball())
     medium = draw.choice(["sdf_grid", "voxel_grid"])
     sampler = "eikonal" if medium == "voxel_grid" else draw.choice(["snell", "eikonal"])
@@ -240,68 +229,6 @@ def meshes(world: World, draw: random.Random) -> str | None:
     if medium == "sdf_grid" and sampler == "snell" and draw.random() < 0.5:
         options.append("sampler.path.interface=mesh")
     return world.trouble("trace", *options, f"rays={out}/rays.npz", f"out={out}/o.npz", own=(out,))
-
-
-def rays(world: World, draw: random.Random) -> str | None:
-    out = fresh(world, "out")
-    out.mkdir()
-    arrays = rays_through_ball()
-    name = draw.choice(sorted(arrays))
-    how = draw.choice(["value", "type", "shape", "missing", "extra", "bytes"])
-    if how == "value":
-        arrays[name][3, 1] = draw.choice([np.nan, np.inf, 1e39, 1e300, -1e7, 1e5, 1e-300, 0.5])
-    elif how == "type":
-        kinds = ["?", "i1", "u8", "f2", "f4", "f8", "g", "c8", "c16", "U3", "S3", "M8[s]", "m8[s]", "V4", ">f8"]
-        with np.errstate(all="ignore"):
-            try:
-                arrays[name] = arrays[name].astype(draw.choice(kinds))
-            except (TypeError, ValueError):
-                arrays[name] = np.zeros((9, 3), "V4")
-    elif how == "shape":
-        arrays[name] = np.ones(draw.choice([(), (0,), (3,), (0, 3), (9, 2), (8, 3), (9, 3, 1), (3, 9)]))
-    elif how == "missing":
-        del arrays[name]
-    elif how == "extra":
-        arrays["near"] = np.ones(3)
-    np.savez(out / "rays.npz", **arrays)
-    if how == "bytes":
-        (out / "rays.npz").write_bytes(damaged(draw, (out / "rays.npz").read_bytes()))
-    options = [f"medium.mesh={world.root}/data/mesh.ply", "medium.resolution=24", f"rays={out}/rays.npz"]
-    return world.trouble("trace", *options, f"out={out}/o.npz", own=(out,))
-
-
-def caches(world: World, draw: random.Random) -> str | None:
-    out = fresh(world, "out")
-    out.mkdir()
-    generator = np.random.default_rng(0)
-    directions = generator.normal(size=(50, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    np.savez(out / "rays.npz", origins=-2 * directions + generator.normal(size=(50, 3)) / 9, directions=directions)
-    options = [f"medium.mesh={world.root}/data/mesh.ply", "medium.resolution=20", f"rays={out}/rays.npz"]
-    world.command("trace", *options, f"out={out}/right.npz")
-    (cached,) = (path for path in (world.root / "cache").glob("distance_*.npz") if "20, 20, 20" in _shapes(path))
-    content = cached.read_bytes()
-    if draw.random() < 0.5:
-        cached.write_bytes(damaged(draw, content))
-    else:
-        with np.load(cached) as file:
-            arrays = dict(file)
-        arrays["distance"] = draw.choice([arrays["distance"] * np.nan, -arrays["distance"], np.zeros(3), np.array("x")])
-        np.savez(cached, **arrays)
-    found = world.trouble("trace", *options, f"out={out}/again.npz", own=(out,))
-    cached.write_bytes(content)
-    if found is None:
-        with np.load(out / "right.npz") as right, np.load(out / "again.npz") as again:
-            found = next((name for name in right.files if not np.array_equal(right[name], again[name])), None)
-    return found
-
-
-def _shapes(path: Path) -> str:
-    try:
-        with np.load(path) as file:
-            return str(file["distance"].shape)
-    except Exception:
-        return ""
 
 
 def run_folders(world: World, draw: random.Random) -> str | None:
@@ -459,6 +386,6 @@ def checkpoints(world: World, draw: random.Random) -> str | None:
 
 KINDS: dict[str, Callable[[World, random.Random], str | None]] = {
     case.__name__: case
-    for case in (options_of_training, options_of_other_commands, pictures_and_masks, meshes, rays, caches,
-                 run_folders, data_formats, single_files, checkpoints)
+    for case in (options_of_training, options_of_other_commands, pictures_and_masks, meshes, run_folders,
+                 data_formats, single_files, checkpoints)
 }  # fmt: skip

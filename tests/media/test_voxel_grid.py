@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 import trimesh
-from scipy.ndimage import gaussian_filter1d
 
 from nerfro.errors import NerfroError
-from nerfro.geometry.interpolation import gradient, smooth
+from nerfro.geometry.interpolation import gradient
 from nerfro.media.voxel_grid import VoxelGrid
 from tests.closed_forms import grid_points
 
@@ -27,16 +25,6 @@ def sphere(tmp_path: Path) -> str:
 def _ball_occupancy(size: int) -> torch.Tensor:
     radius = grid_points(1.5, size).norm(dim=-1)
     return (radius < 0.8).float()
-
-
-def test_smoothing_is_scipys_truncated_gaussian() -> None:
-    values = torch.rand(9, 10, 11, dtype=torch.float64)
-    before = values.clone()
-    expected = values.numpy()
-    for axis in range(3):
-        expected = gaussian_filter1d(expected, 1.3, axis=axis, mode="nearest", radius=3)
-    np.testing.assert_allclose(smooth(values, 7, 1.3).numpy(), expected, rtol=1e-12)
-    assert torch.equal(values, before)
 
 
 def test_gradient_is_central_inside_and_half_at_the_border() -> None:
