@@ -330,9 +330,10 @@ def renamed_override(override: str) -> str:
 def renamed_config(config: DictConfig, origin: Path) -> DictConfig:
     """Replace old names in the configuration of an old run, with one warning, and drop settings that are gone."""
     found = [f"{old} is called {new}" for old, new in RENAMED.items() if _move(config, old, new) and new]
-    data = OmegaConf.select(config, "data")
-    if isinstance(data, DictConfig) and str(data.get("_target_")) in MOVED_CLASSES:
-        data._target_ = MOVED_CLASSES[data._target_]
+    for name in ("data", "field", "model"):
+        node = OmegaConf.select(config, name)
+        if isinstance(node, DictConfig) and str(node.get("_target_")) in MOVED_CLASSES:
+            node._target_ = MOVED_CLASSES[node._target_]
     if found:
         warn(f"{origin} has old names of settings, which can be read for one more release: {', '.join(found)}")
     return config

@@ -46,7 +46,11 @@ _LOCAL_PACKAGE = "nerfro_plugins"
 MOVED_CLASSES = {
     f"nerfro.data.{module}.{name}": f"{_LOCAL_PACKAGE}.data_formats.{module}.{name}"
     for module, name in (("idr", "IdrData"), ("llff", "LlffData"), ("refref", "RefRefData"))
-} | {"nerfro.data.opencv.OpenCVData": "nerfro.data.blender.OpenCVData"}
+} | {
+    "nerfro.data.opencv.OpenCVData": "nerfro.data.blender.OpenCVData",
+    "nerfro.fields.mip_nerf.MipNerfField": f"{_LOCAL_PACKAGE}.mip_nerf.MipNerfField",
+    "nerfro.models.mip_nerf.MipNerfModel": f"{_LOCAL_PACKAGE}.mip_nerf.MipNerfModel",
+}
 _ENTRY_POINTS = "nerfro.plugins"
 
 # Objects of Lightning that a configuration may name as Hydra's `_target_`, beside registered classes.

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from importlib import import_module
 
 import pytest
 import torch
 
-from nerfro.fields.mip_nerf import frustum_gaussians
+from nerfro.registry import discover
 from nerfro.samplers.straight import straight_path
 from nerfro.samplers.stratified import cone_samples
 from nerfro.testing import example_path
 from nerfro.types import Rays, Samples
+
+discover()
+frustum_gaussians = import_module("nerfro_plugins.mip_nerf").frustum_gaussians
 
 NUM_DRAWS = 400_000
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
+from importlib import import_module
 
 import pytest
 import torch
 
 from nerfro.errors import NerfroError
-from nerfro.fields.mip_nerf import MipNerfField
 from nerfro.fields.mlp import (
     RGB_PADDING,
     RadianceMLP,
@@ -20,8 +20,12 @@ from nerfro.fields.mlp import (
 )
 from nerfro.fields.nerf import NerfField
 from nerfro.light import to_srgb
+from nerfro.registry import discover
 from nerfro.samplers.stratified import Stratified
 from nerfro.testing import example_path, example_samples
+
+discover()
+MipNerfField = import_module("nerfro_plugins.mip_nerf").MipNerfField
 
 
 def test_forward_equals_a_slow_loop_over_layers() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import import_module
 
 import pytest
 import torch
@@ -11,8 +12,8 @@ from torch import Tensor
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.skybox import Skybox
 from nerfro.fields.nerf import NerfField
-from nerfro.models.mip_nerf import MipNerfModel
 from nerfro.models.refractive import RefractiveModel
+from nerfro.registry import discover
 from nerfro.rendering import Components
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.hierarchical import Hierarchical
@@ -22,6 +23,9 @@ from nerfro.training.module import TrainingModule
 from nerfro.training.optimizer import OptimizerConfig
 from nerfro.types import Exits
 from tests.closed_forms import Luneburg
+
+discover()
+MipNerfModel = import_module("nerfro_plugins.mip_nerf").MipNerfModel
 
 
 class Compass(Boundary):

@@ -1,16 +1,24 @@
-"""The field of mip-NeRF: an MLP on the integrated positional encoding of conical frustums."""
+"""mip-NeRF (Barron et al., "Mip-NeRF: A multiscale representation for anti-aliasing neural radiance fields", 2021).
+
+The baseline `+experiment=mipnerf` consists of `field=mip_nerf`, an MLP on the integrated positional encoding of conical
+frustums, and of `model=mip_nerf`.
+"""
 
 from __future__ import annotations
 
-from jaxtyping import Float
+from typing import Literal
+
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfro.allowed import Depth, Width
+from nerfro.draws import Draws
 from nerfro.fields.base import Field
 from nerfro.fields.encoding import DIRECTION_DEGREE, integrated_positional_encoding, positional_encoding
 from nerfro.fields.mlp import RadianceMLP
 from nerfro.registry import register
-from nerfro.types import Radiance, Samples
+from nerfro.rendering import Components, Renderer, composite
+from nerfro.types import Path, Radiance, Rendering, Samples
 
 
 @register("field", "mip_nerf")
@@ -58,3 +66,28 @@ def frustum_gaussians(samples: Samples) -> tuple[Float[Tensor, "R N 3"], Float[T
     squared = samples.directions**2
     variance = along[..., None] * squared + across[..., None] * (1 - squared)
     return mean, variance
+
+
+@register("model", "mip_nerf")
+class MipNerfModel(Renderer):
+    """Render straight rays with one radiance field for all sampling levels, as mip-NeRF, and a background.
+
+    Args:
+        colour: see `model=refractive`.
+    """
+
+    empty_shows_boundary = True
+
+    def __init__(self, components: Components, colour: Literal["linear", "srgb"] = "linear") -> None:
+        super().__init__(components, 1, colour)
+
+    def render_path(
+        self, path: Path, draws: Draws | None = None, teaches_background: Bool[Tensor, "R"] | None = None
+    ) -> list[Rendering]:
+        boundary_rgb = self.background(path, teaches_background)
+        (field,) = self.scene.fields
+        renderings: list[Rendering] = []
+        for _ in range(self.point_sampler.num_levels):
+            samples = self.point_sampler(path, renderings[-1] if renderings else None, draws)
+            renderings.append(composite(samples, field(samples), boundary_rgb, path))
+        return renderings
