@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -122,58 +123,81 @@ def test_open_mesh_is_accepted_when_asked(
 
 
 @pytest.mark.parametrize(
-    ("override", "words"),
+    ("overrides", "words"),
     [
-        ("data.near=7", ["data.near=7.0", "data.far=6.0", "near < far"]),
-        ("data.near=5", ["data.near=5 lies behind the object, which the rays meet at distances from 3."]),
-        ("data.far=2.5", ["data.far=2.5 lies before the object", "set data.near and data.far around these"]),
-        ("data.near=-1", ["near=-1.0 is not allowed; take at least 0"]),
-        ("data.downscale=0", ["downscale=0"]),
-        ("evaluation.split=night", ["no split 'night'; it has train, val, test"]),
-        ("data.root=embedded:nothing", ["embedded scenes: torus"]),
-        ("data.root=/", ["data.root=/ is a whole file system; give a folder below it"]),
-        ('data.root="~nobody_of_that_name/x"', ["the home folder is unknown", "give the full path"]),
-        ("data.root=a(1),b", ["data.root=a(1),b cannot be read", "quote"]),
-        ("trainer.max_time=5", ["trainer.max_time=5", "DD:HH:MM:SS"]),
-        ("medium.ior=0", ["ior=0.0 is not allowed; take more than 0"]),
-        ("medium.ior=inf", ["ior=inf is not allowed"]),
-        ("medium.resolution=3000", ["resolution=3000 is not allowed", "at most 2048"]),
-        ("medium.smoothing_size=999999", ["smoothing_size=999999 is not allowed", "at most 99"]),
-        ("loss.boundary.weight=nan", ["weight=nan is not allowed"]),
-        ("batches.subdivision.divergence=nan", ["batches.subdivision.divergence=nan is not allowed"]),
-        ("batches.precrop_fraction=nan", ["precrop_fraction=nan is not allowed"]),
-        ("batches.size=1e12", ["batches.size", "could not be converted to Integer"]),
-        ("batches.size=1000000000000", ["batches.size=1000000000000 is not allowed; take at least 1 and at most"]),
-        ("field.depth=99999", ["depth=99999 is not allowed; take at least 1 and at most 64"]),
-        ("boundary.width=99999999", ["width=99999999 is not allowed; take at least 1 and at most 8192"]),
-        ("sampler.points.num_coarse=1000000000", ["num_coarse=1000000000 is not allowed"]),
-        ("evaluation.subdivision.side=1000000", ["evaluation.subdivision.side=1000000 is not allowed"]),
-        ("optimizer.learning_rate=nan", ["optimizer.learning_rate=nan is not allowed"]),
-        ("optimizer.adam_epsilon=0", ["optimizer.adam_epsilon=0.0 is not allowed"]),
-        ("trainer.max_steps=99999999999", ["trainer.max_steps=99999999999 is not allowed"]),
-        ("trainer.precision=8", ["trainer.precision='8' is not allowed; choose '32-true'"]),
-        ("sampler.path=nothing", ["'nothing' is not a set of settings"]),
-        ("trainer.accumulate_grad_batches=2", ["trainer.accumulate_grad_batches=2 has no meaning in nerfro"]),
-        ("+trainer.limit_train_batches=0", ["trainer.limit_train_batches=0 has no meaning"]),
-        ("checkpoint.every_seconds=-1", ["checkpoint.every_seconds=-1.0 is not allowed"]),
-        ("checkpoint.every_seconds=1e300", ["checkpoint.every_seconds=1e+300 is not allowed"]),
-        ("--shell-completion", ["Expecting one subcommand from ['install', 'uninstall', 'query']"]),
-        ("checkpoint={every_steps: -1, every_seconds: null}", ["checkpoint.every_steps=-1 is not allowed"]),
-        ("data.root=DIR/Übung", ["cannot be read; quote the value"]),
-        ("medium.smoothing_size=4", ["must be odd"]),
-        ("batches.size=100000", ["batch_size=100000 exceeds the 16x16 pixels"]),
+        (["data.near=5"], ["data.near=5 lies behind the object, which the rays meet at distances from 3."]),
+        (["data.far=2.5"], ["data.far=2.5 lies before the object", "set data.near and data.far around these"]),
+        (["evaluation.split=night"], ["no split 'night'; it has train, val, test"]),
+        (["data.root=embedded:nothing"], ["embedded scenes: torus"]),
+        (["data.root=/"], ["data.root=/ is a whole file system; give a folder below it"]),
+        (['data.root="~nobody_of_that_name/x"'], ["the home folder is unknown", "give the full path"]),
+        (["data.root=a(1),b"], ["data.root=a(1),b cannot be read", "quote"]),
+        (["trainer.max_time=5"], ["trainer.max_time=5", "DD:HH:MM:SS"]),
+        (["medium.ior=0"], ["ior=0.0 is not allowed; take more than 0"]),
+        (["medium.ior=inf"], ["ior=inf is not allowed"]),
+        (["medium.resolution=3000"], ["resolution=3000 is not allowed", "at most 2048"]),
+        (["medium.smoothing_size=999999"], ["smoothing_size=999999 is not allowed", "at most 99"]),
+        (["batches.size=1e12"], ["batches.size", "could not be converted to Integer"]),
+        (["batches.size=1000000000000"], ["batches.size=1000000000000 is not allowed; take at least 1 and at most"]),
+        (["sampler.points.num_coarse=1000000000"], ["num_coarse=1000000000 is not allowed"]),
+        (["evaluation.subdivision.side=1000000"], ["evaluation.subdivision.side=1000000 is not allowed"]),
+        (["optimizer.learning_rate=nan"], ["optimizer.learning_rate=nan is not allowed"]),
+        (["optimizer.adam_epsilon=0"], ["optimizer.adam_epsilon=0.0 is not allowed"]),
+        (["trainer.max_steps=99999999999"], ["trainer.max_steps=99999999999 is not allowed"]),
+        (["trainer.precision=8"], ["trainer.precision='8' is not allowed; choose '32-true'"]),
+        (["sampler.path=nothing"], ["'nothing' is not a set of settings"]),
+        (["trainer.accumulate_grad_batches=2"], ["trainer.accumulate_grad_batches=2 has no meaning in nerfro"]),
+        (["+trainer.limit_train_batches=0"], ["trainer.limit_train_batches=0 has no meaning"]),
+        (["checkpoint.every_seconds=-1"], ["checkpoint.every_seconds=-1.0 is not allowed"]),
+        (["checkpoint.every_seconds=1e300"], ["checkpoint.every_seconds=1e+300 is not allowed"]),
+        (["--shell-completion"], ["Expecting one subcommand from ['install', 'uninstall', 'query']"]),
+        (["checkpoint={every_steps: -1, every_seconds: null}"], ["checkpoint.every_steps=-1 is not allowed"]),
+        (["data.root=DIR/Übung"], ["cannot be read; quote the value"]),
+        (["medium.smoothing_size=4"], ["must be odd"]),
+        (["batches.size=100000", "batches.batching=single_image"], ["batch_size=100000 exceeds the 16x16 pixels"]),
+        (["field.depth=99999"], ["depth=99999 is not allowed; take at least 1 and at most 64"]),
+        (["boundary.width=99999999"], ["width=99999999 is not allowed; take at least 1 and at most 8192"]),
+        (["nme=x"], ["nme is not a setting; did you mean name?"]),
+        (["field=nrf"], ["Could not find 'field/nrf'", "Available options", "mip_nerf", "nerf"]),
+        (["field.widht=3"], ["field.widht is not a setting; did you mean width?"]),
+        (["+field.widht=3"], ["field.widht is not a setting; did you mean width?"]),
+        (["+expriment=mipnerf"], ["expriment is not a setting; did you mean experiment?"]),
+        (["+batches.foo=3"], ["batches.foo is not a setting; known: batching, jitter, num_validation_views"]),
+        (["+sampler.point.num_samples=5"], ["sampler.point is not a setting; did you mean points?"]),
+        (["+medium.foo=1"], ["medium.foo is not a setting; known: accept_open_mesh"]),
+        (["+hydra.run.foo=1"], ["hydra.run.foo is not a setting; known: dir"]),
+        (["field.width=abc"], ["Value 'abc' of type 'str' could not be converted to Integer", "field.width"]),
+        (["field=null"], ["Got NoneType; give the name of an option"]),
+        (["+loss.boundry.weight=1"], ["no loss is called 'boundry'; known: backdrop, boundary"]),
+        (["sampler.path.integrator=foo"], ["integrator='foo' is not allowed; choose 'adaptive', 'euler'"]),
+        (["field._target_=os.system"], ["'os.system' is not registered"]),
+        (["trainer._target_=os.system"], ["'os.system' is not registered"]),
+        (["logger=none", "+logger.x={_target_: os.system, command: 'false'}"], ["'os.system' is not registered"]),
+        (["trainer.callbacks=[]"], ["trainer.callbacks=[] has no meaning in nerfro: choose callbacks by name"]),
+        (["+experiment=nope"], ["Could not find 'experiment/nope'", "ablation_noBD", "refractive"]),
+        pytest.param(
+            ["hydra/launcher=ray"],
+            ["Could not find 'hydra/launcher/ray'", "pip install 'nerfro[ray]' adds it"],
+            marks=pytest.mark.skipif(find_spec("ray") is not None, reason="the extra is installed"),
+        ),
+        (["foo"], ["foo is not an option; write key=value"]),
+        (["seed=-1"], ["seed=-1 is not allowed; take at least 0 and at most 4294967295"]),
+        (["data.root=${nope}"], ["Interpolation key 'nope' not found"]),
+        (["batches.batching=some"], ["batching='some' is not allowed; choose 'single_image', 'all_images'"]),
+        (["evaluation.chunk_size=0"], ["evaluation.chunk_size=0 is not allowed; take at least 1"]),
+        (["trainer.max_time=soon"], ["`Timer(duration='soon')` is not a valid duration"]),
+        (["checkpoint.every_steps=3"], ["set one of checkpoint.every_seconds and checkpoint.every_steps"]),
     ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) and "=" in value[0] else "",
 )
-def test_impossible_options_are_refused(
-    override: str, words: list[str], train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path
+def test_mistake_on_the_command_line_is_told_in_one_line(
+    overrides: list[str], words: list[str], train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path
 ) -> None:
-    finished = train_here(
-        *tiny_run, "batches.batching=single_image", "trainer.max_steps=1", override, f"hydra.run.dir={tmp_path / 'run'}"
-    )
+    finished = train_here(*tiny_run, "trainer.max_steps=1", f"hydra.run.dir={tmp_path / 'run'}", *overrides)
     assert finished.code == 1
     lines = finished.err.strip().splitlines()
     assert len(lines) == 1, finished.err
-    for word in words:
+    for word in ["nerfro: error: ", *words]:
         assert word in lines[0]
     assert not list((tmp_path / "run").rglob("*")), "nothing is written"
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -153,16 +151,6 @@ def test_missing_folders_unknown_splits_and_empty_intervals_are_refused(form: Fo
 def test_options_out_of_range_are_refused(options: dict[str, float], message: str) -> None:
     with pytest.raises(NerfroError, match=message):
         BlenderData("anywhere", **options)
-
-
-@pytest.mark.parametrize("data", ["colmap", "llff", "nerfstudio", "idr", "refref"])
-def test_a_missing_folder_is_one_line_on_the_command_line(
-    train_here: Callable[..., Any], tmp_path: Path, data: str
-) -> None:
-    finished = train_here(f"data={data}", f"data.root={tmp_path / 'gone'}", "trainer.max_steps=1", "logger=none")
-    assert finished.code == 1
-    (line,) = finished.err.strip().splitlines()
-    assert f"data.root={tmp_path / 'gone'}" in line
 
 
 def test_alpha_is_dropped_unless_a_background_is_chosen(tmp_path: Path) -> None:
