@@ -1,4 +1,4 @@
-"""Connected closed surfaces of one mesh, and the check that they do not cross."""
+"""Connected closed surfaces of one mesh, and the check for crossing surfaces."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ def require_separate(mesh: TriangleMesh) -> None:
 
 
 class _Others:
-    """Closed surfaces that another surface, given by triangles [F, 3, 3], must not cross."""
+    """Closed surfaces of a mesh, for tests against another surface with triangles [F, 3, 3]."""
 
     def __init__(self, triangles: Float[np.ndarray, "G 3 3"]) -> None:
         self._triangles, self._intersector = torch.from_numpy(triangles), MeshIntersector(triangles)
 
     def are_crossed(self, own: Float[np.ndarray, "F 3 3"]) -> bool:
-        """Return whether an edge crosses a triangle; this test finds crossings of any thickness."""
+        """Return whether an edge crosses a triangle; the test finds crossings of any thickness."""
         start, end = (torch.from_numpy(own[:, corners].reshape(-1, 3)) for corners in ([0, 1, 2], [1, 2, 0]))
         along = end - start
         met, triangle, normal = self._first_hits(start, along)
@@ -100,7 +100,7 @@ class _Others:
     def _first_hits(
         self, start: Float[Tensor, "R 3"], along: Float[Tensor, "R 3"]
     ) -> tuple[Bool[Tensor, "R"], Float[Tensor, "M 3 3"], Float[Tensor, "M 3"]]:
-        """Return which rays hit a triangle, and the first triangle of each of these rays with its normal."""
+        """Return a mask of the rays with a hit, and the first triangle of each of these rays with a normal."""
         hit = self._intersector.first_hits(start, along.contiguous())
         triangle = self._triangles[hit[hit >= 0]]
         return hit >= 0, triangle, torch.linalg.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])

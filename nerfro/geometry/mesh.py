@@ -1,4 +1,4 @@
-"""Triangle meshes as two arrays, read from any format that trimesh supports."""
+"""Triangle meshes as two arrays, read from any format of trimesh."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class TriangleMesh:
     Attributes:
         vertices: corner positions.
         faces: vertex indices of each triangle.
-        normals: unit normals at the corners of the triangles, or zero, if the file has normals that say more than the
-            triangles; else None.
+        normals: unit normals at the corners of the triangles, or zero, if the normals of the file are more accurate
+            than the triangles; else None.
     """
 
     vertices: Float[np.ndarray, "V 3"]
@@ -67,9 +67,9 @@ _FAR = 100
 
 
 def local_origin(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "3"]:
-    """Return the origin of the coordinates in which rays are traced, world units.
+    """Return the origin of the coordinate system for tracing, world units.
 
-    The origin is the origin of the world, unless the object lies far from it, as in georeferenced data.
+    The result is the origin of the world, unless the object is far away from the origin, as in georeferenced data.
 
     Args:
         points: vertices of the object, or corners of its bounds.
@@ -82,7 +82,7 @@ def local_origin(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "3"]:
 
 
 def origin_of_file(path: Path) -> Float[np.ndarray, "3"]:
-    """Return the `local_origin` of a mesh file; zero for a file without points, which loading the mesh refuses."""
+    """Return the `local_origin` of a mesh file; zero for a file without points (`load_mesh` refuses such files)."""
     try:
         points = load_points(path)
     except NerfroError:
@@ -91,14 +91,14 @@ def origin_of_file(path: Path) -> Float[np.ndarray, "3"]:
 
 
 def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
-    """Read a triangle mesh of any format that trimesh supports (ply, obj, stl, glb, ...) and merge duplicate vertices.
+    """Read a triangle mesh in any format of trimesh (ply, obj, stl, glb, ...) and merge duplicate vertices.
 
     Args:
         path: mesh file.
         accept_open_mesh: whether a mesh with holes is accepted.
 
     Raises:
-        NerfroError: the file is missing, unreadable, empty, not finite, or has holes that are not accepted.
+        NerfroError: the file is missing, unreadable, empty, not finite, or has unaccepted holes.
     """
     missing = "set medium.mesh to a closed triangle mesh (ply, obj, stl, glb)"
     with reading(path, "mesh ", advice="export it as ply, obj, stl or glb", missing=missing):
@@ -138,7 +138,7 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
 
 
 def _facing_outwards(mesh: TriangleMesh) -> TriangleMesh:
-    """Reverse triangles and normals that face the inside, and leave out normals that say nothing."""
+    """Reverse triangles and normals on the inside, and drop normals without information."""
     if not len(mesh.faces):
         return mesh
     inwards = inward_faces(mesh.vertices, mesh.faces)[:, None]
@@ -153,7 +153,7 @@ def _facing_outwards(mesh: TriangleMesh) -> TriangleMesh:
 
 
 def load_points(path: Path) -> Float[np.ndarray, "P 3"]:
-    """Read the points of a point cloud, or the vertices of a mesh, of any format that trimesh supports.
+    """Read the points of a point cloud, or the vertices of a mesh, in any format of trimesh.
 
     Raises:
         NerfroError: the file cannot be read.
@@ -163,7 +163,7 @@ def load_points(path: Path) -> Float[np.ndarray, "P 3"]:
 
 
 def _parse(path: Path) -> Any:
-    """Read a file with trimesh; scenes, which may hold several bodies, become one mesh."""
+    """Read a file with trimesh; scenes of several bodies become one mesh."""
     import trimesh
 
     loaded: Any = trimesh.load(path, process=False)

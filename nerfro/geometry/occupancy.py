@@ -18,11 +18,11 @@ PLANES = 16  # planes of a grid per update of the progress bar
 def occupancy_fraction(
     mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], resolution: int, subsamples: int = 4
 ) -> Float[np.ndarray, "X Y Z"]:
-    """Compute the fraction of sub-samples around every grid vertex that lie inside a mesh, A / (A + B).
+    """Compute the fraction A / (A + B) of sub-samples inside a mesh, for the sub-samples around every grid vertex.
 
     The subsamples^3 points around a vertex are spaced evenly from -h to h on each axis with the spacing h, as in the
     authors' code. A point is inside if a line from the point crosses the mesh an odd number of times. One line serves
-    a column of points, so the cost is that of rasterizing the mesh.
+    a column of points, so the computation costs as much as rasterizing the mesh.
 
     Args:
         mesh: world units. If the mesh is not closed, the majority of lines along x, y and z decides.
@@ -48,7 +48,7 @@ def occupancy_fraction(
 def triangles_by_plane(
     triangles: Float[np.ndarray, "F 3 3"], origin: float, spacing: float, num_planes: int, reach: float
 ) -> tuple[Int[np.ndarray, "U"], Int[np.ndarray, "Q"]]:
-    """Return triangles within `reach` of the planes x = origin + i spacing, sorted by plane, and each plane's start."""
+    """Return triangles within `reach` of the planes x = origin + i spacing, sorted by plane, with plane starts."""
     low = np.ceil((triangles[:, :, 0].min(1) - reach - origin) / spacing).astype(np.int64).clip(0, num_planes)
     high = np.floor((triangles[:, :, 0].max(1) + reach - origin) / spacing).astype(np.int64).clip(-1, num_planes - 1)
     uses = (high - low + 1).clip(0)
@@ -60,7 +60,7 @@ def triangles_by_plane(
 
 @compiled
 def _edge_side(ax: float, ay: float, bx: float, by: float, px: float, py: float) -> float:
-    """Return twice the signed area of (a, b, p), with a result that changes only its sign if a and b are swapped."""
+    """Return twice the signed area of (a, b, p); swapping a and b changes only the sign of the result."""
     if ax < bx or (ax == bx and ay < by):
         return (bx - ax) * (py - ay) - (by - ay) * (px - ax)
     return -((ax - bx) * (py - by) - (ay - by) * (px - bx))
@@ -68,7 +68,7 @@ def _edge_side(ax: float, ay: float, bx: float, by: float, px: float, py: float)
 
 @compiled
 def _is_left(side: float, ax: float, ay: float, bx: float, by: float) -> bool:
-    """Return the sign of `_edge_side`; points on a line are moved by (e, e^2), so that it is hit exactly once."""
+    """Return the sign of `_edge_side`; points on a line are moved by (e, e^2), so that one triangle of two is hit."""
     if side != 0.0:
         return side > 0.0
     if ay != by:
@@ -78,7 +78,7 @@ def _is_left(side: float, ax: float, ay: float, bx: float, by: float) -> bool:
 
 @compiled_parallel
 def _count_inside(triangles, order, starts, origin, spacing, offsets, first_plane, counts):
-    """Count the sub-samples inside for planes of the grid, which begin with number `first_plane`."""
+    """Count the sub-samples inside the mesh for the planes of the grid from number `first_plane` on."""
     num, resolution = len(offsets), counts.shape[1]
     for i in prange(len(counts)):
         crossings = np.zeros((resolution, num, num, resolution + 1), np.uint8)

@@ -14,12 +14,12 @@ _BARYCENTRIC, _DEVIATION = np.array([0.23, 0.31, 0.46]), np.array([0.07, 0.11, -
 
 
 def inward_faces(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Bool[np.ndarray, "F"]:
-    """Find the triangles whose front faces the inside, as parity along lines defines it.
+    """Find the triangles with the front towards the inside, where the parity along lines defines the inside.
 
     The outer surface of a body should face outwards and the surface of a cavity should face the cavity. Triangles that
     share an edge of two triangles form a patch with one orientation. On lines through a patch, an even number of
-    crossings in front of the patch means that its front is outside. Lines with an odd number of crossings in total,
-    for example through holes, have no vote.
+    crossings in front of the patch means that the front of the patch is outside. Lines with an odd number of crossings
+    in total, for example through holes, have no vote.
 
     Args:
         vertices: world units; equal positions must be merged.
@@ -73,7 +73,7 @@ def patches(faces: Int[np.ndarray, "F 3"]) -> tuple[Int[np.ndarray, "F"], Bool[n
 
 
 def _count_crossings(triangles: Float[np.ndarray, "F 3 3"], line: Float[np.ndarray, "3"]) -> tuple[int, int]:
-    """Count the triangles that a line through the origin crosses ahead of the origin and behind it."""
+    """Count the crossings of triangles with a line through the origin, ahead of the origin and behind the origin."""
     across = np.linalg.svd(line[None])[2][1:]
     x, y = (triangles @ axis for axis in across)
     parts = np.roll(x, -1, 1) * np.roll(y, -2, 1) - np.roll(y, -1, 1) * np.roll(x, -2, 1)
