@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -85,6 +85,16 @@ class Cameras:
     def select(self, views: list[int]) -> Cameras:
         """Select cameras, in the given order."""
         return self._each(lambda tensor: tensor[views])
+
+    @classmethod
+    def joined(cls, parts: Sequence[Cameras]) -> Cameras:
+        """Join cameras of one image size; the bounds of the rays are those of the first part."""
+        names = ("camera_to_world", "fx", "fy", "cx", "cy")
+        tensors: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+        if any(part.distortion is not None for part in parts):
+            lenses = [torch.zeros(len(part), 9) if part.distortion is None else part.distortion for part in parts]
+            tensors["distortion"] = torch.cat(lenses)
+        return replace(parts[0], **tensors)
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> Cameras:
         changed: dict[str, Any] = {name: change(x) for name, x in vars(self).items() if torch.is_tensor(x)}

@@ -1,34 +1,37 @@
-"""Input and output of the mask command: outlines, existing masks, and masks written beside their images."""
+"""The mask command: outlines and existing masks come in, masks are written beside their images."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, UInt8
-from omegaconf import MISSING, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
+from nerfro.allowed import Range
 from nerfro.cameras import Cameras
-from nerfro.capture.masking import Segmentation
+from nerfro.capture.masking import Segmentation, box_region, grab, polygon_mask, propagate
 from nerfro.capture.opencv import opencv
 from nerfro.capture.outline_hull import AGREES, FEWEST_VIEWS
 from nerfro.cli import warn
 from nerfro.data.base import DataSource, Frame
 from nerfro.data.image_files import read_mask, read_size, to_unit
-from nerfro.data.masks import without_masks
+from nerfro.data.masks import METHOD, POLYGON, checksum, method_of, without_masks
 from nerfro.errors import NerfroError, first_of
 from nerfro.files.drawing import sheet
 from nerfro.files.images import save_image
 from nerfro.files.reading import read_json
 from nerfro.paths import user_path
 
-_TILE, _COLUMNS, _NAME_LENGTH = 220, 6, 20  # width of a tile in pixels, tiles per row, characters of a name
+_SHEET = "masks.png"
+_TILE, _COLUMNS, _NAME_LENGTH = 220, 6, 16  # width of a tile in pixels, tiles per row, characters of a name
 _OUTSIDE = (0.0, 0.0, 90.0)  # 8-bit colour that is added outside the mask
 
 
@@ -42,13 +45,23 @@ class MaskConfig:
             which is the mask, in pixels; or a JSON file with such a mapping.
         hull_only: project the visual hull of at least three existing masks into all other views, without segmentation
             by colour.
-        overwrite: replace existing masks, starting from the outlines alone. Otherwise existing masks are kept and used.
+        overwrite: replace existing masks, starting from the outlines alone. Otherwise existing masks are kept and used,
+            except projections of a hull, which are made again.
+        view: serve a page on which you draw outlines in two to five views and see the projections of the hull in all
+            others; saving writes `outlines.json` to the data folder, and the masks.
+        host: address of the server of this page; 0.0.0.0 accepts connections from other machines.
+        port: port of the server; 0 for any free port.
+        open: open a browser.
     """
 
     data: Any = MISSING
     outlines: Any = None
     hull_only: bool = False
     overwrite: bool = False
+    view: bool = False
+    host: str = "localhost"
+    port: Annotated[int, Range(at_least=0, at_most=65535)] = 8008
+    open: bool = True
 
 
 def read_outlines(given: object) -> dict[str, list]:
@@ -100,10 +113,7 @@ def load_all(source: DataSource) -> tuple[Cameras, list[UInt8[np.ndarray, "H W 3
     sizes = {(part.width, part.height) for part in parts}
     if len(sizes) > 1:
         raise NerfroError(f"the splits have images of several sizes ({sorted(sizes)}); set data.eval_crop=1")
-    names = ("camera_to_world", "fx", "fy", "cx", "cy")
-    tensors: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-    lenses = [torch.zeros(len(part), 9) if part.distortion is None else part.distortion for part in parts]
-    return replace(parts[0], **tensors, distortion=torch.cat(lenses)), images, frames
+    return Cameras.joined(parts), images, frames
 
 
 def find_frame(name: str, frames: list[Frame]) -> int:
@@ -116,9 +126,7 @@ def find_frame(name: str, frames: list[Frame]) -> int:
     return found[0]
 
 
-def check_start(
-    frames: list[Frame], outlined: Mapping[int, object], kept: Mapping[int, object], hull_only: bool
-) -> None:
+def check_start(frames: list[Frame], outlined: Collection[int], kept: Collection[int], hull_only: bool) -> None:
     """Check that there is a mask or outline to start from, a mask to make, and a unique file for each mask."""
     if not outlined and not kept:
         raise NerfroError(
@@ -130,12 +138,6 @@ def check_start(
             f"hull_only=true needs masks or outlines of at least {FEWEST_VIEWS} images from all sides, and there are "
             f"{len(outlined) + len(kept)}; outline the object in more images"
         )
-    for view in outlined:
-        if view in kept:
-            raise NerfroError(
-                f"{frames[view].name} already has a mask, {kept[view]}; delete the mask, or set overwrite=true to "
-                "replace all masks"
-            )
     if len(kept) == len(frames):
         raise NerfroError("all images have masks; delete the wrong ones, or set overwrite=true")
     repeated = [path for path, count in Counter(mask_file(frame) for frame in frames).items() if count > 1]
@@ -161,12 +163,21 @@ def read_resized(mask: Path, size: tuple[int, int], labels: Sequence[int] | None
     return opencv().resize(coverage, size, interpolation=opencv().INTER_AREA) > 0.5
 
 
-def save_mask(frame: Frame, mask: Bool[np.ndarray, "H W"]) -> None:
-    """Write the mask of a frame as a black and white image in the size of its image file."""
+def save_mask(frame: Frame, mask: Bool[np.ndarray, "H W"], method: str | None = None) -> None:
+    """Write the mask of a frame as a black and white image in the size of its image file.
+
+    Args:
+        frame: the frame.
+        mask: pixels of the object.
+        method: what the mask follows from, for `nerfro.data.masks.method_of`; None for a mask of its own.
+    """
     picture, size = Image.fromarray(np.uint8(255 * mask)), read_size(frame.image)[:2]
     if picture.size != size:
         picture = picture.resize(size, Image.Resampling.BICUBIC).point(lambda level: 255 * (level > 127))
-    save_image(mask_file(frame), picture)
+    text = PngInfo()
+    if method is not None:
+        text.add_text(METHOD, f"{method}:{checksum(picture)}")
+    save_image(mask_file(frame), picture, pnginfo=text)
 
 
 def mask_sheet(
@@ -183,7 +194,7 @@ def mask_sheet(
     for view in order:
         inside, image = (torch.from_numpy(array[::stride, ::stride]) for array in (found.masks[view], images[view]))
         pictures.append(torch.where(inside[..., None], image / 255, image / 1020 + torch.tensor(_OUTSIDE) / 255))
-        captions.append(f"{labels.get(view, 'given')}  {frames[view].name[-_NAME_LENGTH:]}")
+        captions.append(f"{labels.get(view, 'given')}  {frames[view].image.stem[-_NAME_LENGTH:]}")
     legend = "overlap of GrabCut and visual hull; hull: the mask is the projection of the hull; dark: outside the mask"
     return sheet(pictures, captions, _TILE, _COLUMNS, legend)
 
@@ -207,3 +218,81 @@ def report_masks(frames: list[Frame], found: Segmentation) -> None:
             f"{len(doubtful)} of {len(frames)} views: GrabCut and the visual hull overlap by less than {AGREES} "
             f"({first_of(doubtful)}); their masks are projections of the hull and slightly too large: check them first"
         )
+
+
+@dataclass(frozen=True)
+class MaskTask:
+    """Views of a data set that need masks.
+
+    Attributes:
+        source: the data set.
+        cameras: cameras of all views.
+        images: 8-bit sRGB images of all views.
+        frames: frames of all views.
+        kept: existing masks by view, which do not change.
+        hull_only: do not use GrabCut.
+    """
+
+    source: DataSource
+    cameras: Cameras
+    images: list[UInt8[np.ndarray, "H W 3"]]
+    frames: list[Frame]
+    kept: dict[int, Bool[np.ndarray, "H W"]]
+    hull_only: bool
+
+    @classmethod
+    def load(cls, source: DataSource, config: DictConfig, outlines: Mapping[str, list]) -> MaskTask:
+        """Load all views and check the options; masks that follow from others are not kept.
+
+        Raises:
+            NerfroError: there is nothing to start from, or nothing to do.
+        """
+        opencv()  # report a missing package before the long work starts
+        cameras, images, frames = load_all(source)
+        outlined, kept = {find_frame(name, frames) for name in outlines}, {}
+        size = cameras.width, cameras.height
+        for view, frame in enumerate(frames):
+            if frame.mask is not None and not config.overwrite:
+                method = method_of(frame.mask)
+                if method is None or (method == POLYGON and view not in outlined):
+                    kept[view] = read_resized(frame.mask, size, source.mask_labels)
+        if not config.view:
+            check_start(frames, outlined, kept, config.hull_only)
+        return cls(source, cameras, images, frames, kept, config.hull_only or config.view)
+
+    def segment(self, outlines: Mapping[str, list], progress: Callable[[], None] = lambda: None) -> Segmentation:
+        """Make the masks of all views from the kept masks and outlines by image name.
+
+        Raises:
+            NerfroError: a mask is empty, or too few views agree with the given masks.
+        """
+        size, given = (self.cameras.width, self.cameras.height), dict(self.kept)
+        for name, outline in outlines.items():
+            view = find_frame(name, self.frames)
+            if view in self.kept:
+                raise NerfroError(
+                    f"{name} already has a mask, {self.frames[view].mask}; delete the mask, or set overwrite=true to "
+                    "replace all masks"
+                )
+            scaled = np.array(outline, np.float64) * size[0] / read_size(self.frames[view].image)[0]
+            if scaled.ndim == 2:  # the user's polygon is the mask
+                given[view] = polygon_mask(scaled, size)
+            else:
+                region = box_region(scaled, size)
+                given[view] = grab(self.images[view], region, region)
+        for view, mask in given.items():
+            if not mask.any():
+                raise NerfroError(f"{self.frames[view].name}: the outline or mask is empty; draw it around the object")
+        return propagate(self.images, self.cameras, given, self.hull_only, progress)
+
+    def save(self, outlines: Mapping[str, list], found: Segmentation) -> str:
+        """Write all masks but the kept ones and a contact sheet, print a report, and return a message."""
+        polygons = {find_frame(name, self.frames) for name, outline in outlines.items() if np.ndim(outline) == 2}
+        made = [view for view in range(len(self.frames)) if view not in self.kept]
+        for view in made:
+            method = POLYGON if view in polygons else found.shape if view in found.by_hull else None
+            save_mask(self.frames[view], found.masks[view], method)
+        path = self.source.root / _SHEET
+        save_image(path, mask_sheet(self.images, self.frames, found))
+        report_masks(self.frames, found)
+        return f"wrote {len(made)} masks beside their images (mask_*.png); check them in {path}"

@@ -154,6 +154,11 @@ def propagate(
     hull_only = hull_only or body is not None
     if not hull_only and len(given) < FEWEST_VIEWS:
         _add_reference_views(images, outlines)
+    if body is None and wanted and hull_only and len(outlines) < FEWEST_VIEWS:
+        raise NerfroError(
+            f"{len(outlines)} masks or outlines do not determine the shape; outline the object in two views from "
+            f"different directions if it is a body of revolution, otherwise in at least {FEWEST_VIEWS}"
+        )
     if body is None and wanted and len(outlines) < FEWEST_VIEWS:
         raise NerfroError(
             f"{len(outlines)} of {len(images)} views agree on a shape, {FEWEST_VIEWS} are needed, because the outlined "
@@ -174,9 +179,9 @@ def propagate(
         progress()
     by_hull = [view for view in wanted if view not in found]
     hull = OutlineHull(cameras, {**given, **found}).hull() if found else common
-    for view in by_hull:
-        found[view] = outlines.seen_from(view, hull)
-    agreement = {view: _overlap(mask, outlines.seen_from(view, hull)) for view, mask in given.items()}
+    seen = outlines.seen_from([*by_hull, *given], hull)
+    found |= {view: seen[view] for view in by_hull}
+    agreement = {view: _overlap(mask, seen[view]) for view, mask in given.items()}
     shape: Shape = "visual hull" if body is None else "body of revolution"
     return Segmentation({**given, **found}, overlaps, by_hull, shape, agreement)
 
@@ -185,7 +190,7 @@ def _guided(
     image: UInt8[np.ndarray, "H W 3"], outlines: OutlineHull, view: int, hull: TriangleMesh | None
 ) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
     """Return the projection of the hull of all other views, and the mask of GrabCut that starts from the projection."""
-    region = outlines.seen_from(view, outlines.hull(without=view) if view in outlines else hull)
+    region = outlines.seen_from([view], outlines.hull(without=view) if view in outlines else hull)[view]
     core = _distance(region) > _CORE * _diameter(region)
     return region, grab(image, region, _dilate(region, _REACH), core)
 
@@ -211,7 +216,7 @@ def _add_reference_views(images: Sequence[UInt8[np.ndarray, "H W 3"]], outlines:
     """Add views from new directions as long as all masks agree with their visual hull."""
     refused: list[int] = []
     while (view := outlines.next_view(refused)) is not None:
-        region = outlines.seen_from(view, outlines.hull())
+        region = outlines.seen_from([view], outlines.hull())[view]
         if not outlines.add_if_agreed(view, grab(images[view], region, _dilate(region, _REACH))):
             refused.append(view)
 

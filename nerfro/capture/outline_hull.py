@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -117,12 +117,13 @@ class OutlineHull:
             self._hulls[without] = carve_mesh(silhouettes, box, _VOXELS, wrong)
         return self._hulls[without]
 
-    def seen_from(self, view: int, hull: TriangleMesh | None) -> Bool[np.ndarray, "H W"]:
-        """Render the silhouette of a hull in the size of the images."""
+    def seen_from(self, views: Sequence[int], hull: TriangleMesh | None) -> dict[int, Bool[np.ndarray, "H W"]]:
+        """Render the silhouettes of a hull in the size of the images, by view."""
         if hull is None:
-            return np.zeros(self.size[::-1], bool)
-        seen = mesh_silhouettes(hull, self.cameras.select([view]), 1)[0].numpy().astype(np.float32)
-        return opencv().resize(seen, self.size, interpolation=opencv().INTER_LINEAR) > 0.5
+            return {view: np.zeros(self.size[::-1], bool) for view in views}
+        seen = mesh_silhouettes(hull, self.cameras.select(list(views)), 1).numpy().astype(np.float32)
+        enlarged = (opencv().resize(one, self.size, interpolation=opencv().INTER_LINEAR) > 0.5 for one in seen)
+        return dict(zip(views, enlarged, strict=True))
 
     def next_view(self, refused: list[int]) -> int | None:
         """Choose the nearest view whose direction differs from all added and refused views; None if there is none."""

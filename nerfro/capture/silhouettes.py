@@ -25,6 +25,8 @@ _MIN_PARTIAL = 0.2
 _REACH = 1.5
 # Smallest magnitude of a distance, in pixels, so that its sign agrees with the mask.
 _MIN_DISTANCE = 1e-3
+# Margin, in pixels, around the projected vertices of a mesh, because lens distortion bends edges between them.
+_MESH_MARGIN = 8
 
 
 def outline_distance(mask: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
@@ -108,11 +110,16 @@ class PixelBlocks:
 
 def mesh_silhouettes(mesh: TriangleMesh, cameras: Cameras, stride: int) -> Bool[Tensor, "V h w"]:
     """Test whether the rays through the centres of every stride-th pixel intersect a mesh."""
-    intersector = MeshIntersector(mesh.triangles)
-    rows, columns = torch.arange(0, cameras.height, stride), torch.arange(0, cameras.width, stride)
-    row, column = torch.meshgrid(rows, columns, indexing="ij")
-    seen = []
+    intersector, vertices = MeshIntersector(mesh.triangles), torch.from_numpy(mesh.vertices).float()
+    row, column = torch.meshgrid(
+        torch.arange(0, cameras.height, stride), torch.arange(0, cameras.width, stride), indexing="ij"
+    )
+    seen = torch.zeros(len(cameras), *row.shape, dtype=torch.bool)
     for view in range(len(cameras)):
-        rays = cameras.rays(torch.full_like(row, view).flatten(), row.flatten(), column.flatten())
-        seen.append((intersector.first_hits(rays.origins, rays.directions) >= 0).view(row.shape))
-    return torch.stack(seen)
+        pixels, depth = cameras.select([view]).project(vertices)
+        (left, top), (right, bottom) = pixels[0].amin(0) - _MESH_MARGIN, pixels[0].amax(0) + _MESH_MARGIN
+        near = (row >= top) & (row <= bottom) & (column >= left) & (column <= right)
+        near |= depth.amin() <= 0  # pixels of points behind the camera are invalid
+        rays = cameras.rays(torch.full((int(near.sum()),), view), row[near], column[near])
+        seen[view, near] = intersector.first_hits(rays.origins, rays.directions) >= 0
+    return seen

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -75,6 +75,22 @@ class Views:
         images = {name: p[chosen] if isinstance(p, Tensor) else p for name, p in images.items()}
         names, frames = [self.names[view] for view in chosen], [self.frames[view] for view in chosen if self.frames]
         return replace(self, cameras=self.cameras.select(chosen), names=names, frames=frames, **images)
+
+    def joined(self, other: Views) -> Views | None:
+        """Append other views, without their usable pixels; None unless both have image and mask files of one size."""
+        parts = self.images, other.images, self.masks, other.masks
+        if not all(isinstance(part, LazyImages) for part in parts) or self.images.shape != other.images.shape:
+            return None
+        images, more_images, masks, more_masks = cast(tuple[LazyImages, ...], parts)
+        return replace(
+            self,
+            cameras=Cameras.joined([self.cameras, other.cameras]),
+            images=images.joined(more_images),
+            masks=masks.joined(more_masks),
+            names=[*self.names, *other.names],
+            frames=[*self.frames, *other.frames],
+            usable=None,
+        )
 
     def spread(self, most: int) -> list[int]:
         """Return the indices of up to `most` evenly spread views, in ascending order."""

@@ -131,6 +131,10 @@ class LazyImages:
         """Return the images with the given indices, in this order."""
         return replace(self, files=[self.files[view] for view in views])
 
+    def joined(self, other: LazyImages) -> LazyImages:
+        """Append images of the same size that are read in the same way."""
+        return replace(self, files=[*self.files, *other.files], dtype=np.promote_types(self.dtype, other.dtype))
+
     def cut(self, window: Window) -> LazyImages:
         """Restrict every image to a window."""
         return replace(self, window=window)

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import os
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from nerfro.cli import warn
-from nerfro.data.base import Views
+from nerfro.data.base import DataSource, Views
 from nerfro.data.image_files import Levels, read_levels, read_mask, read_size
 from nerfro.data.lazy_images import LazyImages
 from nerfro.errors import NerfroError, first_of
@@ -21,6 +23,10 @@ from nerfro.files.reading import open_image
 _SPLIT_FOLDERS = ("train", "val", "test")
 # Lossless format first. Cameras and networks write suffixes in lower or upper case.
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+
+# Key of the text in the PNG file of a derived mask: the method and a checksum of the pixels. The method is the shape
+# whose projection the mask is, or POLYGON for an outline.
+METHOD, POLYGON = "nerfro", "polygon"
 
 _ignore_masks: ContextVar[bool] = ContextVar("ignore_masks", default=False)
 
@@ -33,6 +39,17 @@ def without_masks() -> Iterator[None]:
         yield
     finally:
         _ignore_masks.reset(token)
+
+
+def checksum(image: Image.Image) -> int:
+    return zlib.crc32(np.asarray(image).tobytes())
+
+
+def method_of(mask: Path) -> str | None:
+    """Return how nerfro derived a mask from others; None for all other masks, and for masks edited since."""
+    with open_image(mask, whole=False) as (image, _):
+        method, _, expected = str(image.info.get(METHOD, "")).partition(":")
+        return method if expected and expected == str(checksum(image)) else None
 
 
 def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None:
@@ -114,6 +131,16 @@ def masked_views(views: Views) -> Views:
     files, masks = zip(*((frame.image, frame.mask) for frame in some.frames), strict=True)
     found = find_masks(files, masks, images.downscale, images.size[::-1], views.mask_labels)
     return replace(some, masks=found if found is None or images.window is None else found.cut(images.window))
+
+
+def silhouette_views(source: DataSource) -> Views:
+    """Load the views of all splits that have masks, each image once; the first split alone if image sizes differ."""
+    first, *others = (masked_views(source.load(split)) for split in source.splits)
+    for views in others:
+        known = {frame.image for frame in first.frames}
+        fresh = [i for i, frame in enumerate(views.frames) if frame.image not in known]
+        first = (fresh and first.joined(views.select(fresh))) or first
+    return first
 
 
 def find_usable(

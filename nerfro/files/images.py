@@ -46,10 +46,10 @@ def save_png(path: Path | str, rgb: Float[Tensor, "H W 3"]) -> None:
     save_image(path, Image.fromarray(to_8bit(rgb).cpu().numpy()))
 
 
-def save_image(path: Path | str, image: Image.Image, optimize: bool = False) -> None:
-    """Write an image as PNG atomically."""
+def save_image(path: Path | str, image: Image.Image, **options: Any) -> None:
+    """Write an image as PNG atomically; `options` are those of Pillow's writer."""
     with atomic_file(path) as file:
-        image.save(file, "PNG", optimize=optimize)
+        image.save(file, "PNG", **options)
 
 
 def data_uri(pixels: UInt8[np.ndarray, "H W 3"], form: str, **options: Any) -> str:

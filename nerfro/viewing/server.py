@@ -1,4 +1,4 @@
-"""HTTP server for an interactive page and its updates; the server reads no files."""
+"""HTTP server for an interactive page, its updates and its requests; the server reads no files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -19,12 +19,15 @@ from nerfro.errors import NerfroError
 
 _WATCHED_SECONDS = 10.0  # a page counts as watched for so long after a request
 _MAX_LOSSES = 500  # maximum number of points of the curve
+_MAX_BODY = 2**22  # bytes of a request
 # Placeholder until the page is complete; browsers reload the placeholder every two seconds.
 _PLACEHOLDER = b'<!DOCTYPE html><meta http-equiv="refresh" content="2"><title>nerfro</title><p>The page is being made.'
 
+_FOREIGN, _NOT_FOUND = b"open the page by the address that nerfro has printed", b"this server has only the page at /"
+
 
 class PageServer:
-    """Serves a page at `/` and its updates at `/state`, in a background thread.
+    """Serves a page at `/`, its updates at `/state` and answers to its requests at `/answer`, in a background thread.
 
     The server answers requests of the page only: the header `Host` must name this machine, and the header `Origin` must
     be absent or name the page.
@@ -32,12 +35,17 @@ class PageServer:
     Args:
         host: address of the server; `localhost` accepts connections from this machine only.
         port: port of the server; 0 for any free port.
+        answer: converts the JSON value of a request (POST) to that of the answer. A `NerfroError` is sent as text.
+
+    Attributes:
+        ends: whether the answer to the present request is the last one.
+        ended: set after the browser has received the last answer.
 
     Raises:
         NerfroError: the address is not available.
     """
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, answer: Callable[[Any], Any] | None = None) -> None:
         try:
             self._server = _QuietServer((host, port), _Handler)
         except (OSError, OverflowError) as error:
@@ -46,7 +54,8 @@ class PageServer:
         self._server.daemon_threads = True
         self._server.page = self  # type: ignore[attr-defined]
         self.url = f"http://{host}:{self._server.server_address[1]}"
-        self._lock = threading.Lock()
+        self._lock, self._requests = threading.Lock(), threading.Lock()
+        self._to_answer, self.ends, self.ended = answer, False, threading.Event()
         self._page, self._update, self._version = _PLACEHOLDER, b"null", 0
         self._losses: list[tuple[int, float]] = []
         self._last_request = -_WATCHED_SECONDS
@@ -91,6 +100,16 @@ class PageServer:
             update = self._update if self._version > after else b"null"
         return b'{"losses": ' + losses + b', "news": ' + update + b"}"
 
+    def answer(self, request: bytes) -> tuple[HTTPStatus, bytes]:
+        """Answer a request of the page; requests are answered one after the other."""
+        if self._to_answer is None:
+            return HTTPStatus.NOT_FOUND, _NOT_FOUND
+        with self._requests:
+            try:
+                return HTTPStatus.OK, json.dumps(self._to_answer(json.loads(request))).encode()
+            except (NerfroError, ValueError, RecursionError) as error:  # the last two of requests that are not JSON
+                return HTTPStatus.BAD_REQUEST, str(error).encode()
+
     def close(self) -> None:
         """Stop the server."""
         self._server.shutdown()
@@ -119,7 +138,7 @@ class _Handler(BaseHTTPRequestHandler):
         except ValueError:  # brackets that are not an IPv6 address
             address = urlsplit("invalid")
         if not self._is_same_origin():
-            self._answer(HTTPStatus.FORBIDDEN, b"open the page by the address that nerfro has printed", "text/plain")
+            self._answer(HTTPStatus.FORBIDDEN, _FOREIGN, "text/plain")
         elif address.path == "/":
             self._answer(HTTPStatus.OK, page.page(), "text/html; charset=utf-8")
         elif address.path == "/state":
@@ -127,7 +146,22 @@ class _Handler(BaseHTTPRequestHandler):
             version = int(after) if re.fullmatch(r"[0-9]{1,18}", after) else 0
             self._answer(HTTPStatus.OK, page.state(version), "application/json")
         else:
-            self._answer(HTTPStatus.NOT_FOUND, b"this server has only the page at /", "text/plain")
+            self._answer(HTTPStatus.NOT_FOUND, _NOT_FOUND, "text/plain")
+
+    def do_POST(self) -> None:
+        page: PageServer = self.server.page  # type: ignore[attr-defined]
+        length = self.headers.get("Content-Length", "")
+        if not self._is_same_origin():
+            self._answer(HTTPStatus.FORBIDDEN, _FOREIGN, "text/plain")
+        elif self.path != "/answer":
+            self._answer(HTTPStatus.NOT_FOUND, _NOT_FOUND, "text/plain")
+        elif not re.fullmatch(r"[0-9]{1,9}", length) or int(length) > _MAX_BODY:
+            self._answer(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, b"the request is too large", "text/plain")
+        else:
+            status, body = page.answer(self.rfile.read(int(length)))
+            self._answer(status, body, "application/json" if status == HTTPStatus.OK else "text/plain; charset=utf-8")
+            if page.ends:
+                page.ended.set()
 
     def _is_same_origin(self) -> bool:
         """Check the headers of the request, to refuse pages of other origins and DNS rebinding."""

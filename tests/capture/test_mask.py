@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 from scipy.ndimage import gaussian_filter
 
 pytest.importorskip("cv2")
@@ -17,7 +19,10 @@ pytest.importorskip("cv2")
 from nerfro.cameras import Cameras
 from nerfro.capture.masking import polygon_mask, propagate
 from nerfro.data.blender import OpenCVData
+from nerfro.data.masks import method_of
 from tests.capture.photographs import look_at
+from tests.forked import Command
+from tests.viewing.browser import Browser, needs_chromium
 
 WIDTH, HEIGHT, FOCAL, NUM_VIEWS = 96, 72, 115.0, 14
 CENTRE, RADIUS = np.array([0.05, -0.03, 0.3]), 0.28
@@ -156,6 +161,27 @@ def test_polygons_are_the_masks_of_their_views(capture: Path, photographs: list,
     assert min(overlap(read(capture, view), mask) for view, (_, mask, _) in enumerate(photographs)) > 0.7
 
 
+def test_projections_are_made_again_and_edited_masks_are_kept(
+    capture: Path, photographs: list, command: Callable[..., str]
+) -> None:
+    for view in (1, 5, 9):
+        Image.fromarray(np.uint8(255 * photographs[view][1])).save(capture / "photos" / f"mask_p_{view}.png")
+    assert "wrote 11 masks" in command("mask", f"data.root={capture}", "hull_only=true")
+    file = capture / "photos" / "mask_p_3.png"
+    assert method_of(file) == "visual hull"
+    assert method_of(capture / "photos" / "mask_p_1.png") is None
+    with Image.open(file) as image:
+        edited, text = image.copy(), PngInfo()
+    for key, value in edited.info.items():  # some programs keep the text
+        text.add_text(key, value)
+    edited.paste(255, (40, 30, 42, 32))
+    edited.paste(0, (46, 34, 48, 36))
+    edited.save(file, pnginfo=text)
+    content = file.read_bytes()
+    assert "wrote 10 masks" in command("mask", f"data.root={capture}", "hull_only=true")
+    assert file.read_bytes() == content
+
+
 def test_a_polygon_covers_the_pixels_whose_centres_it_contains() -> None:
     square = [[2, 1], [7, 1], [7, 4], [2, 4]]
     expected = np.zeros((6, 9), bool)
@@ -215,3 +241,85 @@ def test_a_hull_alone_takes_three_masks(capture: Path, photographs: list, comman
     assert "hull_only=true needs masks or outlines of at least 3" in command(
         "mask", f"data.root={capture}", "hull_only=true"
     )
+
+
+def circle(mask: np.ndarray) -> list[tuple[float, float]]:
+    """Vertices around a disk."""
+    (rows, columns), turn = np.nonzero(mask), np.linspace(0, 2 * np.pi, 11)[:-1]
+    radius = 1.05 * np.sqrt(len(rows) / np.pi)
+    vertices = np.stack([columns.mean() + radius * np.cos(turn), rows.mean() + radius * np.sin(turn)], 1) + 0.5
+    return [(float(x), float(y)) for x, y in vertices]
+
+
+def on_screen(browser: Browser, x: float, y: float) -> tuple[float, float]:
+    matrix = "editor.svg.getScreenCTM()"
+    place = browser.evaluate(f"(({{ x, y }}) => [x, y])(new DOMPoint({x}, {y}).matrixTransform({matrix}))")
+    return place[0], place[1]
+
+
+def click(browser: Browser, x: float, y: float) -> None:
+    place = on_screen(browser, x, y)
+    browser.drag(place, place)
+
+
+def choose(browser: Browser, view: int) -> str:
+    """Show a view and return its name."""
+    name = f"photos/p_{view}.png"
+    browser.evaluate(f"tiles[views.findIndex(({{ name }}) => name === '{name}')].button.click()")
+    return f"state.outlines['{name}']"
+
+
+@needs_chromium
+def test_drawn_outlines_lead_to_the_masks_of_the_command(
+    capture: Path,
+    photographs: list,
+    tmp_path: Path,
+    command: Callable[..., str],
+) -> None:
+    options = [f"data.root={capture}", "view=true", "open=false", "port=0"]
+    served = Command("mask", options, tmp_path / "log")
+    address = served.until(r"outlines on (http://localhost:\d+);")[1]
+    with Browser(address, tmp_path, "--force-prefers-reduced-motion", size=(1000, 700)) as browser:
+        browser.wait_for("$('message').textContent.startsWith('0 masks or outlines do not determine the shape')")
+        for view in (1, 5, 9):
+            outline = choose(browser, view)
+            for x, y in circle(photographs[view][1]):
+                click(browser, x, y)
+            assert len(browser.evaluate(outline)) == 10
+        browser.wait_for("!$('message').classList.contains('busy') && Object.keys(state.notes).length === 3")
+        # Mouse: drag a vertex, insert one into an edge, and take both back.
+        drawn = browser.evaluate(outline)
+        browser.drag(on_screen(browser, *drawn[2]), on_screen(browser, drawn[2][0] - 9, drawn[2][1] + 5))
+        assert browser.evaluate(f"{outline}[2]") == pytest.approx([drawn[2][0] - 9, drawn[2][1] + 5], abs=0.3)
+        middle = browser.evaluate(f"[0, 1].map((axis) => ({outline}[6][axis] + {outline}[7][axis]) / 2)")
+        click(browser, *middle)
+        assert browser.evaluate(f"{outline}[7]") == pytest.approx(middle, abs=0.3)
+        for _ in range(2):
+            browser.evaluate("$('undo').click()")
+        assert browser.evaluate(outline) == drawn
+        # Keys: add a vertex, move it, remove it.
+        browser.evaluate("$('editor').focus()")
+        for key in ("Enter", "ArrowDown", "ArrowLeft"):
+            browser.press(key)
+        added = browser.evaluate(f"{outline}[10]")
+        assert added == pytest.approx([drawn[9][0] + 9, drawn[9][1] + 1])
+        browser.press("Delete")
+        assert browser.evaluate(outline) == drawn
+        # Fingers: a tap adds a vertex to another view.
+        outline = choose(browser, 12)
+        browser.touch([on_screen(browser, 30, 20)])
+        browser.wait_for(f"{outline} !== undefined")
+        browser.evaluate("$('clear').click()")
+        browser.evaluate("$('save').click()")
+        browser.wait_for("state.saved")
+        shown = browser.evaluate("state.masks")
+    assert served.wait() == 0, served.errors
+    assert len(shown) == NUM_VIEWS
+    other = shutil.copytree(capture, tmp_path / "other", ignore=shutil.ignore_patterns("mask*"))
+    printed = command(
+        "mask", f"data.root={other}", f"outlines={capture / 'outlines.json'}", "hull_only=true", "overwrite=true"
+    )
+    assert "wrote 14 masks" in printed
+    assert json.loads((capture / "outlines.json").read_text()).keys() == {f"photos/p_{view}.png" for view in (1, 5, 9)}
+    for view in range(NUM_VIEWS):
+        assert np.array_equal(read(capture, view), read(other, view))

@@ -72,6 +72,34 @@ def test_other_origins_are_refused(server: PageServer) -> None:
     assert get(server, "/", Host=f"[::1]:{port}")[0] == 200
 
 
+def test_requests_of_the_page_alone_are_answered() -> None:
+    def answer(value: object) -> object:
+        if value == "wrong":
+            raise NerfroError("this is wrong")
+        server.ends = True
+        return [value]
+
+    server = PageServer("localhost", 0, answer)
+    address = server.url.removeprefix("http://")
+
+    def post(body: str, path: str = "/answer", **headers: str) -> tuple[int, str]:
+        connection = http.client.HTTPConnection(address, timeout=10)
+        connection.request("POST", path, body, headers)
+        found = connection.getresponse()
+        return found.status, found.read().decode()
+
+    for foreign in ({"Origin": "http://evil.example"}, {"Origin": "null"}, {"Host": "evil.example"}):
+        assert post("3", **foreign)[0] == 403
+    assert post("3", "/state")[0] == 404
+    assert post("{")[0] == post("[" * 10**5)[0] == 400
+    assert post("3", **{"Content-Length": str(2**30)})[0] == 413
+    assert post('"wrong"') == (400, "this is wrong")
+    assert not server.ended.is_set()
+    assert post("3", Origin=server.url) == (200, "[3]")
+    assert server.ended.wait(10)
+    server.close()
+
+
 def test_taken_port_is_told(server: PageServer) -> None:
     with pytest.raises(NerfroError, match="is not available"):
         PageServer("localhost", int(server.url.rpartition(":")[2]))
