@@ -20,7 +20,7 @@ from nerfro.capture.surroundings import Observations
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.cli import entry_point, warn
 from nerfro.data.base import Views
-from nerfro.data.masks import masked_views
+from nerfro.data.masks import POLYGON, masked_views, method_of, silhouette_views
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.paths import resolve_path
@@ -34,9 +34,11 @@ def main(config: DictConfig) -> None:
     mesh = None if config.mesh is None else load_mesh(resolve_path(config.mesh))
     request = Request(config, list(HydraConfig.get().overrides.task))
     request.check()
-    views, silhouettes, overlaps = masked_views(build(config.data).load("train")), None, None
-    if mesh is None or views.masks is not None:
-        mesh, silhouettes, overlaps = _reconstruct(request, views, mesh)
+    source = build(config.data)
+    views, outlined = masked_views(source.load("train")), silhouette_views(source)
+    silhouettes, overlaps = None, None
+    if mesh is None or outlined.masks is not None:
+        mesh, outlined, silhouettes, overlaps = _reconstruct(request, outlined, mesh)
     location = config.mesh or str(request.folder / MESH)
     settings = surface_settings(request, views.cameras, mesh, location)
     observations = Observations(views, mesh, config.room)
@@ -52,34 +54,42 @@ def main(config: DictConfig) -> None:
         settings = surface_settings(request, views.cameras, mesh, location)
         if mesh is not given:
             if silhouettes is not None:
-                overlaps = report_overlaps(views, mesh, silhouettes, None, request.folder, list_all=False)
+                overlaps = report_overlaps(outlined, mesh, silhouettes, None, request.folder, list_all=False)
             found = find_medium(request, observations, location, settings)
     inside = surfaces_inside(found.medium)
     if overlaps is not None and inside:
-        draw_overlays(views, mesh, overlaps, inside, request.folder)
+        draw_overlays(outlined, mesh, overlaps, inside, request.folder)
     conclude(request, settings, found.index_settings, found.is_doubtful, observations.near, views.cameras, mesh)
 
 
 def _reconstruct(
     request: Request, views: Views, mesh: TriangleMesh | None
-) -> tuple[TriangleMesh, Silhouettes, Float[np.ndarray, "V"]]:
+) -> tuple[TriangleMesh, Views, Silhouettes, Float[np.ndarray, "V"]]:
     """Carve and fit the surface unless a mesh is given, and compare it with the masks.
 
+    Masks that are projections of a hull carry the shape of this hull, but are no evidence about the object.
+
     Returns:
-        The surface, the silhouettes of the masks, and the overlap of the surface with each mask.
+        The surface, the views whose masks are no projections, the silhouettes of these masks, and the overlap of the
+        surface with each of these masks.
     """
     config, folder = request.config, request.folder
-    silhouettes = read_silhouettes(views, request.box is not None)
+    all_silhouettes = read_silhouettes(views, request.box is not None)
+    own = [i for i, frame in enumerate(views.frames) if frame.mask is None or method_of(frame.mask) in (None, POLYGON)]
+    views, silhouettes = (views.select(own), all_silhouettes.select(own)) if own else (views, all_silhouettes)
+    if len(views) < len(all_silhouettes):
+        print(f"{len(all_silhouettes) - len(views)} masks are projections of a hull: the surface follows these masks, "
+              "but is not compared with them")  # fmt: skip
     wrong_masks = choose_wrong_masks(silhouettes, config.wrong_masks)
     require_consistent_poses(silhouettes, views.names, wrong_masks)
     surface = mesh
     if surface is None:
         options = config.resolution, wrong_masks, config.keep, config.smoothing, config.symmetry
-        surface = make_mesh(silhouettes, request.box, *options)
+        surface = make_mesh(all_silhouettes, request.box, *options, evidence=silhouettes)
         surface.save(folder / MESH)
     # The report is written before the medium is built, because the report shows why a medium refuses a surface.
     overlaps = report_overlaps(views, surface, silhouettes, wrong_masks if mesh is None else None, folder)
-    return surface, silhouettes, overlaps
+    return surface, views, silhouettes, overlaps
 
 
 if __name__ == "__main__":

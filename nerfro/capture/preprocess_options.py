@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 import typing
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from nerfro.allowed import Count, Natural, NotNegative, Range, corners_of_box
 from nerfro.cameras import Cameras
 from nerfro.capture.overlaps import REPORT, SHEET
-from nerfro.capture.overrides import as_overrides, is_given, of_groups
+from nerfro.capture.overrides import as_overrides, is_given, of_groups, print_next
 from nerfro.capture.revolution import Symmetry
 from nerfro.capture.upright import find_up
 from nerfro.errors import NerfroError
@@ -38,7 +37,8 @@ class PreprocessConfig:
     """Options of `python -m nerfro.preprocess`.
 
     Attributes:
-        data: data set (options of the group `data`); the training views are used.
+        data: data set (options of the group `data`); the photographs of the training views and the masks of all views
+            are used.
         medium: medium that is built from the surface (options of the group `medium`).
         refine: after the search for the index, refine the surface until its refractions match the photographs.
         mesh: known surface, which is compared with the masks; replaces the hull.
@@ -206,4 +206,4 @@ def conclude(
     if doubtful:
         print(f"the photographs do not determine the index; add {' '.join(f'{name}=N' for name in index)}")
     print("for near surroundings add +experiment=refractive_room; the baseline is +experiment=mipnerf")
-    print(f"train on it: {shlex.join(['python', '-m', 'nerfro.train', *options])}")
+    print_next("train on it", "train", options)

@@ -87,6 +87,7 @@ def make_mesh(
     keep: int | None,
     smoothing: float,
     symmetry: Symmetry | None = None,
+    evidence: Silhouettes | None = None,
 ) -> TriangleMesh:
     """Carve the visual hull and fit a smooth surface.
 
@@ -99,6 +100,7 @@ def make_mesh(
         smoothing: factor of the estimated smoothing strength; 0 returns the hull itself.
         symmetry: also fit a body of revolution. `auto` uses this body if its overlap with the masks is at least as
             large, `axis` also if the overlap is slightly smaller.
+        evidence: silhouettes that decide between the two surfaces; by default all.
     """
     box = _object_box(silhouettes, wrong_masks) if corners is None else corners
     with bar("carving") as progress:
@@ -111,7 +113,7 @@ def make_mesh(
     if symmetry is not None:
         with bar("finding the axis") as progress:
             revolution = fit_revolution(mesh, silhouettes, progress)
-        mesh = _choose_symmetry(revolution, mesh, silhouettes, symmetry)
+        mesh = _choose_symmetry(revolution, mesh, evidence or silhouettes, symmetry)
     if num_kept < num_parts:
         print(f"kept the largest {num_kept} of {num_parts} separate components")
     if reaches_border(distances):

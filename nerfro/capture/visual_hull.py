@@ -54,6 +54,10 @@ class Silhouettes:
     def __len__(self) -> int:
         return len(self.masks)
 
+    def select(self, views: list[int]) -> Silhouettes:
+        """Select views, in the given order."""
+        return Silhouettes(self.cameras.select(views), self.masks[views], self.distances[views], self.cut[views])
+
     def depth_inside(self, view: int, points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
         """Compute the distances of points to the outline of one view.
 
