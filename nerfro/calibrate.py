@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from nerfro.capture.boards import TagBoard, print_sheets
 from nerfro.capture.calibrate_options import CalibrateConfig, check_options, make_board
 from nerfro.capture.calibrated_data import FILES, ray_range, relative, split_views, write_calibrated
 from nerfro.capture.calibration import Calibration, calibrate
+from nerfro.capture.overrides import print_next
 from nerfro.capture.photographs import list_photographs, luminance, outside
 from nerfro.capture.reconstruction import SfmSettings, find_model, import_model
 from nerfro.cli import entry_point, warn
@@ -52,17 +52,18 @@ def main(config: DictConfig) -> None:
         calibration = calibrate(sightings, size, config.lens)
         quads, points = [sheet.corners for sheet in board.sheets()], np.empty((0, 3))
         seen = np.concatenate(quads)
-    _report(calibration, "points" if board is None else "tags", config.lens == "pinhole")
+    # With an existing model, the option has no effect.
+    may_distort = config.lens == "pinhole" and (board is not None or model.is_relative_to(out / "sparse"))
+    _report(calibration, "points" if board is None else "tags", may_distort, out)
     splits = split_views([image.name for image in images if image.name in calibration.poses], config.test_every)
     reach = ray_range(calibration, seen)
     written = write_calibrated(out, images, size, calibration, splits, config.target, quads, points, reach)
     print(f"wrote {', '.join(written)}")
     options = ["data=opencv", f"data.root={out}", *reach]
     if any(masks):
-        command = ["nerfro.preprocess", *options, "medium.ior=1.33"]
+        print_next("next", "preprocess", [*options, "medium.ior=1.33"])
     else:
-        command = ["nerfro.mask", *options, "outlines={NAME:[LEFT,TOP,RIGHT,BOTTOM]}"]
-    print(f"next: {shlex.join(['python', '-m', *command])}")
+        print_next("next", "mask", [*options, "view=true"])
 
 
 def _write_board(board: TagBoard | None, out: Path, overwrite: bool) -> None:
@@ -73,11 +74,14 @@ def _write_board(board: TagBoard | None, out: Path, overwrite: bool) -> None:
     print(f"wrote {files[0]} ({len(files) - 1} pages, in true size if the unit is a metre) and the pages as PNG")
 
 
-def _report(calibration: Calibration, feature: str, may_distort: bool) -> None:
+def _report(calibration: Calibration, feature: str, may_distort: bool, out: Path) -> None:
     print("\n".join(calibration.lines(feature)))
     lens = calibration.intrinsics
     if calibration.mean_error > _MAX_ERROR and may_distort and not lens.distortion:
-        warn("the reprojection error is large; for a lens with distortion set lens=radial or lens=opencv")
+        warn(
+            "the reprojection error is large; for a lens with distortion set lens=radial or lens=opencv, and delete "
+            f"{out / 'sparse'} if it exists"
+        )
     if lens.focal_deviation is not None and lens.focal_deviation > _MAX_FOCAL_DEVIATION * lens.matrix[0, 0]:
         warn("the focal length is uncertain; photograph the board also at a slant, and from near and far")
 

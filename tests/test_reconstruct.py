@@ -6,6 +6,7 @@ import functools
 import importlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,11 +17,13 @@ from pathlib import Path
 import pytest
 import torch
 from hydra.core.global_hydra import GlobalHydra
+from PIL import ExifTags, Image
 
 import nerfro.reconstruct
 import nerfro.train
 from nerfro.capture import refinement
 from nerfro.files.images import save_png
+from nerfro.files.reading import open_image
 from nerfro.pipeline import stages
 from nerfro.pipeline.hypotheses import Hypothesis
 from nerfro.pipeline.stages import run_command
@@ -57,6 +60,25 @@ def test_links_to_deleted_photographs_are_removed(photos: Path, tmp_path: Path) 
     stages.link_photographs(photos, photos.parent / "silhouettes", tmp_path / "out")
     assert sorted(file.name for file in (tmp_path / "out" / "images").iterdir()) == ["IMG_0.png", "IMG_2.png"]
     assert len(list((tmp_path / "out" / "masks").iterdir())) == 3
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".heic"])
+def test_photographs_of_a_telephone_become_upright(suffix: str, tmp_path: Path) -> None:
+    if suffix == ".heic":
+        pytest.importorskip("pillow_heif").register_heif_opener()
+    lying, exif = Image.new("RGB", (96, 64), (200, 30, 30)), Image.Exif()
+    lying.paste((30, 30, 200), (48, 0, 96, 64))
+    exif[ExifTags.Base.Orientation] = 6  # the left edge is on top
+    exif[ExifTags.Base.Model] = "telephone"
+    (tmp_path / "photos").mkdir()
+    lying.save(tmp_path / "photos" / f"IMG_1{suffix}", exif=exif.tobytes())
+    stages.link_photographs(tmp_path / "photos", None, tmp_path / "out")
+    with open_image(tmp_path / "out" / "images" / "IMG_1.jpg") as (upright, _):
+        assert upright.size == (64, 96)
+        assert upright.getexif()[ExifTags.Base.Model] == "telephone"
+        top, bottom = (upright.getpixel((32, row)) for row in (12, 84))
+    assert top == pytest.approx((200, 30, 30), abs=12)
+    assert bottom == pytest.approx((30, 30, 200), abs=12)
 
 
 class Pretended:
@@ -254,14 +276,21 @@ def test_what_was_found_chooses_the_experiment(
         (("images=PHOTOS", "data.root=PHOTOS"), "images= and video= are for photographs without poses"),
         (("images=PHOTOS", "video=PHOTOS"), "images= and video= are both given"),
         (("video=PHOTOS/none.mp4",), "none.mp4 does not exist; give a video file, or images=FOLDER for photographs"),
-        (("images=PHOTOS",), "the photographs have no masks; draw the outline of the object in two to five images of"),
+        (("images=PHOTOS",), "the photographs have no masks; add mask='view=true' to draw the outline"),
         (("data.root=PHOTOS", "masks=PHOTOS"), "masks= needs images="),
         (("images=PHOTOS/none",), "none is not a folder; it should hold the images"),
+        (("images=PHOTOS/film",), "film holds no image, but .mp4 files; allowed are"),
+        (("images=PHOTOS/two",), "2 photographs do not determine poses and shape"),
     ],
 )
 def test_what_contradicts_itself_is_refused(
     reconstruct: Reconstruct, pretended: Pretended, photos: Path, overrides: tuple[str, ...], told: str
 ) -> None:
+    (photos / "film").mkdir()
+    (photos / "film" / "CLIP.mp4").touch()
+    (photos / "two").mkdir()
+    for i in range(2):
+        shutil.copy(photos / f"IMG_{i}.png", photos / "two")
     refused = reconstruct(f"out={pretended.out}", *(text.replace("PHOTOS", str(photos)) for text in overrides))
     assert refused.code == 1
     assert told in refused.err

@@ -2,8 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Iterable, Mapping
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+
+STAGE = "NERFRO_STAGE"  # environment variable that is set in the stages of nerfro.reconstruct
+
+
+def print_next(label: str, command: str, options: Sequence[str]) -> None:
+    """Print the command that follows, unless nerfro.reconstruct runs the next stage."""
+    if STAGE not in os.environ:
+        print(f"{label}: {shlex.join(['python', '-m', f'nerfro.{command}', *options])}")
 
 
 def is_given(option: str, overrides: Iterable[str]) -> bool:

@@ -8,15 +8,45 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
+from PIL import ExifTags, ImageOps
 
 from nerfro.capture.boards import Sighting
 from nerfro.data.frames import list_images
-from nerfro.data.image_files import read_mask, read_rgb, to_unit
+from nerfro.data.image_files import IMAGE_SUFFIXES, read_mask, read_rgb, read_size, to_unit
 from nerfro.errors import NerfroError
+from nerfro.files.atomic import atomic_file
+from nerfro.files.reading import open_image
 from nerfro.light import to_linear
 from nerfro.progress import track
 
+HEIF_SUFFIXES = (".heic", ".heif")
+PHOTOGRAPH_SUFFIXES = (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)
+_QUALITY = 95  # of converted photographs
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear sRGB (ITU-R BT.709)
+
+
+def place_photograph(file: Path, folder: Path) -> None:
+    """Link a photograph into a folder; one in HEIC format or with an EXIF orientation is converted to an upright JPEG.
+
+    Existing files are kept.
+    """
+    if file.suffix.lower() in HEIF_SUFFIXES:
+        try:
+            import pillow_heif
+        except ImportError as error:
+            raise NerfroError(f"{file} needs pillow-heif; pip install 'nerfro[capture]', or give JPEG files") from error
+        pillow_heif.register_heif_opener()
+    place, converted = folder / file.name, folder / f"{file.stem}.jpg"
+    if place.exists() or converted.exists():
+        return
+    with open_image(file, upright=False) as (image, _):
+        turned = image.getexif().get(ExifTags.Base.Orientation, 1) in range(2, 9)
+        if file.suffix.lower() in HEIF_SUFFIXES or turned:
+            upright = ImageOps.exif_transpose(image).convert("RGB")
+            with atomic_file(converted) as output:
+                upright.save(output, "JPEG", quality=_QUALITY, exif=upright.getexif())
+            return
+    place.symlink_to(file.resolve())
 
 
 def list_photographs(folder: Path) -> tuple[list[Path], tuple[int, int]]:
@@ -25,14 +55,19 @@ def list_photographs(folder: Path) -> tuple[list[Path], tuple[int, int]]:
     repeated = [stem for stem, count in Counter(image.stem for image in images).items() if count > 1]
     if repeated:
         raise NerfroError(f"{folder} contains several images named {repeated[0]}; keep one of each name")
-    shapes = {image: read_rgb(image, "drop").shape[1::-1] for image in track("reading", images)}
+    shapes = {image: read_size(image)[:2] for image in images}
     ((size, _),) = Counter(shapes.values()).most_common(1)
-    odd = next((image for image in images if shapes[image] != size), None)
-    if odd is not None:
+    odd = [image for image in images if shapes[image] != size]
+    if odd:
+        way_out = "rotate or remove this image"
+        if shapes[odd[0]] == size[::-1]:
+            way_out = "the photographs are portrait and landscape, so remove those of one kind, or rotate their pixels"
         raise NerfroError(
-            f"image {odd} has {shapes[odd][0]}x{shapes[odd][1]} pixels, but most images have {size[0]}x{size[1]}; all "
-            "images must have one lens and size: rotate or remove this image"
+            f"image {odd[0]} has {shapes[odd[0]][0]}x{shapes[odd[0]][1]} pixels, but {len(images) - len(odd)} of "
+            f"{len(images)} images have {size[0]}x{size[1]}; all images must have one lens and size: {way_out}"
         )
+    for image in track("reading", images):
+        read_rgb(image, "drop")  # raises an error for a damaged file before the long work starts
     return images, size
 
 

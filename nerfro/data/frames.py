@@ -20,7 +20,7 @@ from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb
 from nerfro.data.lazy_images import LazyImages
 from nerfro.data.lenses import Lens, check_lenses
 from nerfro.data.masks import find_mask, find_masks, find_usable
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, first_of
 from nerfro.paths import refuse_root, resolve_path
 
 Every = Annotated[int, Range(at_least=2)]  # every n-th view is a test view
@@ -171,7 +171,7 @@ def _check_bounds(near: float | None, far: float | None) -> None:
         raise NerfroError(f"data.near={near} and data.far={far} are not an interval; take 0 <= near < far")
 
 
-def list_images(folder: Path) -> list[Path]:
+def list_images(folder: Path, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> list[Path]:
     """List the image files of a folder by name, without masks (`mask_*`) and hidden files.
 
     Raises:
@@ -179,10 +179,14 @@ def list_images(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise NerfroError(f"{folder} is not a folder; it should hold the images, see docs/guides/data_formats.md")
-    images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
-    images = [path for path in images if not path.name.startswith(("mask_", "."))]
+    files = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(("mask_", "."))]
+    images = [path for path in files if path.suffix.lower() in suffixes]
     if not images:
-        raise NerfroError(f"{folder} holds no image; see docs/guides/data_formats.md")
+        found = sorted({path.suffix.lower() for path in files if path.suffix})
+        raise NerfroError(
+            f"{folder} holds no image{f', but {first_of(found)} files' if found else ''}; allowed are "
+            f"{', '.join(suffixes)}. nerfro.reconstruct also reads HEIC photographs and, with video=FILE, videos"
+        )
     return sorted(images)
 
 

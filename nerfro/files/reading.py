@@ -63,12 +63,13 @@ def reading(
 
 
 @contextlib.contextmanager
-def open_image(path: Path, whole: bool = True) -> Iterator[tuple[Image.Image, int]]:
+def open_image(path: Path, whole: bool = True, upright: bool = True) -> Iterator[tuple[Image.Image, int]]:
     """Open an image file, and yield it with the bits per channel of the file, of which Pillow silently keeps 8.
 
     Args:
         path: the file.
         whole: whether the end of a PNG file must be there; Pillow decodes the file without it.
+        upright: whether to refuse an EXIF orientation.
 
     Raises:
         NerfroError: the file is missing or damaged, has more than `MAX_PIXELS` pixels, or has an EXIF orientation.
@@ -86,7 +87,8 @@ def open_image(path: Path, whole: bool = True) -> Iterator[tuple[Image.Image, in
         if too_large:
             raise NerfroError(f"image {path} has more than {MAX_PIXELS / 1e6:.0f} million pixels; downscale the image")
         with image:
-            _require_upright(image, path)
+            if upright:
+                _require_upright(image, path)
             if image.format == "PNG" and whole:
                 _require_end(file)
             yield image, _bits(image, file)

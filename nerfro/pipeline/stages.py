@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import os
 import shlex
 import signal
 import subprocess
@@ -12,10 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
+from nerfro.capture.overrides import STAGE
+from nerfro.capture.photographs import PHOTOGRAPH_SUFFIXES, place_photograph
 from nerfro.cli import EXIT_INTERRUPTED
 from nerfro.data.frames import list_images
 from nerfro.data.image_files import IMAGE_SUFFIXES
 from nerfro.errors import Interrupted, NerfroError
+from nerfro.progress import track
 from nerfro.trust import command_of_module
 
 _INTERRUPTED = (EXIT_INTERRUPTED, -signal.SIGINT, -signal.SIGTERM)  # exit statuses
@@ -87,7 +91,7 @@ def run_command(command: list[str]) -> int:
 
     previous = {number: signal.signal(number, forward) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        process = subprocess.Popen(command)
+        process = subprocess.Popen(command, env={**os.environ, STAGE: "1"})
         if terminates:  # the signal arrived before the command had started
             process.terminate()
         while process.poll() is None:
@@ -109,25 +113,28 @@ def move_aside(folder: Path) -> Path:
 def link_photographs(photographs: Path, masks: Path | None, out: Path) -> None:
     """Link photographs into `out`/images and masks into `out`/masks, so that no result lies among the originals.
 
-    Existing links and files are kept, except links to deleted files.
+    Existing links and files are kept, except links to deleted files. Photographs in HEIC format and those with an EXIF
+    orientation are converted.
 
     Args:
         photographs: folder of the photographs, which may also contain masks (`mask_*`).
         masks: folder of the masks, `<photograph>.png` or `mask_<photograph>.png`.
         out: folder of the data set.
     """
-    list_images(photographs)  # raises an error for a folder without images
+    list_images(photographs, PHOTOGRAPH_SUFFIXES)  # raises an error for a folder without photographs
     for link in (*out.glob("images/*"), *out.glob("masks/*")):
         if not link.exists():
             link.unlink()
     for folder in (photographs, *([] if masks is None else [masks])):
         if not folder.is_dir():
             raise NerfroError(f"masks={folder} is not a folder; give the folder of the masks of the photographs")
-        for file in sorted(folder.iterdir()):
-            if file.suffix.lower() not in IMAGE_SUFFIXES or file.name.startswith("."):
-                continue
+        suffixes = PHOTOGRAPH_SUFFIXES if folder == photographs else IMAGE_SUFFIXES
+        files = (file for file in folder.iterdir() if file.suffix.lower() in suffixes)
+        for file in track("linking", sorted(file for file in files if not file.name.startswith("."))):
             among_images = folder == photographs or file.name.startswith("mask_")
-            link = out / ("images" if among_images else "masks") / file.name
-            link.parent.mkdir(parents=True, exist_ok=True)
-            if not link.exists():
-                link.symlink_to(file.resolve())
+            place = out / ("images" if among_images else "masks")
+            place.mkdir(parents=True, exist_ok=True)
+            if folder == photographs:
+                place_photograph(file, place)
+            elif not (place / file.name).exists():
+                (place / file.name).symlink_to(file.resolve())

@@ -26,6 +26,7 @@ from nerfro.training.run_folder import CONFIG_FILE
 # Smallest gain of bent rays over straight rays in short trainings, in dB. On a simulated empty glass, a gain of 0.25 dB
 # after 40 seconds became a loss of 0.13 dB after three minutes (docs/lab/hypotheses.md).
 _MIN_GAIN = 0.5
+_FEWEST = 3  # photographs
 _MASKS = ("masks/*", "masks/*/*", "mask_*", "*/mask_*")  # where loaders search for masks
 
 
@@ -38,11 +39,17 @@ def calibrate(config: DictConfig, data: list[str], out: Path) -> list[str]:
         if not (out / REPORT).is_file():
             extract_frames(user_path(config.video), photographs, config.frames)
     link_photographs(photographs, None if config.masks is None else user_path(config.masks), out)
-    if not config.outlines and not any(file for place in _MASKS for file in out.glob(place)):
-        example = list_images(photographs)[0].stem
+    linked = list_images(out / "images")
+    if len(linked) < _FEWEST:
         raise NerfroError(
-            f"the photographs have no masks; draw the outline of the object in two to five images of {photographs} and "
-            f"add outlines={{{example}:[[COLUMN,ROW],...],...}}, or give masks=FOLDER"
+            f"{len(linked)} photographs do not determine poses and shape; take at least {_FEWEST}, better 60, from all "
+            "sides"
+        )
+    draws = "view=true" in shlex.split(config.mask)
+    if not config.outlines and not draws and not any(file for place in _MASKS for file in out.glob(place)):
+        raise NerfroError(
+            "the photographs have no masks; add mask='view=true' to draw the outline of the object in two to five "
+            f"images in the browser, outlines={{{linked[0].stem}:[[COLUMN,ROW],...],...}}, or masks=FOLDER"
         )
     options = [*as_overrides({"images": out / "images", "out": out}), "target=colmap", "overwrite=true"]
     options += [text.removeprefix("data.") for text in data if text.startswith("data.mask_labels=")]
