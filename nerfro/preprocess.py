@@ -20,7 +20,7 @@ from nerfro.capture.surroundings import Observations
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.cli import entry_point, warn
 from nerfro.data.base import Views
-from nerfro.data.masks import POLYGON, masked_views, method_of, silhouette_views
+from nerfro.data.masks import POLYGON, masked_views, method_of, with_other_splits
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.paths import resolve_path
@@ -35,8 +35,8 @@ def main(config: DictConfig) -> None:
     request = Request(config, list(HydraConfig.get().overrides.task))
     request.check()
     source = build(config.data)
-    views, outlined = masked_views(source.load("train")), silhouette_views(source)
-    silhouettes, overlaps = None, None
+    views, silhouettes, overlaps = masked_views(source.load("train")), None, None
+    outlined = with_other_splits(views, source, "train")
     if mesh is None or outlined.masks is not None:
         mesh, outlined, silhouettes, overlaps = _reconstruct(request, outlined, mesh)
     location = config.mesh or str(request.folder / MESH)
@@ -78,8 +78,8 @@ def _reconstruct(
     own = [i for i, frame in enumerate(views.frames) if frame.mask is None or method_of(frame.mask) in (None, POLYGON)]
     views, silhouettes = (views.select(own), all_silhouettes.select(own)) if own else (views, all_silhouettes)
     if len(views) < len(all_silhouettes):
-        print(f"{len(all_silhouettes) - len(views)} masks are projections of a hull: the surface follows these masks, "
-              "but is not compared with them")  # fmt: skip
+        num_projections = len(all_silhouettes) - len(views)
+        print(f"{num_projections} masks are projections of a hull, which shape the surface but are no evidence")
     wrong_masks = choose_wrong_masks(silhouettes, config.wrong_masks)
     require_consistent_poses(silhouettes, views.names, wrong_masks)
     surface = mesh

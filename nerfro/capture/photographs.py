@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import ExifTags, ImageOps
+from PIL import ImageOps
 
 from nerfro.capture.boards import Sighting
 from nerfro.data.frames import list_images
 from nerfro.data.image_files import IMAGE_SUFFIXES, read_mask, read_rgb, read_size, to_unit
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import atomic_file
-from nerfro.files.reading import open_image
+from nerfro.files.reading import open_image, orientation_of
 from nerfro.light import to_linear
 from nerfro.progress import track
 
@@ -40,8 +40,7 @@ def place_photograph(file: Path, folder: Path) -> None:
     if place.exists() or converted.exists():
         return
     with open_image(file, upright=False) as (image, _):
-        turned = image.getexif().get(ExifTags.Base.Orientation, 1) in range(2, 9)
-        if file.suffix.lower() in HEIF_SUFFIXES or turned:
+        if file.suffix.lower() in HEIF_SUFFIXES or orientation_of(image) in range(2, 9):
             upright = ImageOps.exif_transpose(image).convert("RGB")
             with atomic_file(converted) as output:
                 upright.save(output, "JPEG", quality=_QUALITY, exif=upright.getexif())

@@ -133,14 +133,14 @@ def masked_views(views: Views) -> Views:
     return replace(some, masks=found if found is None or images.window is None else found.cut(images.window))
 
 
-def silhouette_views(source: DataSource) -> Views:
-    """Load the views of all splits that have masks, each image once; the first split alone if image sizes differ."""
-    first, *others = (masked_views(source.load(split)) for split in source.splits)
-    for views in others:
-        known = {frame.image for frame in first.frames}
-        fresh = [i for i, frame in enumerate(views.frames) if frame.image not in known]
-        first = (fresh and first.joined(views.select(fresh))) or first
-    return first
+def with_other_splits(views: Views, source: DataSource, split: str) -> Views:
+    """Append the views of all other splits that have masks, each image once, if their images have the same size."""
+    for other in source.splits:
+        more = views if other == split else masked_views(source.load(other))
+        known = {frame.image for frame in views.frames}
+        fresh = [i for i, frame in enumerate(more.frames) if frame.image not in known]
+        views = (fresh and views.joined(more.select(fresh))) or views
+    return views
 
 
 def find_usable(

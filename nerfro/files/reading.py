@@ -121,11 +121,16 @@ def _require_end(file: BinaryIO) -> None:
     file.seek(place)
 
 
-def _require_upright(image: Image.Image, path: Path) -> None:
-    """Refuse an EXIF orientation, because it is unknown whether poses and masks refer to the rotated pixels."""
+def orientation_of(image: Image.Image) -> int:
+    """Return the EXIF orientation of an image; 1 is upright."""
     tags = image.tag_v2 if isinstance(image, TiffImagePlugin.TiffImageFile) else {}
     tags = image.getexif() if "exif" in image.info else tags
-    orientation = tags.get(ExifTags.Base.Orientation, 1)
+    return tags.get(ExifTags.Base.Orientation, 1)
+
+
+def _require_upright(image: Image.Image, path: Path) -> None:
+    """Refuse an EXIF orientation, because it is unknown whether poses and masks refer to the rotated pixels."""
+    orientation = orientation_of(image)
     if orientation in range(2, 9):
         raise NerfroError(
             f"image {path} has EXIF orientation {orientation}; rotate its pixels (magick mogrify -auto-orient), or "
