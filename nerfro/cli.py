@@ -251,6 +251,9 @@ def _description(error: Exception) -> str:
     # Hydra refuses a group without an option (field=null), and flags together, by a ValueError.
     if isinstance(error, ValueError) and any(place[0].startswith("hydra.") for place in _places(error)[-1:]):
         return f"{error}; give the name of an option, as in field=nerf, and see --help for the flags"
+    if type(error).__module__.partition(".")[0] in ("joblib", "ray", "submitit"):  # as that a worker was killed
+        reason = str(error).strip().split("\n")[0].rstrip(".")
+        return f"{reason} ({type(error).__name__}); repeat the command to continue the sweep"
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return f"no space is left for {error.filename or 'a file'}; free some, or write to another folder"
     if isinstance(error, OSError) and error.errno is not None:

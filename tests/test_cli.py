@@ -71,8 +71,15 @@ def test_flags_may_stand_anywhere() -> None:
 
 def test_messages_are_one_line_whatever_files_are_called(capsys: pytest.CaptureFixture[str]) -> None:
     assert in_one_line(NerfroError("a\nb\x1b.png does not exist")) == "a\\nb\\x1b.png does not exist"
+
     warn("a\nb.png is skipped")
     assert capsys.readouterr().out == "nerfro: warning: a\\nb.png is skipped\n"
+
+
+def test_killed_worker_of_a_launcher_is_no_bug() -> None:
+    loky = pytest.importorskip("joblib.externals.loky.process_executor")
+    line = in_one_line(loky.TerminatedWorkerError("A worker was terminated.\n\nMore"))
+    assert line == "A worker was terminated (TerminatedWorkerError); repeat the command to continue the sweep"
 
 
 def test_a_configuration_folder_that_does_not_exist_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
