@@ -6,7 +6,9 @@ import ast
 import runpy
 import sys
 
+from nerfro import __version__
 from nerfro.cli import errors_in_one_line
+from nerfro.completion import completions, shell_code
 from nerfro.errors import NerfroError
 from nerfro.paths import PACKAGE_DIR
 
@@ -15,14 +17,22 @@ def main() -> None:
     """List the commands, or run the command in the first argument."""
     with errors_in_one_line():
         known = commands()
-        name = sys.argv[1] if len(sys.argv) > 1 else "--help"
+        name, *arguments = sys.argv[1:] or ["--help"]
         if name in ("-h", "--help"):
             print("nerfro COMMAND [key=value ...], or python -m nerfro.COMMAND [key=value ...]\n")
             for command, purpose in known.items():
                 print(f"  {command:12}{purpose}")
-            return
-        if name not in known:
+            print("\nnerfro COMMAND --help lists the options of a command.")
+        elif name == "--version":
+            print(f"nerfro {__version__}")
+        elif name == "--completion":
+            print(shell_code(" ".join(arguments)))
+        elif name == "--complete":
+            print("\n".join(completions(known, arguments)))
+        elif name not in known:
             raise NerfroError(f"there is no command '{name}'; choose one of {', '.join(known)}")
+    if name not in known:
+        return
     del sys.argv[1]
     # Like python -m, because Hydra, launchers and the record of a run read the command from `__main__`.
     runpy.run_module(f"nerfro.{name}", run_name="__main__", alter_sys=True)

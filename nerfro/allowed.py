@@ -62,6 +62,10 @@ class Range:
         return limits or "a finite number"
 
 
+class Refused(str):
+    """Reason why a setting has no meaning, and what to use instead."""
+
+
 _FURTHEST = 10**7  # world units, as in georeferenced data
 
 AnyNumber = Annotated[float, None]  # including infinity and NaN
@@ -191,6 +195,8 @@ def _refusal(value: Any, hint: Any) -> str | None:
         return None
     if origin is Literal:
         return None if value in hints else f"choose {', '.join(map(repr, hints))}"
+    if origin is Annotated and isinstance(hints[1], Refused):
+        return str(hints[1])
     if origin is Annotated and isinstance(hints[1], Range):
         return f"take {hints[1]}" if value not in hints[1] else None
     if origin is Annotated:

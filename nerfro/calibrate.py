@@ -1,4 +1,9 @@
-"""`python -m nerfro.calibrate images=DIR target=apriltag out=DIR`: estimate lens and poses of photographs."""
+"""`python -m nerfro.calibrate images=DIR target=apriltag out=DIR`: estimate lens and poses of photographs.
+
+Examples:
+    nerfro calibrate images=photographs target=apriltag out=data/glass
+    nerfro calibrate images=photographs masks=masks out=data/glass
+"""
 
 from __future__ import annotations
 
@@ -7,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from omegaconf import DictConfig
 
+import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.capture.boards import TagBoard, print_sheets
 from nerfro.capture.calibrate_options import CalibrateConfig, check_options, make_board
 from nerfro.capture.calibrated_data import FILES, ray_range, relative, split_views, write_calibrated

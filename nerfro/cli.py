@@ -31,14 +31,16 @@ from hydra.errors import HydraException, OverrideParseException
 from hydra.plugins.config_source import ConfigResult
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, flag_override
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
 
 from nerfro.allowed import check_names, check_settings
 from nerfro.errors import NerfroError, nearest_of
+from nerfro.options import ADDED_GROUPS, Described, describe_command, recall, remember, usage
 from nerfro.paths import CONF_DIR, refuse_root, user_path
 from nerfro.registry import MOVED_CLASSES, discover, plugins
 from nerfro.trust import MAX_YAML_CHARACTERS, GuardedConfigLoader, leave_current_directory, require_bounded_yaml
 
+_HELP = {"-h", "--help"}
 _NO_MEMORY = re.compile("allocate memory|out of memory")  # messages of torch on a CPU and on a GPU
 _LONGEST_LINE = 1000  # characters of an error; the middle of longer ones is left out
 # Options of Hydra that the extras of nerfro install.
@@ -122,14 +124,16 @@ def entry_point(
 
     def decorate(task: Callable[[DictConfig], float | None]) -> Callable[[], None]:
         def check_all(config: DictConfig) -> None:
-            check_configuration(config, schema, config_dir)
-            if check is not None:
-                check(config)
+            with _missing_with_example(config_name):
+                check_configuration(config, schema, config_dir)
+                if check is not None:
+                    check(config)
 
         @functools.wraps(task)
         def job(config: DictConfig) -> float | None:
             if HydraConfig.get().mode != RunMode.MULTIRUN:
-                with errors_in_one_line():  # here too, because Hydra prints a line of its own for errors of the job
+                # Here too, because Hydra prints a line of its own for errors of the job.
+                with errors_in_one_line(), _missing_with_example(config_name):
                     return task(config)
             discover()  # the process may be a launcher's worker
             try:
@@ -146,12 +150,20 @@ def entry_point(
             # Otherwise Hydra prints its own report and exits.
             os.environ["HYDRA_FULL_ERROR"] = "1"
             with errors_in_one_line(), _composed_with(check_all):
+                if _HELP & set(sys.argv) and "hydra" in sys.argv:
+                    sys.argv[1:] = ["--hydra-help"]
                 sys.argv[1:] = _flags_first(sys.argv[1:])
                 ConfigStore.instance().store(name=f"{config_name}_schema", node=schema, provider="nerfro")
                 SourcesRegistry.instance().types["file"] = _RenamingFiles
                 leave_current_directory()
                 discover()
+                if _HELP & set(sys.argv) or (program() == config_name and recall(config_name) is None):
+                    described = describe_command(config_name, schema, config_dir)
+                    remember(config_name, described)
+                    answer(described, sys.argv[1:])
                 sys.argv[1:] = [_quoted(renamed_override(argument), verbatim) for argument in sys.argv[1:]]
+                if config_name == "train":
+                    sys.argv[1:] = map(_added, sys.argv[1:])
                 try:
                     hydra.main(version_base="1.3", config_path=str(config_dir), config_name=config_name)(job)()
                 except OSError as error:  # raised by Hydra, which creates the run folder
@@ -169,6 +181,23 @@ def entry_point(
         return run
 
     return decorate
+
+
+@contextlib.contextmanager
+def _missing_with_example(command: str) -> Iterator[None]:
+    """Show an example of the command if a required option is missing."""
+    try:
+        yield
+    except MissingMandatoryValue as error:
+        example = usage(command).partition("Examples:\n")[2].partition("\n")[0].strip()
+        raise NerfroError(f"{error.full_key}=... is missing; for example: {example}") from error
+
+
+def program() -> str | None:
+    """Return the name of the command that this process runs, such as `train`; None for other programs."""
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    package, _, name = ("" if spec is None else spec.name).partition(".")
+    return name if package == "nerfro" else None
 
 
 def check_configuration(config: DictConfig, schema: type, config_dir: Path) -> None:
@@ -197,8 +226,23 @@ def _flags_first(arguments: list[str]) -> list[str]:
     return [text for text in arguments if text not in overrides] + overrides
 
 
+def answer(described: Described, arguments: list[str]) -> None:
+    """Print the help if it is asked for, or refuse misspelt names.
+
+    Raises:
+        NerfroError: a setting or an option does not exist.
+    """
+    if _HELP & set(arguments) and "hydra" not in arguments:
+        print(described.help)
+        sys.exit()
+    unknown = any(argument.startswith(("--config", "-c", "hydra.searchpath")) for argument in arguments)
+    if not unknown:  # other folders of configurations may have other groups
+        current = [text for text in arguments if not any(f"{text.lstrip('+~')}.".startswith(old) for old in RENAMED)]
+        described.require_known(current)
+
+
 def _refuse_flag(message: str) -> NoReturn:
-    raise NerfroError(f"{message}; --help lists the flags")
+    raise NerfroError(f"{message}; --help hydra lists the flags")
 
 
 @contextlib.contextmanager
@@ -290,6 +334,11 @@ def _quoted(argument: str, keys: tuple[str, ...]) -> str:
     if key not in keys or not set(",=") & set(value) or value[0] in "\"'":
         return argument
     return f"{key}='{value}'"
+
+
+def _added(argument: str) -> str:
+    """Add the plus sign with which Hydra selects an option of a group without a default, as in `experiment=glass`."""
+    return f"+{argument}" if argument.partition("=")[0] in ADDED_GROUPS else argument
 
 
 def _not_parsed(override: str) -> str:

@@ -1,18 +1,24 @@
-"""`python -m nerfro.dashboard`: show all runs below a folder in TensorBoard, named by experiment and scene."""
+"""`python -m nerfro.dashboard`: show all runs below a folder in TensorBoard, named by experiment and scene.
+
+Examples:
+    nerfro dashboard
+    nerfro dashboard outputs=outputs/refractive port=0 open=false
+"""
 
 from __future__ import annotations
 
 import tempfile
 import time
-import webbrowser
 from pathlib import Path
 
 from omegaconf import DictConfig
 
+import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
 from nerfro.paths import refuse_root, user_path
 from nerfro.report.dashboard import SEARCH_INTERVAL, DashboardConfig, link_runs, serve
+from nerfro.viewing.server import open_page
 
 
 @entry_point("dashboard", DashboardConfig)
@@ -30,7 +36,7 @@ def main(config: DictConfig) -> None:
             flush=True,
         )
         if config.open:
-            webbrowser.open(url)
+            open_page(url)
         while True:
             time.sleep(SEARCH_INTERVAL)
             link_runs(outputs, Path(names))

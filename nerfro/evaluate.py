@@ -1,9 +1,17 @@
-"""`python -m nerfro.evaluate checkpoint=...` or `predictions=DIR references=DIR`: score a model, or any images."""
+"""`python -m nerfro.evaluate checkpoint=...` or `predictions=DIR references=DIR`: score a model, or any images.
+
+Examples:
+    nerfro evaluate checkpoint=outputs/first/checkpoints/last.ckpt split=val
+    nerfro evaluate predictions=outputs/first/images references=data/test out=scores
+"""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from omegaconf import DictConfig
 
+import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli import entry_point
 from nerfro.evaluation.error_maps import write_error_sheet
 from nerfro.evaluation.folders import match_folders
@@ -14,11 +22,13 @@ from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.scoring import score_folders
 from nerfro.evaluation.tables import report
 from nerfro.evaluation.treatments import score_split
+from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.images import load_png
 from nerfro.paths import user_path
 from nerfro.training.callbacks import Throughput
+from nerfro.training.config import build_data, check_trained
 from nerfro.training.load import scene_of
-from nerfro.training.run_folder import load_checkpoint
+from nerfro.training.run_folder import CONFIG_FILE, load_checkpoint
 
 # Options that replace the options of the run, if given.
 _ADOPTED = (
@@ -70,7 +80,7 @@ def _evaluate_checkpoint(config: DictConfig) -> None:
 def _evaluate_folder(config: DictConfig) -> None:
     predictions, references = user_path(config.predictions), user_path(config.references)
     masks = None if config.masks is None else user_path(config.masks)
-    pairs = match_folders(predictions, references, masks, config.mask_labels)
+    pairs = match_folders(predictions, references, masks, config.mask_labels, _names_in_run(predictions))
     for pair in pairs:  # damaged or mismatched images are reported before the scoring starts
         pair.load(config.alpha)
     device = find_device(config.device)
@@ -81,6 +91,17 @@ def _evaluate_folder(config: DictConfig) -> None:
         result = score_folders(pairs, config.alpha, metrics, networks, folder, device)
         report(RunMetrics(result), f"{predictions} against {references}", folder)
     print(f"images and tables: {folder}")
+
+
+def _names_in_run(predictions: Path) -> dict[str, str]:
+    """Return the names of the images of a run by their names in the data set; empty for images of other programs."""
+    file = predictions.parent / CONFIG_FILE
+    if not file.is_file():
+        return {}
+    config = check_trained(read_foreign_config(file), file)
+    split = config.evaluation.split
+    names = build_data(config).load(split).names
+    return {Path(name).stem: f"{split}_{number:03d}" for number, name in enumerate(names)}
 
 
 if __name__ == "__main__":

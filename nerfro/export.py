@@ -1,9 +1,15 @@
-"""`python -m nerfro.export checkpoint=... what=mesh out=FILE`: write a trained scene for other programs."""
+"""`python -m nerfro.export checkpoint=... what=mesh out=FILE`: write a trained scene for other programs.
+
+Examples:
+    nerfro export checkpoint=outputs/first what=page out=page.html
+    nerfro export checkpoint=outputs/first what=mesh out=mesh.ply
+"""
 
 from __future__ import annotations
 
 from omegaconf import DictConfig
 
+import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli import entry_point
 from nerfro.files.atomic import refuse_existing
 from nerfro.paths import user_path

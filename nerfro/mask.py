@@ -1,4 +1,9 @@
-"""`python -m nerfro.mask data=... data.root=DIR outlines={NAME:BOX}`: segment the object in all views."""
+"""`python -m nerfro.mask data=... data.root=DIR outlines={NAME:BOX}`: segment the object in all views.
+
+Examples:
+    nerfro mask data.root=data/glass 'outlines={img_01.jpg: [120, 80, 400, 460]}'
+    nerfro mask data=colmap data.root=data/glass 'outlines={img_01.jpg: [120, 80, 400, 460]}'
+"""
 
 from __future__ import annotations
 
@@ -7,8 +12,8 @@ import json
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from tqdm import tqdm
 
+import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.capture.mask_files import MaskConfig, MaskTask, read_outlines
 from nerfro.capture.masking import Segmentation
 from nerfro.capture.overrides import is_given, of_groups, print_next
@@ -16,6 +21,7 @@ from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.paths import EMBEDDED_PREFIX
+from nerfro.progress import progress_bar
 from nerfro.registry import build
 from nerfro.viewing.outline_page import OutlinePage
 
@@ -44,7 +50,7 @@ def main(config: DictConfig) -> None:
     else:
         missing = len(task.frames) - len(task.kept) - len(outlines)
         print(f"{len(task.kept)} existing masks, {len(outlines)} outlines; segmenting {missing} further views")
-        with tqdm(total=missing, desc="segmenting", unit="view", dynamic_ncols=True) as progress:
+        with progress_bar("segmenting", missing) as progress:
             found = task.segment(outlines, progress.update)
         print(task.save(outlines, found))
         print("correct wrong masks in a paint program; or delete them, outline one of these views, and repeat")

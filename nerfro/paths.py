@@ -42,6 +42,11 @@ def scene_name(root: str | Path) -> str:
     return Path(str(root).removeprefix(EMBEDDED_PREFIX)).name
 
 
+def cache_dir() -> Path:
+    """Return the folder of the cache: the environment variable `NERFRO_CACHE`, or ~/.cache/nerfro."""
+    return Path(os.environ.get("NERFRO_CACHE") or "~/.cache/nerfro").expanduser()
+
+
 def user_path(location: str | Path) -> Path:
     """Convert a location from a user to a path, and expand `~` and `~name`."""
     try:

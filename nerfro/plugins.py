@@ -1,16 +1,18 @@
-"""`python -m nerfro.plugins`: list the registered plugins with their settings, defaults and summaries."""
+"""`python -m nerfro.plugins`: list the registered plugins with their settings, defaults and summaries.
+
+Examples:
+    nerfro plugins
+    nerfro plugins medium field=hash_grid
+"""
 
 from __future__ import annotations
 
 import sys
 
-import rich
-from rich.console import Group
-from rich.table import Table
-from rich.text import Text
-
+import nerfro.startup
 import nerfro.training.lightning_callbacks  # noqa: F401 - registers callbacks
 from nerfro.cli import errors_in_one_line
+from nerfro.options import plugin_options
 from nerfro.registry import Plugin, discover, find, plugins
 
 
@@ -19,16 +21,9 @@ def main() -> None:
     with errors_in_one_line():
         discover()
         for plugin in _chosen(sys.argv[1:]):
-            rich.print(describe(plugin))
-
-
-def describe(plugin: Plugin) -> Group:
-    """Format the name, summary and settings of a plugin for the console."""
-    table = Table("field", "type", "default", box=None, pad_edge=False, show_header=False)
-    for name, kind, default in plugin.fields():
-        table.add_row(f"    {name}", Text(kind), str(default))  # Text, because brackets would be markup
-    heading = Text.assemble((f"{plugin.kind}={plugin.name}", "bold"), f"  {plugin.summary}")
-    return Group(heading, table) if table.rows else Group(heading)
+            print(f"{plugin.kind}={plugin.name}  {plugin.summary}")
+            for option in plugin_options(plugin, ""):
+                print(option)
 
 
 def _chosen(arguments: list[str]) -> list[Plugin]:

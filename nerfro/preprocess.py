@@ -1,4 +1,9 @@
-"""`python -m nerfro.preprocess data.root=DIR`: reconstruct the surface and the refractive index of an object."""
+"""`python -m nerfro.preprocess data.root=DIR`: reconstruct the surface and the refractive index of an object.
+
+Examples:
+    nerfro preprocess data=opencv data.root=data/glass medium.ior=1.33
+    nerfro preprocess data=opencv data.root=data/glass refine=true
+"""
 
 from __future__ import annotations
 
@@ -10,6 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from jaxtyping import Float
 from omegaconf import DictConfig
 
+import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.capture.index_search import find_medium
 from nerfro.capture.overlaps import choose_wrong_masks, draw_overlays, report_overlaps
 from nerfro.capture.pose_conventions import require_consistent_poses

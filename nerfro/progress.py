@@ -1,26 +1,55 @@
-"""Progress bars for long work outside training."""
+"""Progress bars for long work; a log file receives one line per minute instead of a bar."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from tqdm import tqdm
 
 Item = TypeVar("Item")
 
 DELAY = 2.0  # seconds after which a bar appears, so that short work has none
-_FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
+_LOG_SECONDS = 60.0  # interval between lines in a log file
+_FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
 
 
-def track(description: str, items: Iterable[Item], total: int | None = None) -> Iterable[Item]:
-    """Iterate over items and show a progress bar with the remaining time on standard error."""
-    return tqdm(items, description, total, delay=DELAY, dynamic_ncols=True)
+class _LogFile:
+    """Writes each state of a bar as one line of standard error, which is not a terminal."""
+
+    def write(self, text: str) -> None:
+        if text.strip():
+            sys.stderr.write(f"{text.strip()}\n")
+
+    def flush(self) -> None:
+        sys.stderr.flush()
+
+
+def progress_bar(description: str, total: float | None, items: Iterable[Any] | None = None, **options: Any) -> tqdm:
+    """Create a progress bar with the remaining time on standard error; `update(n)` adds completed work.
+
+    Args:
+        description: name of the work.
+        total: amount of work.
+        items: items to iterate over.
+        options: further arguments of tqdm.
+    """
+    form = _FORMAT
+    if not sys.stderr.isatty():
+        form = form.replace("|{bar}|", "")
+        options |= {"file": _LogFile(), "mininterval": _LOG_SECONDS}
+    return tqdm(items, description, total, bar_format=form, dynamic_ncols=True, **{"delay": DELAY, **options})
+
+
+def track(description: str, items: Iterable[Item], total: int | None = None, **options: Any) -> Iterable[Item]:
+    """Iterate over items and show a progress bar; `options` are further arguments of tqdm."""
+    return progress_bar(description, total, items, **options)
 
 
 @contextmanager
 def bar(description: str) -> Iterator[Callable[[float], None]]:
-    """Show a progress bar with the remaining time; the yielded function sets the completed fraction in [0, 1]."""
-    with tqdm(total=1.0, desc=description, bar_format=_FORMAT, delay=DELAY, dynamic_ncols=True) as progress:
+    """Show a progress bar; the yielded function sets the completed fraction in [0, 1]."""
+    with progress_bar(description, 1.0) as progress:
         yield lambda done: progress.update(done - progress.n)

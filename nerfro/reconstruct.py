@@ -1,10 +1,16 @@
-"""`python -m nerfro.reconstruct images=PHOTOS masks=MASKS out=DIR`: reconstruct a scene from photographs."""
+"""`python -m nerfro.reconstruct images=PHOTOS masks=MASKS out=DIR`: reconstruct a scene from photographs.
+
+Examples:
+    nerfro reconstruct images=photographs masks=masks out=outputs/glass
+    nerfro reconstruct video=glass.mp4 masks=masks out=outputs/glass train='trainer.max_time=10m'
+"""
 
 from __future__ import annotations
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.capture.overrides import is_given, of_groups
 from nerfro.cli import entry_point
 from nerfro.files.folder_lock import lock_folder

@@ -25,10 +25,9 @@ from hydra.core.config_store import ConfigStore
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import MISSING, DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-from torch import nn
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from nerfro.allowed import check, checked
+from nerfro.allowed import Range, check, checked
 from nerfro.errors import NerfroError
 from nerfro.paths import PLUGINS_DIR
 
@@ -36,6 +35,8 @@ KINDS = (
     "model", "camera", "medium", "sampler/path", "sampler/points", "field", "boundary", "loss", "data", "callbacks",
     "metric",
 )  # fmt: skip
+
+SEVERAL = ("loss", "callbacks")  # a run may have several plugins of these types
 
 # Modules and packages with built-in plugins; `discover` imports all of them.
 _BUILT_IN = (
@@ -51,7 +52,7 @@ MOVED_CLASSES = {
     "nerfro.fields.mip_nerf.MipNerfField": f"{_LOCAL_PACKAGE}.mip_nerf.MipNerfField",
     "nerfro.models.mip_nerf.MipNerfModel": f"{_LOCAL_PACKAGE}.mip_nerf.MipNerfModel",
 }
-_ENTRY_POINTS = "nerfro.plugins"
+ENTRY_POINTS = "nerfro.plugins"
 
 # Objects of Lightning that a configuration may name as Hydra's `_target_`, beside registered classes.
 _LIGHTNING_TARGETS = frozenset(
@@ -97,13 +98,18 @@ class Plugin:
         """First line of the docstring of the class."""
         return (inspect.getdoc(self.cls) or "").split("\n", 1)[0]
 
+    @property
+    def setting_names(self) -> list[str]:
+        """Names of the settings of a configuration node, with `_target_`."""
+        return [field.name for field in dataclasses.fields(self.config)]
+
     def fields(self) -> Iterator[tuple[str, str, object]]:
         """Yield the name, type and default of each configurable parameter."""
         for field in dataclasses.fields(self.config):
             if field.name == "_target_":
                 continue
             default = field.default_factory() if callable(field.default_factory) else field.default
-            yield field.name, _type_name(self.hints[field.name]), "required" if default is MISSING else default
+            yield field.name, type_name(self.hints[field.name]), "required" if default is MISSING else default
 
 
 _plugins: dict[tuple[str, str], Plugin] = {}
@@ -285,6 +291,9 @@ def configure(plugin: Plugin, node: DictConfig | Mapping[str, object]) -> dict[s
         given = OmegaConf.to_container(node, resolve=True) if isinstance(node, DictConfig) else dict(node)
         merged = OmegaConf.merge(OmegaConf.structured(plugin.config), given)
         settled = OmegaConf.to_container(merged, resolve=True, throw_on_missing=True)
+    except MissingMandatoryValue as error:
+        place = f"{plugin.kind.replace('/', '.')}.{f'{plugin.name}.' * (plugin.kind in SEVERAL)}{error.full_key}"
+        raise NerfroError(f"{where} needs {error.full_key}; add {place}=...") from error
     except (OmegaConfBaseException, OverflowError) as error:  # the latter of integers with hundreds of digits
         known = ", ".join(name for name, _, _ in plugin.fields()) or "none"
         raise NerfroError(f"{where}: {_first_line(error)}; its fields: {known}") from error
@@ -309,16 +318,20 @@ def discover(plugins_dir: Path = PLUGINS_DIR) -> None:
     if not _discovered:
         for package in _BUILT_IN:
             _import_all(f"nerfro.{package}")
-        for entry_point in importlib.metadata.entry_points(group=_ENTRY_POINTS):
+        for entry_point in importlib.metadata.entry_points(group=ENTRY_POINTS):
             _import_plugin(entry_point.value, f"'{entry_point.name}' of an installed package ({entry_point.value})")
         _discovered.add("built-in")
-    _import_folder(plugins_dir.resolve())
+    for folder in plugin_folders(plugins_dir):
+        _import_folder(folder)
+
+
+def plugin_folders(plugins_dir: Path = PLUGINS_DIR) -> list[Path]:
+    """Return the folders of local plugins; see `discover`."""
     folders = os.environ.get("NERFRO_PLUGINS")
     # A checkout of nerfro contains the plugins that an installed package already has.
     if folders is None and Path("plugins").is_dir() and not Path("nerfro").is_dir():
         folders = "plugins"
-    for folder in filter(None, (folders or "").split(os.pathsep)):
-        _import_folder(Path(folder).resolve())
+    return [plugins_dir.resolve(), *(Path(folder).resolve() for folder in (folders or "").split(os.pathsep) if folder)]
 
 
 def _import_all(package: str) -> None:
@@ -389,8 +402,9 @@ def _parameters(cls: type) -> list[tuple[inspect.Parameter, Any, Any]]:
     """
     found: dict[str, tuple[inspect.Parameter, Any, Any]] = {}
     for base in inspect.getmro(cls):
-        # Classes without their own constructor have no configuration; the signature of nn.Module is generic.
-        if base in (object, nn.Module):
+        # Classes without their own constructor have no configuration; the signature of nn.Module is generic. The class
+        # is compared by name, because this module must not import torch.
+        if base is object or f"{base.__module__}.{base.__name__}" == "torch.nn.modules.module.Module":
             break
         if "__init__" not in vars(base):
             continue
@@ -432,18 +446,22 @@ def _default(parameter: inspect.Parameter) -> Any:
     return dataclasses.field(default=parameter.default)
 
 
-def _type_name(hint: Any) -> str:
+def type_name(hint: Any) -> str:
+    """Describe a type and its allowed values, in Markdown."""
     origin, args = get_origin(hint), get_args(hint)
     if origin is Literal:
-        return " | ".join(map(str, args))
+        return ", ".join(f"`{value}`" for value in args)
     if origin is Annotated:
-        return _type_name(args[0])
-    if origin in (Union, types.UnionType):
-        return " | ".join("none" if a is type(None) else _type_name(a) for a in args)
+        limits = [str(limit) for limit in args[1:] if isinstance(limit, Range)]
+        choices = [limit for limit in args[1:] if get_origin(limit) is Literal]
+        return type_name(choices[0]) if choices else ", ".join([type_name(args[0]), *limits])
+    if type(None) in args:
+        return "; ".join(type_name(arg) for arg in args if arg is not type(None)) + "; or null"
     if origin in (list, tuple, Sequence):
-        return f"list[{_type_name(args[0])}]"
-    name: str = getattr(origin or hint, "__name__", str(hint))
-    return name
+        return f"list of {type_name(args[0])}"
+    if origin is dict:
+        return "mapping"
+    return "any" if hint is Any else getattr(hint, "__name__", str(hint))
 
 
 def _first_line(error: BaseException) -> str:

@@ -1,9 +1,15 @@
-"""`python -m nerfro.render checkpoint=... path=orbit out=DIR`: render images and films of a trained scene."""
+"""`python -m nerfro.render checkpoint=... path=orbit out=DIR`: render images and films of a trained scene.
+
+Examples:
+    nerfro render checkpoint=outputs/first path=orbit frames=60 out=outputs/orbit
+    nerfro render checkpoint=outputs/first views=test what=depth out=outputs/depth
+"""
 
 from __future__ import annotations
 
 from omegaconf import DictConfig
 
+import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli import entry_point
 from nerfro.files.cache import file_hash
 from nerfro.kernels.allocator import keep_freed_memory

@@ -55,9 +55,9 @@ class Subdivision:
 class SubdivisionChanges:
     """Attributes of a `Subdivision` that are replaced; None keeps the value of the run."""
 
-    side: Optional[Side] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    divergence: Optional[NotNegative] = None  # noqa: UP045
-    contrast: Optional[Positive] = None  # noqa: UP045
+    side: Optional[Side] = None  # noqa: UP045 - rays along each side of a divided pixel
+    divergence: Optional[NotNegative] = None  # noqa: UP045 - minimum angle, in pixel angles, for which pixels are divided
+    contrast: Optional[Positive] = None  # noqa: UP045 - minimum difference of a channel for which pixels are divided
 
 
 @dataclass(frozen=True)

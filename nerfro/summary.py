@@ -1,4 +1,9 @@
-"""`python -m nerfro.summary runs=[outputs]`: compare many runs in tables and in a report."""
+"""`python -m nerfro.summary runs=[outputs]`: compare many runs in tables and in a report.
+
+Examples:
+    nerfro summary runs=[outputs]
+    nerfro summary runs=[outputs/first,outputs/straight] out=outputs/report report=true
+"""
 
 from __future__ import annotations
 
@@ -8,6 +13,7 @@ from typing import Annotated, Any, Literal, Optional
 import rich
 from omegaconf import DictConfig, ListConfig
 
+import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.allowed import Natural
 from nerfro.cli import entry_point
 from nerfro.evaluation.results import FULL

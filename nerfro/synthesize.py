@@ -1,9 +1,15 @@
-"""`python -m nerfro.synthesize scene=torus`: render the ground truth of a synthetic scene with Mitsuba 3."""
+"""`python -m nerfro.synthesize scene=torus`: render the ground truth of a synthetic scene with Mitsuba 3.
+
+Examples:
+    nerfro synthesize scene=torus resolution=128 out=outputs/scenes/torus
+    nerfro synthesize scene=ship ior=1.33 seed=1
+"""
 
 from __future__ import annotations
 
 from omegaconf import DictConfig
 
+import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli import entry_point
 from nerfro.paths import CONF_DIR
 from nerfro.scenes.synthesis import SynthesizeConfig, synthesize

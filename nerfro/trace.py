@@ -1,4 +1,9 @@
-"""`python -m nerfro.trace medium.mesh=M.ply medium.ior=1.5 rays=R.npz out=O.npz`: trace rays through a medium."""
+"""`python -m nerfro.trace medium.mesh=M.ply medium.ior=1.5 rays=R.npz out=O.npz`: trace rays through a medium.
+
+Examples:
+    nerfro trace medium.mesh=glass.ply medium.ior=1.5 rays=rays.npz out=exits.npz
+    nerfro trace medium.mesh=glass.ply medium.ior=1.5 sampler/path=eikonal rays=rays.npz out=exits.npz
+"""
 
 from __future__ import annotations
 
@@ -6,6 +11,7 @@ import rich
 import torch
 from omegaconf import DictConfig
 
+import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
 from nerfro.evaluation.path_plot import draw_paths

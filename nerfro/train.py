@@ -1,4 +1,9 @@
-"""`python -m nerfro.train`: train an experiment, evaluate it on the test views, and print the table."""
+"""`python -m nerfro.train`: train an experiment, evaluate it on the test views, and print the scores.
+
+Examples:
+    nerfro train trainer.max_time=2m hydra.run.dir=outputs/first
+    nerfro train experiment=glass data.root=data/glass medium.mesh=data/glass/mesh.ply medium.ior=1.5
+"""
 
 from __future__ import annotations
 
@@ -8,6 +13,7 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli import EXIT_INTERRUPTED, entry_point
 from nerfro.distributed import leave
 from nerfro.evaluation.lpips import find_lpips_networks
@@ -46,12 +52,11 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     prepare_process(config.seed)
     settle_trainer(config)
     source = build_data(config)
-    test = source.load(config.evaluation.split).checked()
-    if config.trainer.limit_test_batches is not None:
-        test = test.select(range(len(test))[: config.trainer.limit_test_batches])
+    training, split = source.load("train"), config.evaluation.split
+    test = training if split is None else source.load(split).checked()
+    test = test.select(range(len(test))[: config.trainer.limit_test_batches])
     subdivision = Subdivision(**config.evaluation.subdivision)
     lpips = find_lpips_networks(config.evaluation.lpips_backbone, config.evaluation.lpips_vgg_backbone)
-    training = source.load("train")
     module, datamodule = build_training(config, source, training)
     renderer = module.renderer
     require_same_run(folder, checkpoint, config, renderer)
@@ -79,19 +84,20 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
         sys.exit(EXIT_INTERRUPTED)
 
     write_cameras(folder / "cameras.json", renderer.to(device).scene.camera, training, source.origin)
-    metrics = ImageMetrics(*lpips, prefix=config.evaluation.split)
-    scores: dict[str, float | None] = {}
+    spent = trainer.global_step, throughput.seconds, throughput.rays_per_second
+    print(f"{spent[0]} steps in {spent[1]:.0f} s, {spent[2] or 0:,.0f} rays/s")
+    scored, scores = None, {}
     try:
-        result, treated = score_split(renderer, test, metrics, folder, subdivision, config.evaluation.refine_steps)
-        scores = {f"{config.evaluation.split}/{name}": mean for name, mean in result.means().items()}
+        if split is not None:
+            metrics = ImageMetrics(*lpips, prefix=split)
+            result, treated = score_split(renderer, test, metrics, folder, subdivision, config.evaluation.refine_steps)
+            scores = {f"{split}/{name}": mean for name, mean in result.means().items()}
+            scored = RunMetrics(result, *spent, treated)
     finally:
         finish_logs(trainer, scores)
-    title = f"{config.name} on {config.data.root}, {config.evaluation.split} views"
-    spent = trainer.global_step, throughput.seconds, throughput.rays_per_second
-    scored = RunMetrics(result, *spent, treated)
-    report(scored, title, folder)
-    print(f"{trainer.global_step} steps in {throughput.seconds:.0f} s, {throughput.rays_per_second or 0:,.0f} rays/s.")
-    print(next_steps(folder))
+    if scored is not None:
+        report(scored, f"{config.name} on {config.data.root}, {split} views", folder, brief=True)
+    print(next_steps(folder, split))
     return scored
 
 

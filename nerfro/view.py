@@ -1,19 +1,24 @@
-"""`python -m nerfro.view checkpoint=RUN`: serve a run's interactive page, and follow the run's checkpoints."""
+"""`python -m nerfro.view checkpoint=RUN`: serve a run's interactive page, and follow the run's checkpoints.
+
+Examples:
+    nerfro view checkpoint=outputs/first
+    nerfro view checkpoint=outputs/first port=0 open=false
+"""
 
 from __future__ import annotations
 
 import time
-import webbrowser
 from pathlib import Path
 
 from omegaconf import DictConfig
 
+import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli import entry_point
 from nerfro.report.curves import CURVES_FILE, read_curves
 from nerfro.training.load import checkpoint_of, load
 from nerfro.viewing.live import POLL_SECONDS, LivePage, ViewConfig
 from nerfro.viewing.page import page_split
-from nerfro.viewing.server import PageServer
+from nerfro.viewing.server import PageServer, open_page
 
 
 @entry_point("view", ViewConfig)
@@ -29,7 +34,7 @@ def main(config: DictConfig) -> None:
     show_losses(server, run)
     print(f"nerfro: {scene.name} on {server.url}; Ctrl-C ends it", flush=True)
     if config.open:
-        webbrowser.open(server.url)
+        open_page(server.url)
     while True:
         time.sleep(POLL_SECONDS)
         if _modified(checkpoint) != scene_time:

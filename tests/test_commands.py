@@ -14,7 +14,10 @@ import pytest
 import nerfro.plugins
 from nerfro.paths import PACKAGE_DIR
 
-COMMANDS = {file.stem for file in PACKAGE_DIR.glob("*.py") if "\n@entry_point" in file.read_text()} | {"plugins"}
+COMMANDS = {file.stem for file in PACKAGE_DIR.glob("*.py") if "\n@entry_point" in file.read_text()} | {
+    "demo",
+    "plugins",
+}
 
 
 def run(*command: str | Path, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -34,7 +37,7 @@ def script(tmp_path: Path) -> Path:
 
 def test_every_command_is_listed_in_one_line() -> None:
     listed = run("-m", "nerfro")
-    lines = [line.split(maxsplit=1) for line in listed.stdout.splitlines()[2:]]
+    lines = [line.split(maxsplit=1) for line in listed.stdout.splitlines()[2:-2]]
     assert {name for name, _ in lines} == COMMANDS, listed.stderr
     assert all(len(purpose) > 15 and purpose.endswith(".") for _, purpose in lines)
     assert listed.returncode == 0

@@ -8,8 +8,10 @@ import re
 import shlex
 import subprocess
 from collections.abc import Iterator
+from dataclasses import is_dataclass
 from importlib import import_module
 from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -18,7 +20,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.allowed import check_names, check_settings
-from nerfro.cli import _quoted, renamed_override
+from nerfro.cli import _added, _quoted, renamed_override
+from nerfro.options import Described, describe_command, usage
 from nerfro.paths import CONF_DIR, PACKAGE_DIR
 from nerfro.registry import KINDS, discover, plugins
 
@@ -61,11 +64,20 @@ def commands(page: str) -> Iterator[tuple[str, list[str]]]:
 
 
 @functools.cache
+def described(command: str) -> Described:
+    """Describe the options of a command without the plugins of the pages."""
+    return describe_command(command, entry_points()[command][0], folder_of(command))
+
+
+def folder_of(command: str) -> Path:
+    return CONF_DIR if (CONF_DIR / f"{command}.yaml").is_file() else CONF_DIR / command
+
+
+@functools.cache
 def composed(command: str, choices: tuple[str, ...]) -> DictConfig:
     """Compose the configuration of a command with options that choose members of groups."""
     ConfigStore.instance().store(name=f"{command}_schema", node=entry_points()[command][0], provider="nerfro")
-    folder = CONF_DIR if (CONF_DIR / f"{command}.yaml").is_file() else CONF_DIR / command
-    with initialize_config_dir(str(folder), version_base="1.3"):
+    with initialize_config_dir(str(folder_of(command)), version_base="1.3"):
         return compose(command, list(choices))
 
 
@@ -76,6 +88,8 @@ def require_valid(command: str, options: list[str]) -> None:
     # Of a sweep the first value; no patterns, and no options of Hydra, whose launchers may not be installed.
     options = [re.sub(r"^([^=]+=[^,[{]+),[^]}]*$", r"\1", option) for option in options if "(" not in option]
     options = [_quoted(option, verbatim) for option in options if not option.lstrip("+").startswith("hydra")]
+    described(command).require_known(options)
+    options = list(map(_added, options)) if command == "train" else options
     choices, settings = [], []
     for override in OverridesParser.create().parse_overrides(options):
         key = override.key_or_group
@@ -114,6 +128,19 @@ def test_job_files_are_scripts() -> None:
     for file in files:
         checked = subprocess.run(["bash", "-n"], input=file, capture_output=True, text=True)
         assert checked.stderr == "", file
+
+
+@pytest.mark.parametrize("command", sorted(entry_points()))
+def test_help_has_two_valid_examples_and_explains_every_option(command: str) -> None:
+    examples = re.findall(rf"^    nerfro {command}\b(.*)$", usage(command), re.MULTILINE)
+    assert len(examples) == 2
+    for options in examples:
+        require_valid(command, shlex.split(options))
+    page, schema = described(command), entry_points()[command][0]
+    settings = re.findall(r"^  ([\w.]+)=.*\n( {6}\S)?", page.help, re.MULTILINE)
+    assert [name for name, explanation in settings if not explanation and name not in page.choices] == []
+    leaves = {name for name, hint in get_type_hints(schema).items() if not is_dataclass(hint)}
+    assert leaves <= {name.split(".")[0] for name, _ in settings}
 
 
 def nested_names(config: DictConfig, prefix: str = "") -> Iterator[str]:

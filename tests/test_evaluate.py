@@ -115,3 +115,13 @@ def test_contradictions_are_refused_in_one_line(arguments: list[str], message: s
     assert code == 1
     assert message in err
     assert err.count("\n") == 1
+
+
+def test_pictures_of_a_run_match_the_photographs_of_its_data(
+    trained_run: Path, tiny_scene: Path, tmp_path: Path, evaluate_here: Callable
+) -> None:
+    folders = [f"predictions={trained_run / 'images'}", f"references={tiny_scene / 'test'}"]
+    finished = evaluate_here(*folders, f"out={tmp_path}")
+    assert finished.code == 0, finished.err
+    run, again = (json.loads((folder / "metrics.json").read_text())["views"] for folder in (trained_run, tmp_path))
+    assert [(view["name"], view["psnr"]) for view in again] == [(f["name"], pytest.approx(f["psnr"])) for f in run]

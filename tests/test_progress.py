@@ -21,3 +21,16 @@ def test_pictures_and_grids_have_bars_once_they_take_long(
         assert finished.code == 0, finished.err
         for work in ("reading", "occupancy", "smoothing"):
             assert (f"{work}: 100%" in finished.err) == has_bars
+
+
+def test_a_log_file_receives_whole_lines_once_per_minute(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for seconds, num_lines in ((60.0, 2), (0.0, 5)):  # the first and the last state, or all of them
+        monkeypatch.setattr(progress, "_LOG_SECONDS", seconds)
+        monkeypatch.setattr(progress, "DELAY", 0)
+        assert list(progress.track("counting", [1, 2, 3])) == [1, 2, 3]
+        lines = capsys.readouterr().err.splitlines(keepends=True)
+        assert len(lines) == num_lines
+        assert all(line.startswith("counting: ") and line.endswith("\n") and "\r" not in line for line in lines)
+        assert lines[-1].startswith("counting: 100%")

@@ -72,10 +72,10 @@ def test_constructor_becomes_the_configuration() -> None:
     assert list(plugin.fields()) == [
         ("required", "int", "required"),
         ("rate", "float", 0.5),
-        ("names", "list[str]", ["a"]),
-        ("maybe", "int | none", None),
-        ("newer", "str | none", None),
-        ("mode", "fast | exact", "fast"),
+        ("names", "list of str", ["a"]),
+        ("maybe", "int; or null", None),
+        ("newer", "str; or null", None),
+        ("mode", "`fast`, `exact`", "fast"),
     ]
     medium = nn.Identity()
     built = build({"_target_": plugin.target, "required": 3}, medium=medium, something_else=1)
@@ -139,7 +139,7 @@ def test_wrong_fields_are_refused(fields: dict[str, object], message: str) -> No
 
 
 def test_missing_required_field_is_named() -> None:
-    with pytest.raises(NerfroError, match=r"data=opencv: Missing mandatory value: root; its fields: root, near, far"):
+    with pytest.raises(NerfroError, match=r"data=opencv needs root; add data\.root=\.\.\."):
         configure(find("data", "opencv"), {})
 
 

@@ -14,9 +14,10 @@ from PIL import Image
 from nerfro.errors import NerfroError
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import RunMetrics, write_metrics_json
+from nerfro.evaluation.tables import to_html
 from nerfro.files.images import load_png, save_png
 from nerfro.registry import discover
-from nerfro.report.comparison import compare, find_metrics, to_table
+from nerfro.report.comparison import combine, compare, find_metrics, to_table
 from nerfro.report.curves import COLOURS, MAX_POINTS, make_charts, read_curves
 from nerfro.report.page import report_page
 from nerfro.report.runs import find_runs
@@ -159,6 +160,20 @@ def test_pictures_of_another_data_set_are_refused(runs: Path, tmp_path: Path, ti
         run.config["data"]["root"] = str(changed)  # type: ignore[index]
     with pytest.raises(NerfroError, match="has changed since these views"):
         scene_images(comparison, scored, Selection())
+
+
+def test_budgets_and_seeds_are_one_table_of_the_columns_with_values(tmp_path: Path) -> None:
+    for time in ("00:00:00:20", "00:00:01:00"):
+        for seed in (0, 1):
+            for name, psnr in (("a", 20.0), ("b", 25.0)):
+                write_run(tmp_path / f"{name}{seed}{time[6:8]}", name, psnr + seed, seed, max_time=time, lpips=None)
+    metrics, comparisons = find_metrics(["psnr", "lpips"]), compare(find_runs([str(tmp_path)])[0], {}, {})
+    table = combine([(comparison, to_table(comparison, metrics, "full")) for comparison in comparisons])
+    assert [column.title for column in table.columns] == ["PSNR"]
+    assert [row.block.split(" on ")[0] for row in table.rows] == ["20 s", "20 s", "1 min", "1 min"]
+    assert [(row.label, row.values) for row in table.rows] == [("a", (20.5,)), ("b", (25.5,))] * 2
+    assert [table.mark_of(number, 0) for number in range(4)] == ["silver", "gold"] * 2
+    assert to_html(table).count("<table>") == 1
 
 
 # What a reader sees at first, after moving the border, and with another view and other sides.

@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 from scipy.ndimage import binary_dilation
-from tqdm import tqdm
 
 from nerfro.capture.calibration import Calibration, Intrinsics, LensModel, Pose
 from nerfro.data.colmap import lens_of
@@ -24,7 +23,7 @@ from nerfro.data.lenses import Lens, check_lenses
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing
 from nerfro.paths import user_path
-from nerfro.progress import track
+from nerfro.progress import progress_bar, track
 
 Pairs = Literal["sequential", "all"]
 
@@ -178,7 +177,7 @@ def _map(pycolmap: Any, database: Path, images: Sequence[Path], folder: Path, th
     options.ba_refine_principal_point = False
     options.random_seed, options.num_threads = _SEED, threads
     folder.mkdir(parents=True, exist_ok=True)
-    with tqdm(total=len(images), desc="registering images", unit="image", dynamic_ncols=True) as progress:
+    with progress_bar("registering images", len(images)) as progress:
 
         def advance(count: int = 1) -> None:
             # Registrations in a model that COLMAP discards are counted again in the next one.

@@ -66,7 +66,11 @@ class ImagePair:
 
 
 def match_folders(
-    predictions: Path, references: Path, masks: Path | None, labels: Sequence[int] | None = None
+    predictions: Path,
+    references: Path,
+    masks: Path | None,
+    labels: Sequence[int] | None = None,
+    renamed: Mapping[str, str] | None = None,
 ) -> list[ImagePair]:
     """Match the images of two folders by name without extension.
 
@@ -75,6 +79,7 @@ def match_folders(
         references: folder of reference images. Files `mask_<name>.png` are masks.
         masks: folder of masks. By default, `find_mask` searches the folder of references.
         labels: labels of the object in the masks, see `nerfro.data.image_files.read_mask`.
+        renamed: names of predictions by the names of their references and masks, where these differ.
 
     Returns:
         The pairs, sorted by name.
@@ -84,6 +89,8 @@ def match_folders(
     """
     predicted, truth = _list_images(predictions, "predictions"), _list_images(references, "references")
     truth = {name: path for name, path in truth.items() if not name.startswith("mask_") or name[5:] not in truth}
+    renamed = renamed or {}
+    truth = {renamed.get(name, name): path for name, path in truth.items()}
     _require(predicted, truth, f"reference in references={references}")
     _require(truth, predicted, f"prediction in predictions={predictions}")
     if masks is None:
@@ -91,7 +98,8 @@ def match_folders(
         files = {name: path for name, path in found.items() if path is not None}
         where = f"references={references}, where others have one"
     else:
-        files = {name.removeprefix("mask_"): path for name, path in _list_images(masks, "masks").items()}
+        named = {name.removeprefix("mask_"): path for name, path in _list_images(masks, "masks").items()}
+        files = {renamed.get(name, name): path for name, path in named.items()}
         where = f"masks={masks}"
     if files:
         _require(truth, files, f"mask in {where}")

@@ -8,7 +8,6 @@ from pathlib import Path
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from tqdm import tqdm
 
 from nerfro.camera.exposure import fit_gain
 from nerfro.data.base import Views
@@ -20,6 +19,7 @@ from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.render_view import render_view
 from nerfro.evaluation.results import EvaluationResult
 from nerfro.files.images import save_png
+from nerfro.progress import track
 from nerfro.rendering import Renderer
 from nerfro.subdivision import Subdivision
 
@@ -55,19 +55,16 @@ def score_views(
     cameras, left = views.cameras.to(scene.device), slice(width // 2)
     scored = slice(width // 2, None) if right_halves else slice(None)
     gains = torch.ones(len(views), 3)
-    progress = tqdm(total=len(views) * height * width, unit="ray", unit_scale=True, desc="evaluate", dynamic_ncols=True)
-    with progress:
-        for view in range(len(views)):
-            radiance = render_view(renderer, cameras, view, subdivision).radiance.view(height, width, 3).cpu()
-            target, mask = views.images[view], None if views.masks is None else views.masks[view]
-            if right_halves and scene.camera.exposure is not None:
-                to_srgb, shown = scene.colour_space.to_srgb, radiance[:, left].flatten(0, 1)
-                gains[view] = fit_gain(to_srgb, shown, target[:, left].flatten(0, 1))
-            rgb = scene.colour_space.to_display(radiance, gains[view])
-            save_png(folder / subfolder / f"{metrics.prefix}_{view:03d}.png", rgb)
-            prediction, target = (image[:, scored].contiguous() for image in (rgb, target))
-            metrics.update(prediction, target, view, None if mask is None else mask[:, scored].contiguous())
-            progress.update(height * width)
+    for view in track("evaluate", range(len(views))):
+        radiance = render_view(renderer, cameras, view, subdivision).radiance.view(height, width, 3).cpu()
+        target, mask = views.images[view], None if views.masks is None else views.masks[view]
+        if right_halves and scene.camera.exposure is not None:
+            to_srgb, shown = scene.colour_space.to_srgb, radiance[:, left].flatten(0, 1)
+            gains[view] = fit_gain(to_srgb, shown, target[:, left].flatten(0, 1))
+        rgb = scene.colour_space.to_display(radiance, gains[view])
+        save_png(folder / subfolder / f"{metrics.prefix}_{view:03d}.png", rgb)
+        prediction, target = (image[:, scored].contiguous() for image in (rgb, target))
+        metrics.update(prediction, target, view, None if mask is None else mask[:, scored].contiguous())
     return metrics.result(), gains
 
 
@@ -81,7 +78,7 @@ def score_folders(
 ) -> EvaluationResult:
     """Score each prediction on a device, and write error maps to `folder/errors`."""
     metrics = metrics.to(device)
-    for pair in tqdm(pairs, unit="view", desc="evaluate", dynamic_ncols=True):
+    for pair in track("evaluate", pairs):
         prediction, reference, coverage = pair.load(alpha)
         prediction, reference = prediction.to(device), reference.to(device)
         metrics.update(prediction, reference, coverage=None if coverage is None else coverage.to(device))

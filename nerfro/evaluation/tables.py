@@ -69,11 +69,13 @@ class Row:
         label: heading of the row.
         values: one number per column, or None for a missing number.
         spreads: standard deviation of each number, or None; empty if no number has one.
+        block: heading of this row and its neighbours of the same block. Marks compare the rows of a block.
     """
 
     label: str
     values: tuple[Score, ...]
     spreads: tuple[Score, ...] = ()
+    block: str = ""
 
     def spread(self, column: int) -> Score:
         return self.spreads[column] if self.spreads else None
@@ -119,7 +121,7 @@ class Table:
         value = self.rows[row].values[column]
         if not self.mark or better is None or value is None:
             return ""
-        values = [other.values[column] for other in self.rows]
+        values = [other.values[column] for other in self.rows if other.block == self.rows[row].block]
         distinct = {round(other, decimals) for other in values if other is not None}
         rank = sorted(distinct, reverse=better == "higher").index(round(value, decimals))
         marks = MEDALS if self.mark == "medals" else ("best",)
@@ -164,14 +166,37 @@ def short(reason: str) -> str:
     return reason.partition(";")[0]
 
 
-def report(metrics: RunMetrics, title: str, folder: Path) -> None:
-    """Write metrics.json and the tables of all regions into a folder, and print the tables of views and means."""
+def describe(metrics: RunMetrics) -> str:
+    """Describe the mean scores in one line, with the error that the PSNR stands for."""
+    result, known = metrics.result, image_metrics()
+    means = {name: mean for name, mean in result.means().items() if mean is not None}
+    scores = [f"{known[name].title} {mean:.{known[name].decimals}f}" for name, mean in means.items()]
+    if "psnr" in means:
+        scores[list(means).index("psnr")] += f" dB (an error of {100 * 10 ** (-means['psnr'] / 20):.1f} % of white)"
+    others = {"on the object": result.mean("psnr", "mask")}
+    others |= {name: treated.mean("psnr") for name, treated in metrics.treatments.items()}
+    scores += [f"PSNR {name} {mean:.2f} dB" for name, mean in others.items() if mean is not None]
+    return f"{', '.join(scores) or 'no scores'}; mean of {len(result.views)} views"
+
+
+def report(metrics: RunMetrics, title: str, folder: Path, brief: bool = False) -> None:
+    """Write metrics.json and the tables of all regions into a folder, and print the scores.
+
+    Args:
+        metrics: the scores.
+        title: title of the tables.
+        folder: folder for the files.
+        brief: print the means in one line, instead of the tables of views and means.
+    """
     result = metrics.result
     for region in result.regions:
         full = region == FULL
         table = views_table(result, title if full else f"{title}, {region}", region)
         write_table(table, folder / ("metrics" if full else f"metrics_{region}"))
     write_metrics_json(folder / "metrics.json", metrics)  # last, because sweeps take it as the end of the run
+    if brief:
+        print(describe(metrics))
+        return
     rich.print(to_rich(views_table(result, title)))
     if len(result.regions) > 1:
         rich.print(to_rich(regions_table(result, "means of the full images, of the object's mask, and of the crop")))
@@ -320,6 +345,9 @@ def to_html(table: Table) -> str:
     lines += [f'<th scope="col">{html.escape(_heading(column))}</th>' for column in table.columns]
     lines += ["</tr>", "</thead>", "<tbody>"]
     for i, row in enumerate(table.rows):
+        if row.block and (i == 0 or row.block != table.rows[i - 1].block):
+            heading = f'<th class="block" scope="rowgroup" colspan="{len(table.columns) + 1}">'
+            lines.append(f"<tr>{heading}{html.escape(row.block)}</th></tr>")
         cells = "".join(table.marked_cells(i, _HTML))
         lines.append(f'<tr><th scope="row">{html.escape(row.label)}</th>{cells}</tr>')
     lines.append("</tbody>")

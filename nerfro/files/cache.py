@@ -15,18 +15,13 @@ import numpy as np
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import atomic_file
 from nerfro.files.reading import load_arrays
-from nerfro.paths import user_path
+from nerfro.paths import cache_dir, user_path
 
 # Maximum size of all entries in bytes; the least recently used entries are removed first.
 LIMIT = 32 * 2**30
 _ENTRIES = ("distance_*.npz", "occupancy_*.npz", "mapped_*.npy")
 _ABANDONED_SECONDS = 86400.0
 _CHECKSUM = "checksum"  # name of the array that holds the checksum of an entry
-
-
-def cache_dir() -> Path:
-    """Return the folder of the cache: the environment variable `NERFRO_CACHE`, or ~/.cache/nerfro."""
-    return Path(os.environ.get("NERFRO_CACHE") or "~/.cache/nerfro").expanduser()
 
 
 def content_hash(*parts: np.ndarray | str | float | int | bool) -> str:

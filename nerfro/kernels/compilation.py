@@ -14,8 +14,8 @@ from typing import Any, TypeVar, cast
 
 import numba
 
-from nerfro.files.cache import cache_dir
 from nerfro.kernels.threads import num_threads, parallel_threads
+from nerfro.paths import cache_dir
 
 Function = TypeVar("Function", bound=Callable)
 

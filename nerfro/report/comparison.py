@@ -88,6 +88,25 @@ def to_table(comparison: Comparison, metrics: Mapping[str, type[ImageMetric]], r
     return Table(title, "method", tuple(columns), tuple(rows), mark=mark, notes=tuple(notes))
 
 
+def combine(compared: Sequence[tuple[Comparison, Table]]) -> Table:
+    """Combine the tables of all budgets in one, with a block of rows for each budget and without empty columns."""
+    columns = dict.fromkeys(
+        column
+        for _, table in compared
+        for number, column in enumerate(table.columns)
+        if any(row.values[number] is not None for row in table.rows)
+    ) or dict.fromkeys(column for _, table in compared for column in table.columns)
+    rows = []
+    for comparison, table in compared:
+        for row in table.rows:
+            found = {column: (row.values[number], row.spread(number)) for number, column in enumerate(table.columns)}
+            values, spreads = zip(*(found.get(column, (None, None)) for column in columns), strict=True)
+            rows.append(Row(row.label, values, spreads, comparison.budget.label))
+    notes = dict.fromkeys(note for _, table in compared for note in table.notes)
+    titles = dict.fromkeys("; ".join(table.title.split("; ")[1:]) for _, table in compared)
+    return Table(" / ".join(titles), "method", tuple(columns), tuple(rows), mark="medals", notes=tuple(notes))
+
+
 def find_metrics(names: Sequence[str] | None = None) -> dict[str, type[ImageMetric]]:
     """Return the metrics with the given names, in this order; by default PSNR, SSIM, LPIPS and the metrics of plugins.
 

@@ -17,7 +17,7 @@ from nerfro.evaluation.tables import Table, to_html
 from nerfro.files.drawing import magma
 from nerfro.files.templates import fill_template
 from nerfro.paths import PACKAGE_DIR
-from nerfro.report.comparison import Comparison
+from nerfro.report.comparison import Comparison, combine
 from nerfro.report.curves import COLOURS, Chart, make_charts, read_curves
 from nerfro.report.runs import Run, device, duration, shown
 from nerfro.report.views import JPEG_QUALITY, PNG_SIDE, SceneImages, Selection, embed_image, scene_images
@@ -63,7 +63,6 @@ class Section:
     id: str
     title: str
     methods: Sequence[str]
-    table: Markup
     scenes: Sequence[SceneSection]
     runs: Sequence[Provenance]
 
@@ -75,15 +74,15 @@ def report_page(compared: Sequence[tuple[Comparison, Table]], unfinished: Sequen
             id=f"b{number}",
             title=f"Trained for {comparison.budget.label}",
             methods=comparison.methods,
-            table=Markup(to_html(table)),
             scenes=_scenes(f"b{number}", comparison, selection),
             runs=[_provenance(comparison, run) for run in comparison.runs],
         )
-        for number, (comparison, table) in enumerate(compared)
+        for number, (comparison, _) in enumerate(compared)
     ]
     ramp = magma(torch.linspace(0, 1, 256)[None], 1)
     return fill_template(
         _TEMPLATES / "page.html.jinja",
+        table=Markup(to_html(combine(compared))),
         sections=sections,
         unfinished=unfinished,
         colours=COLOURS,

@@ -8,11 +8,11 @@ from types import ModuleType
 from typing import Annotated, Optional
 
 from omegaconf import MISSING, DictConfig
-from tqdm import tqdm
 
 from nerfro.allowed import Count, Natural, NotNegative, Positive, Range
 from nerfro.errors import NerfroError
 from nerfro.paths import user_path
+from nerfro.progress import progress_bar
 from nerfro.registry import discover
 from nerfro.scenes import SCENES
 from nerfro.scenes.dataset import DataSet, Views
@@ -97,7 +97,7 @@ def synthesize(config: DictConfig) -> DataSet:
     if waiting:
         tracer = PathTracer(data.lit(), config.fresnel, data.camera, config.variant)
         # The remaining time is estimated from samples, because test views have more samples.
-        with tqdm(total=sum(image.spp for image in waiting), unit="spp", desc="render", dynamic_ncols=True) as bar:
+        with progress_bar("render", sum(image.spp for image in waiting)) as bar:
             for image in waiting:
                 radiance = tracer.render(image.pose, image.spp, image.seed)
                 data.write(image, radiance, tracer.silhouette(image.pose))

@@ -14,6 +14,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar, Timer
 from lightning.pytorch.trainer.states import RunningStage
 from tqdm import tqdm
 
+from nerfro.progress import progress_bar
 from nerfro.training.module import training_progress
 from nerfro.types import Batch
 
@@ -63,48 +64,35 @@ class Throughput(Callback):
         self.num_rays, self.seconds = state_dict["num_rays"], state_dict["seconds"]
 
 
-_FORM = "{desc} {percentage:3.0f}%|{bar}| "
-
-
 class TrainingProgress(ProgressBar):
-    """Show one line with the progress (in steps or time), the remaining time, rays per second and PSNR."""
-
-    _UPDATE_SECONDS = 0.5
+    """Show the progress (in steps or time), the remaining time, rays per second and PSNR."""
 
     def __init__(self, throughput: Throughput) -> None:
         super().__init__()
         self._throughput = throughput
         self._bar: tqdm | None = None
-        self._begun = self._shown = 0.0
-        self._begun_at = 0.0
-        self._enabled = True
+        self._shown, self._enabled = 0.0, True
 
     def disable(self) -> None:
         self._enabled = False
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._begun, self._begun_at = time.perf_counter(), training_progress(trainer)
-        self._bar = tqdm(total=1.0, desc="train", bar_format=_FORM, dynamic_ncols=True, disable=not self._enabled)
+        self._shown, begun = time.perf_counter(), training_progress(trainer)
+        self._bar = progress_bar("train", 1.0, initial=begun, mininterval=0.5, delay=0, disable=not self._enabled)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Batch, batch_idx: int
     ) -> None:
         now = time.perf_counter()
-        if self._bar is None or now - self._shown < self._UPDATE_SECONDS:
+        if self._bar is None or self._bar.disable or now - self._shown < self._bar.mininterval:
             return
-        self._shown = now
-        done = training_progress(trainer)
-        rate = (done - self._begun_at) / (now - self._begun)
-        eta = tqdm.format_interval((1 - done) / rate) if rate > 0 else "?"
-        shown = trainer.callback_metrics
-        self._bar.n = done
-        # tqdm would add a comma before a postfix.
-        self._bar.bar_format = _FORM + (
-            f"step {trainer.global_step} ETA {eta} {self._throughput.rays_per_second or 0:,.0f} rays/s "
+        self._shown, shown = now, trainer.callback_metrics
+        self._bar.n = training_progress(trainer)
+        self._bar.set_postfix_str(
+            f"step {trainer.global_step}, {self._throughput.rays_per_second or 0:,.0f} rays/s, "
             f"train PSNR {-10 * math.log10(max(float(outputs['squared_error']), 1e-10)):.2f}"
-            + (f" val PSNR {float(shown['val/psnr']):.2f}" if "val/psnr" in shown else "")
+            + (f", val PSNR {float(shown['val/psnr']):.2f}" if "val/psnr" in shown else "")
         )
-        self._bar.refresh()
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._bar is not None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +21,7 @@ from nerfro.allowed import (
     NumRays,
     Positive,
     Range,
+    Refused,
     Resolution,
     check_settings,
     corners_of_box,
@@ -70,7 +73,8 @@ class BatchesConfig:
 class EvaluationConfig:
     """Evaluation of the trained model."""
 
-    split: str = "test"  # split of the data set
+    # Split of the data set; None, and `evaluation=none`, end the run without scores.
+    split: Optional[str] = "test"  # noqa: UP045
     chunk_size: NumRays = 8192  # rays rendered in one chunk; bounds the memory
     # File of AlexNet weights; None searches torch's hub cache, then downloads the weights.
     lpips_backbone: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
@@ -105,7 +109,7 @@ class TrainerConfig:
     num_nodes: Optional[Count] = None  # noqa: UP045
     strategy: Any = "auto"
     max_steps: Annotated[int, Range(at_least=-1, at_most=10**9)] = -1  # -1 trains until max_time
-    max_time: Any = None  # DD:HH:MM:SS
+    max_time: Any = None  # such as 90s, 5m, 1.5h, 2d, or DD:HH:MM:SS
     # `fastest` selects bf16-mixed if the machine has bfloat16 units, else 32-true.
     precision: Annotated[str, Literal["32-true", "fastest", "16-mixed", "bf16-mixed", "64-true"]] = "32-true"
     gradient_clip_val: Optional[Positive] = None  # noqa: UP045
@@ -126,50 +130,25 @@ class TrainerConfig:
     inference_mode: Optional[bool] = None  # noqa: UP045
     # Train for this number of steps, or for one step if true, and score one view.
     fast_dev_run: Any = False
-    # Refused with a reason, see `REFUSED_ARGUMENTS`.
-    accumulate_grad_batches: Any = None
-    barebones: Any = None
-    callbacks: Any = None
-    check_val_every_n_epoch: Any = None
-    default_root_dir: Any = None
-    enable_autolog_hparams: Any = None
-    limit_predict_batches: Any = None
-    limit_train_batches: Any = None
-    limit_val_batches: Any = None
-    logger: Any = None
-    max_epochs: Any = None
-    min_epochs: Any = None
-    model_registry: Any = None
-    num_sanity_val_steps: Any = None
-    plugins: Any = None
-    reload_dataloaders_every_n_epochs: Any = None
-    sync_batchnorm: Any = None
-    use_distributed_sampler: Any = None
-    val_check_interval: Any = None
-
-
-# Arguments of Lightning's Trainer that a run cannot support, and what to use instead.
-REFUSED_ARGUMENTS: Mapping[str, str] = {
-    "accumulate_grad_batches": "batches and random numbers depend on the step; set batches.size",
-    "barebones": "a run needs its log and its checkpoints; set logger=none trainer.enable_checkpointing=false",
-    "callbacks": "choose callbacks by name, as in +callbacks=learning_rate_monitor",
-    "check_val_every_n_epoch": _EPOCHS,
-    "default_root_dir": "set hydra.run.dir",
-    "enable_autolog_hparams": "the settings of a run are always written",
-    "limit_predict_batches": "training predicts nothing; see python -m nerfro.render",
-    "limit_train_batches": f"{_EPOCHS}, or trainer.overfit_batches to repeat batches",
-    "limit_val_batches": "validation renders one view at a time; set evaluation.every=0 to switch validation off",
-    "logger": "choose loggers by name, as in logger=wandb",
-    "max_epochs": _EPOCHS,
-    "min_epochs": _EPOCHS,
-    "model_registry": "checkpoints are written to the run folder",
-    "num_sanity_val_steps": "validation is tried in the first steps; set evaluation.every",
-    "plugins": "nerfro's plugins have no access to the trainer's; see docs/guides/plugins.md",
-    "reload_dataloaders_every_n_epochs": _EPOCHS,
-    "sync_batchnorm": "no model has batch normalization",
-    "use_distributed_sampler": "every process draws its own share of the pixels",
-    "val_check_interval": "set evaluation.every",
-}
+    accumulate_grad_batches: Annotated[Any, Refused("batches depend on the step; set batches.size")] = None
+    barebones: Annotated[Any, Refused("set logger=none trainer.enable_checkpointing=false")] = None
+    callbacks: Annotated[Any, Refused("choose callbacks by name, as in +callbacks=learning_rate_monitor")] = None
+    check_val_every_n_epoch: Annotated[Any, Refused(_EPOCHS)] = None
+    default_root_dir: Annotated[Any, Refused("set hydra.run.dir")] = None
+    enable_autolog_hparams: Annotated[Any, Refused("the settings of a run are always written")] = None
+    limit_predict_batches: Annotated[Any, Refused("training predicts nothing; see python -m nerfro.render")] = None
+    limit_train_batches: Annotated[Any, Refused(f"{_EPOCHS}, or trainer.overfit_batches to repeat batches")] = None
+    limit_val_batches: Annotated[Any, Refused("set evaluation.every=0 to switch validation off")] = None
+    logger: Annotated[Any, Refused("choose loggers by name, as in logger=wandb")] = None
+    max_epochs: Annotated[Any, Refused(_EPOCHS)] = None
+    min_epochs: Annotated[Any, Refused(_EPOCHS)] = None
+    model_registry: Annotated[Any, Refused("checkpoints are written to the run folder")] = None
+    num_sanity_val_steps: Annotated[Any, Refused("validation is tried in the first steps; set evaluation.every")] = None
+    plugins: Annotated[Any, Refused("plugins of nerfro have their own registry; see docs/guides/plugins.md")] = None
+    reload_dataloaders_every_n_epochs: Annotated[Any, Refused(_EPOCHS)] = None
+    sync_batchnorm: Annotated[Any, Refused("no model has batch normalization")] = None
+    use_distributed_sampler: Annotated[Any, Refused("every process draws its own share of the pixels")] = None
+    val_check_interval: Annotated[Any, Refused("set evaluation.every")] = None
 
 
 @dataclass
@@ -256,13 +235,8 @@ def check_run(config: DictConfig) -> None:
     Raises:
         NerfroError: a setting has no meaning or contradicts another one, or does not fit its plugin.
     """
-    for name, reason in REFUSED_ARGUMENTS.items():
-        if config.trainer[name] is not None:
-            raise NerfroError(f"trainer.{name}={config.trainer[name]} has no meaning in nerfro: {reason}")
     OmegaConf.to_container(config.data, resolve=True)  # an interpolation without a value is an error
-    limit = config.trainer.max_time
-    if isinstance(limit, (int, float)):
-        raise NerfroError(f"trainer.max_time={limit} has no unit; write DD:HH:MM:SS, such as 00:00:05:00")
+    limit = clock_time(config.trainer.max_time)
     if (config.checkpoint.every_seconds is None) == (config.checkpoint.every_steps is None):
         raise NerfroError("set one of checkpoint.every_seconds and checkpoint.every_steps, and the other to null")
     for node in (config.trainer, *(config.logger or {}).values()):
@@ -281,11 +255,30 @@ def check_run(config: DictConfig) -> None:
     if check_node(config.sampler.path).needs_medium:  # type: ignore[attr-defined]
         check_node(config.medium)
     if limit is None and config.trainer.max_steps < 0 and not (config.debug or config.trainer.fast_dev_run):
-        raise NerfroError("the run would never end; set trainer.max_time (DD:HH:MM:SS), trainer.max_steps, or both")
+        raise NerfroError("the run would never end; set trainer.max_time, such as 5m, trainer.max_steps, or both")
+
+
+def clock_time(duration: object) -> object:
+    """Convert a duration with a unit, such as `90s`, `5m`, `1.5h` or `2d`, to the form DD:HH:MM:SS.
+
+    Args:
+        duration: `trainer.max_time`. None, and mappings, from which Lightning builds a `timedelta`, are returned as is.
+
+    Raises:
+        NerfroError: the text or number is not a duration.
+    """
+    if duration is None or isinstance(duration, Mapping) or re.fullmatch(r"\d+:\d\d:\d\d:\d\d", str(duration)):
+        return duration
+    given = re.fullmatch(r"(\d{1,6}(?:\.\d+)?)([smhd])", str(duration))
+    if given is None:
+        raise NerfroError(f"trainer.max_time={duration} is not a duration; write 90s, 5m, 1h, 2d or DD:HH:MM:SS")
+    seconds = math.ceil(float(given[1]) * {"s": 1, "m": 60, "h": 3600, "d": 86400}[given[2]])
+    return f"{seconds // 86400:02d}:{seconds // 3600 % 24:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
 
 
 def settle_trainer(config: DictConfig) -> None:
-    """Reduce the run to a few steps and one scored view where `debug` or `trainer.fast_dev_run` asks for it."""
+    """Convert `max_time`, and shorten the run to a few steps and one scored view for `debug` or `fast_dev_run`."""
+    config.trainer.max_time = clock_time(config.trainer.max_time)
     fast = config.trainer.fast_dev_run
     if not (config.debug or fast):
         return

@@ -94,16 +94,17 @@ def begin(folder: Path, config: DictConfig, renderer: Renderer) -> None:
     print(f"nerfro: {config.name} on {config.data.root} -> {folder}\n{found}", end="", flush=True)
 
 
-def next_steps(folder: Path) -> str:
-    """Return what a user can look at and do after a run."""
-    checkpoint = shlex.quote(f"checkpoint={folder / LAST_CHECKPOINT}")
-    runs = shlex.quote(f"runs={folder.parent}")
-    table = f"\n  python -m nerfro.summary {runs}  the table of the sweep" if in_sweep() else ""
-    return (
-        f"Look at:\n  {folder}/images/  the rendered views; metrics.json, .csv, .md and .tex are beside\n"
-        f"  python -m nerfro.evaluate {checkpoint}  scores the run again, or other views\n"
-        f"  python -m nerfro.dashboard  losses and validation images{table}"
-    )
+def next_steps(folder: Path, split: str | None) -> str:
+    """Return what a user can look at after a run whose views of a split have been scored, if any."""
+    lines = [f"page: python -m nerfro.view {shlex.quote(f'checkpoint={folder}')}"]
+    if split is None:
+        lines.append(f"scores: python -m nerfro.evaluate {shlex.quote(f'checkpoint={folder / LAST_CHECKPOINT}')}")
+    else:
+        lines.insert(0, f"picture: {folder / 'images' / f'{split}_000.png'}")
+        lines.append(f"tables: {folder}/metrics.md, .csv and .tex for each view, and metrics.json")
+    if in_sweep():
+        lines.append(f"table of the sweep: python -m nerfro.summary {shlex.quote(f'runs={folder.parent}')}")
+    return "\n".join(lines)
 
 
 def require_room(folder: Path, needed_bytes: int) -> None:

@@ -48,7 +48,7 @@ class Viewer(Callback):
             return
         assert isinstance(pl_module, TrainingModule)
         scene = TrainedScene(pl_module.renderer, self._source, name=self._config.name)
-        self._live = LivePage(self._server, scene, self._views, self._config.evaluation.split)
+        self._live = LivePage(self._server, scene, self._views, self._config.evaluation.split or "train")
         print(f"nerfro: the model as it learns: {self._server.url}", flush=True)
 
     def on_train_batch_end(

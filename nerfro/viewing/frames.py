@@ -9,7 +9,6 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
@@ -18,6 +17,7 @@ from nerfro.files.deep_images import write_radiance
 from nerfro.files.drawing import sheet
 from nerfro.files.images import save_image, save_png
 from nerfro.files.reading import read_json
+from nerfro.progress import progress_bar
 from nerfro.viewing.layers import Layer
 from nerfro.viewing.render_request import Shots
 from nerfro.viewing.trained_scene import TrainedScene
@@ -70,11 +70,10 @@ def render_frames(
     missing = [frame for frame, file in enumerate(files) if not file.exists()]
     if len(missing) < len(files):
         print(f"nerfro: {len(files) - len(missing)} of {len(files)} frames exist already")
-    size = shots.cameras.width * shots.cameras.height * len(renderer.scenes)
-    with tqdm(total=len(missing) * size, unit="ray", unit_scale=True, desc="render", dynamic_ncols=True) as progress:
+    with progress_bar("render", len(missing)) as progress:
         for frame in missing:
             _write(files[frame], renderer.render(shots, frame), renderer.labels)
-            progress.update(size)
+            progress.update()
     return files
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import ipaddress
 import json
+import os
 import re
 import socket
 import sys
 import threading
 import time
+import webbrowser
 from collections.abc import Callable, Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -24,6 +26,15 @@ _MAX_BODY = 2**22  # bytes of a request
 _PLACEHOLDER = b'<!DOCTYPE html><meta http-equiv="refresh" content="2"><title>nerfro</title><p>The page is being made.'
 
 _FOREIGN, _NOT_FOUND = b"open the page by the address that nerfro has printed", b"this server has only the page at /"
+
+
+def open_page(url: str) -> None:
+    """Open a page in a graphical browser, or print how to reach the page from another machine over SSH."""
+    if "SSH_CONNECTION" in os.environ:
+        port = urlsplit(url).port
+        print(f"nerfro: on your own machine, run ssh -L {port}:localhost:{port} HOST, and open {url}", flush=True)
+    elif sys.platform != "linux" or {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
+        webbrowser.open(url)
 
 
 class PageServer:

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from tqdm import tqdm
 
 from nerfro.cameras import Cameras
 from nerfro.data.base import DataSource, Views
@@ -21,6 +20,7 @@ from nerfro.files import lat_long
 from nerfro.files.images import data_uri, to_8bit
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.paths import user_path
+from nerfro.progress import track
 from nerfro.rendering import Renderer
 from nerfro.subdivision import Subdivision
 from nerfro.types import Exits
@@ -105,7 +105,7 @@ class TrainedScene:
             progress: whether to show a progress bar.
         """
         scene = self if chunk_size is None else replace(self, renderer=variant(self.renderer, chunk_size=chunk_size))
-        views = tqdm(range(len(cameras)), unit="view", desc="render", disable=not progress, dynamic_ncols=True)
+        views = track("render", range(len(cameras)), disable=not progress)
         rendered = [scene._render_view(cameras, view, subdivision or self.subdivision) for view in views]
         return RenderedViews(*(torch.stack(images) for images in zip(*rendered, strict=True)))
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from tqdm import tqdm
 
 from nerfro.geometry.contraction import contraction_scale, expand
+from nerfro.progress import track
 from nerfro.viewing.trained_scene import TrainedScene
 
 RESOLUTION = 128
@@ -61,8 +61,7 @@ def sample_field(
     if radius is not None:
         positions = expand(positions, box.mean(0), radius)
         scale = contraction_scale(positions, box.mean(0), radius)
-    chunks = positions.split(POINTS_AT_ONCE)
-    chunks = tqdm(chunks, unit="chunk", desc="sample field", dynamic_ncols=True, disable=not progress)
+    chunks = track("sample field", positions.split(POINTS_AT_ONCE), disable=not progress)
     density = torch.cat([field.density(chunk.to(device)).cpu() for chunk in chunks])
     density = density / scale
     cell = float((sides / (counts - 1)).max())

@@ -5,22 +5,31 @@ from __future__ import annotations
 import inspect
 import json
 from collections.abc import Callable
+from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import lightning.pytorch as pl
 import pytest
 import torch
+from lightning.pytorch.callbacks import Timer
 from omegaconf import OmegaConf
 
 import nerfro.training.trainer
+from nerfro.allowed import Refused, check_settings
 from nerfro.errors import NerfroError
 from nerfro.registry import build, find, register
 from nerfro.testing import check
-from nerfro.training.config import REFUSED_ARGUMENTS, TrainConfig, TrainerConfig, check_run
+from nerfro.training.config import TrainConfig, TrainerConfig, clock_time
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.trainer import _OWN
 
+REFUSED = {
+    name: reason
+    for name, hint in get_type_hints(TrainerConfig, include_extras=True).items()
+    for reason in get_args(hint)
+    if isinstance(reason, Refused)
+}
 CALLBACK = '''
 from lightning.pytorch import Callback
 from nerfro.registry import register
@@ -51,7 +60,6 @@ def test_every_argument_of_lightnings_trainer_is_known() -> None:
     arguments = set(inspect.signature(pl.Trainer.__init__).parameters) - {"self"}
     fields = set(TrainerConfig.__dataclass_fields__)
     assert arguments <= fields
-    assert set(REFUSED_ARGUMENTS) <= arguments
 
 
 @pytest.mark.parametrize(
@@ -85,13 +93,13 @@ def test_settings_may_refer_to_hydra(key: str, train: Callable[..., Any]) -> Non
     assert f"root: ${{hydra:{key}}}/data" in printed.out
 
 
-@pytest.mark.parametrize("name", REFUSED_ARGUMENTS)
+@pytest.mark.parametrize("name", REFUSED)
 def test_arguments_without_a_meaning_are_refused_with_a_reason(name: str) -> None:
     config = OmegaConf.structured(TrainConfig)
     config.trainer[name] = 3
     with pytest.raises(NerfroError) as refused:
-        check_run(config)
-    assert str(refused.value) == f"trainer.{name}=3 has no meaning in nerfro: {REFUSED_ARGUMENTS[name]}"
+        check_settings(config, TrainConfig)
+    assert str(refused.value) == f"trainer.{name}=3 is not allowed; {REFUSED[name]}"
 
 
 # A value that differs from the default for each argument that a run hands to Lightning's Trainer.
@@ -117,7 +125,7 @@ def test_other_arguments_reach_lightnings_trainer(train: Callable[..., Any], mon
         train("logger=none", *(f"trainer.{name}={value}" for name, value in PASSED.items()))
     (arguments,) = recorded.value.args
     assert PASSED.items() <= arguments.items()
-    assert PASSED.keys() == TrainerConfig.__dataclass_fields__.keys() - {"_target_", *REFUSED_ARGUMENTS, *_OWN}
+    assert PASSED.keys() == TrainerConfig.__dataclass_fields__.keys() - {"_target_", *REFUSED, *_OWN}
 
 
 @pytest.mark.parametrize(("options", "steps"), [(["debug=true"], 10), (["trainer.fast_dev_run=3"], 3)])
@@ -128,6 +136,43 @@ def test_short_runs_score_one_view(options: list[str], steps: int, train: Callab
     assert scores["steps"] == steps
     assert len(scores["views"]) == 1
     assert (tmp_path / "run" / "images" / "test_000.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("duration", "length"),
+    [
+        ("90s", timedelta(seconds=90)),
+        ("5m", timedelta(minutes=5)),
+        ("1.5h", timedelta(hours=1.5)),
+        ("2d", timedelta(days=2)),
+        ("01:02:03:04", timedelta(days=1, hours=2, minutes=3, seconds=4)),
+    ],
+)
+def test_durations_with_a_unit_equal_those_of_lightning(duration: str, length: timedelta) -> None:
+    assert Timer(clock_time(duration)).time_remaining() == length.total_seconds()
+
+
+def test_training_without_evaluation_ends_after_its_time(train: Callable[..., Any], tmp_path: Path) -> None:
+    finished = train("trainer.max_time=1s", "evaluation=none", "experiment=refractive", "name=mine")
+    assert finished.code == 0, finished.err
+    assert "page: python -m nerfro.view checkpoint=" in finished.out
+    assert "max_time: '00:00:00:01'" in (tmp_path / "run" / "config.yaml").read_text().replace('"', "'")
+    assert not list(tmp_path.rglob("*.png"))
+    assert not (tmp_path / "run" / "metrics.json").exists()
+
+
+def test_training_ends_with_the_score_and_the_files_in_five_lines(train: Callable[..., Any], tmp_path: Path) -> None:
+    finished = train("trainer.max_steps=2")
+    last = finished.out.splitlines()[-5:]
+    assert last[0].startswith("2 steps in ")
+    scores = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    psnr, object_psnr = scores["test"]["psnr"], scores["regions"]["mask"]["psnr"]
+    assert last[1].startswith(f"PSNR {psnr:.2f} dB (an error of {100 * 10 ** (-psnr / 20):.1f} % of white), SSIM ")
+    assert f"PSNR on the object {object_psnr:.2f} dB; mean of {len(scores['views'])} views" in last[1]
+    picture, page, tables = (line.partition(": ")[2] for line in last[2:])
+    assert Path(picture).is_file()
+    assert page == f"python -m nerfro.view checkpoint={tmp_path / 'run'}"
+    assert Path(tables.partition(",")[0]).is_file()
 
 
 def test_overfitting_repeats_batches(train: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
