@@ -6,8 +6,7 @@ import ast
 import runpy
 import sys
 
-from nerfro import __version__
-from nerfro.cli import errors_in_one_line
+from nerfro.cli import errors_in_one_line, print_version
 from nerfro.completion import completions, shell_code
 from nerfro.errors import NerfroError
 from nerfro.paths import PACKAGE_DIR
@@ -24,7 +23,7 @@ def main() -> None:
                 print(f"  {command:12}{purpose}")
             print("\nnerfro COMMAND --help lists the options of a command.")
         elif name == "--version":
-            print(f"nerfro {__version__}")
+            print_version()
         elif name == "--completion":
             print(shell_code(" ".join(arguments)))
         elif name == "--complete":

@@ -2,7 +2,7 @@
 
 Examples:
     nerfro calibrate images=photographs target=apriltag out=data/glass
-    nerfro calibrate images=photographs masks=masks out=data/glass
+    nerfro calibrate images=photographs target=colmap lens=radial out=data/glass
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@ import copy
 import dataclasses
 import errno
 import functools
+import importlib.metadata
 import os
 import re
 import shlex
@@ -191,6 +192,11 @@ def _missing_with_example(command: str) -> Iterator[None]:
     except MissingMandatoryValue as error:
         example = usage(command).partition("Examples:\n")[2].partition("\n")[0].strip()
         raise NerfroError(f"{error.full_key}=... is missing; for example: {example}") from error
+
+
+def print_version() -> None:
+    """Print the version of nerfro, which the package metadata contains."""
+    print(f"nerfro {importlib.metadata.version('nerfro')}")
 
 
 def program() -> str | None:

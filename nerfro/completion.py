@@ -42,7 +42,8 @@ def completions(commands: Iterable[str], arguments: Sequence[str]) -> list[str]:
     described = recall(words[0]) if words else None
     known = (f"{command} " for command in commands) if not words else () if described is None else _options(described)
     kept = len(last) - len(arguments[1]) if len(arguments) > 1 else 0
-    return sorted(text[kept:] for text in known if text.startswith(last))
+    found = (text for text in known if text.startswith(last) and "." not in text[len(last) : -1])
+    return sorted(text[kept:] for text in found)
 
 
 def _options(described: Described) -> Iterator[str]:

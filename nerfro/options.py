@@ -26,7 +26,6 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from nerfro import __version__
 from nerfro.allowed import Refused
 from nerfro.errors import NerfroError, nearest_of
 from nerfro.paths import CONF_DIR, PACKAGE_DIR, cache_dir
@@ -88,6 +87,8 @@ class Described:
             if key in self.choices:
                 if re.fullmatch(r"\w+", value) and value not in (*self.choices[key], "null"):
                     raise NerfroError(f"{key}={value} does not exist; {nearest_of(value, self.choices[key])}")
+                continue
+            if argument.startswith("+") and "." not in key:  # perhaps a group of another package
                 continue
             parts = key.split(".")
             for depth, name in enumerate(parts):
@@ -293,4 +294,4 @@ def _state_of_files() -> str:
         places = [] if found is None else [Path(found.origin or ""), *map(Path, found.submodule_search_locations or ())]
         files += [file for place in places for file in ([place] if place.is_file() else place.rglob("*.py"))]
     facts = sorted((str(file), status.st_mtime_ns, status.st_size) for file in files for status in [file.stat()])
-    return hashlib.sha256(repr((facts, __version__, sys.version)).encode()).hexdigest()
+    return hashlib.sha256(repr((facts, sys.version)).encode()).hexdigest()

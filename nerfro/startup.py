@@ -10,8 +10,7 @@ from __future__ import annotations
 import sys
 from types import TracebackType
 
-from nerfro import __version__
-from nerfro.cli import answer, errors_in_one_line, program
+from nerfro.cli import answer, errors_in_one_line, print_version, program
 from nerfro.options import Described, recall, usage
 
 _WITHOUT_CONFIGURATION = ("demo", "plugins")  # commands
@@ -25,7 +24,7 @@ def begin(command: str) -> None:
     """
     sys.excepthook = _print_in_one_line
     if "--version" in sys.argv[1:]:
-        print(f"nerfro {__version__}")
+        print_version()
         sys.exit()
     with errors_in_one_line():
         described = Described(usage(command), {}, {}) if command in _WITHOUT_CONFIGURATION else recall(command)

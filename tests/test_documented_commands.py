@@ -137,7 +137,7 @@ def test_help_has_two_valid_examples_and_explains_every_option(command: str) -> 
     for options in examples:
         require_valid(command, shlex.split(options))
     page, schema = described(command), entry_points()[command][0]
-    settings = re.findall(r"^  ([\w.]+)=.*\n( {6}\S)?", page.help, re.MULTILINE)
+    settings = re.findall(r"^  ([\w.]+)=.*(?:\n {4}\S.*)*\n( {6}\S)?", page.help, re.MULTILINE)
     assert [name for name, explanation in settings if not explanation and name not in page.choices] == []
     leaves = {name for name, hint in get_type_hints(schema).items() if not is_dataclass(hint)}
     assert leaves <= {name.split(".")[0] for name, _ in settings}

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
 import nerfro.demo
 import nerfro.view
-from nerfro import __version__
 from nerfro.completion import completions
 from nerfro.errors import NerfroError
 from nerfro.options import Described, recall, remember
@@ -44,7 +44,7 @@ def start(*arguments: str) -> subprocess.CompletedProcess[str]:
     [
         (["--help"], "All options.\n"),
         (["seed=1", "-h"], "All options.\n"),
-        (["--version"], f"nerfro {__version__}\n"),
+        (["--version"], f"nerfro {version('nerfro')}\n"),
         (["trainer.max_step=3"], "nerfro: error: trainer.max_step is not a setting; did you mean max_steps?\n"),
     ],
 )

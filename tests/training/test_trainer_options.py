@@ -156,7 +156,7 @@ def test_training_without_evaluation_ends_after_its_time(train: Callable[..., An
     finished = train("trainer.max_time=1s", "evaluation=none", "experiment=refractive", "name=mine")
     assert finished.code == 0, finished.err
     assert "page: python -m nerfro.view checkpoint=" in finished.out
-    assert "max_time: '00:00:00:01'" in (tmp_path / "run" / "config.yaml").read_text().replace('"', "'")
+    assert "max_time: 00:00:00:01\n" in (tmp_path / "run" / "config.yaml").read_text()
     assert not list(tmp_path.rglob("*.png"))
     assert not (tmp_path / "run" / "metrics.json").exists()
 
@@ -166,9 +166,9 @@ def test_training_ends_with_the_score_and_the_files_in_five_lines(train: Callabl
     last = finished.out.splitlines()[-5:]
     assert last[0].startswith("2 steps in ")
     scores = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    psnr, object_psnr = scores["test"]["psnr"], scores["regions"]["mask"]["psnr"]
+    psnr = scores["test"]["psnr"]
     assert last[1].startswith(f"PSNR {psnr:.2f} dB (an error of {100 * 10 ** (-psnr / 20):.1f} % of white), SSIM ")
-    assert f"PSNR on the object {object_psnr:.2f} dB; mean of {len(scores['views'])} views" in last[1]
+    assert last[1].endswith(f"; mean of {len(scores['views'])} views")
     picture, page, tables = (line.partition(": ")[2] for line in last[2:])
     assert Path(picture).is_file()
     assert page == f"python -m nerfro.view checkpoint={tmp_path / 'run'}"
