@@ -7,7 +7,7 @@ import copy
 import dataclasses
 import errno
 import functools
-import importlib.metadata
+import importlib
 import os
 import re
 import shlex
@@ -195,8 +195,8 @@ def _missing_with_example(command: str) -> Iterator[None]:
 
 
 def print_version() -> None:
-    """Print the version of nerfro, which the package metadata contains."""
-    print(f"nerfro {importlib.metadata.version('nerfro')}")
+    """Print the version of nerfro."""
+    print(f"nerfro {importlib.import_module('nerfro').__version__}")
 
 
 def program() -> str | None:

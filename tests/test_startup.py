@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -44,7 +43,7 @@ def start(*arguments: str) -> subprocess.CompletedProcess[str]:
     [
         (["--help"], "All options.\n"),
         (["seed=1", "-h"], "All options.\n"),
-        (["--version"], f"nerfro {version('nerfro')}\n"),
+        (["--version"], f"nerfro {nerfro.__version__}\n"),
         (["trainer.max_step=3"], "nerfro: error: trainer.max_step is not a setting; did you mean max_steps?\n"),
     ],
 )
