@@ -33,6 +33,8 @@ PAGES = {
 }
 pytestmark = pytest.mark.skipif(len(PAGES) < 2, reason="there is no checkout with docs")
 
+discover()
+
 BLOCK = re.compile(r"^```\w*\n(.*?)^```", re.DOTALL | re.MULTILINE)
 PLUGIN = re.compile(r"^```python\n# plugins/(\w+\.py)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 COMMAND = re.compile(
@@ -64,8 +66,8 @@ def commands(page: str) -> Iterator[tuple[str, list[str]]]:
 
 
 @functools.cache
-def described(command: str) -> Described:
-    """Describe the options of a command without the plugins of the pages."""
+def described(command: str, num_plugins: int) -> Described:
+    """Describe the options of a command; with another number of plugins, again."""
     return describe_command(command, entry_points()[command][0], folder_of(command))
 
 
@@ -88,7 +90,7 @@ def require_valid(command: str, options: list[str]) -> None:
     # Of a sweep the first value; no patterns, and no options of Hydra, whose launchers may not be installed.
     options = [re.sub(r"^([^=]+=[^,[{]+),[^]}]*$", r"\1", option) for option in options if "(" not in option]
     options = [_quoted(option, verbatim) for option in options if not option.lstrip("+").startswith("hydra")]
-    described(command).require_known(options)
+    described(command, len(plugins())).require_known(options)
     options = list(map(_added, options)) if command == "train" else options
     choices, settings = [], []
     for override in OverridesParser.create().parse_overrides(options):
@@ -136,7 +138,7 @@ def test_help_has_two_valid_examples_and_explains_every_option(command: str) -> 
     assert len(examples) == 2
     for options in examples:
         require_valid(command, shlex.split(options))
-    page, schema = described(command), entry_points()[command][0]
+    page, schema = described(command, len(plugins())), entry_points()[command][0]
     settings = re.findall(r"^  ([\w.]+)=.*(?:\n {4}\S.*)*\n( {6}\S)?", page.help, re.MULTILINE)
     assert [name for name, explanation in settings if not explanation and name not in page.choices] == []
     leaves = {name for name, hint in get_type_hints(schema).items() if not is_dataclass(hint)}
