@@ -168,7 +168,7 @@ def entry_point(
                 try:
                     hydra.main(version_base="1.3", config_path=str(config_dir), config_name=config_name)(job)()
                 except OSError as error:  # raised by Hydra, which creates the run folder
-                    if isinstance(error, HydraException):
+                    if isinstance(error, (HydraException, BrokenPipeError)):
                         raise
                     reason = f"{error.filename} cannot be used: {error.strerror}"
                     raise NerfroError(f"{reason}; choose another hydra.run.dir, or hydra.sweep.dir") from error

@@ -70,7 +70,8 @@ class GuardedConfigLoader(ConfigLoaderImpl):
             raise NerfroError(
                 f"{key}={value} is not allowed; choose a launcher, sweeper or callback of Hydra by its name"
             )
-        if run_mode == RunMode.RUN:  # jobs of a sweep are composed one by one
+        # Jobs of a sweep are composed one by one; the help of Hydra has no configuration of a job.
+        if run_mode == RunMode.RUN and config_name is not None:
             self.check(config)
         return config
 

@@ -95,6 +95,14 @@ def test_a_missing_option_is_told_with_an_example(
     assert done.err == "nerfro: error: checkpoint=... is missing; for example: nerfro view checkpoint=outputs/first\n"
 
 
+def test_the_help_of_hydra_lists_its_flags(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], unchecked: None
+) -> None:
+    done = finish(nerfro.view.main, ["--help", "hydra"], monkeypatch, capsys)
+    assert (done.code, done.err) == (0, "")
+    assert "--multirun" in done.out
+
+
 def test_ctrl_c_during_the_imports_ends_in_one_line() -> None:
     program = "import sys, nerfro.startup\nsys.argv = ['x']\nnerfro.startup.begin('plugins')\nraise KeyboardInterrupt"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
