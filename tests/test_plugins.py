@@ -228,7 +228,8 @@ def test_metric_of_a_plugin_is_in_tables_files_log_and_report(
     references = np.load(tmp_path / "views" / "test.npz")["images"]
     predictions = np.stack([np.asarray(Image.open(file)) for file in sorted((run / "images").glob("*.png"))])
     assert mean == pytest.approx(np.abs(references / 255 - predictions / 255).mean(), abs=1e-6)
-    assert f"MAE {mean:.4f}" in trained.out
+    assert "MAE ↓" in trained.out
+    assert f"{mean:.4f}" in trained.out
     with (run / "csv" / "metrics.csv").open() as file:
         logged = [row["test/mean_absolute_error"] for row in csv.DictReader(file)]
     assert float(logged[-1]) == pytest.approx(mean)

@@ -148,10 +148,12 @@ def views_table(result: EvaluationResult, title: str, region: Region = FULL) -> 
 
 
 def regions_table(result: EvaluationResult, title: str) -> Table:
-    """Tabulate the mean scores of each region. Notes that `views_table` shows as well are omitted."""
+    """Tabulate the mean scores of each region, with notes about missing scores."""
     scores = {str(region): result.means(region) for region in result.regions}
-    missing = {region: _missing_note(result, region) for region in result.regions}
-    notes = [f"{region}: {note}" for region, note in missing.items() if note and note != missing[FULL]]
+    regions: dict[str, list[str]] = {}
+    for region in result.regions:
+        regions.setdefault(_missing_note(result, region), []).append(region)
+    notes = [f"{', '.join(names)}: {note}" for note, names in regions.items() if note]
     return _scores_table(title, "region", scores, [_mask_note(result), *notes])
 
 
@@ -166,19 +168,6 @@ def short(reason: str) -> str:
     return reason.partition(";")[0]
 
 
-def describe(metrics: RunMetrics) -> str:
-    """Describe the mean scores in one line, with the error that the PSNR stands for."""
-    result, known = metrics.result, image_metrics()
-    means = {name: mean for name, mean in result.means().items() if mean is not None}
-    scores = [f"{known[name].title} {mean:.{known[name].decimals}f}" for name, mean in means.items()]
-    if "psnr" in means:
-        scores[list(means).index("psnr")] += f" dB (an error of {100 * 10 ** (-means['psnr'] / 20):.1f} % of white)"
-    others = {"on the object": result.mean("psnr", "mask")}
-    others |= {name: treated.mean("psnr") for name, treated in metrics.treatments.items()}
-    scores += [f"PSNR {name} {mean:.2f} dB" for name, mean in others.items() if mean is not None]
-    return f"{', '.join(scores) or 'no scores'}; mean of {len(result.views)} views"
-
-
 def report(metrics: RunMetrics, title: str, folder: Path, brief: bool = False) -> None:
     """Write metrics.json and the tables of all regions into a folder, and print the scores.
 
@@ -186,7 +175,7 @@ def report(metrics: RunMetrics, title: str, folder: Path, brief: bool = False) -
         metrics: the scores.
         title: title of the tables.
         folder: folder for the files.
-        brief: print the means in one line, instead of the tables of views and means.
+        brief: print only means, without a table of views.
     """
     result = metrics.result
     for region in result.regions:
@@ -194,12 +183,10 @@ def report(metrics: RunMetrics, title: str, folder: Path, brief: bool = False) -
         table = views_table(result, title if full else f"{title}, {region}", region)
         write_table(table, folder / ("metrics" if full else f"metrics_{region}"))
     write_metrics_json(folder / "metrics.json", metrics)  # last, because sweeps take it as the end of the run
-    if brief:
-        print(describe(metrics))
-        return
-    rich.print(to_rich(views_table(result, title)))
-    if len(result.regions) > 1:
-        rich.print(to_rich(regions_table(result, "means of the full images, of the object's mask, and of the crop")))
+    if not brief:
+        rich.print(to_rich(views_table(result, title)))
+    if brief or len(result.regions) > 1:
+        rich.print(to_rich(regions_table(result, f"mean of {len(result.views)} views")))
     if metrics.treatments:
         rich.print(to_rich(treatments_table(metrics, "means of the full images, or of right halves")))
 

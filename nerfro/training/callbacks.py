@@ -77,7 +77,7 @@ class TrainingProgress(ProgressBar):
         self._enabled = False
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._shown, begun = time.perf_counter(), training_progress(trainer)
+        self._shown, begun = -math.inf, training_progress(trainer)  # the first step is shown at once
         self._bar = progress_bar("train", 1.0, initial=begun, mininterval=0.5, delay=0, disable=not self._enabled)
 
     def on_train_batch_end(

@@ -128,16 +128,21 @@ def test_a_model_is_made_where_there_is_none(tmp_path: Path, command: Callable[.
 
 
 @pytest.mark.parametrize(
-    ("camera", "advised"),
-    [(("RADIAL", [1280.0, 512, 384, 0.05, 0.0]), False), (("SIMPLE_PINHOLE", [1280.0, 512, 384]), True)],
+    ("camera", "folder", "advised"),
+    [
+        (("RADIAL", [1280.0, 512, 384, 0.05, 0.0]), "out/sparse", False),
+        (("SIMPLE_PINHOLE", [1280.0, 512, 384]), "out/sparse", True),
+        (("SIMPLE_PINHOLE", [1280.0, 512, 384]), "model", False),  # a given model keeps its lens
+    ],
 )
-def test_a_model_is_named_and_a_lens_that_distorts_is_not_advised_to(
-    camera: tuple[str, list[float]], advised: bool, tmp_path: Path, command: Callable[..., str]
+def test_a_lens_with_distortion_is_advised_where_the_option_acts(
+    camera: tuple[str, list[float]], folder: str, advised: bool, tmp_path: Path, command: Callable[..., str]
 ) -> None:
-    names = [image.name for image in synthesized(tmp_path / "model", camera, 0.02).images.values()]
+    model = tmp_path / folder / "0"
+    names = [image.name for image in synthesized(model, camera, 0.02).images.values()]
     blank(tmp_path / "images", names, (1024, 768))
     own = [f"images={tmp_path / 'images'}", f"out={tmp_path / 'out'}", "target=colmap"]
-    printed = command("calibrate", *own, f"reconstruction={tmp_path / 'model'}", "test_every=3")
+    printed = command("calibrate", *own, f"reconstruction={model}", "test_every=3")
     report = json.loads((tmp_path / "out" / "calibration.json").read_text())
     assert set(report["images"]) == set(names)
     assert np.mean([image["error"] for image in report["images"].values()]) > 0.7

@@ -35,10 +35,13 @@ def test_views_table_of_a_region_has_its_numbers_and_reasons() -> None:
     assert table.notes == ("n/a: MS-SSIM (crops too small), LPIPS (no network)",)
 
 
-def test_regions_table_has_their_means_and_what_the_views_did_not_tell() -> None:
+def test_regions_table_has_their_means_and_each_reason_once() -> None:
     table = regions_table(REGIONS, "means")
     assert table.rows == (line("full", 20.5), line("mask", 10.0), line("crop", 15.5))
-    assert table.notes == ("crop: n/a: MS-SSIM (crops too small), LPIPS (no network)",)
+    assert table.notes == (
+        "full, mask: n/a: LPIPS (no network)",
+        "crop: n/a: MS-SSIM (crops too small), LPIPS (no network)",
+    )
 
 
 def test_a_column_with_some_numbers_stays() -> None:
