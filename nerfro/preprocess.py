@@ -23,6 +23,7 @@ from nerfro.capture.preprocess_options import MESH, PreprocessConfig, Request, c
 from nerfro.capture.refinement import refine
 from nerfro.capture.surface import make_mesh, read_silhouettes, surfaces_inside
 from nerfro.capture.surroundings import Observations
+from nerfro.capture.vessel_fit import find_vessel
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.cli import entry_point, warn
 from nerfro.data.base import Views
@@ -65,7 +66,9 @@ def main(config: DictConfig) -> None:
     inside = surfaces_inside(found.medium)
     if overlaps is not None and inside:
         draw_overlays(outlined, mesh, overlaps, inside, request.folder)
-    conclude(request, settings, found.index_settings, found.is_doubtful, observations.near, views.cameras, mesh)
+    index, is_doubtful = found.index_settings, found.is_doubtful
+    vessel = find_vessel(cast(SdfGrid, found.medium), location, mesh, observations) if config.vessel else {}
+    conclude(request, settings, index, is_doubtful, observations.near, views.cameras, vessel)
 
 
 def _reconstruct(

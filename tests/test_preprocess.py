@@ -118,6 +118,16 @@ def test_a_body_of_revolution_is_fitted_where_it_is_asked_for(preprocess: Callab
     assert abs(radii(capture).mean() - RADIUS) < 0.06
 
 
+def test_a_vessel_is_fitted_where_it_is_asked_for(preprocess: Callable[..., str]) -> None:
+    printed = preprocess("medium.ior=1.33", "smoothing=0", "vessel=true")
+    command = shlex.split(printed.split("train on the vessel: ")[1])
+    assert {"medium=vessel", "medium.ior=1.52"} <= set(command)
+    assert "medium.ior=1.33" not in command
+    for name in ("wall", "foot", "fillet"):
+        (given,) = (float(text.split("=")[1]) for text in command if text.startswith(f"medium.{name}="))
+        assert 0 < given < RADIUS
+
+
 def test_nothing_is_overwritten_unasked(preprocess: Callable[..., str], capture: Path) -> None:
     (capture / "mesh.ply").write_text("mine")
     assert "mesh.ply exists; give another out=... or overwrite=true" in preprocess()

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Bool, Float, Num
 
 from nerfro.capture.preprocess_options import CURVE, INDEX, Request, build_medium, index_settings
-from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings, robust
+from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings, half_weight, robust
 from nerfro.cli import warn
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import atomic_file, write_atomically
@@ -53,9 +53,6 @@ _MAX_GRIDS, _USUAL_GRIDS = 10, 4
 _MAX_ELONGATION, _SLOPE_PIXELS, _DIFFERENCE = 6.0, 6_000, 1 / 300
 # Rays with more events, or more than two per surface, are left out: small errors of the surface turn them far.
 _MAX_EVENTS = 4
-# Residuals have half weight at this fraction of the standard deviation of the surroundings, because opaque objects
-# inside the body spoil many pixels.
-_HALF_WEIGHT = 0.5
 _NUM_BOOTSTRAP = 200
 # Limits of a reliable estimate: depth of the valley relative to the error of unrelated colours, standard error and
 # distance from the ends of the search relative to the range, and fraction of the pixels with known surroundings.
@@ -112,7 +109,7 @@ def find_indices(
     coarse = 0.5 * (LOWEST + HIGHEST + _RANGE * coarse)
     work = len(coarse) * plan.coarse_pixels + _USUAL_GRIDS * len(offsets) * plan.fine_pixels
     search = _Search(medium, through.some(plan.fine_pixels), surroundings, lambda done: progress(min(1, done / work)))
-    coarse_errors = _mean_errors(*search.errors(coarse, plan.coarse_pixels, False))
+    coarse_errors = mean_errors(*search.errors(coarse, plan.coarse_pixels, False))
     middle = coarse[coarse_errors.argmin()]
     for radius in plan.fine_radii:
         num_pixels = plan.fine_pixels // (1 if radius == plan.fine_radii[-1] else 3)
@@ -122,17 +119,15 @@ def find_indices(
             middle = middle.clip(LOWEST + extent, HIGHEST - extent)
             fine = middle + offsets @ axes.T
             sums, counts = search.errors(fine, num_pixels, True)
-            errors = _mean_errors(sums, counts)
+            errors = mean_errors(sums, counts)
             minimum, curvature = _minimum(fine, errors, axes)
             converged = (np.abs(np.linalg.solve(axes, minimum[0] - middle)) < 0.5).all()
             middle = minimum[0].clip(LOWEST, HIGHEST)
             if converged:
                 break
     progress(1.0)
-    num_views = len(counts)
-    weights = np.random.default_rng(0).multinomial(num_views, np.full(num_views, 1 / num_views), _NUM_BOOTSTRAP)
-    weights = weights.astype(np.float64)
-    standard_errors = _minimum(fine, _mean_errors(sums, counts, weights), axes)[0].std(0)
+    weights = bootstrap_weights(len(counts))
+    standard_errors = _minimum(fine, mean_errors(sums, counts, weights), axes)[0].std(0)
     names = ["index"] if num_bodies == 1 else [f"index of body {body + 1}" for body in range(num_bodies)]
     depth, known = 1 - errors.min() / search.unrelated, counts.sum() / search.num_pixels
     doubts = _doubts(names, middle, np.where(curvature[0] > 0, standard_errors, np.inf), depth, known)
@@ -145,7 +140,13 @@ def _grid(steps: int, num_axes: int) -> Float[np.ndarray, "C K"]:
     return np.array(list(itertools.product(np.linspace(-1, 1, steps), repeat=num_axes)))
 
 
-def _mean_errors(
+def bootstrap_weights(num_views: int) -> Float[np.ndarray, "B V"]:
+    """Return how often each view is drawn in random samples of the views."""
+    drawn = np.random.default_rng(0).multinomial(num_views, np.full(num_views, 1 / num_views), _NUM_BOOTSTRAP)
+    return drawn.astype(np.float64)
+
+
+def mean_errors(
     sums: Float[np.ndarray, "C V"], counts: Float[np.ndarray, "V"], weights: Num[np.ndarray, "B V"] | int = 1
 ) -> Float[np.ndarray, "B C"]:
     """Average errors that are summed by view over all pixels, optionally for B weightings of the views."""
@@ -221,7 +222,7 @@ class _Search:
                 "no ray of the object's pixels meets the surface; check that mesh, masks and poses belong together"
             )
         colours = surroundings.colours
-        self._half_weight = max(_HALF_WEIGHT * float(colours.std(0).mean()), 1e-3)
+        self._half_weight = half_weight(surroundings)
         other = colours[torch.randint(len(colours), (len(self._pixels),), generator=torch.Generator().manual_seed(1))]
         self.unrelated = float(robust(other - self._pixels.radiance, self._half_weight).mean())
 

@@ -50,8 +50,9 @@ class PreprocessConfig:
             agrees best with the masks.
         keep: number of largest separate components to keep; by default all but small ones.
         smoothing: factor of the smoothness of the surface; 0 keeps the carved hull.
-        symmetry: `axis` fits a body of revolution if the body agrees about as well with the masks; `auto` only if it
-            agrees at least as well as the free surface.
+        symmetry: fit a body of revolution unless a free surface overlaps more with the masks, by 0.005 (`auto`) or 0.01
+            (`axis`).
+        vessel: also fit wall, foot and contents of an open vessel to the photographs.
         overwrite: allow replacing existing files.
     """
 
@@ -68,6 +69,7 @@ class PreprocessConfig:
     keep: Optional[Count] = None  # noqa: UP045
     smoothing: NotNegative = 1.0
     symmetry: Annotated[Optional[str], Symmetry] = None  # noqa: UP045
+    vessel: bool = False
     overwrite: bool = False
 
 
@@ -122,6 +124,8 @@ class Request:
             corners_of_box(config.box_min, config.box_max)
         if config.refine and "shell_voxels" not in config.medium:
             raise NerfroError("refine=true needs a distance grid; set medium=object or medium=vessel")
+        if config.vessel and ("shell_voxels" not in config.medium or "wall" in config.medium):
+            raise NerfroError("vessel=true estimates the lengths of a vessel; set medium=object, or remove vessel=true")
         if config.out is None and str(config.data.root).startswith(EMBEDDED_PREFIX):
             raise NerfroError(f"data.root={config.data.root} is part of nerfro and read-only; add out=FOLDER")
         refuse_existing(self.files, config.overwrite)
@@ -178,7 +182,7 @@ def conclude(
     index_is_doubtful: bool,
     near: bool | None,
     cameras: Cameras,
-    mesh: TriangleMesh,
+    vessel: dict[str, object],
 ) -> None:
     """Write preprocess.json with the options for training, and print the result files and the next command.
 
@@ -189,21 +193,21 @@ def conclude(
         index_is_doubtful: whether to leave the indices to the user, because the photographs do not determine them.
         near: whether the surroundings are near; None if unknown.
         cameras: cameras of the photographs.
-        mesh: the surface.
+        vessel: options of a vessel that was fitted; empty without one.
     """
     settings = settings if index_is_doubtful else settings | index
     given = of_groups(("data", "medium"), request.overrides)
     given = [text for text in given if not any(is_given(name, [text]) for name in (*settings, "medium.mesh"))]
     options = [*given, *as_overrides(settings)]
     doubtful = as_overrides(index) if index_is_doubtful else []
-    found_up = find_up(cameras, mesh)
-    up = [0.0, 0.0, 1.0] if found_up is None else [round(float(x), 4) for x in found_up[0]]
-    across = mesh.vertices - np.outer(mesh.vertices @ np.array(up), up)
-    shape = {"up": up, "width": float(f"{np.ptp(across, axis=0).max():.4g}")}
-    found = {"options": options, "doubtful": doubtful, "near": near, "pixels": [cameras.width, cameras.height], **shape}
+    found = {"options": options, "doubtful": doubtful, "near": near, "pixels": [cameras.width, cameras.height]}
+    without = [text for text in options if not any(is_given(name, [text]) for name in vessel)]
+    found["vessel"] = as_vessel = [*without, *as_overrides(vessel)] if vessel else []
     write_atomically(request.folder / FOUND, json.dumps(found, indent=1) + "\n")
     print(f"results: {', '.join(str(file) for file in request.files if file.exists())}")
     if doubtful:
         print(f"the photographs do not determine the index; add {' '.join(f'{name}=N' for name in index)}")
     print("for near surroundings add +experiment=refractive_room; the baseline is +experiment=mipnerf")
     print_next("train on it", "train", options)
+    if as_vessel:
+        print_next("train on the vessel", "train", as_vessel)

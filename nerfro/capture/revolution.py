@@ -33,11 +33,16 @@ _OUTLINE_POINTS, _SIDE_POINTS, _NEAR, _FAR = 100, 40, 3.0, 40.0
 # Iterations, and the distance in pixels at which the weight of an observation is one half, first and last.
 _ITERATIONS, _HALF_WEIGHT = 24, (8.0, 1.0)
 # Weight of bending relative to pixels; longest step and smallest radius, as fractions of the height.
-_BENDING, _MAX_STEP, _MIN_RADIUS = 0.03, 0.03, 1e-3
+_BENDING, _MAX_STEP, _MIN_RADIUS = 2.0, 0.03, 1e-3
 _EDGE = 0.5  # radius of the rounded edges, in pixels
 # Weight of the height relative to the observations: no camera sees a low roof on the top or a cone below the foot.
 _FLAT = 0.003
 _END_BENDING = 10.0  # factor of bending at the ends, where the masks show only thin slices
+# Bending at which its weight is one quarter, as a fraction of the height: objects have few, sharp corners.
+_CORNER = 0.002
+# A cone below the foot is cut if its slope exceeds this fraction of the slope that no camera sees as an outline, and if
+# the slope decreases by at least this factor at the edge of the foot.
+_HIDDEN_SLOPE, _EDGE_RATIO = 0.5, 0.6
 # Number of samples along a ray, of samples in each refinement, and width in pixels of the ignored frame.
 _PLACES, _CLOSER, _FRAME = 48, 12, 2
 
@@ -118,6 +123,9 @@ def fit_revolution(
         return None
     origins, directions, width, side = _rays(silhouettes)
     middle, size = start.foot + 0.5 * start.height * start.axis, start.height
+    if ((origins - middle) @ start.axis).mean() < 0:  # the axis points towards the cameras
+        start = Profile(start.foot + size * start.axis, -start.axis, size, start.radii.flip(0))
+    least_sine = float((normalize(origins - middle, dim=-1) @ start.axis).min())
     across = torch.linalg.svd(start.axis[None])[2][1:]
     pixels = float(size / (width * (origins - middle).norm(dim=-1)).median())  # in the height
 
@@ -142,7 +150,8 @@ def fit_revolution(
         place = _nearest_place(body(numbers), origins, directions)
         misfit, slopes = misfits(numbers).double(), jacfwd(misfits)(numbers).double()
         weight = 1 / (1 + (misfit / half_weight).square()).square()
-        stiff = (_BENDING * pixels) ** 2 * len(misfit) / _KNOTS * (bends.T @ bends).double()
+        smooth = 1 / (1 + (bends @ numbers / _CORNER).square()).square()  # corners have little weight
+        stiff = (_BENDING * pixels) ** 2 * len(misfit) / _KNOTS * (bends.T @ (smooth[:, None] * bends)).double()
         system = slopes.T @ (weight[:, None] * slopes) + stiff
         right = slopes.T @ (weight * misfit) + stiff @ numbers.double()
         right[4:6] += _FLAT * len(misfit) * pixels * torch.tensor([-1.0, 1.0])
@@ -150,7 +159,25 @@ def fit_revolution(
         step = torch.linalg.solve(system + damping, right)
         numbers = numbers - (step * (_MAX_STEP / step.abs().max()).clamp(max=1)).float()
         progress((iteration + 1) / _ITERATIONS)
-    return body(numbers).mesh()
+    return _without_hidden_cone(body(numbers), least_sine).mesh()
+
+
+def _without_hidden_cone(body: Profile, least_sine: float) -> Profile:
+    """Cut the part below a sharp edge of the foot that hardly a camera sees as an outline, such as a flat cone.
+
+    Args:
+        body: fitted body.
+        least_sine: sine of the smallest angle between the lines of sight and the plane of the foot.
+    """
+    if least_sine <= 0:
+        return body
+    step = body.height / (len(body.radii) - 1)
+    slopes = body.radii.diff()[: len(body.radii) // 3] / step
+    hidden = slopes[:-1] > _HIDDEN_SLOPE * (1 / least_sine**2 - 1) ** 0.5
+    edges = (hidden & (slopes[1:] < _EDGE_RATIO * slopes[:-1])).nonzero()
+    first = int(edges.max()) + 1 if len(edges) else 0
+    foot, height = body.foot + first * step * body.axis, body.height - first * step
+    return Profile(foot, body.axis, height, body.radii[first:], body.edge)
 
 
 def _initial_profile(mesh: TriangleMesh) -> Profile | None:

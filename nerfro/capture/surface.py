@@ -25,9 +25,9 @@ _COARSE_VOXELS = 64
 _BOX_FACTORS = (1.0, 1.3, 1.7)
 # Margin of the object's box, in coarse voxels.
 _MARGIN_VOXELS = 2
-# With symmetry=axis a body of revolution is preferred although its overlap may be smaller by this amount; the overlap
-# is computed at the given number of pixels per side.
-_MAX_OVERLAP_LOSS, _MAX_PIXELS = 0.01, 256
+# A body of revolution is preferred although its overlap may be smaller by this amount, because a free surface is rough
+# and follows errors of the masks; the overlap is computed at the given number of pixels per side.
+_MAX_OVERLAP_LOSS, _MAX_PIXELS = {"axis": 0.01, "auto": 0.005}, 256
 # Cameras within this angle, in degrees, see the object from one side.
 _ONE_SIDE = 75.0
 
@@ -98,8 +98,8 @@ def make_mesh(
         wrong_masks: number of views that may be wrong about any point.
         keep: number of components to keep; None keeps all but small ones.
         smoothing: factor of the estimated smoothing strength; 0 returns the hull itself.
-        symmetry: also fit a body of revolution. `auto` uses this body if its overlap with the masks is at least as
-            large, `axis` also if the overlap is slightly smaller.
+        symmetry: also fit a body of revolution, which is used unless its overlap with the masks is smaller by more
+            than 0.005 (`auto`) or 0.01 (`axis`, with a warning).
         evidence: silhouettes that decide between the two surfaces; by default all.
     """
     box = _object_box(silhouettes, wrong_masks) if corners is None else corners
@@ -137,11 +137,11 @@ def _choose_symmetry(
         float(np.median(overlap(mesh, silhouettes, _MAX_PIXELS))) for mesh in (revolution, free)
     )
     result = f"median overlap with the masks: {symmetric:.4f} as a body of revolution, {unconstrained:.4f} otherwise"
-    if symmetry == "axis" and symmetric < unconstrained - _MAX_OVERLAP_LOSS:
+    if symmetry == "axis" and symmetric < unconstrained - _MAX_OVERLAP_LOSS[symmetry]:
         warn(f"{result}; the object is no body of revolution, and symmetry=axis is ignored")
         return free
     print(result)
-    return free if symmetry == "auto" and symmetric < unconstrained else revolution
+    return revolution if symmetric >= unconstrained - _MAX_OVERLAP_LOSS[symmetry] else free
 
 
 def surfaces_inside(medium: Medium) -> list[TriangleMesh]:

@@ -47,6 +47,9 @@ _MIN_VARIANCE = 1e-4
 # Resolution of the map of observed directions: maximum texels per side of a face, and training pixels per texel, chosen
 # so that the map has no holes where photographs cover the surroundings.
 _SEEN_TEXELS, _SEEN_PIXELS = 64, 8
+# Residuals have half weight at this fraction of the standard deviation of the surroundings, because opaque objects
+# inside the body spoil many pixels.
+_HALF_WEIGHT = 0.5
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,11 @@ def robust(residual: Float[Tensor, "P 3"], half: float) -> Float[Tensor, "P"]:
     """Compute the Geman-McClure error r^2 / (r^2 + half^2), r^2 the mean square over channels: 0 exact, 1 outlier."""
     square = residual.square().mean(-1)
     return square / (square + half**2)
+
+
+def half_weight(surroundings: Surroundings) -> float:
+    """Return the residual at which a pixel has half weight."""
+    return max(_HALF_WEIGHT * float(surroundings.colours.std(0).mean()), 1e-3)
 
 
 def divide_pixels(views: Views, mesh: TriangleMesh, max_pixels: int = _MAX_PIXELS) -> tuple[Pixels, Pixels]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -40,6 +40,7 @@ class SdfVessel(SdfGrid):
             units.
         wall: thickness of the wall.
         foot: thickness of the bottom; by default that of the wall.
+        fillet: radius of the rounded edge between wall and foot inside the vessel.
         level: height of the liquid; by default the vessel is full.
         closed: whether the wall continues over the top. Otherwise the part of the outer surface at the top that faces
             up is an opening.
@@ -51,7 +52,7 @@ class SdfVessel(SdfGrid):
         absorption, learn_absorption, abbe: of wall and liquid, see `Solid`.
 
     Attributes:
-        lengths: wall, foot and level as given; a full vessel has no level.
+        lengths: wall, foot, fillet and level as given; a full vessel has no level.
     """
 
     nested = True
@@ -79,6 +80,7 @@ class SdfVessel(SdfGrid):
         learn_absorption: bool = False,
         abbe: Sequence[Positive] = (),
         cache: bool = True,
+        fillet: NotNegative = 0.0,
     ) -> None:
         require_bytes(BYTES_PER_VERTEX * resolution**3, f"medium.resolution={resolution}")
         surface = load_mesh(resolve_path(mesh), accept_open_mesh)
@@ -104,7 +106,7 @@ class SdfVessel(SdfGrid):
         low, high = (float(end(surface.vertices @ upwards)) for end in (np.min, np.max))
         self.height = high - low if height is None else height
         self.unit = (high - low) / self.height
-        self.lengths = {"wall": wall, "foot": wall if foot is None else foot}
+        self.lengths = {"wall": wall, "foot": wall if foot is None else foot, "fillet": fillet}
         if level is not None:
             self.lengths["level"] = level
         self._require_lengths_within()
@@ -140,14 +142,23 @@ class SdfVessel(SdfGrid):
         changed = variant(self, _outer=self._outer - outwards, _side=self._side - outwards)
         return changed._with_distances(changed._distances())
 
+    def with_lengths(self, lengths: Mapping[str, float]) -> SdfVessel:
+        """Return the vessel with other lengths; the wall is at most twice as thick as that of the original."""
+        changed = variant(self, lengths=self.lengths | dict(lengths))
+        return changed._with_distances(changed._distances())
+
     def _distances(self) -> Float[Tensor, "K X Y Z"]:
         """Compute the signed distances of the outer body, the cavity and the space below the level, world units."""
-        wall, foot, *level = (length * self.unit for length in self.lengths.values())
-        cavity = torch.maximum(self._side + wall, foot - self._heights)
+        wall, foot, fillet, *level = (length * self.unit for length in self.lengths.values())
+        side, base = self._side + wall, foot - self._heights
+        # In the corner, the distance is that to a circle that touches wall and foot.
+        in_corner = (side > -fillet) & (base > -fillet)
+        circle = torch.hypot(side + fillet, base + fillet) - fillet
+        cavity = torch.where(in_corner, circle, torch.maximum(side, base))
         return torch.stack([self._outer, cavity, *(self._heights - height for height in level)])
 
     def _require_lengths_within(self) -> None:
-        heights = {name: value for name, value in self.lengths.items() if name != "wall"}
+        heights = {name: value for name, value in self.lengths.items() if name in ("foot", "level")}
         if not 0 < heights["foot"] < heights.get("level", self.height) <= self.height:
             given = " and ".join(f"medium.{name}={value:g}" for name, value in heights.items())
             raise NerfroError(

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from nerfro.capture.overrides import as_overrides, is_given, of_groups
+from nerfro.capture.overrides import is_given, of_groups
 
 # Number of training photographs that score the hypotheses.
 _NUM_VALIDATION_VIEWS = 5
@@ -14,8 +14,6 @@ _NUM_VALIDATION_VIEWS = 5
 _STRAIGHT_SPEED = 1.5
 # Indices of water and of soda-lime glass, for photographs that do not determine the index.
 _COMMON_INDICES = {"water": 1.333, "glass": 1.52}
-# Thickness of the wall and of the foot of an ordinary drinking glass, as fractions of its width.
-_WALL, _FOOT = 0.02, 0.06
 
 
 @dataclass(frozen=True)
@@ -62,8 +60,7 @@ def hypotheses(found: Mapping[str, Any], medium: Mapping[str, Any]) -> list[Hypo
 
     Straight rays show an opaque object, and are the baseline of all other hypotheses. A body has the index that
     `preprocess` found; without a reliable index, the indices of water and of glass are the initial values of a learned
-    index. An empty glass has ordinary dimensions, and needs the up direction and the width of the surface, which
-    results of earlier releases lack.
+    index. A vessel needs the lengths of `preprocess vessel=true`.
 
     Args:
         found: content of the result file of `preprocess`.
@@ -85,10 +82,6 @@ def hypotheses(found: Mapping[str, Any], medium: Mapping[str, Any]) -> list[Hypo
             Hypothesis(f"solid body, {name}", [*body, f"medium.ior={index}", "medium.learn_ior=true"], doubt)
             for name, index in _COMMON_INDICES.items()
         ]
-    if "shell_voxels" not in medium or is_given("medium", options) or not {"up", "width"} <= found.keys():
+    if "shell_voxels" not in medium or is_given("medium", options) or not found.get("vessel"):
         return [straight, *bodies]
-    kept = [text for text in options if not is_given("medium.ior", [text])]
-    vessel = {"medium": "vessel", "medium.ior": 1.52, "medium.liquid_ior": 1.0, "medium.up": found["up"]}
-    lengths = {"medium.wall": _WALL * found["width"], "medium.foot": _FOOT * found["width"]}
-    settings = as_overrides(vessel | {name: float(f"{length:.4g}") for name, length in lengths.items()})
-    return [straight, *bodies, Hypothesis("empty glass", [known_materials, *kept, *settings])]
+    return [straight, *bodies, Hypothesis("vessel", [known_materials, *found["vessel"]])]

@@ -30,7 +30,7 @@ class ReconstructConfig:
         outlines: outlines of the object in some photographs (see `python -m nerfro.mask`).
         out: output folder.
         trial_steps: number of steps of the training that tries each hypothesis about the object on validation
-            photographs (straight rays, solid body, empty glass); 0 trains the solid body without a comparison.
+            photographs (straight rays, solid body, vessel); 0 trains the solid body without a comparison.
         pixels: maximum length of the longer side of the photographs in training; `data.downscale` has precedence.
         calibrate, mask, preprocess, train: further command-line options of these stages.
     """

@@ -85,6 +85,18 @@ def test_the_inner_wall_is_the_outer_one_moved_in_and_an_opening_has_none(tmp_pa
     assert bool(vessel.signed_distances(below_the_brim)[0][0, 1] > 0) == closed
 
 
+def test_a_fillet_is_a_circle_that_touches_wall_and_foot(tmp_path: Path) -> None:
+    trimesh.creation.cylinder(0.5, HEIGHT, sections=256).export(tmp_path / "cylinder.ply")
+    wall, foot, fillet, box = 0.05, 0.2, 0.15, {"box_min": [-1.0] * 3, "box_max": [1.0] * 3}
+    vessel = SdfVessel(str(tmp_path / "cylinder.ply"), wall, foot, resolution=96, cache=False, fillet=fillet, **box)
+    turn, bend = (torch.from_numpy(x) for x in np.meshgrid(np.linspace(0, 6, 20), np.linspace(0.1, 1.5, 15)))
+    radius, z = 0.5 - wall - fillet * (1 - bend.cos()), -0.5 * HEIGHT + foot + fillet * (1 - bend.sin())
+    cavity, normals = vessel.signed_distances(torch.stack([radius * turn.cos(), radius * turn.sin(), z], -1).float())
+    assert cavity[..., 1].abs().max() < 2e-3
+    expected = torch.stack([bend.cos() * turn.cos(), bend.cos() * turn.sin(), -bend.sin()], -1)
+    assert angle(normals[..., 1, :].double().reshape(-1, 3), expected.reshape(-1, 3)).max() < 1.5
+
+
 def test_light_enters_an_opening_freely_and_meets_water_glass_and_air(tmp_path: Path) -> None:
     d = torch.nn.functional.normalize(torch.tensor([[0.06, 0.02, -1.0]], dtype=torch.float64), dim=-1)
     trace = Snell().trace(make_rays(-2.5 * d, d, 0.5, 9.0), _glass(tmp_path))

@@ -1,0 +1,179 @@
+"""Fit of the lengths of an open drinking glass to photographs.
+
+Rays through pixels of the object are traced with all reflections, and the colours of the pixels are compared with the
+known surroundings in the exit directions. A thin wall hardly bends rays, so that most of the information comes from
+reflections, the foot and the liquid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from nerfro.capture.index_search import bootstrap_weights, mean_errors
+from nerfro.capture.surroundings import Observations, half_weight, robust
+from nerfro.capture.upright import find_up
+from nerfro.cli import warn
+from nerfro.errors import NerfroError
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.vessel import SdfVessel
+from nerfro.progress import bar
+from nerfro.samplers.snell import Snell
+
+# Lengths of an ordinary glass, as fractions of its width.
+_ORDINARY = {"wall": 0.02, "foot": 0.06, "fillet": 0.1}
+_GLASS, _WATER = 1.52, 1.333
+# Levels of a liquid that are compared with an empty glass, as fractions of the height.
+_LEVELS = (0.3, 0.5, 0.7, 0.9)
+# Half width of the grid of candidates of each round: a factor for lengths, and a fraction of the height for the level.
+_ROUNDS = ((2.0, 0.1), (1.5, 0.06), (1.5, 0.03))
+_GRID = np.linspace(-1, 1, 5)
+_NUM_PIXELS = 6000
+_LEAST_WEIGHT = 0.02
+# A vessel contains a liquid if the liquid decreases the error by this number of standard errors.
+_SIGNIFICANT = 2.0
+# Largest standard error of a known length, relative to the length; the last grid limits the error to about 0.4.
+_MAX_STANDARD_ERROR = 0.2
+
+
+@dataclass(frozen=True)
+class VesselFit:
+    """Lengths of a vessel.
+
+    Attributes:
+        lengths: wall, foot, fillet, and level if there is a liquid, world units.
+        standard_errors: standard error of each length by resampling of the views; errors of the surface are not
+            included.
+        unknown: lengths that the photographs do not determine, which keep their ordinary values.
+    """
+
+    lengths: dict[str, float]
+    standard_errors: dict[str, float]
+    unknown: list[str]
+
+
+def find_vessel(medium: SdfGrid, location: str, mesh: TriangleMesh, observations: Observations) -> dict[str, object]:
+    """Fit a vessel to the photographs, print its lengths, and return the options of the medium.
+
+    Args:
+        medium: solid body with the outer surface.
+        location: file of the outer surface.
+        mesh: the outer surface.
+        observations: observations of the object and its surroundings.
+
+    Returns:
+        Options of the vessel; empty if the surface leaves no cavity.
+    """
+    found_up = find_up(observations.views.cameras, mesh)
+    up = [0.0, 0.0, 1.0] if found_up is None else [round(float(x), 4) for x in found_up[0]]
+    across = mesh.vertices - np.outer(mesh.vertices @ np.array(up), up)
+    box = (medium.box.double().numpy() + medium.origin).tolist()
+
+    def build(**options: Any) -> SdfVessel:
+        return SdfVessel(
+            location, up=up, ior=_GLASS, box_min=box[0], box_max=box[1], resolution=len(medium.distances[0]), **options
+        )
+
+    try:
+        with bar("vessel") as progress:
+            fit = fit_vessel(build, float(np.ptp(across, axis=0).max()), observations, progress)
+    except NerfroError as error:
+        warn(f"no vessel is fitted: {error}")
+        return {}
+    values = [
+        f"{name} {value:.3g}" + ("" if name in fit.unknown else f" +- {fit.standard_errors[name]:.2g}")
+        for name, value in fit.lengths.items()
+    ]
+    print(f"vessel, {'partly filled' if 'level' in fit.lengths else 'empty'}: {', '.join(values)} world units")
+    if fit.unknown:
+        warn(f"the photographs do not determine {' and '.join(fit.unknown)}, which keep ordinary values")
+    options = {"medium.up": up, "medium.ior": _GLASS, "medium.liquid_ior": _WATER if "level" in fit.lengths else 1.0}
+    lengths = {f"medium.{name}": float(f"{length:.4g}") for name, length in fit.lengths.items()}
+    return {"medium": "vessel"} | options | lengths
+
+
+def fit_vessel(
+    build: Callable[..., SdfVessel],
+    width: float,
+    observations: Observations,
+    progress: Callable[[float], None] = lambda done: None,
+) -> VesselFit:
+    """Fit wall, foot, fillet and level of an open vessel.
+
+    Args:
+        build: constructor of the vessel, which takes the lengths and the index of the liquid.
+        width: width of the outer surface, world units.
+        observations: observations of the object and its surroundings.
+        progress: called with the completed fraction.
+    """
+    ordinary = {name: fraction * width for name, fraction in _ORDINARY.items()}
+    empty = build(**ordinary, liquid_ior=1.0)
+    filled = build(**ordinary, liquid_ior=_WATER, level=0.5 * empty.height)
+    work = 1 + len(_LEVELS) + len(_ROUNDS) * (len(ordinary) + 1) * len(_GRID)
+    search = _Search(observations, lambda count: progress(min(1.0, count / work)))
+    levels: list[dict[str, float]] = [{}, *({"level": level * empty.height} for level in _LEVELS)]
+    errors = [search.errors(filled if level else empty, ordinary | level) for level in levels]
+    best = int(np.argmin([mean_errors(each[None], search.counts)[0, 0] for each in errors]))
+    vessel = filled if best and search.differs(errors[0], errors[best]) else empty
+    ordinary |= levels[best] if vessel is filled else {}
+    lengths, standard_errors = dict(ordinary), dict[str, float]()
+    for factor, fraction in _ROUNDS:
+        for name in ordinary:
+            is_level = name == "level"
+            half_width = fraction * empty.height if is_level else np.log(factor)
+            middle = lengths[name] if is_level else np.log(lengths[name])
+            grid = middle + half_width * _GRID
+            values = grid.clip(max=empty.height) if is_level else np.exp(grid)
+            sums = np.stack([search.errors(vessel, lengths | {name: value}) for value in values.tolist()])
+            found = _minimum(grid, mean_errors(sums, search.counts))[0]
+            spread = float(_minimum(grid, mean_errors(sums, search.counts, search.samples)).std())
+            lengths[name] = float(min(found, empty.height) if is_level else np.exp(found))
+            standard_errors[name] = spread if is_level else spread * lengths[name]
+    unknown = [name for name in ordinary if standard_errors[name] > _MAX_STANDARD_ERROR * lengths[name]]
+    progress(1.0)
+    return VesselFit(lengths | {name: ordinary[name] for name in unknown}, standard_errors, unknown)
+
+
+def _minimum(grid: Float[np.ndarray, "C"], errors: Float[np.ndarray, "B C"]) -> Float[np.ndarray, "B"]:
+    """Return the minima of the parabolas through the lowest error and its neighbours.
+
+    Robust errors have narrow minima, which a parabola through all candidates would miss.
+    """
+    lowest = errors.argmin(1).clip(1, len(grid) - 2)
+    before, at, after = (errors[np.arange(len(errors)), lowest + offset] for offset in (-1, 0, 1))
+    curvature = before - 2 * at + after
+    offset = 0.5 * (before - after) / np.where(curvature > 0, curvature, 1)
+    offset = np.where(curvature > 0, offset.clip(-1, 1), np.sign(before - after))
+    return grid[lowest] + offset * (grid[1] - grid[0])
+
+
+class _Search:
+    """Errors of vessels at pixels of the object; `progress` is called with the number of vessels."""
+
+    def __init__(self, observations: Observations, progress: Callable[[int], None]) -> None:
+        self._surroundings = observations.surroundings
+        self._pixels = observations.through.some(_NUM_PIXELS)
+        self._half_weight = half_weight(self._surroundings)
+        self._sampler = Snell(branches="all", least_weight=_LEAST_WEIGHT)
+        self._progress, self._num_errors = progress, 0
+        self.samples = bootstrap_weights(len(self._pixels.cameras))
+        self.counts = np.bincount(self._pixels.view, minlength=len(self._pixels.cameras)).astype(np.float64)
+
+    def errors(self, vessel: SdfVessel, lengths: Mapping[str, float]) -> Float[np.ndarray, "V"]:
+        """Sum the robust errors over the pixels of each view."""
+        path = self._sampler(self._pixels.rays, vessel.with_lengths(lengths))
+        radiance = path.per_ray(self._surroundings.boundary(path.exits())).clamp(max=1)
+        error = robust(radiance - self._pixels.radiance, self._half_weight).double()
+        self._num_errors += 1
+        self._progress(self._num_errors)
+        return np.bincount(self._pixels.view, error, len(self.counts))
+
+    def differs(self, before: Float[np.ndarray, "V"], after: Float[np.ndarray, "V"]) -> bool:
+        """Test whether the error decreases significantly, by resampling of the views."""
+        gains = mean_errors((before - after)[None], self.counts, self.samples)
+        return bool(gains.mean() > _SIGNIFICANT * gains.std())
