@@ -151,6 +151,7 @@ def fit_revolution(
         misfit, slopes = misfits(numbers).double(), jacfwd(misfits)(numbers).double()
         weight = 1 / (1 + (misfit / half_weight).square()).square()
         smooth = 1 / (1 + (bends @ numbers / _CORNER).square()).square()  # corners have little weight
+        smooth[-_END:] = 1  # the upper end would flare
         stiff = (_BENDING * pixels) ** 2 * len(misfit) / _KNOTS * (bends.T @ (smooth[:, None] * bends)).double()
         system = slopes.T @ (weight[:, None] * slopes) + stiff
         right = slopes.T @ (weight * misfit) + stiff @ numbers.double()

@@ -27,6 +27,7 @@ from nerfro.samplers.snell import Snell
 
 # Lengths of an ordinary glass, as fractions of its width.
 _ORDINARY = {"wall": 0.02, "foot": 0.06, "fillet": 0.1}
+_MAX_FILLET = 0.4
 _GLASS, _WATER = 1.52, 1.333
 # Levels of a liquid that are compared with an empty glass, as fractions of the height.
 _LEVELS = (0.3, 0.5, 0.7, 0.9)
@@ -112,8 +113,9 @@ def fit_vessel(
         progress: called with the completed fraction.
     """
     ordinary = {name: fraction * width for name, fraction in _ORDINARY.items()}
-    empty = build(**ordinary, liquid_ior=1.0)
-    filled = build(**ordinary, liquid_ior=_WATER, level=0.5 * empty.height)
+    widest = ordinary | {"fillet": _MAX_FILLET * width}  # distances are exact up to this depth
+    empty = build(**widest, liquid_ior=1.0)
+    filled = build(**widest, liquid_ior=_WATER, level=0.5 * empty.height)
     work = 1 + len(_LEVELS) + len(_ROUNDS) * (len(ordinary) + 1) * len(_GRID)
     search = _Search(observations, lambda count: progress(min(1.0, count / work)))
     levels: list[dict[str, float]] = [{}, *({"level": level * empty.height} for level in _LEVELS)]

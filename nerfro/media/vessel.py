@@ -110,8 +110,8 @@ class SdfVessel(SdfGrid):
         if level is not None:
             self.lengths["level"] = level
         self._require_lengths_within()
-        # The wall's inner surface is made of these distances, and a refinement moves it.
-        band = min(BAND + 2 * wall * self.unit / spacing, resolution)
+        # The wall's inner surface and the fillet are made of these distances, and a refinement moves them.
+        band = min(BAND + (2 * wall + fillet) * self.unit / spacing, resolution)
         settings = surface, box, resolution, band, cache
         outer = side = torch.from_numpy(cached_distance(*settings))
         if not closed:
@@ -143,7 +143,7 @@ class SdfVessel(SdfGrid):
         return changed._with_distances(changed._distances())
 
     def with_lengths(self, lengths: Mapping[str, float]) -> SdfVessel:
-        """Return the vessel with other lengths; the wall is at most twice as thick as that of the original."""
+        """Return the vessel with other lengths; twice the wall plus the fillet is at most that of the original."""
         changed = variant(self, lengths=self.lengths | dict(lengths))
         return changed._with_distances(changed._distances())
 
@@ -152,7 +152,7 @@ class SdfVessel(SdfGrid):
         wall, foot, fillet, *level = (length * self.unit for length in self.lengths.values())
         side, base = self._side + wall, foot - self._heights
         # In the corner, the distance is that to a circle that touches wall and foot.
-        in_corner = (side > -fillet) & (base > -fillet)
+        in_corner = (side > -fillet) & (base > -fillet) & (fillet > 0)
         circle = torch.hypot(side + fillet, base + fillet) - fillet
         cavity = torch.where(in_corner, circle, torch.maximum(side, base))
         return torch.stack([self._outer, cavity, *(self._heights - height for height in level)])
