@@ -124,7 +124,7 @@ def test_masks_that_exist_are_kept_and_show_the_way(
             assert (capture / "photos" / f"mask_p_{view}.png").read_bytes() == before[view]
         else:
             assert overlap(read(capture, view), mask) > 0.9
-    assert "all images have masks" in command("mask", f"data.root={capture}")
+    assert "5 existing masks" in command("mask", f"data.root={capture}")  # projections are made again
 
 
 def test_two_outlines_of_a_body_of_revolution_give_all_masks_whatever_the_colours() -> None:
@@ -168,7 +168,7 @@ def test_projections_are_made_again_and_edited_masks_are_kept(
         Image.fromarray(np.uint8(255 * photographs[view][1])).save(capture / "photos" / f"mask_p_{view}.png")
     assert "wrote 11 masks" in command("mask", f"data.root={capture}", "hull_only=true")
     file = capture / "photos" / "mask_p_3.png"
-    assert method_of(file) == "visual hull"
+    assert method_of(file) == "body of revolution"
     assert method_of(capture / "photos" / "mask_p_1.png") is None
     with Image.open(file) as image:
         edited, text = image.copy(), PngInfo()
@@ -232,7 +232,7 @@ def test_the_hull_is_taken_where_colours_say_something_else(
     printed = command("mask", f"data.root={root}", f"hull_only={str(hull_only).lower()}")
     overlaps = [overlap(read(root, view), photographs[view][1]) for view in range(1, NUM_VIEWS, 2)]
     assert min(overlaps) > 0.85, overlaps
-    assert "7 masks are projections of the visual hull" in printed
+    assert "7 masks are projections of the body of revolution" in printed
 
 
 def test_a_hull_alone_takes_three_masks(capture: Path, photographs: list, command: Callable[..., str]) -> None:
