@@ -113,6 +113,8 @@ class Plugin:
 
 
 _plugins: dict[tuple[str, str], Plugin] = {}
+# Checks of classes that register, by plugin type; each takes the name and the class, and raises NerfroError.
+CHECKS: dict[str, Callable[[str, type], None]] = {}
 _discovered: set[str] = set()
 
 
@@ -128,7 +130,7 @@ def register(kind: str, name: str) -> Callable[[type[Part]], type[Part]]:
         name: name of the option.
 
     Raises:
-        NerfroError: the plugin type is unknown, or the name is taken.
+        NerfroError: the plugin type is unknown, the name is taken, or the class lacks a part of its contract.
     """
     _require_kind(kind)
 
@@ -148,6 +150,8 @@ def add(kind: str, name: str, cls: type) -> None:
         raise NerfroError(
             f"{kind}={name} is registered twice, by {taken.cls.__module__} and {cls.__module__}; rename one of them"
         )
+    if kind in CHECKS:
+        CHECKS[kind](name, cls)
     plugin = _make_plugin(kind, name, cls)
     _plugins[kind, name] = plugin
     package = f"{kind}.{name}" if kind == "callbacks" else None  # a run may have several

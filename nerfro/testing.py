@@ -49,12 +49,22 @@ def check(plugin: Plugin, fields: Mapping[str, object] | None = None) -> None:
 
     Raises:
         ContractError: the plugin breaks a contract.
+        NerfroError: a required field has no value, or a value is not allowed.
     """
     _require(bool(plugin.summary), "the class has no docstring, which `python -m nerfro.plugins` shows")
     base, check_contract = _CONTRACTS[plugin.kind]
+    _require(issubclass(plugin.cls, base), f"a {plugin.kind} derives from {base.__module__}.{base.__name__}")
+    missing = sorted(getattr(plugin.cls, "__abstractmethods__", ()))
+    _require(not missing, f"{plugin.cls.__name__} lacks {', '.join(missing)}")
     built = build({"_target_": plugin.target, **(fields or {})}, components=example_components())
-    _require(isinstance(built, base), f"a {plugin.kind} derives from {base.__module__}.{base.__name__}")
-    check_contract(built)
+    try:
+        check_contract(built)
+    except ContractError:
+        raise
+    except Exception as error:  # any error of a plugin's author
+        first_line = str(error).strip().partition("\n")[0]
+        raise ContractError(f"contract broken: {plugin.kind}={plugin.name} raised {type(error).__name__}: "
+                            f"{first_line}") from error  # fmt: skip
 
 
 def example_rays(num_rays: int = NUM_RAYS) -> Rays:
@@ -112,6 +122,8 @@ def example_draws(num_rays: int = NUM_RAYS, step: int = 0) -> Draws:
 
 
 def _check_medium(medium: Medium) -> None:
+    box = getattr(medium, "box", None)
+    _require(box is not None and box.shape == (2, 3), "a medium has a buffer `box` [2, 3], its lower and upper corner")
     low, high = medium.box
     points = low + torch.rand(200, 3) * (high - low)
     ior, gradient = medium(points)
@@ -217,6 +229,7 @@ def _check_model(model: Renderer) -> None:
 
 
 def _check_data(source: DataSource) -> None:
+    _require(hasattr(source, "root"), "a data source has the attribute `root`, the folder of the data set")
     for split in source.splits:
         views = source.load(split)
         size = (views.cameras.height, views.cameras.width)

@@ -10,19 +10,24 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 import nerfro.export
 import nerfro.plugins
 import nerfro.registry
 import nerfro.summary
+from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData
 from nerfro.errors import NerfroError
+from nerfro.media.base import Medium
 from nerfro.paths import PLUGINS_DIR
-from nerfro.registry import KINDS, discover, find, plugins
+from nerfro.registry import KINDS, discover, find, plugins, register
+from nerfro.testing import ContractError, check
 from tests.conftest import Finished, finish
 
 discover()
@@ -107,6 +112,68 @@ def test_plugin_that_fails_is_named_with_the_cause(
     with pytest.raises(NerfroError) as caught:
         discover(folder)
     assert str(caught.value).startswith(f"plugin {folder / 'broken.py'} cannot be imported: {cause}")
+
+
+METRIC = """
+from nerfro.evaluation.image_metrics import ImageMetric
+from nerfro.registry import register
+
+@register("metric", "worst")
+class Worst(ImageMetric):
+    '''Largest error.'''
+    better = "lower"
+    def forward(self, prediction, target, inside=None):
+        return ((prediction - target).abs() if inside is None else (prediction - target).abs()[inside]).max()
+"""
+
+
+@pytest.mark.parametrize(
+    ("part", "replacement", "advice"),
+    [
+        ('better = "lower"', "", 'add better = "higher" or better = "lower"'),
+        (", inside=None", "", "write forward(self, prediction, target, inside=None)"),
+        ("Worst(ImageMetric)", "Worst", "derive it from nerfro.evaluation.image_metrics.ImageMetric"),
+    ],
+)
+def test_metric_that_cannot_be_scored_is_refused_with_its_file(
+    part: str, replacement: str, advice: str, write_plugin: Callable[[str, str], Path]
+) -> None:
+    folder = write_plugin("worst_metric", METRIC.replace(part, replacement))
+    with pytest.raises(NerfroError) as caught:
+        discover(folder)
+    assert str(caught.value).startswith(f"plugin {folder / 'worst_metric.py'}: metric=worst: class Worst ")
+    assert advice in str(caught.value)
+
+
+def test_metric_without_a_title_is_called_by_its_name(write_plugin: Callable[[str, str], Path]) -> None:
+    discover(write_plugin("worst_metric", METRIC))
+    check(find("metric", "worst"))
+    assert find("metric", "worst").cls.title == "worst"
+
+
+def ones(medium: Medium, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.ones_like(positions[..., 0]), torch.zeros_like(positions)
+
+
+@pytest.mark.parametrize(
+    ("kind", "base", "members", "contract"),
+    [
+        ("medium", Medium, {"forward": ones}, r"a medium has a buffer `box` \[2, 3\]"),
+        ("medium", Medium, {}, "Broken lacks forward"),
+        ("data", DataSource, {"load": None, "splits": ["train"]}, "has the attribute `root`"),
+    ],
+)
+def test_check_names_the_broken_contract(kind: str, base: type, members: dict[str, object], contract: str) -> None:
+    register(kind, "broken")(type("Broken", (base,), {"__doc__": "Broken.", "__module__": __name__, **members}))
+    with pytest.raises(ContractError, match=contract):
+        check(find(kind, "broken"))
+
+
+def test_views_refuse_a_list_of_images() -> None:
+    # Without the constructor, whose annotations are checked in tests alone.
+    views = SimpleNamespace(images=[torch.zeros(16, 16, 3)], masks=None, usable=None)
+    with pytest.raises(NerfroError, match=r"Views\.images is a list; give one tensor of all views"):
+        Views.__post_init__(views)  # type: ignore[arg-type]
 
 
 def test_plugin_with_a_taken_name_names_both_modules_and_its_file(write_plugin: Callable[[str, str], Path]) -> None:

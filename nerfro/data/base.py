@@ -16,7 +16,7 @@ from torch import Tensor
 from nerfro.cameras import Cameras
 from nerfro.cli import warn
 from nerfro.data.lazy_images import LazyImages
-from nerfro.errors import first_of
+from nerfro.errors import NerfroError, first_of
 from nerfro.progress import track
 from nerfro.types import WORLD_ORIGIN
 
@@ -42,7 +42,8 @@ class Frame:
 class Views:
     """Posed images of one split.
 
-    Images, masks and usable pixels are indexed by view. They are usually `LazyImages`, which decode a file on access.
+    Images, masks and usable pixels are indexed by view. Each is a tensor, or `LazyImages`, which decode a file on
+    access. `torch.stack(list(views.images))` is a tensor in both cases.
 
     Attributes:
         cameras: one camera per image; all images have the same resolution.
@@ -52,6 +53,9 @@ class Views:
         usable: pixels [H, W] that training may use (1 or True), or None if all pixels are usable.
         frames: image and mask files, if the data format knows them; otherwise empty.
         mask_labels: labels of the object in the mask files, see `nerfro.data.image_files.read_mask`.
+
+    Raises:
+        NerfroError: images, masks or usable pixels are neither a tensor nor `LazyImages`.
     """
 
     cameras: Cameras
@@ -61,6 +65,15 @@ class Views:
     usable: LazyImages | Bool[Tensor, "V H W"] | None = None
     frames: Sequence[Frame] = ()
     mask_labels: Sequence[int] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("images", "masks", "usable"):
+            given = getattr(self, name)
+            if not isinstance(given, (Tensor, LazyImages)) and (given is not None or name == "images"):
+                raise NerfroError(
+                    f"Views.{name} is a {type(given).__name__}; give one tensor of all views, as by torch.stack, or "
+                    "LazyImages"
+                )
 
     def __len__(self) -> int:
         return len(self.names)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -11,13 +12,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from nerfro.errors import NerfroError
 from nerfro.evaluation.error_maps import squared_error_map
 from nerfro.evaluation.flip import flip
 from nerfro.evaluation.flip import is_available as flip_available
 from nerfro.evaluation.lpips import ALEX, VGG, LpipsNetwork
 from nerfro.evaluation.regions import mean_over, require_images
 from nerfro.evaluation.ssim import MS_SSIM_MIN_SIZE, WINDOW, ms_ssim, ssim
-from nerfro.registry import Plugin, create, plugins, register
+from nerfro.registry import CHECKS, Plugin, create, plugins, register
 
 MAX_PSNR = 100.0  # dB; the infinite PSNR of equal images has no mean and no representation in JSON
 
@@ -29,7 +31,7 @@ class ImageMetric(nn.Module, ABC):
     """Score of a rendered image.
 
     Attributes:
-        title: heading in tables.
+        title: heading in tables; by default, the registered name.
         better: whether higher or lower scores are better.
         decimals: number of decimals in tables.
         min_size: smallest side of an image in pixels; smaller images have no score.
@@ -65,6 +67,26 @@ class ImageMetric(nn.Module, ABC):
         if self.missing is not None or min(prediction.shape[:2]) < self.min_size:
             return math.nan
         return float(self(prediction, target, inside))
+
+
+def _check_class(name: str, cls: type) -> None:
+    """Refuse a class that cannot be scored, and derive a missing title from the name.
+
+    Raises:
+        NerfroError: the class does not derive from `ImageMetric`, or lacks `better` or the parameter `inside`.
+    """
+    what = f"metric={name}: class {cls.__name__}"
+    if not issubclass(cls, ImageMetric):
+        raise NerfroError(f"{what} is not a metric; derive it from {ImageMetric.__module__}.ImageMetric")
+    if getattr(cls, "better", None) not in ("higher", "lower"):
+        raise NerfroError(f'{what} does not say which scores are better; add better = "higher" or better = "lower"')
+    inside = inspect.signature(cls.forward).parameters.get("inside")
+    if inside is None or inside.default is inside.empty:
+        raise NerfroError(f"{what} cannot score a region; write forward(self, prediction, target, inside=None)")
+    cls.title = getattr(cls, "title", name)
+
+
+CHECKS["metric"] = _check_class
 
 
 def image_metrics() -> dict[str, type[ImageMetric]]:
