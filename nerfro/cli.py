@@ -38,7 +38,7 @@ from nerfro.allowed import check_names, check_settings
 from nerfro.errors import NerfroError, nearest_of
 from nerfro.options import ADDED_GROUPS, Described, describe_command, recall, remember, usage
 from nerfro.paths import CONF_DIR, refuse_root, user_path
-from nerfro.registry import MOVED_CLASSES, discover, plugins
+from nerfro.registry import MOVED_CLASSES, SEVERAL, discover, plugins
 from nerfro.trust import MAX_YAML_CHARACTERS, GuardedConfigLoader, leave_current_directory, require_bounded_yaml
 
 _HELP = {"-h", "--help"}
@@ -366,8 +366,20 @@ def _messages(error: BaseException) -> list[str]:
     names = schema.__dataclass_fields__ if dataclasses.is_dataclass(schema) else cause.parent_node
     if isinstance(cause, (ConfigKeyError, ConfigAttributeError)) and names is not None:
         where = [f"{lines[0].partition(':')[0]}:"] if lines[0].startswith("In '") else []
-        return [*where, f"{cause.full_key} is not a setting; {nearest_of(str(cause.key), list(map(str, names)))}"]
+        key, nearest = str(cause.full_key), nearest_of(str(cause.key), list(map(str, names)))
+        return [*where, _unselected(key) or f"{key} is not a setting; {nearest}"]
     return lines + [line.strip() for line in str(cause).splitlines() if line.strip() and line.strip() not in lines]
+
+
+def _unselected(key: str) -> str | None:
+    """Say how to select a loss or a callback that the experiment lacks; None for other settings."""
+    kind, name, option = [*key.split("."), "", ""][:3]
+    plugin = next((plugin for plugin in plugins() if (plugin.kind, plugin.name) == (kind, name)), None)
+    if plugin is None or kind not in SEVERAL or (option and option not in plugin.setting_names):
+        return None
+    if kind == "loss":
+        return f"the experiment does not set {key}; write +loss.{name}.{option or 'weight'}=..., with a plus sign"
+    return f"callbacks.{name} is not selected; add +callbacks={name}"
 
 
 def renamed_override(override: str) -> str:

@@ -84,6 +84,8 @@ class Described:
             key, equals, value = argument.lstrip("+~").partition("=")
             if not equals or not re.fullmatch(r"[\w./]+", key) or key.startswith("hydra"):
                 continue
+            if key == "metric" and key not in self.names[""]:
+                raise NerfroError(f"{argument}: all registered metrics are scored, so there is nothing to choose")
             if key in self.choices:
                 if re.fullmatch(r"\w+", value) and value not in (*self.choices[key], "null"):
                     raise NerfroError(f"{key}={value} does not exist; {nearest_of(value, self.choices[key])}")

@@ -159,6 +159,8 @@ def test_open_mesh_is_accepted_when_asked(
         (["boundary.width=99999999"], ["width=99999999 is not allowed; take at least 1 and at most 8192"]),
         (["nme=x"], ["nme is not a setting; did you mean name?"]),
         (["field=nrf"], ["Could not find 'field/nrf'", "Available options", "mip_nerf", "nerf"]),
+        (["loss.opaque.start=1"], ["write +loss.opaque.weight=..., with a plus sign"]),
+        (["callbacks.early_stopping.patience=2"], ["not selected; add +callbacks=early_stopping"]),
         (["field.widht=3"], ["field.widht is not a setting; did you mean width?"]),
         (["+field.widht=3"], ["field.widht is not a setting; did you mean width?"]),
         (["+expriment=mipnerf"], ["expriment is not a setting; did you mean experiment?"]),

@@ -9,13 +9,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
 
+import nerfro
 from nerfro.__main__ import commands
 from nerfro.paths import PACKAGE_DIR
 from nerfro.registry import discover, find
 from nerfro.testing import check
+from nerfro.viewing import PLUGIN_EXPORTS
+from nerfro.viewing.exports import ExportConfig, find_export
 
 CHECKOUT = PACKAGE_DIR.parent
 pytestmark = pytest.mark.skipif(not (CHECKOUT / "docs").is_dir(), reason="there is no checkout with docs")
@@ -36,12 +41,14 @@ def guide_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, restored_regi
         else:
             (tmp_path / file[1]).write_text(block)
     monkeypatch.setenv("NERFRO_PLUGINS", str(tmp_path))
+    monkeypatch.setitem(PLUGIN_EXPORTS, "centres", "")  # the export ends with the test
     discover()
     return rest
 
 
 def test_plugins_of_the_guide_keep_their_contracts(guide_plugins: list[str]) -> None:
-    for kind, name in (("sampler/points", "square_root"), ("loss", "half_transparent"), ("boundary", "horizon")):
+    named = ["sampler/points=square_root", "loss=half_transparent", "boundary=horizon", "metric=worst_pixel"]
+    for kind, _, name in (text.partition("=") for text in named):
         check(find(kind, name))
     test, check_of_tutorial = guide_plugins
     namespace: dict[str, Any] = {}
@@ -53,13 +60,20 @@ def test_plugins_of_the_guide_keep_their_contracts(guide_plugins: list[str]) -> 
 def test_plugins_of_the_guide_train_where_rays_split(
     guide_plugins: list[str], train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
 ) -> None:
-    options = ("sampler/points=square_root", "+loss.half_transparent={weight: 0.1, power: 2}", "boundary=horizon")
+    loss = ("+loss.half_transparent.weight=0.1", "+loss.half_transparent.power=2")
+    options = ("sampler/points=square_root", *loss, "boundary=horizon")
     finished = train_here(
         *(option for option in tiny_default_run if not option.startswith(("sampler.points", "boundary."))), *options,
         "sampler.path.branches=all", "trainer.max_steps=2", f"hydra.run.dir={tmp_path}/run",
     )  # fmt: skip
     assert finished.code == 0, finished.err
     assert "2 steps in" in finished.out
+
+
+def test_export_of_the_guide_writes_its_file(guide_plugins: list[str], trained_run: Path, tmp_path: Path) -> None:
+    scene, out = nerfro.load(trained_run), tmp_path / "centres.csv"
+    find_export("centres", out).write(scene, out, OmegaConf.structured(ExportConfig))
+    np.testing.assert_allclose(np.loadtxt(out, delimiter=","), scene.cameras("train").camera_to_world[:, :, 3])
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/guides/export_and_share.md", "docs/tutorials/notebook.md"])

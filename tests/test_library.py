@@ -117,3 +117,15 @@ def test_bending_at_a_ball_is_as_in_closed_form(interface: str, tmp_path: Path, 
 def test_rays_that_are_none_are_refused(rays: tuple, message: str, tmp_path: Path) -> None:
     with pytest.raises(NerfroError, match=message):
         nerfro.bend(tmp_path / "ball.ply", 1.5, *rays)
+
+
+@pytest.mark.parametrize(
+    ("experiment", "overrides", "message"),
+    [
+        ("refractive", ["fild=nerf"], "fild is not a setting; did you mean field"),
+        ("refractiv", [], "experiment=refractiv does not exist; did you mean refractive"),
+    ],
+)
+def test_misspelt_names_are_refused_as_on_the_command_line(experiment: str, overrides: list[str], message: str) -> None:
+    with pytest.raises(NerfroError, match=message):
+        nerfro.build(experiment, overrides)

@@ -65,6 +65,8 @@ def test_help_version_and_mistakes_do_not_wait_for_torch(arguments: list[str], p
         ("field=nref", "field=nref does not exist; did you mean nerf"),
         ("experiment=glas", "experiment=glas does not exist; did you mean glass"),
         ("field.widht=3", "field.widht is not a setting; did you mean width"),
+        ("metric=psnr", "metric=psnr: all registered metrics are scored"),
+        ("+metric=psnr", r"\+metric=psnr: all registered metrics are scored"),
     ],
 )
 def test_names_that_nothing_knows_are_refused(mistake: str, message: str) -> None:

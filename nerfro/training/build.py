@@ -7,12 +7,14 @@ from collections.abc import Sequence
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
+from hydra.errors import HydraException
 from lightning.pytorch import seed_everything
 from omegaconf import DictConfig
 
-from nerfro.cli import check_configuration, renamed_override
+from nerfro.cli import check_configuration, in_one_line, renamed_override
 from nerfro.data.base import DataSource, Views
 from nerfro.errors import NerfroError
+from nerfro.options import describe_command
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover
 from nerfro.rendering import Renderer
@@ -46,8 +48,13 @@ def build(experiment: str | None = None, overrides: Sequence[str] = ()) -> tuple
     discover()
     ConfigStore.instance().store(name="train_schema", node=TrainConfig, provider="nerfro")
     chosen = [] if experiment is None else [f"+experiment={experiment}"]
-    with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
-        config = compose("train", [*chosen, *map(renamed_override, overrides)])
+    given = [*chosen, *map(renamed_override, overrides)]
+    try:
+        with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+            config = compose("train", given)
+    except HydraException as error:
+        describe_command("train", TrainConfig, CONF_DIR).require_known(given)
+        raise NerfroError(in_one_line(error)) from error
     check_configuration(config, TrainConfig, CONF_DIR)
     check_run(config)
     settle_trainer(config)
