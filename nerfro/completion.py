@@ -12,7 +12,8 @@ _BASH = "complete -o nospace -C 'nerfro --complete' nerfro"
 _CODE = {
     "bash": _BASH,
     "zsh": f"autoload -U +X bashcompinit && bashcompinit\n{_BASH}",
-    "fish": "complete -c nerfro -f -a '(env COMP_LINE=(commandline -cp | string collect) nerfro --complete | string trim)'",
+    "fish": "complete -c nerfro -f -a "
+    "'(env COMP_LINE=(commandline -cp | string collect) nerfro --complete | string trim)'",
 }
 
 
