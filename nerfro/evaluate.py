@@ -1,7 +1,7 @@
-"""`python -m nerfro.evaluate checkpoint=...` or `predictions=DIR references=DIR`: score a model, or any images.
+"""`python -m nerfro.evaluate checkpoint=RUN` or `predictions=DIR references=DIR`: score a model, or any images.
 
 Examples:
-    nerfro evaluate checkpoint=outputs/first/checkpoints/last.ckpt split=val
+    nerfro evaluate checkpoint=outputs/first split=val
     nerfro evaluate predictions=outputs/first/images references=data/test out=scores
 """
 
@@ -27,7 +27,7 @@ from nerfro.files.images import load_png
 from nerfro.paths import user_path
 from nerfro.training.callbacks import Throughput
 from nerfro.training.config import build_data, check_trained
-from nerfro.training.load import scene_of
+from nerfro.training.load import checkpoint_of, scene_of
 from nerfro.training.run_folder import CONFIG_FILE, load_checkpoint
 
 # Options that replace the options of the run, if given.
@@ -45,7 +45,7 @@ def main(config: DictConfig) -> None:
 
 
 def _evaluate_checkpoint(config: DictConfig) -> None:
-    path = user_path(config.checkpoint)
+    path = checkpoint_of(config.checkpoint)
     checkpoint, trained = load_checkpoint(path)
     if config.root is not None:
         trained.data.root = config.root

@@ -247,7 +247,10 @@ def _plugin_of(node: DictConfig) -> Plugin:
     place = MOVED_CLASSES.get(target, target)
     plugin = next((plugin for plugin in _plugins.values() if plugin.target == place), None)
     if plugin is None:
-        raise NerfroError(f"'{target}' is not registered; `python -m nerfro.plugins` lists the registered classes")
+        raise NerfroError(
+            f"'{target}' is not registered; `python -m nerfro.plugins` lists the registered classes; "
+            "for a class in a local folder, set NERFRO_PLUGINS=DIR or start beside its plugins/"
+        )
     return plugin
 
 

@@ -35,7 +35,7 @@ class SummaryConfig:
     # Folder for the report and the tables (.csv, .md and .tex, one table per budget); without it, only print.
     out: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     report: bool = False  # whether to write `report.html`; the default of `out` is then `outputs/summary`
-    # Columns of the tables; by default psnr, ssim, lpips and the metrics of plugins.
+    # Columns of the tables; by default psnr, ssim, lpips, flip and the metrics of plugins, as far as runs have them.
     metrics: Optional[list[str]] = None  # noqa: UP045
     region: Annotated[str, Literal["full", "mask", "crop"]] = FULL  # region of the scores: full, mask or crop
     methods: dict[str, str] = field(default_factory=dict)  # titles of experiments, in the order of the rows

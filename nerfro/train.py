@@ -85,6 +85,9 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
 
     write_cameras(folder / "cameras.json", renderer.to(device).scene.camera, training, source.origin)
     spent = trainer.global_step, throughput.seconds, throughput.rays_per_second
+    for callback in trainer.early_stopping_callbacks:
+        if trainer.should_stop and callback.stopping_reason_message:
+            print(f"stopped by early stopping at step {spent[0]}: {callback.stopping_reason_message}")
     print(f"{spent[0]} steps in {spent[1]:.0f} s, {spent[2] or 0:,.0f} rays/s")
     scored, scores = None, {}
     try:

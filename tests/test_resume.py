@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import itertools
 import os
 import random
@@ -53,6 +54,12 @@ def tensors(node: Any, prefix: str = "") -> dict[str, torch.Tensor]:
         return {prefix: node}
     items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, (list, tuple)) else ()
     return {name: value for key, child in items for name, value in tensors(child, f"{prefix}/{key}").items()}
+
+
+def log_rows(file: Path) -> list[dict[str, str]]:
+    """Rows of a CSV log, without empty cells."""
+    with file.open(newline="") as stream:
+        return [{name: value for name, value in row.items() if value} for row in csv.DictReader(stream)]
 
 
 @pytest.mark.slow
@@ -149,7 +156,12 @@ def test_resuming_a_finished_run_with_more_steps_trains_the_rest(
 ) -> None:
     shutil.copytree(trained_run, tmp_path / "run")
     options = ["evaluation.every=0", f"hydra.run.dir={tmp_path / 'run'}", "trainer.max_steps=5", "ckpt_path=last"]
-    assert train_here(*tiny_default_run, *options).code == 0
+    log = tmp_path / "run" / "csv" / "metrics.csv"
+    before = log_rows(log)
+    assert train_here(*tiny_default_run, *options, "logger=tensorboard", "trainer.log_every_n_steps=1").code == 0
+    assert before
+    assert log_rows(log)[: len(before)] == before, "the log keeps its earlier rows"
+    assert len(log_rows(log)) > len(before)
     checkpoint, _ = load_checkpoint(tmp_path / "run" / LAST_CHECKPOINT)
     assert checkpoint["global_step"] == 5
     assert checkpoint["callbacks"]["Throughput"]["num_rays"] >= 5 * 32

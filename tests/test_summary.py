@@ -21,7 +21,7 @@ from nerfro.evaluation.tables import Column, Row, Table, to_csv, to_html, to_lat
 from nerfro.files.images import save_png
 from nerfro.report.comparison import compare, find_metrics, to_table
 from nerfro.report.runs import find_runs
-from nerfro.training.run_folder import record
+from nerfro.training.run_folder import LAST_CHECKPOINT, record
 from tests.conftest import finish
 
 PAPER = find_metrics(["psnr", "ssim", "lpips"])
@@ -99,11 +99,13 @@ def test_runs_of_different_budgets_never_share_a_table(tmp_path: Path, monkeypat
     monkeypatch.setattr(torch, "get_num_threads", lambda: torch_threads + 7)
     write_run(tmp_path / "3", "a", 23.0)  # as long, on another device
     write_run(tmp_path / "4", "b", 24.0, max_time=None, max_steps=100)  # as many steps cost the same there
+    write_run(tmp_path / "5", "a", 25.0, max_time="00:00:09:00", max_steps=10)
     found = tables(tmp_path)
-    assert [[row.values[0] for row in table.rows] for table in found] == [[24.0, 22.0], [20.0], [23.0], [21.0]]
-    assert found[0].title.startswith("Trained for 100 steps of 512 rays;")
-    assert found[3].title.startswith("Trained for 8 min on ")
-    assert len({re.split(";", table.title)[0] for table in found}) == 4
+    assert [[row.values[0] for row in table.rows] for table in found] == [[24.0, 22.0], [20.0], [23.0], [21.0], [25.0]]
+    assert found[0].title.startswith("Budget: at most 100 steps of 512 rays;")
+    assert found[3].title.startswith("Budget: at most 8 min on ")
+    assert re.match(r"Budget: at most 9 min on .* and at most 10 steps of 512 rays;", found[4].title)
+    assert len({re.split(";", table.title)[0] for table in found}) == 5
 
 
 def test_what_was_scored_differently_stands_in_columns_of_its_own(tmp_path: Path) -> None:
@@ -151,7 +153,7 @@ def test_missing_scores_are_missing_in_the_mean_too_and_have_their_reason(tmp_pa
     write_run(tmp_path / "0", "a", 20.0, seed=0)
     write_run(tmp_path / "1", "a", 20.0, seed=1, lpips=None)
     (table,) = tables(tmp_path)
-    assert cell(table, "a", "torus", "LPIPS") == (None, None)
+    assert [column.title for column in table.columns] == ["PSNR", "SSIM"]
     assert cell(table, "a", "torus") == (20.0, 0.0)
     assert "LPIPS n/a: no network" in table.notes
 
@@ -186,13 +188,26 @@ def test_places_are_folders_and_globs_and_runs_without_scores_are_named(tmp_path
     assert [run.folder.name for run in runs] == ["a", "b"]
     assert len(unfinished) == 1
     assert str(tmp_path / "c") in unfinished[0]
-    with pytest.raises(NerfroError, match="has not been evaluated"):
+    with pytest.raises(NerfroError, match=r"has not been evaluated$"):
+        find_runs([str(tmp_path / "c")])
+    (tmp_path / "c" / LAST_CHECKPOINT).parent.mkdir()
+    (tmp_path / "c" / LAST_CHECKPOINT).touch()
+    with pytest.raises(NerfroError, match=rf"; run python -m nerfro.evaluate checkpoint={tmp_path / 'c'}$"):
         find_runs([str(tmp_path / "c")])
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "cell.json").write_text(json.dumps({"state": "failed", "reason": "no space left"}))
     assert find_runs([str(tmp_path)])[1][1] == f"{tmp_path / 'd'} is omitted: it failed: no space left"
     with pytest.raises(NerfroError, match="nowhere does not exist"):
         find_runs([str(tmp_path / "nowhere")])
+
+
+def test_run_without_scores_has_those_of_its_later_evaluation(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "a", "a", 20.0)
+    for name in ("metrics.json", "images"):
+        (run / "evaluate_test").mkdir(exist_ok=True)
+        (run / name).rename(run / "evaluate_test" / name)
+    (table,) = tables(run)
+    assert cell(table, "a", "torus") == (20.0, None)
 
 
 MEDALS = Table(

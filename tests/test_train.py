@@ -152,7 +152,7 @@ def test_time_ends_a_run(train_here: Callable[..., Any], overrides: list[str], t
 
 
 def test_evaluation_of_the_checkpoint_repeats_the_runs_own(run: Path, evaluate_here: Callable[..., Any]) -> None:
-    code, _, errors = evaluate_here(f"checkpoint={run / LAST_CHECKPOINT}")
+    code, _, errors = evaluate_here(f"checkpoint={run}")
     assert code == 0, errors
     again = run / "evaluate_test"
     first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (run, again))
@@ -167,4 +167,4 @@ def test_evaluation_of_the_checkpoint_repeats_the_runs_own(run: Path, evaluate_h
 def test_evaluation_without_a_checkpoint_asks_for_one(evaluate_here: Callable[..., Any]) -> None:
     code, _, errors = evaluate_here()
     assert code == 1
-    assert "give either checkpoint=RUN/checkpoints/last.ckpt, or predictions=DIR" in errors
+    assert "give either checkpoint=RUN, or predictions=DIR" in errors

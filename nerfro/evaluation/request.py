@@ -28,7 +28,7 @@ REQUEST_FILE = "evaluate.yaml"
 class EvaluateConfig:
     """Options of `python -m nerfro.evaluate`, which scores a trained model or images of any program."""
 
-    checkpoint: Optional[str] = None  # checkpoint of nerfro.train to render and score
+    checkpoint: Optional[str] = None  # run folder or checkpoint of nerfro.train to render and score
     split: str = "test"  # split to render
     root: Optional[str] = None  # folder of the data set, if it has moved since training
     chunk_size: Optional[NumRays] = None  # rays rendered at once, which limits memory; by default as in training
@@ -56,9 +56,7 @@ class EvaluateConfig:
 def require_one_task(config: DictConfig) -> None:
     """Refuse options without effect, and options with contradictory values."""
     if (config.checkpoint is None) == (config.predictions is None):
-        raise NerfroError(
-            "give either checkpoint=RUN/checkpoints/last.ckpt, or predictions=DIR and references=DIR, to score"
-        )
+        raise NerfroError("give either checkpoint=RUN, or predictions=DIR and references=DIR, to score")
     if config.predictions is not None and config.references is None:
         raise NerfroError(f"predictions={config.predictions} need references; give references=DIR")
     others: tuple[str, ...]

@@ -232,7 +232,7 @@ class _Drawn:
         grouped = any(column.group for column in table.columns)
         title = rich.text.Text(table.title) if start == 0 else None
         drawn = rich.table.Table(title=title, box=rich.box.SIMPLE_HEAD)
-        drawn.add_column(rich.text.Text(table.label_title), vertical="bottom")
+        drawn.add_column(rich.text.Text(table.label_title), vertical="bottom", overflow="fold")
         for j in columns:
             column = table.columns[j]
             above = column.group if j == start or column.group != table.columns[j - 1].group else ""

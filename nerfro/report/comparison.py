@@ -57,19 +57,25 @@ def compare(runs: Sequence[Run], methods: Mapping[str, str], scenes: Mapping[str
 
 
 def to_table(comparison: Comparison, metrics: Mapping[str, type[ImageMetric]], region: Region) -> Table:
-    """Tabulate means and standard deviations over seeds, with medals for the best three methods."""
+    """Tabulate means and standard deviations over seeds, with medals for the best three methods.
+
+    Columns without any score are omitted, unless no column has one.
+    """
+
+    def scores(method: str, scene: EvaluationSet, name: str) -> tuple[float | None, float | None]:
+        return _score(comparison.cells.get((method, scene), ()), name, region)
+
+    all_columns = [(scene, name) for scene in comparison.scenes for name in metrics]
+    chosen = [
+        column for column in all_columns if any(scores(method, *column)[0] is not None for method in comparison.methods)
+    ] or all_columns
     columns = [
-        Column(metric.title, metric.better, metric.decimals, group=title)
-        for title in comparison.scenes.values()
-        for metric in metrics.values()
+        Column(metrics[name].title, metrics[name].better, metrics[name].decimals, group=comparison.scenes[scene])
+        for scene, name in chosen
     ]
     rows, notes = [], list(comparison.notes)
     for method in comparison.methods:
-        cells = [
-            _score(comparison.cells.get((method, scene), ()), name, region)
-            for scene in comparison.scenes
-            for name in metrics
-        ]
+        cells = [scores(method, *column) for column in chosen]
         rows.append(Row(method, tuple(mean for mean, _ in cells), tuple(spread for _, spread in cells)))
     notes += dict.fromkeys(
         f"{metric.title} {MISSING}: {short(reason)}"
@@ -79,7 +85,7 @@ def to_table(comparison: Comparison, metrics: Mapping[str, type[ImageMetric]], r
     )
     title = "; ".join(
         [
-            f"Trained for {comparison.budget.label}",
+            comparison.budget.title,
             *_common_description(comparison, region),
             _describe_seeds(comparison),
         ]
@@ -108,14 +114,14 @@ def combine(compared: Sequence[tuple[Comparison, Table]]) -> Table:
 
 
 def find_metrics(names: Sequence[str] | None = None) -> dict[str, type[ImageMetric]]:
-    """Return the metrics with the given names, in this order; by default PSNR, SSIM, LPIPS and the metrics of plugins.
+    """Return the metrics with the given names, in this order; by default PSNR, SSIM, LPIPS, FLIP and those of plugins.
 
     Raises:
         NerfroError: there is no name, or a name is unknown.
     """
     known = image_metrics()
     if names is None:
-        names = [name for name in known if name not in ("ms_ssim", "lpips_vgg", "flip")]
+        names = [name for name in known if name not in ("ms_ssim", "lpips_vgg")]
     if not names:
         raise NerfroError(f"metrics: the list is empty; choose from {', '.join(known)}")
     for name in names:

@@ -72,7 +72,7 @@ def report_page(compared: Sequence[tuple[Comparison, Table]], unfinished: Sequen
     sections = [
         Section(
             id=f"b{number}",
-            title=f"Trained for {comparison.budget.label}",
+            title=comparison.budget.title,
             methods=comparison.methods,
             scenes=_scenes(f"b{number}", comparison, selection),
             runs=[_provenance(comparison, run) for run in comparison.runs],

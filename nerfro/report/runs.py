@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
@@ -19,7 +20,7 @@ from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.reading import open_image, read_json
 from nerfro.paths import EMBEDDED_PREFIX, refuse_root, scene_name, user_path
 from nerfro.training.config import check_trained
-from nerfro.training.run_folder import CELL_FILE
+from nerfro.training.run_folder import CELL_FILE, LAST_CHECKPOINT
 
 # Types of the values in run.json.
 _FACTS: dict[str, Any] = {
@@ -53,11 +54,16 @@ class Budget:
 
     @property
     def label(self) -> str:
-        """Description, such as "4 min on 1 CPU thread (x86_64)" or "200,000 steps of 1,024 rays"."""
+        """Limits, such as "4 min on 1 CPU thread (x86_64)" or "200,000 steps of 1,024 rays"."""
         steps = "" if self.steps is None else f"{self.steps:,} steps of {self.rays:,} rays"
         if self.seconds is None:
             return steps
-        return f"{duration(self.seconds)} on {self.device}" + (f", at most {steps}" if steps else "")
+        return f"{duration(self.seconds)} on {self.device}" + (f" and at most {steps}" if steps else "")
+
+    @property
+    def title(self) -> str:
+        """Limits as the title of a table."""
+        return f"Budget: at most {self.label}"
 
 
 @dataclass(frozen=True)
@@ -93,6 +99,7 @@ class Run:
 
     Attributes:
         folder: run folder.
+        scores: folder with metrics.json and images: the run folder, or an evaluation of the run.
         name: name of the experiment.
         seed: random seed.
         config: resolved configuration.
@@ -104,6 +111,7 @@ class Run:
     """
 
     folder: Path
+    scores: Path
     name: str
     seed: int
     config: Mapping[str, Any]
@@ -139,7 +147,7 @@ def find_runs(places: Sequence[str]) -> tuple[list[Run], list[str]]:
         folders |= {file.parent.resolve() for file in found}
     runs, unfinished = [], []
     for folder in sorted(folders):
-        if (folder / "metrics.json").is_file():
+        if _scores_folder(folder) is not None:
             runs.append(read_run(folder))
         else:
             unfinished.append(f"{shown(folder)} is omitted: {_why_unfinished(folder)}")
@@ -149,18 +157,28 @@ def find_runs(places: Sequence[str]) -> tuple[list[Run], list[str]]:
     return runs, unfinished
 
 
+def _scores_folder(folder: Path) -> Path | None:
+    """Return the folder with the scores of a run: those of nerfro.train, or those of nerfro.evaluate for test views."""
+    places = (folder, folder / "evaluate_test")
+    return next((place for place in places if (place / "metrics.json").is_file()), None)
+
+
 def _why_unfinished(folder: Path) -> str:
     """Return the reason for a run without scores, if a sweep recorded it."""
     try:
         reason = read_json(folder / CELL_FILE, "")["reason"]
     except (NerfroError, KeyError, TypeError, IndexError):
         reason = ""
-    return f"it failed: {reason}" if reason else "it has no metrics.json, so it has not been evaluated"
+    if reason:
+        return f"it failed: {reason}"
+    command = f"; run python -m nerfro.evaluate {shlex.quote(f'checkpoint={shown(folder)}')}"
+    return f"it has not been evaluated{command if (folder / LAST_CHECKPOINT).is_file() else ''}"
 
 
 def read_run(folder: Path) -> Run:
     """Read an evaluated run folder."""
-    metrics = read_metrics_json(folder / "metrics.json")
+    scores = _scores_folder(folder) or folder
+    metrics = read_metrics_json(scores / "metrics.json")
     try:
         path = folder / "config.yaml"
         config: Any = OmegaConf.to_container(check_trained(read_foreign_config(path), path))
@@ -170,11 +188,12 @@ def read_run(folder: Path) -> Run:
             raise NerfroError(f"{folder / 'run.json'} has no valid {first_of(wrong)}; omit the run")
         data, trainer, root = config["data"], config["trainer"], str(config["data"]["root"])
         view = metrics.result.views[0].name
-        with open_image(folder / "images" / f"{view}.png") as (image, _):
+        with open_image(scores / "images" / f"{view}.png") as (image, _):
             width, height = image.size
         options = sorted((key, str(value)) for key, value in data.items() if key not in ("root", "near", "far"))
         return Run(
             folder=folder,
+            scores=scores,
             name=str(config["name"]),
             seed=int(config["seed"]),
             config=config,
@@ -183,14 +202,14 @@ def read_run(folder: Path) -> Run:
             budget=_budget(trainer, int(config["batches"]["size"]), facts),
             test_set=EvaluationSet(
                 root=root if root.startswith(EMBEDDED_PREFIX) else str(user_path(root).resolve()),
-                split=str(config["evaluation"]["split"]),
+                split="test" if scores != folder else str(config["evaluation"]["split"]),
                 num_views=len(metrics.result.views),
                 width=width,
                 height=height,
                 protocol=metrics.result.protocol,
                 options=tuple(options),
             ),
-            evaluated_at=(folder / "metrics.json").stat().st_mtime,
+            evaluated_at=(scores / "metrics.json").stat().st_mtime,
         )
     except OSError as error:
         reason = f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}"

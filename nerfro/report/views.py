@@ -152,7 +152,7 @@ def _view(
 
 
 def _prediction(run: Run, index: int) -> Float[Tensor, "H W 3"]:
-    return load_png(run.folder / "images" / f"{run.metrics.result.views[index].name}.png")
+    return load_png(run.scores / "images" / f"{run.metrics.result.views[index].name}.png")
 
 
 def _choose_crops(reference: Tensor, predictions: Sequence[Tensor]) -> tuple[Crop, ...]:

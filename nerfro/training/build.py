@@ -11,7 +11,7 @@ from hydra.errors import HydraException
 from lightning.pytorch import seed_everything
 from omegaconf import DictConfig
 
-from nerfro.cli import check_configuration, in_one_line, renamed_override
+from nerfro.cli import check_configuration, in_one_line, renamed_override, warn
 from nerfro.data.base import DataSource, Views
 from nerfro.errors import NerfroError
 from nerfro.options import describe_command
@@ -58,6 +58,8 @@ def build(experiment: str | None = None, overrides: Sequence[str] = ()) -> tuple
     check_configuration(config, TrainConfig, CONF_DIR)
     check_run(config)
     settle_trainer(config)
+    if config.callbacks:
+        warn("nerfro.build ignores callbacks; give them to your own Trainer: lightning.Trainer(callbacks=[...])")
     seed_everything(config.seed, verbose=False)
     source = build_data(config)
     return build_training(config, source, source.load("train"))

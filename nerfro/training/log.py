@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import csv
 import functools
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, WandbLogger
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
@@ -19,6 +21,7 @@ from nerfro.cameras import Cameras
 from nerfro.evaluation.error_maps import triptych
 from nerfro.evaluation.path_plot import image_of_paths
 from nerfro.files.lat_long import directions
+from nerfro.files.reading import reading
 from nerfro.media.analytic import Vacuum
 from nerfro.rendering import Scene
 from nerfro.training.module import TrainingModule
@@ -35,6 +38,16 @@ _LAYOUT = {
         "weights of losses": ["Multiline", ["weight/.*"]],
     }
 }
+
+
+def keep_rows(logger: CSVLogger) -> None:
+    """Keep the rows of a run that is resumed; a new log of Lightning begins by deleting them."""
+    file = Path(logger.log_dir, "metrics.csv")
+    if file.is_file():
+        with reading(file, advice="remove it"), file.open(newline="", encoding="utf-8") as stream:
+            rows = list(csv.DictReader(stream))
+        logger.experiment.metrics += [{name: value for name, value in row.items() if value} for row in rows]
+        logger.save()
 
 
 class TrainingLog(Callback):

@@ -98,7 +98,7 @@ def next_steps(folder: Path, split: str | None) -> str:
     """Return what a user can look at after a run whose views of a split have been scored, if any."""
     lines = [f"page: python -m nerfro.view {shlex.quote(f'checkpoint={folder}')}"]
     if split is None:
-        lines.append(f"scores: python -m nerfro.evaluate {shlex.quote(f'checkpoint={folder / LAST_CHECKPOINT}')}")
+        lines.append(f"scores: python -m nerfro.evaluate {shlex.quote(f'checkpoint={folder}')}")
     else:
         lines.insert(0, f"picture: {folder / 'images' / f'{split}_000.png'}")
         lines.append(f"tables: {folder}/metrics.md, .csv and .tex for each view, and metrics.json")

@@ -13,7 +13,7 @@ from typing import Any
 import lightning.pytorch as pl
 import torch
 from lightning.pytorch.callbacks import Callback, Timer
-from lightning.pytorch.loggers import WandbLogger
+from lightning.pytorch.loggers import CSVLogger, WandbLogger
 from lightning.pytorch.profilers import AdvancedProfiler, Profiler, PyTorchProfiler, SimpleProfiler
 from lightning.pytorch.strategies import DDPStrategy
 from omegaconf import DictConfig
@@ -28,7 +28,7 @@ from nerfro.training.callbacks import Checkpoints, SharedTimer, Throughput, Trai
 from nerfro.training.checkpoint_files import CheckpointFiles
 from nerfro.training.config import training_device
 from nerfro.training.data_module import validation_interval
-from nerfro.training.log import TrainingLog
+from nerfro.training.log import TrainingLog, keep_rows
 from nerfro.training.run_folder import CONFIG_FILE, LAST_CHECKPOINT, in_sweep
 from nerfro.training.validation import OverfittingWarning
 
@@ -78,6 +78,9 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
     accelerator = training_accelerator(config.trainer.accelerator)
     given = {name: value for name, value in config.trainer.items() if value is not None and name not in _OWN}
     trainer = build(given | {"accelerator": accelerator}, **ours)
+    for logger in trainer.loggers:
+        if isinstance(logger, CSVLogger) and trainer.is_global_zero:
+            keep_rows(logger)
     trainer.callbacks = [_shared(callback) for callback in trainer.callbacks]
     if trainer.world_size > 1 and in_sweep():
         raise NerfroError("a sweep (-m) cannot use several devices; start its runs one by one")
@@ -186,5 +189,6 @@ def _quieten_lightning() -> None:
         # A run that is resumed, in its own folder or in another one.
         ".*Checkpoint directory .* exists and is not empty.*",
         ".*The dirpath has changed from .*",
+        ".*Experiment logs directory .* exists and is not empty.*",  # `keep_rows` keeps its rows
     ):
         warnings.filterwarnings("ignore", message)

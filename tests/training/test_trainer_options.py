@@ -218,6 +218,13 @@ def test_callbacks_are_chosen_by_name(
     check(find("callbacks", "step_file"), {"file": "steps"})
 
 
+def test_early_stopping_prints_its_step_and_reason(train: Callable[..., Any]) -> None:
+    stopping = "{monitor: val/psnr, mode: max, patience: 1, min_delta: 1000}"
+    finished = train("trainer.max_steps=9", "evaluation.every=5", f"+callbacks.early_stopping={stopping}")
+    assert finished.code == 0, finished.err
+    assert "stopped by early stopping at step 2: Monitored metric val/psnr did not improve" in finished.out
+
+
 @pytest.mark.usefixtures("restored_registry")
 def test_errors_of_a_plugin_name_its_file_and_line(
     train: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
