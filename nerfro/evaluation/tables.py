@@ -6,7 +6,7 @@ import csv
 import html
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Literal
@@ -134,6 +134,19 @@ class Table:
     def marked_cells(self, row: int, forms: Mapping[str, str]) -> list[str]:
         """Return the cells of one of `rows`, formatted by mark; `forms` maps each mark to a format with `%s`."""
         return [forms[self.mark_of(row, j)] % cell for j, cell in enumerate(self.cells(self.rows[row]))]
+
+    def without_empty_columns(self) -> Table:
+        """Omit columns without any number in `rows`, unless no column has one."""
+        kept = [j for j in range(len(self.columns)) if any(row.values[j] is not None for row in self.rows)]
+        if not kept:
+            return self
+
+        def cut(row: Row) -> Row:
+            spreads = tuple(row.spreads[j] for j in kept) if row.spreads else ()
+            return replace(row, values=tuple(row.values[j] for j in kept), spreads=spreads)
+
+        columns, rows, summary = (self.columns[j] for j in kept), map(cut, self.rows), map(cut, self.summary)
+        return replace(self, columns=tuple(columns), rows=tuple(rows), summary=tuple(summary))
 
     def groups(self) -> list[tuple[str, int]]:
         """Return the group headings and the number of columns of each group."""
@@ -359,15 +372,15 @@ def _scores_table(
     notes: Sequence[str],
     summary: Mapping[str, Mapping[str, Score]] | None = None,
 ) -> Table:
-    """Tabulate scores by row label and metric. Metrics without any score are omitted, unless no metric has one."""
+    """Tabulate scores by row label and metric, without empty columns."""
     known = image_metrics()
-    names = [name for name in known if any(scores[name] is not None for scores in rows.values())] or list(known)
-    columns = tuple(Column(known[name].title, known[name].better, known[name].decimals) for name in names)
+    columns = tuple(Column(metric.title, metric.better, metric.decimals) for metric in known.values())
     body, foot = (
-        tuple(Row(label, tuple(scores[name] for name in names)) for label, scores in part.items())
+        tuple(Row(label, tuple(scores[name] for name in known)) for label, scores in part.items())
         for part in (rows, summary or {})
     )
-    return Table(title, label_title, columns, body, foot, notes=tuple(note for note in notes if note))
+    table = Table(title, label_title, columns, body, foot, notes=tuple(note for note in notes if note))
+    return table.without_empty_columns()
 
 
 def _mask_note(result: EvaluationResult) -> str:

@@ -57,25 +57,19 @@ def compare(runs: Sequence[Run], methods: Mapping[str, str], scenes: Mapping[str
 
 
 def to_table(comparison: Comparison, metrics: Mapping[str, type[ImageMetric]], region: Region) -> Table:
-    """Tabulate means and standard deviations over seeds, with medals for the best three methods.
-
-    Columns without any score are omitted, unless no column has one.
-    """
-
-    def scores(method: str, scene: EvaluationSet, name: str) -> tuple[float | None, float | None]:
-        return _score(comparison.cells.get((method, scene), ()), name, region)
-
-    all_columns = [(scene, name) for scene in comparison.scenes for name in metrics]
-    chosen = [
-        column for column in all_columns if any(scores(method, *column)[0] is not None for method in comparison.methods)
-    ] or all_columns
+    """Tabulate means and standard deviations over seeds, without empty columns; medals mark the best three methods."""
     columns = [
-        Column(metrics[name].title, metrics[name].better, metrics[name].decimals, group=comparison.scenes[scene])
-        for scene, name in chosen
+        Column(metric.title, metric.better, metric.decimals, group=title)
+        for title in comparison.scenes.values()
+        for metric in metrics.values()
     ]
     rows, notes = [], list(comparison.notes)
     for method in comparison.methods:
-        cells = [scores(method, *column) for column in chosen]
+        cells = [
+            _score(comparison.cells.get((method, scene), ()), name, region)
+            for scene in comparison.scenes
+            for name in metrics
+        ]
         rows.append(Row(method, tuple(mean for mean, _ in cells), tuple(spread for _, spread in cells)))
     notes += dict.fromkeys(
         f"{metric.title} {MISSING}: {short(reason)}"
@@ -91,17 +85,13 @@ def to_table(comparison: Comparison, metrics: Mapping[str, type[ImageMetric]], r
         ]
     )
     mark: Literal["", "medals"] = "medals" if len(rows) > 1 else ""
-    return Table(title, "method", tuple(columns), tuple(rows), mark=mark, notes=tuple(notes))
+    table = Table(title, "method", tuple(columns), tuple(rows), mark=mark, notes=tuple(notes))
+    return table.without_empty_columns()
 
 
 def combine(compared: Sequence[tuple[Comparison, Table]]) -> Table:
     """Combine the tables of all budgets in one, with a block of rows for each budget and without empty columns."""
-    columns = dict.fromkeys(
-        column
-        for _, table in compared
-        for number, column in enumerate(table.columns)
-        if any(row.values[number] is not None for row in table.rows)
-    ) or dict.fromkeys(column for _, table in compared for column in table.columns)
+    columns = dict.fromkeys(column for _, table in compared for column in table.columns)
     rows = []
     for comparison, table in compared:
         for row in table.rows:
@@ -110,7 +100,8 @@ def combine(compared: Sequence[tuple[Comparison, Table]]) -> Table:
             rows.append(Row(row.label, values, spreads, comparison.budget.label))
     notes = dict.fromkeys(note for _, table in compared for note in table.notes)
     titles = dict.fromkeys("; ".join(table.title.split("; ")[1:]) for _, table in compared)
-    return Table(" / ".join(titles), "method", tuple(columns), tuple(rows), mark="medals", notes=tuple(notes))
+    table = Table(" / ".join(titles), "method", tuple(columns), tuple(rows), mark="medals", notes=tuple(notes))
+    return table.without_empty_columns()
 
 
 def find_metrics(names: Sequence[str] | None = None) -> dict[str, type[ImageMetric]]:
