@@ -2,7 +2,7 @@
 
 Examples:
     nerfro export checkpoint=outputs/first what=page out=page.html
-    nerfro export checkpoint=outputs/first what=mesh out=mesh.ply
+    nerfro export checkpoint=outputs/first what=mesh out=mesh.glb
 """
 
 from __future__ import annotations

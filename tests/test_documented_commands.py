@@ -24,6 +24,7 @@ from nerfro.cli import _added, _quoted, renamed_override
 from nerfro.options import Described, describe_command, usage
 from nerfro.paths import CONF_DIR, PACKAGE_DIR
 from nerfro.registry import KINDS, discover, plugins
+from nerfro.viewing.exports import find_export
 
 CHECKOUT = PACKAGE_DIR.parent
 PAGES = {
@@ -102,6 +103,8 @@ def require_valid(command: str, options: list[str]) -> None:
         OmegaConf.update(config, setting.key_or_group, setting.value(), force_add=setting.is_add())
     check_names(config)
     check_settings(config, schema)
+    if command == "export" and not OmegaConf.is_missing(config, "what"):
+        find_export(config.what, Path(config.out))
 
 
 @pytest.fixture
