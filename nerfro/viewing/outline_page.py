@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import webbrowser
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +20,7 @@ from nerfro.errors import NerfroError
 from nerfro.files.images import data_uri
 from nerfro.files.templates import fill_template
 from nerfro.paths import ASSETS_DIR
-from nerfro.viewing.server import PageServer
+from nerfro.viewing.server import PageServer, open_page
 
 _TEMPLATE = ASSETS_DIR / "_page" / "outlines.html.jinja"
 _MAX_SIDE = 960  # of a photograph on the page, pixels
@@ -59,7 +58,7 @@ class OutlinePage:
         self._server.open(fill_template(_TEMPLATE, title=title, photographs=self._photographs()))
         print(f"nerfro: draw the outlines on {self._server.url}; Ctrl-C ends without masks", flush=True)
         if opens:
-            webbrowser.open(self._server.url)
+            open_page(self._server.url)
         while not self._server.ended.wait(1.0):  # without a limit, Windows does not interrupt the wait
             pass
         self._server.close()
