@@ -233,7 +233,7 @@ def _flags_first(arguments: list[str]) -> list[str]:
 
 
 def answer(described: Described, arguments: list[str]) -> None:
-    """Print the help if it is asked for, or refuse misspelt names.
+    """Print the help on request, or refuse misspelt names.
 
     Raises:
         NerfroError: a setting or an option does not exist.

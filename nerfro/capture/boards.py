@@ -20,6 +20,10 @@ from nerfro.files.atomic import atomic_file
 
 Family = Literal["tag36h11", "tagStandard41h12"]
 
+# Of printed pages: resolution, margin and largest width; lengths in metres.
+_DOTS_PER_METRE = 300 / 0.0254
+_MARGIN, _WIDEST = 0.008, 3.0
+
 
 class Layout(NamedTuple):
     """Dimensions of the tags of a family, in modules (the black and white squares of a tag)."""
@@ -223,10 +227,6 @@ def tag_detector(family: Family) -> Any:
 def _on_face(face: Face, places: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
     """Convert coordinates on a face (lengths to the right and down from the upper left corner) to board coordinates."""
     return np.array(face.origin) + places @ np.array([face.right, face.down], np.float64)
-
-
-_DOTS_PER_METRE = 300 / 0.0254
-_MARGIN, _WIDEST = 0.008, 3.0  # metres
 
 
 def print_sheets(sheets: list[Sheet], folder: Path) -> list[Path]:

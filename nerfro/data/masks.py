@@ -136,10 +136,12 @@ def masked_views(views: Views) -> Views:
 def with_other_splits(views: Views, source: DataSource, split: str) -> Views:
     """Append the views of all other splits that have masks, each image once, if their images have the same size."""
     for other in source.splits:
-        more = views if other == split else masked_views(source.load(other))
-        known = {frame.image for frame in views.frames}
+        if other == split:
+            continue
+        more, known = masked_views(source.load(other)), {frame.image for frame in views.frames}
         fresh = [i for i, frame in enumerate(more.frames) if frame.image not in known]
-        views = (fresh and views.joined(more.select(fresh))) or views
+        joined = views.joined(more.select(fresh)) if fresh else None
+        views = views if joined is None else joined
     return views
 
 

@@ -25,6 +25,13 @@ from nerfro.rays import Rays
 from nerfro.rendering import Renderer
 from nerfro.subdivision import Subdivision
 
+# Pixels per view and step, and candidates drawn per pixel; the candidates with the most contrast are used.
+_NUM_PIXELS, _NUM_CANDIDATES = 600, 3
+# Distance of finite differences in pixels, in the first and in the last step.
+_FIRST_DIFFERENCE, _LAST_DIFFERENCE = 2.0, 0.5
+# Scale of the robust error in sRGB, and maximum motion of a camera in one step in pixels.
+_ERROR_SCALE, _MAX_PIXELS = 0.3, 3.0
+
 
 def score_split(
     renderer: Renderer,
@@ -64,14 +71,6 @@ def score_split(
             renderer, views, metrics, folder, subdivision, "images_refined", right_halves=True
         )
     return given, treated
-
-
-# Pixels per view and step, and candidates drawn per pixel; the candidates with the most contrast are used.
-_NUM_PIXELS, _NUM_CANDIDATES = 600, 3
-# Distance of finite differences in pixels, in the first and in the last step.
-_FIRST_DIFFERENCE, _LAST_DIFFERENCE = 2.0, 0.5
-# Scale of the robust error in sRGB, and maximum motion of a camera in one step in pixels.
-_ERROR_SCALE, _MAX_PIXELS = 0.3, 3.0
 
 
 @torch.no_grad()

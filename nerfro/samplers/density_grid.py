@@ -30,6 +30,11 @@ from nerfro.samplers.stepfun import invert_cdf, midpoints, spread_uniform, volum
 from nerfro.samplers.stratified import cone_samples
 from nerfro.types import Path, Rendering, Samples
 
+# Optical depth by the grid below which a sample is not worth a query of the field.
+_EMPTY = 0.005
+# In training: samples on the faintest branches, and the weight from which all samples of a branch are queried.
+_FEWEST, _HEAVY = 8, 0.5
+
 
 @dataclass(frozen=True)
 class LengthInBox:
@@ -99,12 +104,6 @@ class ContractedLength:
             x.gather(1, segment) for x in (self.start_length, self.closest, self.impact, self.cumulative)
         )
         return closest + world_length(start_length + length - before, impact, self.radius)
-
-
-# Optical depth by the grid below which a sample is not worth a query of the field.
-_EMPTY = 0.005
-# In training: samples on the faintest branches, and the weight from which all samples of a branch are queried.
-_FEWEST, _HEAVY = 8, 0.5
 
 
 @register("sampler/points", "density_grid")

@@ -280,7 +280,7 @@ def draw(
                 first, last = _span(positions[ray], directions[ray], s[ray], low, high)
                 _even_segments(s[ray], segments.cumulative)
             width = (last - first) / num_bins
-            if width == 0.0:  # most rays of a picture miss the object
+            if width == 0.0:  # most rays of an image miss the object
                 segment = _segment(segments.cumulative, 0, last)
                 for axis in range(3):
                     slope = directions[ray, segment, axis]
