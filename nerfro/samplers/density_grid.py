@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -235,17 +235,17 @@ class DensityGridSampler(PointSampler):
 
     def draw_compiled(self, path: Path, draws: Draws | None) -> Samples:
         """Draw the samples of `draw` on the CPU."""
-        from nerfro.samplers.density_grid_cpu import draw  # compiled code, so only where it is used
+        from nerfro.samplers.density_grid_cpu import Settings, draw  # compiled code, so only where it is used
 
         if draws is None:
             num_samples, of_path, key = self.num_samples_evaluation, (path.ray[:0], path.ray[:0]), (0, 0, 0, 0)
         else:
-            of_path = draws.ray[path.ray], self._num_intervals(path)
             num_samples, key = self.num_samples, draws.counters("samples")
-        tensors = path.positions, path.directions, path.s, *self.box, self.density, *of_path
-        settings = self.num_bins, self._floor, self.max_bin_alpha, _EMPTY, self.radius or 0.0, self.near
-        arguments: list[Any] = [*arrays(*tensors), key, num_samples, *settings]
-        drawn = draw(*arguments)
+            of_path = draws.ray[path.ray], self._num_intervals(path)
+        settings = Settings(self.num_bins, self._floor, self.max_bin_alpha, _EMPTY, self.radius or 0.0, self.near)
+        paths, box = tuple(arrays(path.positions, path.directions, path.s)), tuple(arrays(*self.box))
+        [density], random = arrays(self.density), (*arrays(*of_path), key)
+        drawn = draw(paths, box, density, random, num_samples, settings)
         edges, s, positions, directions, occupied, *of_measure = (torch.from_numpy(array) for array in drawn)
         lengths, measure = (None, None) if self.radius is None else of_measure
         return Samples(positions, directions, s, edges, path.radii, occupied, lengths, measure)

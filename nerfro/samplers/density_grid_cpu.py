@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numba import prange
 
 from nerfro.geometry.contraction import FAR, NEAREST
@@ -18,6 +18,41 @@ _DARK = 1e-9  # transmittance behind which nothing is seen
 _EPS = float(np.finfo(np.float32).eps)
 
 
+class Grid(NamedTuple):
+    """Grid of densities over a box in world space or, if `radius` is above 0, in contracted space."""
+
+    density: Float[np.ndarray, "C*C*C"]  # per unit of length, row by row
+    cells: int  # along each axis
+    low: Float[np.ndarray, "3"]  # lowest corner
+    high: Float[np.ndarray, "3"]  # highest corner
+    centre: Float[np.ndarray, "3"]
+    per_unit: Float[np.ndarray, "3"]  # cells per unit of length along each axis
+    radius: float  # radius of the ball beyond which space is contracted
+
+
+class Settings(NamedTuple):
+    """Settings of `DensityGridSampler`."""
+
+    num_bins: int
+    floor: float  # weight that is added to each bin's share of the weights, which sum to one
+    max_bin_alpha: float
+    empty: float  # optical depth from which a sample counts as occupied
+    radius: float  # 0 for the box alone
+    near: float
+
+
+class Drawn(NamedTuple):
+    """Samples on R paths, or on one path without the first axis."""
+
+    edges: Float[np.ndarray, "R N+1"]
+    s: Float[np.ndarray, "R N"]  # arc lengths
+    positions: Float[np.ndarray, "R N 3"]
+    directions: Float[np.ndarray, "R N 3"]
+    occupied: Bool[np.ndarray, "R N"]
+    lengths: Float[np.ndarray, "R N"]
+    measure: Float[np.ndarray, "R N+1"]
+
+
 class Segments(NamedTuple):
     """The segments of one polyline; `closest`, `impact` and `start_length` are set for contracted space alone."""
 
@@ -28,8 +63,9 @@ class Segments(NamedTuple):
 
 
 @compiled
-def _span(positions, directions, s, low, high):
-    """Arc lengths between which one polyline scratch inside a box; both are far where it never does."""
+def _span(path, low, high):
+    """Return the arc lengths at which one polyline enters and leaves a box; both are far if it misses the box."""
+    positions, directions, s = path
     last_vertex = len(s) - 1
     first, last = s[last_vertex], -np.inf
     for vertex in range(last_vertex):
@@ -79,8 +115,9 @@ def _world_length(length, impact, radius):
 
 
 @compiled
-def _contracted_segments(positions, directions, s, centre, radius, near, segments):
+def _contracted_segments(path, centre, radius, near, segments):
     """Fill the segments of `samplers.density_grid.ContractedLength` for one polyline; return its total."""
+    positions, directions, s = path
     cumulative, start_length, closest, impact = segments
     total, last = 0.0, len(s) - 1
     for segment in range(last + 1):
@@ -127,33 +164,33 @@ def _contraction_scale(x, y, z, centre, radius):
 
 
 @compiled
-def _cell(x, y, z, per_unit, cells):
-    """Number of the cell at a position relative to the grid's corner.
-
-    There are `per_unit` cells for each unit of length along each axis, and `cells` cells along each axis.
-    """
-    i = min(max(int(x * per_unit[0]), 0), cells - 1)
-    j = min(max(int(y * per_unit[1]), 0), cells - 1)
-    k = min(max(int(z * per_unit[2]), 0), cells - 1)
+def _density(x, y, z, grid):
+    """Look up the density at a position relative to the grid's lowest corner."""
+    last = grid.cells - 1
+    i = min(max(int(x * grid.per_unit[0]), 0), last)
+    j = min(max(int(y * grid.per_unit[1]), 0), last)
+    k = min(max(int(z * grid.per_unit[2]), 0), last)
     # Unsigned, because Numba counts signed indices from the end where they are negative, a test for each access.
-    return np.uintp((i * cells + j) * cells + k)
+    return grid.density[np.uintp((i * grid.cells + j) * grid.cells + k)]
 
 
 @compiled
-def _cell_of(x, y, z, scale, centre, low, per_unit, cells):
-    """Number of the cell at a position in world space, which is contracted where `scale` is below 1."""
+def _density_in_world(x, y, z, scale, grid):
+    """Look up the density at a position in world space, which is contracted where `scale` is below 1."""
+    centre, low = grid.centre, grid.low
     if scale < 1.0:
         share = (2.0 - np.sqrt(scale)) * np.sqrt(scale)
         x = centre[0] + share * (x - centre[0])
         y = centre[1] + share * (y - centre[1])
         z = centre[2] + share * (z - centre[2])
-    return _cell(x - low[0], y - low[1], z - low[2], per_unit, cells)
+    return _density(x - low[0], y - low[1], z - low[2], grid)
 
 
 @compiled
-def _depths_even(positions, directions, s, first, width, low, flat, per_unit, cells, depths):
+def _depths_even(path, grid, first, width, depths):
     """Compute the optical depth of each bin of arc length from `first` on, by the density at its midpoint."""
-    segment = 0
+    positions, directions, s = path
+    low, segment = grid.low, 0
     for index in range(len(depths)):
         place = first + (index + 0.5) * width
         segment = _segment(s, segment, place)
@@ -161,11 +198,11 @@ def _depths_even(positions, directions, s, first, width, low, flat, per_unit, ce
         x = positions[segment, 0] + ahead * directions[segment, 0]
         y = positions[segment, 1] + ahead * directions[segment, 1]
         z = positions[segment, 2] + ahead * directions[segment, 2]
-        depths[index] = flat[_cell(x - low[0], y - low[1], z - low[2], per_unit, cells)] * width
+        depths[index] = _density(x - low[0], y - low[1], z - low[2], grid) * width
 
 
 @compiled
-def _depths_contracted(positions, directions, s, centre, radius, segments, width, flat, per_unit, cells, depths):
+def _depths_contracted(path, grid, segments, width, depths):
     """Compute the optical depth of each bin of contracted length, by the density at its midpoint.
 
     Outside the ball of radius R, a point of a line with impact parameter a is a tan(phi) away from the closest
@@ -173,6 +210,8 @@ def _depths_contracted(positions, directions, s, centre, radius, segments, width
     (2 - R cos(phi) / a) R (e cos(phi) + d sin(phi)), where d is the line's direction and e the unit vector from the
     centre to the closest approach. Therefore one rotation leads from bin to bin, without a square root or a tangent.
     """
+    positions, directions, s = path
+    centre, radius = grid.centre, grid.radius
     cumulative, start_length, closest, impact = segments
     segment, turned_segment, turned_side, cosine, sine, by_cosine, by_sine = 0, -1, 0, 0.0, 0.0, 0.0, 0.0
     x0, y0, z0, within, a = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -204,7 +243,7 @@ def _depths_contracted(positions, directions, s, centre, radius, segments, width
         x = across * x0 + along * directions[segment, 0] + half
         y = across * y0 + along * directions[segment, 1] + half
         z = across * z0 + along * directions[segment, 2] + half
-        depths[index] = flat[_cell(x, y, z, per_unit, cells)] * width
+        depths[index] = _density(x, y, z, grid) * width
 
 
 @compiled
@@ -230,117 +269,144 @@ def _random_quantiles(u, num_intervals, index, key):
         u[edge] = np.float32(edge + u[edge]) / np.float32(num_intervals + 1) if edge <= num_intervals else u[edge - 1]
 
 
+@compiled
+def _bin_weights(weights, settings):
+    """Convert the optical depths of the bins to the share of the samples that each bin receives."""
+    total, transmittance = 0.0, 1.0
+    for index in range(len(weights)):
+        alpha = min(_stopped(weights[index]), settings.max_bin_alpha)
+        weights[index] = transmittance * alpha
+        transmittance *= 1.0 - alpha
+        total += weights[index]
+        if transmittance < _DARK:
+            weights[index + 1 :] = 0.0
+            break
+    per_total, norm = 1.0 / max(total, 1e-6), 0.0
+    for index in range(len(weights)):
+        weights[index] = weights[index] * per_total + settings.floor
+        norm += weights[index]
+    for index in range(len(weights)):
+        weights[index] /= norm
+
+
+@compiled
+def _predict(path, grid, settings, segments, weights):
+    """Fill the segments of a path and the weights of its bins.
+
+    Returns:
+        The measure at which the first bin begins, and the width of a bin; 0 if the path misses the box.
+    """
+    if grid.radius > 0.0:
+        first = 0.0
+        last = _contracted_segments(path, grid.centre, grid.radius, settings.near, segments)
+    else:
+        first, last = _span(path, grid.low, grid.high)
+        _even_segments(path[2], segments.cumulative)
+    width = (last - first) / len(weights)
+    if width > 0.0:
+        if grid.radius > 0.0:
+            _depths_contracted(path, grid, segments, width, weights)
+        else:
+            _depths_even(path, grid, first, width, weights)
+        _bin_weights(weights, settings)
+    return first, width
+
+
+@compiled
+def _put_no_samples(path, segments, at, drawn):
+    """Place all samples of a path that misses the box at one arc length, without length."""
+    positions, directions, s = path
+    segment = _segment(segments.cumulative, 0, at)
+    for axis in range(3):
+        slope = directions[segment, axis]
+        drawn.positions[:, axis] = positions[segment, axis] + (at - s[segment]) * slope
+        drawn.directions[:, axis] = slope
+    drawn.edges[:], drawn.measure[:], drawn.s[:] = at, at, at
+    drawn.lengths[:], drawn.occupied[:] = 0.0, False
+
+
+@compiled
+def _put_samples(path, grid, segments, bins, u, empty, drawn):
+    """Place the edges of samples at the values `u` of the cumulative weights, and the samples between them."""
+    positions, directions, s = path
+    first, width, weights = bins
+    below, index = 0.0, 0
+    before, edge_segment, segment = np.float32(0), 0, 0
+    for edge in range(len(u)):
+        while index < len(weights) - 1 and u[edge] >= below + weights[index]:
+            below += weights[index]
+            index += 1
+        inside = min(max((u[edge] - below) / weights[index], 0.0), 1.0)
+        place = np.float32(first + (index + inside) * width)
+        drawn.measure[edge] = place
+        edge_segment = _segment(segments.cumulative, edge_segment, place)
+        drawn.edges[edge] = _arc_length(place, edge_segment, segments, grid.radius)
+        if edge > 0:
+            middle = 0.5 * (before + place)
+            segment = _segment(segments.cumulative, segment, middle)
+            at = _arc_length(middle, segment, segments, grid.radius)
+            drawn.s[edge - 1] = at
+            ahead = at - s[segment]
+            dx, dy, dz = directions[segment, 0], directions[segment, 1], directions[segment, 2]
+            x = positions[segment, 0] + ahead * dx
+            y = positions[segment, 1] + ahead * dy
+            z = positions[segment, 2] + ahead * dz
+            drawn.positions[edge - 1, 0], drawn.positions[edge - 1, 1], drawn.positions[edge - 1, 2] = x, y, z
+            drawn.directions[edge - 1, 0], drawn.directions[edge - 1, 1], drawn.directions[edge - 1, 2] = dx, dy, dz
+            scale = _contraction_scale(x, y, z, grid.centre, grid.radius)
+            drawn.lengths[edge - 1] = (place - before) / scale
+            depth = _density_in_world(x, y, z, scale, grid) * (place - before)
+            drawn.occupied[edge - 1] = depth >= empty
+        before = place
+
+
 @compiled_parallel
-def draw(
-    positions, directions, s, low, high, density, ray_index, num_intervals, key, num_samples, num_bins, floor,
-    max_bin_alpha, empty, radius, near,
-):  # fmt: skip
+def draw(paths, box, density, random, num_samples, settings):
     """Draw samples in proportion to the weights that the density grid predicts, plus a floor.
 
     Args:
-        positions, directions, s: vertices of the paths [R, S, 3] and [R, S].
-        low, high: corners of the grid, [3]; those of contracted space if `radius` is above 0.
+        paths: positions [R, S, 3], directions [R, S, 3] and arc lengths [R, S] of the vertices of R paths.
+        box: lowest and highest corner of the grid; those of contracted space if `settings.radius` is above 0.
         density: densities of the cells, [C, C, C].
-        ray_index: index of each path's ray in the random numbers, [R]; without indices, samples are evenly spread.
-        num_intervals: number of random samples on each path, [R]; the others have no length.
-        key: `Draws.counters` of the random numbers.
-        num_samples, num_bins: samples and bins on each path.
-        floor: weight that is added to each bin's share of the weights, which sum to one.
-        max_bin_alpha: upper bound on the opacity of one bin.
-        empty: optical depth from which a sample counts as occupied.
-        radius, near: of `DensityGridSampler`; `radius` is 0 for the box alone.
+        random: index of each path's ray in the random numbers [R], number of random samples on each path [R], and
+            `Draws.counters`. Without indices, samples are evenly spread.
+        num_samples: number of samples on each path; beyond the number of random samples, they have no length.
+        settings: the `Settings`.
 
     Returns:
-        Edges [R, N + 1], arc lengths [R, N], positions and directions [R, N, 3], whether samples are occupied [R, N],
-        and the samples' `lengths` [R, N] and `measure` [R, N + 1].
+        The fields of `Drawn`.
     """
-    num_rays, num_edges = len(s), num_samples + 1
-    cells, num_vertices = density.shape[0], s.shape[1]
-    edges = np.empty((num_rays, num_edges), np.float32)
-    middles = np.empty((num_rays, num_edges - 1), np.float32)
-    points = np.empty((num_rays, num_edges - 1, 3), np.float32)
-    headings = np.empty((num_rays, num_edges - 1, 3), np.float32)
-    occupied = np.empty((num_rays, num_edges - 1), np.bool_)
-    lengths = np.empty((num_rays, num_edges - 1), np.float32)
-    measure = np.empty((num_rays, num_edges), np.float32)
-    flat = density.ravel()
+    positions, directions, s = paths
+    ray_index, num_intervals, key = random
+    num_rays, num_vertices, cells = s.shape[0], s.shape[1], density.shape[0]
+    edges = np.empty((num_rays, num_samples + 1), np.float32)
+    at = np.empty((num_rays, num_samples), np.float32)
+    points = np.empty((num_rays, num_samples, 3), np.float32)
+    headings = np.empty((num_rays, num_samples, 3), np.float32)
+    occupied = np.empty((num_rays, num_samples), np.bool_)
+    lengths = np.empty((num_rays, num_samples), np.float32)
+    measure = np.empty((num_rays, num_samples + 1), np.float32)
+    low, high = box
+    centre, per_unit = np.empty(3), np.empty(3)
+    for axis in range(3):
+        centre[axis] = 0.5 * (low[axis] + high[axis])
+        per_unit[axis] = cells / (high[axis] - low[axis])
+    grid = Grid(density.ravel(), cells, low, high, centre, per_unit, settings.radius)
     for block in prange((num_rays + _BLOCK - 1) // _BLOCK):
-        scratch, weights = np.empty((4, num_vertices)), np.empty(num_bins, np.float32)
-        u = np.empty(num_edges, np.float32)
-        segments = Segments(scratch[0], scratch[1], scratch[2], scratch[3])
-        centre, per_unit = np.empty(3), np.empty(3)
-        for axis in range(3):
-            centre[axis] = 0.5 * (low[axis] + high[axis])
-            per_unit[axis] = cells / (high[axis] - low[axis])
+        scratch, weights = np.empty((4, num_vertices)), np.empty(settings.num_bins, np.float32)
+        segments, u = Segments(scratch[0], scratch[1], scratch[2], scratch[3]), np.empty(num_samples + 1, np.float32)
         for ray in range(block * _BLOCK, min((block + 1) * _BLOCK, num_rays)):
-            if radius > 0.0:
-                first = 0.0
-                last = _contracted_segments(positions[ray], directions[ray], s[ray], centre, radius, near, segments)
-            else:
-                first, last = _span(positions[ray], directions[ray], s[ray], low, high)
-                _even_segments(s[ray], segments.cumulative)
-            width = (last - first) / num_bins
+            path = positions[ray], directions[ray], s[ray]
+            drawn = Drawn(
+                edges[ray], at[ray], points[ray], headings[ray], occupied[ray], lengths[ray], measure[ray]
+            )  # fmt: skip
+            first, width = _predict(path, grid, settings, segments, weights)
             if width == 0.0:  # most rays of an image miss the object
-                segment = _segment(segments.cumulative, 0, last)
-                for axis in range(3):
-                    slope = directions[ray, segment, axis]
-                    points[ray, :, axis] = positions[ray, segment, axis] + (last - s[ray, segment]) * slope
-                    headings[ray, :, axis] = slope
-                edges[ray], measure[ray], middles[ray] = last, last, last
-                lengths[ray], occupied[ray] = 0.0, False
+                _put_no_samples(path, segments, first, drawn)
                 continue
-            if radius > 0.0:
-                _depths_contracted(
-                    positions[ray], directions[ray], s[ray], centre, radius, segments, width, flat, per_unit, cells,
-                    weights,
-                )  # fmt: skip
-            else:
-                _depths_even(positions[ray], directions[ray], s[ray], first, width, low, flat, per_unit, cells, weights)
             if len(ray_index) == 0:
                 _even_quantiles(u)
             else:
                 _random_quantiles(u, num_intervals[ray], ray_index[ray], key)
-            total, passed = 0.0, 1.0
-            for index in range(num_bins):
-                stopped = min(_stopped(weights[index]), max_bin_alpha)
-                weights[index] = passed * stopped
-                passed *= 1.0 - stopped
-                total += weights[index]
-                if passed < _DARK:
-                    weights[index + 1 :] = 0.0
-                    break
-            per_total, norm = 1.0 / max(total, 1e-6), 0.0
-            for index in range(num_bins):
-                weights[index] = weights[index] * per_total + floor
-                norm += weights[index]
-            below, index = 0.0, 0
-            share = weights[0] / norm
-            before, edge_segment, segment = np.float32(0), 0, 0
-            for edge in range(num_edges):
-                while index < num_bins - 1 and u[edge] >= below + share:
-                    below += share
-                    index += 1
-                    share = weights[index] / norm
-                inside = min(max((u[edge] - below) / share, 0.0), 1.0)
-                place = np.float32(first + (index + inside) * width)
-                measure[ray, edge] = place
-                edge_segment = _segment(segments.cumulative, edge_segment, place)
-                edges[ray, edge] = _arc_length(place, edge_segment, segments, radius)
-                if edge > 0:
-                    middle = 0.5 * (before + place)
-                    segment = _segment(segments.cumulative, segment, middle)
-                    at = _arc_length(middle, segment, segments, radius)
-                    middles[ray, edge - 1] = at
-                    ahead = at - s[ray, segment]
-                    dx, dy, dz = directions[ray, segment, 0], directions[ray, segment, 1], directions[ray, segment, 2]
-                    x = positions[ray, segment, 0] + ahead * dx
-                    y = positions[ray, segment, 1] + ahead * dy
-                    z = positions[ray, segment, 2] + ahead * dz
-                    points[ray, edge - 1, 0], points[ray, edge - 1, 1], points[ray, edge - 1, 2] = x, y, z
-                    headings[ray, edge - 1, 0], headings[ray, edge - 1, 1], headings[ray, edge - 1, 2] = dx, dy, dz
-                    scale = _contraction_scale(x, y, z, centre, radius)
-                    lengths[ray, edge - 1] = (place - before) / scale
-                    depth = flat[_cell_of(x, y, z, scale, centre, low, per_unit, cells)] * (place - before)
-                    occupied[ray, edge - 1] = depth >= empty
-                before = place
-    return edges, middles, points, headings, occupied, lengths, measure
+            _put_samples(path, grid, segments, (first, width, weights), u, settings.empty, drawn)
+    return edges, at, points, headings, occupied, lengths, measure
