@@ -20,7 +20,7 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from datetime import date
 from pathlib import Path
@@ -133,12 +133,12 @@ class Training:
         self.batches = traced(batches, self.renderer, self.config)
         self.num_rays = wanted.size
 
-    def run(self, num_steps: int, data: RayDataModule | None = None) -> Steps:
-        """Train for some steps with a new optimiser."""
+    def run(self, num_steps: int, data: RayDataModule | None = None, callbacks: Sequence[pl.Callback] = ()) -> Steps:
+        """Train for some steps with a new optimizer; what callbacks do at the end of a step counts as the next step."""
         steps = Steps()
         trainer = pl.Trainer(
             max_steps=num_steps,
-            callbacks=[steps],
+            callbacks=[steps, *callbacks],
             precision=lightning_precision(self.config),
             logger=False,
             enable_checkpointing=False,

@@ -171,6 +171,14 @@ def test_memory_of_a_training_is_measured(run: Run, tiny_default_run: list[str])
     assert len(run("memory", "2x8x8", "--steps", 2, "--options", *options)) == 2
 
 
+@pytest.mark.slow
+def test_growth_of_the_costs_is_measured(run: Run, tiny_default_run: list[str], tmp_path: Path) -> None:
+    options = [option for option in tiny_default_run if not option.startswith(("data.root", "trainer."))]
+    arguments = ("--steps", 2, "--figure", tmp_path / "scaling.png", "pixels=8,16", "--options", *options)
+    assert len(run("scaling", *arguments)) == 5
+    assert (tmp_path / "scaling.png").stat().st_size > 0
+
+
 def test_the_cost_of_a_viewer_is_measured(run: Run, tiny_default_run: list[str]) -> None:
     run("viewer", "--seconds", 6, "--warm-up", 0, "--window", 2, "--options", *tiny_default_run)
 

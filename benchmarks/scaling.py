@@ -1,0 +1,216 @@
+"""Measure how the cost of training and rendering grows, with a separate process for each row.
+
+    python benchmarks/scaling.py [--steps 300] [--psnr 26] [AXIS=VALUE,VALUE ...]
+
+AXIS is `pixels` (per side of an image), `views`, `bodies` (one inside the other) or `threads`; each varies while the
+others keep their first value. Images of the embedded scene are scaled, and repeated for more than 100 views. Prints a
+Markdown table of the rows and one of the slopes in logarithmic axes, and draws `docs/images/scaling.png`.
+
+Times are processor times of all threads, except for the rows of `threads`, which show clock time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+import numpy as np
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+from training import Training
+
+from nerfro.evaluation.render_view import render_view
+from nerfro.geometry.mesh import TriangleMesh, load_mesh
+from nerfro.paths import ASSETS_DIR
+from nerfro.registry import build
+from nerfro.subdivision import Subdivision
+from nerfro.training.validation import ValidationPixels
+from nerfro.types import Batch
+
+SCENE = ASSETS_DIR / "torus"
+AXES = {
+    "pixels": [128, 64, 256, 512, 1024, 1600],
+    "views": [100, 25, 50, 200, 400],
+    "bodies": [1, 2, 4, 8],
+    "threads": [1, 2],
+}
+COSTS = {
+    "first step": "s to the first step",
+    "step": "ms per step",
+    "quality": "s to {psnr:g} dB",
+    "render": "s per rendered megapixel",
+    "memory": "peak MiB",
+}
+Costs = dict[str, float | None]
+FIGURE = Path(__file__).resolve().parent.parent / "docs" / "images" / "scaling.png"
+EVERY = 20  # steps between two measurements of the PSNR
+RENDERED = 128  # pixels per side of the view whose rendering is measured
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("axes", nargs="*", metavar="AXIS=VALUE,VALUE")
+    parser.add_argument("--steps", type=int, default=300, help="of training")
+    parser.add_argument("--psnr", type=float, default=26.0, help="that training has to reach on test views, dB")
+    parser.add_argument("--figure", type=Path, default=FIGURE)
+    parser.add_argument("--options", nargs="+", default=[], help="of nerfro.train, for all rows")
+    parser.add_argument("--measure", help=argparse.SUPPRESS)  # one row, in a process of its own
+    arguments = parser.parse_args()
+    if arguments.measure is not None:
+        logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+        print(json.dumps(measure(**json.loads(arguments.measure))))
+        return
+    axes = {}
+    for given in arguments.axes:
+        name, values = given.split("=")
+        axes[name] = [int(value) for value in values.split(",")]
+    axes = axes or AXES
+    base = {name: axes.get(name, values)[0] for name, values in AXES.items()}
+    print(f"{os.cpu_count()} CPU cores, torch {torch.__version__}, {arguments.steps} steps, {date.today()}\n")
+    heads = [head.format(psnr=arguments.psnr) for head in COSTS.values()]
+    print(f"| row | {' | '.join(heads)} |\n|---|{'---|' * len(heads)}")
+    curves: dict[str, list[tuple[int, Costs]]] = {}
+    measured: dict[tuple[object, ...], Costs] = {}  # the base row lies on several axes
+    for name, values in axes.items():
+        curves[name] = []
+        for value in values:
+            row, by_clock = base | {name: value}, name == "threads"
+            key = (*row.values(), by_clock)
+            if key not in measured:
+                measured[key] = run_row(row, arguments.steps, arguments.psnr, arguments.options, by_clock)
+            costs = measured[key]
+            curves[name].append((value, costs))
+            cells = ("not reached" if cost is None else f"{cost:.3g}" for cost in costs.values())
+            print(f"| {value} {name} | {' | '.join(cells)} |", flush=True)
+    print(f"\n| slope | {' | '.join(heads)} |\n|---|{'---|' * len(heads)}")
+    for name, curve in curves.items():
+        print(f"| {name} | {' | '.join(slope(curve, cost) for cost in COSTS)} |")
+    draw(curves, heads, arguments.figure)
+
+
+def run_row(row: dict[str, int], steps: int, psnr: float, options: list[str], by_clock: bool) -> Costs:
+    """Write the data of a row and measure it in a process of its own."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_images(folder, row["pixels"], row["views"])
+        overrides = [f"data.root={folder}", "data=blender", *write_bodies(folder, row["bodies"]), *options]
+        task = {"overrides": overrides, "steps": steps, "psnr": psnr, "by_clock": by_clock, "begun": time.time()}
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), str(row["threads"]))
+        with subprocess.Popen(
+            [sys.executable, __file__, "--measure", json.dumps(task)],
+            env=os.environ | threads,
+            stdout=subprocess.PIPE,
+            text=True,
+        ) as process:
+            output = process.communicate()[0]
+    if process.returncode != 0:
+        raise SystemExit(f"failed: {row}")
+    return json.loads(output.splitlines()[-1])
+
+
+def write_images(folder: Path, pixels: int, views: int) -> None:
+    """Write images of the embedded scene, scaled and repeated."""
+    for split, count in (("train", views), ("test", 5)):
+        document = json.loads((SCENE / f"transforms_{split}.json").read_text())
+        frames = []
+        for number in range(count):
+            frame = document["frames"][number % len(document["frames"])]
+            file = folder / f"{split}_{number:03d}.png"
+            given = Image.open(SCENE / f"{frame['file_path']}.png").convert("RGB")
+            given.resize((pixels, pixels), Image.Resampling.BICUBIC).save(file, compress_level=1)
+            frames.append({"file_path": file.stem, "transform_matrix": frame["transform_matrix"]})
+        (folder / f"transforms_{split}.json").write_text(json.dumps(document | {"frames": frames}))
+
+
+def write_bodies(folder: Path, count: int) -> list[str]:
+    """Write nested copies of the embedded mesh, and return the options of the medium."""
+    outer = load_mesh(SCENE / "mesh.ply")
+    files = []
+    for number in range(count):
+        files.append(str(folder / f"body_{number}.ply"))
+        TriangleMesh(outer.vertices * 0.9**number, outer.faces).save(Path(files[-1]))
+    iors = [1.33 if number % 2 else 1.5 for number in range(1, count)]
+    inner = [f"medium.inner_meshes=[{','.join(files[1:])}]", f"medium.inner_iors={iors}"] if count > 1 else []
+    return [f"medium.mesh={files[0]}", "medium.ior=1.5", *inner]
+
+
+class Quality(pl.Callback):
+    """Measure the PSNR of test pixels every `EVERY` steps.
+
+    Attributes:
+        reached: number of steps after which the PSNR reached the goal; None if it did not.
+    """
+
+    def __init__(self, training: Training, pixels: ValidationPixels, goal: float) -> None:
+        self.training, self.pixels, self.goal = training, pixels, goal
+        self.reached: int | None = None
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Batch, batch_idx: int
+    ) -> None:
+        if self.reached is None and (batch_idx + 1) % EVERY == 0:
+            with torch.no_grad():
+                psnr = self.pixels.psnr(self.training.renderer, Subdivision())
+            if float(psnr) >= self.goal:
+                self.reached = batch_idx + 1
+
+
+def measure(overrides: list[str], steps: int, psnr: float, by_clock: bool, begun: float) -> Costs:
+    """Measure the costs of one training and of rendering one view."""
+    training = Training(*overrides)
+    training.run(1)
+    costs: Costs = {"first step": time.time() - begun if by_clock else time.process_time()}
+    test = build(training.config.data).load("test")
+    quality = Quality(training, ValidationPixels.of(test), psnr)
+    timed = training.run(steps, callbacks=[quality])
+    per_step = float(np.median(timed.seconds if by_clock else timed.processor))
+    costs["step"] = 1e3 * per_step
+    costs["quality"] = None if quality.reached is None else quality.reached * per_step
+    cameras, clock = test.cameras.resized(RENDERED, RENDERED), time.perf_counter if by_clock else time.process_time
+    start = clock()
+    render_view(training.renderer, cameras, 0, Subdivision())
+    costs["render"] = (clock() - start) * 1e6 / RENDERED**2
+    costs["memory"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return costs
+
+
+def slope(curve: list[tuple[int, Costs]], cost: str) -> str:
+    """Fit the exponent with which a cost grows."""
+    points = [(value, costs[cost]) for value, costs in curve if costs[cost] is not None]
+    if len(points) < 2:
+        return "n/a"
+    return f"{np.polyfit(*np.log(np.transpose(points)), 1)[0]:.2f}"
+
+
+def draw(curves: dict[str, list[tuple[int, Costs]]], heads: list[str], file: Path) -> None:
+    """Draw every cost against every axis, in logarithmic axes."""
+    figure = Figure(figsize=(3 * len(curves), 2.2 * len(COSTS)), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(len(COSTS), len(curves), squeeze=False, sharex="col", sharey="row")
+    for column, (name, curve) in enumerate(curves.items()):
+        for row, (cost, head) in enumerate(zip(COSTS, heads, strict=True)):
+            points = sorted((value, costs[cost]) for value, costs in curve if costs[cost] is not None)
+            axes = grid[row, column]
+            axes.loglog([value for value, _ in points], [value for _, value in points], "o-")
+            axes.grid(alpha=0.3, which="both")
+            if column == 0:
+                axes.set_ylabel(head)
+        grid[-1, column].set_xlabel("pixels per side" if name == "pixels" else name)
+    figure.savefig(file, dpi=80)
+
+
+if __name__ == "__main__":
+    main()
