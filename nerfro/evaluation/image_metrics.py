@@ -18,13 +18,13 @@ from nerfro.evaluation.flip import flip
 from nerfro.evaluation.flip import is_available as flip_available
 from nerfro.evaluation.lpips import ALEX, VGG, LpipsNetwork
 from nerfro.evaluation.regions import mean_over, require_images
-from nerfro.evaluation.ssim import MS_SSIM_MIN_SIZE, WINDOW, ms_ssim, ssim
+from nerfro.evaluation.ssim import WINDOW, ssim
 from nerfro.registry import CHECKS, Plugin, create, plugins, register
 
 MAX_PSNR = 100.0  # dB; the infinite PSNR of equal images has no mean and no representation in JSON
 
 # Order in tables; metrics of other packages follow.
-_BUILT_IN = ("psnr", "ssim", "ms_ssim", "lpips", "lpips_vgg", "flip")
+_BUILT_IN = ("psnr", "ssim", "lpips", "lpips_vgg", "flip")
 
 
 class ImageMetric(nn.Module, ABC):
@@ -153,16 +153,6 @@ class Ssim(ImageMetric):
     better = "higher"
     min_size = WINDOW
     forward = staticmethod(ssim)
-
-
-@register("metric", "ms_ssim")
-class MsSsim(ImageMetric):
-    """Multiscale structural similarity over five scales."""
-
-    title = "MS-SSIM"
-    better = "higher"
-    min_size = MS_SSIM_MIN_SIZE
-    forward = staticmethod(ms_ssim)
 
 
 class _Lpips(ImageMetric):

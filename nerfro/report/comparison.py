@@ -112,7 +112,7 @@ def find_metrics(names: Sequence[str] | None = None) -> dict[str, type[ImageMetr
     """
     known = image_metrics()
     if names is None:
-        names = [name for name in known if name not in ("ms_ssim", "lpips_vgg")]
+        names = [name for name in known if name != "lpips_vgg"]
     if not names:
         raise NerfroError(f"metrics: the list is empty; choose from {', '.join(known)}")
     for name in names:
