@@ -7,6 +7,9 @@ Examples:
 
 from __future__ import annotations
 
+import contextlib
+import csv
+import math
 import time
 from pathlib import Path
 
@@ -14,11 +17,13 @@ from omegaconf import DictConfig
 
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli import entry_point
-from nerfro.report.curves import CURVES_FILE, read_curves
+from nerfro.files.reading import reading
 from nerfro.training.load import checkpoint_of, load
 from nerfro.viewing.live import POLL_SECONDS, LivePage, ViewConfig
 from nerfro.viewing.page import page_split
 from nerfro.viewing.server import PageServer, open_page
+
+_LOSSES = Path("csv", "metrics.csv")  # of the CSV logger of Lightning, see conf/logger/
 
 
 @entry_point("view", ViewConfig)
@@ -27,11 +32,11 @@ def main(config: DictConfig) -> None:
     checkpoint = checkpoint_of(config.checkpoint)
     run = checkpoint.parent.parent
     scene = load(checkpoint, config.device, config.root)
-    scene_time, curve_time = _modified(checkpoint), _modified(run / CURVES_FILE)
+    scene_time, curve_time = _modified(checkpoint), _modified(run / _LOSSES)
     server = PageServer(config.host, config.port)
     split = page_split(scene.source)
     page = LivePage(server, scene, scene.views(split), split, config.resolution)
-    show_losses(server, run)
+    server.set_losses(read_losses(run))
     print(f"nerfro: {scene.name} on {server.url}; Ctrl-C ends it", flush=True)
     if config.open:
         open_page(server.url)
@@ -40,15 +45,24 @@ def main(config: DictConfig) -> None:
         if _modified(checkpoint) != scene_time:
             scene_time = _modified(checkpoint)
             page.show(load(checkpoint, config.device, config.root))
-        if _modified(run / CURVES_FILE) != curve_time:
-            curve_time = _modified(run / CURVES_FILE)
-            show_losses(server, run)
+        if _modified(run / _LOSSES) != curve_time:
+            curve_time = _modified(run / _LOSSES)
+            server.set_losses(read_losses(run))
 
 
-def show_losses(server: PageServer, run: Path) -> None:
-    """Show the training curve of a run; the curve is empty without a CSV log."""
-    steps, losses = read_curves(run).get("loss/total", ((), ()))
-    server.set_losses([(int(step), float(loss)) for step, loss in zip(steps, losses, strict=True)])
+def read_losses(run: Path) -> list[tuple[int, float]]:
+    """Read pairs of step and total loss of a run; empty without a CSV log.
+
+    Unreadable rows are skipped, such as the last row of an interrupted run.
+    """
+    losses: dict[int, float] = {}
+    file = run / _LOSSES
+    if file.is_file():
+        with reading(file, advice="remove it"), file.open(newline="", encoding="utf-8", errors="replace") as stream:
+            for row in csv.DictReader(stream):
+                with contextlib.suppress(KeyError, TypeError, ValueError, OverflowError):
+                    losses[int(float(row["step"]))] = float(row["loss/total"])
+    return sorted((step, loss) for step, loss in losses.items() if math.isfinite(loss))
 
 
 def _modified(file: Path) -> float:

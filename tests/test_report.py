@@ -3,7 +3,6 @@ import io
 import json
 import re
 import shutil
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,6 @@ from nerfro.evaluation.tables import to_html
 from nerfro.files.images import load_png, save_png
 from nerfro.registry import discover
 from nerfro.report.comparison import combine, compare, find_metrics, to_table
-from nerfro.report.curves import COLOURS, MAX_POINTS, make_charts, read_curves
 from nerfro.report.page import report_page
 from nerfro.report.runs import find_runs
 from nerfro.report.views import Selection, embed_image, scene_images
@@ -26,13 +24,6 @@ from tests.test_summary import write_run
 from tests.viewing.browser import Browser, needs_chromium
 
 PSNR = find_metrics(["psnr"])
-CSV = """epoch,loss/photometric,loss/total,step,train/psnr,val/psnr
-0,0.1,0.2,9,10.0,
-0,0.01,0.02,19,20.0,
-0,,,19,,18.5
-0,0.001,nan,29,30.0,
-0,0.0
-"""
 
 
 def write_scored_run(folder: Path, name: str, scene: Path, noise: float) -> None:
@@ -45,8 +36,6 @@ def write_scored_run(folder: Path, name: str, scene: Path, noise: float) -> None
         save_png(folder / "images" / f"test_{view:03d}.png", prediction)
         metrics.update(prediction, reference, view)
     write_metrics_json(folder / "metrics.json", RunMetrics(metrics.result(), 30, 20.0, 1000.0))
-    (folder / "csv").mkdir()
-    (folder / "csv" / "metrics.csv").write_text(CSV)
 
 
 @pytest.fixture(scope="module")
@@ -62,38 +51,6 @@ def page(runs: Path, unfinished: tuple[str, ...] = ()) -> str:
     comparisons = compare(find_runs([str(runs)])[0], {}, {})
     compared = [(comparison, to_table(comparison, PSNR, "full")) for comparison in comparisons]
     return report_page(compared, unfinished, Selection())
-
-
-def test_curves_are_read_by_name_without_empty_broken_or_endless_values(tmp_path: Path) -> None:
-    (tmp_path / "csv").mkdir()
-    (tmp_path / "csv" / "metrics.csv").write_text(CSV)
-    curves = read_curves(tmp_path)
-    assert curves.keys() == {"loss/photometric", "loss/total", "train/psnr", "val/psnr"}
-    assert [list(part) for part in curves["train/psnr"]] == [[9, 19, 29], [10, 20, 30]]
-    assert [list(part) for part in curves["loss/total"]] == [[9, 19], [0.2, 0.02]]
-    assert [list(part) for part in curves["val/psnr"]] == [[19], [18.5]]
-    assert read_curves(tmp_path / "nowhere") == {}
-
-
-def test_charts_put_psnr_first_and_draw_a_line_for_each_run() -> None:
-    steps = np.arange(1, 4) * 10
-    run = {"loss/a": (steps, np.array([1.0, 0.1, 0.01])), "val/psnr": (steps[:1], np.array([20.0]))}
-    psnr, loss = make_charts([(3, run), (0, {"loss/a": run["loss/a"]})])
-    assert (psnr.name, psnr.logarithmic, loss.name, loss.logarithmic) == ("val/psnr", False, "loss/a", True)
-    kind, encoded = loss.uri.split(",")
-    assert kind == "data:image/svg+xml;base64"
-    drawn = ElementTree.fromstring(base64.b64decode(encoded))
-    styles = [element.get("style", "") for element in drawn.iter() if "stroke-width: 1.2" in element.get("style", "")]
-    assert [re.findall("stroke: (#.{6})", style) for style in styles] == [[COLOURS[3]], [COLOURS[0]]]
-
-
-def test_long_logs_are_averaged_and_losses_of_zero_are_not_drawn() -> None:
-    steps = np.arange(10 * MAX_POINTS)
-    (psnr,) = make_charts([(0, {"train/psnr": (steps, np.tile([0.0, 10.0], 5 * MAX_POINTS))})])
-    ((_, (thinned, values)),) = psnr.lines
-    assert len(thinned) == MAX_POINTS
-    assert values == pytest.approx(5)
-    assert make_charts([(0, {"loss/a": (steps, np.zeros(len(steps)))})]) == []
 
 
 def test_figure_shows_the_view_of_the_median_score_and_insets_that_lie_apart(runs: Path) -> None:
@@ -144,7 +101,6 @@ def test_page_without_its_data_keeps_the_rest(runs: Path, tmp_path: Path) -> Non
     assert "The images cannot be shown" in html
     assert "/nowhere/scene" in html
     assert "<image" not in html
-    assert "train/psnr" in html
     assert "max_time" in html
 
 

@@ -1,4 +1,4 @@
-"""Self-contained HTML report of many runs: tables, training curves, images and provenance."""
+"""Self-contained HTML report of many runs: tables, images and provenance."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from nerfro.files.drawing import magma
 from nerfro.files.templates import fill_template
 from nerfro.paths import PACKAGE_DIR
 from nerfro.report.comparison import Comparison, combine
-from nerfro.report.curves import COLOURS, Chart, make_charts, read_curves
 from nerfro.report.runs import Run, device, duration, shown
 from nerfro.report.views import JPEG_QUALITY, PNG_SIDE, SceneImages, Selection, embed_image, scene_images
 
@@ -32,14 +31,12 @@ class SceneSection:
     Attributes:
         id: unique identifier on the page.
         title: title of the scene.
-        charts: training curves.
         images: views, or None if these cannot be shown.
         reason: reason for missing views.
     """
 
     id: str
     title: str
-    charts: Sequence[Chart]
     images: SceneImages | None
     reason: str
 
@@ -85,7 +82,6 @@ def report_page(compared: Sequence[tuple[Comparison, Table]], unfinished: Sequen
         table=Markup(to_html(combine(compared))),
         sections=sections,
         unfinished=unfinished,
-        colours=COLOURS,
         error_ramp=embed_image(ramp),
         error_limit=SQUARED_ERROR_LIMIT,
         png_side=PNG_SIDE,
@@ -101,12 +97,7 @@ def _scenes(prefix: str, comparison: Comparison, selection: Selection) -> list[S
             images = scene_images(comparison, test_set, selection)
         except NerfroError as error:  # a missing data set does not prevent the rest of the page
             reason = str(error)
-        logged = [
-            (method, read_curves(run.folder))
-            for method, name in enumerate(comparison.methods)
-            for run in comparison.cells.get((name, test_set), ())
-        ]
-        sections.append(SceneSection(f"{prefix}s{number}", title, make_charts(logged), images, reason))
+        sections.append(SceneSection(f"{prefix}s{number}", title, images, reason))
     return sections
 
 

@@ -26,7 +26,7 @@ def test_a_run_is_served_with_its_curve(trained_run: Path, tmp_path: Path) -> No
         file = tmp_path / "run" / "csv" / "metrics.csv"
         header, *rows = file.read_text().splitlines()
         row = dict(zip(header.split(","), rows[-1].split(","), strict=True)) | {"step": "2", "loss/total": "0.125"}
-        file.write_text("\n".join([header, *rows, ",".join(row.values()), ""]))
+        file.write_text("\n".join([header, *rows, ",".join(row.values()), "7,0.0"]))  # the last row is incomplete
         deadline = time.monotonic() + 30
         while losses(address)[-1] != [2, 0.125]:
             assert time.monotonic() < deadline
