@@ -21,7 +21,7 @@ from nerfro.capture.overrides import print_next
 from nerfro.capture.photographs import list_photographs, luminance, outside
 from nerfro.capture.reconstruction import SfmSettings, find_model, import_model
 from nerfro.cli import entry_point, warn
-from nerfro.data.masks import find_mask
+from nerfro.data.masks import find_mask, require_used
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing
 from nerfro.paths import user_path
@@ -44,6 +44,7 @@ def main(config: DictConfig) -> None:
     images, size = list_photographs(user_path(config.images))
     # Masks lie where the loader of the data set will look for them.
     masks = [find_mask(out, out / relative(image, out)) for image in images]
+    require_used(out, [out / relative(image, out) for image in images], masks)
     refuse_existing([out / name for name in FILES], config.overwrite)
     if board is None:
         settings = SfmSettings(config.lens, config.pairs, config.threads, config.mask_labels)

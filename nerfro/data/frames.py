@@ -19,7 +19,7 @@ from nerfro.data.base import DataSource, Frame, Views
 from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb
 from nerfro.data.lazy_images import LazyImages
 from nerfro.data.lenses import Lens, check_lenses
-from nerfro.data.masks import find_mask, find_masks, find_usable
+from nerfro.data.masks import find_mask, find_masks, find_usable, require_used, unused_masks
 from nerfro.errors import NerfroError, first_of
 from nerfro.paths import refuse_root, resolve_path
 
@@ -119,6 +119,11 @@ class PosedImages(DataSource):
         images = LazyImages.of(files, lambda path: read_rgb(path, alpha), self.downscale, composited, recipe=alpha)
         (height, width), stored = images.shape, images.size[::-1]
         self._require_own_masks(frames)
+        if unused_masks(self.root, files, [*(frame.mask for frame in frames), *read.usable]):
+            sets = [self.read(split) for split in self.splits]
+            every = [frame for one in sets for frame in one.frames]
+            masks_of_all = [*(frame.mask for frame in every), *(mask for one in sets for mask in one.usable)]
+            require_used(self.root, [frame.image for frame in every], masks_of_all)
         masks = find_masks(files, [frame.mask for frame in frames], self.downscale, stored, self.mask_labels)
         for frame in frames:
             check_pose(frame.camera_to_world, frame.name, "the pose")

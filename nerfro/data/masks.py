@@ -15,7 +15,7 @@ from PIL import Image
 
 from nerfro.cli import warn
 from nerfro.data.base import DataSource, Views
-from nerfro.data.image_files import Levels, read_levels, read_mask, read_size
+from nerfro.data.image_files import IMAGE_SUFFIXES, Levels, read_levels, read_mask, read_size
 from nerfro.data.lazy_images import LazyImages
 from nerfro.errors import NerfroError, first_of
 from nerfro.files.reading import open_image
@@ -87,6 +87,38 @@ def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None
             names = [*(f"{image.stem}{suffix}" for suffix in _SUFFIXES), f"{image.name}.png"]
             candidates += [root / "masks" / within / name for name in names]
     return next((path for path in candidates if path.is_file()), None)
+
+
+def unused_masks(root: Path, images: Sequence[Path], masks: Sequence[Path | None]) -> list[Path]:
+    """List the files at the usual places of masks if no image has a mask; otherwise, return an empty list.
+
+    The arguments are those of `require_used`.
+    """
+    if any(masks) or _ignore_masks.get():
+        return []
+    beside = (path for folder in {image.parent for image in images} for path in folder.glob("mask_*"))
+    files = {path for path in (*beside, *root.glob("masks/**/*")) if path.suffix.lower() in IMAGE_SUFFIXES}
+    return sorted(path for path in files.difference(images) if path.is_file() and not path.name.startswith("."))
+
+
+def require_used(root: Path, images: Sequence[Path], masks: Sequence[Path | None]) -> None:
+    """Refuse a data set with mask files of which none belongs to an image.
+
+    Args:
+        root: folder of the data set.
+        images: all image files.
+        masks: mask files of the images.
+
+    Raises:
+        NerfroError: there are mask files, but no image has a mask.
+    """
+    unused = unused_masks(root, images, masks)
+    if unused:
+        raise NerfroError(
+            f"no image has a mask, although {first_of([*map(str, unused)])} exist: the mask of {images[0]} has another "
+            "place or name, and one file is never the mask of several images; rename the masks as "
+            "docs/guides/data_formats.md describes, or move them out of the folder"
+        )
 
 
 def find_masks(

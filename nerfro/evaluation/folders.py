@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb, to_unit
-from nerfro.data.masks import find_mask, find_masks
+from nerfro.data.masks import find_mask, find_masks, require_used
 from nerfro.errors import NerfroError
 from nerfro.evaluation.regions import object_pixels
 
@@ -95,6 +95,7 @@ def match_folders(
     _require(truth, predicted, f"prediction in predictions={predictions}")
     if masks is None:
         found = {name: find_mask(references, path) for name, path in truth.items()}
+        require_used(references, list(truth.values()), list(found.values()))
         files = {name: path for name, path in found.items() if path is not None}
         where = f"references={references}, where others have one"
     else:

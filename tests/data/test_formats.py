@@ -102,6 +102,21 @@ def test_a_mask_that_is_found_for_two_images_is_refused(tmp_path: Path) -> None:
 
 
 @with_files
+def test_masks_that_fit_no_image_are_refused(form: Format, tmp_path: Path) -> None:
+    save_mask(form.write(tmp_path) / "masks/000000.png", 1)
+    with pytest.raises(NerfroError, match=r"no image has a mask, although .*masks/000000\.png exist|1 masks for 6"):
+        form.load(tmp_path)
+
+
+def test_masks_of_another_split_are_in_use(tmp_path: Path) -> None:
+    source = BlenderData(str(write_blender(tmp_path, masks=True)))
+    save_mask(tmp_path / "masks/000000.png", 1)  # fits no image
+    for frame in source.load("test").frames:
+        frame.mask.unlink()
+    assert source.load("test").masks is None
+
+
+@with_files
 def test_damaged_images_and_masks_are_named(form: Format, tmp_path: Path) -> None:
     frame = form.load(form.write(tmp_path, masks=True)).frames[-1]
     content, name = frame.image.read_bytes(), frame.image.name.replace(".", r"\.")
