@@ -24,6 +24,7 @@ from nerfro.cli import entry_point, warn
 from nerfro.data.masks import find_mask, require_used
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing
+from nerfro.files.folder_lock import lock_folder
 from nerfro.paths import user_path
 from nerfro.progress import track
 
@@ -36,6 +37,11 @@ def main(config: DictConfig) -> None:
     """Detect the board, estimate lens and poses, write the data set, and print the next command."""
     check_options(config)
     out = user_path(config.out)
+    with lock_folder(out, "out"):
+        _calibrate(config, out)
+
+
+def _calibrate(config: DictConfig, out: Path) -> None:
     board = None if config.target == "colmap" else make_board(config)
     if config.write_board:
         _write_board(board, out, config.overwrite)

@@ -18,8 +18,11 @@ from nerfro.capture.mask_files import MaskConfig, MaskTask, read_outlines
 from nerfro.capture.masking import Segmentation
 from nerfro.capture.overrides import is_given, of_groups, print_next
 from nerfro.cli import entry_point
+from nerfro.data.base import DataSource
+from nerfro.data.frames import require_root
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
+from nerfro.files.folder_lock import lock_folder
 from nerfro.paths import EMBEDDED_PREFIX
 from nerfro.progress import progress_bar
 from nerfro.registry import build
@@ -35,6 +38,15 @@ def main(config: DictConfig) -> None:
     if str(config.data.root).startswith(EMBEDDED_PREFIX):
         raise NerfroError(f"data.root={config.data.root} is part of nerfro and has masks; set data.root to your folder")
     source = build(config.data)
+    require_root(source.root)
+    with lock_folder(source.root, "data.root"):
+        _mask(config, source)
+    given = of_groups(("data",), HydraConfig.get().overrides.task)
+    given = given if is_given("data", given) else ["data=opencv", *given]
+    print_next("next", "preprocess", [*given, "medium.ior=1.33"])
+
+
+def _mask(config: DictConfig, source: DataSource) -> None:
     drawn = source.root / _OUTLINES
     continues = config.view and config.outlines is None and drawn.is_file()
     outlines = read_outlines(str(drawn) if continues else config.outlines)
@@ -54,9 +66,6 @@ def main(config: DictConfig) -> None:
             found = task.segment(outlines, progress.update)
         print(task.save(outlines, found))
         print("correct wrong masks in a paint program; or delete them, outline one of these views, and repeat")
-    given = of_groups(("data",), HydraConfig.get().overrides.task)
-    given = given if is_given("data", given) else ["data=opencv", *given]
-    print_next("next", "preprocess", [*given, "medium.ior=1.33"])
 
 
 if __name__ == "__main__":

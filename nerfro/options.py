@@ -13,7 +13,6 @@ import importlib.metadata
 import importlib.util
 import inspect
 import json
-import os
 import re
 import sys
 import textwrap
@@ -273,12 +272,11 @@ def recall(command: str) -> Described | None:
 
 def remember(command: str, described: Described) -> None:
     """Write the description of a command to the cache, if possible."""
-    with contextlib.suppress(OSError):
-        file = _cache_file(command)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        partial = file.with_suffix(f".{os.getpid()}")
-        partial.write_text(json.dumps({"state": _state_of_files(), **dataclasses.asdict(described)}), encoding="utf-8")
-        partial.replace(file)
+    from nerfro.files.atomic import write_atomically  # --help and completion only read the cache
+
+    with contextlib.suppress(OSError, NerfroError):
+        content = {"state": _state_of_files(), **dataclasses.asdict(described)}
+        write_atomically(_cache_file(command), json.dumps(content))
 
 
 def _cache_file(command: str) -> Path:

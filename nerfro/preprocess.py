@@ -28,6 +28,8 @@ from nerfro.capture.visual_hull import Silhouettes
 from nerfro.cli import entry_point, warn
 from nerfro.data.base import Views
 from nerfro.data.masks import POLYGON, masked_views, method_of, with_other_splits
+from nerfro.files.atomic import refuse_existing
+from nerfro.files.folder_lock import lock_folder
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.paths import resolve_path
@@ -38,9 +40,15 @@ from nerfro.registry import build
 @torch.no_grad()
 def main(config: DictConfig) -> None:
     """Reconstruct the surface, search the index, refine the surface if requested, and print the next command."""
-    mesh = None if config.mesh is None else load_mesh(resolve_path(config.mesh))
     request = Request(config, list(HydraConfig.get().overrides.task))
     request.check()
+    with lock_folder(request.folder, "data.root" if config.out is None else "out"):
+        _preprocess(config, request)
+
+
+def _preprocess(config: DictConfig, request: Request) -> None:
+    mesh = None if config.mesh is None else load_mesh(resolve_path(config.mesh))
+    refuse_existing(request.files, config.overwrite)
     source = build(config.data)
     views, silhouettes, overlaps = masked_views(source.load("train")), None, None
     outlined = with_other_splits(views, source, "train")

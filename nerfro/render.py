@@ -7,11 +7,14 @@ Examples:
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from omegaconf import DictConfig
 
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli import entry_point
 from nerfro.files.cache import file_hash
+from nerfro.files.folder_lock import lock_folder
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.paths import CONF_DIR, user_path
 from nerfro.training.load import checkpoint_of, load
@@ -26,13 +29,17 @@ def main(config: DictConfig) -> None:
     """Check the request, load the scenes, render the missing frames, and encode films."""
     check_request(config)
     keep_freed_memory()
+    with lock_folder(user_path(config.out), "out"):
+        _render(config, user_path(config.out))
+
+
+def _render(config: DictConfig, folder: Path) -> None:
     runs = checkpoints(config)
     scenes = [prepared(config, load(run, config.device, config.root)) for run in runs]
     shots = find_shots(config, scenes[0])
     renderer = FrameRenderer(scenes, labels(config), LAYERS[config.what])
     inputs = [*map(checkpoint_of, runs), *([config.sky] if config.sky else [])]
     request = (config.what, renderer.labels, scenes[0].subdivision, *map(file_hash, inputs))
-    folder = user_path(config.out)
     films = config.film if shots.film and config.format == "png" else []
     if "mp4" in films:
         find_ffmpeg()  # a missing ffmpeg is reported before the frames are rendered

@@ -7,6 +7,7 @@ Examples:
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Optional
 
@@ -17,8 +18,9 @@ import nerfro.startup  # noqa: F401 - before the other imports, which take secon
 from nerfro.allowed import Natural
 from nerfro.cli import entry_point
 from nerfro.evaluation.results import FULL
-from nerfro.evaluation.tables import to_rich, write_table
+from nerfro.evaluation.tables import Table, to_rich, write_table
 from nerfro.files.atomic import refuse_existing, write_atomically
+from nerfro.files.folder_lock import lock_folder
 from nerfro.paths import user_path
 from nerfro.report.comparison import compare, find_metrics, to_table
 from nerfro.report.page import report_page
@@ -54,25 +56,30 @@ def main(config: DictConfig) -> None:
     tables = {c.budget.file_name: to_table(c, metrics, config.region) for c in comparisons}
 
     folder = "outputs/summary" if config.out is None and config.report else config.out
-    out = None if folder is None else user_path(folder)
-    if out is not None:
+    if folder is None:
+        _print(tables, unfinished)
+        return
+    out = user_path(folder)
+    with lock_folder(out, "out"):
         names = [name + suffix for name in tables for suffix in (".csv", ".md", ".tex")]
         written = [*names, "report.html"] if config.report else names
         refuse_existing([out / name for name in written], config.overwrite)
+        _print(tables, unfinished)
+        for name, table in tables.items():
+            write_table(table, out / name)
+        print(f"tables: {out}")
+        if config.report:
+            selection = Selection(config.views, next(iter(metrics)), config.region)
+            page = report_page(list(zip(comparisons, tables.values(), strict=True)), unfinished, selection)
+            write_atomically(out / "report.html", page)
+            print(f"report: {out / 'report.html'}, {len(page) / 2**20:.1f} MiB")
+
+
+def _print(tables: Mapping[str, Table], unfinished: Sequence[str]) -> None:
     for table in tables.values():
         rich.print(to_rich(table))
     for line in unfinished:
         print(line)
-    if out is None:
-        return
-    for name, table in tables.items():
-        write_table(table, out / name)
-    print(f"tables: {out}")
-    if config.report:
-        selection = Selection(config.views, next(iter(metrics)), config.region)
-        page = report_page(list(zip(comparisons, tables.values(), strict=True)), unfinished, selection)
-        write_atomically(out / "report.html", page)
-        print(f"report: {out / 'report.html'}, {len(page) / 2**20:.1f} MiB")
 
 
 if __name__ == "__main__":

@@ -302,8 +302,8 @@ def test_command_prints_writes_all_forms_and_refuses_to_overwrite(
     assert not out.exists()
     code, printed = summarise(runs, f"out={out}")
     assert code == 0, printed
-    assert {path.suffix for path in out.iterdir()} == {".csv", ".md", ".tex"}
-    assert len(list(out.iterdir())) == 6
+    assert {path.suffix for path in out.glob("[!.]*")} == {".csv", ".md", ".tex"}
+    assert len(list(out.glob("[!.]*"))) == 6
     assert "22.00" in (out / "100_steps_of_512_rays.md").read_text()
     code, printed = summarise(runs, f"out={out}")
     assert code == 1

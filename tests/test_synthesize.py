@@ -107,7 +107,7 @@ def test_another_data_set_is_replaced_only_on_request_and_strangers_survive(tmp_
 @pytest.mark.usefixtures("mitsuba")
 def test_a_folder_of_something_else_is_left_alone(tmp_path, name, content):
     (tmp_path / name).write_text(content)
-    with pytest.raises(NerfroError, match="is not a data set of nerfro"):
+    with pytest.raises(NerfroError, match="it is no data set of nerfro"):
         synthesize(small(tmp_path, overwrite=True))
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, content)]
 

@@ -7,7 +7,7 @@ import re
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 
-STAGE = "NERFRO_STAGE"  # environment variable that is set in the stages of nerfro.reconstruct
+from nerfro.files.folder_lock import STAGE
 
 
 def print_next(label: str, command: str, options: Sequence[str]) -> None:

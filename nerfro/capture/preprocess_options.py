@@ -19,8 +19,9 @@ from nerfro.capture.overlaps import REPORT, SHEET
 from nerfro.capture.overrides import as_overrides, is_given, of_groups, print_next
 from nerfro.capture.revolution import Symmetry
 from nerfro.capture.upright import find_up
+from nerfro.data.frames import require_root
 from nerfro.errors import NerfroError
-from nerfro.files.atomic import refuse_existing, write_atomically
+from nerfro.files.atomic import write_atomically
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.base import Medium
 from nerfro.paths import EMBEDDED_PREFIX, resolve_path, user_path
@@ -112,7 +113,7 @@ class Request:
         return [self.folder / name for name in [*names, FOUND]]
 
     def check(self) -> None:
-        """Check the options, and check that no existing file would be replaced.
+        """Check the options and the output folder.
 
         Raises:
             NerfroError: options contradict each other, or the output folder cannot be used.
@@ -128,7 +129,8 @@ class Request:
             raise NerfroError("vessel=true estimates the lengths of a vessel; set medium=object, or remove vessel=true")
         if config.out is None and str(config.data.root).startswith(EMBEDDED_PREFIX):
             raise NerfroError(f"data.root={config.data.root} is part of nerfro and read-only; add out=FOLDER")
-        refuse_existing(self.files, config.overwrite)
+        if config.out is None:
+            require_root(self.folder)
 
 
 def surface_settings(request: Request, cameras: Cameras, mesh: TriangleMesh, location: str) -> dict[str, object]:

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from nerfro.files.atomic import atomic_file
 from nerfro.media.base import Medium
 from nerfro.types import Path
 
@@ -24,8 +25,8 @@ _MARGIN = 0.15
 
 def draw_paths(path: Path, medium: Medium, file: FilePath) -> None:
     """Write a plot of a few paths and the medium to a PNG file; see `plot_paths`."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    _draw(path, medium).print_png(str(file))
+    with atomic_file(file) as stream:
+        _draw(path, medium).print_png(stream)
 
 
 def image_of_paths(path: Path, medium: Medium) -> UInt8[np.ndarray, "H W 3"]:

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from nerfro.allowed import Natural, NumRays
 from nerfro.errors import Interrupted, NerfroError
 from nerfro.files.atomic import refuse_existing, write_atomically
-from nerfro.files.folder_lock import lock_folder, remove_unfinished, require_only
+from nerfro.files.folder_lock import lock_folder, require_only
 from nerfro.paths import user_path
 from nerfro.subdivision import SubdivisionChanges
 
@@ -74,11 +74,10 @@ def require_one_task(config: DictConfig) -> None:
 def own_folder(config: DictConfig, default: Path) -> Iterator[Path]:
     """Lock the output folder; raises an error unless the folder is empty or holds a replaceable evaluation."""
     folder = default if config.out is None else user_path(config.out)
-    if not (folder / REQUEST_FILE).is_file():
-        require_only(folder, (), "it is not the folder of an evaluation; give another out=...")
-    refuse_existing([folder / "metrics.json"], config.overwrite)
     with lock_folder(folder, "out"):
-        remove_unfinished(folder)
+        if not (folder / REQUEST_FILE).is_file():
+            require_only(folder, (), "it is not the folder of an evaluation; give another out=...")
+        refuse_existing([folder / "metrics.json"], config.overwrite)
         try:
             yield folder
         except KeyboardInterrupt:

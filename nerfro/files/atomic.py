@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO
 
 from nerfro.errors import NerfroError
-from nerfro.files.folder_lock import PARTIAL, require_lock
+from nerfro.files.folder_lock import PARTIAL, hold, require_lock
 
 
 @contextlib.contextmanager
@@ -36,6 +36,7 @@ def atomic_file(path: Path | str, advice: str = "free some space or choose anoth
         # setting it for the whole process. The operating system applies the umask to a file that is opened like this.
         temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}{PARTIAL}")
         with open(temporary, "x+b") as stream:
+            hold(stream)
             yield stream
             stream.flush()
             os.fsync(stream.fileno())

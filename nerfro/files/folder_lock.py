@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 from filelock import FileLock, Timeout
 
@@ -12,6 +14,7 @@ from nerfro.errors import NerfroError, first_of
 from nerfro.paths import refuse_root
 
 _LOCK, PARTIAL = ".lock", ".partial"  # lock file, and ending of files that are being written
+STAGE = "NERFRO_STAGE"  # environment variable of the stages of nerfro.reconstruct: the folders that it has locked
 _locked: dict[Path, int] = {}  # folders that this process has locked, with the inode of each lock file
 
 
@@ -19,7 +22,9 @@ _locked: dict[Path, int] = {}  # folders that this process has locked, with the 
 def lock_folder(folder: Path, option: str) -> Iterator[None]:
     """Lock a folder for this process, and create the folder if needed.
 
-    A process may lock a folder several times. A folder without new files at the end is restored to its earlier state.
+    A process may lock a folder several times. A stage of nerfro.reconstruct may use the folder that nerfro.reconstruct
+    has locked. Partial files of killed processes are removed. A folder without new files at the end is restored to its
+    earlier state.
 
     Args:
         folder: folder to lock.
@@ -30,6 +35,9 @@ def lock_folder(folder: Path, option: str) -> Iterator[None]:
     """
     refuse_root(folder, option)
     folder = folder.absolute()
+    if os.path.realpath(folder) in os.environ.get(STAGE, "").split("\n"):
+        yield
+        return
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -37,6 +45,8 @@ def lock_folder(folder: Path, option: str) -> Iterator[None]:
         lock = FileLock(folder / _LOCK, is_singleton=True)
         lock.acquire(blocking=False)
         _locked[folder] = (folder / _LOCK).stat().st_ino
+        if lock.lock_counter == 1:
+            _remove_unfinished(folder)
     except Timeout as error:
         raise NerfroError(
             f"another process is writing to {folder}; wait until it has ended, or choose another {option}"
@@ -57,15 +67,9 @@ def lock_folder(folder: Path, option: str) -> Iterator[None]:
         lock.release()
 
 
-def is_locked(folder: Path) -> bool:
-    """Check whether another process has locked a folder."""
-    if not (folder / _LOCK).exists():
-        return False
-    try:
-        with FileLock(folder / _LOCK, is_singleton=True).acquire(blocking=False):
-            return False
-    except Timeout:
-        return True
+def environment_of_stages() -> dict[str, str]:
+    """Return the environment of the stages of nerfro.reconstruct, which may use the folders of this process."""
+    return {**os.environ, STAGE: "\n".join(map(os.path.realpath, _locked))}
 
 
 def require_lock(path: Path) -> None:
@@ -81,12 +85,25 @@ def require_lock(path: Path) -> None:
             raise NerfroError(f"{folder} was removed or replaced while nerfro was writing to the folder; start again")
 
 
-def remove_unfinished(folder: Path) -> None:
-    """Remove partial files of killed processes, except in subfolders that other processes have locked."""
-    for partial in folder.rglob(f".*{PARTIAL}"):
-        below = [path for path in partial.parents if path != folder and path.is_relative_to(folder)]
-        if not any(map(is_locked, below)):
-            partial.unlink(missing_ok=True)
+def hold(file: IO[bytes]) -> bool:
+    """Lock an open file as long as it is open; returns False if this fails, as while another process holds the lock."""
+    try:
+        import fcntl
+    except ImportError:  # Windows, which does not remove open files
+        return True
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+def _remove_unfinished(folder: Path) -> None:
+    """Remove partial files of killed processes."""
+    for partial in folder.rglob(f".*.{'[0-9a-f]' * 16}{PARTIAL}"):
+        with contextlib.suppress(OSError), open(partial, "r+b") as file:
+            if hold(file):
+                partial.unlink()
 
 
 def require_only(folder: Path, allowed: tuple[str, ...], advice: str) -> None:

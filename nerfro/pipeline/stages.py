@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import os
 import shlex
 import signal
 import subprocess
@@ -13,12 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-from nerfro.capture.overrides import STAGE
 from nerfro.capture.photographs import PHOTOGRAPH_SUFFIXES, place_photograph
 from nerfro.cli import EXIT_INTERRUPTED
 from nerfro.data.frames import list_images
 from nerfro.data.image_files import IMAGE_SUFFIXES
 from nerfro.errors import Interrupted, NerfroError
+from nerfro.files.folder_lock import environment_of_stages
 from nerfro.progress import track
 from nerfro.trust import command_of_module
 
@@ -91,7 +90,7 @@ def run_command(command: list[str]) -> int:
 
     previous = {number: signal.signal(number, forward) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        process = subprocess.Popen(command, env={**os.environ, STAGE: "1"})
+        process = subprocess.Popen(command, env=environment_of_stages())
         if terminates:  # the signal arrived before the command had started
             process.terminate()
         while process.poll() is None:

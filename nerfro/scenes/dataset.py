@@ -20,7 +20,9 @@ from PIL import Image
 from nerfro.errors import NerfroError
 from nerfro.files import lat_long
 from nerfro.files.atomic import write_atomically
+from nerfro.files.folder_lock import require_only
 from nerfro.files.images import save_image
+from nerfro.files.reading import read_json
 from nerfro.light import to_srgb
 from nerfro.scenes.path_tracer import Pinhole
 from nerfro.scenes.scene import Scene, lat_long_texture
@@ -99,8 +101,8 @@ class DataSet(ABC):
         settings = {"scene": self.config.scene, "fingerprint": fingerprint(self.scene)}
         settings |= {name: options[name] for name in self.OPTIONS}
         try:
-            stored = json.loads((self.folder / self.META).read_text()).get("settings")
-        except (FileNotFoundError, NotADirectoryError, ValueError, AttributeError):
+            stored = read_json(self.folder / self.META, "").get("settings")
+        except (NerfroError, AttributeError):
             stored = None
         if stored == settings:
             return
@@ -113,8 +115,8 @@ class DataSet(ABC):
             # Other files in the folder may belong to the user.
             for path in [path for pattern in self.FILES for path in self.folder.glob(pattern)]:
                 path.unlink()
-        elif self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
-            raise NerfroError(f"'{self.folder}' exists and is not a data set of nerfro; choose another with out=DIR")
+        else:
+            require_only(self.folder, (), "it is no data set of nerfro; choose another folder with out=DIR")
         versions = {name: importlib.metadata.version(name) for name in ("mitsuba", "drjit", "numpy")}
         versions |= {"python": platform.python_version(), "variant": mitsuba.variant()}
         meta = {"scene": self.config.scene, "ior": self.scene.ior, "tint": list(self.scene.tint)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Optional
 
@@ -11,6 +12,7 @@ from omegaconf import MISSING, DictConfig
 
 from nerfro.allowed import Count, Natural, NotNegative, Positive, Range
 from nerfro.errors import NerfroError
+from nerfro.files.folder_lock import lock_folder
 from nerfro.paths import user_path
 from nerfro.progress import progress_bar
 from nerfro.registry import discover
@@ -85,7 +87,12 @@ def synthesize(config: DictConfig) -> DataSet:
     """
     if len(config.absorption) != 3:
         raise NerfroError(f"absorption={list(config.absorption)} is not allowed; give red, green and blue")
-    scene, folder = build_scene(config.scene, config.resolution), user_path(config.out)
+    with lock_folder(user_path(config.out), "out"):
+        return _synthesize(config, user_path(config.out))
+
+
+def _synthesize(config: DictConfig, folder: Path) -> DataSet:
+    scene = build_scene(config.scene, config.resolution)
     ior = scene.ior if config.ior is None else config.ior
     scene = replace(scene, absorption=tuple(config.absorption), ior=ior)
     mitsuba = load_mitsuba(config.variant)  # a missing Mitsuba is reported before files are removed

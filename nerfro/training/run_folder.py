@@ -23,7 +23,7 @@ from torch import Tensor
 
 from nerfro.errors import Interrupted, NerfroError, first_of
 from nerfro.files.atomic import write_atomically
-from nerfro.files.folder_lock import lock_folder, remove_unfinished, require_only
+from nerfro.files.folder_lock import lock_folder, require_only
 from nerfro.files.foreign_config import foreign_config, read_foreign_config
 from nerfro.files.reading import reading
 from nerfro.kernels.available import fast_bfloat16
@@ -67,7 +67,6 @@ def own(folder: Path, config: DictConfig) -> Iterator[Path | None]:
         if config.ckpt_path is None or begun.resolve() != folder.resolve():
             advice = "resume a run (ckpt_path=last) or choose another folder (hydra.run.dir=...)"
             require_only(folder, (CELL_FILE,), advice)
-        remove_unfinished(folder)
         try:
             yield checkpoint
         except KeyboardInterrupt:  # before training, or after it

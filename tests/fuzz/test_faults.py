@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from filelock import FileLock
 
 from nerfro.evaluation.request import REQUEST_FILE
 from nerfro.training.run_folder import CONFIG_FILE, LAST_CHECKPOINT, load_checkpoint
@@ -140,26 +141,56 @@ class Disk:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
-@pytest.mark.parametrize("command", ["train", "evaluate", "trace", "summary"])
+# Options of each command that writes to a folder, or to a file in it; {out} stands for the folder.
+COMMANDS = {
+    "train": ["hydra.run.dir={out}"],
+    "evaluate": ["checkpoint={run}", "out={out}", "device=cpu"],
+    "render": ["checkpoint={run}", "out={out}", "device=cpu", "path=orbit", "frames=2", "resolution=8", "film=[gif]"],
+    "summary": ["runs=[{run}]", "out={out}", "report=true"],
+    "preprocess": ["data.root={data}", "out={out}", "resolution=16", "medium.resolution=24"],
+    "calibrate": ["images={data}/train", "out={out}", "write_board=true", "overwrite=true"],
+    "synthesize": ["scene=torus", "out={out}", "resolution=8", "spp=1"],
+    "reconstruct": ["images={data}/train", "masks={data}/train", "out={out}"],
+    "mask": ["data.root={out}", "outlines={{r_0: [4, 4, 12, 12]}}"],
+    "export": ["checkpoint={run}", "what=sky", "out={out}/sky.png", "resolution=8"],
+    "trace": ["medium.mesh={data}/mesh.ply", "medium.resolution=24", "medium.cache=false", "rays={rays}",
+              "out={out}/o.npz", "plot=true"],
+}  # fmt: skip
+
+
+def arguments(command: str, world: World, out: Path) -> list[str]:
+    """The command line of a command that writes to a folder."""
+    rays = world.root / "rays.npz"
+    if not rays.exists():
+        np.savez(rays, origins=np.tile([[0, 0, 4.0]], (9, 1)), directions=np.tile([[0, 0, -1.0]], (9, 1)))
+    places = {"out": out, "run": world.root / "run", "data": world.root / "data", "rays": rays}
+    given = [option.format(**places) for option in COMMANDS[command]]
+    return [*world.train_options(world.root / "data"), *given] if command == "train" else given
+
+
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("export", "trace")])
+def test_folder_that_another_process_uses_and_a_whole_file_system_are_refused(
+    command: str, world: World, tmp_path: Path
+) -> None:
+    with FileLock(tmp_path / ".lock"):
+        for out, words in ((tmp_path, "another process is writing to"), (Path("/"), "is a whole file system")):
+            ended = world.command(command, *arguments(command, world, out))
+            assert ended.code == 1
+            (line,) = ended.lines
+            assert words in line
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate", "render", "trace", "summary", "export"])
 def test_disk_that_is_full_at_any_file_is_told_in_one_line(
     command: str, world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    disk, run, out = Disk(monkeypatch), world.root / "run", world.root / "full"
-    origins, directions = np.tile([[0, 0, 4.0]], (9, 1)), np.tile([[0, 0, -1.0]], (9, 1))
-    np.savez(world.root / "rays.npz", origins=origins, directions=directions)
-    mesh = f"medium.mesh={world.root}/data/mesh.ply"
-    rays = f"rays={world.root}/rays.npz"
-    arguments = {
-        "train": [*world.train_options(world.root / "data"), f"hydra.run.dir={out}"],
-        "evaluate": [f"checkpoint={run / LAST_CHECKPOINT}", f"out={out}", "device=cpu"],
-        "trace": [mesh, "medium.resolution=24", "medium.cache=false", rays, f"out={out}/o.npz"],
-        "summary": [f"runs=[{run}]", f"out={out}", "report=true"],
-    }
+    disk, out = Disk(monkeypatch), world.root / "full"
     for number in range(100):
         disk.left = number
-        found = world.trouble(command, *arguments[command], own=(out,))
+        found = world.trouble(command, *arguments(command, world, out), own=(out,))
         assert found is None, f"full at file {number}: {found}"
         complete = disk.left >= 0
+        assert complete or not [*out.rglob("*.partial")]
         subprocess.run(["rm", "-rf", str(out)], check=True)
         if complete:
             break
