@@ -25,7 +25,7 @@ from nerfro.evaluation.treatments import score_split
 from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.images import load_png
 from nerfro.paths import user_path
-from nerfro.training.callbacks import Throughput
+from nerfro.training.callbacks import Throughput, steps_by_phase
 from nerfro.training.config import build_data, check_trained
 from nerfro.training.load import checkpoint_of, scene_of
 from nerfro.training.run_folder import CONFIG_FILE, load_checkpoint
@@ -73,7 +73,8 @@ def _evaluate_checkpoint(config: DictConfig) -> None:
             spent.load_state_dict(checkpoint["callbacks"]["Throughput"])
         title = f"{trained.name} on {trained.data.root}, {config.split} views"
         spending = checkpoint["global_step"], spent.seconds, spent.rays_per_second
-        report(RunMetrics(result, *spending, treated), title, folder)
+        phases = steps_by_phase(checkpoint["callbacks"], checkpoint["global_step"])
+        report(RunMetrics(result, *spending, treated, phases), title, folder)
     print(f"images and tables: {folder}")
 
 

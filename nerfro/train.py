@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch import Callback
 from omegaconf import DictConfig
 
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
@@ -24,7 +25,7 @@ from nerfro.evaluation.treatments import score_split
 from nerfro.fields.mlp import compile_networks
 from nerfro.subdivision import Subdivision
 from nerfro.training.build import build_training, check_first_batch
-from nerfro.training.callbacks import StopOnSignal, Throughput
+from nerfro.training.callbacks import StopOnSignal, Throughput, steps_by_phase
 from nerfro.training.config import TrainConfig, build_data, check_run, settle_trainer
 from nerfro.training.mesh_match import require_match
 from nerfro.training.run_folder import LAST_CHECKPOINT, begin, next_steps, own, require_same_run, resume_advice
@@ -95,7 +96,9 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
             metrics = ImageMetrics(*lpips, prefix=split)
             result, treated = score_split(renderer, test, metrics, folder, subdivision, config.evaluation.refine_steps)
             scores = {f"{split}/{name}": mean for name, mean in result.means().items()}
-            scored = RunMetrics(result, *spent, treated)
+            callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+            states = {callback.state_key: callback.state_dict() for callback in callbacks}
+            scored = RunMetrics(result, *spent, treated, steps_by_phase(states, spent[0]))
     finally:
         finish_logs(trainer, scores)
     if scored is not None:

@@ -103,6 +103,7 @@ class RunMetrics:
         train_seconds: wall-clock time of training in seconds, without evaluation; None without training.
         rays_per_second: training throughput; None without training.
         treatments: scores of the same views with corrected cameras or exposures; see `nerfro.evaluation.treatments`.
+        steps_by_phase: number of steps of each phase of the training, such as `background` and `scene`.
     """
 
     result: EvaluationResult
@@ -110,6 +111,7 @@ class RunMetrics:
     train_seconds: float | None = None
     rays_per_second: float | None = None
     treatments: Mapping[str, EvaluationResult] = field(default_factory=dict)
+    steps_by_phase: Mapping[str, int] = field(default_factory=dict)
 
 
 def write_metrics_json(path: Path | str, metrics: RunMetrics) -> None:
@@ -124,6 +126,7 @@ def write_metrics_json(path: Path | str, metrics: RunMetrics) -> None:
         "test_views": AS_GIVEN,
         "treatments": {name: _scored(treated) for name, treated in metrics.treatments.items()},
         "steps": metrics.steps,
+        "steps_by_phase": dict(metrics.steps_by_phase),
         "train_seconds": metrics.train_seconds,
         "rays_per_second": metrics.rays_per_second,
         "notes": dict(result.notes),
@@ -156,7 +159,8 @@ def read_metrics_json(path: Path | str) -> RunMetrics:
             for name, treated in content.get("treatments", {}).items()
         }
         spent = {key: _number(content[key]) for key in ("steps", "train_seconds", "rays_per_second")}
-        return RunMetrics(result, **spent, treatments=treatments)  # type: ignore[arg-type]
+        phases = {str(phase): _number(count) for phase, count in content.get("steps_by_phase", {}).items()}
+        return RunMetrics(result, **spent, treatments=treatments, steps_by_phase=phases)  # type: ignore[arg-type]
     except (KeyError, TypeError, AttributeError) as error:
         raise NerfroError(f"{path} is not a metrics file ({error!r}); run nerfro.evaluate on the run again") from error
 

@@ -13,7 +13,7 @@ from nerfro.fields.base import Field
 from nerfro.progress import track
 from nerfro.rendering import Renderer
 from nerfro.training.callbacks import StopOnSignal
-from nerfro.training.module import TrainingModule
+from nerfro.training.module import TrainingModule, training_progress
 from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Exits
 
@@ -21,6 +21,8 @@ from nerfro.types import Exits
 _NUM_PIXELS, _SHARE = 16384, 0.01
 # Pretraining ends if fewer of the drawn pixels miss the object.
 _MIN_PIXELS = 64
+# Largest fraction of `trainer.max_time` that pretraining takes, so that short runs train the scene, too.
+_TIME_SHARE = 0.2
 # Factor of the learning rate of the background in the first and in the last step.
 _RATES = 25.0, 1.0
 
@@ -30,6 +32,8 @@ class BackgroundPretraining(Callback):
 
     Such pixels need one evaluation of the background and no tracing. With a known background, the first gradients of
     the field depend on the object. The optimizer of the run takes the steps, so that its moments are initialized, too.
+
+    Pretraining ends early after a fifth of `trainer.max_time`.
 
     Args:
         num_steps: number of steps. If `StopOnSignal` ends pretraining, a resumed run takes the remaining steps.
@@ -64,9 +68,10 @@ class BackgroundPretraining(Callback):
             if any(interruption.stop(trainer) for interruption in interruptions):
                 break
             rays, view, rgb = batches.missing(box, num_pixels, step, scene.camera)
-            if len(rays) < _MIN_PIXELS:
+            progress = max(step / self._num_steps, training_progress(trainer) / _TIME_SHARE)
+            if len(rays) < _MIN_PIXELS or progress >= 1:
                 break
-            group["lr"] = group["initial_lr"] * first * (last / first) ** (step / self._num_steps)
+            group["lr"] = group["initial_lr"] * first * (last / first) ** progress
             radiance = scene.boundary(Exits.unbent(rays))
             compared = scene.colour_space.prediction_and_target(radiance, rgb, scene.camera.gains(view))
             loss = torch.nn.functional.mse_loss(*compared)

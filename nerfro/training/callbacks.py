@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import signal
 import time
+from collections.abc import Mapping
 from datetime import timedelta
 from types import FrameType
 from typing import Any
@@ -17,6 +18,19 @@ from tqdm import tqdm
 from nerfro.progress import progress_bar
 from nerfro.training.module import training_progress
 from nerfro.types import Batch
+
+_PHASES = {"background": "BackgroundPretraining", "cameras": "CameraSteps"}  # callbacks that take steps of their own
+
+
+def steps_by_phase(callbacks: Mapping[str, Any], num_steps: int) -> dict[str, int]:
+    """Return the number of steps in each phase of a training that took steps.
+
+    Args:
+        callbacks: states of the callbacks by name, as in a checkpoint.
+        num_steps: number of training steps.
+    """
+    taken = {phase: callbacks.get(name, {}).get("num_done", 0) for phase, name in _PHASES.items()}
+    return {phase: count for phase, count in taken.items() if count} | {"scene": num_steps}
 
 
 class Throughput(Callback):

@@ -47,6 +47,7 @@ class CameraSteps(Callback):
         self._views = views
         self._priors: dict[str, PriorInformation] = {}  # by source
         self._aligned = False  # a run that resumes at step 0 does not repeat the alignment
+        self._num_done = 0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, TrainingModule)
@@ -61,10 +62,11 @@ class CameraSteps(Callback):
         self._aligned = True
 
     def state_dict(self) -> dict[str, Any]:
-        return {"aligned": self._aligned, "priors": {name: dict(vars(prior)) for name, prior in self._priors.items()}}
+        priors = {name: dict(vars(prior)) for name, prior in self._priors.items()}
+        return {"num_done": self._num_done, "aligned": self._aligned, "priors": priors}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._aligned = state_dict["aligned"]
+        self._num_done, self._aligned = state_dict.get("num_done", 0), state_dict["aligned"]
         self._priors = {name: PriorInformation(**prior) for name, prior in state_dict["priors"].items()}
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
@@ -80,6 +82,7 @@ class CameraSteps(Callback):
         # Errors may increase: the scene fits the current cameras, so they are at a local minimum.
         settings = Step(difference, _ERROR_SCALE * difference, _MAX_PIXELS, fraction, keep_improvements=False)
         _move(pl_module.renderer, camera, data.batches, step, settings, self._priors)
+        self._num_done += 1
 
 
 @torch.no_grad()

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from lightning.pytorch.callbacks import timer
 from torch import Tensor
 
 from nerfro.data.blender import BlenderData
+from nerfro.evaluation.results import read_metrics_json
 from nerfro.training import background_pretraining
+from nerfro.training.callbacks import steps_by_phase
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 
@@ -40,6 +45,20 @@ def test_the_boundary_alone_has_learned_before_the_first_step(weights: Callable[
     without, learned = weights("without", "optimizer.boundary_steps=0"), weights("with", "optimizer.boundary_steps=20")
     changed = {name for name, value in learned.items() if not torch.equal(value, without[name])}
     assert changed == {"renderer.scene.boundary.texels"}
+
+
+def test_pretraining_leaves_time_for_the_scene(
+    weights: Callable[..., dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    seconds = itertools.count()
+    monkeypatch.setattr(timer, "time", SimpleNamespace(monotonic=lambda: float(next(seconds))))
+    weights("run", "optimizer.boundary_steps=100000", "trainer.max_time=300s")
+    checkpoint = load_checkpoint(tmp_path / "run" / LAST_CHECKPOINT)[0]
+    phases = steps_by_phase(checkpoint["callbacks"], checkpoint["global_step"])
+    # The clock advances by at least a second in each step, and pretraining takes a fifth of the limit.
+    assert phases["scene"] == 1
+    assert 0 < phases["background"] <= 60
+    assert read_metrics_json(tmp_path / "run" / "metrics.json").steps_by_phase == phases
 
 
 def test_rays_that_miss_a_box_have_their_own_colours(tiny_scene: Path) -> None:
