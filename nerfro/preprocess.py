@@ -9,19 +9,17 @@ from __future__ import annotations
 
 from typing import cast
 
-import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
-from jaxtyping import Float
 from omegaconf import DictConfig
 
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.capture.index_search import find_medium
-from nerfro.capture.overlaps import choose_wrong_masks, draw_overlays, report_overlaps
+from nerfro.capture.overlaps import choose_wrong_masks, report_overlaps
 from nerfro.capture.pose_conventions import require_consistent_poses
 from nerfro.capture.preprocess_options import MESH, PreprocessConfig, Request, conclude, surface_settings
 from nerfro.capture.refinement import refine
-from nerfro.capture.surface import make_mesh, read_silhouettes, surfaces_inside
+from nerfro.capture.surface import make_mesh, read_silhouettes
 from nerfro.capture.surroundings import Observations
 from nerfro.capture.vessel_fit import find_vessel
 from nerfro.capture.visual_hull import Silhouettes
@@ -50,10 +48,10 @@ def _preprocess(config: DictConfig, request: Request) -> None:
     mesh = None if config.mesh is None else load_mesh(resolve_path(config.mesh))
     refuse_existing(request.files, config.overwrite)
     source = build(config.data)
-    views, silhouettes, overlaps = masked_views(source.load("train")), None, None
+    views, silhouettes = masked_views(source.load("train")), None
     outlined = with_other_splits(views, source, "train")
     if mesh is None or outlined.masks is not None:
-        mesh, outlined, silhouettes, overlaps = _reconstruct(request, outlined, mesh)
+        mesh, outlined, silhouettes = _reconstruct(request, outlined, mesh)
     location = config.mesh or str(request.folder / MESH)
     settings = surface_settings(request, views.cameras, mesh, location)
     observations = Observations(views, mesh, config.room)
@@ -69,26 +67,20 @@ def _preprocess(config: DictConfig, request: Request) -> None:
         settings = surface_settings(request, views.cameras, mesh, location)
         if mesh is not given:
             if silhouettes is not None:
-                overlaps = report_overlaps(outlined, mesh, silhouettes, None, request.folder, list_all=False)
+                report_overlaps(outlined, mesh, silhouettes, None, request.folder, list_all=False)
             found = find_medium(request, observations, location, settings)
-    inside = surfaces_inside(found.medium)
-    if overlaps is not None and inside:
-        draw_overlays(outlined, mesh, overlaps, inside, request.folder)
     index, is_doubtful = found.index_settings, found.is_doubtful
     vessel = find_vessel(cast(SdfGrid, found.medium), location, mesh, observations) if config.vessel else {}
     conclude(request, settings, index, is_doubtful, observations.near, views.cameras, vessel)
 
 
-def _reconstruct(
-    request: Request, views: Views, mesh: TriangleMesh | None
-) -> tuple[TriangleMesh, Views, Silhouettes, Float[np.ndarray, "V"]]:
+def _reconstruct(request: Request, views: Views, mesh: TriangleMesh | None) -> tuple[TriangleMesh, Views, Silhouettes]:
     """Carve and fit the surface unless a mesh is given, and compare it with the masks.
 
     Masks that are projections of a hull carry the shape of this hull, but are no evidence about the object.
 
     Returns:
-        The surface, the views whose masks are no projections, the silhouettes of these masks, and the overlap of the
-        surface with each of these masks.
+        The surface, the views whose masks are no projections, and the silhouettes of these masks.
     """
     config, folder = request.config, request.folder
     all_silhouettes = read_silhouettes(views, request.box is not None)
@@ -105,8 +97,8 @@ def _reconstruct(
         surface = make_mesh(all_silhouettes, request.box, *options, evidence=silhouettes)
         surface.save(folder / MESH)
     # The report is written before the medium is built, because the report shows why a medium refuses a surface.
-    overlaps = report_overlaps(views, surface, silhouettes, wrong_masks if mesh is None else None, folder)
-    return surface, views, silhouettes, overlaps
+    report_overlaps(views, surface, silhouettes, wrong_masks if mesh is None else None, folder)
+    return surface, views, silhouettes
 
 
 if __name__ == "__main__":

@@ -18,11 +18,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Num
 
-from nerfro.capture.preprocess_options import CURVE, INDEX, Request, build_medium, index_settings
+from nerfro.capture.preprocess_options import INDEX, Request, build_medium, index_settings
 from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings, half_weight, robust
 from nerfro.cli import warn
 from nerfro.errors import NerfroError
-from nerfro.files.atomic import atomic_file, write_atomically
+from nerfro.files.atomic import write_atomically
 from nerfro.media.base import Medium
 from nerfro.media.solid import Solid
 from nerfro.progress import bar
@@ -67,9 +67,8 @@ class Estimate:
         names: names of the indices for messages.
         values: the indices.
         standard_errors: standard errors by resampling of the views; errors of the surface are not included.
-        coarse, fine: candidates of the first and of the last grid, with their mean robust errors in the last column: 0
-            for exact colours, 1 for outliers. The two grids use different pixels and are not comparable.
-        unrelated: mean robust error of unrelated colours.
+        coarse: candidates of the first grid, with their mean robust errors in the last column: 0 for exact colours, 1
+            for outliers.
         doubts: reasons why the photographs do not determine the indices; empty for a reliable estimate.
     """
 
@@ -77,8 +76,6 @@ class Estimate:
     values: Float[np.ndarray, "K"]
     standard_errors: Float[np.ndarray, "K"]
     coarse: Float[np.ndarray, "C N"]
-    fine: Float[np.ndarray, "c N"]
-    unrelated: float
     doubts: list[str]
 
 
@@ -131,8 +128,7 @@ def find_indices(
     names = ["index"] if num_bodies == 1 else [f"index of body {body + 1}" for body in range(num_bodies)]
     depth, known = 1 - errors.min() / search.unrelated, counts.sum() / search.num_pixels
     doubts = _doubts(names, middle, np.where(curvature[0] > 0, standard_errors, np.inf), depth, known)
-    first, last = np.column_stack([coarse, coarse_errors.T]), np.column_stack([fine, errors.T])
-    return Estimate(names, middle, standard_errors, first, last, search.unrelated, doubts)
+    return Estimate(names, middle, standard_errors, np.column_stack([coarse, coarse_errors.T]), doubts)
 
 
 def _grid(steps: int, num_axes: int) -> Float[np.ndarray, "C K"]:
@@ -329,7 +325,7 @@ def find_medium(
 
 
 def _search_index(observations: Observations, medium: Solid, folder: Path) -> Estimate:
-    """Search the indices of the bodies of a medium, print the result, and write index.json and index.png.
+    """Search the indices of the bodies of a medium, print the result, and write index.json.
 
     Args:
         observations: observations of the object and its surroundings.
@@ -342,32 +338,8 @@ def _search_index(observations: Observations, medium: Solid, folder: Path) -> Es
     for name, value, error in zip(found.names, found.values, found.standard_errors, strict=True):
         print(f"{name}: {value:.5g} +- {error:.2g} (standard error by resampling of the views)")
     for doubt in found.doubts:
-        warn(f"the photographs do not determine the {' and '.join(found.names)}: {doubt}; look at {CURVE}")
-    _plot(found, folder / CURVE)
+        warn(f"the photographs do not determine the {' and '.join(found.names)}: {doubt}")
     values, errors = ([round(float(x), 5) for x in each] for each in (found.values, found.standard_errors))
     figures = {"ior": values, "standard_error": errors, "doubts": found.doubts}
     write_atomically(folder / INDEX, json.dumps(figures, indent=1) + "\n")
     return found
-
-
-def _plot(found: Estimate, file: Path) -> None:
-    """Plot the error against each index, minimized over the other index, on the coarse and on the last fine grid."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    count = len(found.names)
-    figure = Figure(figsize=(11, 4 * count), layout="constrained", dpi=110)
-    for number, axes in enumerate(figure.subplots(count, 2, squeeze=False)):
-        best, error = found.values[number], found.standard_errors[number]
-        for plot, grid in zip(axes, (found.coarse, found.fine), strict=True):
-            values = np.unique(grid[:, number])
-            plot.plot(values, [grid[grid[:, number] == value, -1].min() for value in values], "o-", markersize=4)
-            plot.axvline(best, color="tab:red", linewidth=1)
-            plot.axvspan(best - error, best + error, color="tab:red", alpha=0.2)
-            plot.set_xlabel(found.names[number])
-            plot.set_ylabel("robust error")
-        axes[0].axhline(found.unrelated, color="grey", linestyle=":", label="unrelated colours")
-        axes[0].legend()
-        axes[1].set_title(f"{best:.5g} ± {error:.2g}")
-    with atomic_file(file) as stream:
-        FigureCanvasAgg(figure).print_png(stream)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.capture.pose_conventions import GOOD_OVERLAP, better_wrong_masks, overlap
@@ -27,7 +27,6 @@ _MAX_VIEWS, _COLUMNS = 48, 8
 _WIDTH = 192  # width of a tile, in pixels
 _NAME_LENGTH = 16  # number of last characters of a name that fit below a tile
 _BOTH, _MASK_ONLY, _SURFACE_ONLY = (60, 190, 90), (235, 60, 45), (40, 110, 240)
-_OUTLINES = {"yellow": (255, 215, 0), "white": (255, 255, 255)}  # colours of the first and of further inner bodies
 
 
 def choose_wrong_masks(silhouettes: Silhouettes, wrong_masks: int | None) -> int:
@@ -45,7 +44,7 @@ def report_overlaps(
     wrong_masks: int | None,
     folder: Path,
     list_all: bool = True,
-) -> Float[np.ndarray, "V"]:
+) -> None:
     """Print and write the overlap of the silhouettes of a surface with the masks.
 
     Args:
@@ -55,9 +54,6 @@ def report_overlaps(
         wrong_masks: number of views that may be wrong in the visual hull; None for a surface of another origin.
         folder: output folder.
         list_all: print the overlap of every view.
-
-    Returns:
-        Intersection over union by view.
     """
     overlaps = overlap(mesh, silhouettes, _MAX_PIXELS)
     print("overlap (intersection over union) of the silhouette of the surface with each mask:")
@@ -66,11 +62,10 @@ def report_overlaps(
     worst = int(overlaps.argmin())
     print(f"  {overlaps.mean():.4f}  mean; {overlaps[worst]:.4f} lowest, {views.names[worst]}")
     _warn_of_bad(overlaps, views.names, silhouettes, wrong_masks)
-    draw_overlays(views, mesh, overlaps, [], folder)
+    _draw_overlays(views, mesh, overlaps, folder)
     each = dict(zip(views.names, (round(float(x), 4) for x in overlaps), strict=True))
     figures = {"mean": round(float(overlaps.mean()), 4), "views": each}
     write_atomically(folder / REPORT, json.dumps(figures, indent=1) + "\n")
-    return overlaps
 
 
 def _warn_of_bad(
@@ -87,43 +82,22 @@ def _warn_of_bad(
     )
 
 
-def draw_overlays(
-    views: Views, mesh: TriangleMesh, overlaps: Float[np.ndarray, "V"], inside: list[TriangleMesh], folder: Path
-) -> None:
+def _draw_overlays(views: Views, mesh: TriangleMesh, overlaps: Float[np.ndarray, "V"], folder: Path) -> None:
     """Write a contact sheet of the views with the smallest overlap, the worst first.
 
     Green pixels belong to mask and silhouette, red ones to the mask alone, blue ones to the silhouette alone.
-
-    Args:
-        views: views with masks.
-        mesh: the surface.
-        overlaps: intersection over union by view.
-        inside: inner bodies, drawn as outlines.
-        folder: output folder.
     """
     assert views.masks is not None
     stride = pixel_stride(views.cameras, _MAX_PIXELS)
     chosen = np.argsort(overlaps, kind="stable")[:_MAX_VIEWS].tolist()
     pictures, captions = [], []
     cameras = views.cameras.select(chosen)
-    outlines = [_outlines(mesh_silhouettes(body, cameras, stride)) for body in inside]
-    for place, (view, ours) in enumerate(zip(chosen, mesh_silhouettes(mesh, cameras, stride), strict=True)):
+    for view, ours in zip(chosen, mesh_silhouettes(mesh, cameras, stride), strict=True):
         theirs = views.masks[view][::stride, ::stride] > 0.5
-        picture = _tinted(views.images[view][::stride, ::stride], ours, theirs)
-        for body, outline in enumerate(outlines):
-            picture[outline[place]] = torch.tensor(list(_OUTLINES.values())[min(body, 1)]) / 255
-        pictures.append(picture)
+        pictures.append(_tinted(views.images[view][::stride, ::stride], ours, theirs))
         captions.append(f"{overlaps[view]:.3f}  {views.names[view][-_NAME_LENGTH:]}")
-    colours = [f"{colour}: body {body + 2}" for body, colour in zip(range(len(inside)), _OUTLINES, strict=False)]
-    legend = ", ".join(["green: both, red: mask only, blue: surface only", *colours])
-    legend += f"; worst {len(chosen)} of {len(views)} views"
+    legend = f"green: both, red: mask only, blue: surface only; worst {len(chosen)} of {len(views)} views"
     save_image(folder / SHEET, sheet(pictures, captions, _WIDTH, _COLUMNS, legend))
-
-
-def _outlines(silhouettes: Bool[Tensor, "V h w"]) -> Bool[Tensor, "V h w"]:
-    """Select the pixels of silhouettes that touch a pixel outside."""
-    others = torch.nn.functional.max_pool2d((~silhouettes[:, None]).float(), 3, 1, 1)[:, 0]
-    return silhouettes & (others > 0)
 
 
 def _tinted(image: Tensor, ours: Tensor, theirs: Tensor) -> Tensor:

@@ -28,7 +28,7 @@ from nerfro.paths import EMBEDDED_PREFIX, resolve_path, user_path
 from nerfro.registry import build
 
 MESH, FOUND = "mesh.ply", "preprocess.json"
-INDEX, CURVE, FIGURES = "index.json", "index.png", "refinement.json"
+INDEX, FIGURES = "index.json", "refinement.json"
 # Margin of the index grid around the object, as a fraction of the object's size.
 _MARGIN = 0.15
 
@@ -108,7 +108,7 @@ class Request:
         config = self.config
         names = [MESH] if config.mesh is None or config.refine else []
         names += [SHEET, REPORT]
-        names += [INDEX, CURVE] if self.searches_index else []
+        names += [INDEX] if self.searches_index else []
         names += [FIGURES] if config.refine else []
         return [self.folder / name for name in [*names, FOUND]]
 

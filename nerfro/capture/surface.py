@@ -15,8 +15,6 @@ from nerfro.cli import warn
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError, first_of
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.media.base import Medium
-from nerfro.media.sdf_grid import SdfGrid
 from nerfro.progress import bar
 
 _FEWEST_VIEWS, _FEW_VIEWS = 3, 12
@@ -142,15 +140,6 @@ def _choose_symmetry(
         return free
     print(result)
     return revolution if symmetric >= unconstrained - _MAX_OVERLAP_LOSS[symmetry] else free
-
-
-def surfaces_inside(medium: Medium) -> list[TriangleMesh]:
-    """Extract the surfaces of the inner bodies of a medium on a grid; empty for other media."""
-    if not isinstance(medium, SdfGrid):
-        return []
-    low, spacing = (values.double().cpu().numpy() for values in (medium.box[0], medium.spacing))
-    of_bodies = medium.distances.cummax(0).values[1:].cpu().numpy()
-    return [extract_surface(distances, low, spacing) for distances in of_bodies if (distances < 0).any()]
 
 
 def _object_box(silhouettes: Silhouettes, wrong_masks: int) -> Float[np.ndarray, "2 3"]:
