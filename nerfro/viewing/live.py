@@ -1,42 +1,19 @@
 """Interactive page of a model during training, updated within a fixed fraction of the training time."""
 
-# ruff: noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
-from typing import Annotated, Optional
 
-from omegaconf import MISSING
-
-from nerfro.allowed import Range
 from nerfro.data.base import Views
 from nerfro.viewing.baking import Baked
 from nerfro.viewing.page import assemble_page, bake_parts, static_parts
 from nerfro.viewing.server import PageServer
 from nerfro.viewing.trained_scene import TrainedScene
-from nerfro.viewing.volume import RESOLUTION
-
-POLL_SECONDS = 3.0  # interval at which the command checks for a new checkpoint
 
 _TIME_FRACTION = 0.02  # maximum share of the training time that updates take
 _UPDATE_SECONDS = 5.0  # target interval between updates; the resolution of the volume is adapted
 _RESOLUTIONS = 24, 128  # bounds of the adapted resolution
 _COMPRESSION = 1  # fastest level of zlib, because local connections are fast
-
-
-@dataclass
-class ViewConfig:
-    """Options of `python -m nerfro.view`."""
-
-    checkpoint: str = MISSING  # run folder, or a checkpoint in it
-    host: str = "localhost"  # address of the server; 0.0.0.0 accepts connections from other machines
-    port: Annotated[int, Range(at_least=0, at_most=65535)] = 8008  # 0 for any free port
-    open: bool = True  # whether to open a browser
-    resolution: Annotated[int, Range(at_least=2)] = RESOLUTION  # grid vertices along the longest side of the volume
-    root: Optional[str] = None  # folder of the data, if it has moved since training
-    device: str = "auto"  # `cpu`, `cuda`, or `auto` for a GPU if there is one
 
 
 class LivePage:
@@ -61,21 +38,21 @@ class LivePage:
         self._next = time.monotonic()
 
     def update(self) -> None:
-        """Publish the current model, if an update is due and a browser shows the page."""
+        """Call `show` if an update is due and a browser shows the page."""
         start = time.monotonic()
         if start < self._next or not self._server.watched:
             return
-        self.show(self._scene)
+        self.show()
         duration = time.monotonic() - start
         self._next = start + max(duration / _TIME_FRACTION, _UPDATE_SECONDS)
         scale = (_TIME_FRACTION * _UPDATE_SECONDS / duration) ** (1 / 3)
         low, high = _RESOLUTIONS
         self._resolution = round(min(max(self._resolution * min(max(scale, 0.7), 1.3), low), high))
 
-    def show(self, scene: TrainedScene) -> None:
-        """Publish another state of the scene."""
-        surface_changes = any(parameter.requires_grad for parameter in scene.renderer.scene.medium.parameters())
-        self._scene = scene
+    def show(self) -> None:
+        """Publish the current model."""
+        medium = self._scene.renderer.scene.medium
+        surface_changes = any(parameter.requires_grad for parameter in medium.parameters())
         parts = self._bake(surface=surface_changes)
         arrays = {name: uri for part in parts.values() for name, uri in part.packed(_COMPRESSION).items()}
         self._server.publish({name: part.facts for name, part in parts.items()}, arrays)

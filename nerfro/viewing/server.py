@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 import webbrowser
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -92,11 +92,6 @@ class PageServer:
         """Append a point to the training curve."""
         with self._lock:
             self._losses.append((step, loss))
-
-    def set_losses(self, losses: Sequence[tuple[int, float]]) -> None:
-        """Replace the training curve by pairs of optimization step and loss."""
-        with self._lock:
-            self._losses = list(losses)
 
     def page(self) -> bytes:
         return self._page

@@ -62,7 +62,7 @@ def test_bakes_take_their_share_of_the_time(scene: TrainedScene, server: PageSer
 def test_training_mode_and_weights_stay(scene: TrainedScene, server: PageServer) -> None:
     scene.renderer.train()
     page = LivePage(server, scene, scene.views(), "test", resolution=8)
-    page.show(scene)
+    page.show()
     assert scene.renderer.training
     assert set(json.loads(server.state(0))["news"]["scene"]) == {"volume", "sky", "version"}, "the surface stays"
 
@@ -72,7 +72,7 @@ def test_browser_shows_news_and_losses(scene: TrainedScene, server: PageServer, 
     page = LivePage(server, scene, scene.views(), "test", resolution=8)
     server.add_loss(3, 0.5)
     server.add_loss(7, 0.25)
-    page.show(scene)
+    page.show()
     with Browser(server.url, tmp_path) as browser:
         browser.wait_for("document.body.textContent.includes('step 7, training loss 0.250')")
         browser.wait_for("document.querySelector('polyline[points^=\"428\"]') !== null")

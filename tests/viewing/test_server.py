@@ -45,14 +45,12 @@ def test_page_and_its_news(server: PageServer) -> None:
 
 
 def test_a_long_curve_is_thinned_and_keeps_its_end(server: PageServer) -> None:
-    server.set_losses([(step, 1 / (step + 1)) for step in range(0, 12340, 10)])
-    server.add_loss(12340, 0.5)
+    for step in range(0, 12350, 10):
+        server.add_loss(step, 0.5)
     losses = json.loads(server.state(0))["losses"]
     assert 300 < len(losses) <= 500
     assert losses[-1] == [12340, 0.5]
     assert [step for step, _ in losses] == sorted(step for step, _ in losses)
-    server.set_losses([])
-    assert json.loads(server.state(0))["losses"] == []
 
 
 @pytest.mark.parametrize("path", ["/../pyproject.toml", "/etc/passwd", "/%2e%2e/pyproject.toml", "/index.html"])
