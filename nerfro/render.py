@@ -19,14 +19,14 @@ from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.paths import CONF_DIR, user_path
 from nerfro.training.load import checkpoint_of, load
 from nerfro.viewing.film import find_ffmpeg, write_film
-from nerfro.viewing.frames import FrameRenderer, render_frames
+from nerfro.viewing.frames import render_frames
 from nerfro.viewing.layers import LAYERS
-from nerfro.viewing.render_request import RenderConfig, check_request, checkpoints, find_shots, labels, prepared
+from nerfro.viewing.render_request import RenderConfig, check_request, find_shots, prepared
 
 
 @entry_point("render", RenderConfig, CONF_DIR / "render")
 def main(config: DictConfig) -> None:
-    """Check the request, load the scenes, render the missing frames, and encode films."""
+    """Check the request, load the scene, render the missing frames, and encode films."""
     check_request(config)
     keep_freed_memory()
     with lock_folder(user_path(config.out), "out"):
@@ -34,16 +34,14 @@ def main(config: DictConfig) -> None:
 
 
 def _render(config: DictConfig, folder: Path) -> None:
-    runs = checkpoints(config)
-    scenes = [prepared(config, load(run, config.device, config.root)) for run in runs]
-    shots = find_shots(config, scenes[0])
-    renderer = FrameRenderer(scenes, labels(config), LAYERS[config.what])
-    inputs = [*map(checkpoint_of, runs), *([config.sky] if config.sky else [])]
-    request = (config.what, renderer.labels, scenes[0].subdivision, *map(file_hash, inputs))
+    scene = prepared(config, load(config.checkpoint, config.device, config.root))
+    shots = find_shots(config, scene)
+    inputs = [checkpoint_of(config.checkpoint), *([config.sky] if config.sky else [])]
+    request = (config.what, scene.subdivision, *map(file_hash, inputs))
     films = config.film if shots.film and config.format == "png" else []
     if "mp4" in films:
         find_ffmpeg()  # a missing ffmpeg is reported before the frames are rendered
-    files = render_frames(renderer, shots, folder, f".{config.format}", request, config.overwrite)
+    files = render_frames(LAYERS[config.what], scene, shots, folder, f".{config.format}", request, config.overwrite)
     print(f"{len(files)} frames: {files[0]}")
     for form in films:
         film = folder / f"film.{form}"

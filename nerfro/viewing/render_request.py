@@ -33,7 +33,7 @@ FilmFormat = Annotated[str, Literal["mp4", "gif"]]
 class RenderConfig:
     """Options of `python -m nerfro.render`; `path`, `views` or `position` selects the cameras."""
 
-    checkpoint: Any = MISSING  # run folder or a checkpoint in it; a list shows several runs side by side
+    checkpoint: str = MISSING  # run folder or a checkpoint in it
     path: Optional[str] = None  # path around the object: orbit, spiral, arc or dolly; or FILE.json of cameras
     frames: Count = 120  # number of frames of the film
     seconds: Positive = 5.0  # duration of the film
@@ -57,7 +57,6 @@ class RenderConfig:
     # Format of the frames; exr stores values in their units: linear radiance, world units, unit vectors.
     format: Annotated[str, Literal["png", "exr"]] = "png"
     film: list[FilmFormat] = dataclasses.field(default_factory=lambda: ["mp4"])  # mp4, gif, both or none
-    labels: Optional[list[str]] = None  # captions of images side by side; by default the names of the run folders
     root: Optional[str] = None  # folder of the data, if it has moved since training
     device: str = "auto"  # `cpu`, `cuda`, or `auto` for a GPU if there is one
     overwrite: bool = False  # whether other frames in `out` may be replaced
@@ -93,23 +92,7 @@ def check_request(config: DictConfig) -> None:
         raise NerfroError(f"target={list(config.target)} needs position=[X,Y,Z]; add the position, or remove target")
     if config.path is not None and config.path not in PATHS and not config.path.endswith(".json"):
         raise NerfroError(f"path={config.path} is not known; give {', '.join(PATHS)}, or a FILE.json of cameras")
-    if config.format == "exr" and len(checkpoints(config)) > 1:
-        raise NerfroError("format=exr cannot show runs side by side with captions; set format=png, or give one run")
-    if config.labels is not None and len(config.labels) != len(checkpoints(config)):
-        raise NerfroError(f"{len(config.labels)} labels for {len(checkpoints(config))} runs; give one for each")
     _size(config, 1, 1)
-
-
-def checkpoints(config: DictConfig) -> list[str]:
-    """Return the runs that are shown side by side."""
-    given = config.checkpoint
-    return [str(path) for path in given] if isinstance(given, ListConfig) else [str(given)]
-
-
-def labels(config: DictConfig) -> list[str]:
-    """Return the caption of each run: the given labels, or the names of the run folders."""
-    paths = [user_path(path) for path in checkpoints(config)]
-    return list(config.labels or [path.name if path.is_dir() else path.absolute().parent.parent.name for path in paths])
 
 
 def prepared(config: DictConfig, scene: TrainedScene) -> TrainedScene:

@@ -122,17 +122,6 @@ def test_another_sky_replaces_the_scenes(render: Callable[..., tuple[int, str]])
     np.testing.assert_allclose(read("O/test_000.png"), 255 * (1.055 * 0.5 ** (1 / 2.4) - 0.055), atol=2)
 
 
-def test_runs_stand_side_by_side_under_their_names(render: Callable[..., tuple[int, str]], scene: TrainedScene) -> None:
-    Path("b.ckpt").write_bytes(b"another")
-    code, err = render("checkpoint=[a.ckpt,b.ckpt]", "labels=[one,two]", "views=test:0", "resolution=64")
-    assert code == 0, err
-    both = read("O/test_000.png")
-    alone = scene.render(scene.cameras().select([0]).resized(64, 64), Subdivision()).rgb[0]
-    for left in (0, both.shape[1] - 64):
-        np.testing.assert_allclose(both[:64, left : left + 64], 255 * alone, atol=0.51)
-        assert both[64:, left : left + 64].min() < 100, "a label in ink"
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -148,7 +137,6 @@ def test_runs_stand_side_by_side_under_their_names(render: Callable[..., tuple[i
         (["path=orbit", "film=[avi]"], "film=['avi'] is not allowed; choose 'mp4', 'gif'"),
         (["views=test", "resolution=[1,2,3]"], "resolution=[1, 2, 3] is not allowed"),
         (["views=test", "resolution=0"], "resolution=0 is not allowed"),
-        (["views=test", "checkpoint=[a.ckpt,a.ckpt]", "labels=[one]"], "1 labels for 2 runs"),
         (["views=test", "sky=gone.hdr"], "the sky gone.hdr does not exist"),
         (["path=orbit", "fov=190"], "fov=190.0 is not allowed; take more than 0 and less than 180"),
     ],
