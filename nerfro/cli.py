@@ -73,6 +73,11 @@ RENAMED: dict[str, str | None] = {
     "optimizer.surface_learning_rate": None,
     "optimizer.surface_start": None,
     "search": None,
+    "labels": None,  # of render
+    "lpips_backbone": None,  # of evaluate
+    "lpips_vgg_backbone": None,
+    "evaluation.lpips_backbone": None,
+    "evaluation.lpips_vgg_backbone": None,
     "batches.supersample": "batches.subdivision.side",
     "batches.divergence": "batches.subdivision.divergence",
     "batches.contrast": "batches.subdivision.contrast",

@@ -30,10 +30,7 @@ from nerfro.training.config import build_data, check_trained
 from nerfro.training.load import checkpoint_of, scene_of
 from nerfro.training.run_folder import CONFIG_FILE, load_checkpoint
 
-# Options that replace the options of the run, if given.
-_ADOPTED = (
-    "chunk_size", "lpips_backbone", "lpips_vgg_backbone", "refine_steps",
-)  # fmt: skip
+_ADOPTED = ("chunk_size", "refine_steps")  # options that replace the options of the run, if given
 
 
 @entry_point("evaluate", EvaluateConfig)
@@ -57,9 +54,7 @@ def _evaluate_checkpoint(config: DictConfig) -> None:
     with own_folder(config, path.parent.parent / f"evaluate_{config.split}") as folder:
         scene = scene_of(checkpoint, trained, device)
         views = scene.views(config.split).checked()
-        networks, reasons = find_lpips_networks(
-            trained.evaluation.lpips_backbone, trained.evaluation.lpips_vgg_backbone
-        )
+        networks, reasons = find_lpips_networks()
         metrics = ImageMetrics(networks, reasons, config.protocol == "8bit", prefix=config.split)
         record(folder, config)
         result, treated = score_split(
@@ -86,7 +81,7 @@ def _evaluate_folder(config: DictConfig) -> None:
         pair.load(config.alpha)
     device = find_device(config.device)
     with own_folder(config, predictions / "scores") as folder:
-        networks, reasons = find_lpips_networks(config.lpips_backbone, config.lpips_vgg_backbone)
+        networks, reasons = find_lpips_networks()
         metrics = ImageMetrics(networks, reasons, config.protocol == "8bit")
         record(folder, config)
         result = score_folders(pairs, config.alpha, metrics, networks, folder, device)

@@ -57,7 +57,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     test = training if split is None else source.load(split).checked()
     test = test.select(range(len(test))[: config.trainer.limit_test_batches])
     subdivision = Subdivision(**config.evaluation.subdivision)
-    lpips = find_lpips_networks(config.evaluation.lpips_backbone, config.evaluation.lpips_vgg_backbone)
+    lpips = find_lpips_networks()
     module, datamodule = build_training(config, source, training)
     renderer = module.renderer
     require_same_run(folder, checkpoint, config, renderer)

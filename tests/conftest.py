@@ -139,7 +139,7 @@ def train_here(
     """`python -m nerfro.train`'s main in this process, on the CPU and without looking for LPIPS weights."""
     import nerfro.train
 
-    monkeypatch.setattr(nerfro.train, "find_lpips_networks", lambda *files: ({}, {}))
+    monkeypatch.setattr(nerfro.train, "find_lpips_networks", lambda: ({}, {}))
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     return lambda *overrides: finish(nerfro.train.main, overrides, monkeypatch, capsys)
 
@@ -151,7 +151,7 @@ def evaluate_here(
     """`python -m nerfro.evaluate`'s main in this process, on the CPU and without looking for LPIPS weights."""
     import nerfro.evaluate
 
-    monkeypatch.setattr(nerfro.evaluate, "find_lpips_networks", lambda *files: ({}, {"lpips": "no cable"}))
+    monkeypatch.setattr(nerfro.evaluate, "find_lpips_networks", lambda: ({}, {"lpips": "no cable"}))
     return lambda *overrides: finish(nerfro.evaluate.main, ("device=cpu", *overrides), monkeypatch, capsys)
 
 
@@ -160,7 +160,7 @@ def train_in(folder: Path, *overrides: str) -> Path:
     import nerfro.train
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(nerfro.train, "find_lpips_networks", lambda *files: ({}, {}))
+        patch.setattr(nerfro.train, "find_lpips_networks", lambda: ({}, {}))
         patch.setattr(sys, "argv", ["nerfro.train", *overrides, f"hydra.run.dir={folder}"])
         nerfro.train.main()
     return folder

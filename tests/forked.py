@@ -28,7 +28,7 @@ def _main(name: str, arguments: list[str], log: Path, environment: dict[str, str
     sys.argv = [f"nerfro.{name}", *arguments]
     os.environ.update(environment, HYDRA_FULL_ERROR="1")
     module = importlib.import_module(f"nerfro.{name}")
-    module.find_lpips_networks = lambda *files: ({}, {})
+    module.find_lpips_networks = lambda: ({}, {})
     module.main()
 
 

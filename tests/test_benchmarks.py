@@ -53,7 +53,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> R
     def run_script(name: str, *arguments: object) -> list[str]:
         monkeypatch.syspath_prepend(str(FOLDER))
         monkeypatch.setattr(subprocess, "run", train_here)
-        monkeypatch.setattr(nerfro.train, "find_lpips_networks", lambda *files: ({}, {}))
+        monkeypatch.setattr(nerfro.train, "find_lpips_networks", lambda: ({}, {}))
         monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
         # Benchmarks replace these.
         for module, attribute in (

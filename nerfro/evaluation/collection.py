@@ -27,7 +27,7 @@ def metrics(*names: str) -> torchmetrics.MetricCollection:
     discover()
     for name in names:
         find("metric", name)
-    found = build_metrics(*find_lpips_networks(metrics=names or image_metrics()))
+    found = build_metrics(*find_lpips_networks(names or image_metrics()))
     for name in names:
         if found[name].missing is not None:
             raise NerfroError(f"metric={name} is not available: {found[name].missing}")

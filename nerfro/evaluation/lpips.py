@@ -11,7 +11,6 @@ Source:
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -191,42 +190,32 @@ def unit_length(features: Float[Tensor, "1 C h w"]) -> Float[Tensor, "1 C h w"]:
     return features / (features.square().sum(dim=1, keepdim=True).sqrt() + 1e-10)
 
 
-def load_lpips_network(backbone: Backbone, path: Path | str | None = None, download: bool = True) -> LpipsNetwork:
-    """Load a network with published weights on the CPU; see `load_weights` for `path` and `download`."""
+def load_lpips_network(backbone: Backbone, weights: dict[str, Tensor]) -> LpipsNetwork:
+    """Build a network with the weights of its backbone and the published heads, on the CPU."""
     with np.load(_HEADS, allow_pickle=False) as file:
         layers = range(sum(layer.compared for layer in backbone.layers))
         heads = [torch.from_numpy(file[f"{backbone.heads}{i}"]) for i in layers]
-    return LpipsNetwork(backbone, load_weights(backbone.published, path, download), heads)
+    return LpipsNetwork(backbone, weights, heads)
 
 
 def find_lpips_networks(
-    alex: Path | str | None = None,
-    vgg: Path | str | None = None,
-    download: bool = True,
-    metrics: Collection[str] = ("lpips", "lpips_vgg"),
+    metrics: Collection[str] = ("lpips", "lpips_vgg"), download: bool = True
 ) -> tuple[dict[str, LpipsNetwork], dict[str, str]]:
     """Load the networks whose weights are available.
 
     Args:
-        alex: file of AlexNet weights; by default the cache of torch hub, or a download.
-        vgg: file of VGG-16 weights; by default the cache of torch hub. The 528 MB are never downloaded automatically.
-        download: whether missing AlexNet weights may be downloaded.
         metrics: metrics whose networks are loaded.
+        download: whether missing weights of AlexNet may be downloaded. The 528 MB of VGG-16 are never downloaded.
 
     Returns:
         Networks by the name of the metric, `lpips` and `lpips_vgg`, and the reasons for missing networks.
-
-    Raises:
-        NerfroError: a file is given and does not contain the weights of this network.
     """
     networks, reasons = {}, {}
-    for metric, backbone, path, fetched in (("lpips", ALEX, alex, download), ("lpips_vgg", VGG, vgg, False)):
+    for metric, backbone, fetched in (("lpips", ALEX, download), ("lpips_vgg", VGG, False)):
         if metric not in metrics:
             continue
         try:
-            networks[metric] = load_lpips_network(backbone, path, fetched)
+            networks[metric] = load_lpips_network(backbone, load_weights(backbone.published, fetched))
         except NerfroError as error:
-            if path is not None:
-                raise
             reasons[metric] = str(error)
     return networks, reasons

@@ -1,4 +1,4 @@
-"""ImageNet weights of AlexNet and VGG-16, from a file, the cache of torch hub, or a download."""
+"""ImageNet weights of AlexNet and VGG-16, from the cache of torch hub or a download."""
 
 from __future__ import annotations
 
@@ -37,24 +37,19 @@ ALEXNET = Published("AlexNet", "https://download.pytorch.org/models/alexnet-owt-
 VGG16 = Published("VGG-16", "https://download.pytorch.org/models/vgg16-397923af.pth")  # 528 MB
 
 
-def load_weights(published: Published, path: Path | str | None = None, download: bool = True) -> dict[str, Tensor]:
+def load_weights(published: Published, download: bool = True) -> dict[str, Tensor]:
     """Load a state dict on the CPU, without executing pickled code.
 
     Args:
         published: the weights.
-        path: a file as published by torchvision. By default, the cache of torch hub is used,
-            `torch.hub.get_dir()/checkpoints`, which respects TORCH_HOME.
-        download: whether to download a missing file into the cache. If the server does not answer within five seconds,
+        download: whether to download a missing file into the cache, `torch.hub.get_dir()/checkpoints`, which respects
+            TORCH_HOME. If the server does not answer within five seconds,
             no further attempt is made in this process.
 
     Raises:
         NerfroError: the file cannot be read, or the weights are not cached and cannot be downloaded.
     """
     title, url = published.title, published.url
-    if path is not None:
-        if not Path(path).is_file():
-            raise NerfroError(f"the {title} weights {path} do not exist; give the path of a downloaded {url}")
-        return _read(Path(path), title, f"give the path of a downloaded {url}")
     cached = Path(torch.hub.get_dir()) / "checkpoints" / url.rsplit("/", 1)[-1]
     if not cached.is_file():
         by_hand = f"download {url} to {cached}"
@@ -74,7 +69,7 @@ def load_weights(published: Published, path: Path | str | None = None, download:
             raise NerfroError(f"the download of {title} weights failed ({error}); {by_hand}") from error
         finally:
             socket.setdefaulttimeout(before)
-    return _read(cached, title, "delete it to fetch it again")
+    return _read(cached, title)
 
 
 @functools.lru_cache
@@ -100,7 +95,8 @@ def unreachable(url: str, seconds: float = CONNECT_SECONDS) -> str:
     return reasons[-1]
 
 
-def _read(path: Path, title: str, advice: str) -> dict[str, Tensor]:
+def _read(path: Path, title: str) -> dict[str, Tensor]:
+    advice = "delete them to fetch them again"
     try:
         weights = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch.load raises almost any exception on a foreign file

@@ -47,8 +47,6 @@ class EvaluateConfig:
     out: Optional[str] = None
     # `8bit` rounds predictions to 8 bits, as in PNG files, before scoring; `float` does not.
     protocol: Annotated[str, Literal["8bit", "float"]] = "8bit"
-    lpips_backbone: Optional[str] = None  # file of AlexNet weights; by default the cache of torch hub
-    lpips_vgg_backbone: Optional[str] = None  # file of VGG-16 weights; by default the cache of torch hub
     device: str = "auto"  # `cpu`, `cuda`, or `auto` for a GPU if available
     overwrite: bool = False  # whether to replace an earlier evaluation in `out`
 

@@ -74,12 +74,8 @@ class EvaluationConfig:
     """Evaluation of the trained model."""
 
     # Split of the data set; None, and `evaluation=none`, end the run without scores.
-    split: Optional[str] = "test"  # noqa: UP045
+    split: Optional[str] = "test"  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     chunk_size: NumRays = 8192  # rays rendered in one chunk; bounds the memory
-    # File of AlexNet weights; None searches torch's hub cache, then downloads the weights.
-    lpips_backbone: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    # File of VGG-16 weights; None searches torch's hub cache alone.
-    lpips_vgg_backbone: Optional[str] = None  # noqa: UP045
     # Steps between two images of validation views during training; the PSNR of a subset of their pixels is computed
     # five times as often. 0 switches validation off.
     every: Natural = 500

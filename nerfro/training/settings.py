@@ -28,8 +28,6 @@ _NAMED = {
     "trainer.max_time": Role.BUDGET,
     "evaluation": Role.SCORING,
     "evaluation.chunk_size": Role.MACHINE,
-    "evaluation.lpips_backbone": Role.MACHINE,
-    "evaluation.lpips_vgg_backbone": Role.MACHINE,
     "medium.cache": Role.MACHINE,
     "compile": Role.MACHINE,
     "trainer.accelerator": Role.MACHINE,

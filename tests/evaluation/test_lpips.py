@@ -34,15 +34,8 @@ def random_weights(backbone: Backbone) -> dict[str, Tensor]:
 
 
 @pytest.fixture(scope="module")
-def backbone_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("backbone") / "alexnet.pth"
-    torch.save(random_weights(ALEX), path)
-    return path
-
-
-@pytest.fixture(scope="module")
-def network(backbone_file: Path) -> LpipsNetwork:
-    return load_lpips_network(ALEX, backbone_file)
+def network() -> LpipsNetwork:
+    return load_lpips_network(ALEX, random_weights(ALEX))
 
 
 @pytest.fixture(scope="module")
@@ -73,19 +66,13 @@ def pictures() -> tuple[Tensor, Tensor]:
 
 
 @pytest.fixture(scope="module", params=["torchmetrics alex", "torchmetrics vgg", "lpips alex", "lpips vgg"])
-def reference(
-    request: pytest.FixtureRequest,
-    published: Callable[[str], dict[str, dict]],
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Reference:
+def reference(request: pytest.FixtureRequest, published: Callable[[str], dict[str, dict]]) -> Reference:
     """The other package's own values, and our network with the same backbone and the published heads."""
     package, backbone = request.param.split()
     if importlib.util.find_spec(package) is None:
         pytest.skip(f"{package} is not installed; pip install --no-deps {package}")
     results = published(package)[backbone]
-    path = tmp_path_factory.mktemp("backbone") / "backbone.pth"
-    torch.save(results["backbone"], path)
-    network = load_lpips_network({"alex": ALEX, "vgg": VGG}[backbone], path)
+    network = load_lpips_network({"alex": ALEX, "vgg": VGG}[backbone], results["backbone"])
     predictions, targets = pictures()
     return Reference(network, predictions.movedim(1, -1), targets.movedim(1, -1), results)
 
@@ -107,14 +94,13 @@ def test_distance_map_is_that_of_lpips(reference: Reference) -> None:
 
 
 @pytest.mark.parametrize("backbone", [ALEX, VGG])
-def test_heads_are_the_published_ones_to_the_last_bit(backbone: Backbone, tmp_path: Path) -> None:
+def test_heads_are_the_published_ones_to_the_last_bit(backbone: Backbone) -> None:
     installed = importlib.util.find_spec("lpips")
     if installed is None or installed.origin is None:
         pytest.skip("lpips is not installed; pip install --no-deps lpips")
     file = Path(installed.origin).with_name("weights") / "v0.1" / f"{backbone.heads}.pth"
     published = torch.load(file, map_location="cpu", weights_only=True)
-    torch.save(random_weights(backbone), tmp_path / "weights.pth")
-    network = load_lpips_network(backbone, tmp_path / "weights.pth")
+    network = load_lpips_network(backbone, random_weights(backbone))
     assert len(published) == 5
     for i in range(5):
         assert torch.equal(network.get_buffer(f"head{i}"), published[f"lin{i}.model.1.weight"])
@@ -129,10 +115,9 @@ def test_distance_on_a_mask_is_the_mean_of_the_map_there(network: LpipsNetwork) 
 
 
 @pytest.mark.parametrize("backbone", [ALEX, VGG])
-def test_smallest_picture_is_the_smallest_that_the_backbone_takes(backbone: Backbone, tmp_path: Path) -> None:
+def test_smallest_picture_is_the_smallest_that_the_backbone_takes(backbone: Backbone) -> None:
     size = backbone.min_size
-    torch.save(random_weights(backbone), tmp_path / "weights.pth")
-    network = load_lpips_network(backbone, tmp_path / "weights.pth")
+    network = load_lpips_network(backbone, random_weights(backbone))
     assert torch.isfinite(network(torch.rand(size, size, 3), torch.rand(size, size, 3)))
     with pytest.raises(NerfroError, match=f"at least {size} x {size} pixels"):
         network(torch.rand(size - 1, 64, 3), torch.rand(size - 1, 64, 3))
@@ -180,16 +165,10 @@ def test_vgg_is_taken_from_the_cache_but_never_fetched(tmp_path: Path, monkeypat
     assert list(reasons) == ["lpips"]
 
 
-def test_named_weights_are_never_passed_over(tmp_path: Path, backbone_file: Path) -> None:
-    with pytest.raises(NerfroError, match=r"the AlexNet weights .* do not exist"):
-        find_lpips_networks(tmp_path / "nothing.pth")
-    with pytest.raises(NerfroError, match=r"the VGG-16 weights .* do not exist"):
-        find_lpips_networks(vgg=tmp_path / "nothing.pth", download=False)
+def test_weights_of_another_network_are_refused() -> None:
     other = random_weights(ALEX)
     other["features.3.weight"] = other["features.3.weight"][:, :3]
-    torch.save(other, tmp_path / "other.pth")
     with pytest.raises(NerfroError, match=r"features\.3\.weight of shape \[192, 64, 5, 5\], found \[192, 3, 5, 5\]"):
-        find_lpips_networks(tmp_path / "other.pth")
+        load_lpips_network(ALEX, other)
     with pytest.raises(NerfroError, match=r"use the published file of VGG-16"):
-        find_lpips_networks(backbone_file, vgg=backbone_file)
-    assert list(find_lpips_networks(backbone_file, download=False)[0]) == ["lpips"]
+        load_lpips_network(VGG, random_weights(ALEX))

@@ -69,6 +69,12 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     unreachable.cache_clear()
 
 
+def cached_alexnet() -> Path:
+    folder = Path(torch.hub.get_dir(), "checkpoints")
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder / ALEXNET.url.rpartition("/")[2]
+
+
 def right_name() -> str:
     return f"alexnet-{hashlib.sha256(Site.content).hexdigest()[:8]}.pth"
 
@@ -120,12 +126,12 @@ def test_refused_connection_is_the_reason_in_one_line() -> None:
 @example(text="\x80\x02]q\x00.")
 @example(text="PK\x03\x04")  # the beginning of a zip file
 def test_any_text_file_is_refused_in_one_line_that_says_what_to_give(
-    text: str, tmp_path_factory: pytest.TempPathFactory
+    text: str,
 ) -> None:
-    file = tmp_path_factory.mktemp("texts") / "weights.txt"
-    file.write_text(text, encoding="latin-1", errors="replace")
-    with pytest.raises(NerfroError, match=rf"AlexNet weights {file} .*; give the path of a downloaded") as caught:
-        load_weights(ALEXNET, file)
+    cached = cached_alexnet()
+    cached.write_text(text, encoding="latin-1", errors="replace")
+    with pytest.raises(NerfroError, match=rf"AlexNet weights {cached} .*; delete them to fetch them again") as caught:
+        load_weights(ALEXNET)
     assert "\n" not in str(caught.value)
     assert "weights_only" not in str(caught.value)
 
@@ -137,8 +143,8 @@ class Code:
         return (print, ("this must never run",))
 
 
-def test_pickled_code_is_not_executed(tmp_path: Path, capsys) -> None:
-    torch.save({"features.0.weight": Code()}, tmp_path / "evil.pth")
+def test_pickled_code_is_not_executed(capsys) -> None:
+    torch.save({"features.0.weight": Code()}, cached_alexnet())
     with pytest.raises(NerfroError, match="cannot be read"):
-        load_weights(ALEXNET, tmp_path / "evil.pth")
+        load_weights(ALEXNET)
     assert "must never run" not in capsys.readouterr().out
