@@ -41,6 +41,8 @@ def measure(folder: Path, data: Path) -> dict[str, float]:
     """
     lens, true_poses = read_cameras(folder / "truth")
     found_lens, found_poses = read_cameras(data)
+    # Frames of a video are copies of the photographs with equal names.
+    true_poses, found_poses = ({file.name: pose for file, pose in poses.items()} for poses in (true_poses, found_poses))
     names = sorted(found_poses)
     if len(names) < 3:
         raise NerfroError(f"{data} has {len(names)} cameras; three or more can be aligned")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -16,6 +18,7 @@ import torch
 from lightning.pytorch.callbacks import timer
 
 import nerfro.train
+from nerfro.capture.video import extract_frames
 from nerfro.viewing import server
 from tests import ball_photographs
 from tests.viewing.test_exports import write
@@ -188,3 +191,24 @@ def test_mitsuba_renders_beside_a_run(run: Run, trained_run: Path, tmp_path: Pat
     write(nerfro.load(trained_run), "mitsuba", tmp_path / "scene.xml")
     assert len(run("mitsuba_export", trained_run, tmp_path / "scene.xml", "--views", 0, "--samples", 1)) == 3
     assert len(run("new_sky", trained_run, "--views", 1, "--spp", 1, "--texture", 16)) == 5
+
+
+def test_glassware_is_rendered_and_a_perfect_reconstruction_is_scored(
+    run: Run, trained_run: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("mitsuba")
+    for kind in ("bottle", "jar", "tumbler", "wine"):
+        run("glassware", kind, tmp_path / kind, "--photographs", 4, "--width", 24, "--spp", 1)
+        assert len(json.loads((tmp_path / kind / "outlines.json").read_text())) == 3
+    jar, perfect = tmp_path / "jar", tmp_path / "perfect"
+    names = {file.stem for file in (jar / "images").iterdir()}
+    assert {file.stem for file in extract_frames(jar / "film.mp4", tmp_path / "frames", 4)} == names
+    shutil.copytree(jar / "images", perfect / "images")
+    for name in names:
+        shutil.copy(jar / "masks" / f"{name}.png", perfect / "images" / f"mask_{name}.png")
+    cameras = (jar / "truth" / "transforms_train.json").read_text()
+    cameras = cameras.replace("../masks/", "images/mask_").replace("../", "")
+    (perfect / "transforms_train.json").write_text(cameras)
+    (perfect / "run").symlink_to(trained_run)
+    (row,) = run("glassware", "jar", jar, "--reconstruction", perfect)[1:]
+    assert row.startswith("| jar | 4 | 0.00° | 1.000, 1.000 |")
