@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nerfro.cameras import Cameras
 from nerfro.types import Radiance, Samples
 
 
@@ -22,6 +23,9 @@ class Field(nn.Module, ABC):
     def bounds(self) -> Float[Tensor, "2 3"] | None:
         """Opposite corners of the box outside of which the field is empty, world units; None for unbounded fields."""
         return None
+
+    def begin(self, cameras: Cameras) -> None:
+        """Prepare for training on photographs of these cameras."""
 
     def density(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
         """Evaluate only the density, per world unit, in single precision; density is independent of the direction."""

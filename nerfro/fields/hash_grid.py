@@ -7,14 +7,16 @@ from itertools import pairwise
 from typing import Annotated, Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from nerfro.allowed import Count, Depth, Positive, Range, Width, corners_of_box
+from nerfro.cameras import Cameras
 from nerfro.fields import hash_encoding
 from nerfro.fields import spherical_harmonics as harmonics
 from nerfro.fields.base import Field
 from nerfro.fields.mlp import radiance
+from nerfro.fields.observed_space import NUM_CELLS, observed_cells
 from nerfro.fields.selection import evaluate_selected, inside_box
 from nerfro.geometry.contraction import contract, contracted_box, contraction_scale
 from nerfro.kernels.available import fast_bfloat16
@@ -58,6 +60,7 @@ class HashGridField(Field):
 
     box_min: Float[Tensor, "3"]
     box_max: Float[Tensor, "3"]
+    observed: Bool[Tensor, "C C C"] | None
 
     def __init__(
         self,
@@ -79,6 +82,8 @@ class HashGridField(Field):
         self.register_buffer("box_min", box[0].float(), persistent=False)
         self.register_buffer("box_max", box[1].float(), persistent=False)
         self.side = float((box[1] - box[0]).max())
+        observed = None if radius is None else torch.ones(NUM_CELLS, NUM_CELLS, NUM_CELLS, dtype=torch.bool)
+        self.register_buffer("observed", observed)
         self.initial_density = initial_depth / self.side
         self.direction_bands, self.shortcut, self.precision = direction_bands, shortcut, precision
         self.levels = hash_encoding.grid_levels(num_levels, _COARSEST_RESOLUTION, finest_resolution, log2_table_size)
@@ -96,8 +101,9 @@ class HashGridField(Field):
         if self.radius is None:
             return evaluate_selected(self.decode, samples, inside_box(samples.positions, self.box_min, self.box_max))
         positions = samples.positions.flatten(0, 1)
-        density, rgb = self.decode(contract(positions, self.centre, self.radius), samples.directions.flatten(0, 1))
-        density = density * contraction_scale(positions, self.centre, self.radius)
+        places = contract(positions, self.centre, self.radius)
+        density, rgb = self.decode(places, samples.directions.flatten(0, 1))
+        density = self._world_density(density, positions, places)
         return Radiance(density.view(samples.s.shape), rgb.view(samples.positions.shape))
 
     def decode(
@@ -116,6 +122,21 @@ class HashGridField(Field):
             return torch.where(inside_box(positions, self.box_min, self.box_max), density, 0.0)
         places = contract(positions, self.centre, self.radius)
         density = self._to_density(self.apply_mlp(self.density_mlp, self.encode(places)))
+        return self._world_density(density, positions, places)
+
+    def begin(self, cameras: Cameras) -> None:
+        if self.radius is not None:
+            self.observed = observed_cells(cameras, self.centre, self.radius)
+
+    def _world_density(
+        self, density: Float[Tensor, "P"], positions: Float[Tensor, "P 3"], places: Float[Tensor, "P 3"]
+    ) -> Float[Tensor, "P"]:
+        """Convert the density at contracted places to one per world unit, which is zero in cells not observed."""
+        assert self.observed is not None
+        assert self.radius is not None
+        cells = self.observed.shape[0]
+        x, y, z = ((places.detach() - self.box_min) / self.side * cells).long().clamp(0, cells - 1).unbind(-1)
+        density = density * self.observed.view(-1)[(x * cells + y) * cells + z]
         return density * contraction_scale(positions, self.centre, self.radius)
 
     @property

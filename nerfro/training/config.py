@@ -363,4 +363,8 @@ def build_model(config: DictConfig, training: Views | None = None) -> Renderer:
         camera=camera,
         chunk_size=config.evaluation.chunk_size,
     )
-    return build(config.model, components=components)
+    renderer = build(config.model, components=components)
+    if training is not None:
+        for field in renderer.scene.fields:
+            field.begin(training.cameras)
+    return renderer

@@ -10,8 +10,9 @@ from nerfro.fields import hash_encoding
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.fields.selection import evaluate_selected, inside_box
 from nerfro.fields.spherical_harmonics import spherical_harmonics
-from nerfro.geometry.contraction import contract
+from nerfro.geometry.contraction import contract, expand
 from nerfro.types import Samples
+from tests.silhouettes import cameras_around
 
 
 def make_samples(num_rays: int = 6, num_samples: int = 9, scale: float = 2.0) -> Samples:
@@ -179,3 +180,23 @@ def test_field_of_all_space_is_asked_where_contraction_leads() -> None:
 def test_density_alone_is_that_of_samples(radius: float | None) -> None:
     field, samples = make_field(radius=radius), make_samples()
     assert torch.equal(field.density(samples.positions.flatten(0, 1)), field(samples).density.flatten())
+
+
+@pytest.mark.parametrize(("num_cameras", "needed"), [(12, 3), (1, 1)])
+def test_space_close_to_a_camera_is_empty_unless_three_cameras_see_it(num_cameras: int, needed: int) -> None:
+    cameras = cameras_around(num_cameras, 16)
+    field, whole = make_field(radius=2.0), make_field(radius=2.0)
+    field.begin(cameras)
+    cells = torch.randint(64, (20_000, 3), generator=torch.Generator().manual_seed(0))
+    points = expand(-4 + (cells + 0.5) / 8, torch.zeros(3), 2.0)
+    offset = points - cameras.camera_to_world[:, None, :, 3]
+    right, up, back = (offset @ cameras.camera_to_world[:, :, :3]).unbind(-1)
+    seen = torch.maximum(right.abs(), up.abs()) * 2 * 1.4 < -back  # a focal length of 1.4 image sides
+    empty = (offset.norm(dim=-1) < 2).any(0) & (seen.sum(0) < needed)
+    assert 100 < empty.sum() < 10_000
+    samples = Samples(points[:, None], points[:, None], *[torch.zeros(len(points), n) for n in (1, 2)], points[:, 0])
+    for found, expected in (
+        (field.density(points), whole.density(points)),
+        (field(samples).density[:, 0], whole(samples).density[:, 0]),
+    ):
+        assert torch.equal(found, torch.where(empty, 0, expected))
