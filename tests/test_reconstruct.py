@@ -22,6 +22,8 @@ from PIL import ExifTags, Image
 import nerfro.reconstruct
 import nerfro.train
 from nerfro.capture import refinement
+from nerfro.capture.overrides import print_next
+from nerfro.files.folder_lock import STAGE
 from nerfro.files.images import save_png
 from nerfro.files.reading import open_image
 from nerfro.pipeline import stages
@@ -225,6 +227,13 @@ def test_training_continues_with_the_hypothesis_that_the_validation_photographs_
     assert best[: len(train) - 1] == train[:-1], "the same options as in its trial"
     assert f"trainer.max_steps={105 if chosen == 'straight rays' else 70}" in best
     assert "medium.ior=1.0" not in [option for trial in trials for option in trial], "an index in doubt is never known"
+
+
+def test_stages_print_no_next_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    print_next("next", "mask", [])
+    monkeypatch.setenv(STAGE, "")
+    print_next("next", "preprocess", [])
+    assert capsys.readouterr().out == "next: python -m nerfro.mask\n"
 
 
 def test_an_interrupted_training_goes_on(reconstruct: Reconstruct, pretended: Pretended, photos: Path) -> None:

@@ -57,6 +57,7 @@ _NUM_BOOTSTRAP = 200
 # Limits of a reliable estimate: depth of the valley relative to the error of unrelated colours, standard error and
 # distance from the ends of the search relative to the range, and fraction of the pixels with known surroundings.
 _MIN_DEPTH, _MAX_STANDARD_ERROR, _MIN_DISTANCE_FROM_END, _MIN_KNOWN = 0.03, 0.02, 1 / 150, 0.1
+_LOWEST_MATERIAL = 1.25  # ordinary liquids and solids have larger indices; that of ice is 1.31
 
 
 @dataclass(frozen=True)
@@ -198,6 +199,8 @@ def _doubts(names: list[str], values: np.ndarray, standard_errors: np.ndarray, d
             doubts.append(f"the {name} is at an end of the search range, {LOWEST:.4g} to {HIGHEST:.4g}")
         elif error > _MAX_STANDARD_ERROR * _RANGE:
             doubts.append(f"the {name} has a standard error of {error:.2g}: the views do not agree")
+    if LOWEST + end < values[0] < _LOWEST_MATERIAL:
+        doubts.append(f"no liquid or solid has an index of {values[0]:.3g}: the object may be opaque or hollow")
     return doubts
 
 
@@ -336,7 +339,9 @@ def _search_index(observations: Observations, medium: Solid, folder: Path) -> Es
     with bar("search") as progress:
         found = find_indices(medium, through, surroundings, progress)
     for name, value, error in zip(found.names, found.values, found.standard_errors, strict=True):
-        print(f"{name}: {value:.5g} +- {error:.2g} (standard error by resampling of the views)")
+        # At an end of the search range, all samples of the views have the same minimum.
+        spread = f" +- {error:.2g} (standard error by resampling of the views)" if error > 0 else ""
+        print(f"{name}: {value:.5g}{spread}")
     for doubt in found.doubts:
         warn(f"the photographs do not determine the {' and '.join(found.names)}: {doubt}")
     values, errors = ([round(float(x), 5) for x in each] for each in (found.values, found.standard_errors))

@@ -195,7 +195,8 @@ def mask_sheet(
         inside, image = (torch.from_numpy(array[::stride, ::stride]) for array in (found.masks[view], images[view]))
         pictures.append(torch.where(inside[..., None], image / 255, image / 1020 + torch.tensor(_OUTSIDE) / 255))
         captions.append(f"{labels.get(view, 'given')}  {frames[view].image.stem[-_NAME_LENGTH:]}")
-    legend = "overlap of GrabCut and visual hull; hull: the mask is the projection of the hull; dark: outside the mask"
+    legend = "overlap of GrabCut and visual hull; " if found.overlaps else ""
+    legend += f"hull: the mask is the projection of the {found.shape}; dark: outside the mask"
     return sheet(pictures, captions, _TILE, _COLUMNS, legend)
 
 

@@ -10,10 +10,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from nerfro.files.folder_lock import STAGE
 
 
-def print_next(label: str, command: str, options: Sequence[str]) -> None:
-    """Print the command that follows, unless nerfro.reconstruct runs the next stage."""
+def print_hint(text: str) -> None:
+    """Print what the user may do next, unless nerfro.reconstruct runs the next stage."""
     if STAGE not in os.environ:
-        print(f"{label}: {shlex.join(['python', '-m', f'nerfro.{command}', *options])}")
+        print(text)
+
+
+def print_next(label: str, command: str, options: Sequence[str]) -> None:
+    """Print the command that follows as a hint."""
+    print_hint(f"{label}: {shlex.join(['python', '-m', f'nerfro.{command}', *options])}")
 
 
 def is_given(option: str, overrides: Iterable[str]) -> bool:

@@ -16,7 +16,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from nerfro.allowed import Count, Natural, NotNegative, Range, corners_of_box
 from nerfro.cameras import Cameras
 from nerfro.capture.overlaps import REPORT, SHEET
-from nerfro.capture.overrides import as_overrides, is_given, of_groups, print_next
+from nerfro.capture.overrides import as_overrides, is_given, of_groups, print_hint, print_next
 from nerfro.capture.revolution import Symmetry
 from nerfro.capture.upright import find_up
 from nerfro.data.frames import require_root
@@ -208,8 +208,8 @@ def conclude(
     write_atomically(request.folder / FOUND, json.dumps(found, indent=1) + "\n")
     print(f"results: {', '.join(str(file) for file in request.files if file.exists())}")
     if doubtful:
-        print(f"the photographs do not determine the index; add {' '.join(f'{name}=N' for name in index)}")
-    print("for near surroundings add +experiment=refractive_room; the baseline is +experiment=mipnerf")
+        print_hint(f"the photographs do not determine the index; add {' '.join(f'{name}=N' for name in index)}")
+    print_hint("for near surroundings add +experiment=refractive_room; the baseline is +experiment=mipnerf")
     print_next("train on it", "train", options)
     if as_vessel:
         print_next("train on the vessel", "train", as_vessel)

@@ -68,7 +68,7 @@ def find_model(
     folder = images[0].parent
     for candidate in (root / name for root in (folder.parent, folder) for name in _MODEL_FOLDERS):
         if any((candidate / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
-            print(f"using the COLMAP model {candidate}")
+            print(f"using the COLMAP model {candidate} with its lens; delete the folder to compute another model")
             return candidate
     refuse_existing([out], overwrite)
     num_masks = sum(mask is not None for mask in masks)

@@ -85,6 +85,7 @@ class TrainingProgress(ProgressBar):
         super().__init__()
         self._throughput = throughput
         self._bar: tqdm | None = None
+        self._outputs: Any = None  # of the last step
         self._shown, self._enabled = 0.0, True
 
     def disable(self) -> None:
@@ -97,20 +98,27 @@ class TrainingProgress(ProgressBar):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Batch, batch_idx: int
     ) -> None:
-        now = time.perf_counter()
+        self._outputs, now = outputs, time.perf_counter()
         if self._bar is None or self._bar.disable or now - self._shown < self._bar.mininterval:
             return
-        self._shown, shown = now, trainer.callback_metrics
-        self._bar.n = training_progress(trainer)
-        self._bar.set_postfix_str(
+        self._shown = now
+        self._update(self._bar, trainer)
+        self._bar.refresh()
+
+    def _update(self, bar: tqdm, trainer: Trainer) -> None:
+        """Set the progress and the figures of the last step."""
+        bar.n, metrics = training_progress(trainer), trainer.callback_metrics
+        bar.set_postfix_str(
             f"step {trainer.global_step}, {self._throughput.rays_per_second or 0:,.0f} rays/s, "
-            f"train PSNR {-10 * math.log10(max(float(outputs['squared_error']), 1e-10)):.2f}"
-            + (f", val PSNR {float(shown['val/psnr']):.2f}" if "val/psnr" in shown else "")
+            f"train PSNR {-10 * math.log10(max(float(self._outputs['squared_error']), 1e-10)):.2f}"
+            + (f", val PSNR {float(metrics['val/psnr']):.2f}" if "val/psnr" in metrics else ""),
+            refresh=False,
         )
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._bar is not None:
-            self._bar.n = training_progress(trainer)
+            if self._outputs is not None:
+                self._update(self._bar, trainer)
             self._bar.close()
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
@@ -185,6 +186,7 @@ def test_overfitting_repeats_batches(train: Callable[..., Any], monkeypatch: pyt
     finished = train("trainer.max_steps=6", "trainer.overfit_batches=2", "evaluation.every=0")
     assert finished.code == 0, finished.err
     assert set(drawn) <= {0, 1, 2}  # the thread that traces ahead draws one more
+    assert re.search(r"100%.*step 6,.*train PSNR", finished.err), "a log ends with the last step"
 
 
 @pytest.mark.parametrize(
