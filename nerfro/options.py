@@ -13,6 +13,7 @@ import importlib.metadata
 import importlib.util
 import inspect
 import json
+import os
 import re
 import sys
 import textwrap
@@ -272,11 +273,16 @@ def recall(command: str) -> Described | None:
 
 def remember(command: str, described: Described) -> None:
     """Write the description of a command to the cache, if possible."""
-    from nerfro.files.atomic import write_atomically  # --help and completion only read the cache
-
-    with contextlib.suppress(OSError, NerfroError):
-        content = {"state": _state_of_files(), **dataclasses.asdict(described)}
-        write_atomically(_cache_file(command), json.dumps(content))
+    file = _cache_file(command)
+    partial = file.with_suffix(f".{os.getpid()}")
+    with contextlib.suppress(OSError):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            content = {"state": _state_of_files(), **dataclasses.asdict(described)}
+            partial.write_text(json.dumps(content), encoding="utf-8")
+            partial.replace(file)
+        finally:
+            partial.unlink(missing_ok=True)
 
 
 def _cache_file(command: str) -> Path:

@@ -7,14 +7,16 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+from nerfro.allowed import Range, check
 from nerfro.errors import NerfroError
 from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import is_number, read_json
 
 TOO_LARGE = 1e15  # for scores, steps and times; sums of larger numbers may overflow
+_Amount = Annotated[float, Range(at_least=0, less_than=TOO_LARGE)]
 Score = float | None  # None if not available; the notes contain the reason
 
 
@@ -158,9 +160,11 @@ def read_metrics_json(path: Path | str) -> RunMetrics:
             name: EvaluationResult(_views(treated["views"]), notes, protocol)
             for name, treated in content.get("treatments", {}).items()
         }
-        spent = {key: _number(content[key]) for key in ("steps", "train_seconds", "rays_per_second")}
-        phases = {str(phase): _number(count) for phase, count in content.get("steps_by_phase", {}).items()}
-        return RunMetrics(result, **spent, treatments=treatments, steps_by_phase=phases)  # type: ignore[arg-type]
+        amounts = {key: content[key] for key in ("steps", "train_seconds", "rays_per_second")}
+        phases = {str(phase): count for phase, count in content.get("steps_by_phase", {}).items()}
+        for values in (amounts, phases):
+            check(f"{path}: ", dict.fromkeys(values, _Amount), values)
+        return RunMetrics(result, **amounts, treatments=treatments, steps_by_phase=phases)
     except (KeyError, TypeError, AttributeError) as error:
         raise NerfroError(f"{path} is not a metrics file ({error!r}); run nerfro.evaluate on the run again") from error
 

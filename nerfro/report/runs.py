@@ -14,6 +14,7 @@ from typing import Any
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from nerfro.allowed import Count, check
 from nerfro.errors import NerfroError, first_of
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
 from nerfro.files.foreign_config import read_foreign_config
@@ -186,6 +187,7 @@ def read_run(folder: Path) -> Run:
         wrong = [name for name, kind in _FACTS.items() if not isinstance(facts.get(name), kind)]
         if wrong:
             raise NerfroError(f"{folder / 'run.json'} has no valid {first_of(wrong)}; omit the run")
+        check(f"{folder / 'run.json'}: ", {"threads": Count}, {"threads": facts["threads"]})
         data, trainer, root = config["data"], config["trainer"], str(config["data"]["root"])
         view = metrics.result.views[0].name
         with open_image(scores / "images" / f"{view}.png") as (image, _):

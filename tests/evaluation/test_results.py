@@ -87,6 +87,8 @@ def test_numbers_that_json_lacks_are_refused_and_the_old_file_stays(tmp_path: Pa
         '{"views": [3]}',
         '{"views": [{"psnr": 3}]}',
         '{"views": [{"name": "a", "regions": 3}]}',
+        '{"views": [], "steps": -1, "train_seconds": 1, "rays_per_second": 1}',
+        '{"views": [], "steps": 1, "train_seconds": -1, "rays_per_second": 1}',
         "\xff",
     ],
 )
