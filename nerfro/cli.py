@@ -8,6 +8,7 @@ import dataclasses
 import errno
 import functools
 import importlib
+import io
 import os
 import re
 import shlex
@@ -175,7 +176,7 @@ def entry_point(
                 except OSError as error:  # raised by Hydra, which creates the run folder
                     if isinstance(error, (HydraException, BrokenPipeError)):
                         raise
-                    reason = f"{error.filename} cannot be used: {error.strerror}"
+                    reason = f"{error.filename or 'the folder'} cannot be used: {error.strerror}"
                     raise NerfroError(f"{reason}; choose another hydra.run.dir, or hydra.sweep.dir") from error
                 except ValueError as error:
                     if "null byte" not in str(error):
@@ -259,6 +260,7 @@ def _refuse_flag(message: str) -> NoReturn:
 @contextlib.contextmanager
 def errors_in_one_line() -> Iterator[None]:
     """Print any error in one line and exit with status 1. With NERFRO_DEBUG=1 the error is raised instead."""
+    _accept_all_text()
     try:
         yield
         sys.stdout.flush()
@@ -273,6 +275,16 @@ def errors_in_one_line() -> Iterator[None]:
             raise
         print(f"nerfro: error: {in_one_line(error)}", file=sys.stderr)
         sys.exit(1)
+
+
+def _accept_all_text() -> None:
+    """Replace characters that the encoding of the terminal lacks, and discard text for closed streams (`>&-`)."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 - open until the process ends
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 def in_one_line(error: Exception) -> str:

@@ -25,7 +25,7 @@ from nerfro.capture.vessel_fit import find_vessel
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.cli import entry_point, warn
 from nerfro.data.base import Views
-from nerfro.data.masks import POLYGON, masked_views, method_of, with_other_splits
+from nerfro.data.masks import EVIDENCE, masked_views, method_of, with_other_splits
 from nerfro.files.atomic import refuse_existing
 from nerfro.files.folder_lock import lock_folder
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
@@ -84,7 +84,7 @@ def _reconstruct(request: Request, views: Views, mesh: TriangleMesh | None) -> t
     """
     config, folder = request.config, request.folder
     all_silhouettes = read_silhouettes(views, request.box is not None)
-    own = [i for i, frame in enumerate(views.frames) if frame.mask is None or method_of(frame.mask) in (None, POLYGON)]
+    own = [i for i, frame in enumerate(views.frames) if frame.mask is None or method_of(frame.mask) in EVIDENCE]
     views, silhouettes = (views.select(own), all_silhouettes.select(own)) if own else (views, all_silhouettes)
     if len(views) < len(all_silhouettes):
         num_projections = len(all_silhouettes) - len(views)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
@@ -15,7 +16,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 from omegaconf import OmegaConf
 
-from nerfro.cli import RENAMED, _flags_first, _RenamingFiles, in_one_line, renamed_override, warn
+from nerfro.cli import RENAMED, _flags_first, _RenamingFiles, errors_in_one_line, in_one_line, renamed_override, warn
 from nerfro.errors import NerfroError
 from nerfro.files.foreign_config import foreign_config
 from nerfro.paths import CONF_DIR, resolve_path, user_path
@@ -35,6 +36,15 @@ def test_a_reader_that_has_seen_enough_is_no_error(num_lines: int) -> None:
     os.close(writer)
     assert done.stderr == ""
     assert done.returncode == 141
+
+
+def test_streams_that_lack_characters_or_are_closed_are_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = io.BytesIO()
+    for stream in (io.TextIOWrapper(written, "ascii"), None):
+        monkeypatch.setattr(sys, "stdout", stream)
+        with errors_in_one_line():
+            print("PSNR ↑")
+    assert written.getvalue() == b"PSNR ?\n"
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Optional
 
 import numpy as np
 import torch
@@ -17,13 +17,15 @@ from PIL.PngImagePlugin import PngInfo
 
 from nerfro.allowed import Range
 from nerfro.cameras import Cameras
-from nerfro.capture.masking import Segmentation, box_region, grab, polygon_mask, propagate
+from nerfro.capture.masking import Segmentation, box_region, check_tracked, grab, polygon_mask, propagate
 from nerfro.capture.opencv import opencv
 from nerfro.capture.outline_hull import AGREES, FEWEST_VIEWS
+from nerfro.capture.reconstruction import numeric_order
+from nerfro.capture.tracking import load_tracker, track_object
 from nerfro.cli import warn
 from nerfro.data.base import DataSource, Frame
 from nerfro.data.image_files import read_mask, read_size, to_unit
-from nerfro.data.masks import METHOD, POLYGON, checksum, method_of, without_masks
+from nerfro.data.masks import METHOD, POLYGON, TRACKED, checksum, method_of, without_masks
 from nerfro.errors import NerfroError, first_of
 from nerfro.files.drawing import sheet
 from nerfro.files.images import save_image
@@ -43,6 +45,8 @@ class MaskConfig:
         data: data set (options of the group `data`); the views of all splits get masks.
         outlines: by image name, a box [left, top, right, bottom] around the object, or a polygon [[column, row], ...],
             which is the mask, in pixels; or a JSON file with such a mapping.
+        sam2: folder of a Segment Anything 2 network in the format of transformers, which follows the object from the
+            outlines and existing masks through the photographs in the order of their names; needs the extra `sam2`.
         hull_only: project the visual hull of at least three existing masks into all other views, without segmentation
             by colour.
         overwrite: replace existing masks, starting from the outlines alone. Otherwise existing masks are kept and used,
@@ -56,6 +60,7 @@ class MaskConfig:
 
     data: Any = MISSING
     outlines: Any = None
+    sam2: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     hull_only: bool = False
     overwrite: bool = False
     view: bool = False
@@ -195,29 +200,31 @@ def mask_sheet(
         inside, image = (torch.from_numpy(array[::stride, ::stride]) for array in (found.masks[view], images[view]))
         pictures.append(torch.where(inside[..., None], image / 255, image / 1020 + torch.tensor(_OUTSIDE) / 255))
         captions.append(f"{labels.get(view, 'given')}  {frames[view].image.stem[-_NAME_LENGTH:]}")
-    legend = "overlap of GrabCut and visual hull; " if found.overlaps else ""
+    legend = f"overlap of {found.segmenter} and visual hull; " if found.overlaps else ""
     legend += f"hull: the mask is the projection of the {found.shape}; dark: outside the mask"
     return sheet(pictures, captions, _TILE, _COLUMNS, legend)
 
 
 def report_masks(frames: list[Frame], found: Segmentation) -> None:
     """Print how well the masks agree with the shape of the object, the least certain masks first."""
-    worst = min(found.agreement, key=found.agreement.__getitem__)
-    print(
-        f"{len(found.by_hull)} masks are projections of the {found.shape}, which overlaps by "
-        f"{found.agreement[worst]:.3f} or more with the {len(found.agreement)} given masks "
-        f"(least: {frames[worst].name})"
-    )
+    print(f"{len(found.by_hull)} masks are projections of the {found.shape}")
+    if found.agreement:
+        worst = min(found.agreement, key=found.agreement.__getitem__)
+        print(
+            f"the {found.shape} overlaps by {found.agreement[worst]:.3f} or more with the {len(found.agreement)} given "
+            f"masks (least: {frames[worst].name})"
+        )
     if found.overlaps:
-        print("overlap (intersection over union) of GrabCut's mask with the visual hull of the other views:")
+        print(f"overlap (intersection over union) of the mask of {found.segmenter} with the visual hull:")
     for view in sorted(found.overlaps, key=lambda view: found.overlaps[view]):
         taken = " (mask from the hull)" if view in found.by_hull else ""
         print(f"  {found.overlaps[view]:.4f}  {frames[view].name}{taken}")
     doubtful = [frames[view].name for view in found.by_hull if view in found.overlaps]
     if doubtful:
         warn(
-            f"{len(doubtful)} of {len(frames)} views: GrabCut and the visual hull overlap by less than {AGREES} "
-            f"({first_of(doubtful)}); their masks are projections of the hull and slightly too large: check them first"
+            f"{len(doubtful)} of {len(frames)} views: {found.segmenter} and the visual hull overlap by less than "
+            f"{AGREES} ({first_of(doubtful)}); their masks are projections of the hull and slightly "
+            "too large: check them first"
         )
 
 
@@ -232,6 +239,7 @@ class MaskTask:
         frames: frames of all views.
         kept: existing masks by view, which do not change.
         hull_only: do not use GrabCut.
+        tracker: network that follows the object through the photographs, instead of GrabCut.
     """
 
     source: DataSource
@@ -240,6 +248,7 @@ class MaskTask:
     frames: list[Frame]
     kept: dict[int, Bool[np.ndarray, "H W"]]
     hull_only: bool
+    tracker: Any = None
 
     @classmethod
     def load(cls, source: DataSource, config: DictConfig, outlines: Mapping[str, list]) -> MaskTask:
@@ -249,17 +258,21 @@ class MaskTask:
             NerfroError: there is nothing to start from, or nothing to do.
         """
         opencv()  # report a missing package before the long work starts
+        if config.sam2 is not None and (config.hull_only or config.view):
+            raise NerfroError("sam2= segments all photographs, so it excludes hull_only=true and view=true; remove one")
+        tracker = None if config.sam2 is None else load_tracker(user_path(config.sam2))
         cameras, images, frames = load_all(source)
         outlined, kept = {find_frame(name, frames) for name in outlines}, {}
         size = cameras.width, cameras.height
         for view, frame in enumerate(frames):
             if frame.mask is not None and not config.overwrite:
                 method = method_of(frame.mask)
-                if method is None or (method == POLYGON and view not in outlined):
+                stays = {POLYGON: view not in outlined, TRACKED: tracker is None}
+                if method is None or stays.get(method, False):
                     kept[view] = read_resized(frame.mask, size, source.mask_labels)
         if not config.view:
             check_start(frames, outlined, kept, config.hull_only)
-        return cls(source, cameras, images, frames, kept, config.hull_only or config.view)
+        return cls(source, cameras, images, frames, kept, config.hull_only or config.view, tracker)
 
     def segment(self, outlines: Mapping[str, list], progress: Callable[[], None] = lambda: None) -> Segmentation:
         """Make the masks of all views from the kept masks and outlines by image name.
@@ -268,6 +281,7 @@ class MaskTask:
             NerfroError: a mask is empty, or too few views agree with the given masks.
         """
         size, given = (self.cameras.width, self.cameras.height), dict(self.kept)
+        boxes: dict[int, list[float]] = {}
         for name, outline in outlines.items():
             view = find_frame(name, self.frames)
             if view in self.kept:
@@ -278,13 +292,24 @@ class MaskTask:
             scaled = np.array(outline, np.float64) * size[0] / read_size(self.frames[view].image)[0]
             if scaled.ndim == 2:  # the user's polygon is the mask
                 given[view] = polygon_mask(scaled, size)
+            elif self.tracker is not None:
+                boxes[view] = scaled.tolist()
             else:
                 region = box_region(scaled, size)
                 given[view] = grab(self.images[view], region, region)
         for view, mask in given.items():
             if not mask.any():
                 raise NerfroError(f"{self.frames[view].name}: the outline or mask is empty; draw it around the object")
-        return propagate(self.images, self.cameras, given, self.hull_only, progress)
+        if self.tracker is None:
+            return propagate(self.images, self.cameras, given, self.hull_only, progress)
+        names = [frame.image.name for frame in self.frames]
+        order = numeric_order(names) or sorted(range(len(names)), key=names.__getitem__)
+        place = {view: number for number, view in enumerate(order)}
+        images = [self.images[view] for view in order]
+        prompts = {place[view]: mask for view, mask in given.items()}
+        corners = {place[view]: box for view, box in boxes.items()}
+        tracked = track_object(self.tracker, images, prompts, corners, progress)
+        return check_tracked(self.cameras, given, {order[number]: mask for number, mask in tracked.items()})
 
     def save(self, outlines: Mapping[str, list], found: Segmentation) -> str:
         """Write all masks but the kept ones and a contact sheet, print a report, and return a message."""
@@ -292,6 +317,7 @@ class MaskTask:
         made = [view for view in range(len(self.frames)) if view not in self.kept]
         for view in made:
             method = POLYGON if view in polygons else found.shape if view in found.by_hull else None
+            method = TRACKED if method is None and self.tracker is not None else method
             save_mask(self.frames[view], found.masks[view], method)
         path = self.source.root / _SHEET
         save_image(path, mask_sheet(self.images, self.frames, found))

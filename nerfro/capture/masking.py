@@ -106,9 +106,9 @@ class Segmentation:
 
     Attributes:
         masks: by view, the given masks included.
-        overlaps: by view, intersection over union of GrabCut's mask and the visual hull of the other views.
-        by_hull: views whose mask is the projection of the visual hull, because GrabCut disagrees with the hull or was
-            not used.
+        overlaps: by view, intersection over union of the segmented mask and the visual hull.
+        by_hull: views whose mask is the projection of the visual hull, because the segmented mask disagrees with the
+            hull or there is none.
         shape: shape that the projections show.
         agreement: by view of a given mask, intersection over union of the mask and this shape.
     """
@@ -118,6 +118,34 @@ class Segmentation:
     by_hull: list[int]
     shape: Shape
     agreement: dict[int, float]
+    segmenter: str = "GrabCut"
+
+
+def check_tracked(
+    cameras: Cameras, given: Mapping[int, Bool[np.ndarray, "H W"]], tracked: Mapping[int, Bool[np.ndarray, "H W"]]
+) -> Segmentation:
+    """Compare masks of Segment Anything 2 with the visual hull of all masks, and replace those that disagree.
+
+    Args:
+        cameras: cameras of all views.
+        given: known masks by view, which do not change.
+        tracked: masks of all other views.
+
+    Raises:
+        NerfroError: the masks have no common visual hull.
+    """
+    outlines = OutlineHull(cameras, {**given, **tracked})
+    hull = outlines.hull() if len(outlines) >= FEWEST_VIEWS else None
+    if hull is None:
+        raise NerfroError(
+            "Segment Anything 2 does not find the same object in several images; outline the object in more images"
+        )
+    seen = outlines.seen_from([*given, *tracked], hull)
+    overlaps = {view: _overlap(mask, seen[view]) for view, mask in tracked.items()}
+    by_hull = [view for view in tracked if overlaps[view] < AGREES]
+    masks = {**given, **tracked, **{view: seen[view] for view in by_hull}}
+    agreement = {view: _overlap(mask, seen[view]) for view, mask in given.items()}
+    return Segmentation(masks, overlaps, by_hull, "visual hull", agreement, "Segment Anything 2")
 
 
 def propagate(

@@ -21,12 +21,13 @@ from nerfro.data.colmap_model import read_colmap
 from nerfro.data.image_files import read_mask, to_unit
 from nerfro.data.lenses import Lens, check_lenses
 from nerfro.errors import NerfroError
-from nerfro.files.atomic import refuse_existing
+from nerfro.files.atomic import refuse_existing, require_room, write_atomically
 from nerfro.paths import user_path
 from nerfro.progress import progress_bar, track
 
 Pairs = Literal["sequential", "all"]
 
+_MODELS = "models"  # temporary folder of new models
 _MODEL_FOLDERS = ("sparse/0", "sparse")
 # COLMAP's camera model for each of nerfro's lens models.
 _CAMERAS = {"pinhole": "PINHOLE", "radial": "RADIAL", "opencv": "OPENCV"}
@@ -37,6 +38,7 @@ _SEED, _ALL_THREADS = 0, -1
 _NUM_NEIGHBORS = 10
 # File names are a sequence if this fraction of the steps between their numbers is at most so many median steps.
 _LARGE_STEP, _MIN_REGULAR = 4, 0.9
+_BYTES_PER_IMAGE = 2**22  # of COLMAP's database
 # COLMAP reports no progress, so the work is divided into chunks of images and of pairs.
 _IMAGES_PER_CHUNK, _PAIRS_PER_CHUNK = 4, 100
 
@@ -82,14 +84,24 @@ def reconstruct(images: Sequence[Path], masks: Sequence[Path | None], folder: Pa
     Features on the refractive object are discarded, because refracted rays do not intersect in a scene point and would
     bias the poses.
 
+    Args:
+        images: the photographs.
+        masks: mask of the object in each image, if any.
+        folder: output folder.
+        settings: settings of COLMAP.
+
     Returns:
-        Folder of the model with the most images.
+        Folder of the model with the most images, which is a new folder in `folder`.
+
+    Raises:
+        NerfroError: no image has a pose, or the disk is full.
     """
     pycolmap = require_pycolmap()
     pycolmap.set_random_seed(_SEED)
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     names, threads = [image.name for image in images], settings.threads or _ALL_THREADS
     with tempfile.TemporaryDirectory() as scratch:
+        require_room(Path(scratch), _BYTES_PER_IMAGE * len(images), "TMPDIR")  # COLMAP would abort the process
         database = Path(scratch) / "database.db"
         _extract(pycolmap, images, masks, Path(scratch), settings, threads)
         order = numeric_order(names) if settings.pairs != "all" else None
@@ -97,20 +109,34 @@ def reconstruct(images: Sequence[Path], masks: Sequence[Path | None], folder: Pa
             order = sorted(range(len(names)), key=names.__getitem__)
         pairs = list(itertools.combinations(range(len(names)), 2)) if order is None else sequential_pairs(order)
         _match(pycolmap, database, [(names[i], names[j]) for i, j in pairs], threads)
-        models = _map(pycolmap, database, images, folder, threads)
+        models = _map(pycolmap, database, images, threads)
         if settings.pairs is None and order is not None and len(_registered(models)) < len(images):
             posed = _registered(models)
             print(f"{len(posed)} of {len(images)} images have a pose: matching the others with all images")
             left = set(itertools.combinations(range(len(names)), 2)) - {(min(pair), max(pair)) for pair in pairs}
             left = {pair for pair in left if not {names[pair[0]], names[pair[1]]} <= posed}
             _match(pycolmap, database, [(names[i], names[j]) for i, j in sorted(left)], threads)
-            models = _map(pycolmap, database, images, folder, threads)
-    if not models:
+            models = _map(pycolmap, database, images, threads)
+        if not models:
+            raise NerfroError(
+                f"COLMAP finds no poses for the {len(images)} images, because too few features match; photograph with "
+                "more overlap and texture around the object, or lay a board beside the object (target=apriltag)"
+            )
+        largest = max(models, key=lambda number: models[number].num_reg_images())
+        return _copy_model(database.parent / _MODELS / str(largest), folder / "0")
+
+
+def _copy_model(model: Path, folder: Path) -> Path:
+    """Copy a model atomically, because COLMAP ignores a full disk; `find_model` finds the file that is written last."""
+    try:
+        read_colmap(model)
+    except NerfroError as error:
         raise NerfroError(
-            f"COLMAP finds no poses for the {len(images)} images, because too few features match; photograph with more "
-            "overlap and texture around the object, or lay a board beside the object (target=apriltag)"
-        )
-    return folder / str(max(models, key=lambda number: models[number].num_reg_images()))
+            f"COLMAP cannot write to {model}; free some space, or set TMPDIR to another folder"
+        ) from error
+    for file in sorted(model.iterdir(), key=lambda file: file.stem == "cameras"):
+        write_atomically(folder / file.name, file.read_bytes())
+    return folder
 
 
 def numeric_order(names: Sequence[str]) -> list[int] | None:
@@ -171,12 +197,13 @@ def _match(pycolmap: Any, database: Path, pairs: Sequence[tuple[str, str]], thre
         pycolmap.match_image_pairs(database, matching_options=options, pairing_options=pairing)
 
 
-def _map(pycolmap: Any, database: Path, images: Sequence[Path], folder: Path, threads: int) -> dict[int, Any]:
-    """Register the images one after the other and write the models to the folder; returns the models by number."""
+def _map(pycolmap: Any, database: Path, images: Sequence[Path], threads: int) -> dict[int, Any]:
+    """Register the images one after the other and write models beside the database; returns the models by number."""
     options = pycolmap.IncrementalPipelineOptions()
     options.ba_refine_principal_point = False
     options.random_seed, options.num_threads = _SEED, threads
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = database.with_name(_MODELS)
+    folder.mkdir(exist_ok=True)
     with progress_bar("registering images", len(images)) as progress:
 
         def advance(count: int = 1) -> None:

@@ -159,7 +159,7 @@ def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
 
 
 def _text_rows(
-    path: Path, form: str, parsers: tuple[Callable[[str], Any], ...], skip: int = 0
+    path: Path, form: str, parsers: tuple[Callable[[str], Any], ...], features: bool = False
 ) -> Iterator[tuple[str, list[Any]]]:
     """Yield location and parsed words of each line that is not a comment.
 
@@ -167,7 +167,7 @@ def _text_rows(
         path: the text file.
         form: format of a line, for the error message.
         parsers: one per word; the last parser receives the rest of the line.
-        skip: number of lines to skip after each line.
+        features: whether a line of features, which may be empty, follows each line.
     """
     lines = read_text(path, "export it again", MAX_ARRAY_BYTES).splitlines()
     numbered = ((i, line.strip()) for i, line in enumerate(lines, 1) if not line.startswith("#"))
@@ -180,8 +180,8 @@ def _text_rows(
         except ValueError as error:
             raise NerfroError(f"{path}, line {i} is not {form}: {line[:60]!r}") from error
         yield f"{path}, line {i}", words
-        for _ in range(skip):
-            next(numbered, None)
+        if features and len(next(numbered, (0, ""))[1].split()) % 3 != 0:
+            raise NerfroError(f"{path}: after line {i} there is no line of features, which may be empty; add the line")
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
@@ -193,8 +193,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
 
 def _text_images(path: Path) -> Iterator[ColmapImage]:
     parsers, form = (str, *[float] * 7, int, str), "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-    # Each image is followed by one line of features, which may be empty.
-    for _, (_, *pose, camera, name) in _text_rows(path, form, parsers, skip=1):
+    for _, (_, *pose, camera, name) in _text_rows(path, form, parsers, features=True):
         yield _image(name, tuple(pose[:4]), tuple(pose[4:]), camera, path)
 
 

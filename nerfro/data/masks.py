@@ -25,8 +25,9 @@ _SPLIT_FOLDERS = ("train", "val", "test")
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
 # Key of the text in the PNG file of a derived mask: the method and a checksum of the pixels. The method is the shape
-# whose projection the mask is, or POLYGON for an outline.
-METHOD, POLYGON = "nerfro", "polygon"
+# whose projection the mask is, POLYGON for an outline, or TRACKED for Segment Anything 2.
+METHOD, POLYGON, TRACKED = "nerfro", "polygon", "sam2"
+EVIDENCE = (None, POLYGON, TRACKED)  # methods whose masks show the object in the photograph
 
 _ignore_masks: ContextVar[bool] = ContextVar("ignore_masks", default=False)
 
@@ -97,7 +98,8 @@ def unused_masks(root: Path, images: Sequence[Path], masks: Sequence[Path | None
     if any(masks) or _ignore_masks.get():
         return []
     beside = (path for folder in {image.parent for image in images} for path in folder.glob("mask_*"))
-    files = {path for path in (*beside, *root.glob("masks/**/*")) if path.suffix.lower() in IMAGE_SUFFIXES}
+    below = root.glob("[mM][aA][sS][kK][sS]/**/*")
+    files = {path for path in (*beside, *below) if path.suffix.lower() in IMAGE_SUFFIXES}
     return sorted(path for path in files.difference(images) if path.is_file() and not path.name.startswith("."))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
+import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO
@@ -63,3 +64,13 @@ def refuse_existing(files: Iterable[Path], overwrite: bool) -> None:
     taken = [path for path in files if path.exists()]
     if taken and not overwrite:
         raise NerfroError(f"{taken[0]} exists; give another out=... or overwrite=true")
+
+
+def require_room(folder: Path, needed_bytes: int, option: str) -> None:
+    """Raise an error if the disk of a folder is too full; `option` names the folder, for the message."""
+    free = shutil.disk_usage(folder).free
+    if free < needed_bytes:
+        raise NerfroError(
+            f"{folder} has {free / 2**20:,.0f} MiB free and this run needs {needed_bytes / 2**20:,.0f}; free some or "
+            f"choose another {option}"
+        )

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt16
 
+from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import MAX_PIXELS
 
@@ -61,7 +62,8 @@ def write_radiance(path: Path, values: Float[np.ndarray, "H W C"]) -> None:
             raise OSError(OpenImageIO.geterror())
         written = output.open(str(file), spec) and output.write_image(np.ascontiguousarray(values, np.float32))
         if not (output.close() and written):
-            raise OSError(output.geterror())
+            reason = " ".join(output.geterror().split())
+            raise NerfroError(f"cannot write {path}: {reason}; free some space, or set TMPDIR to another folder")
         write_atomically(path, file.read_bytes())
 
 

@@ -14,7 +14,7 @@ from nerfro.errors import NerfroError, first_of
 from nerfro.paths import refuse_root
 
 _LOCK, PARTIAL = ".lock", ".partial"  # lock file, and ending of files that are being written
-STAGE = "NERFRO_STAGE"  # environment variable of the stages of nerfro.reconstruct: the folders that it has locked
+STAGE = "NERFRO_STAGE"  # environment variable of stages: the folders that nerfro.reconstruct has locked
 _locked: dict[Path, int] = {}  # folders that this process has locked, with the inode of each lock file
 
 
@@ -86,7 +86,7 @@ def require_lock(path: Path) -> None:
 
 
 def hold(file: IO[bytes]) -> bool:
-    """Lock an open file as long as it is open; returns False if this fails, as while another process holds the lock."""
+    """Lock an open file until the file is closed; returns False if another process holds the lock, or without locks."""
     try:
         import fcntl
     except ImportError:  # Windows, which does not remove open files

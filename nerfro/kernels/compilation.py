@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import ast
+import errno
 import functools
 import hashlib
 import inspect
+import os
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -17,6 +20,7 @@ import numba
 from nerfro.kernels.threads import num_threads, parallel_threads
 from nerfro.paths import cache_dir
 
+_KERNEL_BYTES = 2**24  # free disk space for the machine code of a kernel
 Function = TypeVar("Function", bound=Callable)
 
 
@@ -66,6 +70,8 @@ def _compile(function: Function, parallel: bool, allocates: bool = True) -> Func
         # Numba would try __pycache__ next, where machine code of other versions of imported files may lie.
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
+        if shutil.disk_usage(folder).free < _KERNEL_BYTES:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]  # read while the function's cache is made
         return numba.njit(cache=True, **options)(function)
     except (RuntimeError, OSError) as error:

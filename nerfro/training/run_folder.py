@@ -6,7 +6,6 @@ import json
 import pickle
 import platform
 import shlex
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -22,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from nerfro.errors import Interrupted, NerfroError, first_of
-from nerfro.files.atomic import write_atomically
+from nerfro.files.atomic import require_room, write_atomically
 from nerfro.files.folder_lock import lock_folder, require_only
 from nerfro.files.foreign_config import foreign_config, read_foreign_config
 from nerfro.files.reading import reading
@@ -87,7 +86,7 @@ def in_sweep() -> bool:
 
 def begin(folder: Path, config: DictConfig, renderer: Renderer) -> None:
     """Check the disk space, write the records of a run, and print a summary."""
-    require_room(folder, needed_bytes(renderer))
+    require_room(folder, needed_bytes(renderer), "hydra.run.dir")
     record(folder, config)
     found = f"{content.describe(config.content)}{backdrop.describe(config)}"
     print(f"nerfro: {config.name} on {config.data.root} -> {folder}\n{found}", end="", flush=True)
@@ -104,16 +103,6 @@ def next_steps(folder: Path, split: str | None) -> str:
     if in_sweep():
         lines.append(f"table of the sweep: python -m nerfro.summary {shlex.quote(f'runs={folder.parent}')}")
     return "\n".join(lines)
-
-
-def require_room(folder: Path, needed_bytes: int) -> None:
-    """Raise an error if the disk is too full for a run."""
-    free = shutil.disk_usage(folder).free
-    if free < needed_bytes:
-        raise NerfroError(
-            f"{folder} has {free / 2**20:,.0f} MiB free and this run needs {needed_bytes / 2**20:,.0f}; "
-            "free some or choose another hydra.run.dir"
-        )
 
 
 def needed_bytes(renderer: Renderer) -> int:

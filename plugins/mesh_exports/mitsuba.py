@@ -22,6 +22,7 @@ from nerfro.files.deep_images import write_radiance
 from nerfro.scenes.path_tracer import envmap_texture
 from nerfro.viewing.changes import absorption_of
 from nerfro.viewing.exports import Export
+from nerfro.viewing.page import page_split
 from nerfro.viewing.trained_scene import SKY_HEIGHT, TrainedScene
 
 from .meshes import glass_meshes, inside_mesh
@@ -42,8 +43,8 @@ def write_mitsuba(scene: TrainedScene, out: Path, config: DictConfig) -> str:
 
     The glass is a `dielectric`, with partial reflection; the parameter `glass` selects another material, such as
     `transmitting_glass` (see `scenes.glass`) for a model without partial reflection. The content is a light source
-    with the radiance that is seen from outside. The test cameras are the sensors, in their order. `config` is an
-    `ExportConfig`.
+    with the radiance that is seen from outside. The sensors are the test cameras in their order, or the cameras of
+    another split if there are no test cameras. `config` is an `ExportConfig`.
 
     Raises:
         NerfroError: the scene has bodies inside bodies.
@@ -51,7 +52,8 @@ def write_mitsuba(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     glass, inside = glass_meshes(scene), inside_mesh(scene, config.resolution, config.half_depth)
     if len(glass) > 1:
         raise NerfroError("bodies inside bodies are not written for Mitsuba; write them with what=mesh")
-    cameras, absorption = scene.cameras("test").to("cpu"), absorption_of(scene.renderer.scene)
+    split = page_split(scene.source)
+    cameras, absorption = scene.cameras(split).to("cpu"), absorption_of(scene.renderer.scene)
     glass_file, inside_file, sky_file = (out.with_name(out.stem + ending) for ending in MITSUBA_FILES)
     objects: dict[str, Any] = {
         "integrator": {"type": "volpath" if absorption.any() else "path", "max_depth": _MAX_DEPTH},
@@ -71,7 +73,7 @@ def write_mitsuba(scene: TrainedScene, out: Path, config: DictConfig) -> str:
         black = {"type": "conductor", "material": "none", "specular_reflectance": (0.0, 0.0, 0.0)}
         light = {"type": "area", "radiance": {"type": "mesh_attribute", "name": "vertex_color"}}
         objects["inside"] = {**_write_shape(inside_file, inside), "bsdf": black, "emitter": light}
-    objects |= {f"test_{view:03d}": _sensor(cameras, view) for view in range(len(cameras))}
+    objects |= {f"{split}_{view:03d}": _sensor(cameras, view) for view in range(len(cameras))}
     root = ElementTree.Element("scene", version="3.0.0")
     ElementTree.SubElement(root, "default", name="glass", value="dielectric")
     for name, value in objects.items():

@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from scipy.ndimage import gaussian_filter
 pytest.importorskip("cv2")
 
 from nerfro.cameras import Cameras
+from nerfro.capture import mask_files
 from nerfro.capture.masking import polygon_mask, propagate
 from nerfro.data.blender import OpenCVData
 from nerfro.data.masks import method_of
@@ -148,12 +150,39 @@ def test_two_outlines_of_a_body_of_revolution_give_all_masks_whatever_the_colour
     assert min(overlap(found.masks[view], masks[view]) for view in found.by_hull) > 0.95
 
 
+def polygon_around(mask: np.ndarray) -> list[list[float]]:
+    """A regular polygon with the area and the centre of a mask."""
+    angles, (rows, columns) = np.linspace(0, 2 * np.pi, 25)[:-1], np.nonzero(mask)
+    radius, middle = np.sqrt(len(rows) / np.pi), np.array([columns.mean() + 0.5, rows.mean() + 0.5])
+    return (middle + radius * np.stack([np.cos(angles), np.sin(angles)], 1)).tolist()
+
+
+def test_masks_of_a_network_are_marked_and_compared_with_their_hull(
+    capture: Path, photographs: list, command: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    polygon, box, lost = polygon_around(photographs[1][1]), [10, 8, 80, 64], 3
+
+    def track(model: Any, images: list, masks: dict, boxes: dict, progress: Callable[[], None]) -> dict:
+        assert all(np.array_equal(image, photograph[0]) for image, photograph in zip(images, photographs, strict=True))
+        assert (model, list(masks), boxes) == ("network", [1], {5: box})
+        found = {view: mask for view, (_, mask, _) in enumerate(photographs) if view not in masks}
+        return found | {lost: np.zeros_like(found[lost])}
+
+    monkeypatch.setattr(mask_files, "load_tracker", lambda folder: "network")
+    monkeypatch.setattr(mask_files, "track_object", track)
+    printed = command("mask", f"data.root={capture}", f"outlines={{p_1:{polygon},p_5:{box}}}", "sam2=folder")
+    assert "1 masks are projections of the visual hull" in printed
+    assert np.array_equal(read(capture, 1), polygon_mask(polygon, (WIDTH, HEIGHT)))
+    methods = [method_of(capture / "photos" / f"mask_p_{view}.png") for view in (1, 2, lost, 5)]
+    assert methods == ["polygon", "sam2", "visual hull", "sam2"]
+    assert np.array_equal(read(capture, 2), photographs[2][1])
+    assert overlap(read(capture, lost), photographs[lost][1]) > 0.8
+    assert "wrote 1 masks" in command("mask", f"data.root={capture}", "hull_only=true"), "the others are kept"
+    assert "sam2= segments all photographs" in command("mask", f"data.root={capture}", "sam2=folder", "view=true")
+
+
 def test_polygons_are_the_masks_of_their_views(capture: Path, photographs: list, command: Callable[..., str]) -> None:
-    angles, polygons = np.linspace(0, 2 * np.pi, 25)[:-1], {}
-    for view in (1, 5, 9):
-        rows, columns = np.nonzero(photographs[view][1])
-        radius, middle = np.sqrt(len(rows) / np.pi), np.array([columns.mean() + 0.5, rows.mean() + 0.5])
-        polygons[f"p_{view}"] = (middle + radius * np.stack([np.cos(angles), np.sin(angles)], 1)).tolist()
+    polygons = {f"p_{view}": polygon_around(photographs[view][1]) for view in (1, 5, 9)}
     (capture / "outlines.json").write_text(json.dumps(polygons))
     command("mask", f"data.root={capture}", f"outlines={capture / 'outlines.json'}", "hull_only=true")
     for name, polygon in polygons.items():

@@ -20,6 +20,7 @@ import pycolmap
 from nerfro.capture import reconstruction
 from nerfro.capture.boards import Sheet
 from nerfro.capture.reconstruction import numeric_order, sequential_pairs
+from nerfro.errors import NerfroError
 from tests.capture.photographs import angle, look_at, photograph
 
 
@@ -125,6 +126,15 @@ def test_a_model_is_made_where_there_is_none(tmp_path: Path, command: Callable[.
     for name in truth:
         turns = [poses["p_0.png"][:, :3].T @ poses[name][:, :3] for poses in (found, truth)]
         assert angle(turns[0], turns[1]) < 0.5
+
+
+def test_a_model_that_colmap_could_not_write_is_not_kept(tmp_path: Path) -> None:
+    synthesized(tmp_path / "model", ("SIMPLE_PINHOLE", [1280.0, 512, 384]), 0.0, "binary")
+    images = tmp_path / "model" / "images.bin"
+    images.write_bytes(images.read_bytes()[:-1])
+    with pytest.raises(NerfroError, match="COLMAP cannot write to"):
+        reconstruction._copy_model(tmp_path / "model", tmp_path / "sparse" / "0")
+    assert not (tmp_path / "sparse").exists()
 
 
 @pytest.mark.parametrize(

@@ -198,6 +198,7 @@ def test_truncated_and_overlong_binary_files_are_refused(write, file):
         ("cameras", "1 OPENCV", "2 OPENCV", "has camera 1, which the model does not hold"),
         ("images", "top/v5.png", "top/v4.png", "two images have the name top/v4.png"),
         ("images", "top/v5.png", "top/v6.png", "image .*v6.png of the model .* does not exist; set data.images"),
+        ("images", "\n\n", "\n", r"images\.txt: after line \d+ there is no line of features"),
         ("images", " top/v5.png", "", r"images\.txt, line 6 is not IMAGE_ID"),
         ("points3D", "1 ", "1 x", r"points3D\.txt, line 1 is not POINT3D_ID"),
     ],

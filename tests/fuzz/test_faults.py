@@ -148,7 +148,7 @@ COMMANDS = {
     "render": ["checkpoint={run}", "out={out}", "device=cpu", "path=orbit", "frames=2", "resolution=8", "film=[gif]"],
     "summary": ["runs=[{run}]", "out={out}", "report=true"],
     "preprocess": ["data.root={data}", "out={out}", "resolution=16", "medium.resolution=24"],
-    "calibrate": ["images={data}/train", "out={out}", "write_board=true", "overwrite=true"],
+    "calibrate": ["out={out}", "write_board=true", "board=grid", "columns=2", "rows=2"],
     "synthesize": ["scene=torus", "out={out}", "resolution=8", "spp=1"],
     "reconstruct": ["images={data}/train", "masks={data}/train", "out={out}"],
     "mask": ["data.root={out}", "outlines={{r_0: [4, 4, 12, 12]}}"],
@@ -180,7 +180,7 @@ def test_folder_that_another_process_uses_and_a_whole_file_system_are_refused(
             assert words in line
 
 
-@pytest.mark.parametrize("command", ["train", "evaluate", "render", "trace", "summary", "export"])
+@pytest.mark.parametrize("command", ["train", "evaluate", "render", "trace", "summary", "export", "calibrate"])
 def test_disk_that_is_full_at_any_file_is_told_in_one_line(
     command: str, world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
