@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from lightning.pytorch import Callback
 from omegaconf import DictConfig
 
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
@@ -96,7 +96,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
             metrics = ImageMetrics(*lpips, prefix=split)
             result, treated = score_split(renderer, test, metrics, folder, subdivision, config.evaluation.refine_steps)
             scores = {f"{split}/{name}": mean for name, mean in result.means().items()}
-            callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+            callbacks: list[Any] = trainer.callbacks  # type: ignore[attr-defined]
             states = {callback.state_key: callback.state_dict() for callback in callbacks}
             scored = RunMetrics(result, *spent, treated, steps_by_phase(states, spent[0]))
     finally:
