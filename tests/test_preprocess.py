@@ -119,7 +119,7 @@ def test_a_body_of_revolution_is_fitted_where_it_is_asked_for(preprocess: Callab
 
 
 def test_a_vessel_is_fitted_where_it_is_asked_for(preprocess: Callable[..., str]) -> None:
-    printed = preprocess("medium.ior=1.33", "smoothing=0", "vessel=true")
+    printed = preprocess("medium.ior=1.33", "smoothing=0", "vessel=true", "room=false", "data.downscale=2")
     command = shlex.split(printed.split("train on the vessel: ")[1])
     assert {"medium=vessel", "medium.ior=1.52"} <= set(command)
     assert "medium.ior=1.33" not in command
