@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from nerfro.allowed import Depth, Width, checked
 from nerfro.errors import NerfroError
+from nerfro.kernels.linear import Linear
 
 # Colours extend slightly beyond [0, 1], so that black and white need no infinite activation (mip-NeRF's code).
 RGB_PADDING = 1e-3
@@ -33,12 +34,13 @@ class SkipMLP(nn.Module):
         self.num_outputs = width + num_inputs * (skip == depth)
 
     def forward(self, x: Float[Tensor, "*batch I"]) -> Float[Tensor, "*batch O"]:
-        y = x = x.to(self.layers[0].weight.dtype)  # type: ignore[arg-type]  # rays are in single precision
+        batch = x.shape[:-1]
+        y = x = x.reshape(-1, x.shape[-1]).to(self.layers[0].weight.dtype)  # type: ignore[arg-type]
         for i, layer in enumerate(self.layers, start=1):
-            y = F.relu(layer(y))
-            if i == self.skip:
-                y = torch.cat([y, x.to(y.dtype)], dim=-1)
-        return y
+            y = F.relu(layer(y, x) if i == self.skip + 1 else layer(y), inplace=True)
+        if self.skip == len(self.layers):
+            y = torch.cat([y, x.to(y.dtype)], dim=-1)
+        return y.view(*batch, self.num_outputs)
 
 
 class RadianceMLP(nn.Module):
@@ -65,7 +67,7 @@ class RadianceMLP(nn.Module):
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         features = self.trunk(position)
         density = F.softplus(self.density(features).squeeze(-1).float() - 1.0)
-        view = F.relu(self.view(torch.cat([self.bottleneck(features), direction.to(features.dtype)], dim=-1)))
+        view = F.relu(self.view(self.bottleneck(features), direction))
         return density, padded_sigmoid(self.rgb(view))
 
 
@@ -81,7 +83,7 @@ def compile_networks(model: nn.Module, backend: str) -> None:
 
 def glorot_linear(num_inputs: int, num_outputs: int) -> nn.Linear:
     """Create a linear layer with Glorot-uniform weights and zero bias."""
-    layer = nn.Linear(num_inputs, num_outputs)
+    layer = Linear(num_inputs, num_outputs)
     nn.init.xavier_uniform_(layer.weight)
     nn.init.zeros_(layer.bias)
     return layer

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from lightning.pytorch import LightningDataModule
 from omegaconf import DictConfig
-from torch import Tensor
+from torch import Tensor, nn
 
 from nerfro.data.base import Views
 from nerfro.rendering import Renderer
@@ -26,6 +26,8 @@ from nerfro.types import Batch
 _VALIDATIONS_PER_IMAGE = 5
 # Number of a validation view that stands for a validation without an image.
 NO_IMAGE = -1
+# Weights of linear layers; the default field has 9,000, the networks of the paper 1.2 million.
+_LARGE = 100_000
 
 
 class RayDataModule(LightningDataModule):
@@ -56,7 +58,7 @@ class RayDataModule(LightningDataModule):
         self.batches = shared.to(device, cast(torch.dtype, module.dtype))
         self.end_thread()
         if device.type == "cpu" and can_prefetch(module.renderer):
-            self._ahead = Prefetcher(self.batches.batch)
+            self._ahead = Prefetcher(self.batches.batch, spare_core=not multiplies_large_matrices(module.renderer))
         # Lightning calls this method after restoring a checkpoint, so a resumed run continues with the next batch.
         return itertools.count(self.trainer.global_step)
 
@@ -106,18 +108,22 @@ Made = TypeVar("Made")
 class Prefetcher(Generic[Made]):
     """Make the batch of the next step in a thread. The batches do not depend on the thread.
 
-    The thread uses one core, and kernels release Python and the threads of Numba (`kernels.compilation`). PyTorch has
-    one thread less meanwhile, because its threads spin while they wait for one that has no core.
+    The thread uses one core, and kernels release Python and the threads of Numba (`kernels.compilation`).
+
+    Args:
+        make: function that makes the batch of a step.
+        spare_core: whether PyTorch has one thread less meanwhile, because its threads spin while they wait for one that
+            has no core.
     """
 
-    def __init__(self, make: Callable[[int], Made]) -> None:
+    def __init__(self, make: Callable[[int], Made], spare_core: bool = True) -> None:
         self._make = make
         self._next: tuple[int, Future[Made]] | None = None
         # PyTorch has a number of threads per thread, and new threads inherit the last one.
         self._num_threads = torch.get_num_threads()
         self._thread = ThreadPoolExecutor(1, "paths", lambda: torch.set_num_threads(1))
         self._thread.submit(torch.get_num_threads).result()
-        torch.set_num_threads(max(1, self._num_threads - 1))
+        torch.set_num_threads(max(1, self._num_threads - spare_core))
 
     def __call__(self, step: int) -> Made:
         """Return the batch of a step; errors of the thread are raised here."""
@@ -141,6 +147,12 @@ class Prefetcher(Generic[Made]):
     def _without_gradients(self, step: int) -> Made:
         with torch.no_grad():
             return self._make(step)
+
+
+def multiplies_large_matrices(renderer: Renderer) -> bool:
+    """Return whether matrix products take most of a step, so that all threads of PyTorch pay."""
+    linear = (module for module in renderer.modules() if isinstance(module, nn.Linear))
+    return sum(module.weight.numel() for module in linear) > _LARGE
 
 
 def can_prefetch(renderer: Renderer) -> bool:

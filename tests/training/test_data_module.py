@@ -20,7 +20,7 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.rendering import Renderer, Scene
 from nerfro.samplers.eikonal import Eikonal
 from nerfro.samplers.snell import Snell
-from nerfro.training.data_module import Prefetcher, RayDataModule, can_prefetch
+from nerfro.training.data_module import Prefetcher, RayDataModule, can_prefetch, multiplies_large_matrices
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Rays
@@ -100,13 +100,17 @@ def test_what_goes_wrong_in_the_thread_is_raised_where_the_batch_is_asked_for(ah
         one(2)
 
 
-def test_the_thread_takes_one_core_from_the_others_until_it_ends() -> None:
-    threads = torch.get_num_threads()
+@pytest.mark.parametrize(("width", "expected"), [(8, 2), (512, 3)])
+def test_the_thread_takes_one_core_from_torch_unless_matrices_are_large(width: int, expected: int) -> None:
+    threads, renderer = torch.get_num_threads(), Mock(spec=Renderer, modules=lambda: [torch.nn.Linear(width, width)])
     try:
         torch.set_num_threads(3)
-        prefetcher = Prefetcher(lambda step: (torch.get_num_threads(), torch.is_grad_enabled()))
+        prefetcher = Prefetcher(
+            lambda step: (torch.get_num_threads(), torch.is_grad_enabled()),
+            spare_core=not multiplies_large_matrices(renderer),
+        )
         assert prefetcher(0) == (1, False)
-        assert torch.get_num_threads() == 2
+        assert torch.get_num_threads() == expected
         prefetcher.close()
         assert torch.get_num_threads() == 3
     finally:
@@ -140,7 +144,7 @@ def test_a_batch_is_made_when_its_step_begins_if_paths_learn(
     batches.forget = lambda: None
     data = RayDataModule(batches, None, 0)
     scene = Mock(spec=Scene, medium=ball)
-    renderer = Mock(spec=Renderer, path_sampler=Snell(), scene=scene, paths_learn=learns)
+    renderer = Mock(spec=Renderer, path_sampler=Snell(), scene=scene, paths_learn=learns, modules=list)
     module = Mock(spec=TrainingModule, renderer=renderer, dtype=torch.float32)
     strategy = Mock(root_device=torch.device("cpu"))
     data.trainer = Mock(spec=Trainer, strategy=strategy, lightning_module=module, global_step=5, training=True)  # type: ignore[assignment]
