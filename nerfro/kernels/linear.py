@@ -25,7 +25,7 @@ class Linear(nn.Linear):
     def forward(self, *inputs: Float[Tensor, "*batch _"]) -> Float[Tensor, "*batch O"]:
         """Apply the layer to one or several inputs, which are concatenated."""
         first, *others = inputs
-        if not _suits_onednn(first) or torch.compiler.is_compiling():
+        if torch.compiler.is_compiling() or not _suits_onednn(first):
             return super().forward(torch.cat([first, *(other.to(first.dtype) for other in others)], -1))
         result = _Linear.apply(self.weight, self.bias, *(part.reshape(-1, part.shape[-1]) for part in inputs))
         # PyTorch would copy a view before an operator in place.
