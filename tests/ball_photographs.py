@@ -1,7 +1,5 @@
 """Photographs of balls in balls under a smooth sky, all in closed form but for the grid of distances."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Media whose rays are known in closed form, and what tests of optics share. Lengths are in world units."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,7 @@
 """What all tests share."""
 
-from __future__ import annotations
-
+import functools
+import importlib
 import json
 import math
 import os
@@ -133,26 +133,44 @@ class Finished(NamedTuple):
 
 
 @pytest.fixture
+def run_here(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Finished]:
+    """Run a command's main in this process to its end, as in `run_here("train", "seed=1")`."""
+
+    def run(name: str, *overrides: str) -> Finished:
+        main = importlib.import_module(f"nerfro.{name}").main
+        monkeypatch.setattr(sys, "argv", [f"nerfro.{name}", *overrides])
+        monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+        capsys.readouterr()
+        code = 0
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 1
+        return Finished(code, *capsys.readouterr())
+
+    return run
+
+
+@pytest.fixture
 def train_here(
-    unchecked: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    unchecked: None, run_here: Callable[..., Finished], monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., Finished]:
-    """`python -m nerfro.train`'s main in this process, on the CPU and without looking for LPIPS weights."""
+    """`python -m nerfro.train` in this process, without looking for LPIPS weights."""
     import nerfro.train
 
     monkeypatch.setattr(nerfro.train, "find_lpips_networks", lambda: ({}, {}))
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    return lambda *overrides: finish(nerfro.train.main, overrides, monkeypatch, capsys)
+    return functools.partial(run_here, "train")
 
 
 @pytest.fixture
 def evaluate_here(
-    unchecked: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    unchecked: None, run_here: Callable[..., Finished], monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., Finished]:
-    """`python -m nerfro.evaluate`'s main in this process, on the CPU and without looking for LPIPS weights."""
+    """`python -m nerfro.evaluate` in this process, on the CPU and without looking for LPIPS weights."""
     import nerfro.evaluate
 
     monkeypatch.setattr(nerfro.evaluate, "find_lpips_networks", lambda: ({}, {"lpips": "no cable"}))
-    return lambda *overrides: finish(nerfro.evaluate.main, ("device=cpu", *overrides), monkeypatch, capsys)
+    return functools.partial(run_here, "evaluate", "device=cpu")
 
 
 def train_in(folder: Path, *overrides: str) -> Path:
@@ -164,24 +182,6 @@ def train_in(folder: Path, *overrides: str) -> Path:
         patch.setattr(sys, "argv", ["nerfro.train", *overrides, f"hydra.run.dir={folder}"])
         nerfro.train.main()
     return folder
-
-
-def finish(
-    main: Callable[[], None],
-    overrides: Sequence[str],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> Finished:
-    """Run a command's main with these arguments to its end."""
-    monkeypatch.setattr(sys, "argv", [main.__module__, *overrides])
-    capsys.readouterr()
-    code = 0
-    try:
-        main()
-    except SystemExit as end:
-        code = end.code if isinstance(end.code, int) else 1
-    printed = capsys.readouterr()
-    return Finished(code, printed.out, printed.err)
 
 
 UTM = (345678.0, 5234567.0, 120.0)  # typical coordinates of georeferenced data
@@ -265,27 +265,33 @@ def tiny_default_run(tiny_scene: Path) -> list[str]:
     return tiny_default_options(tiny_scene)
 
 
+# Overrides of experiments with a hash grid and a density grid.
+SMALL = [
+    "medium.resolution=32",
+    "medium.cache=false",
+    "sampler.points.num_samples=8",
+    "sampler.points.num_bins=16",
+    "sampler.points.resolution=16",
+    "field.num_levels=4",
+    "field.log2_table_size=10",
+    "field.width=16",
+    "batches.size=32",
+    "trainer.accelerator=cpu",
+    "trainer.max_time=null",
+    "logger=none",
+]
+
+
 def tiny_default_options(scene: Path) -> list[str]:
     """Overrides that make a training step of the default experiment take milliseconds."""
     return [
         f"data.root={scene}",
-        "medium.resolution=32",
-        "medium.cache=false",
-        "sampler.points.num_samples=8",
-        "sampler.points.num_bins=16",
-        "sampler.points.resolution=16",
+        *SMALL,
         "sampler.points.update_every=3",  # the grid is updated at steps that write a checkpoint
-        "field.num_levels=4",
-        "field.log2_table_size=10",
-        "field.width=16",
         "boundary.resolutions=[4,8]",
-        "batches.size=32",
         "loss.boundary={weight: 0.01, start: 2}",
         "loss.smoothness={weight: 0.1, start: 3, tile_size: 4}",
         "evaluation.subdivision.side=2",
-        "trainer.accelerator=cpu",
-        "trainer.max_time=null",
-        "logger=none",
     ]
 
 

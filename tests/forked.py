@@ -3,8 +3,6 @@
 A server that has imported what commands import forks the processes, so that starting one takes no seconds.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import multiprocessing

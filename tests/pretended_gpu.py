@@ -4,8 +4,6 @@ While `PretendedGpu` is entered, what mixes devices fails as it would there, and
 the host wait for the device is written down. (Fake tensors have no values, without which no loop over rays ends.)
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Masks that cameras around a body take of it, and hulls of them."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 import trimesh

@@ -4,8 +4,6 @@ A code line holds at least one token that is neither a comment nor part of a doc
 strings, because they are data there.
 """
 
-from __future__ import annotations
-
 import ast
 import io
 import tokenize

@@ -1,7 +1,5 @@
 """Which values annotations allow: in constructors, in configurations, and how the others are refused."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Annotated, Literal

@@ -1,8 +1,7 @@
 """Input that cannot be trained on is refused in one line, before training starts and with nothing written."""
 
-from __future__ import annotations
-
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -22,10 +21,6 @@ def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
     document = json.loads(path.read_text())
     change(document)
     path.write_text(json.dumps(document))
-
-
-def put_nan(document: dict[str, Any]) -> None:
-    document["frames"][1]["transform_matrix"][0][3] = float("nan")
 
 
 def put_pose(value: float) -> Callable[[dict[str, Any]], None]:
@@ -65,7 +60,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     "truncated image": (lambda root: truncate(root / "train" / "r_1.png"), ["r_1.png"]),
     "truncated test image": (lambda root: truncate(root / "test" / "r_1.png"), ["test", "r_1.png"]),
     "wrong size": (wrong_size, ["r_1", "12", "16"]),
-    "pose that is not a number": (lambda root: edit(root / "transforms_train.json", put_nan), ["r_1"]),
+    "pose that is not a number": (lambda root: edit(root / "transforms_train.json", put_pose(math.nan)), ["r_1"]),
     "no field of view": (
         lambda root: edit(root / "transforms_train.json", lambda d: d.pop("camera_angle_x")),
         ["camera_angle_x"],
@@ -111,14 +106,8 @@ def test_open_mesh_is_accepted_when_asked(
     root = tmp_path / "data"
     shutil.copytree(tiny_scene, root)
     open_mesh(root)
-    finished = train_here(
-        *tiny_run,
-        f"data.root={root}",
-        "medium.accept_open_mesh=true",
-        "trainer.max_steps=1",
-        "evaluation.every=0",
-        f"hydra.run.dir={tmp_path / 'run'}",
-    )
+    accepted = ["medium.accept_open_mesh=true", "trainer.max_steps=1", "evaluation.every=0"]
+    finished = train_here(*tiny_run, f"data.root={root}", *accepted, f"hydra.run.dir={tmp_path / 'run'}")
     assert finished.code == 0, finished.err
 
 
@@ -134,29 +123,18 @@ def test_open_mesh_is_accepted_when_asked(
         (["data.root=a(1),b"], ["data.root=a(1),b cannot be read", "quote"]),
         (["trainer.max_time=5"], ["trainer.max_time=5 is not a duration", "write 90s, 5m, 1h"]),
         (["medium.ior=0"], ["ior=0.0 is not allowed; take more than 0"]),
-        (["medium.ior=inf"], ["ior=inf is not allowed"]),
         (["medium.resolution=3000"], ["resolution=3000 is not allowed", "at most 2048"]),
         (["medium.smoothing_size=999999"], ["smoothing_size=999999 is not allowed", "at most 99"]),
         (["batches.size=1e12"], ["batches.size", "could not be converted to Integer"]),
-        (["batches.size=1000000000000"], ["batches.size=1000000000000 is not allowed; take at least 1 and at most"]),
-        (["sampler.points.num_coarse=1000000000"], ["num_coarse=1000000000 is not allowed"]),
-        (["evaluation.subdivision.side=1000000"], ["evaluation.subdivision.side=1000000 is not allowed"]),
         (["optimizer.learning_rate=nan"], ["optimizer.learning_rate=nan is not allowed"]),
-        (["optimizer.adam_epsilon=0"], ["optimizer.adam_epsilon=0.0 is not allowed"]),
-        (["trainer.max_steps=99999999999"], ["trainer.max_steps=99999999999 is not allowed"]),
         (["trainer.precision=8"], ["trainer.precision='8' is not allowed; choose '32-true'"]),
         (["sampler.path=nothing"], ["'nothing' is not a set of settings"]),
         (["trainer.accumulate_grad_batches=2"], ["trainer.accumulate_grad_batches=2 is not allowed; batches depend"]),
         (["+trainer.limit_train_batches=0"], ["trainer.limit_train_batches=0 is not allowed; a run has no epochs"]),
         (["checkpoint.every_seconds=-1"], ["checkpoint.every_seconds=-1.0 is not allowed"]),
-        (["checkpoint.every_seconds=1e300"], ["checkpoint.every_seconds=1e+300 is not allowed"]),
         (["--shell-completion"], ["Expecting one subcommand from ['install', 'uninstall', 'query']"]),
-        (["checkpoint={every_steps: -1, every_seconds: null}"], ["checkpoint.every_steps=-1 is not allowed"]),
-        (["data.root=DIR/Übung"], ["cannot be read; quote the value"]),
         (["medium.smoothing_size=4"], ["must be odd"]),
         (["batches.size=100000", "batches.batching=single_image"], ["batch_size=100000 exceeds the 16x16 pixels"]),
-        (["field.depth=99999"], ["depth=99999 is not allowed; take at least 1 and at most 64"]),
-        (["boundary.width=99999999"], ["width=99999999 is not allowed; take at least 1 and at most 8192"]),
         (["nme=x"], ["nme is not a setting; did you mean name?"]),
         (["field=nrf"], ["Could not find 'field/nrf'", "Available options", "mip_nerf", "nerf"]),
         (["loss.opaque.start=1"], ["write +loss.opaque.weight=..., with a plus sign"]),
@@ -166,7 +144,6 @@ def test_open_mesh_is_accepted_when_asked(
         (["+expriment=mipnerf"], ["expriment is not a setting; did you mean experiment?"]),
         (["+batches.foo=3"], ["batches.foo is not a setting; known: batching, jitter, num_validation_views"]),
         (["+sampler.point.num_samples=5"], ["sampler.point is not a setting; did you mean points?"]),
-        (["+medium.foo=1"], ["medium.foo is not a setting; known: accept_open_mesh"]),
         (["+hydra.run.foo=1"], ["hydra.run.foo is not a setting; known: dir"]),
         (["field.width=abc"], ["Value 'abc' of type 'str' could not be converted to Integer", "field.width"]),
         (["field=null"], ["Got NoneType; give the name of an option"]),
@@ -185,9 +162,6 @@ def test_open_mesh_is_accepted_when_asked(
         (["foo"], ["foo is not an option; write key=value"]),
         (["seed=-1"], ["seed=-1 is not allowed; take at least 0 and at most 4294967295"]),
         (["data.root=${nope}"], ["Interpolation key 'nope' not found"]),
-        (["batches.batching=some"], ["batching='some' is not allowed; choose 'single_image', 'all_images'"]),
-        (["evaluation.chunk_size=0"], ["evaluation.chunk_size=0 is not allowed; take at least 1"]),
-        (["trainer.max_time=soon"], ["trainer.max_time=soon is not a duration; write 90s, 5m, 1h"]),
         (["checkpoint.every_steps=3"], ["set one of checkpoint.every_seconds and checkpoint.every_steps"]),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) and "=" in value[0] else "",

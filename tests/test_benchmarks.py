@@ -1,7 +1,5 @@
 """Every benchmark runs to its end with tiny settings and prints complete tables."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Cameras against hand-checked cases and an independent projection in float64."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,13 +1,10 @@
 """The simulated capture: photographs fit the truth that is kept apart, and the commands lead back to it."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
 import shlex
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from functools import cache
 from importlib import import_module
@@ -86,7 +83,7 @@ def test_from_photographs_to_a_table(
     request: pytest.FixtureRequest,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    run_here: Callable,
     train_here: Callable,
 ) -> None:
     """The commands of docs/lab/simulated_capture.md as each prints the next, with few small photographs."""
@@ -97,17 +94,11 @@ def test_from_photographs_to_a_table(
     photograph(kept, resolution=400, photographs=24, spp=4, overwrite=True)
     data = tmp_path / "data"
 
-    def run(command: str, *overrides: str) -> str:
-        monkeypatch.setattr(sys, "argv", [f"nerfro.{command}", *overrides])
-        capsys.readouterr()
-        import_module(f"nerfro.{command}").main()
-        return capsys.readouterr().out
-
     for name in ("images", "masks", "truth"):
         shutil.copytree(kept / name, data / name)
-    printed = run("calibrate", f"images={data / 'images'}", "target=apriltag", f"out={data}")
+    printed = run_here("calibrate", f"images={data / 'images'}", "target=apriltag", f"out={data}").out
     hull = ["resolution=48", "medium.resolution=48", "medium.cache=false", "medium.ior=1.33"]
-    printed = run("preprocess", *printed_command("next", printed), *hull)
+    printed = run_here("preprocess", *printed_command("next", printed), *hull).out
     figures = measure(data, data)
     assert figures["photographs with a pose"] == 24
     assert figures["rotation, median error in degrees"] <= 0.1

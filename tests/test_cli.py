@@ -1,7 +1,5 @@
 """What every command shares: how it ends, and mistakes told in one line."""
 
-from __future__ import annotations
-
 import io
 import os
 import subprocess

@@ -1,18 +1,171 @@
-"""`python -m nerfro` and the console script `nerfro` list the commands, and run them as `python -m nerfro.NAME`."""
-
-from __future__ import annotations
+"""Commands: list, help, mistakes, completion and start; `nerfro NAME` is `python -m nerfro.NAME`."""
 
 import json
 import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-import nerfro.plugins
+import nerfro.demo
+from nerfro.completion import completions
+from nerfro.errors import NerfroError
+from nerfro.options import Described, recall, remember
 from nerfro.paths import PACKAGE_DIR
+from nerfro.viewing.server import open_page
+
+DESCRIBED = Described(
+    "All options.",
+    {"": ["seed", "trainer", "field"], "trainer": ["max_time", "max_steps"], "field": ["width"]},
+    {"field": ["nerf", "hash_grid"], "experiment": ["glass"]},
+)
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of plugins, beside an empty cache."""
+    monkeypatch.setenv("NERFRO_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("NERFRO_PLUGINS", str(tmp_path))
+    return tmp_path
+
+
+def start(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run `python -m nerfro.ARGUMENTS`, and list the imported modules on standard error."""
+    command = [sys.executable, "-X", "importtime", "-m", f"nerfro.{arguments[0]}", *arguments[1:]]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "printed"),
+    [
+        (["--help"], "All options.\n"),
+        (["seed=1", "-h"], "All options.\n"),
+        (["--version"], f"nerfro {nerfro.__version__}\n"),
+        (["trainer.max_step=3"], "nerfro: error: trainer.max_step is not a setting; did you mean max_steps?\n"),
+    ],
+)
+def test_help_version_and_mistakes_do_not_wait_for_torch(arguments: list[str], printed: str, cache: Path) -> None:
+    remember("train", DESCRIBED)
+    done = start("train", *arguments)
+    imports = [line.split("|")[-1].strip() for line in done.stderr.splitlines() if line.startswith("import time")]
+    assert "nerfro.startup" in imports
+    assert not {"torch", "lightning"} & set(imports)
+    others = [line for line in done.stderr.splitlines(keepends=True) if not line.startswith("import time")]
+    assert "".join([done.stdout, *others]) == printed
+
+
+@pytest.mark.parametrize(
+    ("mistake", "message"),
+    [
+        ("sed=1", "sed is not a setting; did you mean seed"),
+        ("+trainer.max_tim=5m", "trainer.max_tim is not a setting; did you mean max_time"),
+        ("field=nref", "field=nref does not exist; did you mean nerf"),
+        ("experiment=glas", "experiment=glas does not exist; did you mean glass"),
+        ("field.widht=3", "field.widht is not a setting; did you mean width"),
+        ("metric=psnr", "metric=psnr: all registered metrics are scored"),
+        ("+metric=psnr", r"\+metric=psnr: all registered metrics are scored"),
+    ],
+)
+def test_names_that_nothing_knows_are_refused(mistake: str, message: str) -> None:
+    with pytest.raises(NerfroError, match=message):
+        DESCRIBED.require_known(["seed=1", mistake])
+
+
+def test_names_that_may_exist_pass() -> None:
+    DESCRIBED.require_known(["seed=1", "field.width=3", "field=nerf,hash_grid", "hydra.run.dir=x", "+group@here=x"])
+    DESCRIBED.require_known(["-m", "field=null", "field={width: 3}", "~trainer.max_time", "trainer={max_steps: 1}"])
+
+
+def test_the_cache_ends_when_a_plugin_changes(cache: Path) -> None:
+    assert recall("train") is None
+    remember("train", DESCRIBED)
+    assert recall("train") == DESCRIBED
+    (cache / "mine.py").write_text("")
+    assert recall("train") is None
+    remember("train", DESCRIBED)
+    (cache / "mine.py").write_text("changed = True")
+    assert recall("train") is None
+
+
+def test_a_missing_option_is_told_with_an_example(run_here: Callable, unchecked: None) -> None:
+    done = run_here("view")
+    assert done.err == "nerfro: error: checkpoint=... is missing; for example: nerfro view checkpoint=outputs/first\n"
+
+
+def test_the_help_of_hydra_lists_its_flags(run_here: Callable, unchecked: None) -> None:
+    done = run_here("view", "--help", "hydra")
+    assert (done.code, done.err) == (0, "")
+    assert "--multirun" in done.out
+
+
+def test_ctrl_c_during_the_imports_ends_in_one_line() -> None:
+    program = "import sys, nerfro.startup\nsys.argv = ['x']\nnerfro.startup.begin('plugins')\nraise KeyboardInterrupt"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert done.stderr == "nerfro: interrupted\n"
+    assert done.returncode not in (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("line", "word", "found"),
+    [
+        ("nerfro tr", "tr", ["trace ", "train "]),
+        ("nerfro train tr", "tr", ["trainer."]),
+        ("nerfro train seed=1 trainer.max", "trainer.max", ["trainer.max_steps=", "trainer.max_time="]),
+        ("nerfro train field=n", "n", ["nerf "]),
+        ("nerfro view che", "che", []),
+    ],
+)
+def test_completion_of_commands_options_and_choices(
+    line: str, word: str, found: list[str], cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    remember("train", DESCRIBED)
+    monkeypatch.setenv("COMP_LINE", f"{line} and more")
+    monkeypatch.setenv("COMP_POINT", str(len(line)))
+    assert completions(["train", "trace", "view"], ["nerfro", word, ""]) == found
+
+
+def test_demo_opens_the_page_and_ends_with_the_score_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_here: Callable
+) -> None:
+    program = "import json, sys; print('much'); print('nerfro: the page: http://localhost:1', flush=True)\n"
+    program += "folder = next(a for a in sys.argv if a.startswith('hydra.run.dir=')).partition('=')[2]\n"
+    program += "import os; os.makedirs(folder); open(f'{folder}/metrics.json', 'w').write(sys.argv[1])"
+    scores = {"views": [{"name": "a", "psnr": 31.26}], "steps": 1, "train_seconds": 1.0, "rays_per_second": 1.0}
+    commands = {"nerfro.train": [program, json.dumps(scores)], "nerfro.export": ["pass"]}
+    monkeypatch.setattr(nerfro.demo, "command_of_module", lambda name: [sys.executable, "-c", *commands[name]])
+    opened: list[str] = []
+    monkeypatch.setattr(nerfro.demo, "open_page", opened.append)
+    monkeypatch.chdir(tmp_path)
+    done = run_here("demo")
+    assert opened == ["http://localhost:1"]
+    address, last = done.out.splitlines()
+    assert address == "nerfro: the page: http://localhost:1"
+    assert last.startswith("PSNR 31.3 dB on 1 photographs that were not trained on; page: ")
+    commands["nerfro.train"] = ["raise SystemExit(3)"]
+    assert run_here("demo")[:2] == (3, "")
+
+
+def test_pages_open_in_graphical_browsers_and_are_printed_over_ssh(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    for name in ("SSH_CONNECTION", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    open_page("http://localhost:81")
+    assert opened == []
+    monkeypatch.setenv("DISPLAY", ":0")
+    open_page("http://localhost:82")
+    assert opened == ["http://localhost:82"]
+    monkeypatch.setenv("SSH_CONNECTION", "there 1 here 2")
+    open_page("http://localhost:83")
+    assert opened == ["http://localhost:82"]
+    assert "ssh -L 83:localhost:83 HOST" in capsys.readouterr().out
+
 
 COMMANDS = {file.stem for file in PACKAGE_DIR.glob("*.py") if "\n@entry_point" in file.read_text()} | {
     "demo",
@@ -50,13 +203,10 @@ def test_an_unknown_command_is_refused_in_one_line(script: Path) -> None:
     assert refused.stderr.count("\n") == 1
 
 
-def test_arguments_reach_the_command_and_its_status_comes_back(
-    script: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["nerfro.plugins", "loss=smoothness"])
-    nerfro.plugins.main()
+def test_arguments_reach_the_command_and_its_status_comes_back(script: Path, run_here: Callable) -> None:
     # Word by word: lines are as wide as each one's terminal.
-    assert run(script, "plugins", "loss=smoothness").stdout.split() == capsys.readouterr().out.split()
+    listed = run(script, "plugins", "loss=smoothness")
+    assert listed.stdout.split() == run_here("plugins", "loss=smoothness").out.split()
     refused = run("-m", "nerfro", "train", "sed=1")
     assert refused.returncode == 1
     assert "sed" in refused.stderr

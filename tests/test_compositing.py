@@ -1,7 +1,5 @@
 """Volume rendering against a slow loop and a closed form, and paths as polylines."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Every registered plugin, local ones included, keeps the contract of its kind."""
 
-from __future__ import annotations
-
 import pytest
 
 from nerfro.registry import Plugin, discover, plugins

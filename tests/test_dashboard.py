@@ -1,7 +1,5 @@
 """`python -m nerfro.dashboard`: names of runs, and a real server that shows them."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -10,14 +8,13 @@ import subprocess
 import sys
 import time
 import urllib.request
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from torch.utils.tensorboard import SummaryWriter
 
-import nerfro.dashboard
 from nerfro.report.dashboard import link_runs, run_name
-from tests.conftest import finish
 
 
 def make_run(folder: Path, name: str, root: str) -> None:
@@ -70,14 +67,10 @@ def test_a_damaged_configuration_does_not_end_the_dashboard(content: str, output
     ],
 )
 def test_refuses_in_one_line(
-    arguments: list[str],
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    arguments: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_here: Callable
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    done = finish(nerfro.dashboard.main, ["open=false", *arguments], monkeypatch, capsys)
+    done = run_here("dashboard", "open=false", *arguments)
     assert done.code == 1
     assert message in done.err
 

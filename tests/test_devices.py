@@ -1,7 +1,5 @@
 """Every kind of experiment on a GPU, pretended: nothing is left on the CPU, and it is known where the host waits."""
 
-from __future__ import annotations
-
 import warnings
 
 import pytest

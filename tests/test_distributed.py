@@ -1,7 +1,5 @@
 """Several processes that train one model: what one process would learn, stopped and resumed together."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

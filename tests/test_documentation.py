@@ -1,7 +1,5 @@
 """The Python code of README and guides runs, and the plugins that the guides define train."""
 
-from __future__ import annotations
-
 import itertools
 import re
 import runpy

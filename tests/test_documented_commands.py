@@ -1,7 +1,5 @@
 """The commands and settings in README and documentation exist."""
 
-from __future__ import annotations
-
 import copy
 import functools
 import re

@@ -1,7 +1,5 @@
 """Random numbers that are a function of seed, step, stream, index and dimension."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

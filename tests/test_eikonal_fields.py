@@ -1,7 +1,5 @@
 """The plugin that holds Eikonal Fields: its medium, paths and stages, and the index of a ball learned from images."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Every experiment and scene file composes, and every experiment trains."""
 
-from __future__ import annotations
-
 import functools
 import json
 from collections.abc import Callable

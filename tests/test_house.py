@@ -1,7 +1,5 @@
 """Every import points down: from the commands through the packages to the core, types included."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator

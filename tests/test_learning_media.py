@@ -1,7 +1,5 @@
 """A medium that learns must learn, whatever the model and the path sampler are made of."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Distortion against hand-worked numbers, finite differences and its own inverse; cameras that have it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

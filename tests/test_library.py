@@ -1,11 +1,10 @@
 """`import nerfro` as a library: a run from its folder, and the optics alone."""
 
-from __future__ import annotations
-
 import math
 import subprocess
 import sys
 import urllib.request
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +14,6 @@ import trimesh
 from PIL import Image
 
 import nerfro
-import nerfro.export
-import nerfro.render
 from nerfro.errors import NerfroError
 from nerfro.files.images import load_png
 from tests.conftest import UTM, moved_mesh
@@ -36,9 +33,7 @@ def test_what_is_not_there_is_an_attribute_error() -> None:
         assert getattr(nerfro, name) is not None
 
 
-def test_a_run_is_loaded_rendered_and_exported(
-    trained_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_is_loaded_rendered_and_exported(trained_run: Path, tmp_path: Path, run_here: Callable) -> None:
     scene = nerfro.load(trained_run, device="cpu")
     cameras = scene.cameras("test")
     views = scene.render(cameras)
@@ -65,18 +60,12 @@ def test_a_run_is_loaded_rendered_and_exported(
     with pytest.raises(NerfroError, match=r"checkpoint .* does not exist"):
         nerfro.load(tmp_path / "gone")
 
-    for command, arguments in (
-        (nerfro.render, ["path=orbit", "frames=2", "resolution=8", f"out={tmp_path / 'O'}"]),
-        (nerfro.export, ["what=sky", "resolution=8", f"out={tmp_path / 'sky.hdr'}"]),
-    ):
-        monkeypatch.setattr(
-            sys, "argv", ["-", f"checkpoint={trained_run}/checkpoints/last.ckpt", "device=cpu", *arguments]
-        )
-        command.main()
+    common = f"checkpoint={trained_run}/checkpoints/last.ckpt", "device=cpu", "resolution=8"
+    assert run_here("render", *common, "path=orbit", "frames=2", f"out={tmp_path / 'O'}").code == 0
+    assert run_here("export", *common, "what=sky", f"out={tmp_path / 'sky.hdr'}").code == 0
     for name in ("O/frame_0000.png", "O/frame_0001.png", "O/film.mp4", "sky.hdr"):
         assert (tmp_path / name).stat().st_size > 0
-    with pytest.raises(SystemExit):
-        nerfro.export.main()
+    assert run_here("export", *common, "what=sky", f"out={tmp_path / 'sky.hdr'}").code == 1, "nothing is overwritten"
 
 
 @pytest.mark.parametrize("interface", ["mesh", "sdf"])

@@ -1,7 +1,5 @@
 """The transfer function against the standard's values and itself."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

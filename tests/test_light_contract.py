@@ -1,7 +1,5 @@
 """Light adds: several polylines of a ray, linear radiance from parts to pixels, and what a model learns."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path as FilePath
 

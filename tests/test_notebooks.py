@@ -3,8 +3,6 @@
 Their cells are plain Python, so they are executed here without a Jupyter kernel.
 """
 
-from __future__ import annotations
-
 import json
 import linecache
 from pathlib import Path

@@ -3,8 +3,6 @@
 Set NERFRO_REFERENCE to compare with another recording of the same keys.
 """
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Plugins from plugins/, from other folders, and from installed packages; and the command that lists them."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os
@@ -17,10 +15,7 @@ import pytest
 import torch
 from PIL import Image
 
-import nerfro.export
-import nerfro.plugins
 import nerfro.registry
-import nerfro.summary
 from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData
 from nerfro.errors import NerfroError
@@ -28,7 +23,7 @@ from nerfro.media.base import Medium
 from nerfro.paths import PLUGINS_DIR
 from nerfro.registry import KINDS, discover, find, plugins, register
 from nerfro.testing import ContractError, check
-from tests.conftest import Finished, finish
+from tests.conftest import Finished
 
 discover()
 
@@ -275,21 +270,19 @@ def test_template_trains(template: str, train_template: Callable[..., Finished])
 
 
 def test_export_of_a_plugin_writes_its_file(
-    trained_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    trained_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_here: Callable[..., Finished]
 ) -> None:
     monkeypatch.setenv("NERFRO_PLUGINS", str(PLUGINS_DIR / "opt_in"))
     out = tmp_path / "centres.csv"
-    options = [f"checkpoint={trained_run}", "what=cameras", f"out={out}", "device=cpu"]
-    finished = finish(nerfro.export.main, options, monkeypatch, capsys)
+    finished = run_here("export", f"checkpoint={trained_run}", "what=cameras", f"out={out}", "device=cpu")
     assert finished.code == 0, finished.err
     centres = np.loadtxt(out, delimiter=",", skiprows=1)
     np.testing.assert_allclose(np.linalg.norm(centres, axis=1), 4, rtol=1e-6)
 
 
 def test_metric_of_a_plugin_is_in_tables_files_log_and_report(
-    train_template: Callable[..., Finished], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    train_template: Callable[..., Finished], tmp_path: Path, run_here: Callable[..., Finished]
+) -> None:
     trained, run = train_template([]), tmp_path / "run"
     mean = json.loads((run / "metrics.json").read_text())["test"]["mean_absolute_error"]
     references = np.load(tmp_path / "views" / "test.npz")["images"]
@@ -300,25 +293,15 @@ def test_metric_of_a_plugin_is_in_tables_files_log_and_report(
     with (run / "csv" / "metrics.csv").open() as file:
         logged = [row["test/mean_absolute_error"] for row in csv.DictReader(file)]
     assert float(logged[-1]) == pytest.approx(mean)
-    finish(nerfro.summary.main, [f"runs={run}", f"out={tmp_path / 'out'}", "report=true"], monkeypatch, capsys)
+    run_here("summary", f"runs={run}", f"out={tmp_path / 'out'}", "report=true")
     assert "MAE ↓" in (tmp_path / "out" / "report.html").read_text()
 
 
 # The list.
 
 
-def listed(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
-    monkeypatch.setattr(sys, "argv", ["nerfro.plugins", *arguments])
-    monkeypatch.setenv("COLUMNS", "200")
-    nerfro.plugins.main()
-    return capsys.readouterr().out
-
-
-def test_list_shows_every_plugin_with_its_fields_defaults_and_summary(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    shown = listed([], monkeypatch, capsys)
-    words = " ".join(shown.split())
+def test_list_shows_every_plugin_with_its_fields_defaults_and_summary(run_here: Callable[..., Finished]) -> None:
+    words = " ".join(run_here("plugins").out.split())
     for plugin in plugins():
         assert f"{plugin.kind}={plugin.name}" in words
         assert " ".join(plugin.summary.split()) in words
@@ -328,11 +311,9 @@ def test_list_shows_every_plugin_with_its_fields_defaults_and_summary(
     assert {plugin.kind for plugin in plugins()} == set(KINDS)
 
 
-def test_list_of_one_kind_or_one_plugin_shows_no_other(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert "field=" not in listed(["boundary"], monkeypatch, capsys)
-    shown = listed(["boundary=skybox"], monkeypatch, capsys)
+def test_list_of_one_kind_or_one_plugin_shows_no_other(run_here: Callable[..., Finished]) -> None:
+    assert "field=" not in run_here("plugins", "boundary").out
+    shown = run_here("plugins", "boundary=skybox").out
     assert "boundary=skybox" in shown
     assert "boundary=constant" not in shown
     assert "width" in shown
@@ -346,14 +327,10 @@ def test_list_of_one_kind_or_one_plugin_shows_no_other(
         ("field=x", "no field is called 'x'; known: "),
     ],
 )
-def test_list_of_nothing_known_is_refused(
-    argument: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["nerfro.plugins", argument])
-    with pytest.raises(SystemExit) as caught:
-        nerfro.plugins.main()
-    assert caught.value.code == 1
-    assert message in capsys.readouterr().err
+def test_list_of_nothing_known_is_refused(argument: str, message: str, run_here: Callable[..., Finished]) -> None:
+    refused = run_here("plugins", argument)
+    assert refused.code == 1
+    assert message in refused.err
 
 
 # Installed packages.

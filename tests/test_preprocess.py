@@ -1,11 +1,8 @@
 """`python -m nerfro.preprocess`: what it writes, the command that it prints, and what it refuses."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +11,6 @@ import pytest
 import torch
 from PIL import Image
 
-import nerfro.preprocess
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import load_mesh
@@ -40,20 +36,14 @@ def radii(capture: Path) -> np.ndarray:
 
 
 @pytest.fixture
-def preprocess(
-    capture: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., str]:
+def preprocess(capture: Path, run_here: Callable) -> Callable[..., str]:
     """Run the entry point in this process on the capture; returns what it printed, or its one line of error."""
 
     def run(*overrides: str) -> str:
         common = [f"data.root={capture}", "resolution=24", "medium.resolution=32", "medium.cache=false"]
         common += [] if any(text.startswith("medium.ior=") for text in overrides) else ["medium.ior=1.5"]
-        monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", *common, *overrides])
-        try:
-            nerfro.preprocess.main()
-        except SystemExit:
-            return capsys.readouterr().err
-        return capsys.readouterr().out
+        done = run_here("preprocess", *common, *overrides)
+        return done.err if done.code else done.out
 
     return run
 

@@ -1,7 +1,5 @@
 """Work that may take long before training starts says how far it is."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`python -m nerfro.reconstruct`: stages in their order, what is kept, what is made again, and how it fails."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 import json
@@ -30,7 +28,7 @@ from nerfro.pipeline import stages
 from nerfro.pipeline.hypotheses import Hypothesis
 from nerfro.pipeline.stages import run_command
 from tests.ball_photographs import mesh, photographs, save, soft_masks
-from tests.conftest import Finished, finish
+from tests.conftest import Finished
 
 Reconstruct = Callable[..., Finished]
 
@@ -52,8 +50,8 @@ def given(photos: Path) -> tuple[str, str]:
 
 
 @pytest.fixture
-def reconstruct(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Reconstruct:
-    return lambda *overrides: finish(nerfro.reconstruct.main, overrides, monkeypatch, capsys)
+def reconstruct(run_here: Reconstruct) -> Reconstruct:
+    return functools.partial(run_here, "reconstruct")
 
 
 def test_links_to_deleted_photographs_are_removed(photos: Path, tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """The registry and the typed configuration: what they accept, and how they refuse what they do not."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Runs that are killed, interrupted, resumed, or asked to go on from the wrong thing."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import itertools

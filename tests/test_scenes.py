@@ -1,7 +1,5 @@
 """The synthetic scenes, and the plugin package that holds most of them: solids and their triangulation."""
 
-from __future__ import annotations
-
 from importlib import import_module
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rays through parts of pixels, the pixels that need them, and batches that hold them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

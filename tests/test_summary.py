@@ -13,7 +13,6 @@ import rich.console
 import torch
 from omegaconf import OmegaConf
 
-import nerfro.summary
 from nerfro.errors import NerfroError
 from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import EvaluationResult, RunMetrics, ViewScores, write_metrics_json
@@ -22,7 +21,6 @@ from nerfro.files.images import save_png
 from nerfro.report.comparison import compare, find_metrics, to_table
 from nerfro.report.runs import find_runs
 from nerfro.training.run_folder import LAST_CHECKPOINT, record
-from tests.conftest import finish
 
 PAPER = find_metrics(["psnr", "ssim", "lpips"])
 FIELD = {"_target_": "nerfro.fields.nerf.NerfField", "width": 64, "scale": 1.0}
@@ -278,12 +276,11 @@ def test_console_stacks_groups_that_do_not_fit_side_by_side(width: int, blocks: 
 
 
 @pytest.fixture
-def summarise(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
+def summarise(run_here: Callable) -> Callable[..., tuple[int, str]]:
     """Exit code and output of `python -m nerfro.summary`'s main in this process."""
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
 
     def run(*overrides: str) -> tuple[int, str]:
-        done = finish(nerfro.summary.main, overrides, monkeypatch, capsys)
+        done = run_here("summary", *overrides)
         return done.code, done.out + done.err
 
     return run

@@ -1,7 +1,5 @@
 """Sweeps that are stopped, continued, changed, and that fail in part; and the launchers and sweepers that run them."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import os

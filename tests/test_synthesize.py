@@ -1,7 +1,5 @@
 """`nerfro.synthesize`: what it writes, what it keeps and what it refuses; and the scene that ships with the package."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

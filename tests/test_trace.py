@@ -1,7 +1,5 @@
 """`python -m nerfro.trace`: its files, its options, its refusals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -9,19 +7,18 @@ import numpy as np
 import pytest
 import trimesh
 
-import nerfro.trace
-from tests.conftest import UTM, finish, moved_mesh
+from tests.conftest import UTM, moved_mesh
 
 
 @pytest.fixture
-def trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+def trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_here: Callable) -> Callable[..., str]:
     """Run the entry point in this process on a glass ball; returns what it printed."""
     trimesh.creation.icosphere(4, 0.8).export(tmp_path / "ball.ply")
     monkeypatch.chdir(tmp_path)
     common = ["medium.mesh=ball.ply", "medium.resolution=64", "medium.cache=false", "rays=rays.npz", "out=out.npz"]
 
     def run(*overrides: str) -> str:
-        done = finish(nerfro.trace.main, [*common, *overrides], monkeypatch, capsys)
+        done = run_here("trace", *common, *overrides)
         return done.err if done.code else done.out
 
     return run

@@ -1,7 +1,5 @@
 """A training run from beginning to end, its files, and its evaluation afterwards."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

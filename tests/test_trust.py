@@ -1,7 +1,5 @@
 """Commands execute nerfro, Hydra and registered plugins, and nothing that files or the current directory name."""
 
-from __future__ import annotations
-
 import pickle
 import subprocess
 import sys

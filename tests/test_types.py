@@ -1,7 +1,5 @@
 """Paths in arc length."""
 
-from __future__ import annotations
-
 import torch
 
 from nerfro.testing import example_path

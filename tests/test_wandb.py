@@ -1,7 +1,5 @@
 """Weights & Biases without an account: a run's own file holds what TensorBoard and the CSV show."""
 
-from __future__ import annotations
-
 import csv
 import json
 import struct

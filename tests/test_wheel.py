@@ -1,7 +1,5 @@
 """The wheel carries conf/, plugins/ and the embedded scene, and works from any folder."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The paper's boundary, and the constant one."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Gains of photographs: nothing on average, seen by every loss."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

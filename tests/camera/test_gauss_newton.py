@@ -1,7 +1,5 @@
 """Cameras find back to a scene that is known, each by itself, and the lens that they share."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from unittest.mock import Mock

@@ -1,7 +1,5 @@
 """Photographs of a distant sky tell how cameras are turned towards each other, and the lens that they share."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

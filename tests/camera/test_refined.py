@@ -1,7 +1,5 @@
 """Refined cameras: derivatives of rays, what is held, units, files; how far disturbed poses and gains come back."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

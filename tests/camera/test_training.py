@@ -1,7 +1,5 @@
 """What disturbed poses and exposures come to in training, and that it is said, scored, written and resumed."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

@@ -1,7 +1,5 @@
 """What the tests of capture share: photographs of printed sheets, from cameras that are known."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

@@ -1,7 +1,5 @@
 """Boards: positions against the authors' published formulas, and codes against OpenCV's."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

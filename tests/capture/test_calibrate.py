@@ -1,7 +1,5 @@
 """`python -m nerfro.calibrate` on photographs of boards whose lens and poses are known."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Bodies with sharp edges come out of their silhouettes with sharp edges."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

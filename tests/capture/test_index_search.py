@@ -1,7 +1,5 @@
 """The index of a known surface, from photographs of it under a sky in closed form."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

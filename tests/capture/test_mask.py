@@ -1,7 +1,5 @@
 """`python -m nerfro.mask` on a coloured ball before a textured floor."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

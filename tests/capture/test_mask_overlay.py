@@ -1,7 +1,5 @@
 """A known mesh, seen through the loaders' cameras, covers the masks."""
 
-from __future__ import annotations
-
 import json
 import math
 

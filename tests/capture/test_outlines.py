@@ -1,7 +1,5 @@
 """Cameras move until a known surface is seen in its masks."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

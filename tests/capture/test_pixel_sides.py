@@ -1,7 +1,5 @@
 """What the sides of pixels tell of an outline that masks in black and white leave open."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,10 +1,7 @@
 """A dent that no outline shows, from photographs of what is seen through it."""
 
-from __future__ import annotations
-
 import functools
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 
-import nerfro.preprocess
 from nerfro.boundaries.base import Boundary
 from nerfro.capture import refinement
 from nerfro.capture.refinement import Refined, RefinementSettings, Stage, refine_surface
@@ -128,7 +124,7 @@ def test_a_backdrop_is_the_room_along_every_line() -> None:
 
 
 @pytest.fixture
-def preprocess(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable:
+def preprocess(tmp_path: Path, run_here: Callable) -> Callable:
     """Refine the ball's mesh by photographs of another medium; returns the folder, and what was printed."""
 
     def run(*overrides: str, medium: SdfGrid | None = None, ior: float | None = 1.5) -> tuple[Path, str]:
@@ -137,9 +133,7 @@ def preprocess(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
         options = [f"data.root={tmp_path}", f"mesh={tmp_path / 'mesh.ply'}", f"out={out}", "data.near=0.5"]
         options += ["refine=true", "medium.cache=false", "medium.resolution=41"]
         options += [] if ior is None else [f"medium.ior={ior}"]
-        monkeypatch.setattr(sys, "argv", ["nerfro.preprocess", *options, *overrides])
-        nerfro.preprocess.main()
-        return out, capsys.readouterr().out
+        return out, run_here("preprocess", *options, *overrides).out
 
     return run
 

@@ -1,7 +1,5 @@
 """Bodies of revolution from their masks: a glass behind something, and what is none."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Which way is up: cameras that people hold, and glasses that stand on tables."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

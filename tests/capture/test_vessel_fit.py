@@ -1,7 +1,5 @@
 """The lengths of a glass from its pixels under a sky in closed form."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Extraction of sharp frames from a video."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

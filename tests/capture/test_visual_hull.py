@@ -1,7 +1,5 @@
 """From silhouettes to a surface: outlines, carving, the fit, and what explains silhouettes that do not agree."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the tests of the loaders share: cameras whose projection is known without nerfro's."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Properties that all data formats share."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

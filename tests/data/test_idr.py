@@ -1,7 +1,5 @@
 """Matrices of IDR and NeuS are decomposed into the cameras that they were made of."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path

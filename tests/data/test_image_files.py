@@ -1,7 +1,5 @@
 """Images and masks of every kind, against slow means and hand-written values."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Keys that state a lens in transforms files, and lenses that no format accepts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """LLFF's poses_bounds.npy in its own world and in the frames of LLFF and Eikonal Fields."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path

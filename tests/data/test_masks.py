@@ -1,7 +1,5 @@
 """Where silhouettes are looked for, and what they are read as."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

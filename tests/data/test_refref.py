@@ -1,7 +1,5 @@
 """RefRef's parquet files."""
 
-from __future__ import annotations
-
 import math
 from importlib import import_module
 

@@ -1,7 +1,5 @@
 """Formats with transforms files (Blender, OpenCV, nerfstudio), and the messages about wrong files."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

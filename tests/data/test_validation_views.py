@@ -1,7 +1,5 @@
 """Views that are held back: which, and that nobody trains on them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

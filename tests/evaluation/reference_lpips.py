@@ -1,14 +1,13 @@
-"""LPIPS as torchmetrics or lpips compute it, on a seeded random backbone; run as a program of its own.
+"""LPIPS as torchmetrics computes it, on a seeded random backbone; run as a program of its own.
 
-    python reference_lpips.py {torchmetrics,lpips} INPUT.pt OUTPUT.pt
+    python reference_lpips.py INPUT.pt OUTPUT.pt
 
-Both packages take the backbones from torchvision, which does not load beside a CPU build of torch. Here a module of
+torchmetrics takes the backbones from torchvision, which does not load beside a CPU build of torch. Here a module of
 that name that holds nothing but AlexNet and VGG-16 stands in for it, which is why this cannot run inside the test
-process. INPUT holds `predictions` and `targets` [B, 3, H, W] in [0, 1]; OUTPUT for `alex` and for `vgg` the state dict
-of the backbone, the distances and, of lpips, the distance maps.
+process. INPUT holds predictions and targets [B, 3, H, W] in [0, 1]; OUTPUT for `alex` and for `vgg` the state dict of
+the backbone, the distances and the distance maps.
 """
 
-import importlib.machinery
 import sys
 import types
 
@@ -63,55 +62,28 @@ def initialise(layers):
             nn.init.normal_(module.bias, std=0.1)
 
 
-def stand_in_for_torchvision():
+def main():
+    import torchmetrics.functional.image.lpips as lpips
+
+    # The stand-in comes after the import: were it there before, torchmetrics would look for the rest of torchvision.
     torchvision = types.ModuleType("torchvision")
-    torchvision.__spec__ = importlib.machinery.ModuleSpec("torchvision", None)
     torchvision.models = types.ModuleType("torchvision.models")
-    torchvision.models.alexnet = lambda pretrained=True, weights=None: AlexNet()
-    torchvision.models.vgg16 = lambda pretrained=True, weights=None: VGG16()
-    torchvision.models.AlexNet_Weights = torchvision.models.VGG16_Weights = types.SimpleNamespace(DEFAULT="seeded")
+    torchvision.models.alexnet = lambda weights: AlexNet()
+    torchvision.models.vgg16 = lambda weights: VGG16()
+    torchvision.models.AlexNet_Weights = torchvision.models.VGG16_Weights = types.SimpleNamespace(DEFAULT=None)
     sys.modules["torchvision"] = torchvision
     sys.modules["torchvision.models"] = torchvision.models
-
-
-def by_torchmetrics(backbone, predictions, targets):
-    # The stand-in comes after the import: were it there before, torchmetrics would look for the rest of torchvision.
-    import torchmetrics.functional.image.lpips
-    import torchmetrics.image.lpip
-
-    stand_in_for_torchvision()
-    torchmetrics.functional.image.lpips._TORCHVISION_AVAILABLE = True
-    torchmetrics.image.lpip._TORCHVISION_AVAILABLE = True
-    metric = torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity(
-        net_type=backbone, reduction="mean", normalize=True
-    )
-    pairs = zip(predictions[:, None], targets[:, None], strict=True)
-    distances = torch.stack([metric(prediction, target) for prediction, target in pairs])
-    return {"distances": distances, "mean": metric.compute()}
-
-
-def by_lpips(backbone, predictions, targets):
-    stand_in_for_torchvision()
-    import lpips
-
-    distances = lpips.LPIPS(net=backbone, version="0.1")(predictions, targets, normalize=True).flatten()
-    maps = lpips.LPIPS(net=backbone, version="0.1", spatial=True)(predictions, targets, normalize=True)[:, 0]
-    return {"distances": distances, "mean": distances.mean(), "maps": maps}
-
-
-def main():
-    package, source, destination = sys.argv[1:]
-    pictures = torch.load(source)
-    compute = {"torchmetrics": by_torchmetrics, "lpips": by_lpips}[package]
-    with torch.no_grad():
-        results = {
-            name: {
-                "backbone": backbone().state_dict(),
-                **compute(name, pictures["predictions"], pictures["targets"]),
-            }
-            for name, backbone in (("alex", AlexNet), ("vgg", VGG16))
+    lpips._TORCHVISION_AVAILABLE = True
+    pictures = torch.load(sys.argv[1])
+    results = {}
+    for name, backbone in (("alex", AlexNet), ("vgg", VGG16)):
+        distance, distance_map = (lpips._LPIPS(net=name, spatial=spatial) for spatial in (False, True))
+        results[name] = {
+            "backbone": backbone().state_dict(),
+            "distances": distance(*pictures, normalize=True).flatten(),
+            "maps": distance_map(*pictures, normalize=True)[:, 0],
         }
-    torch.save(results, destination)
+    torch.save(results, sys.argv[2])
 
 
 if __name__ == "__main__":

@@ -1,13 +1,11 @@
-import functools
-import importlib.util
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 import torch
+import torchmetrics
 from torch import Tensor
 
 from nerfro.errors import NerfroError
@@ -39,21 +37,15 @@ def network() -> LpipsNetwork:
 
 
 @pytest.fixture(scope="module")
-def published(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict[str, dict]]:
-    """The values of another package with both backbones, computed once."""
-
-    @functools.lru_cache
-    def compute(package: str) -> dict[str, dict]:
-        folder = tmp_path_factory.mktemp(package)
-        predictions, targets = pictures()
-        torch.save({"predictions": predictions, "targets": targets}, folder / "pictures.pt")
-        program = [sys.executable, str(Path(__file__).with_name("reference_lpips.py")), package]
-        command = [*program, str(folder / "pictures.pt"), str(folder / "results.pt")]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, done.stderr
-        return torch.load(folder / "results.pt", weights_only=True)
-
-    return compute
+def published(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
+    """The values of torchmetrics with both backbones."""
+    folder = tmp_path_factory.mktemp("published")
+    torch.save(pictures(), folder / "pictures.pt")
+    program = [sys.executable, str(Path(__file__).with_name("reference_lpips.py"))]
+    command = [*program, str(folder / "pictures.pt"), str(folder / "results.pt")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return torch.load(folder / "results.pt", weights_only=True)
 
 
 def pictures() -> tuple[Tensor, Tensor]:
@@ -65,19 +57,15 @@ def pictures() -> tuple[Tensor, Tensor]:
     return predictions, targets
 
 
-@pytest.fixture(scope="module", params=["torchmetrics alex", "torchmetrics vgg", "lpips alex", "lpips vgg"])
-def reference(request: pytest.FixtureRequest, published: Callable[[str], dict[str, dict]]) -> Reference:
-    """The other package's own values, and our network with the same backbone and the published heads."""
-    package, backbone = request.param.split()
-    if importlib.util.find_spec(package) is None:
-        pytest.skip(f"{package} is not installed; pip install --no-deps {package}")
-    results = published(package)[backbone]
-    network = load_lpips_network({"alex": ALEX, "vgg": VGG}[backbone], results["backbone"])
-    predictions, targets = pictures()
-    return Reference(network, predictions.movedim(1, -1), targets.movedim(1, -1), results)
+@pytest.fixture(scope="module", params=[ALEX, VGG])
+def reference(request: pytest.FixtureRequest, published: dict[str, dict]) -> Reference:
+    """The values of torchmetrics, and our network with the same backbone and the published heads."""
+    results = published[request.param.heads]
+    predictions, targets = (images.movedim(1, -1) for images in pictures())
+    return Reference(load_lpips_network(request.param, results["backbone"]), predictions, targets, results)
 
 
-def test_distance_is_that_of_the_published_packages(reference: Reference) -> None:
+def test_distance_is_that_of_torchmetrics(reference: Reference) -> None:
     for prediction, target, expected in zip(
         reference.predictions, reference.targets, reference.results["distances"], strict=True
     ):
@@ -85,8 +73,7 @@ def test_distance_is_that_of_the_published_packages(reference: Reference) -> Non
         assert reference.network(prediction, target).item() == pytest.approx(expected.item(), abs=1e-6)
 
 
-@pytest.mark.parametrize("reference", ["lpips alex", "lpips vgg"], indirect=True)  # torchmetrics gives no maps
-def test_distance_map_is_that_of_lpips(reference: Reference) -> None:
+def test_distance_map_is_that_of_torchmetrics(reference: Reference) -> None:
     for prediction, target, expected in zip(
         reference.predictions, reference.targets, reference.results["maps"], strict=True
     ):
@@ -95,11 +82,8 @@ def test_distance_map_is_that_of_lpips(reference: Reference) -> None:
 
 @pytest.mark.parametrize("backbone", [ALEX, VGG])
 def test_heads_are_the_published_ones_to_the_last_bit(backbone: Backbone) -> None:
-    installed = importlib.util.find_spec("lpips")
-    if installed is None or installed.origin is None:
-        pytest.skip("lpips is not installed; pip install --no-deps lpips")
-    file = Path(installed.origin).with_name("weights") / "v0.1" / f"{backbone.heads}.pth"
-    published = torch.load(file, map_location="cpu", weights_only=True)
+    folder = Path(torchmetrics.functional.image.__file__).with_name("lpips_models")
+    published = torch.load(folder / f"{backbone.heads}.pth", map_location="cpu", weights_only=True)
     network = load_lpips_network(backbone, random_weights(backbone))
     assert len(published) == 5
     for i in range(5):

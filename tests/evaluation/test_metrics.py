@@ -1,21 +1,26 @@
+"""Metrics of images against other packages, and scores of views and regions."""
+
 import math
 from collections.abc import Callable
 from pathlib import Path
 
+import flip_evaluator
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import binary_dilation
 from skimage.metrics import peak_signal_noise_ratio
 from torch import Tensor
+from torchmetrics.functional.image import structural_similarity_index_measure
 
 import nerfro
 from nerfro.errors import NerfroError
-from nerfro.evaluation.flip import flip
+from nerfro.evaluation.flip import flip, flip_map
 from nerfro.evaluation.image_metrics import MAX_PSNR, psnr
 from nerfro.evaluation.lpips import ALEX
 from nerfro.evaluation.metrics import ImageMetrics
-from nerfro.evaluation.regions import mean_over
-from nerfro.evaluation.ssim import ssim
+from nerfro.evaluation.regions import crop_rectangle, mean_over, object_pixels
+from nerfro.evaluation.ssim import ssim, ssim_map
 from nerfro.files.images import load_png, save_png
 
 
@@ -221,3 +226,78 @@ def test_collection_scores_batches_like_single_images_and_names_its_results() ->
     assert {name: metric.higher_is_better for name, metric in collection.items()} == {"psnr": True, "flip": False}
     with pytest.raises(NerfroError, match=r"both must have the same shape \[B, 3, H, W\]"):
         collection.update(*pairs[0])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ssim_is_that_of_torchmetrics_over_whole_windows(seed: int) -> None:
+    prediction, target = pictures(seed=seed)
+    batches = [image.double().permute(2, 0, 1)[None] for image in (prediction, target)]
+    _, full = structural_similarity_index_measure(*batches, data_range=1.0, return_full_image=True)
+    whole = full[0, :, 5:-5, 5:-5]
+    torch.testing.assert_close(ssim_map(prediction, target), whole.permute(1, 2, 0), atol=1e-6, rtol=0)
+    assert ssim(prediction, target).item() == pytest.approx(whole.mean().item(), abs=1e-6)
+
+
+def test_ssim_on_a_mask_is_the_mean_of_the_map_there() -> None:
+    prediction, target = pictures()
+    inside = torch.zeros(37, 45, dtype=torch.bool)
+    inside[0:20, 3:30] = True  # reaches over the border, where there is no whole window
+    expected = ssim_map(prediction, target)[:15, :25].mean()
+    assert ssim(prediction, target, inside).item() == pytest.approx(expected.item())
+    border = torch.zeros(37, 45, dtype=torch.bool)
+    border[:5] = True
+    assert ssim(prediction, target, border).isnan()
+
+
+def test_a_picture_without_a_whole_window_is_refused() -> None:
+    with pytest.raises(NerfroError, match="at least 11 x 11"):
+        ssim(torch.zeros(10, 40, 3), torch.zeros(10, 40, 3))
+
+
+@pytest.mark.parametrize("swap", [False, True])
+def test_map_and_mean_are_those_of_flip_evaluator_whose_first_argument_is_the_reference(swap: bool) -> None:
+    prediction, target = pictures()[::-1] if swap else pictures()
+    errors, mean, viewed = flip_evaluator.evaluate(target.numpy(), prediction.numpy(), "LDR", applyMagma=False)
+    assert viewed["ppd"] == pytest.approx(67.02, abs=0.01)
+    torch.testing.assert_close(flip_map(prediction, target), torch.from_numpy(errors[..., 0]))
+    assert flip(prediction, target).item() == pytest.approx(mean, abs=1e-6)
+    inside = torch.zeros(37, 45, dtype=torch.bool)
+    inside[3:9, 10:20] = True
+    assert flip(prediction, target, inside).item() == pytest.approx(errors[3:9, 10:20].mean(), abs=1e-6)
+
+
+def test_half_covered_pixels_belong_to_the_object() -> None:
+    coverage = torch.tensor([[0.0, 0.49, 0.5, 1.0]])
+    assert object_pixels(coverage).tolist() == [[False, False, True, True]]
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("dilation", [1, 3, 35])
+def test_crop_is_the_bounding_rectangle_of_the_dilated_mask(seed: int, dilation: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    inside = torch.rand(60, 90, generator=generator) > 0.999
+    inside[30, 40] = True
+    dilated = torch.from_numpy(binary_dilation(inside.numpy(), torch.ones(dilation, dilation).numpy()))
+    rows, columns = dilated.any(1).nonzero(), dilated.any(0).nonzero()
+    expected = slice(int(rows.min()), int(rows.max()) + 1), slice(int(columns.min()), int(columns.max()) + 1)
+    assert crop_rectangle(inside, dilation) == expected
+    assert torch.equal(dilated[expected].sum(), dilated.sum())
+
+
+def test_authors_dilation_is_seventeen_pixels_to_each_side() -> None:
+    inside = torch.zeros(100, 100, dtype=torch.bool)
+    inside[40:50, 60:95] = True
+    assert crop_rectangle(inside) == (slice(23, 67), slice(43, 100))
+
+
+def test_mean_over_a_mask_leaves_the_rest_out() -> None:
+    values, inside = torch.tensor([[1.0, 2.0], [3.0, torch.nan]]), torch.tensor([[True, False], [True, False]])
+    assert mean_over(values, inside).item() == 2
+    assert mean_over(values, torch.zeros(2, 2, dtype=torch.bool)).isnan()
+
+
+def test_impossible_crops_are_refused() -> None:
+    with pytest.raises(NerfroError, match="mask is empty"):
+        crop_rectangle(torch.zeros(4, 4, dtype=torch.bool))
+    with pytest.raises(NerfroError, match="dilation=4 has no centre"):
+        crop_rectangle(torch.ones(4, 4, dtype=torch.bool), 4)

@@ -1,7 +1,5 @@
 """Pixels with several rays: only those need them beside which rays part."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -1,7 +1,5 @@
 """Positional encodings: their order, and the integrated one against Monte Carlo."""
 
-from __future__ import annotations
-
 import math
 
 import torch

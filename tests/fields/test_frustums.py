@@ -1,7 +1,5 @@
 """Conical frustums as Gaussians, against points drawn uniformly from a frustum."""
 
-from __future__ import annotations
-
 import math
 from importlib import import_module
 

@@ -1,7 +1,5 @@
 """The hash encoding: interpolation in plain PyTorch, and the compiled kernels against it."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """The hash-grid field and its evaluation of selected samples."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

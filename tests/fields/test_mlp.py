@@ -1,7 +1,5 @@
 """The networks: sizes as published, activations, and where the input is fed in again."""
 
-from __future__ import annotations
-
 import math
 from importlib import import_module
 

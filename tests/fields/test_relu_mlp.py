@@ -1,7 +1,5 @@
 """The MLP with its gradient written out, against torch.nn.Sequential."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import pytest

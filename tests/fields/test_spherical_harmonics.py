@@ -1,7 +1,5 @@
 """Spherical harmonics as an encoding."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The disk cache never gives stale or damaged arrays, and never fails a run."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Files of linear radiance keep their values, agree with another program, and are refused when truncated."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

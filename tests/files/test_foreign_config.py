@@ -1,7 +1,5 @@
 """Configurations of other people's runs are plain values, and nothing in them reaches this machine."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Mapped arrays are whole or not there, and the cache folder does not grow without end."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path

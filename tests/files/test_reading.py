@@ -1,7 +1,5 @@
 """Files of strangers: what is damaged, without end or too large is refused in one line, and quickly."""
 
-from __future__ import annotations
-
 import json
 import os
 import struct

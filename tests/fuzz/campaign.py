@@ -3,8 +3,6 @@
 Every case is a function of seed and number. `only=KIND` draws cases of one kind, `first=N` begins with case N.
 """
 
-from __future__ import annotations
-
 import random
 import sys
 import tempfile

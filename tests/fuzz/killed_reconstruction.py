@@ -3,8 +3,6 @@
 A repeated reconstruction must end with the weights of an undisturbed one, bit for bit.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import signal

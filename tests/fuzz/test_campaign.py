@@ -1,7 +1,5 @@
 """A short slice of `tests/fuzz/campaign.py`: a few cases of every kind."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Processes that are killed, disks that are full, and two processes in one folder."""
 
-from __future__ import annotations
-
 import errno
 import os
 import random

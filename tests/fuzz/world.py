@@ -4,8 +4,6 @@ A command that is given anything ends within a minute: it either does what it wa
 has a status other than zero. It writes to its own folder only, and what existed stays as it was.
 """
 
-from __future__ import annotations
-
 import contextlib
 import faulthandler
 import importlib

@@ -1,7 +1,5 @@
 """Closed surfaces of one mesh: crossing surfaces are refused, others are accepted."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Contracted space: places and lengths against closed forms and plain sums."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

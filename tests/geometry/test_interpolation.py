@@ -1,7 +1,5 @@
 """Interpolation on grids: what it reproduces exactly, its order, and its gradient."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

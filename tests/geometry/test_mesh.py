@@ -1,7 +1,5 @@
 """Reading meshes, and the messages about bad ones."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

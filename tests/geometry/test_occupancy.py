@@ -1,7 +1,5 @@
 """Occupancy fractions against inside tests of one point at a time."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

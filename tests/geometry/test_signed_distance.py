@@ -1,7 +1,5 @@
 """Signed distances of meshes against closed forms and brute force."""
 
-from __future__ import annotations
-
 import numpy as np
 import trimesh
 

@@ -1,7 +1,5 @@
 """The allocator's settings, in a process of its own so that other tests keep theirs."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """Kernels compile wherever nerfro is installed, and again whenever a source of theirs changes."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Networks multiply in bfloat16 only where the machine has units for it, or where they are told to."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf

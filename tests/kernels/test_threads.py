@@ -1,7 +1,5 @@
 """Kernels share a process with other threads and with other users of Numba."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

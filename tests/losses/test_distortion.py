@@ -1,7 +1,5 @@
 """The distortion loss against its definition."""
 
-from __future__ import annotations
-
 from unittest.mock import Mock
 
 import pytest

@@ -1,7 +1,5 @@
 """Tint along paths: Beer-Lambert in closed form, what is seen through it, what learns, and what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

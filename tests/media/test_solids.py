@@ -1,7 +1,5 @@
 """Bodies with surfaces: distances, shells, nesting, grids made of meshes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Vessels: rays through walls and liquids against formulas, openings, and what is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

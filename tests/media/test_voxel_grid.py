@@ -1,7 +1,5 @@
 """The paper's medium: smoothing, gradient, look-up, files and refusals."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

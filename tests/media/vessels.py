@@ -1,7 +1,5 @@
 """Spherical vessels: as a medium, and their rays by formulas for spheres and a plane in double precision."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How the parts are composed: fields for each level, where the boundary is asked, and rendering in chunks."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from importlib import import_module
 

@@ -1,7 +1,5 @@
 """One volume: a glass ball in a painted room with a toy before it, which no sky can explain, learned from pictures."""
 
-from __future__ import annotations
-
 import torch
 from torch.nn.functional import normalize
 

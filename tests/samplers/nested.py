@@ -1,7 +1,5 @@
 """A ball in a ball, in closed form and as meshes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

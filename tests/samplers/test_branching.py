@@ -1,7 +1,5 @@
 """Light that splits at surfaces: energy, closed forms, the three tracers against each other, derivatives of shares."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import replace
 from pathlib import Path as FilePath

@@ -4,8 +4,6 @@ Positions are within 1e-5 of the scene's size in double precision and 1e-4 in si
 is stated in each test.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

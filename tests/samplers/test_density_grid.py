@@ -1,7 +1,5 @@
 """Sampling from a remembered density: the compiled kernel against its plain twin, and where samples go."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

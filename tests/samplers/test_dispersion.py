@@ -1,7 +1,5 @@
 """Colours that part: Cauchy's index, the rainbow and a prism in closed form, and bands as rays of one colour."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path as FilePath
 

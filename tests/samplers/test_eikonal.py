@@ -1,7 +1,5 @@
 """Adaptive Eikonal paths against closed-form optics, and the plain reference of the compiled kernels."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -3,8 +3,6 @@
 The samplers themselves trace without gradients; these are properties of the plain functions they are made of.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Fine samples go where the coarse rendering has weight."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """What every path conserves: |v| = n, moments, reversibility, phase-space volume, and straightness where n = 1."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

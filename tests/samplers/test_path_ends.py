@@ -1,7 +1,5 @@
 """A bent path ends where it has left the object for good, however short `far` is."""
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path as FilePath
 

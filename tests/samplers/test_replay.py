@@ -1,7 +1,5 @@
 """Refined paths: the traced values, and their first derivatives against central differences of the trace itself."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Snell paths against closed-form optics, independent tracers, and the plain reference of the compiled kernel."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path as FilePath
 

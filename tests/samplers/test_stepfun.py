@@ -1,7 +1,5 @@
 """Inverse transform sampling against its analytic distribution and against a slow loop."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Straight paths."""
 
-from __future__ import annotations
-
 import torch
 
 from nerfro.media.shapes import Ball

@@ -1,7 +1,5 @@
 """Coarse samples: one in each bin, on straight and on bent paths."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

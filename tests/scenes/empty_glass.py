@@ -1,7 +1,5 @@
 """Glass without content, for comparisons of its light with formulas."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

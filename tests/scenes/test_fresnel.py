@@ -1,7 +1,5 @@
 """Ground truth with partial reflection (`fresnel=true`) against Fresnel's equations; energy and radiance are kept."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Pictures of empty glass under a known sky: all branches of our rays against Mitsuba's path tracing."""
 
-from __future__ import annotations
-
 from pathlib import Path as FilePath
 
 import numpy as np

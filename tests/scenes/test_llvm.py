@@ -1,7 +1,5 @@
 """Which LLVM library Dr.Jit loads, and that an old one, or none, costs time but does not end the process."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The path tracer against closed forms: furnace, Snell's law, total reflection, camera and sky conventions."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Shapes, viewpoints and skies that the synthetic scenes are made of."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A glass half full of water, made of Mitsuba's own shapes and dielectrics, against the rays of a vessel."""
 
-from __future__ import annotations
-
 from types import ModuleType
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`trainer.accelerator=auto` trains on the CPU, and reports a GPU that stays unused."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Photographs that are cut out on one colour are found, and that colour is beyond the volume then."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The sky is learned before the first step, from rays that miss the object, and by nothing else."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import signal

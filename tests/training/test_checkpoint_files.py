@@ -1,7 +1,5 @@
 """Checkpoints are whole, wherever the system keeps its temporary files."""
 
-from __future__ import annotations
-
 import errno
 import os
 import tempfile

@@ -1,7 +1,5 @@
 """Which space a run covers: from Eikonal Fields' file, or found from cameras."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Batches made one step ahead are the ones that a step would make, and whatever goes wrong is told."""
 
-from __future__ import annotations
-
 import gc
 import threading
 import weakref

@@ -1,7 +1,5 @@
 """What a run needs is counted, compared with what there is, and refused where it does not fit."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A mesh that does not belong to the photographs is named before training: unit, axes, or place."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

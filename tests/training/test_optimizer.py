@@ -1,7 +1,5 @@
 """The learning rate's endpoints, and how far a run is."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from datetime import timedelta

@@ -1,7 +1,5 @@
 """Every precision that the trainer offers on a CPU trains, and is scored."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable

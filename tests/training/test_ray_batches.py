@@ -1,7 +1,5 @@
 """Random training pixels: which ones, how often, and the same ones after a resume."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A folder belongs to one run: what another run, a user or another process has there is never touched."""
 
-from __future__ import annotations
-
 import math
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """What each setting says about a run, and that resuming, sweeps and tables go by the same statement."""
 
-from __future__ import annotations
-
 import inspect
 
 import lightning.pytorch as pl

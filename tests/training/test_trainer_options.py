@@ -1,7 +1,5 @@
 """Arguments of Lightning's Trainer act or are refused with a reason, and callbacks are chosen by name."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import re

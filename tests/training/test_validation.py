@@ -1,7 +1,5 @@
 """Validation pixels, and the warning about overfitting."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Callable

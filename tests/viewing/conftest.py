@@ -1,8 +1,7 @@
 """A scene in closed form: a coloured ball inside a ball of glass, under a smooth sky."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -20,6 +19,7 @@ from nerfro.samplers.snell import Snell
 from nerfro.samplers.stratified import Stratified
 from nerfro.scenes.viewpoints import look_at_origin
 from nerfro.types import Radiance, Samples
+from nerfro.viewing.server import PageServer
 from nerfro.viewing.trained_scene import TrainedScene
 
 RADIUS, INSIDE_RADIUS, INSIDE_CENTRE, IOR = 0.8, 0.3, (0.1, 0.0, 0.05), 1.3
@@ -69,3 +69,10 @@ def scene() -> TrainedScene:
         boundary=sky,
     )
     return TrainedScene(RefractiveModel(parts).eval(), Photographs())
+
+
+@pytest.fixture
+def server() -> Iterator[PageServer]:
+    server = PageServer("localhost", 0)
+    yield server
+    server.close()

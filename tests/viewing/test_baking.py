@@ -1,7 +1,5 @@
 """What a page is made of stands for what the model traces and shows."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

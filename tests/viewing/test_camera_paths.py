@@ -1,7 +1,5 @@
 """Cameras that fly around an object, and those of other programs."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

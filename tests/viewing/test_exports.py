@@ -1,7 +1,5 @@
 """Every export is read back by another program's reader, and shows the scene that was written."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

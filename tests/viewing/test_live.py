@@ -1,10 +1,8 @@
 """A page that follows a model: baked when somebody looks, within its share of the time, and shown in the browser."""
 
-from __future__ import annotations
-
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,13 +12,6 @@ from nerfro.viewing.live import LivePage
 from nerfro.viewing.server import PageServer
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.viewing.browser import Browser, needs_chromium
-
-
-@pytest.fixture
-def server() -> Iterator[PageServer]:
-    server = PageServer("localhost", 0)
-    yield server
-    server.close()
 
 
 @pytest.fixture

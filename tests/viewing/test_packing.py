@@ -1,7 +1,5 @@
 """Arrays come back from their pictures as they were."""
 
-from __future__ import annotations
-
 import base64
 import io
 import math

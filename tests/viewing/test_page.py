@@ -1,7 +1,5 @@
 """The page of a scene shows in a browser what nerfro renders, and its controls change what they say."""
 
-from __future__ import annotations
-
 import base64
 import io
 import math

@@ -1,7 +1,5 @@
 """Input on a page: pointers, fingers, keys and dropped files."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`python -m nerfro.render`: its frames and films, what it goes on with, and what it refuses."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -17,12 +15,11 @@ import nerfro.render
 from nerfro.files.lat_long import save_lat_long
 from nerfro.subdivision import Subdivision
 from nerfro.viewing.trained_scene import TrainedScene
-from tests.conftest import finish
 
 
 @pytest.fixture
 def render(
-    scene: TrainedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    scene: TrainedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_here: Callable
 ) -> Callable[..., tuple[int, str]]:
     """The entry point in this process, on the scene in closed form; exit code and output."""
     (tmp_path / "a.ckpt").write_bytes(b"scene")
@@ -31,7 +28,7 @@ def render(
     common = ["checkpoint=a.ckpt", "out=O", "resolution=16", "subdivision.side=1"]
 
     def run(*arguments: str) -> tuple[int, str]:
-        done = finish(nerfro.render.main, [*common, *arguments], monkeypatch, capsys)
+        done = run_here("render", *common, *arguments)
         return done.code, done.err if done.code else done.out
 
     return run

@@ -1,7 +1,5 @@
 """A scene is rendered as in closed form, and its parts are changed without changing it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

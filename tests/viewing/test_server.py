@@ -1,25 +1,15 @@
 """The page's server answers the page's own browser alone, and reads no files."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import random
 import socket
 import threading
-from collections.abc import Iterator
 
 import pytest
 
 from nerfro.errors import NerfroError
 from nerfro.viewing.server import PageServer, _Handler
-
-
-@pytest.fixture
-def server() -> Iterator[PageServer]:
-    server = PageServer("localhost", 0)
-    yield server
-    server.close()
 
 
 def get(server: PageServer, path: str, **headers: str) -> tuple[int, str]:

@@ -1,7 +1,5 @@
 """`python -m nerfro.view` serves the page of a trained run."""
 
-from __future__ import annotations
-
 import signal
 import urllib.request
 from pathlib import Path

@@ -1,0 +1,256 @@
+"""Losses and the schedule of their weights: values by hand, and what gradients reach."""
+
+import math
+from dataclasses import replace
+from unittest.mock import Mock
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d
+
+from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.boundaries.skybox import Skybox
+from nerfro.errors import NerfroError
+from nerfro.fields.nerf import NerfField
+from nerfro.light import to_srgb
+from nerfro.losses.boundary import BoundaryRegulariser
+from nerfro.losses.photometric import Photometric
+from nerfro.losses.smoothness import Smoothness, tile_roughness
+from nerfro.losses.total_variation import TotalVariation, direction_pairs
+from nerfro.models.refractive import RefractiveModel
+from nerfro.registry import create, find
+from nerfro.rendering import ColourSpace, Components, Renderer, Scene
+from nerfro.samplers.eikonal import Eikonal
+from nerfro.samplers.hierarchical import Hierarchical
+from nerfro.samplers.stratified import point_samples
+from nerfro.testing import NUM_RAYS, example_batch, example_components, example_draws, example_path, example_rendering
+from nerfro.types import Batch, Rendering
+from tests.closed_forms import Luneburg
+
+
+@pytest.fixture(scope="module")
+def model() -> Renderer:
+    parts = Components(
+        medium=Luneburg(),
+        path_sampler=Eikonal("euler", 32),
+        point_sampler=Hierarchical(8, 8),
+        make_field=lambda: NerfField(width=16, depth=2, skip=1, view_width=8),
+        boundary=Skybox(width=8),
+    )
+    return RefractiveModel(parts, colour="srgb")
+
+
+def gradient_norms(model: Renderer, value: Tensor) -> dict[str, float]:
+    model.zero_grad()
+    value.backward()
+    parts = {"coarse": model.scene.fields[0], "fine": model.scene.fields[1], "boundary": model.scene.boundary}
+    return {
+        name: sum(float(p.grad.abs().sum()) for p in part.parameters() if p.grad is not None)
+        for name, part in parts.items()
+    }
+
+
+def test_photometric_loss_is_the_mean_over_rays_and_channels_of_both_levels(model: Renderer) -> None:
+    batch = example_batch()
+    coarse = replace(example_rendering(), rgb=batch.rgb + 0.1)
+    fine = replace(coarse, rgb=batch.rgb - 0.3)
+    torch.testing.assert_close(Photometric()([coarse, fine], batch, model.scene), torch.tensor(0.09 + 0.01))
+    torch.testing.assert_close(Photometric(coarse=0.1)([coarse, fine], batch, model.scene), torch.tensor(0.09 + 0.001))
+
+
+def test_photometric_loss_reaches_both_fields_and_the_boundary(model: Renderer) -> None:
+    batch = example_batch()
+    norms = gradient_norms(model, Photometric()(model(batch.rays), batch, model.scene))
+    assert min(norms.values()) > 0
+
+
+def test_boundary_regulariser_by_hand(model: Renderer) -> None:
+    batch = example_batch()
+    transmittance = torch.linspace(0, 1, NUM_RAYS)
+    rendering = replace(example_rendering(), transmittance=transmittance)
+    total, count = 0.0, 0
+    for ray in range(NUM_RAYS):
+        if transmittance[ray] > 0.5:
+            count += 1
+            passed = transmittance[ray] * rendering.boundary_rgb[ray]
+            total += sum(abs(float(passed[c] - batch.rgb[ray, c])) for c in range(3))
+    value = BoundaryRegulariser()([rendering, rendering], batch, model.scene)
+    assert value.item() == pytest.approx(total / (count + 1), rel=1e-5)
+
+
+def test_boundary_regulariser_can_be_restricted_to_refracted_rays(model: Renderer) -> None:
+    batch = example_batch()
+    rendering = replace(example_rendering(), transmittance=torch.ones(NUM_RAYS))
+    refracted = rendering.path.refracted
+    assert 0 < refracted.sum() < NUM_RAYS
+    error = (rendering.boundary_rgb - batch.rgb).abs().sum(-1)[refracted]
+    value = BoundaryRegulariser(refracted_only=True)([rendering], batch, model.scene)
+    torch.testing.assert_close(value, error.sum() / (len(error) + 1))
+
+
+def test_boundary_regulariser_teaches_the_fine_density_only(model: Renderer) -> None:
+    with torch.no_grad():
+        for field in model.scene.fields:
+            field.mlp.density.bias.fill_(-3.0)  # thin enough for light to pass
+    batch = example_batch()
+    renderings = model(batch.rays)
+    assert (renderings[-1].transmittance > 0.5).any()
+    norms = gradient_norms(model, BoundaryRegulariser()(renderings, batch, model.scene))
+    assert norms["coarse"] == norms["boundary"] == 0
+    assert norms["fine"] > 0
+    colour = model.scene.fields[1].mlp.rgb
+    assert colour.weight.grad is None or (colour.weight.grad == 0).all()
+
+
+def test_roughness_is_half_the_mean_square_of_two_convolutions() -> None:
+    rgb = torch.rand(9, 7, 3)
+    channels = rgb.movedim(-1, 0)[:, None]
+    horizontal = conv2d(channels, torch.tensor([[[[-1.0, 1.0]]]]))
+    vertical = conv2d(channels, torch.tensor([[[[-1.0], [1.0]]]]))
+    expected = 0.5 * horizontal.square().mean() + 0.5 * vertical.square().mean()
+    torch.testing.assert_close(tile_roughness(rgb), expected)
+
+
+def test_smoothness_teaches_the_boundary_only(model: Renderer) -> None:
+    batch = example_batch()
+    norms = gradient_norms(model, Smoothness(tile_size=8)(model(batch.rays), batch, model.scene))
+    assert norms["coarse"] == norms["fine"] == 0
+    assert norms["boundary"] > 0
+
+
+def test_weight_is_zero_before_the_start_then_grows_linearly_to_its_value() -> None:
+    loss = create(find("loss", "photometric"), {"weight": 2.0, "start": 10, "ramp": 4})
+    assert [loss.weight_at(step) for step in (0, 9)] == [0, 0]
+    torch.testing.assert_close(
+        torch.tensor([loss.weight_at(step) for step in range(10, 16)]), torch.tensor([0.4, 0.8, 1.2, 1.6, 2.0, 2.0])
+    )
+
+
+@pytest.mark.parametrize("option", ["weight", "start", "ramp"])
+def test_negative_schedules_are_refused(option: str) -> None:
+    with pytest.raises(NerfroError, match=f"{option}=-1.* is not allowed; take at least 0"):
+        create(find("loss", "photometric"), {option: -1})
+
+
+def test_tile_without_neighbours_is_refused() -> None:
+    with pytest.raises(NerfroError, match="tile_size=1 is not allowed; take at least 2"):
+        Smoothness(tile_size=1)
+
+
+BATCH = example_batch()
+
+
+def test_pairs_are_the_angle_apart_and_uniform() -> None:
+    first, second = direction_pairs(torch.rand(20_000, 3), 0.3)
+    for directions in (first, second):
+        torch.testing.assert_close(directions.norm(dim=-1), torch.ones(20_000))
+        # A uniform direction has mean 0 and covariance 1/3; the means scatter by 0.004.
+        assert directions.mean(0).abs().max() < 0.02
+        torch.testing.assert_close(directions.T @ directions / 20_000, torch.eye(3) / 3, rtol=0, atol=0.02)
+    torch.testing.assert_close((first * second).sum(-1), torch.full((20_000,), math.cos(0.3)), rtol=0, atol=1e-5)
+
+
+def scene(boundary) -> Mock:
+    return Mock(spec=Scene, boundary=boundary, colour_space=ColourSpace.SRGB)
+
+
+def test_value_is_that_of_a_linear_sky() -> None:
+    # For C = d . a the mean of |C(d') - C(d)| is angle |a| / 2, the mean of |cos| over the sphere, to second order.
+    sky = scene(lambda exits: (exits.directions * 0.8).sum(-1, keepdim=True).expand(-1, 3) * 0.5 / math.sqrt(3))
+    loss = TotalVariation(angle=1.0)
+    values = [float(loss([], replace(BATCH, draws=example_draws(step=step)), sky)) for step in range(30)]
+    # The mean over 30 steps of 1024 pairs scatters by 0.3 %.
+    assert sum(values) / len(values) == pytest.approx(math.radians(1.0) * 0.4 / 2, rel=0.02)
+
+
+def test_impossible_settings_are_refused() -> None:
+    with pytest.raises(NerfroError, match="more than 0 and less than 90"):
+        TotalVariation(angle=0.0)
+
+
+# Rays of three pixels: one through the first, three through the second, four through the last.
+PIXEL = torch.tensor([0, 1, 2, 2, 1, 2, 1, 2])
+MODEL = RefractiveModel(example_components())
+
+
+def rendering(colour: Tensor, background: Tensor, passed: Tensor) -> Rendering:
+    path = example_path(8)
+    samples = point_samples(path, path.near[:, None])
+    rgb = (1 - passed)[:, None] * colour + passed[:, None] * background
+    return Rendering(rgb, (1 - passed)[:, None], passed, background, samples, path)
+
+
+def batch() -> Batch:
+    """Three pixels of any colour."""
+    rows = torch.arange(3)
+    return replace(
+        example_batch(8), pixel=PIXEL, index=rows, view=0 * rows, rgb=torch.rand(3, 3), teaches_background=rows >= 0
+    )
+
+
+def test_values_of_a_pixel_are_the_mean_over_its_rays_in_any_order() -> None:
+    for values in (torch.rand(8), torch.rand(8, 3)):
+        expected = torch.stack([values[pixel == PIXEL].mean(0) for pixel in range(3)])
+        torch.testing.assert_close(batch().per_pixel(values), expected)
+        assert example_batch(8).per_pixel(values) is values
+
+
+def test_pixels_are_compared_and_not_their_rays() -> None:
+    given, rendered = batch(), rendering(torch.rand(8, 3), torch.rand(8, 3), torch.rand(8))
+    expected = (to_srgb(given.per_pixel(rendered.rgb)) - given.rgb).square().mean()
+    torch.testing.assert_close(Photometric()([rendered], given, MODEL.scene), expected)
+
+
+def test_the_regulariser_compares_the_background_of_a_pixel_as_well() -> None:
+    given, passed = batch(), torch.tensor([0.9, 0.9, 0.2, 0.2, 0.9, 0.2, 0.9, 0.2])  # of the last pixel little
+    rendered = rendering(torch.rand(8, 3), torch.rand(8, 3), passed)
+    background = to_srgb(given.per_pixel(passed[:, None] * rendered.boundary_rgb))
+    expected = (background - given.rgb).abs().sum(-1)[:2].sum() / (2 + 1)
+    torch.testing.assert_close(BoundaryRegulariser()([rendered], given, MODEL.scene), expected)
+
+
+@pytest.mark.parametrize("absorbs", [False, True])
+def test_a_background_learns_from_chosen_rays_and_what_bends_them_from_all(absorbs: bool) -> None:
+    sky = EnvironmentMap([4])
+    torch.nn.init.normal_(sky.texels)
+    model = RefractiveModel(replace(example_components(), boundary=sky))
+    directions = torch.nn.functional.normalize(torch.randn(8, 3), dim=-1).requires_grad_()
+    absorption = torch.tensor([[0.0] * 3, [0.1, 0.2, 0.3]], requires_grad=True)
+    path = example_path(8)
+    path = replace(path, directions=torch.cat([path.directions[:, :-1], directions[:, None]], 1))
+    path = replace(path, absorption=absorption) if absorbs else path
+    teaches = PIXEL != 1
+
+    def gradients(held: Tensor) -> list[Tensor]:
+        """By the sky and by what bends and tints the rays; by the rays in a sum of two renderings."""
+        weights = torch.linspace(0.5, 1.5, 8)[:, None]
+        seen = model.render_path(path, None, held)[-1].rgb
+        learned = [sky.texels, directions, *([absorption] if absorbs else [])]
+        return list(torch.autograd.grad((weights * seen.square()).sum(), learned))
+
+    every, none = torch.ones(8, dtype=torch.bool), torch.zeros(8, dtype=torch.bool)
+    of_all, of_some = gradients(every), gradients(teaches)
+    for whole, part in zip(of_all[1:], of_some[1:], strict=True):
+        torch.testing.assert_close(part, whole)
+    torch.testing.assert_close(of_some[0] + gradients(~teaches)[0], of_all[0])
+    assert of_some[0].abs().max() > 0
+    assert gradients(none)[0].abs().max() == 0
+
+
+def test_a_saturated_pixel_is_no_error_where_both_clip_and_keeps_a_gradient_where_one_does() -> None:
+    photograph = torch.tensor([1.0, 1.0, 0.6])  # saturated, saturated, not
+    radiance = torch.tensor([3.0, 0.5, 3.0], requires_grad=True)
+    prediction, target = MODEL.scene.colour_space.prediction_and_target(radiance, photograph)
+    (prediction - target).square().sum().backward()
+    lamp, too_dark, too_bright = radiance.grad
+    assert lamp == 0
+    assert too_dark < 0 < too_bright
+
+
+def test_in_the_authors_arithmetic_nothing_is_encoded_or_clipped() -> None:
+    model = RefractiveModel(example_components(), colour="srgb")
+    radiance, photograph = 1.2 * torch.rand(50, 3), torch.rand(50, 3).round()
+    prediction, target = model.scene.colour_space.prediction_and_target(radiance, photograph)
+    assert prediction is radiance
+    assert target is photograph
