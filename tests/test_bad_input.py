@@ -2,10 +2,7 @@
 
 import json
 import math
-import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -176,32 +173,6 @@ def test_mistake_on_the_command_line_is_told_in_one_line(
     for word in ["nerfro: error: ", *words]:
         assert word in lines[0]
     assert not list((tmp_path / "run").rglob("*")), "nothing is written"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("module", "override", "words"),
-    [
-        ("nerfro.train", "field.widht=3", "field.widht is not a setting; did you mean width?"),
-        ("nerfro.train", "data.root=/nowhere", "/nowhere is not a folder"),
-        ("nerfro.evaluate", "checkpoint=no.ckpt", "checkpoint no.ckpt does not exist"),
-    ],
-)
-def test_user_sees_one_line_and_exit_code_one(module: str, override: str, words: str, tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", module, override],
-        cwd=tmp_path,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 1
-    assert done.stdout == ""
-    (line,) = done.stderr.strip().splitlines()
-    assert line.startswith("nerfro: error: ")
-    assert words in line
-    assert not [path for path in tmp_path.rglob("*") if path.is_file()], "nothing is written"
 
 
 def test_a_field_that_rays_miss_is_told_before_training(

@@ -160,9 +160,3 @@ def test_evaluation_of_the_checkpoint_repeats_the_runs_own(run: Path, evaluate_h
     for name in ("test_000.png", "test_001.png"):
         assert np.array_equal(read(run / "images" / name), read(again / "images" / name))
         assert (again / "errors" / name).is_file()
-
-
-def test_evaluation_without_a_checkpoint_asks_for_one(evaluate_here: Callable[..., Any]) -> None:
-    code, _, errors = evaluate_here()
-    assert code == 1
-    assert "give either checkpoint=RUN, or predictions=DIR" in errors

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -16,13 +15,12 @@ from nerfro.evaluation import flip
 from nerfro.evaluation.lpips import LpipsNetwork
 from nerfro.evaluation.regions import require_images
 from nerfro.evaluation.ssim import WINDOW, ssim_map
-from nerfro.files.drawing import GAP, LINE_HEIGHT, colour_scale, fit, magma, paper, write
-from nerfro.files.images import save_png
+from nerfro.files.drawing import magma, sheet
+from nerfro.files.images import save_image
 
 # Squared error at the end of the colour scale; 0.05 is a difference of 0.22 in every channel.
 SQUARED_ERROR_LIMIT = 0.05
-MIN_WIDTH = 256  # pixels; smaller images are enlarged in sheets, because titles need this width
-_SCALE_HEIGHT = 64  # pixels
+_MIN_WIDTH = 256  # pixels; smaller images are enlarged in sheets, because captions need this width
 
 
 @dataclass(frozen=True)
@@ -94,28 +92,6 @@ def triptych(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"])
     return torch.cat([prediction.detach().cpu().float().clamp(0, 1), target.detach().cpu().float(), error], dim=1)
 
 
-def error_sheet(
-    prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], maps: Sequence[ErrorMap]
-) -> Float[Tensor, "h w 3"]:
-    """Draw a prediction, its reference and its error maps in one row, with the colour scale below each map.
-
-    Images are enlarged by a whole factor without smoothing, so that single pixels remain visible.
-    """
-    zoom = -(-MIN_WIDTH // target.shape[1])
-    height, width = zoom * target.shape[0], zoom * target.shape[1]
-    titles = ["prediction", "reference", *(error.title for error in maps)]
-    images = [prediction, target, *(error.colours() for error in maps)]
-    scales = [None, None, *(colour_scale(width, _SCALE_HEIGHT, error.title, error.limit) for error in maps)]
-    sheet = paper(len(titles) * (width + GAP) - GAP, LINE_HEIGHT + height + _SCALE_HEIGHT)
-    for column, (title, image, scale) in enumerate(zip(titles, images, scales, strict=True)):
-        left = column * (width + GAP)
-        write(sheet, title, left + width // 2, LINE_HEIGHT // 2)
-        sheet.paste(fit(image, width, height), (left, LINE_HEIGHT))
-        if scale is not None:
-            sheet.paste(scale, (left, LINE_HEIGHT + height))
-    return torch.from_numpy(np.array(sheet)).float() / 255
-
-
 def write_error_sheet(
     folder: Path,
     name: str,
@@ -123,6 +99,13 @@ def write_error_sheet(
     reference: Float[Tensor, "H W 3"],
     networks: Mapping[str, LpipsNetwork],
 ) -> None:
-    """Write the error maps of a view to `folder/errors/<name>.png`."""
+    """Write a prediction, its reference and its error maps in one row to `folder/errors/<name>.png`.
+
+    Images are enlarged by a whole factor without smoothing, so that single pixels remain visible.
+    """
     maps = error_maps(prediction, reference, networks)
-    save_png(folder / "errors" / f"{name}.png", error_sheet(prediction, reference, maps))
+    images = [prediction, reference, *(error.colours() for error in maps)]
+    captions = ["prediction", "reference", *(f"{error.title}, 0 to {error.limit:g}" for error in maps)]
+    width = -(-_MIN_WIDTH // reference.shape[1]) * reference.shape[1]
+    title = "error maps: black is 0, and pale yellow is the end of the scale or more"
+    save_image(folder / "errors" / f"{name}.png", sheet(images, captions, width, len(images), title))

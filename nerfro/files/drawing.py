@@ -1,4 +1,4 @@
-"""Elements of drawn images: cells of equal size, text, and colour scales."""
+"""Elements of drawn images: cells of equal size, text, and the colours of error maps."""
 
 from __future__ import annotations
 
@@ -57,20 +57,6 @@ def write(image: Image.Image, text: str, x: int, y: int) -> None:
     draw = ImageDraw.Draw(image)
     half = draw.textlength(text, font=font) / 2
     draw.text((min(max(x, half), image.width - half), y), text, fill=INK, font=font, anchor="mm")
-
-
-def colour_scale(width: int, height: int, title: str, limit: float) -> Image.Image:
-    """Draw the colour scale of error maps, labelled with its limits."""
-    cell = paper(width, height)
-    length, thickness = round(0.8 * width), max(height // 12, 4)
-    left, top = (width - length) // 2, (height - thickness) // 2
-    ramp = magma(torch.linspace(0, limit, length).expand(thickness, length), limit)
-    cell.paste(fit(ramp, length, thickness), (left, top))
-    write(cell, title, width // 2, top - LINE_HEIGHT // 2)
-    below = top + thickness + LINE_HEIGHT // 2
-    write(cell, "0", left, below)
-    write(cell, f"≥ {limit:g}", left + length, below)
-    return cell
 
 
 def magma(values: Float[Tensor, "H W"], limit: float) -> Float[Tensor, "H W 3"]:

@@ -65,14 +65,9 @@ def test_every_argument_of_lightnings_trainer_is_known() -> None:
     "override",
     [
         "trainer.max_epochs=3",
-        "trainer.max_time=5",
-        "checkpoint.every_seconds=null",
         "batches.size=0",
-        "field.width=-1",
         "+loss.nothing.weight=1",
-        "+callbacks.nothing.every=1",
         "optimized_metric=beauty",
-        "optimized_metric=hole.psnr",
     ],
 )
 def test_cfg_refuses_what_training_refuses_in_the_same_line(
