@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -96,8 +95,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
             metrics = ImageMetrics(*lpips, prefix=split)
             result, treated = score_split(renderer, test, metrics, folder, subdivision, config.evaluation.refine_steps)
             scores = {f"{split}/{name}": mean for name, mean in result.means().items()}
-            callbacks: list[Any] = trainer.callbacks  # type: ignore[attr-defined]
-            states = {callback.state_key: callback.state_dict() for callback in callbacks}
+            states = {each.state_key: each.state_dict() for each in trainer.callbacks}  # type: ignore[attr-defined]
             scored = RunMetrics(result, *spent, treated, steps_by_phase(states, spent[0]))
     finally:
         finish_logs(trainer, scores)
