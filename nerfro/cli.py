@@ -59,7 +59,7 @@ EXIT_BROKEN_PIPE = 141  # exit status of a program that SIGPIPE has ended, in a 
 # name that you change; command lines, YAML files of users, run folders and checkpoints then follow. Three forms:
 #   "batches.hold_back": "batches.num_validation_views"   a setting or a node with all settings below it
 #   "loss=nearby": "near_camera"                          an option of a group (`experiment=NAME` is one, too)
-#   "medium.learn_surface": None                          a setting that is gone: refused on the command line and in
+#   "medium.learn_surface": None                          a removed setting: refused on the command line and in
 #                                                         YAML files, dropped from the configurations of old runs
 #   "medium[SdfGrid].smoothing_size": None                the same in old runs for one class, where others keep it
 RENAMED: dict[str, str | None] = {
@@ -139,7 +139,7 @@ def entry_point(
         @functools.wraps(task)
         def job(config: DictConfig) -> float | None:
             if HydraConfig.get().mode != RunMode.MULTIRUN:
-                # Here too, because Hydra prints a line of its own for errors of the job.
+                # Caught here as well, because Hydra prints an additional line for errors of the job.
                 with errors_in_one_line(), _missing_with_example(config_name):
                     return task(config)
             discover()  # the process may be a launcher's worker
@@ -206,14 +206,14 @@ def print_version() -> None:
 
 
 def program() -> str | None:
-    """Return the name of the command that this process runs, such as `train`; None for other programs."""
+    """Return the name of the command of this process, such as `train`; None for other programs."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     package, _, name = ("" if spec is None else spec.name).partition(".")
     return name if package == "nerfro" else None
 
 
 def check_configuration(config: DictConfig, schema: type, config_dir: Path) -> None:
-    """Refuse settings whose names or values the dataclass of a command does not allow.
+    """Refuse names and values of settings that are invalid for the dataclass of a command.
 
     Raises:
         NerfroError: a setting is not allowed.
@@ -318,7 +318,7 @@ def _description(error: Exception) -> str:
     # Hydra refuses a group without an option (field=null), and flags together, by a ValueError.
     if isinstance(error, ValueError) and any(place[0].startswith("hydra.") for place in _places(error)[-1:]):
         return f"{error}; give the name of an option, as in field=nerf, and see --help for the flags"
-    if type(error).__module__.partition(".")[0] in ("joblib", "ray", "submitit"):  # as that a worker was killed
+    if type(error).__module__.partition(".")[0] in ("joblib", "ray", "submitit"):  # for example if a worker was killed
         reason = str(error).strip().split("\n")[0].rstrip(".")
         return f"{reason} ({type(error).__name__}); repeat the command to continue the sweep"
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -374,7 +374,7 @@ def _not_parsed(override: str) -> str:
 
 
 def _messages(error: BaseException) -> list[str]:
-    """Return the lines of an error and of its cause, in which Hydra keeps the name of the wrong key."""
+    """Return the lines of an error and of its cause, because Hydra names the wrong key only in the cause."""
     lines = [line.strip() for line in str(error).partition("Config search path")[0].splitlines() if line.strip()]
     cause = error.__cause__ or error.__context__ or error
     if not isinstance(cause, OmegaConfBaseException):
@@ -389,7 +389,7 @@ def _messages(error: BaseException) -> list[str]:
 
 
 def _unselected(key: str) -> str | None:
-    """Say how to select a loss or a callback that the experiment lacks; None for other settings."""
+    """Explain how to add a missing loss or callback to the experiment; None for other settings."""
     kind, name, option = [*key.split("."), "", ""][:3]
     plugin = next((plugin for plugin in plugins() if (plugin.kind, plugin.name) == (kind, name)), None)
     if plugin is None or kind not in SEVERAL or (option and option not in plugin.setting_names):
@@ -415,7 +415,7 @@ def renamed_override(override: str) -> str:
 
 
 def renamed_config(config: DictConfig, origin: Path) -> DictConfig:
-    """Replace old names in the configuration of an old run, with one warning, and drop settings that are gone."""
+    """Replace old names in the configuration of an old run, with one warning, and drop removed settings."""
     found = [f"{old} is called {new}" for old, new in RENAMED.items() if _move(config, old, new) and new]
     for name in ("data", "field", "model"):
         node = OmegaConf.select(config, name)
@@ -550,7 +550,7 @@ def _renamed_key(key: str) -> str | None:
 
 
 def _move(config: DictConfig, old: str, new: str | None) -> bool:
-    """Move a node of a configuration to its new place, or drop it; whether there is one."""
+    """Move a node of a configuration to its new place, or drop it; returns whether the node exists."""
     parent, _, name = old.rpartition(".")
     parent, _, owner = parent.rstrip("]").partition("[")
     node = OmegaConf.select(config, parent) if parent else config

@@ -199,7 +199,7 @@ def test_what_changed_is_followed_by_what_is_made_of_it(
 @pytest.mark.parametrize(
     ("doubtful", "psnr", "chosen", "printed"),
     [
-        ([], {"straight": 21.6}, "straight rays", "bent rays do not pay: the surface or the index is not accurate"),
+        ([], {"straight": 21.6}, "straight rays", "bent rays are not clearly better: the surface or the index"),
         ([], {"straight": 21.4}, "solid body", "training continues with: solid body"),
         ([], {"glass": 23.0}, "vessel", "training continues with: vessel"),
         (["medium.ior=1.0"], {"straight": 23.0}, "straight rays", "the photographs do not determine its index"),

@@ -30,7 +30,7 @@ Photographed = Callable[[Int[Tensor, "R"]], Float[Tensor, "R 3"]]
 
 # Pixels with a smaller contrast to their neighbours (sRGB) carry no information about the pose.
 _MIN_CONTRAST = 0.03
-# Colour change per pixel of motion above which the weight decreases, because steep slopes hold over short distances.
+# Colour change per pixel of motion above which the weight decreases, because steep gradients hold over short distances.
 _STEEP_SLOPE = 0.1
 _TINY = 1e-9
 

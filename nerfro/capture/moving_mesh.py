@@ -61,7 +61,7 @@ class MovingMesh:
         return unit(np.stack(sums, -1))
 
     def surface(self, vertices: Float[np.ndarray, "V 3"]) -> Surface:
-        """Compute normals and creases. A single displaced vertex makes no crease, because normals agree beyond it."""
+        """Compute normals and creases. A single displaced vertex is no crease, because the normals around it agree."""
         normals = self.normals(vertices)
         beside, beyond = unit(self.face_normals(vertices))[self._beside], normals[self._beyond]
         sharp = (beside.prod(1).sum(1) < _CREASE) & (beyond.prod(1).sum(1) < _CREASE)

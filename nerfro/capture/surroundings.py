@@ -40,7 +40,7 @@ _NEAR_STEPS, _NEAR_PIXELS = 400, 2048
 _RATES = (0.03, 0.0015)
 # Every so many-th view is a validation view.
 VALIDATION_EVERY = 8
-# Surroundings are near if distant ones leave more than this fraction of the variance of validation views unexplained.
+# Surroundings are near if a sky leaves more than this fraction of the variance of validation views unexplained.
 _MAX_SKY_RESIDUAL = 0.25
 # Lower bound of the variance of linear radiance.
 _MIN_VARIANCE = 1e-4
@@ -99,7 +99,7 @@ def robust(residual: Float[Tensor, "P 3"], half: float) -> Float[Tensor, "P"]:
 
 
 def half_weight(surroundings: Surroundings) -> float:
-    """Return the residual at which a pixel has half weight."""
+    """Return the residual at which a pixel has half the weight."""
     return max(_HALF_WEIGHT * float(surroundings.colours.std(0).mean()), 1e-3)
 
 

@@ -59,7 +59,8 @@ class PosedImages(DataSource):
 
     Args:
         root: folder of the data set.
-        near, far: bounds of the rays, arc lengths in world units; None for the bounds of the data set.
+        near: arc length at which rays begin, world units; None for the value of the data set.
+        far: arc length at which rays end, world units; None for the value of the data set.
         downscale: downscaling factor of each side, any number from 1. Each pixel becomes the mean of the area that it
             covers, and the intrinsics are scaled accordingly.
         alpha: `drop` ignores transparency; `white` and `black` composite the images over this colour.

@@ -1,4 +1,4 @@
-"""Lenses of cameras: the keys that state one in a transforms file, and the checks that all data formats share."""
+"""Lenses of cameras: keys in transforms files, and checks for all data formats."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from nerfro.lens import coefficients, distort, opencv_coefficients, undistort
 # Perspective lenses in the files of nerfstudio, COLMAP and Blender. They differ in the coefficients that are zero.
 _PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE", "PERSP")
 _MODEL = ("camera_model", "camera_type", "lens_model", "projection", "projection_type")
-# Other projections, which a key may name, or the text of a key about the camera.
+# Other projections, as keys or as values of `camera_model`.
 _PROJECTIONS = re.compile("fish_?eye|ortho|equirect|equidist|lat_?long|panoram|omni|spheric|cylind|f_?theta", re.I)
 _STATES_PROJECTION = re.compile("camera|lens|model|projection|type")
 # Keys of other projections, and other names of what `_NUMBERS` states; without underscores, in lower case.
@@ -134,7 +134,7 @@ def read_lens(file: Mapping[str, Any], frame: Mapping[str, Any], size: tuple[int
 
 
 def _model(level: Mapping[str, Any], where: str) -> str | None:
-    """Return the perspective lens that a level names, if any; refuse keys of other projections."""
+    """Return the perspective lens that the file or a frame names, if any; refuse keys of other projections."""
     for key, value in level.items():
         plain = re.sub(r"[\W_]", "", key).lower()
         names_other = isinstance(value, str) and _STATES_PROJECTION.search(plain) and _PROJECTIONS.search(value)
@@ -224,7 +224,7 @@ def _focal_length(level: Mapping[str, float], axis: str, side: float) -> float |
 
 
 def check_lenses(lenses: Iterable[Lens], names: Iterable[str], size: tuple[int, int]) -> None:
-    """Refuse lenses that no camera has, and warn of a principal point outside the image.
+    """Refuse implausible lenses, and warn of a principal point outside the image.
 
     Args:
         lenses: one lens per image.

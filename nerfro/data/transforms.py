@@ -130,7 +130,7 @@ def _read_frame(
 
 
 def _candidates(root: Path, name: str) -> list[Path]:
-    """List the possible image files of a `file_path`, which may lack its extension, or have one in the other case."""
+    """List the possible image files of a `file_path` with a missing extension, or with one in upper or lower case."""
     suffix = PurePosixPath(name).suffix
     suffixes: tuple[str, ...] = IMAGE_SUFFIXES
     if suffix.lower() in IMAGE_SUFFIXES:

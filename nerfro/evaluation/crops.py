@@ -16,7 +16,7 @@ from nerfro.evaluation.error_maps import squared_error_map
 
 @dataclass(frozen=True)
 class Crop:
-    """A square crop of an image: position of its upper left corner and side, in pixels."""
+    """A square crop of an image: position of the upper left corner and length of the side, in pixels."""
 
     top: int
     left: int
@@ -27,7 +27,7 @@ class Crop:
         return min(self.top, self.left) >= 0 and self.top + self.size <= height and self.left + self.size <= width
 
     def of(self, image: Float[Tensor, "H W C"]) -> Float[Tensor, "size size C"]:
-        """Crop an image; raises an error if the crop exceeds it."""
+        """Crop an image; raises an error if the crop exceeds the image."""
         height, width = image.shape[:2]
         if not self.inside(height, width):
             raise NerfroError(f"{self} exceeds an image of {height} x {width} pixels; choose another crop")
@@ -51,7 +51,7 @@ def most_different_crop(
         apart_from: squares that the result must not overlap.
 
     Raises:
-        NerfroError: there is no prediction, or there is no space for the square.
+        NerfroError: there is no prediction, or no space for the square.
     """
     if not predictions or not 0 < size <= min(reference.shape[:2]):
         raise NerfroError(

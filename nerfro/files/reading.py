@@ -1,4 +1,4 @@
-"""Readers of files that strangers may have written: images, JSON documents and arrays.
+"""Readers of untrusted files: images, JSON documents and arrays.
 
 Decoders raise nearly any exception on a damaged file, allocate what a header asks for, and wait at a pipe. Therefore
 these readers accept regular files of bounded size, and convert any error to one line.
@@ -107,7 +107,7 @@ def _bits(image: Image.Image, file: BinaryIO) -> int:
 
 
 def _require_end(file: BinaryIO) -> None:
-    """Require all chunks of a PNG file up to its last one, IEND."""
+    """Require all chunks of a PNG file, including the last one, IEND."""
     place, kind = file.tell(), b""
     file.seek(8)
     while kind != b"IEND":

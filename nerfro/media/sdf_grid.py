@@ -56,12 +56,15 @@ class SdfGrid(Solid):
         inner_meshes: meshes of inner bodies (a liquid, a bubble), each inside all bodies before it. Opaque objects do
             not belong here, because they do not refract.
         inner_iors: refractive index of each inner body.
-        learn_ior: refine all refractive indices in training, by the differentiable replay of paths.
+        learn_ior: refine all refractive indices in training.
         resolution: vertices along each side of the grid.
         box_min, box_max: corners of the grid, world units; None for the bounds of the mesh and a margin of air.
         shell_voxels: half width of the smooth interface that the Eikonal equation sees, voxels.
-        accept_open_mesh: accept meshes with holes; the majority of three axes decides which points are inside.
-        absorption, learn_absorption, abbe: absorption and dispersion, see `Solid`; for `snell` alone.
+        accept_open_mesh: accept meshes with holes. Rays along three axes decide by majority whether a point is inside.
+        absorption: absorption coefficients per world unit: red, green and blue of each body, or one number for all;
+            only for `sampler/path=snell`.
+        learn_absorption: learn the absorption; only for `sampler/path=snell`.
+        abbe: Abbe number of each body, or one for all bodies, for dispersion; only for `sampler/path=snell`.
         cache: keep the distances in the cache folder.
 
     Attributes:

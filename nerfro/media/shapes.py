@@ -24,7 +24,11 @@ class Ball(Solid):
 
     Args:
         radius: of the ball, world units.
-        ior, shell, absorption, learn_absorption, abbe: see `Solid`.
+        ior: refractive index.
+        shell: half width of the smooth interface for `sampler/path=eikonal`, world units.
+        absorption: absorption coefficients of red, green and blue, or one number for all, per world unit.
+        learn_absorption: learn the absorption.
+        abbe: Abbe number, for dispersion.
     """
 
     def __init__(

@@ -19,7 +19,7 @@ from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.types import Path
 from nerfro.variants import variant
 
-# Initial absorption per world unit where it is learned. A larger one would explain the content at first.
+# Initial value of a learned absorption, per world unit. With a larger value, the absorption would explain the content.
 _ALMOST_CLEAR = 0.02
 # Wavelengths of the lines d, F and C, nm.
 _FRAUNHOFER = (587.56, 486.13, 656.27)

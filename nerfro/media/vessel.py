@@ -49,7 +49,9 @@ class SdfVessel(SdfGrid):
         up: direction from the bottom to the top, world axes; its length does not matter.
         height: outer height of the vessel, in the unit of the other lengths.
         resolution, box_min, box_max, shell_voxels, accept_open_mesh, cache: see `SdfGrid`.
-        absorption, learn_absorption, abbe: of wall and liquid, see `Solid`.
+        absorption: coefficients per world unit: red, green and blue of wall and liquid, or one number for all.
+        learn_absorption: learn the absorption.
+        abbe: Abbe numbers of wall and liquid, or one for both, for dispersion.
 
     Attributes:
         lengths: wall, foot, fillet and level as given; a full vessel has no level.

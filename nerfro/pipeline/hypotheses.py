@@ -23,7 +23,7 @@ class Hypothesis:
     Attributes:
         name: name in the table.
         options: options of `python -m nerfro.train` under this assumption.
-        doubt: why bent rays may not pay, for the message about the result; empty if nothing is known.
+        doubt: reason for a failure of bent rays, for the message about the result; empty if unknown.
         speed: number of training steps in the time of one step with bent rays.
     """
 
@@ -56,7 +56,7 @@ class Hypothesis:
 
 
 def hypotheses(found: Mapping[str, Any], medium: Mapping[str, Any]) -> list[Hypothesis]:
-    """List the assumptions about the object that the photographs have to decide between, straight rays first.
+    """List the assumptions about the object, straight rays first.
 
     Straight rays show an opaque object, and are the baseline of all other hypotheses. A body has the index that
     `preprocess` found; without a reliable index, the indices of water and of glass are the initial values of a learned

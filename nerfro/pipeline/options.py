@@ -21,18 +21,21 @@ class ReconstructConfig:
     """Options of `python -m nerfro.reconstruct`.
 
     Attributes:
-        data: data set with poses, instead of `images` (options of the group `data`, passed to all stages).
+        data: data set with poses, instead of `images` or `video` (options of the group `data`, passed to all stages).
         medium: medium that is built from the surface (options of the group `medium`).
         images: folder of photographs without poses.
         video: video instead of photographs; the sharpest of its frames are used.
         frames: number of frames to take from the video.
-        masks: folder of the masks, `<photograph>.png` or `mask_<photograph>.png`.
-        outlines: outlines of the object in some photographs (see `python -m nerfro.mask`).
+        masks: folder of the masks, `<photograph>` or `mask_<photograph>` with the ending of any image format.
+        outlines: outlines of the object in some photographs, as for `python -m nerfro.mask`.
         out: output folder.
         trial_steps: number of steps of the training that tries each hypothesis about the object on validation
             photographs (straight rays, solid body, vessel); 0 trains the solid body without a comparison.
         pixels: maximum length of the longer side of the photographs in training; `data.downscale` has precedence.
-        calibrate, mask, preprocess, train: further command-line options of these stages.
+        calibrate: further options of `python -m nerfro.calibrate`, separated by spaces.
+        mask: further options of `python -m nerfro.mask`; `view=true` opens a page for drawing outlines.
+        preprocess: further options of `python -m nerfro.preprocess`.
+        train: further options of the final `python -m nerfro.train` and of the trials.
     """
 
     data: Any = MISSING

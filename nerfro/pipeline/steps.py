@@ -1,4 +1,4 @@
-"""The steps of `nerfro.reconstruct`; each runs a command unless its result is there and newer than its inputs."""
+"""The steps of `nerfro.reconstruct`. A step runs a command, unless the result exists and is newer than the inputs."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def preprocess(config: DictConfig, options: list[str], root: Path, folder: Path)
 
 
 def train(config: DictConfig, overrides: list[str], surface: Path, out: Path) -> None:
-    """Train under the hypothesis that the validation photographs prefer."""
+    """Train with the hypothesis that predicts the validation photographs best."""
     inputs = [surface / FOUND, surface / MESH]
     found = read_result(surface / FOUND, {"options", "doubtful", "near", "pixels"})
     common = common_options(config, overrides, found)
@@ -110,21 +110,21 @@ def _best_hypothesis(tried: Sequence[Hypothesis], runs: Sequence[Path]) -> Hypot
     print(f"  {'hypothesis':<20}{'image':>9}{'object':>9}")
     for hypothesis, run in zip(tried, runs, strict=True):
         result = read_metrics_json(run / "metrics.json").result
-        image, thing = result.mean("psnr", FULL) or 0.0, result.mean("psnr", "mask")
-        scores.append(image if thing is None else 0.5 * (image + thing))
-        print(f"  {hypothesis.name:<20}{image:>9.2f}{'n/a' if thing is None else f'{thing:.2f}':>9}")
+        image, inside = result.mean("psnr", FULL) or 0.0, result.mean("psnr", "mask")
+        scores.append(image if inside is None else 0.5 * (image + inside))
+        print(f"  {hypothesis.name:<20}{image:>9.2f}{'n/a' if inside is None else f'{inside:.2f}':>9}")
     bent = max(range(1, len(tried)), key=scores.__getitem__)
     best = tried[bent if scores[bent] >= scores[0] + _MIN_GAIN else 0]
     print(f"training continues with: {best.name}")
     if best is tried[0]:
         doubts = [hypothesis.doubt for hypothesis in tried if hypothesis.doubt]
         reason = doubts[0] if doubts else "the surface or the index is not accurate enough, or the object is opaque"
-        print(f"bent rays do not pay: {reason}; to bend them nevertheless, add train=+experiment=NAME")
+        print(f"bent rays are not clearly better: {reason}; to use bent rays nevertheless, add train=+experiment=NAME")
     return best
 
 
 def _run_training(options: list[str], inputs: list[Path], run: Path) -> None:
-    """Train, or resume an interrupted training if its inputs have not changed."""
+    """Train, or resume an interrupted training if the inputs have not changed."""
     started = run / CONFIG_FILE
     options = [*options, *as_overrides({"hydra.run.dir": run})]
     stage = Stage("train", options, run / "metrics.json", run / "images", inputs)

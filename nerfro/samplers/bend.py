@@ -82,7 +82,7 @@ def polylines(
     """Trace rays through a medium, and return the vertices of their paths, for example to plot them.
 
     Args:
-        medium: bodies, which Snell's law is applied to, or a medium whose index varies continuously.
+        medium: bodies, traced by Snell's law, or a medium with a continuous index, traced by the ray equation.
         origins, directions: rays [R, 3], world units; directions need not have unit length.
         length: length of the paths, world units; bent paths end outside of the medium. By default, paths end well
             beyond the medium.
@@ -96,7 +96,7 @@ def polylines(
     rays = make_rays(*_checked_rays(origins, directions), medium, 0.0, length)
     path = (Snell() if isinstance(medium, Solid) else Eikonal())(rays, medium)
     vertices = zip(path.positions.numpy() + medium.origin, path.s.numpy(), strict=True)
-    # Rows repeat their last vertex.
+    # Rows repeat the last vertex.
     return [positions[np.diff(s, prepend=-1.0) > 0] for positions, s in vertices]
 
 

@@ -30,9 +30,9 @@ from nerfro.samplers.stepfun import invert_cdf, midpoints, spread_uniform, volum
 from nerfro.samplers.stratified import cone_samples
 from nerfro.types import Path, Rendering, Samples
 
-# Optical depth by the grid below which a sample is not worth a query of the field.
+# Smallest optical depth, predicted by the grid, of samples at which the field is queried.
 _EMPTY = 0.005
-# In training: samples on the faintest branches, and the weight from which all samples of a branch are queried.
+# In training: number of samples on branches of the smallest weight, and the weight from which all samples are queried.
 _FEWEST, _HEAVY = 8, 0.5
 
 
@@ -129,8 +129,8 @@ class DensityGridSampler(PointSampler):
         update_every: training steps between two updates of the grid.
         update_fraction: fraction of the cells that an update queries, drawn at random.
         decay: factor of the density of a cell at each update.
-        max_bin_alpha: upper bound on the opacity (alpha) of one bin. A cell keeps its largest density, but many rays
-            cross it elsewhere; without the bound, what these rays meet behind it would get next to no samples.
+        max_bin_alpha: upper bound on the opacity (alpha) of one bin. A cell stores the density of its densest point,
+            which many rays miss; without the bound, these rays would have hardly any samples behind the cell.
         num_samples_evaluation: number of intervals in evaluation, where noise does not average out over steps; None
             for `num_samples`.
     """
@@ -183,8 +183,8 @@ class DensityGridSampler(PointSampler):
     def _quantiles(self, path: Path, draws: Draws | None) -> Float[Tensor, "P E"]:
         """Compute the values of the cumulative weights at which edges of samples lie.
 
-        In training, polylines of rays that split get samples in proportion to their weight. The intervals that one
-        lacks are at its end and have no length.
+        In training, polylines of rays that split have samples in proportion to their weight. Missing intervals are at
+        the end of a polyline and have no length.
         """
         if draws is None:
             return spread_uniform(path, self.num_samples_evaluation + 1, None)
@@ -200,9 +200,9 @@ class DensityGridSampler(PointSampler):
 
     @staticmethod
     def _queried(path: Path, samples: Samples) -> Bool[Tensor, "P N"] | None:
-        """Samples at which the field is queried in training: all but those of faint branches in empty cells.
+        """Samples at which the field is queried in training: all, except in empty cells on branches of small weight.
 
-        The field may have become dense since the last update of the grid, which heavy branches discover.
+        Branches of large weight find density that is newer than the last update of the grid.
         """
         if not path.splits:
             return None
@@ -290,7 +290,7 @@ class DensityGridSampler(PointSampler):
         unit = (corners + (words[:, 1:] >> 8) * 2.0**-24) / self.resolution
         density = self._query(fields[-1], self.box[0] + unit * (self.box[1] - self.box[0]))
         flat = self.density.view(-1)
-        # A cell that was drawn twice must not depend on the order of writing, or runs could not be repeated.
+        # A cell that is drawn twice must not depend on the order of writing, because runs must be repeatable.
         flat[cells] = flat[cells] * self.decay
         flat.scatter_reduce_(0, cells, density, "amax")
 

@@ -20,7 +20,7 @@ from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
 from nerfro.types import Path, Rays
 
-# Without `far`, paths end this number of diagonals beyond the medium's box, because reflected rays need long paths.
+# Without `far`, paths end this number of diagonals beyond the box of the medium, because reflected paths are long.
 _DIAGONALS = 2
 
 
@@ -42,8 +42,8 @@ class TraceConfig:
     # split, there is one row for each polyline, and the arrays `ray` (row in `rays`) and `throughput` [P, 3].
     out: str = MISSING
     near: Distance = 0.0  # arc length at which paths begin
-    # Arc length at which paths end; bent paths end outside the medium's box, beyond `far` if necessary. By default, all
-    # paths end where they leave the box.
+    # Arc length at which paths end. Bent paths end outside the box of the medium, beyond `far` if necessary. By
+    # default, all paths end at the exit from the box.
     far: Optional[Distance] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     plot: bool = False  # whether to plot some of the paths and the medium as .png beside `out`
     overwrite: bool = False  # whether to replace `out` and the plot
@@ -68,8 +68,8 @@ def make_rays(
 
 
 def leave_box(path: Path, medium: Medium) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R"]]:
-    """Return positions and arc lengths at which paths leave the box; rays that miss the box have their first vertex."""
-    # Short rows repeat their last vertex, so the last event is the last vertex before far.
+    """Return positions and arc lengths at which paths leave the box; for rays that miss the box, the first vertex."""
+    # Short rows repeat the last vertex, so the last event is the last vertex before far.
     last = (path.s < path.far[:, None]).sum(-1).sub(1).clamp(min=0)
     rows = torch.arange(len(last))
     start = path.positions[rows, last]

@@ -66,12 +66,12 @@ def find_scene(name: str) -> ModuleType:
 
 
 def data_set_type(scene: ModuleType) -> type[DataSet]:
-    """Return the kind of images that a scene is rendered as, which its module may choose as `DATA_SET`."""
+    """Return the class of the data set of a scene; the module of the scene may define it as `DATA_SET`."""
     return getattr(scene, "DATA_SET", Views)
 
 
 def build_scene(name: str, resolution: int) -> Scene:
-    """Model a scene, with colours as fine as half a pixel of images that are `resolution` pixels wide."""
+    """Model a scene. Colours have a resolution of half a pixel in images of `resolution` pixels."""
     module = find_scene(name)
     return module.build(spacing=max(0.5 * data_set_type(module).WIDTH / resolution, 0.0025))
 

@@ -93,7 +93,7 @@ def begin(folder: Path, config: DictConfig, renderer: Renderer) -> None:
 
 
 def next_steps(folder: Path, split: str | None) -> str:
-    """Return what a user can look at after a run whose views of a split have been scored, if any."""
+    """Return the lines about results at the end of a run: an image, the page and the tables of scores."""
     lines = [f"page: python -m nerfro.view {shlex.quote(f'checkpoint={folder}')}"]
     if split is None:
         lines.append(f"scores: python -m nerfro.evaluate {shlex.quote(f'checkpoint={folder}')}")
@@ -163,7 +163,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], DictConfig]:
     with reading(path, "checkpoint ", trouble, "train the run again", missing):
         try:
             checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        except pickle.UnpicklingError as error:  # torch advises to load it nevertheless
+        except pickle.UnpicklingError as error:  # the message of torch recommends unsafe loading
             raise NerfroError(f"checkpoint {path} {trouble} (it holds more than numbers)") from error
         absent = _REQUIRED_KEYS.keys() - checkpoint.keys()
         if absent:
@@ -176,7 +176,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], DictConfig]:
 
 
 def require_finite(weights: Mapping[str, Any], path: Path) -> None:
-    """Refuse weights that are no tensors, or that are infinite or NaN."""
+    """Refuse weights that are not tensors, or not finite."""
     for name, weight in weights.items():
         if not isinstance(weight, Tensor):
             raise NerfroError(f"{path} holds a {type(weight).__name__} as {name}; it is damaged")
@@ -185,7 +185,7 @@ def require_finite(weights: Mapping[str, Any], path: Path) -> None:
 
 
 def require_optimizer_fits(checkpoint: Mapping[str, Any], renderer: Renderer, path: Path) -> None:
-    """Refuse an optimizer state that is not of Adam, or whose moments are not finite or have other shapes."""
+    """Refuse an optimizer state that is not of Adam, or has moments of wrong shape or infinite values."""
     groups = renderer.parameter_groups().values()
     shapes = [parameter.shape for parameters in groups for parameter in parameters]
     defaults = torch.optim.Adam([torch.empty(0)]).defaults
@@ -225,7 +225,7 @@ def restore(checkpoint: dict, config: DictConfig) -> Renderer:
 
 
 def require_same_run(folder: Path, checkpoint: Path | None, config: DictConfig, renderer: Renderer) -> None:
-    """Refuse to resume from a checkpoint that does not fit, or in a folder that another run has begun."""
+    """Refuse to resume from an unsuitable checkpoint, or in the folder of another run."""
     begun = folder / CONFIG_FILE
     if checkpoint is not None:
         content, trained = load_checkpoint(checkpoint)

@@ -47,7 +47,7 @@ _NAMED = {
     "trainer.enable_model_summary": Role.WATCHING,
 }
 
-# A run can resume a checkpoint if these settings are equal; budget, machine and scoring may differ.
+# To resume a checkpoint, these settings must be equal; budget, machine and scoring may differ.
 RESUMING = frozenset({Role.METHOD, Role.SEED, Role.SCENE})
 # Two cells of a sweep have the same result if these settings are equal.
 RESULT = RESUMING | {Role.BUDGET, Role.SCORING}

@@ -1,4 +1,4 @@
-"""Cells of a sweep, each of which is one training run that is trained at most once.
+"""Cells of a sweep. A cell is one training run, and is trained at most once.
 
 Hydra's sweeper chooses the settings of the cells, and its launcher runs them. The folder of a cell contains its state,
 so that repeating the command of a sweep continues the sweep.
@@ -34,7 +34,7 @@ OmegaConf.register_new_resolver("scene_name", scene_name, replace=True)
 
 
 def identity_of(config: DictConfig) -> dict[str, Any]:
-    """Return what determines the result of a run, except for the machine: settings, and a hash of the data files."""
+    """Return the settings that determine the result of a run, and a hash of the data files."""
     return {"settings": settings(config, RESULT), "data": _hash_of_files(resolve_path(config.data.root))}
 
 

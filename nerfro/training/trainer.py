@@ -32,7 +32,7 @@ from nerfro.training.log import TrainingLog, keep_rows
 from nerfro.training.run_folder import CONFIG_FILE, LAST_CHECKPOINT, in_sweep
 from nerfro.training.validation import OverfittingWarning
 
-# Arguments of the trainer that nerfro itself acts on.
+# Arguments of the Trainer that nerfro implements itself.
 _OWN = ("profiler", "fast_dev_run", "overfit_batches", "limit_test_batches")
 _LOST_CONNECTION = re.compile("gloo|NCCL|[Cc]onnection (closed|reset)")  # in errors of torch.distributed
 _PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch": PyTorchProfiler}
@@ -110,7 +110,7 @@ def _shared(callback: Callback) -> Callback:
 
 
 def training_accelerator(name: str) -> str:
-    """Replace `auto` by `cpu`, because compiled kernels exist for CPUs alone, and report a GPU that stays unused.
+    """Replace `auto` by `cpu`, because compiled kernels exist only for CPUs, and warn of an unused GPU.
 
     Args:
         name: `trainer.accelerator`.
@@ -165,7 +165,7 @@ def fit(
 
 
 def finish_logs(trainer: pl.Trainer, scores: Mapping[str, float | None]) -> None:
-    """Log the final scores, and finish logs, because the next job of a sweep would append to them."""
+    """Log the final scores, and close the logs, because otherwise the next job of a sweep appends to them."""
     known = {name: score for name, score in scores.items() if score is not None}
     for logger in trainer.loggers:
         if known:
@@ -176,19 +176,19 @@ def finish_logs(trainer: pl.Trainer, scores: Mapping[str, float | None]) -> None
 
 
 def _quieten_lightning() -> None:
-    """Suppress hints of Lightning about data loaders and hardware, which do not apply."""
+    """Suppress hints of Lightning about data loaders and hardware, because they do not apply."""
     for package in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(package).setLevel(logging.WARNING)
     for message in (
         ".*does not have many workers.*",
         ".*You are using .* devices.*",
         ".*Starting from v1.9.*",
-        ".*sync_dist=True.*",  # one process looks at validation views
-        ".*broadcast_buffers.* is deprecated.*",  # its successor is not in all versions of torch that are supported
+        ".*sync_dist=True.*",  # only one process evaluates validation views
+        ".*broadcast_buffers.* is deprecated.*",  # the replacement is missing in older supported versions of torch
         ".*LeafSpec.* is deprecated.*",
-        # A run that is resumed, in its own folder or in another one.
+        # Resumed runs, in their own folder or in another one.
         ".*Checkpoint directory .* exists and is not empty.*",
         ".*The dirpath has changed from .*",
-        ".*Experiment logs directory .* exists and is not empty.*",  # `keep_rows` keeps its rows
+        ".*Experiment logs directory .* exists and is not empty.*",  # `keep_rows` keeps the rows
     ):
         warnings.filterwarnings("ignore", message)
