@@ -33,7 +33,7 @@ def choose_wrong_masks(silhouettes: Silhouettes, wrong_masks: int | None) -> int
     """Return the given number of views that may be wrong, or else the number for which the hull agrees best."""
     if wrong_masks is None:
         wrong_masks = better_wrong_masks(silhouettes, 0) or 0
-        print(f"wrong_masks={wrong_masks}: a coarse hull agrees best with the masks if so many views may be wrong")
+        print(f"wrong_masks={wrong_masks}: with this number, a coarse hull agrees best with the masks")
     return wrong_masks
 
 

@@ -209,7 +209,7 @@ def conclude(
     print(f"results: {', '.join(str(file) for file in request.files if file.exists())}")
     if doubtful:
         print_hint(f"the photographs do not determine the index; add {' '.join(f'{name}=N' for name in index)}")
-    print_hint("for near surroundings add +experiment=refractive_room; the baseline is +experiment=mipnerf")
+    print_hint("for near surroundings, add +experiment=refractive_room; for straight rays, +experiment=mipnerf_sky")
     print_next("train on it", "train", options)
     if as_vessel:
         print_next("train on the vessel", "train", as_vessel)

@@ -198,13 +198,13 @@ def refine(
         warn(f"surface unchanged: {reason}")
         return mesh
     before, after = refined.errors[0], min(refined.errors)
-    change = f"validation error {before:.4f} -> {after:.4f} (0 exact, 1 unrelated)"
+    change = f"the validation error changes from {before:.4f} to {after:.4f} (0: exact, 1: unrelated images)"
     if refined.mesh is mesh:
-        print(f"surface unchanged: {change}, which is no significant improvement")
+        print(f"surface unchanged: {change}, which is not significant")
     else:
         moved = float(torch.from_numpy(refined.mesh.vertices - mesh.vertices).norm(dim=-1).median())
         print(f"surface refined: {change}; median displacement {moved:.2g} world units")
-    figures = {"steps": refined.steps, "held_back_error": [round(error, 5) for error in refined.errors]}
+    figures = {"steps": refined.steps, "validation_error": [round(error, 5) for error in refined.errors]}
     write_atomically(folder / FIGURES, json.dumps(figures, indent=1) + "\n")
     return refined.mesh
 

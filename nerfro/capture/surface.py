@@ -73,7 +73,7 @@ def read_silhouettes(views: Views, has_box: bool) -> Silhouettes:
             "from farther away, or give box_min= and box_max= to bound the hull"
         )
     if silhouettes.cut.any():
-        warn(f"{_names(views, silhouettes.cut)}: the frame cuts the object; nothing is known outside the frame")
+        warn(f"{_names(views, silhouettes.cut)}: the frame cuts the object; the surface outside the frame is unknown")
     return silhouettes
 
 

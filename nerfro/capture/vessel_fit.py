@@ -25,7 +25,7 @@ from nerfro.media.vessel import SdfVessel
 from nerfro.progress import bar
 from nerfro.samplers.snell import Snell
 
-# Lengths of an ordinary glass, as fractions of its width.
+# Lengths of a typical glass, as fractions of its width.
 _ORDINARY = {"wall": 0.02, "foot": 0.06, "fillet": 0.1}
 _MAX_FILLET = 0.4
 _GLASS, _WATER = 1.52, 1.333
@@ -50,7 +50,7 @@ class VesselFit:
         lengths: wall, foot, fillet, and level if there is a liquid, world units.
         standard_errors: standard error of each length by resampling of the views; errors of the surface are not
             included.
-        unknown: lengths that the photographs do not determine, which keep their ordinary values.
+        unknown: lengths that the photographs do not determine, which keep their typical values.
     """
 
     lengths: dict[str, float]
@@ -92,7 +92,7 @@ def find_vessel(medium: SdfGrid, location: str, mesh: TriangleMesh, observations
     ]
     print(f"vessel, {'partly filled' if 'level' in fit.lengths else 'empty'}: {', '.join(values)} world units")
     if fit.unknown:
-        warn(f"the photographs do not determine {' and '.join(fit.unknown)}, which keep ordinary values")
+        warn(f"the photographs do not determine {' and '.join(fit.unknown)}, which keep typical values")
     options = {"medium.up": up, "medium.ior": _GLASS, "medium.liquid_ior": _WATER if "level" in fit.lengths else 1.0}
     lengths = {f"medium.{name}": float(f"{length:.4g}") for name, length in fit.lengths.items()}
     return {"medium": "vessel"} | options | lengths

@@ -146,7 +146,7 @@ def test_preprocess_writes_the_refined_surface(preprocess: Callable, monkeypatch
     assert f"medium.mesh={out / 'mesh.ply'}" in printed
     assert load_mesh(out / "mesh.ply").vertices.shape == mesh().vertices.shape
     figures = json.loads((out / "refinement.json").read_text())
-    assert min(figures["held_back_error"]) < 0.6 * figures["held_back_error"][0]
+    assert min(figures["validation_error"]) < 0.6 * figures["validation_error"][0]
 
 
 def test_a_surface_that_cannot_be_refined_stays_as_it_is(preprocess: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
