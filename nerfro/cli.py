@@ -107,6 +107,8 @@ RENAMED: dict[str, str | None] = {
     "medium[SdfGrid].smoothing_sigma": None,
     "medium[SdfGrid].smoothing_size": None,
 }
+# Short names of settings, on the command line and in YAML files.
+SHORT_NAMES = {"bodies": "medium.bodies"}
 
 
 def entry_point(
@@ -250,7 +252,7 @@ def answer(described: Described, arguments: list[str]) -> None:
     unknown = any(argument.startswith(("--config", "-c", "hydra.searchpath")) for argument in arguments)
     if not unknown:  # other folders of configurations may have other groups
         current = [text for text in arguments if not any(f"{text.lstrip('+~')}.".startswith(old) for old in RENAMED)]
-        described.require_known(current)
+        described.require_known([_full_key(text) for text in current])
 
 
 def _refuse_flag(message: str) -> NoReturn:
@@ -405,7 +407,9 @@ def renamed_override(override: str) -> str:
     Raises:
         NerfroError: the setting is gone.
     """
-    prefix, key, equals, value = cast(re.Match, re.fullmatch(r"(~|\+*)([^=]*)(=?)(.*)", override, re.DOTALL)).groups()
+    prefix, key, equals, value = cast(
+        re.Match, re.fullmatch(r"(~|\+*)([^=]*)(=?)(.*)", _full_key(override), re.DOTALL)
+    ).groups()
     group, at, package = key.partition("@")
     new_value = re.sub(r"\w+", lambda name: _renamed_option(group, name[0]), value)
     new_package = _renamed_key(package if at else key)
@@ -510,6 +514,9 @@ class _RenamingFiles(FileConfigSource):
                 if new is None:
                     raise NerfroError(f"{config_path}.yaml: {_gone(old)}")
                 warn(f"{config_path}.yaml: {_since(old, new)}")
+        for short, full in SHORT_NAMES.items():
+            if package in ("", "_global_"):
+                _move(config, short, full)
         if "defaults" in config:
             config.defaults = [_renamed_default(group, entry) for entry in config.defaults]
         return result
@@ -561,6 +568,11 @@ def _move(config: DictConfig, old: str, new: str | None) -> bool:
     if new is not None:
         OmegaConf.update(config, new, value, force_add=True)
     return True
+
+
+def _full_key(override: str) -> str:
+    """Replace the short name of a setting by the full one."""
+    return re.sub(r"^([+~]*)(\w+)(?=[.=])", lambda key: key[1] + SHORT_NAMES.get(key[2], key[2]), override)
 
 
 def _since(old: str, new: str) -> str:

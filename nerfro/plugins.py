@@ -3,6 +3,7 @@
 Examples:
     nerfro plugins
     nerfro plugins medium field=hash_grid
+    nerfro plugins material
 """
 
 from __future__ import annotations
@@ -12,18 +13,35 @@ import sys
 import nerfro.startup
 import nerfro.training.lightning_callbacks  # noqa: F401 - registers callbacks
 from nerfro.cli import errors_in_one_line
+from nerfro.media.material import MATERIALS
 from nerfro.options import plugin_options
 from nerfro.registry import Plugin, discover, find, plugins
 
 
 def main() -> None:
-    """List all plugins, or those of the types (`medium`) or options (`medium=ball`) on the command line."""
+    """List all plugins, or those of the types (`medium`) or options (`medium=ball`) on the command line.
+
+    The type `material` stands for the catalogue of materials.
+    """
     with errors_in_one_line():
         discover()
-        for plugin in _chosen(sys.argv[1:]):
+        arguments = sys.argv[1:]
+        if "material" in arguments:
+            _print_materials()
+            arguments.remove("material")
+            if not arguments:
+                return
+        for plugin in _chosen(arguments):
             print(f"{plugin.kind}={plugin.name}  {plugin.summary}")
             for option in plugin_options(plugin, ""):
                 print(option)
+
+
+def _print_materials() -> None:
+    """Print the materials that `bodies.NAME.material` may name, with index, Abbe number and source."""
+    for name, formula in MATERIALS.items():
+        print(f"material={name}  {formula.description}")
+        print(f"    n_d = {formula.ior:.4f}, Abbe number {formula.abbe:.1f}; {formula.source}")
 
 
 def _chosen(arguments: list[str]) -> list[Plugin]:

@@ -435,6 +435,8 @@ def _config_type(hint: Any) -> Any:
         return type(args[0])
     if origin in (Union, types.UnionType) and type(None) in args and len(args) == 2:
         inner = _config_type(next(a for a in args if a is not type(None)))
+        if get_origin(inner) is dict:  # OmegaConf cannot replace None by a mapping if it knows the type
+            return Any
         return None if inner is None else Optional[inner]  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     if origin in (list, tuple, Sequence):
         element = next((a for a in args if a is not Ellipsis), Any)

@@ -181,6 +181,16 @@ def test_old_names_in_files_of_users_and_in_old_runs_are_replaced_with_a_warning
     assert capsys.readouterr().out.count("batches.hidden is called batches.size") == 1
 
 
+def test_bodies_are_settings_of_the_medium(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert renamed_override("bodies={a: {ior: 1.5}}") == "medium.bodies={a: {ior: 1.5}}"
+    assert renamed_override("+bodies.a.ior=1.5") == "+medium.bodies.a.ior=1.5"
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text("# @package _global_\nbodies: {a: {ior: 1.5}}\n")
+    config = _RenamingFiles("main", str(tmp_path)).load_config("experiment/mine").config
+    assert config == {"medium": {"bodies": {"a": {"ior": 1.5}}}}
+    assert not capsys.readouterr().out
+
+
 def test_renamed_settings_exist_and_their_old_names_do_not() -> None:
     discover()
     ConfigStore.instance().store(name="train_schema", node=TrainConfig, provider="nerfro")

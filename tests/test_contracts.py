@@ -9,6 +9,7 @@ discover()
 
 # What has no default that builds, or is needlessly large with its defaults.
 FIELDS: dict[str, dict[str, object]] = {
+    "medium/sdf_grid": {"mesh": "embedded:torus/mesh.ply", "resolution": 32},
     "medium/voxel_grid": {"mesh": "embedded:torus/mesh.ply", "resolution": 32, "smoothing_size": 3},
     "sampler/path/eikonal": {"num_steps": 128},
     "field/nerf": {"width": 16, "depth": 3, "skip": 2, "view_width": 8},

@@ -13,7 +13,9 @@ import torch
 from omegaconf import OmegaConf
 
 import nerfro
+import nerfro.media.material
 from nerfro.__main__ import commands
+from nerfro.media.material import MATERIALS
 from nerfro.paths import PACKAGE_DIR
 from nerfro.registry import discover, find
 from nerfro.testing import check
@@ -113,3 +115,17 @@ def test_code_of_the_library_page_executes(tmp_path: Path, monkeypatch: pytest.M
         assert torch.equal(experiment["again"].renderer.state_dict()[name], weights)
     assert paths["path"].shape[1] == 3
     assert max(len(repr(value)) for value in (build["model"].scene, build["components"].medium)) < 250
+
+
+def test_the_example_of_several_bodies_agrees_with_the_closed_form(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(nerfro.media.material, "MATERIALS", dict(MATERIALS))
+    plugin, example = python_blocks("docs/guides/several_bodies.md")
+    exec(plugin, {})
+    assert nerfro.media.material.find_material("silicone").ior == pytest.approx(1.4316, abs=1e-4)
+    exec(example, {})
+    for line in capsys.readouterr().out.splitlines():
+        traced, exact = map(float, line.split())
+        assert traced == pytest.approx(exact, abs=1e-4)

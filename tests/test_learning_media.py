@@ -45,6 +45,6 @@ def test_an_index_that_is_off_is_mended_in_training(train_here: Callable[..., An
     done = train_here(*options, f"hydra.run.dir={tmp_path / 'run'}")
     assert done.code == 0, done.err
     state = load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")[0]["state_dict"]
-    assert state["renderer.scene.medium.iors"].item() == pytest.approx(
+    assert state["renderer.scene.medium.materials.0.ior"].item() == pytest.approx(
         1.45, rel=0.01
     )  # 1.462 from above and from below: the grid's ball is not the photographs'

@@ -63,6 +63,22 @@ def test_rays_leave_a_ball_as_in_closed_form(
         assert (out["path_lengths"][out["hit"]] > 5.3).all()
 
 
+def test_bodies_by_name_are_those_of_the_short_form(trace: Callable[..., str], tmp_path: Path) -> None:
+    _write_rays(tmp_path / "rays.npz")
+    trimesh.creation.icosphere(3, 0.4).export(tmp_path / "inner.ply")
+    forms = [
+        ["medium.ior=1.5", "medium.inner_meshes=[inner.ply]", "medium.inner_iors=[1.33]"],
+        ["bodies={water: {mesh: inner.ply, ior: 1.33, priority: 1}, glass: {ior: 1.5}}"],
+    ]
+    exits = []
+    for number, options in enumerate(forms):
+        trace(*options, f"out={number}.npz")
+        with np.load(tmp_path / f"{number}.npz") as out:
+            exits.append(out["exit_directions"])
+    np.testing.assert_array_equal(*exits)
+    assert np.abs(exits[0][:, 1]).max() > 0.1
+
+
 def test_far_ends_straight_paths_and_bent_ones_outside_the_box(trace: Callable[..., str], tmp_path: Path) -> None:
     _write_rays(tmp_path / "rays.npz")
     trace("sampler/path=eikonal", "near=2", "far=6", *BOX)
@@ -129,6 +145,10 @@ def test_bad_rays_are_one_clear_line(trace: Callable[..., str], tmp_path: Path, 
         (["far=nan"], "far=nan is not allowed"),
         (["medium.nothing=1"], "medium.nothing is not a setting"),
         (["medium=voxel_grid", "medium.smoothing_size=3"], "medium=sdf_grid"),
+        (["bodies={a: {ior: 1.5, colour: red}}"], "bodies.a.colour is not a setting"),
+        (["bodies={a: {material: waters}}"], "'waters' is not a material"),
+        (["bodies={a: {ior: 1.5, mesh: none.ply}}"], "none.ply does not exist"),
+        (["medium=voxel_grid", "bodies={a: {ior: 1.5}}"], "bodies is not a setting"),
     ],
 )
 def test_bad_options_are_one_clear_line(

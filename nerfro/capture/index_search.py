@@ -27,7 +27,6 @@ from nerfro.media.base import Medium
 from nerfro.media.solid import Solid
 from nerfro.progress import bar
 from nerfro.samplers.snell import Snell
-from nerfro.variants import variant
 
 LOWEST, HIGHEST = 1.0, 2.5  # range of the search
 _RANGE = HIGHEST - LOWEST
@@ -210,7 +209,7 @@ class _Search:
     def __init__(
         self, medium: Solid, through: Pixels, surroundings: Surroundings, progress: Callable[[int], None]
     ) -> None:
-        self._achromatic, self._surroundings = variant(medium, abbe=[]), surroundings
+        self._achromatic, self._surroundings = medium.achromatic(), surroundings
         self._progress, self._num_traced = progress, 0
         medium = self._achromatic.with_indices(torch.full_like(medium.iors, 0.5 * (LOWEST + HIGHEST)))
         self._sampler = Snell(max_events=max(_MAX_EVENTS, 2 * len(medium.iors)))

@@ -57,7 +57,7 @@ def align_to_masks(
     masks = torch.stack([blocks.mean(mask) for mask in views.masks])
     silhouettes = Silhouettes.of(blocks.cameras(views.cameras), masks)
     priors = [] if panorama is None else [panorama]
-    return align_to_outlines(camera, views.cameras, blocks.cameras, silhouettes, medium.meshes[0], priors)
+    return align_to_outlines(camera, views.cameras, blocks.cameras, silhouettes, medium.outline, priors)
 
 
 @torch.no_grad()

@@ -99,8 +99,9 @@ class Request:
 
     @property
     def searches_index(self) -> bool:
-        """Whether to search the index. The materials of a vessel are known."""
-        return not is_given("medium.ior", self.overrides) and "wall" not in self.config.medium
+        """Whether to search the index. The materials of a vessel and of named bodies are known."""
+        medium = self.config.medium
+        return not (is_given("medium.ior", self.overrides) or "wall" in medium or medium.get("bodies") is not None)
 
     @property
     def files(self) -> list[Path]:
@@ -145,7 +146,8 @@ def surface_settings(request: Request, cameras: Cameras, mesh: TriangleMesh, loc
     settings: dict[str, object] = {}
     if location != f"{request.config.data.root}/{MESH}":
         settings["medium.mesh"] = location
-    if not (is_given("medium.box_min", request.overrides) or is_given("medium.box_max", request.overrides)):
+    names = ("medium.box_min", "medium.box_max", "medium.bodies")  # each of several bodies has a box of its own
+    if not any(is_given(name, request.overrides) for name in names):
         centre, half_side = mesh.bounds.mean(0), (0.5 + _MARGIN) * float(np.ptp(mesh.bounds, axis=0).max())
         digits = max(0, 3 - int(np.floor(np.log10(half_side))))
         for name, corner in (("box_min", centre - half_side), ("box_max", centre + half_side)):

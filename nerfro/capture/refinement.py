@@ -38,13 +38,12 @@ from nerfro.capture.visual_hull import Silhouettes
 from nerfro.cli import warn
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
-from nerfro.geometry.interpolation import bspline_basis, quadratic_spline, smooth
+from nerfro.geometry.interpolation import bspline_basis, smooth
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.progress import bar
 from nerfro.samplers.snell import Snell
 from nerfro.types import Exits, Path
-from nerfro.variants import variant
 
 _MAX_VALIDATION_PIXELS = 20_000
 # Residual of linear radiance at which a pixel has half weight.
@@ -261,7 +260,7 @@ class _Descent:
         # Rays with internal reflections are left out: small errors of the surface turn them far.
         self.sampler = Snell(max_events=2 * len(medium.iors))
         self.size = float(np.ptp(mesh.bounds, axis=0).max())
-        self.offsets = Displacement(tuple(medium.distances.shape[1:]), self.size, settings.levels)
+        self.offsets = Displacement(tuple(medium.grids[0].distances.shape), self.size, settings.levels)
         self.learned = [*self.offsets.levels, self.iors]
         self.training, validation = through.split()
         self.validation = validation.some(_MAX_VALIDATION_PIXELS)
@@ -280,7 +279,7 @@ class _Descent:
         return self._medium()
 
     def _medium(self) -> SdfGrid:
-        return variant(self.start.grown(self.offsets()), iors=1.0 * self.iors)
+        return self.start.grown(self.offsets()).with_indices(self.iors)
 
     def values(self) -> list[Tensor]:
         """Return a copy of the learned values."""
@@ -315,7 +314,7 @@ class _Descent:
         residual = self.blurred(path.exits()).clamp(max=1) - pixels.radiance[usable]
         photometric = robust(residual, _HALF_WEIGHT).sum() / max(1, len(rays))
         rims = self.rims[torch.randint(len(self.rims), (_NUM_CONTOUR_POINTS,), generator=self.generator)]
-        current, given = (quadratic_spline(each.coefficients[0], each.box, rims)[0] for each in (medium, self.given))
+        current, given = (each.grids[0](rims)[0] for each in (medium, self.given))
         square = ((current - given) / self.contour_deviation).square()
         contours = (square / (1 + square)).mean()
         return photometric + _CONTOUR_WEIGHT * contours + _ROUGHNESS_WEIGHT * self.offsets.roughness()
@@ -328,10 +327,10 @@ class _Descent:
             medium: the medium.
             error: validation error of the medium.
         """
-        distances, best = medium.distances[0], medium
+        grid, best = medium.grids[0], medium
         for fraction in self.settings.smoothings:
-            sigma = fraction * self.size / float(medium.spacing.min())
-            candidate = medium.grown(distances - smooth(distances, 2 * math.ceil(3 * sigma) + 1, sigma))
+            sigma = fraction * self.size / float(grid.spacing.min())
+            candidate = medium.grown(grid.distances - smooth(grid.distances, 2 * math.ceil(3 * sigma) + 1, sigma))
             if (new := self.validation_error(candidate)) < error:
                 best, error = candidate, new
         return best, error
@@ -381,9 +380,10 @@ def _blurred(picture: EnvironmentMap | RoomPicture, degrees: float) -> Boundary:
 def _project_onto(mesh: TriangleMesh, medium: SdfGrid) -> TriangleMesh:
     """Move the vertices of a mesh onto the zero level of the outer body, by Newton's method."""
     vertices = torch.from_numpy(mesh.vertices).float()
-    spacing = float(medium.spacing.min())
+    grid = medium.grids[0]
+    spacing = float(grid.spacing.min())
     for _ in range(5):
-        phi, gradient = quadratic_spline(medium.coefficients[0], medium.box, vertices)
+        phi, gradient = grid(vertices)
         square = gradient.square().sum(-1, keepdim=True).clamp(min=0.25)
         vertices = vertices - (phi[:, None] * gradient / square).clamp(-spacing, spacing)
     return TriangleMesh(vertices.double().numpy(), mesh.faces)

@@ -73,11 +73,18 @@ def find_vessel(medium: SdfGrid, location: str, mesh: TriangleMesh, observations
     found_up = find_up(observations.views.cameras, mesh)
     up = [0.0, 0.0, 1.0] if found_up is None else [round(float(x), 4) for x in found_up[0]]
     across = mesh.vertices - np.outer(mesh.vertices @ np.array(up), up)
-    box = (medium.box.double().numpy() + medium.origin).tolist()
+    grid = medium.grids[0]
+    box = (grid.box.double().numpy() + medium.origin).tolist()
 
     def build(**options: Any) -> SdfVessel:
         return SdfVessel(
-            location, up=up, ior=_GLASS, box_min=box[0], box_max=box[1], resolution=len(medium.distances[0]), **options
+            location,
+            up=up,
+            ior=_GLASS,
+            box_min=box[0],
+            box_max=box[1],
+            resolution=len(grid.distances),
+            **options,
         )
 
     try:

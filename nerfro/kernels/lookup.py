@@ -9,7 +9,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from nerfro.kernels.compilation import compiled
 from nerfro.kernels.tolerances import BEYOND_BOX, SAFE_SHARE
@@ -18,27 +18,83 @@ from nerfro.kernels.tolerances import BEYOND_BOX, SAFE_SHARE
 _UINT = np.uintp
 
 
-class MediumGrid(NamedTuple):
-    """A medium on a grid, as kernels take it. Numba compiles a kernel separately for fields that are None."""
+class Voxels(NamedTuple):
+    """A medium whose index varies on a grid, as kernels take it (`media.voxel_grid`)."""
 
-    # Index and its gradient at the grid's vertices [X, Y, Z, 4] (`media.voxel_grid`); or coefficients of the bodies'
-    # splines [K, X, Y, Z] (`media.sdf_grid`).
-    values: Float[np.ndarray, "..."]
-    clearance: Float[np.ndarray, "x y z"]  # distance within which the index is constant, of blocks of cells
-    iors: Float[np.ndarray, "K"] | None  # index of each body; None if the values are the index
-    nested: bool  # whether each body is bounded by all previous bodies (`media.solid`)
-    shell: float  # half width of the bodies' smooth interface, world units
-    # Corners of the grid, world units.
+    table: Float[np.ndarray, "X Y Z 4"]  # index and its gradient at the vertices
+    clearance: Float[np.ndarray, "x y z"]  # distance within which the index is constant, of each cell
+    # Corners of the grid, world units, and cells per world unit.
     low: Float[np.ndarray, "3"]
     high: Float[np.ndarray, "3"]
-    # Cells and blocks per world unit.
     inverse_spacing: Float[np.ndarray, "3"]
-    inverse_block: Float[np.ndarray, "3"]
-    # Smaller blocks for the search of surfaces; None without bodies. Lowest and highest derivatives of the bodies'
-    # splines, number of empty blocks around each block, and blocks per world unit.
-    slopes: Float[np.ndarray, "K x y z 3 2"] | None
-    empty: UInt8[np.ndarray, "x y z"] | None
-    inverse_small: Float[np.ndarray, "3"] | None
+
+
+class Solids(NamedTuple):
+    """Bodies of constant index with distance grids, as kernels take them (`media.solid`, `media.distance_grid`).
+
+    The grids of all bodies follow each other in flat arrays.
+    """
+
+    # Corners of each body's grid, world units, and cells per world unit.
+    low: Float[np.ndarray, "K 3"]
+    high: Float[np.ndarray, "K 3"]
+    inverse_spacing: Float[np.ndarray, "K 3"]
+    min_step: Float[np.ndarray, "K"]  # shortest step of the search for the body's surface, world units
+    # Coefficients of the splines, the first coefficient of each body, and its numbers of vertices.
+    coefficients: Float[np.ndarray, "N"]
+    start: Int[np.ndarray, "K"]
+    shape: Int[np.ndarray, "K 3"]
+    # Distances of blocks of cells to the surface, the first block of each body, its numbers of blocks, and blocks per
+    # world unit.
+    clearance: Float[np.ndarray, "M"]
+    clearance_start: Int[np.ndarray, "K"]
+    clearance_shape: Int[np.ndarray, "K 3"]
+    inverse_clearance: Float[np.ndarray, "K 3"]
+    # Smaller blocks: lowest and highest derivatives of the spline, number of empty blocks around, and as above.
+    slopes: Float[np.ndarray, "B 3 2"]
+    empty: UInt8[np.ndarray, "B"]
+    block_start: Int[np.ndarray, "K"]
+    block_shape: Int[np.ndarray, "K 3"]
+    inverse_block: Float[np.ndarray, "K 3"]
+    iors: Float[np.ndarray, "K"]
+    nested: bool  # whether each body is bounded by all previous bodies
+    shell: float  # half width of the smooth interfaces, world units
+    # Corners of the box of all bodies, world units.
+    box_low: Float[np.ndarray, "3"]
+    box_high: Float[np.ndarray, "3"]
+
+
+# Arguments of kernels that take a medium of either type.
+NO_VOXELS = Voxels(np.empty((0, 0, 0, 4), np.float32), np.empty((0, 0, 0), np.float32), *np.empty((3, 3)))
+_corners, _lengths, _counts, _numbers = np.empty((0, 3)), np.empty(0), np.empty((0, 3), np.int64), np.empty(0, np.int64)
+_values, _bounds, _bytes = np.empty(0, np.float32), np.empty((0, 3, 2), np.float32), np.empty(0, np.uint8)
+NO_SOLIDS = Solids(
+    _corners, _corners, _corners, _lengths, _values, _numbers, _counts, _values, _numbers, _counts, _corners, _bounds,
+    _bytes, _numbers, _counts, _corners, _lengths, False, 0.0, *np.empty((2, 3)),
+)  # fmt: skip
+
+
+class Grid(NamedTuple):
+    """Place of a body's spline: first coefficient, numbers of vertices, lower corner, and cells per world unit."""
+
+    start: int
+    nx: int
+    ny: int
+    nz: int
+    low_x: float
+    low_y: float
+    low_z: float
+    per_x: float
+    per_y: float
+    per_z: float
+
+
+@compiled
+def grid_of(solids, body):
+    """Return the place of a body's spline in the arrays of all bodies."""
+    nx, ny, nz = solids.shape[body, 0], solids.shape[body, 1], solids.shape[body, 2]
+    low, per = solids.low[body], solids.inverse_spacing[body]
+    return Grid(solids.start[body], nx, ny, nz, low[0], low[1], low[2], per[0], per[1], per[2])
 
 
 @compiled
@@ -59,39 +115,43 @@ def _slopes(t):
 
 
 @compiled
-def spline_value(coefficients, low, inverse_spacing, x, y, z):
+def spline_value(coefficients, grid, x, y, z):
     """Evaluate a quadratic B-spline on a grid."""
-    i, tx = _stencil((x - low[0]) * inverse_spacing[0], coefficients.shape[0])
-    j, ty = _stencil((y - low[1]) * inverse_spacing[1], coefficients.shape[1])
-    k, tz = _stencil((z - low[2]) * inverse_spacing[2], coefficients.shape[2])
+    i, tx = _stencil((x - grid.low_x) * grid.per_x, grid.nx)
+    j, ty = _stencil((y - grid.low_y) * grid.per_y, grid.ny)
+    k, tz = _stencil((z - grid.low_z) * grid.per_z, grid.nz)
     wx, wy, wz = _weights(tx), _weights(ty), _weights(tz)
+    row, plane_size = _UINT(grid.nz), _UINT(grid.ny * grid.nz)
+    first = _UINT(grid.start) + i * plane_size + j * row + k
     value = 0.0
     for a in range(3):
         plane = 0.0
         for b in range(3):
             line = 0.0
             for c in range(3):
-                line += wz[c] * coefficients[i + _UINT(a), j + _UINT(b), k + _UINT(c)]
+                line += wz[c] * coefficients[first + _UINT(a) * plane_size + _UINT(b) * row + _UINT(c)]
             plane += wy[b] * line
         value += wx[a] * plane
     return value
 
 
 @compiled
-def spline_value_gradient(coefficients, low, inverse_spacing, x, y, z):
+def spline_value_gradient(coefficients, grid, x, y, z):
     """Evaluate a quadratic B-spline on a grid and its exact gradient."""
-    i, tx = _stencil((x - low[0]) * inverse_spacing[0], coefficients.shape[0])
-    j, ty = _stencil((y - low[1]) * inverse_spacing[1], coefficients.shape[1])
-    k, tz = _stencil((z - low[2]) * inverse_spacing[2], coefficients.shape[2])
+    i, tx = _stencil((x - grid.low_x) * grid.per_x, grid.nx)
+    j, ty = _stencil((y - grid.low_y) * grid.per_y, grid.ny)
+    k, tz = _stencil((z - grid.low_z) * grid.per_z, grid.nz)
     wx, wy, wz = _weights(tx), _weights(ty), _weights(tz)
     ux, uy, uz = _slopes(tx), _slopes(ty), _slopes(tz)
+    row, plane_size = _UINT(grid.nz), _UINT(grid.ny * grid.nz)
+    first = _UINT(grid.start) + i * plane_size + j * row + k
     value, gx, gy, gz = 0.0, 0.0, 0.0, 0.0
     for a in range(3):
         plane, plane_y, plane_z = 0.0, 0.0, 0.0
         for b in range(3):
             line, line_z = 0.0, 0.0
             for c in range(3):
-                value_there = coefficients[i + _UINT(a), j + _UINT(b), k + _UINT(c)]
+                value_there = coefficients[first + _UINT(a) * plane_size + _UINT(b) * row + _UINT(c)]
                 line += wz[c] * value_there
                 line_z += uz[c] * value_there
             plane += wy[b] * line
@@ -101,26 +161,73 @@ def spline_value_gradient(coefficients, low, inverse_spacing, x, y, z):
         gx += ux[a] * plane
         gy += wx[a] * plane_y
         gz += wx[a] * plane_z
-    return value, gx * inverse_spacing[0], gy * inverse_spacing[1], gz * inverse_spacing[2]
+    return value, gx * grid.per_x, gy * grid.per_y, gz * grid.per_z
 
 
 @compiled
-def solid_clearance(coefficients, shell, low, inverse_spacing, x, y, z):
-    """Return a lower bound of the distance to the nearest shell of nested bodies (`media.solid`)."""
-    clearance = math.inf
-    for body in range(coefficients.shape[0]):
-        phi = spline_value(coefficients[body], low, inverse_spacing, x, y, z)
-        clearance = min(clearance, SAFE_SHARE * abs(phi) - shell)
-    return max(clearance, 0.0)
+def nearest_in_box(low, high, x, y, z):
+    """Return the nearest point of a box, and the squared distance to it."""
+    nx = min(max(x, low[0]), high[0])
+    ny = min(max(y, low[1]), high[1])
+    nz = min(max(z, low[2]), high[2])
+    return nx, ny, nz, (x - nx) ** 2 + (y - ny) ** 2 + (z - nz) ** 2
 
 
 @compiled
-def solid_index(coefficients, iors, nested, shell, low, inverse_spacing, x, y, z):
+def _distance_from(phi, beyond):
+    """Bound the distance to a body at a point, given that at the nearest point of its box (`media.distance_grid`).
+
+    Args:
+        phi: signed distance to the body at the nearest point of the box.
+        beyond: squared distance to the box.
+    """
+    return math.sqrt(beyond + phi * phi) if beyond > 0.0 and phi > 0.0 else phi
+
+
+@compiled
+def body_distance(solids, body, x, y, z):
+    """Return the signed distance to a body, or outside of its box a lower bound."""
+    x, y, z, beyond = nearest_in_box(solids.low[body], solids.high[body], x, y, z)
+    return _distance_from(spline_value(solids.coefficients, grid_of(solids, body), x, y, z), beyond)
+
+
+@compiled
+def solid_clearance(solids, x, y, z, enough):
+    """Return a lower bound of the distance to the nearest shell (`media.solid`); tight if less than `enough`.
+
+    The lookup of a block is cheap. The signed distances are only evaluated near surfaces.
+    """
+    nearest = math.inf
+    for body in range(len(solids.iors)):
+        nx, ny, nz, beyond = nearest_in_box(solids.low[body], solids.high[body], x, y, z)
+        low, per, counts = solids.low[body], solids.inverse_clearance[body], solids.clearance_shape[body]
+        bx, by, bz = blocks_from(low, per, nx, ny, nz)
+        i, j, k = block_at(counts, bx, by, bz)
+        free = float(solids.clearance[block_number(solids.clearance_start[body], counts, i, j, k)])
+        nearest = min(nearest, math.sqrt(beyond + free * free) if beyond > 0.0 else free)
+    if nearest - solids.shell > enough:
+        return nearest - solids.shell
+    nearest = math.inf
+    for body in range(len(solids.iors)):
+        nearest = min(nearest, SAFE_SHARE * abs(body_distance(solids, body, x, y, z)))
+    return max(nearest - solids.shell, 0.0)
+
+
+@compiled
+def solid_index(solids, x, y, z):
     """Return index, gradient of the index and clearance of bodies with smooth shells (`media.solid`)."""
+    shell, nested = solids.shell, solids.nested
     n, gx, gy, gz, clearance = 1.0, 0.0, 0.0, 0.0, math.inf
     within, rx, ry, rz = 1.0, 0.0, 0.0, 0.0
-    for body in range(coefficients.shape[0]):
-        phi, px, py, pz = spline_value_gradient(coefficients[body], low, inverse_spacing, x, y, z)
+    for body in range(len(solids.iors)):
+        ior = solids.iors[body]
+        nx, ny, nz, beyond = nearest_in_box(solids.low[body], solids.high[body], x, y, z)
+        phi, px, py, pz = spline_value_gradient(solids.coefficients, grid_of(solids, body), nx, ny, nz)
+        if beyond > 0.0 and phi > 0.0:  # the shell is inside of the box
+            clearance = min(clearance, SAFE_SHARE * _distance_from(phi, beyond) - shell)
+            if nested:
+                break
+            continue
         clearance = min(clearance, SAFE_SHARE * abs(phi) - shell)
         t = 0.5 - 0.5 * phi / shell
         if t <= 0.0:
@@ -128,7 +235,7 @@ def solid_index(coefficients, iors, nested, shell, low, inverse_spacing, x, y, z
                 break
             continue
         if t >= 1.0 and within == 1.0:
-            n, gx, gy, gz = iors[body], 0.0, 0.0, 0.0
+            n, gx, gy, gz = ior, 0.0, 0.0, 0.0
             continue
         t = min(t, 1.0)
         step = t * t * (3.0 - 2.0 * t)
@@ -138,7 +245,7 @@ def solid_index(coefficients, iors, nested, shell, low, inverse_spacing, x, y, z
             px, py, pz = rx * step + within * px, ry * step + within * py, rz * step + within * pz
             step *= within
             within, rx, ry, rz = step, px, py, pz
-        change = iors[body] - n
+        change = ior - n
         gx = gx * (1.0 - step) + change * px
         gy = gy * (1.0 - step) + change * py
         gz = gz * (1.0 - step) + change * pz
@@ -182,16 +289,15 @@ def block_at(counts, bx, by, bz):
 
 
 @compiled
-def blocks_from(low, inverse_size, x, y, z):
-    """Return a point's coordinates in blocks from the grid's corner."""
-    return (x - low[0]) * inverse_size[0], (y - low[1]) * inverse_size[1], (z - low[2]) * inverse_size[2]
+def block_number(start, counts, i, j, k):
+    """Return the number of a block in a flat array of the blocks of all bodies."""
+    return _UINT(start) + (i * _UINT(counts[1]) + j) * _UINT(counts[2]) + k
 
 
 @compiled
-def block_clearance(clearance, low, inverse_size, x, y, z):
-    """Return the distance around a point's block within which the index is constant."""
-    bx, by, bz = blocks_from(low, inverse_size, x, y, z)
-    return clearance[block_at(clearance.shape, bx, by, bz)]
+def blocks_from(low, inverse_size, x, y, z):
+    """Return a point's coordinates in blocks from the grid's corner."""
+    return (x - low[0]) * inverse_size[0], (y - low[1]) * inverse_size[1], (z - low[2]) * inverse_size[2]
 
 
 @compiled
@@ -224,19 +330,14 @@ def end_of_blocks(i, j, k, reach, bx, by, bz, qx, qy, qz):
 
 
 @compiled
-def slopes_along(slopes, i, j, k, dx, dy, dz, lowest, highest):
-    """Bound each body's slope along a line in a block; return whether every spline is monotone."""
-    monotone, direction = True, (dx, dy, dz)
-    for body in range(slopes.shape[0]):
-        least, most = 0.0, 0.0
-        for axis in range(3):
-            bounds = slopes[_UINT(body), i, j, k, _UINT(axis)]
-            one, other = direction[axis] * bounds[0], direction[axis] * bounds[1]
-            least += min(one, other)
-            most += max(one, other)
-        lowest[body], highest[body] = least, most
-        monotone = monotone and (least > 0.0 or most < 0.0)
-    return monotone
+def slope_along(bounds, dx, dy, dz):
+    """Bound the slope of a body's distance along a line, given bounds of its derivatives along the axes [3, 2]."""
+    least, most, direction = 0.0, 0.0, (dx, dy, dz)
+    for axis in range(3):
+        one, other = direction[axis] * bounds[axis, 0], direction[axis] * bounds[axis, 1]
+        least += min(one, other)
+        most += max(one, other)
+    return least, most
 
 
 @compiled

@@ -10,27 +10,25 @@ from typing import TypeVar
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
-from torch.nn.functional import softplus
 
 from nerfro.allowed import NotNegative, Positive, checked
 from nerfro.errors import NerfroError
 from nerfro.kernels.tolerances import MIN_COSINE, SAFE_SHARE, STEPS_PER_SHELL
 from nerfro.media.base import Medium, Scalars, Vectors
+from nerfro.media.material import Material, materials_of
 from nerfro.types import Path
 from nerfro.variants import variant
 
-# Initial value of a learned absorption, per world unit. With a larger value, the absorption would explain the content.
-_ALMOST_CLEAR = 0.02
-# Wavelengths of the lines d, F and C, nm.
-_FRAUNHOFER = (587.56, 486.13, 656.27)
-
+_COLOURS = ("red", "green", "blue")
+# Paths record bodies as 8-bit integers.
+_MAX_BODIES = 127
 
 Self = TypeVar("Self", bound="Solid")  # typing has it from Python 3.11 on
 
 
 @checked("medium")
 class Solid(Medium):
-    """Bodies of constant index, bounded by the zero levels of signed distances; later bodies lie inside earlier ones.
+    """Bodies of constant index, bounded by the zero levels of signed distances; the last body at a point decides.
 
     For the Eikonal equation the surface is a shell of half width w around the zero level. In the shell the index rises
     as a cubic step of the signed distance phi: S = t^2 (3 - 2 t), t = (1 - phi / w) / 2. The bodies are applied in
@@ -50,12 +48,12 @@ class Solid(Medium):
         nested: whether a body exists only where all bodies before it exist. A nested body may then reach beyond the
             others and touch them without a gap, and a body of index 1 is air, as outside. Otherwise a point belongs to
             the last body that contains it.
-        iors: refractive index of each body [K]; a parameter if it is learned.
+        materials: material of each body.
+        names: name of each body in the log.
     """
 
     nested = False
-    iors: Float[Tensor, "K"]
-    _absorption: Float[Tensor, "K 3"] | None  # a parameter is passed through softplus
+    materials: Sequence[Material]
 
     def __init__(
         self,
@@ -67,26 +65,15 @@ class Solid(Medium):
         learn_ior: bool = False,
     ) -> None:
         super().__init__()
-        if len(abbe) not in (0, 1, len(iors)):
-            raise NerfroError(f"medium.abbe={list(abbe)} has {len(abbe)} numbers; give one for each body, or for all")
-        self.abbe = list(abbe)
-        if len(absorption) not in (0, 1, 3 * len(iors)):
-            raise NerfroError(
-                f"medium.absorption={list(absorption)} has {len(absorption)} numbers; give red, green and blue of each "
-                f"body ({3 * len(iors)} numbers), or one for all"
-            )
-        given = torch.tensor(list(absorption) or [0.0], dtype=torch.float32).expand(3 * len(iors)).view(-1, 3)
-        if learn_absorption:
-            self._absorption = nn.Parameter(given.clamp(min=_ALMOST_CLEAR).expm1().log())
-        else:
-            self.register_buffer("_absorption", given if given.any() else None, persistent=False)
-        # Double precision, as the kernels need; scalar tensors do not promote float32 operands.
-        indices = torch.tensor(iors, dtype=torch.float64)
-        if learn_ior:
-            self.iors = nn.Parameter(indices)
-        else:
-            self.register_buffer("iors", indices, persistent=False)
+        self._set_materials(materials_of(iors, absorption, learn_absorption, abbe, learn_ior))
         self.shell = float(shell)
+
+    def _set_materials(self, materials: Sequence[Material], names: Sequence[str] = ()) -> None:
+        if len(materials) > _MAX_BODIES:
+            raise NerfroError(f"the medium has {len(materials)} bodies; at most {_MAX_BODIES} are allowed")
+        self.materials = nn.ModuleList(materials)  # type: ignore[assignment]
+        self.names = list(names) or [str(body + 1) for body in range(len(materials))]
+        self.register_load_state_dict_pre_hook(_read_old_parameters)
 
     def extra_repr(self) -> str:
         size = (self.box[1] - self.box[0]).tolist()
@@ -95,29 +82,43 @@ class Solid(Medium):
         )
 
     @property
+    def iors(self) -> Float[Tensor, "K"]:
+        """Refractive index of each body, with gradients, in double precision."""
+        return torch.stack([material.ior for material in self.materials])
+
+    @property
     def indices(self) -> Float[Tensor, "K"]:
         return self.iors.detach()
 
-    def with_indices(self, indices: Float[Tensor, "K"]) -> Solid:
-        return variant(self, iors=indices.to(self.iors))
+    def with_indices(self: Self, indices: Float[Tensor, "K"]) -> Self:
+        return self._with_materials([{"ior": ior} for ior in indices.to(self.iors).unbind()])
 
     @property
     def absorption(self) -> Float[Tensor, "K 3"] | None:
         """Absorption coefficients of each body and colour channel, per world unit; None if all bodies are clear."""
-        return softplus(self._absorption) if isinstance(self._absorption, nn.Parameter) else self._absorption
+        if not any(material.absorbs for material in self.materials):
+            return None
+        return torch.stack([material.absorption for material in self.materials])
+
+    def with_absorption_coefficients(self: Self, absorption: Float[Tensor, "K 3"]) -> Self:
+        """Return the same bodies with other coefficients, per world unit."""
+        return self._with_materials([{"_absorption": values} for values in absorption])
 
     @property
     def disperses(self) -> bool:
-        return bool(self.abbe)
+        return any(material.dispersion is not None for material in self.materials)
+
+    def achromatic(self: Self) -> Self:
+        """Return the same bodies with the index of the d line at all wavelengths."""
+        return self._with_materials([{"dispersion": None}] * len(self.materials))
 
     def at_wavelength(self: Self, wavelength: float) -> Self:
-        """Return the same bodies with their indices at a wavelength in nm; gradients reach the original indices.
+        """Return the same bodies with their indices at a wavelength in nm; gradients reach the original indices."""
+        return self._with_materials([{"ior": material.ior_at(wavelength)} for material in self.materials])
 
-        Cauchy's two terms: n(w) = n_d + B (1 / w^2 - 1 / w_d^2), with B from Abbe's V = (n_d - 1) / (n_F - n_C).
-        """
-        line_d, line_f, line_c = (line**-2 for line in _FRAUNHOFER)
-        per_unit = (wavelength**-2 - line_d) / (line_f - line_c) / self.iors.new_tensor(self.abbe)
-        return variant(self, iors=self.iors + (self.iors - 1) * per_unit)
+    def _with_materials(self: Self, changes: Sequence[dict[str, object]]) -> Self:
+        changed = [variant(material, **change) for material, change in zip(self.materials, changes, strict=True)]
+        return variant(self, materials=nn.ModuleList(changed))
 
     def with_absorption(self, path: Path) -> Path:
         of_bodies = self.absorption
@@ -126,16 +127,18 @@ class Solid(Medium):
         return replace(path, absorption=torch.cat([torch.zeros_like(of_bodies[:1]), of_bodies]).to(path.s))
 
     def bending_parameters(self) -> list[nn.Parameter]:
-        return [parameter for parameter in self.parameters() if parameter is not self._absorption]
+        of_absorption = {id(material._absorption) for material in self.materials}
+        return [parameter for parameter in self.parameters() if id(parameter) not in of_absorption]
 
     def learned(self) -> dict[str, float]:
-        if not isinstance(self._absorption, nn.Parameter):
-            return {}
-        values = self.absorption.detach()  # type: ignore[union-attr]
-        names = [
-            f"absorption_{body + 1}_{colour}" for body in range(len(values)) for colour in ("red", "green", "blue")
-        ]
-        return dict(zip(names, values.flatten().tolist(), strict=True))
+        found: dict[str, float] = {}
+        for name, material in zip(self.names, self.materials, strict=True):
+            if isinstance(material.ior, nn.Parameter):
+                found[f"ior_{name}"] = float(material.ior.detach())
+            if isinstance(material._absorption, nn.Parameter):
+                values = material.absorption.detach().tolist()
+                found |= {f"absorption_{name}_{colour}": value for colour, value in zip(_COLOURS, values, strict=True)}
+        return found
 
     @abstractmethod
     def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
@@ -194,3 +197,11 @@ class Solid(Medium):
         cosine = ((directions * gradients).sum(-1) / torch.where(varies, slope, 1.0)).abs()
         cosine = torch.where(varies, cosine, 1.0)
         return 2 * self.shell / STEPS_PER_SHELL / cosine.clamp(min=MIN_COSINE)
+
+
+def _read_old_parameters(module: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:
+    """Read the parameters of earlier releases, which held the values of all bodies."""
+    for old, new in (("iors", "ior"), ("_absorption", "_absorption")):
+        values = state.pop(f"{prefix}{old}", None)
+        if values is not None:
+            state |= {f"{prefix}materials.{body}.{new}": value for body, value in enumerate(values)}

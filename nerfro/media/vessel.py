@@ -15,7 +15,8 @@ from nerfro.geometry.bodies import require_separate
 from nerfro.geometry.lids import find_lid
 from nerfro.geometry.mesh import load_mesh, local_origin
 from nerfro.kernels.available import require_bytes
-from nerfro.media.sdf_grid import AIR, BAND, SdfGrid, cached_distance
+from nerfro.media.distance_grid import BAND, DistanceGrid, cached_distance
+from nerfro.media.sdf_grid import AIR, SdfGrid
 from nerfro.media.solid import Solid
 from nerfro.media.voxel_grid import BYTES_PER_VERTEX, check_margin, grid_box
 from nerfro.paths import resolve_path
@@ -121,8 +122,8 @@ class SdfVessel(SdfGrid):
         heights = _heights(box, resolution, upwards) - low
         for name, values in (("_outer", outer), ("_side", side), ("_heights", heights.float())):
             self.register_buffer(name, values, persistent=False)
-        self._set(self._distances(), torch.from_numpy(box).float())
-        if not (self.distances[:2].amax(0) < 0).any():
+        self._set_distances(torch.from_numpy(box).float())
+        if not ((outer < 0) & (self.grids[1].distances < 0)).any():
             deepest = -float(side[outer < 0].min()) / self.unit
             raise NerfroError(
                 f"medium.wall={wall:g} and medium.foot={self.lengths['foot']:g} leave no cavity: no point of the body "
@@ -142,22 +143,25 @@ class SdfVessel(SdfGrid):
     def grown(self, outwards: Float[Tensor, "X Y Z"]) -> SdfVessel:
         """Return the vessel with a displaced outer surface. The cavity follows, as the wall keeps its thickness."""
         changed = variant(self, _outer=self._outer - outwards, _side=self._side - outwards)
-        return changed._with_distances(changed._distances())
+        changed._set_distances(self.box)
+        return changed
 
     def with_lengths(self, lengths: Mapping[str, float]) -> SdfVessel:
         """Return the vessel with other lengths; twice the wall plus the fillet is at most that of the original."""
         changed = variant(self, lengths=self.lengths | dict(lengths))
-        return changed._with_distances(changed._distances())
+        changed._set_distances(self.box)
+        return changed
 
-    def _distances(self) -> Float[Tensor, "K X Y Z"]:
-        """Compute the signed distances of the outer body, the cavity and the space below the level, world units."""
+    def _set_distances(self, box: Float[Tensor, "2 3"]) -> None:
+        """Compute the signed distances of the outer body, the cavity and the space below the level."""
         wall, foot, fillet, *level = (length * self.unit for length in self.lengths.values())
         side, base = self._side + wall, foot - self._heights
         # In the corner, the distance is that to a circle that touches wall and foot.
         in_corner = (side > -fillet) & (base > -fillet) & (fillet > 0)
         circle = torch.hypot(side + fillet, base + fillet) - fillet
         cavity = torch.where(in_corner, circle, torch.maximum(side, base))
-        return torch.stack([self._outer, cavity, *(self._heights - height for height in level)])
+        distances = [self._outer, cavity, *(self._heights - height for height in level)]
+        self._set_grids(DistanceGrid(values, box) for values in distances)
 
     def _require_lengths_within(self) -> None:
         heights = {name: value for name, value in self.lengths.items() if name in ("foot", "level")}

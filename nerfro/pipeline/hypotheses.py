@@ -73,6 +73,8 @@ def hypotheses(found: Mapping[str, Any], medium: Mapping[str, Any]) -> list[Hypo
     known_materials = f"+experiment={'glass_room' if near else 'glass'}"
     if "wall" in medium:  # the materials of a vessel are known
         return [straight, Hypothesis("vessel", [known_materials, *options])]
+    if medium.get("bodies") is not None:
+        return [straight, Hypothesis("bodies", [known_materials, *options])]
     body = [f"+experiment={'glass_room' if near else 'unknown'}", *options]
     if not found["doubtful"]:
         bodies = [Hypothesis("solid body", body)]

@@ -70,7 +70,7 @@ def preprocess(config: DictConfig, options: list[str], root: Path, folder: Path)
     """Reconstruct surface and index in a folder."""
     inputs = [*root.glob("transforms*.json"), *(file for place in _MASKS for file in root.glob(place))]
     automatic = [*as_overrides({"out": folder}), "refine=true", "wrong_masks=null", "symmetry=auto", "overwrite=true"]
-    if "wall" not in config.medium and "shell_voxels" in config.medium:
+    if "wall" not in config.medium and "shell_voxels" in config.medium and config.medium.get("bodies") is None:
         automatic.append("vessel=true")
     options = [*options, *automatic, *shlex.split(config.preprocess)]
     Stage("preprocess", options, folder / FOUND, folder / SHEET, inputs).run()

@@ -17,7 +17,7 @@ from nerfro.samplers.polylines import SnellTrace
 from nerfro.types import Path, Rays
 
 if TYPE_CHECKING:
-    from nerfro.kernels.lookup import MediumGrid
+    from nerfro.kernels.lookup import Voxels
     from nerfro.media.sdf_grid import SdfGrid
     from nerfro.media.voxel_grid import VoxelGrid
     from nerfro.samplers.snell_cpu import Polylines
@@ -27,15 +27,12 @@ if TYPE_CHECKING:
 _CAPACITY, _ROOM = 18, 8
 
 
-def snell_on_grid(rays: Rays, medium: SdfGrid, min_step: float, max_events: int, branching: Branching) -> SnellTrace:
+def snell_on_grid(rays: Rays, medium: SdfGrid, max_events: int, branching: Branching) -> SnellTrace:
     """Evaluate `samplers.snell.trace_interfaces` by the compiled kernel."""
     from nerfro.samplers.snell_cpu import Settings, trace_snell
 
-    solids = _for_kernels(medium)
-    settings = Settings(
-        min_step * float((solids.high - solids.low).min()), max_events, branching.num_events, branching.least_weight,
-        branching.main_only,
-    )  # fmt: skip
+    solids = medium.packed()
+    settings = Settings(max_events, branching.num_events, branching.least_weight, branching.main_only)
     room = _ROOM if branching.num_events and not branching.main_only else 1
     rows, counts = trace_snell(*_ray_arrays(rays), solids, settings, _CAPACITY, room)
     kept, needed = (counts <= (room, _CAPACITY)).all(1), counts.max(0, initial=1)
@@ -78,14 +75,17 @@ def eikonal_on_grid(
     rays: Rays, medium: VoxelGrid | SdfGrid, step: float, tolerance: float, max_steps: int
 ) -> tuple[Path, Bool[Tensor, "R"]]:
     """Evaluate `samplers.eikonal.march_adaptive` by the compiled kernel."""
+    from nerfro.kernels.lookup import NO_SOLIDS, NO_VOXELS
+    from nerfro.media.sdf_grid import SdfGrid
     from nerfro.samplers.eikonal_cpu import march_adaptive
 
-    settings = _for_kernels(medium), step, tolerance, max_steps
-    *columns, counts, refracted, exceeded = march_adaptive(*_ray_arrays(rays), *settings, _CAPACITY)
+    packed = (NO_VOXELS, medium.packed()) if isinstance(medium, SdfGrid) else (_voxels(medium), NO_SOLIDS)
+    settings = step, tolerance, max_steps
+    *columns, counts, refracted, exceeded = march_adaptive(*_ray_arrays(rays), *packed, settings, _CAPACITY)
     width = max(int(counts.max(initial=2)), 2)
     if width > _CAPACITY:  # trace the rays with more vertices again
         rows = np.nonzero(counts > _CAPACITY)[0]
-        again = march_adaptive(*_ray_arrays(rays[torch.from_numpy(rows)]), *settings, width)[:3]
+        again = march_adaptive(*_ray_arrays(rays[torch.from_numpy(rows)]), *packed, settings, width)[:3]
         for i, (short, long) in enumerate(zip(columns, again, strict=True)):
             columns[i] = np.concatenate([short, np.repeat(short[:, -1:], width - _CAPACITY, axis=1)], axis=1)
             columns[i][rows] = long
@@ -96,7 +96,7 @@ def uniform_on_grid(rays: Rays, medium: VoxelGrid, num_steps: int) -> Path:
     """Evaluate `samplers.eikonal.march_uniform` with Euler steps by the compiled kernel."""
     from nerfro.samplers.eikonal_cpu import march_uniform
 
-    *vertices, refracted = march_uniform(*_ray_arrays(rays), _for_kernels(medium), num_steps)
+    *vertices, refracted = march_uniform(*_ray_arrays(rays), _voxels(medium), num_steps)
     return _path(rays, vertices, refracted)
 
 
@@ -105,32 +105,12 @@ def _ray_arrays(rays: Rays) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
     return origins, directions, near, far
 
 
-def _for_kernels(medium: VoxelGrid | SdfGrid) -> MediumGrid:
-    from nerfro.kernels.lookup import MediumGrid
-    from nerfro.media.sdf_grid import BLOCK, SURFACE_BLOCK, SdfGrid
+def _voxels(medium: VoxelGrid) -> Voxels:
+    from nerfro.kernels.lookup import Voxels
 
     low, high = medium.box.double().numpy()
-    if isinstance(medium, SdfGrid):
-        inverse_spacing = (np.array(medium.coefficients.shape[1:]) - 1) / (high - low)
-        values, clearance = medium.coefficients.detach().numpy(), medium.coarse_clearance.numpy()
-        return MediumGrid(
-            values,
-            clearance,
-            medium.iors.detach().double().numpy(),
-            medium.nested,
-            medium.shell,
-            low,
-            high,
-            inverse_spacing,
-            inverse_spacing / BLOCK,
-            medium.coarse_slopes.numpy(),
-            medium.empty_blocks.numpy(),
-            inverse_spacing / SURFACE_BLOCK,
-        )
     inverse_spacing = (np.array(medium.table.shape[:3]) - 1) / (high - low)
-    values, clearance = medium.table.detach().numpy(), medium.clearance_grid.numpy()
-    no_bodies = (None, None, None)
-    return MediumGrid(values, clearance, None, False, 0.0, low, high, inverse_spacing, inverse_spacing, *no_bodies)
+    return Voxels(medium.table.detach().numpy(), medium.clearance_grid.numpy(), low, high, inverse_spacing)
 
 
 def _path(rays: Rays, vertices: Sequence[np.ndarray], refracted: np.ndarray) -> Path:

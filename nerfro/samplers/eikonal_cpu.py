@@ -12,7 +12,8 @@ from numba import prange
 
 from nerfro.kernels.compilation import compiled, compiled_parallel, inlined
 from nerfro.kernels.lookup import (
-    block_clearance,
+    block_at,
+    blocks_from,
     box_span,
     put_end,
     put_vertex,
@@ -60,7 +61,7 @@ def _kick(h, px, py, pz, vx, vy, vz, n, gx, gy, gz):
 @compiled
 def _march_ray_uniformly(voxels, origin, direction, near, far, num_steps, row):
     """Trace one ray by `integrators.euler` and write its vertices; returns whether the index varied along the path."""
-    table, low, inverse_spacing = voxels.values, voxels.low, voxels.inverse_spacing
+    table, low, inverse_spacing = voxels.table, voxels.low, voxels.inverse_spacing
     positions, directions, lengths = row
     vx, vy, vz = float(direction[0]), float(direction[1]), float(direction[2])
     s = float(near)
@@ -106,30 +107,41 @@ def march_uniform(origins, directions, near, far, voxels, num_steps):
 
 
 @compiled
-def _free_length(values, clearance, iors, shell, low, inverse_spacing, inverse_block, x, y, z, enough):
+def _box_of(voxels, solids):
+    """Return the corners of the medium's box."""
+    if len(solids.iors) == 0:
+        return voxels.low, voxels.high
+    return solids.box_low, solids.box_high
+
+
+@compiled
+def _voxel_clearance(voxels, x, y, z):
+    """Return the distance around a point's cell within which the index is constant."""
+    bx, by, bz = blocks_from(voxels.low, voxels.inverse_spacing, x, y, z)
+    return voxels.clearance[block_at(voxels.clearance.shape, bx, by, bz)]
+
+
+@compiled
+def _free_length(voxels, solids, x, y, z, enough):
     """Return a lower bound of the distance without a change of the index; the bound is tight if less than `enough`."""
-    # The lookup of a block is cheap. The signed distance is only evaluated near surfaces.
-    free = block_clearance(clearance, low, inverse_block, x, y, z) - shell
-    if iors is None:
-        return free
-    if free <= enough:
-        free = solid_clearance(values, shell, low, inverse_spacing, x, y, z)
-    return free
+    if len(solids.iors) == 0:
+        return _voxel_clearance(voxels, x, y, z)
+    return solid_clearance(solids, x, y, z, enough)
 
 
 @compiled
-def _look_up(values, clearance, iors, nested, shell, low, inverse_spacing, inverse_block, x, y, z):
+def _look_up(voxels, solids, x, y, z):
     """Return the index, its gradient, and the distance without a change of the index."""
-    if iors is None:
-        n, gx, gy, gz = voxel_index(values, low, inverse_spacing, x, y, z)
-        return n, gx, gy, gz, float(block_clearance(clearance, low, inverse_block, x, y, z))
-    return solid_index(values, iors, nested, shell, low, inverse_spacing, x, y, z)
+    if len(solids.iors) == 0:
+        n, gx, gy, gz = voxel_index(voxels.table, voxels.low, voxels.inverse_spacing, x, y, z)
+        return n, gx, gy, gz, float(_voxel_clearance(voxels, x, y, z))
+    return solid_index(solids, x, y, z)
 
 
 @compiled
-def _step_length(iors, step, dx, dy, dz, gx, gy, gz):
+def _step_length(solids, step, dx, dy, dz, gx, gy, gz):
     """Return the length of the next step, which depends on the slant in a shell (`media.solid.Solid.step_length`)."""
-    if iors is None:
+    if len(solids.iors) == 0:
         return step
     slope = math.sqrt(gx * gx + gy * gy + gz * gz)
     if slope == 0.0:
@@ -138,9 +150,10 @@ def _step_length(iors, step, dx, dy, dz, gx, gy, gz):
 
 
 @compiled
-def _march_ray(medium, origin, direction, near, far, step, tolerance, max_steps, row):
+def _march_ray(voxels, solids, origin, direction, near, far, settings, row):
     """Trace one ray and write its vertices; returns their number, whether the index varied, and the excess of steps."""
-    values, clearance, iors, nested, shell, low, high, inverse_spacing, inverse_block = medium[:9]
+    low, high = _box_of(voxels, solids)
+    step, tolerance, max_steps = settings
     positions, directions, lengths = row
     skip = REACHED * step
     dx, dy, dz = float(direction[0]), float(direction[1]), float(direction[2])
@@ -158,11 +171,9 @@ def _march_ray(medium, origin, direction, near, far, step, tolerance, max_steps,
         exceeded = True
         for _ in range(max_steps):
             if not known:
-                free = _free_length(values, clearance, iors, shell, low, inverse_spacing, inverse_block, x, y, z, skip)
+                free = _free_length(voxels, solids, x, y, z, skip)
                 if free <= skip:
-                    n, gx, gy, gz, free = _look_up(
-                        values, clearance, iors, nested, shell, low, inverse_spacing, inverse_block, x, y, z
-                    )
+                    n, gx, gy, gz, free = _look_up(voxels, solids, x, y, z)
                     vx, vy, vz = n * dx, n * dy, n * dz
                     known = True
             if free > skip:
@@ -173,13 +184,11 @@ def _march_ray(medium, origin, direction, near, far, step, tolerance, max_steps,
                 known = False
             else:
                 varied = gx != 0.0 or gy != 0.0 or gz != 0.0
-                ds = _step_length(iors, step, dx, dy, dz, gx, gy, gz)
+                ds = _step_length(solids, step, dx, dy, dz, gx, gy, gz)
                 x, y, z, px, py, pz, h = _drift(ds, x, y, z, vx, vy, vz, n, gx, gy, gz)
                 s += h * math.sqrt(px * px + py * py + pz * pz)
                 refracted = refracted or varied
-                n, gx, gy, gz, free = _look_up(
-                    values, clearance, iors, nested, shell, low, inverse_spacing, inverse_block, x, y, z
-                )
+                n, gx, gy, gz, free = _look_up(voxels, solids, x, y, z)
                 vx, vy, vz = _kick(h, px, py, pz, vx, vy, vz, n, gx, gy, gz)
                 # A straight step must not change the direction by rounding.
                 if varied or gx != 0.0 or gy != 0.0 or gz != 0.0:
@@ -202,16 +211,22 @@ def _march_ray(medium, origin, direction, near, far, step, tolerance, max_steps,
 
 
 @compiled_parallel
-def march_adaptive(origins, directions, near, far, medium, step, tolerance, max_steps, capacity):
+def march_adaptive(origins, directions, near, far, voxels, solids, settings, capacity):
     """Trace rays by steps in regions of varying index, and straight jumps elsewhere.
 
-    A vertex is recorded when the path is more than `tolerance` from its last tangent.
+    A vertex is recorded when the path is more than the tolerance from its last tangent.
+
+    Args:
+        origins, directions, near, far: rays [R, ...].
+        voxels, solids: the medium, which is one of them; `NO_SOLIDS` beside voxels, and `NO_VOXELS` beside solids.
+        settings: length of a step, tolerance, and largest number of steps of a ray.
+        capacity: largest number of vertices of a path, V.
 
     Returns:
         positions [R, V, 3], directions [R, V, 3], s [R, V]: V is the capacity; in the precision of the rays.
         counts [R]: number of vertices of each path, which may be more than the capacity.
         refracted [R]: whether the index varied along the path.
-        exceeded [R]: whether a ray took `max_steps`, after which the path continues straight.
+        exceeded [R]: whether a ray took the largest number of steps, after which the path continues straight.
     """
     num_rays = origins.shape[0]
     out_positions = np.empty((num_rays, capacity, 3), origins.dtype)
@@ -223,6 +238,6 @@ def march_adaptive(origins, directions, near, far, medium, step, tolerance, max_
     for ray in prange(num_rays):
         row = (out_positions[ray], out_directions[ray], out_s[ray])
         counts[ray], refracted[ray], exceeded[ray] = _march_ray(
-            medium, origins[ray], directions[ray], near[ray], far[ray], step, tolerance, max_steps, row
+            voxels, solids, origins[ray], directions[ray], near[ray], far[ray], settings, row
         )
     return out_positions, out_directions, out_s, counts, refracted, exceeded

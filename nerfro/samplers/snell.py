@@ -129,7 +129,7 @@ class Snell(PathSampler):
                 raise NerfroError("sampler.path.interface=mesh needs a medium made of a mesh; take medium=sdf_grid")
             return _trace_triangles(rays, medium, self.max_events, branching)
         if isinstance(medium, SdfGrid) and rays.origins.device.type == "cpu":
-            return snell_on_grid(rays, medium, MIN_SEARCH_STEP, self.max_events, branching)
+            return snell_on_grid(rays, medium, self.max_events, branching)
         return trace_interfaces(rays, medium, self.max_events, branching)
 
 
@@ -227,10 +227,11 @@ def trace_interfaces(rays: Rays, medium: Solid, max_events: int, branching: Bran
         front.moving[rows] = crossed
         rows, x, d, inside, before, after = (values[crossed] for values in (rows, x, d, inside, before, after))
         before, after, body = _first_crossing(medium, x, d, inside, before, after)
+        after, bodies = _closed_gaps(medium, x, d, inside, after, body, min_step)
         _, normals = medium.signed_distances(x + after[:, None] * d)
         normal = normals.gather(1, body[:, None, None].expand(-1, 1, 3))[:, 0]
         normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
-        front.meet(rows, before, after, body[:, None], normal)
+        front.meet(rows, before, after, bodies, normal)
     return front.finish(rays)
 
 
@@ -265,3 +266,21 @@ def _first_crossing(
     phi, _ = medium.signed_distances(x + after[:, None] * d)
     changed = (phi < 0) != inside
     return before, after, changed.long().argmax(-1)
+
+
+def _closed_gaps(
+    medium: Solid, x: Tensor, d: Tensor, inside: Tensor, after: Tensor, body: Tensor, min_step: float
+) -> tuple[Tensor, Tensor]:
+    """Close gaps of air between two bodies that are thinner than the shortest step of the search.
+
+    Returns:
+        Distance behind all surfaces that are met, and the bodies with these surfaces [A, L], -1 for none.
+    """
+    if inside.shape[1] == 1:
+        return after, body[:, None]
+    flipped = inside ^ one_hot(body, inside.shape[1]).bool()
+    leaves = (medium.innermost(inside) > 0) & (medium.innermost(flipped) == 0)
+    phi, _ = medium.signed_distances(x + (after + min_step)[:, None] * d)
+    behind = leaves[:, None] & ((phi < 0) != flipped)
+    others = torch.where(behind, torch.arange(inside.shape[1], device=x.device), -1)
+    return torch.where(behind.any(1), after + min_step, after), torch.cat([body[:, None], others], 1)

@@ -1,4 +1,4 @@
-"""Compiled refraction and reflection at the zero level of signed-distance grids, one thread per ray.
+"""Compiled refraction and reflection at the zero level of signed-distance solids, one thread per ray.
 
 The algorithm is `samplers.snell.trace_interfaces`, for one ray at a time. A *segment* is the straight part of a
 polyline between two *events*, refractions or reflections at a surface. If light splits, the transmitted part is
@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float, Int, Int8
 from numba import prange
 
 from nerfro.kernels.compilation import compiled, compiled_parallel
-from nerfro.kernels.lookup import box_span, distance_out, spline_value_gradient
-from nerfro.samplers.surface_search_cpu import Line, advance, signed_distance, surface_ahead
+from nerfro.kernels.lookup import body_distance, box_span, distance_out, grid_of, spline_value_gradient
+from nerfro.samplers.surface_search_cpu import Line, advance, first_surface
 
 _BLOCK = 64  # number of rays for which a thread allocates scratch memory once
 
@@ -25,7 +25,6 @@ _BLOCK = 64  # number of rays for which a thread allocates scratch memory once
 class Settings(NamedTuple):
     """Settings of the trace, see `samplers.snell.Snell` and `samplers.branching.Branching`."""
 
-    min_step: float  # shortest step of the search for surfaces, world units
     max_events: int
     num_splits: int  # first events of a polyline at which light may split
     least_weight: float
@@ -74,6 +73,7 @@ class Pending(NamedTuple):
     num_vertices: Int[np.ndarray, "N"]
     num_events: Int[np.ndarray, "N"]
     surface: Int[np.ndarray, "N"]  # surface of the reflection
+    across: Int[np.ndarray, "N"]  # body behind this surface
     inside: Bool[np.ndarray, "N K"]
 
 
@@ -81,7 +81,7 @@ class Scratch(NamedTuple):
     """Memory of a thread."""
 
     inside: Bool[np.ndarray, "K"]  # whether the ray is inside each body's surface
-    known: Float[np.ndarray, "4 K"]  # see `surface_ahead`
+    crossings: Float[np.ndarray, "K"]  # see `first_surface`
     pending: Pending
 
 
@@ -148,7 +148,7 @@ def _event(solids, hit, near, far, ratio, settings, branch):
         settings: settings of the trace.
         branch: arriving branch.
     """
-    _, nx, ny, nz = spline_value_gradient(solids.values[hit], solids.low, solids.inverse_spacing, far.x, far.y, far.z)
+    _, nx, ny, nz = spline_value_gradient(solids.coefficients, grid_of(solids, hit), far.x, far.y, far.z)
     norm = math.sqrt(nx * nx + ny * ny + nz * nz)
     nx, ny, nz = nx / norm, ny / norm, nz / norm
     transmitted, total = _transmitted(far, nx, ny, nz, ratio)
@@ -183,21 +183,22 @@ def _put_end(solids, rows, row, branch, far, exceeded):
     line, ahead = branch.line, far - branch.s
     if branch.num_events > 0:
         x, y, z, dx, dy, dz = line
-        ahead = max(ahead, distance_out(solids.low, solids.high, x, y, z, dx, dy, dz))
+        ahead = max(ahead, distance_out(solids.box_low, solids.box_high, x, y, z, dx, dy, dz))
     end = Branch(advance(line, ahead), branch.s + ahead, branch.weight, branch.num_vertices, branch.num_events)
     rows.weight[row], rows.num_events[row], rows.exceeded[row] = branch.weight, branch.num_events, exceeded
     return _put_vertex(rows, row, end, 0, -1, 0).num_vertices
 
 
 @compiled
-def _push(pending, size, branch, mirrored, s, weight, hit, inside):
+def _push(scratch, size, branch, mirrored, s, weight, surface, across):
     """Put the reflected part of a branch on the stack; returns the size of the stack."""
+    pending = scratch.pending
     for i in range(6):
         pending.line[size, i] = mirrored[i]
-    pending.s[size], pending.weight[size], pending.surface[size] = s, weight, hit
+    pending.s[size], pending.weight[size], pending.surface[size], pending.across[size] = s, weight, surface, across
     pending.num_vertices[size], pending.num_events[size] = branch.num_vertices, branch.num_events + 1
-    for body in range(len(inside)):
-        pending.inside[size, body] = inside[body]
+    for body in range(len(scratch.inside)):
+        pending.inside[size, body] = scratch.inside[body]
     return size + 1
 
 
@@ -216,20 +217,53 @@ def _resume(solids, scratch, top, rows, former, row):
     pending, inside = scratch.pending, scratch.inside
     for body in range(len(inside)):
         inside[body] = pending.inside[top, body]
-    count, surface = pending.num_vertices[top], pending.surface[top]
+    count = pending.num_vertices[top]
     for i in range(min(count, rows.s.shape[1])):
         for axis in range(3):
             rows.positions[row, i, axis] = rows.positions[former, i, axis]
             rows.directions[row, i, axis] = rows.directions[former, i, axis]
         rows.s[row, i], rows.body[row, i] = rows.s[former, i], rows.body[former, i]
         rows.surface[row, i], rows.across[row, i] = rows.surface[former, i], rows.across[former, i]
-    body = _innermost(inside, solids)
-    inside[surface] = not inside[surface]
-    across = _innermost(inside, solids)
-    inside[surface] = not inside[surface]
     x, y, z, dx, dy, dz = pending.line[top]
     branch = Branch(Line(x, y, z, dx, dy, dz), pending.s[top], pending.weight[top], count, pending.num_events[top])
-    return _put_vertex(rows, row, branch, body, surface, across)
+    return _put_vertex(rows, row, branch, _innermost(inside, solids), pending.surface[top], pending.across[top])
+
+
+@compiled
+def _cross(solids, scratch, body, hit, after):
+    """Move a ray to the other side of a surface; returns the body there, and the arc length behind the surface.
+
+    A gap of air between two bodies that is thinner than the shortest step of the search counts as closed, so touching
+    bodies need not fit exactly.
+
+    Args:
+        solids: bodies.
+        scratch: memory of the thread, with the crossings of `first_surface`. They become negative for crossed surfaces,
+            as `_flip` needs them.
+        body: body before the surface.
+        hit: body whose surface is met.
+        after: arc length behind this surface.
+    """
+    inside, crossings = scratch.inside, scratch.crossings
+    inside[hit] = not inside[hit]
+    across, behind = _innermost(inside, solids), after
+    crossings[hit] = -1.0
+    if across == 0 and body > 0:
+        for other in range(len(inside)):
+            if 0.0 <= crossings[other] <= after + solids.min_step[other]:
+                inside[other] = not inside[other]
+                behind = max(behind, crossings[other])
+                crossings[other] = -1.0
+        across = _innermost(inside, solids)
+    return across, behind
+
+
+@compiled
+def _flip(scratch):
+    """Change the side of all surfaces that `_cross` has crossed."""
+    for body in range(len(scratch.inside)):
+        if scratch.crossings[body] < 0.0:
+            scratch.inside[body] = not scratch.inside[body]
 
 
 @compiled
@@ -242,33 +276,31 @@ def _follow(solids, settings, scratch, rows, row, branch, num_pending):
     inside = scratch.inside
     while True:
         here = branch.line
-        hit, before, after = surface_ahead(solids, inside, scratch.known, here, settings.min_step)
+        hit, before, after = first_surface(solids, inside, scratch.crossings, here)
         if hit < 0:
             return branch, False, num_pending
         body = _innermost(inside, solids)
-        inside[hit] = not inside[hit]
-        across = _innermost(inside, solids)
+        across, behind = _cross(solids, scratch, body, hit, after)
         n_before, n_across = _index(body, solids), _index(across, solids)
-        near, far = advance(here, before), advance(here, after)
+        far = advance(here, behind)
         if n_before == n_across:
-            branch = Branch(far, branch.s + after, branch.weight, branch.num_vertices, branch.num_events)
+            branch = Branch(far, branch.s + behind, branch.weight, branch.num_vertices, branch.num_events)
             continue
         if branch.num_events >= settings.max_events:
             return branch, True, num_pending
-        event = _event(solids, hit, near, far, n_before / n_across, settings, branch)
+        event = _event(solids, hit, advance(here, before), far, n_before / n_across, settings, branch)
         weight = branch.weight
         if event.share > 0.0:
             if not settings.main_only:
-                inside[hit] = not inside[hit]
+                _flip(scratch)
                 num_pending = _push(
-                    scratch.pending, num_pending, branch, event.mirrored, branch.s + before, weight * event.share,
-                    hit, inside,
-                )  # fmt: skip
-                inside[hit] = not inside[hit]
+                    scratch, num_pending, branch, event.mirrored, branch.s + before, weight * event.share, hit, across
+                )
+                _flip(scratch)
             weight *= 1.0 - event.share
         if event.reflected:
-            inside[hit] = not inside[hit]
-        length = before if event.reflected else after
+            _flip(scratch)
+        length = before if event.reflected else behind
         branch = Branch(event.line, branch.s + length, weight, branch.num_vertices, branch.num_events + 1)
         branch = _put_vertex(rows, row, branch, body if event.reflected else across, hit, across)
 
@@ -282,11 +314,11 @@ def _trace_ray(solids, line, near, far, settings, scratch, rows):
     inside, last_row = scratch.inside, len(rows.weight) - 1
     branch = Branch(advance(line, near), near, 1.0, 0, 0)
     x, y, z, dx, dy, dz = branch.line
-    enter, leave = box_span(solids.low, solids.high, x, y, z, dx, dy, dz)
+    enter, leave = box_span(solids.box_low, solids.box_high, x, y, z, dx, dy, dz)
     misses = not (enter < leave and leave > 0.0 and enter < far - near)
     entry = advance(branch.line, max(enter, 0.0))
     for body in range(len(inside)):
-        inside[body] = not misses and signed_distance(solids, body, entry, 0.0) < 0.0
+        inside[body] = not misses and body_distance(solids, body, entry.x, entry.y, entry.z) < 0.0
     branch = _put_vertex(rows, 0, branch, _innermost(inside, solids), -1, 0)
     if misses:
         return 1, _put_end(solids, rows, 0, branch, far, False)
@@ -309,7 +341,7 @@ def trace_snell(origins, directions, near, far, solids, settings, capacity, room
 
     Args:
         origins, directions, near, far: rays [R, ...].
-        solids: bodies, a `kernels.lookup.MediumGrid`.
+        solids: bodies, a `kernels.lookup.Solids`.
         settings: settings of the trace.
         capacity: largest number of vertices of a polyline, V.
         room: largest number of polylines of a ray, B.
@@ -319,7 +351,7 @@ def trace_snell(origins, directions, near, far, solids, settings, capacity, room
             more than events; the other entries are undefined.
         counts [R, 2]: number of polylines of each ray, and largest number of vertices, which may exceed B and V.
     """
-    num_rays, num_bodies, num_splits = origins.shape[0], solids.values.shape[0], settings.num_splits
+    num_rays, num_bodies, num_splits = origins.shape[0], len(solids.iors), settings.num_splits
     rows = Polylines(
         np.empty((num_rays, room, capacity, 3), origins.dtype), np.empty((num_rays, room, capacity, 3), origins.dtype),
         np.empty((num_rays, room, capacity), origins.dtype), np.empty((num_rays, room, capacity), np.int8),
@@ -331,10 +363,10 @@ def trace_snell(origins, directions, near, far, solids, settings, capacity, room
     for block in prange((num_rays + _BLOCK - 1) // _BLOCK):
         pending = Pending(
             np.empty((num_splits, 6)), np.empty(num_splits), np.empty(num_splits), np.empty(num_splits, np.int64),
-            np.empty(num_splits, np.int64), np.empty(num_splits, np.int64),
+            np.empty(num_splits, np.int64), np.empty(num_splits, np.int64), np.empty(num_splits, np.int64),
             np.empty((num_splits, num_bodies), np.bool_),
         )  # fmt: skip
-        scratch = Scratch(np.empty(num_bodies, np.bool_), np.empty((4, num_bodies)), pending)
+        scratch = Scratch(np.empty(num_bodies, np.bool_), np.empty(num_bodies), pending)
         for ray in range(block * _BLOCK, min((block + 1) * _BLOCK, num_rays)):
             x, d = origins[ray], directions[ray]
             line = Line(

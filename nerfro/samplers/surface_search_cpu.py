@@ -1,4 +1,8 @@
-"""Compiled search for the first surface on a line, among the zero levels of signed-distance grids."""
+"""Compiled search for the first surface on a line, among the zero levels of signed-distance solids.
+
+Every body has a grid in a box of its own, so the search skips bodies whose boxes the line misses, or meets behind the
+nearest surface found so far.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +12,13 @@ from typing import NamedTuple
 from nerfro.kernels.compilation import compiled
 from nerfro.kernels.lookup import (
     block_at,
+    block_number,
     blocks_from,
     box_span,
     end_of_blocks,
+    grid_of,
     lengths_of_block,
-    slopes_along,
+    slope_along,
     spline_value,
 )
 
@@ -41,21 +47,21 @@ def advance(line, length):
 
 
 @compiled
-def signed_distance(solids, body, line, t):
-    """Return the signed distance to a body's surface at arc length t of a line."""
+def _distance_at(coefficients, grid, line, t):
+    """Return the signed distance to a body's surface at arc length t of a line inside the body's box."""
     x, y, z, dx, dy, dz = line
-    return spline_value(solids.values[body], solids.low, solids.inverse_spacing, x + t * dx, y + t * dy, z + t * dz)
+    return spline_value(coefficients, grid, x + t * dx, y + t * dy, z + t * dz)
 
 
 @compiled
-def _root(solids, body, line, start, end, at_start, at_end, tolerance):
+def _root(coefficients, grid, line, start, end, at_start, at_end, tolerance):
     """Shrink [start, end] around a change of sign by the method of Anderson and Bjorck; both ends keep their signs.
 
     The value at the end is known; the value at the start is known or NaN. Secants approach the root from one side until
     a secant exceeds the root; if none does, bisection alternates with secants.
     """
     if math.isnan(at_start):
-        at_start = signed_distance(solids, body, line, start)
+        at_start = _distance_at(coefficients, grid, line, start)
     start_inside = at_start < 0.0
     weight_start, weight_end, moved = at_start, at_end, 0
     for iteration in range(_ROOT_ITERATIONS):
@@ -67,7 +73,7 @@ def _root(solids, body, line, start, end, at_start, at_end, tolerance):
             middle = (start * weight_end - end * weight_start) / (weight_end - weight_start)
             # A step beyond the root moves the other end, too.
             middle = min(max(middle, start + 0.25 * tolerance), end - 0.25 * tolerance)
-        value = signed_distance(solids, body, line, middle)
+        value = _distance_at(coefficients, grid, line, middle)
         # Without a smaller weight, the same end would stay in all iterations.
         if (value < 0.0) == start_inside:
             if moved == 1:
@@ -81,91 +87,97 @@ def _root(solids, body, line, start, end, at_start, at_end, tolerance):
 
 
 @compiled
-def surface_ahead(solids, inside, known, line, min_step):
-    """Find the first surface on a line; returns the body, or -1, and arc lengths before and after the surface.
+def first_surface(solids, inside, crossings, line):
+    """Find the first surface on a line.
 
-    Blocks without a surface are skipped. In other blocks, steps are at least as long as the distance to the nearest
-    surface, as in sphere tracing. The bounds of the slope in a block allow longer steps. In a block with a monotonic
-    distance, each body has at most one surface, between values of opposite sign, so one step crosses the block.
+    Args:
+        solids: bodies.
+        inside: whether the line starts inside each body's surface.
+        crossings: array for the arc length behind the next surface of each body; infinite for bodies without a surface
+            ahead. The search of a body ends a little behind the first surface that is known so far.
+        line: the line.
 
-    `known` is scratch memory: signed distances to the bodies at the last two points, and the lowest and highest slopes
-    along the line in the current block.
+    Returns:
+        The body, or -1, and arc lengths before and after its surface.
+    """
+    hit, hit_before, hit_after = -1, 0.0, math.inf
+    for body in range(len(inside)):
+        limit = hit_after + solids.min_step[body]
+        found, before, after = _surface_ahead(solids, body, inside[body], line, limit)
+        crossings[body] = after if found else math.inf
+        if found and after < hit_after:
+            hit, hit_before, hit_after = body, before, after
+    return hit, hit_before, hit_after
+
+
+@compiled
+def _surface_ahead(solids, body, inside, line, limit):
+    """Find the first surface of a body on a line; returns whether there is one, and arc lengths before and after it.
+
+    Blocks without a surface are skipped. In other blocks, steps are at least as long as the distance to the surface, as
+    in sphere tracing. The bounds of the slope in a block allow longer steps. In a block with a monotonic distance there
+    is at most one surface, between values of opposite sign, so one step crosses the block.
+
+    Args:
+        solids: bodies.
+        body: body that is searched.
+        inside: whether the line starts inside its surface.
+        line: the line.
+        limit: arc length at which the search ends.
     """
     x, y, z, dx, dy, dz = line
-    _, leave = box_span(solids.low, solids.high, x, y, z, dx, dy, dz)
-    small = solids.inverse_small
+    enter, leave = box_span(solids.low[body], solids.high[body], x, y, z, dx, dy, dz)
+    t, leave = max(enter, 0.0), min(leave, limit)
+    if not t < leave:
+        return False, 0.0, 0.0
+    coefficients, grid, min_step = solids.coefficients, grid_of(solids, body), solids.min_step[body]
+    counts, small = solids.block_shape[body], solids.inverse_block[body]
     # Direction and start in units of blocks, and arc lengths for one block along each axis.
     rx, ry, rz = dx * small[0], dy * small[1], dz * small[2]
-    bx, by, bz = blocks_from(solids.low, small, x, y, z)
+    bx, by, bz = blocks_from(solids.low[body], small, x, y, z)
     qx, qy, qz = lengths_of_block(rx, ry, rz)
     beyond = _BEYOND_WALL * min_step
-    t, before, crossed, across = 0.0, 0.0, False, False
-    wall, monotone = 0.0, False
-    while not crossed:
-        i, j, k = block_at(solids.empty.shape, bx + t * rx, by + t * ry, bz + t * rz)
-        reach = solids.empty[i, j, k]
+    # Signed distances at the last point and at the point before; NaN if unknown.
+    before, at_before, at_point, across = t, math.nan, math.nan, False
+    while True:
+        i, j, k = block_at(counts, bx + t * rx, by + t * ry, bz + t * rz)
+        block = block_number(solids.block_start[body], counts, i, j, k)
+        reach = solids.empty[block]
         # After a step across a block, a surface in this block may be behind an empty block.
         if reach > 0 and not across:
-            before = t
-            known[1, :] = math.nan
+            before, at_point = t, math.nan
             t = max(t, end_of_blocks(i, j, k, reach, bx, by, bz, qx, qy, qz)) + beyond
             if t >= leave:
-                return -1, 0.0, 0.0
+                return False, 0.0, 0.0
             continue
+        wall, lowest, highest = t, -math.inf, math.inf
         if reach == 0:
             wall = max(t, end_of_blocks(i, j, k, 1, bx, by, bz, qx, qy, qz))
-            monotone = slopes_along(solids.slopes, i, j, k, dx, dy, dz, known[2], known[3])
+            lowest, highest = slope_along(solids.slopes[block], dx, dy, dz)
         while True:
-            distance, crossed = _query(solids, inside, known, line, t)
-            if crossed:
-                break
+            at_before, at_point = at_point, _distance_at(coefficients, grid, line, t)
+            if (at_point < 0.0) != inside:
+                start, end = _root(coefficients, grid, line, before, t, at_before, at_point, _ROOT_TOLERANCE * min_step)
+                return True, start, end
             if t >= leave:
-                return -1, 0.0, 0.0
+                return False, 0.0, 0.0
             before, across = t, False
             if reach > 0:
                 break
-            step = max(distance, min_step, min(wall - t, _free_length(inside, known)))
-            across = monotone and wall - t > step
+            step = max(abs(at_point), min_step, min(wall - t, _free_length(inside, at_point, lowest, highest)))
+            across = (lowest > 0.0 or highest < 0.0) and wall - t > step
             # Slightly beyond the wall, so that the next block is certain despite rounding errors.
             t = min((wall if across else t + step) + beyond, leave)
             if t > wall:
                 break
-    return _first_crossing(solids, inside, known, line, before, t, _ROOT_TOLERANCE * min_step)
 
 
 @compiled
-def _query(solids, inside, known, line, t):
-    """Evaluate signed distances at arc length t; returns the least, and whether a surface was crossed."""
-    distance, crossed = math.inf, False
-    for body in range(len(inside)):
-        known[0, body] = known[1, body]
-        value = signed_distance(solids, body, line, t)
-        known[1, body] = value
-        crossed = crossed or (value < 0.0) != inside[body]
-        distance = min(distance, abs(value))
-    return distance, crossed
-
-
-@compiled
-def _free_length(inside, known):
-    """Return a length without surfaces ahead, from the distances and the bounds of slopes in the current block."""
-    free = math.inf
-    for body in range(len(inside)):
-        # Largest slope towards zero; NaN at the border of the grid, where slopes are unknown.
-        towards = known[3, body] if inside[body] else -known[2, body]
-        if not towards <= 0.0:
-            reached = abs(known[1, body]) / towards
-            free = min(free, reached) if reached >= 0.0 else 0.0
-    return free
-
-
-@compiled
-def _first_crossing(solids, inside, known, line, before, t, tolerance):
-    """Find the first surface that is crossed in a step; see `surface_ahead` for the results."""
-    hit, hit_before, hit_after = -1, 0.0, math.inf
-    for body in range(len(inside)):
-        if (known[1, body] < 0.0) != inside[body]:
-            first, last = _root(solids, body, line, before, t, known[0, body], known[1, body], tolerance)
-            if last < hit_after:
-                hit, hit_before, hit_after = body, first, last
-    return hit, hit_before, hit_after
+def _free_length(inside, distance, lowest, highest):
+    """Return a length without surface ahead, from the distance and the bounds of its slope in the current block."""
+    # Largest slope towards zero; NaN at the border of the grid, where slopes are unknown.
+    towards = highest if inside else -lowest
+    if towards <= 0.0:
+        return math.inf
+    reached = abs(distance) / towards
+    return reached if reached >= 0.0 else 0.0

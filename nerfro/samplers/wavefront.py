@@ -119,7 +119,7 @@ class Wavefront:
             normal: unit normal of either orientation.
             triangles: triangles that are met, as in `body`; by default none.
         """
-        triangles = torch.full_like(body, -1) if triangles is None else triangles
+        triangles = torch.full_like(self.triangles[rows], -1) if triangles is None else triangles
         inside = self.inside[rows]
         # Number of crossed surfaces of each body; the first column takes the entries without a surface.
         num_crossed = rows.new_zeros(len(rows), inside.shape[1] + 1)

@@ -16,6 +16,7 @@ from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import load_mesh, local_origin
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
+from nerfro.media.bodies import mesh_files
 from nerfro.paths import resolve_path
 from nerfro.registry import build
 
@@ -132,10 +133,11 @@ def _box(config: DictConfig, medium: Medium) -> Float[np.ndarray, "2 3"] | None:
     """Return the bounds of the object from the medium or its mesh; None without both."""
     if not isinstance(medium, Vacuum):
         return medium.content_box.double().numpy().round(6)
-    if "mesh" in config.medium and resolve_path(config.medium.mesh).is_file():
+    files = [resolve_path(mesh) for mesh in mesh_files(config.medium)]
+    if files and all(file.is_file() for file in files):
         # Straight rays need no medium, but the baselines get the same bounds as the refractive model.
-        bounds = load_mesh(resolve_path(config.medium.mesh), accept_open_mesh=True).bounds
-        return (bounds - local_origin(bounds)).round(6)
+        bounds = np.stack([load_mesh(file, accept_open_mesh=True).bounds for file in files])
+        return (np.stack([bounds[:, 0].min(0), bounds[:, 1].max(0)]) - local_origin(bounds[0])).round(6)
     return None
 
 

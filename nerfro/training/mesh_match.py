@@ -57,7 +57,7 @@ def require_match(medium: Medium, views: Views) -> None:
     inside = bool((indices != 1).all())
     comparison = None
     if isinstance(medium, SdfGrid) and medium.meshes and views.masks is not None:
-        comparison = _Comparison.of(medium.meshes[0], views, medium.origin)
+        comparison = _Comparison.of(medium.outline, views, medium.origin)
     agreement = 1.0 if comparison is None else comparison.agreement(_SAME)
     if not inside and agreement >= _DOUBTFUL:
         return

@@ -16,17 +16,17 @@ from torch import Tensor
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.errors import NerfroError
-from nerfro.kernels.tolerances import MIN_SEARCH_STEP
 from nerfro.light import to_srgb
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
-from nerfro.media.sdf_grid import BLOCK, SdfGrid
+from nerfro.media.distance_grid import BLOCK
+from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
 from nerfro.rendering import ColourSpace, Renderer
 from nerfro.types import Exits
 from nerfro.viewing import packing
 from nerfro.viewing.changes import absorption_of
-from nerfro.viewing.surface import distances_on_grid
+from nerfro.viewing.surface import body_on_grid
 from nerfro.viewing.volume import MIN_OPTICAL_DEPTH, Volume
 
 # Distances are stored up to this many cells from the surface, where the B-spline of the surface reads them. Farther
@@ -58,49 +58,54 @@ def bake_surface(renderer: Renderer) -> Baked:
     """
     medium: Medium = renderer.scene.medium
     if isinstance(medium, Vacuum):
-        return Baked({"iors": [], "nested": False, "absorption": [], "vertices": [2, 2, 2], "low": [0, 0, 0],
-                      "high": [1, 1, 1], "step": 1.0, "clearance": 1.0, "block": BLOCK, "shortest": 1.0,
+        return Baked({"iors": [], "nested": False, "absorption": [], "vertices": [2, 2, 2], "low": [[0, 0, 0]],
+                      "high": [[1, 1, 1]], "steps": [1.0], "clearances": [1.0], "block": BLOCK, "shortest": 1.0,
                       "events": 0})  # fmt: skip
     if not isinstance(medium, Solid):
         raise NerfroError(
             f"an interactive page shows bodies with a surface, and the index of {type(medium).__name__} varies "
             "in space; render a film of this run, or train with medium=sdf_grid"
         )
-    grid = medium if isinstance(medium, SdfGrid) else _on_grid(medium)
-    coefficients = grid.coefficients.detach().cpu().double().numpy()
-    low, high = grid.box.detach().cpu().double().numpy()
-    vertices = np.array(coefficients.shape[1:])
-    spacing = (high - low) / (vertices - 1)
-    step = _BAND * float(spacing.max()) / 32767
-    steps = np.clip(np.round(coefficients / step), -32767, 32767).astype(np.int64)
-    clearance = grid.coarse_clearance.cpu().double().numpy()
-    unit = max(float(clearance.max()), 1e-9) / 255
-    slices = np.concatenate([body.transpose(2, 1, 0) for body in steps])
-    blocks = np.floor(clearance / unit + 1e-9).astype(np.uint8).transpose(2, 1, 0)
+    solids = _on_same_grid(medium).packed()
+    bodies = range(len(solids.low))
+    spacing = 1 / solids.inverse_spacing
+    steps = _BAND * spacing.max(1) / 32767
+    clearance = solids.clearance.reshape(len(bodies), *solids.clearance_shape[0]).astype(np.float64)
+    units = clearance.max((1, 2, 3)).clip(min=1e-9) / 255
+    coefficients = solids.coefficients.reshape(len(bodies), *solids.shape[0]).astype(np.float64)
+    # The grids of all bodies follow each other along z.
+    slices = np.concatenate([np.round(coefficients[body] / steps[body]).transpose(2, 1, 0) for body in bodies])
+    slices = slices.clip(-32767, 32767).astype(np.int64)
+    blocks = np.concatenate([np.floor(clearance[body] / units[body] + 1e-9).transpose(2, 1, 0) for body in bodies])
     return Baked(
         {
             "iors": [float(ior) for ior in medium.indices],
             "nested": medium.nested,
             "absorption": absorption_of(renderer.scene).tolist(),
-            "vertices": vertices.tolist(),
+            "vertices": solids.shape[0].tolist(),
             "size": list(slices.shape[::-1]),
             "blocks": list(blocks.shape[::-1]),
-            "low": low.tolist(),
-            "high": high.tolist(),
-            "step": step,
-            "clearance": unit,
+            "low": solids.low.tolist(),
+            "high": solids.high.tolist(),
+            "steps": steps.tolist(),
+            "clearances": units.tolist(),
             "block": BLOCK,
-            "shortest": MIN_SEARCH_STEP * float((high - low).min()),
+            "shortest": float(solids.min_step.min()),
             "events": getattr(renderer.path_sampler, "max_events", 16),
         },
-        {"distances": packing.two_bytes(slices), "clearance": blocks[..., None]},
+        {"distances": packing.two_bytes(slices), "clearance": blocks[..., None].astype(np.uint8)},
     )
 
 
-def _on_grid(medium: Solid) -> SdfGrid:
-    """Sample the signed distances of a medium in closed form on a grid."""
-    distances = distances_on_grid(medium).to(medium.box)
-    return SdfGrid.from_distances(distances, medium.box, medium.indices.tolist(), medium.shell)
+def _on_same_grid(medium: Solid) -> SdfGrid:
+    """Return the bodies on grids with equal numbers of vertices; samples distances in closed form."""
+    if isinstance(medium, SdfGrid) and len({grid.distances.shape for grid in medium.grids}) == 1:
+        return medium
+    if isinstance(medium, SdfGrid):
+        raise NerfroError("an interactive page needs bodies with equal numbers of vertices; build them alike")
+    grids = [body_on_grid(medium, body) for body in range(len(medium.iors))]
+    distances, boxes = ([values.to(medium.box) for values in column] for column in zip(*grids, strict=True))
+    return SdfGrid.from_distances(distances, boxes, medium.indices.tolist(), medium.shell)
 
 
 @torch.inference_mode()

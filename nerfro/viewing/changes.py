@@ -55,7 +55,7 @@ def with_absorption(renderer: Renderer, absorption: Float[Tensor, "*K 3"]) -> Re
             "medium=sdf_grid"
         )
     given = _of_bodies(absorption, absorption_of(renderer.scene), "absorption")
-    return with_changed_scene(renderer, medium=variant(medium, _absorption=given.to(renderer.scene.device)))
+    return with_changed_scene(renderer, medium=medium.with_absorption_coefficients(given.to(renderer.scene.device)))
 
 
 def absorption_of(scene: Scene) -> Float[Tensor, "K 3"]:

@@ -32,15 +32,16 @@ def surface_of(medium: Medium, triangles: bool) -> list[TriangleMesh]:
         )
     if triangles and isinstance(medium, SdfGrid):
         return [TriangleMesh(mesh.vertices, mesh.faces, corner_normals(mesh)) for mesh in medium.meshes]
-    return [_zero_level(medium, body, values) for body, values in enumerate(distances_on_grid(medium))]
+    return [_zero_level(medium, body) for body in range(len(medium.iors))]
 
 
-def _zero_level(medium: Solid, body: int, values: Float[Tensor, "X Y Z"]) -> TriangleMesh:
+def _zero_level(medium: Solid, body: int) -> TriangleMesh:
     """Triangulate with marching cubes, then improve each vertex by a Newton step on the distance of the medium.
 
     The step is needed because marching cubes interpolates linearly, and the medium does not.
     """
-    mesh = level_set(-values, medium.box.cpu(), 0.0)
+    values, box = body_on_grid(medium, body)
+    mesh = level_set(-values, box, 0.0)
     vertices = torch.from_numpy(mesh.vertices).to(medium.box)
     phi, gradient = (value[:, body] for value in medium.regions(vertices))
     vertices = vertices - phi[:, None] * gradient / gradient.square().sum(-1, keepdim=True).clamp(min=1e-6)
@@ -49,13 +50,14 @@ def _zero_level(medium: Solid, body: int, values: Float[Tensor, "X Y Z"]) -> Tri
 
 
 @torch.no_grad()
-def distances_on_grid(medium: Solid) -> Float[Tensor, "K X Y Z"]:
-    """Sample `Solid.regions` at the vertices of a grid over the box of the medium, on the CPU."""
-    counts = medium.coefficients.shape[1:] if isinstance(medium, SdfGrid) else [_ANALYTIC_RESOLUTION] * 3
-    box = medium.box.cpu()
+def body_on_grid(medium: Solid, body: int) -> tuple[Float[Tensor, "X Y Z"], Float[Tensor, "2 3"]]:
+    """Sample `Solid.regions` of a body at the vertices of a grid, on the CPU; returns also the corners of the grid."""
+    grid = medium.grids[body] if isinstance(medium, SdfGrid) else None
+    counts = [_ANALYTIC_RESOLUTION] * 3 if grid is None else grid.distances.shape
+    box = (medium if grid is None else grid).box.cpu()
     axes = [torch.linspace(float(low), float(high), n) for low, high, n in zip(*box, counts, strict=True)]
-    slabs = [medium.regions(torch.cartesian_prod(x[None], *axes[1:]).to(medium.box))[0].cpu() for x in axes[0]]
-    return torch.stack(slabs).view(*counts, -1).movedim(-1, 0).contiguous()
+    slabs = [torch.cartesian_prod(x[None], *axes[1:]).to(medium.box) for x in axes[0]]
+    return torch.stack([medium.regions(slab)[0][..., body].cpu() for slab in slabs]).view(*counts), box
 
 
 def level_set(values: Float[Tensor, "X Y Z"], box: Float[Tensor, "2 3"], level: float) -> TriangleMesh:

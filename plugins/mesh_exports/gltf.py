@@ -13,6 +13,7 @@ from trimesh.exchange.gltf import export_glb
 
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
+from nerfro.media.material import Dispersion
 from nerfro.viewing.changes import absorption_of
 from nerfro.viewing.exports import Export
 from nerfro.viewing.trained_scene import TrainedScene
@@ -38,9 +39,11 @@ _VERTICES, _INDICES = 34962, 34963  # ARRAY_BUFFER and ELEMENT_ARRAY_BUFFER (glT
 
 def _encode_glb(scene: TrainedScene, glass: list[trimesh.Trimesh], inside: trimesh.Trimesh | None) -> bytes:
     meshes, materials = {}, {}
+    bodies = getattr(scene.renderer.scene.medium, "materials", [])
     for number, (mesh, absorption) in enumerate(zip(glass, absorption_of(scene.renderer.scene), strict=True)):
         meshes[f"glass_{number}"] = mesh
-        materials[f"glass_{number}"] = _glass_material(mesh, float(scene.ior[number]), absorption.numpy())
+        dispersion = bodies[number].dispersion
+        materials[f"glass_{number}"] = _glass_material(mesh, float(scene.ior[number]), absorption.numpy(), dispersion)
     if inside is not None:
         meshes["inside"] = inside
         inside.vertex_attributes["radiance"] = np.clip(inside.vertex_attributes["radiance"], 0, 1)
@@ -68,19 +71,21 @@ def _encode_glb(scene: TrainedScene, glass: list[trimesh.Trimesh], inside: trime
     return export_glb(document, include_normals=True, tree_postprocessor=add_materials)
 
 
-def _glass_material(mesh: trimesh.Trimesh, ior: float, absorption: np.ndarray) -> dict[str, Any]:
-    """Describe glass by KHR_materials_transmission, KHR_materials_ior and KHR_materials_volume (Khronos)."""
+def _glass_material(
+    mesh: trimesh.Trimesh, ior: float, absorption: np.ndarray, dispersion: Dispersion | None
+) -> dict[str, Any]:
+    """Describe glass by the extensions KHR_materials_transmission, _ior, _volume and _dispersion (Khronos)."""
     volume: dict[str, Any] = {"thicknessFactor": float(mesh.extents.min())}
     if absorption.any():
         volume |= {"attenuationDistance": 1.0, "attenuationColor": np.exp(-absorption).tolist()}
-    return {
-        "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.0},
-        "extensions": {
-            "KHR_materials_transmission": {"transmissionFactor": 1.0},
-            "KHR_materials_ior": {"ior": ior},
-            "KHR_materials_volume": volume,
-        },
+    extensions: dict[str, Any] = {
+        "KHR_materials_transmission": {"transmissionFactor": 1.0},
+        "KHR_materials_ior": {"ior": ior},
+        "KHR_materials_volume": volume,
     }
+    if dispersion is not None:
+        extensions["KHR_materials_dispersion"] = {"dispersion": 20 / dispersion.abbe}
+    return {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.0}, "extensions": extensions}
 
 
 EXPORT = Export((".glb",), write_mesh)

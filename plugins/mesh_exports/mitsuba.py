@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from xml.etree import ElementTree
 
 import numpy as np
@@ -17,8 +17,9 @@ from trimesh.exchange.ply import export_ply
 
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
-from nerfro.files.atomic import write_atomically
+from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.files.deep_images import write_radiance
+from nerfro.media.solid import Solid
 from nerfro.scenes.path_tracer import envmap_texture
 from nerfro.viewing.changes import absorption_of
 from nerfro.viewing.exports import Export
@@ -47,11 +48,11 @@ def write_mitsuba(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     another split if there are no test cameras. `config` is an `ExportConfig`.
 
     Raises:
-        NerfroError: the scene has bodies inside bodies.
+        NerfroError: bodies lie inside others or overlap.
     """
     glass, inside = glass_meshes(scene), inside_mesh(scene, config.resolution, config.half_depth)
     if len(glass) > 1:
-        raise NerfroError("bodies inside bodies are not written for Mitsuba; write them with what=mesh")
+        _require_apart(scene, glass)
     split = page_split(scene.source)
     cameras, absorption = scene.cameras(split).to("cpu"), absorption_of(scene.renderer.scene)
     glass_file, inside_file, sky_file = (out.with_name(out.stem + ending) for ending in MITSUBA_FILES)
@@ -60,12 +61,14 @@ def write_mitsuba(scene: TrainedScene, out: Path, config: DictConfig) -> str:
         "sky": {"type": "envmap", "filename": sky_file.name, "to_world": _Y_UP_TO_Z_UP},
     }
     _write_sky(sky_file, scene)
-    for mesh in glass:
-        material = {"type": "$glass", "int_ior": float(scene.ior[0])}
-        objects["glass"] = {**_write_shape(glass_file, mesh), "bsdf": material}
-        if absorption.any():
-            sigma_t = tuple(absorption[0].tolist())
-            objects["glass"]["interior"] = {"type": "homogeneous", "sigma_t": sigma_t, "albedo": (0.0, 0.0, 0.0)}
+    glass_files = [glass_file, *(out.with_name(f"{out.stem}_glass_{body}.ply") for body in range(1, len(glass)))]
+    refuse_existing(glass_files[1:], config.overwrite)
+    for body, (mesh, file) in enumerate(zip(glass, glass_files, strict=False)):
+        shape = {**_write_shape(file, mesh), "bsdf": {"type": "$glass", "int_ior": float(scene.ior[body])}}
+        if absorption[body].any():
+            sigma_t = tuple(absorption[body].tolist())
+            shape["interior"] = {"type": "homogeneous", "sigma_t": sigma_t, "albedo": (0.0, 0.0, 0.0)}
+        objects[f"glass_{body}" if body else "glass"] = shape
     if inside is not None:
         radiance = np.asarray(inside.vertex_attributes.pop("radiance"))
         inside.vertex_attributes.update(zip("rgb", radiance.T, strict=True))
@@ -82,6 +85,18 @@ def write_mitsuba(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     write_atomically(out, ElementTree.tostring(root, encoding="unicode") + "\n")
     content = "nothing" if inside is None else f"{len(inside.faces)} triangles"
     return f"a scene of {len(cameras)} sensors with {content} inside"
+
+
+def _require_apart(scene: TrainedScene, glass: list[trimesh.Trimesh]) -> None:
+    """Refuse bodies that lie inside others or overlap, which a `dielectric` of Mitsuba cannot describe."""
+    medium = cast(Solid, scene.renderer.scene.medium)
+    for body, mesh in enumerate(glass):
+        phi, _ = medium.signed_distances(torch.from_numpy(np.asarray(mesh.vertices)).to(medium.box))
+        phi[:, body] = torch.inf
+        if (phi < 0).any():
+            raise NerfroError(
+                "bodies that lie inside others or overlap are not written for Mitsuba; write them with what=mesh"
+            )
 
 
 def _write_sky(file: Path, scene: TrainedScene) -> None:

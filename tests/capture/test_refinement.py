@@ -30,10 +30,10 @@ DEPTH, WIDTH, AXIS = 0.05, 0.12, torch.tensor([0.6, 0.0, 0.8])
 def dented() -> SdfGrid:
     """The ball, flattened on one side."""
     ball = solid([1.5])
-    directions = grid_points(0.9, ball.distances.shape[-1])
+    directions = grid_points(0.9, len(ball.grids[0].distances))
     directions = torch.nn.functional.normalize(directions, dim=-1)
     dent = DEPTH * torch.exp((directions @ AXIS - 1) / WIDTH)
-    return SdfGrid.from_distances(ball.distances + dent, BOX, [1.5], 0.01)
+    return SdfGrid.from_distances([ball.grids[0].distances + dent], BOX, [1.5], 0.01)
 
 
 SHORT = RefinementSettings((Stage(150, 5e-4, (3.0, 1.0)), Stage(50, 1e-4, (0.0, 0.0))), 2000, (8, 16))
@@ -84,8 +84,8 @@ def test_a_surface_that_is_right_stays() -> None:
 
 def test_a_rough_surface_is_smoothed_as_much_as_its_judges_like() -> None:
     right = dented()
-    rough = 0.004 * torch.randn(right.distances.shape, generator=torch.Generator().manual_seed(0))
-    start = right.grown(rough[0])
+    rough = 0.004 * torch.randn(right.grids[0].distances.shape, generator=torch.Generator().manual_seed(0))
+    start = right.grown(rough)
     found = refined(start, settings=RefinementSettings(stages=(), smoothings=(0.02, 0.04, 0.3)))
     assert degrees_off(found.medium) < 0.6 * degrees_off(start)
     assert found.steps == [0, 0, 0]

@@ -60,7 +60,7 @@ def test_absorption_learns_without_tracing_again() -> None:
     model = RefractiveModel(replace(example_components(), medium=Ball(learn_absorption=True), path_sampler=Snell()))
     assert not model.paths_learn, "paths may be traced ahead"
     parameters = model.parameter_groups()["absorption"]
-    assert [tuple(parameter.shape) for parameter in parameters] == [(1, 3)]
+    assert [tuple(parameter.shape) for parameter in parameters] == [(3,)]
     with torch.no_grad():
         path = model.trace(example_rays())
     renderings = model.render_path(model.trace(example_rays(), path))

@@ -10,7 +10,8 @@ import trimesh
 from nerfro.errors import NerfroError
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
-from nerfro.media.sdf_grid import SURFACE_BLOCK, SdfGrid
+from nerfro.media.distance_grid import SURFACE_BLOCK
+from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
 from tests.closed_forms import Luneburg, RoundedBox, Slab, grid_points
 
@@ -25,8 +26,8 @@ def _nested_balls(size: int = 48) -> SdfGrid:
 def _half_full_ball() -> SdfGrid:
     """Bodies that are where all before them are: a wall of glass, air in it, water in its lower half."""
     balls = _nested_balls()
-    axis = torch.linspace(-1.5, 1.5, balls.distances.shape[-1])
-    distances = torch.stack([*balls.distances, axis.expand(balls.distances.shape[1:])])
+    outer, inner = (grid.distances for grid in balls.grids)
+    distances = [outer, inner, torch.linspace(-1.5, 1.5, len(outer)).expand(outer.shape)]
     medium = SdfGrid.from_distances(distances, BOX, [1.5, 1.0, 1.33], 0.1)
     medium.nested = True
     return medium
@@ -88,13 +89,11 @@ def test_clearance_reaches_no_shell(make: Callable[[], SdfGrid]) -> None:
 
 
 def test_coarse_clearance_is_a_lower_bound() -> None:
-    medium = _nested_balls(43)
+    grid = _nested_balls(43).grids[0]
     block = 4 * 3 / 42
     positions = torch.rand(2000, 3) * 3 - 1.5
-    x, y, z = ((positions + 1.5) / block).long().unbind(-1)
-    coarse = medium.coarse_clearance[x, y, z]
-    radius = positions.norm(dim=-1)
-    exact = torch.minimum((radius - 0.9).abs(), (radius - 0.5).abs())
+    coarse = grid.clearance(positions)
+    exact = (positions.norm(dim=-1) - 0.9).abs()
     assert (coarse <= exact + 1e-6).all()
     # Short by the diagonals of a block and a cell, at most.
     assert (coarse >= exact - 3**0.5 * (block + 3 / 42) - 1e-6).all()
@@ -105,7 +104,7 @@ def test_coarse_slopes_bound_all_derivatives() -> None:
     block = SURFACE_BLOCK * 3 / 42
     positions = torch.rand(20000, 3, dtype=torch.float64) * 3 - 1.5
     x, y, z = ((positions + 1.5) / block).long().unbind(-1)
-    bounds = medium.coarse_slopes.double()[:, x, y, z].movedim(0, 1)
+    bounds = torch.stack([grid.coarse_slopes.double()[x, y, z] for grid in medium.grids], 1)
     gradients = medium.signed_distances(positions)[1]
     assert (bounds[..., 0] <= gradients + 1e-5).all()
     assert (gradients <= bounds[..., 1] + 1e-5).all()
@@ -118,20 +117,19 @@ def test_coarse_slopes_bound_all_derivatives() -> None:
 def test_no_surface_is_in_blocks_that_are_said_to_be_empty() -> None:
     medium = _nested_balls(43)
     block = SURFACE_BLOCK * 3 / 42
-    empty = medium.empty_blocks
+    empty = medium.grids[0].empty_blocks
     positions = torch.rand(20000, 3, dtype=torch.float64) * 3 - 1.5
     places = ((positions + 1.5) / block).long().clamp(max=len(empty) - 1)
-    signs = medium.signed_distances(positions)[0] < 0
+    signs = medium.grids[0](positions)[0] < 0
     reach = empty[places.unbind(-1)].long()
-    # As far as the blocks around are empty, every body is on the same side of a place as of that block's middle.
+    # As far as the blocks around are empty, the body is on the same side of a place as of that block's middle.
     moved = (places + (torch.rand(20000, 3) * 2 - 1) * (reach[:, None] - 1) + torch.rand(20000, 3)) * block - 1.5
     moved = moved.round(decimals=6).clamp(-1.5, 1.5)
     rows = (reach > 0) & (((moved + 1.5) / block - (places + 0.5)).abs().amax(-1) < reach - 0.5)
     assert rows.sum() > 10000
-    assert torch.equal(signs[rows], medium.signed_distances(moved[rows])[0] < 0)
-    # Blocks are empty but for those around the two surfaces, and some at the border.
-    radius = positions.norm(dim=-1)
-    near = torch.minimum((radius - 0.9).abs(), (radius - 0.5).abs())
+    assert torch.equal(signs[rows], medium.grids[0](moved[rows])[0] < 0)
+    # Blocks are empty but for those around the surface, and some at the border.
+    near = (positions.norm(dim=-1) - 0.9).abs()
     assert (reach[near < 0.01] == 0).all()
     assert (reach[(near > 3**0.5 * (block + 2 * 3 / 42)) & (positions.abs().amax(-1) < 1.2)] > 0).all()
 

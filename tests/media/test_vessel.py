@@ -12,7 +12,6 @@ from nerfro.geometry.lids import find_lid
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media.vessel import SdfVessel
 from nerfro.samplers.snell import Snell
-from nerfro.variants import variant
 from nerfro.viewing.surface import surface_of
 from tests.closed_forms import angle, make_rays
 from tests.media.vessels import RADIUS, WALL, exit_directions, spherical_vessel
@@ -114,7 +113,7 @@ def test_paths_through_a_glass_have_gradients_by_its_indices(tmp_path: Path) -> 
     rays = make_rays(origins, torch.nn.functional.normalize(targets - origins, dim=-1), 0.5, 9.0)
     sampler, step = Snell(max_events=6), 1e-4
     iors = vessel.iors.clone().requires_grad_()
-    learning = variant(vessel, iors=iors)
+    learning = vessel.with_indices(iors)
     path = sampler(rays, learning)
     weights = torch.randn(80, 3, generator=random, dtype=torch.float64) * sampler.steady(path, learning)[:, None]
     (found,) = torch.autograd.grad((sampler.refine(path, rays, learning).exit_directions * weights).sum(-1).sum(), iors)
@@ -181,12 +180,12 @@ def test_what_no_vessel_has_is_refused_in_one_line(tmp_path: Path, options: dict
 
 def test_a_vessel_that_grows_keeps_its_wall(tmp_path: Path) -> None:
     vessel = spherical_vessel(tmp_path, wall=WALL)
-    before = vessel.coarse_clearance
-    larger = vessel.grown(torch.full_like(vessel.distances[0], 0.02))
-    torch.testing.assert_close(larger.distances[0], vessel.distances[0] - 0.02)
+    before = vessel.grids[0].coarse_clearance
+    larger = vessel.grown(torch.full_like(vessel.grids[0].distances, 0.02))
+    torch.testing.assert_close(larger.grids[0].distances, vessel.grids[0].distances - 0.02)
     # Where the wall and not the foot bounds the cavity, before and after.
-    by_wall = (vessel.distances[1] == vessel._side + WALL) & (larger.distances[1] == larger._side + WALL)
+    by_wall = (vessel.grids[1].distances == vessel._side + WALL) & (larger.grids[1].distances == larger._side + WALL)
     assert by_wall.float().mean() > 0.5
-    torch.testing.assert_close(larger.distances[1][by_wall], vessel.distances[1][by_wall] - 0.02)
-    assert vessel.coarse_clearance is before
-    assert not torch.equal(larger.coarse_clearance, before)
+    torch.testing.assert_close(larger.grids[1].distances[by_wall], vessel.grids[1].distances[by_wall] - 0.02)
+    assert vessel.grids[0].coarse_clearance is before
+    assert not torch.equal(larger.grids[0].coarse_clearance, before)

@@ -170,7 +170,7 @@ def test_replayed_shares_have_the_derivatives_of_traced_ones(what: str) -> None:
 
     def traced(step: Tensor) -> tuple[Path, Rays, Solid]:
         medium = NestedBalls()
-        medium.iors = medium.iors + (step if what == "index" else 0)
+        medium = medium.with_indices(medium.iors + (step if what == "index" else 0))
         moved = Rays(rays.origins + (step if what == "origin" else 0), *list(vars(rays).values())[1:])
         with torch.no_grad():
             path, _, _ = trace_interfaces(moved, medium, 16, sampler.branching)
@@ -218,9 +218,8 @@ def test_gradients_belong_to_the_body_that_light_met_where_two_bodies_touch(what
     def moved(step: Tensor) -> CementedHalves:
         medium = CementedHalves()
         if what == "iors":
-            medium.iors = medium.iors + step
-        else:
-            medium.radii = medium.radii + step * torch.tensor([what.endswith("first"), what.endswith("second")])
+            return medium.with_indices(medium.iors + step)
+        medium.radii = medium.radii + step * torch.tensor([what.endswith("first"), what.endswith("second")])
         return medium
 
     def traced(step: float) -> Path:
@@ -238,7 +237,7 @@ def test_gradients_belong_to_the_body_that_light_met_where_two_bodies_touch(what
 
     def refined(step: Tensor) -> Tensor:
         medium = moved(step)
-        medium.iors, medium.radii, medium.box = medium.iors.float(), medium.radii.float(), medium.box.float()
+        medium.radii, medium.box = medium.radii.float(), medium.box.float()
         return values(sampler.refine(single, rays.to(torch.float32), medium))
 
     zero = torch.zeros((), dtype=torch.float64)

@@ -99,11 +99,15 @@ def _shifted(what: str, rays: Rays, medium: Medium) -> Callable[[Tensor], Rays]:
             return replace(rays, directions=torch.nn.functional.normalize(new, dim=-1))
 
         return shift_rays
-    old = getattr(medium, what)
-    change = random(old) * (1 if what == "iors" else 0.1)
+    owners = list(medium.materials if what == "ior" else medium.grids)
+    old = [getattr(owner, what) for owner in owners]
+    change = [random(values) * (1 if what == "ior" else 0.1) for values in old]
 
     def shift_medium(step: Tensor) -> Rays:
-        setattr(medium, what, old + step * change)
+        for owner, values, along in zip(owners, old, change, strict=True):
+            setattr(owner, what, values + step * along)
+        if what == "coefficients":
+            vars(medium.grids).pop("packed", None)  # the arrays of the kernel are made once
         return rays
 
     return shift_medium
@@ -111,7 +115,7 @@ def _shifted(what: str, rays: Rays, medium: Medium) -> Callable[[Tensor], Rays]:
 
 # On a grid the cell that a ray is in says where its steps begin; now and then differences see that.
 EVERYWHERE = [name for name in SCENES if name != "eikonal-nested-grid"]
-CASES = [(name, what) for name in EVERYWHERE for what in ("iors", "origin", "direction")]
+CASES = [(name, what) for name in EVERYWHERE for what in ("ior", "origin", "direction")]
 CASES += [("snell-nested-grid", "coefficients"), ("eikonal-nested-grid", "coefficients")]
 
 

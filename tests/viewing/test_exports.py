@@ -4,9 +4,11 @@ import json
 import math
 import shutil
 import subprocess
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -20,7 +22,9 @@ from PIL import Image
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.light import to_linear, to_srgb
+from nerfro.media.sdf_grid import SdfGrid
 from nerfro.subdivision import Subdivision
+from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.exports import ExportConfig, find_export
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, colour, sky_of
@@ -58,6 +62,51 @@ def test_glb_holds_glass_as_glass_and_the_inside_as_light(scene: TrainedScene, t
     # The z axis is up in nerfro, and the y axis in the file.
     lifted = loaded.graph.get("inside")[0][:3, :3] @ INSIDE_CENTRE
     np.testing.assert_allclose(lifted, [INSIDE_CENTRE[0], INSIDE_CENTRE[2], -INSIDE_CENTRE[1]], atol=1e-6)
+
+
+@pytest.fixture
+def two_bodies(scene: TrainedScene, tmp_path: Path) -> TrainedScene:
+    """Bodies apart: a ball of water that disperses, and an absorbing ball."""
+    bodies: dict[str, dict] = {"water": {"material": "water"}, "tinted": {"ior": 1.4, "absorption": [0.5, 0.1, 0.2]}}
+    for name, x in (("water", -0.7), ("tinted", 0.7)):
+        shape = trimesh.creation.icosphere(3, 0.4)
+        shape.apply_translation([x, 0, 0])
+        shape.export(tmp_path / f"{name}.ply")
+        bodies[name]["mesh"] = str(tmp_path / f"{name}.ply")
+    medium = SdfGrid(bodies=bodies, resolution=32, cache=False)
+    return replace(scene, renderer=with_changed_scene(scene.renderer, medium=medium))
+
+
+def test_glb_holds_each_body_with_its_material(two_bodies: TrainedScene, tmp_path: Path) -> None:
+    write(two_bodies, "mesh", tmp_path / "two.glb")
+    loaded = trimesh.load(tmp_path / "two.glb", process=False)
+    for number, x in enumerate((-0.7, 0.7)):
+        distances = np.linalg.norm(loaded.geometry[f"glass_{number}"].vertices - [x, 0, 0], axis=1)
+        np.testing.assert_allclose(distances, 0.4, atol=4e-3)
+    content = (tmp_path / "two.glb").read_bytes()
+    document = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    water, tinted = (material["extensions"] for material in document["materials"][:2])
+    assert water["KHR_materials_dispersion"]["dispersion"] == pytest.approx(20 / 55.8, rel=2e-3)
+    assert water["KHR_materials_ior"]["ior"] == pytest.approx(1.3334, abs=1e-4)
+    assert "KHR_materials_dispersion" not in tinted
+    np.testing.assert_allclose(
+        tinted["KHR_materials_volume"]["attenuationColor"], np.exp([-0.5, -0.1, -0.2]), rtol=1e-6
+    )
+    assert "KHR_materials_dispersion" in document["extensionsUsed"]
+
+
+def test_mitsuba_scenes_hold_bodies_that_are_apart(two_bodies: TrainedScene, tmp_path: Path) -> None:
+    write(two_bodies, "mitsuba", tmp_path / "two.xml")
+    shapes = ElementTree.parse(tmp_path / "two.xml").getroot().findall("shape")
+    indices = {shape.get("id"): shape.find("bsdf/float[@name='int_ior']").get("value") for shape in shapes[:2]}  # type: ignore[union-attr]
+    assert {name: round(float(str(ior)), 3) for name, ior in indices.items()} == {"glass": 1.333, "glass_1": 1.4}
+    assert [shape.find("medium") is not None for shape in shapes[:2]] == [False, True]
+    for file, x in (("two_glass.ply", -0.7), ("two_glass_1.ply", 0.7)):
+        np.testing.assert_allclose(trimesh.load(tmp_path / file).bounds.mean(0), [x, 0, 0], atol=1e-2)
+    medium = two_bodies.renderer.scene.medium
+    medium.grids[1].box.add_(torch.tensor([-1.0, 0, 0]))  # type: ignore[index, operator, union-attr]
+    with pytest.raises(NerfroError, match="inside others or overlap"):
+        write(two_bodies, "mitsuba", tmp_path / "overlapping.xml")
 
 
 VALIDATE = """const bytes = new Uint8Array(require("fs").readFileSync(process.argv[1]));

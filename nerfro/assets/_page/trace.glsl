@@ -16,13 +16,14 @@ uniform mat3 axes;
 uniform vec3 eye;
 uniform float near;
 
-// Bodies: the quadratic B-splines of their signed distances, one grid after another along z.
+// Bodies: the quadratic B-splines of their signed distances, one grid after another along z, each in its own box.
 uniform isampler3D coefficients;
 uniform ivec3 vertices;  // of one body's grid
-uniform vec3 gridLow, gridHigh;
-uniform float distanceStep;  // distance of one step of the coefficients
-uniform usampler3D clearance;  // how far blocks of cells are from all surfaces, at least
-uniform float clearanceStep, blockCells;
+uniform vec3 gridLow[MAX_BODIES], gridHigh[MAX_BODIES];
+uniform vec3 allLow, allHigh;  // corners of the box of all bodies
+uniform float distanceStep[MAX_BODIES];  // distance of one step of the coefficients
+uniform usampler3D clearance;  // how far blocks of cells are from the body's surface, at least
+uniform float clearanceStep[MAX_BODIES], blockCells;
 uniform float shortestStep;
 uniform int bodies, maxEvents;
 uniform bool nested;  // whether a body is only where all before it are too; one of index 1 is air then
@@ -59,14 +60,15 @@ vec2 boxSpan(vec3 low, vec3 high, vec3 x, vec3 d) {
   return vec2(max(first.x, max(first.y, first.z)), min(last.x, min(last.y, last.z)));
 }
 
-vec3 cellsPerUnit() {
-  return vec3(vertices - 1) / (gridHigh - gridLow);
+vec3 cellsPerUnit(int body) {
+  return vec3(vertices - 1) / (gridHigh[body] - gridLow[body]);
 }
 
-// Gradient and value of one body's signed distance (geometry/interpolation.py).
+// Gradient and value of one body's signed distance; outside of its box a lower bound (media/distance_grid.py).
 vec4 signedDistance(int body, vec3 x) {
-  vec3 scale = cellsPerUnit();
-  vec3 place = (x - gridLow) * scale;
+  vec3 scale = cellsPerUnit(body);
+  vec3 nearest = clamp(x, gridLow[body], gridHigh[body]);
+  vec3 place = (nearest - gridLow[body]) * scale;
   ivec3 centre = clamp(ivec3(floor(place + 0.5)), ivec3(1), vertices - 2);
   vec3 t = clamp(place - vec3(centre), -1.5, 1.5);
   vec3 weight[3] = vec3[3](0.5 * (0.5 - t) * (0.5 - t), 0.75 - t * t, 0.5 * (0.5 + t) * (0.5 + t));
@@ -84,12 +86,22 @@ vec4 signedDistance(int body, vec3 x) {
       sum += vec4(line.x * wy * wz, line.y * slope[j].y * wz, line.y * wy * slope[k].z, line.y * wy * wz);
     }
   }
-  return distanceStep * sum * vec4(scale, 1.0);
+  vec4 phi = distanceStep[body] * sum * vec4(scale, 1.0);
+  float beyond = distance(x, nearest);
+  return beyond > 0.0 && phi.w > 0.0 ? vec4(normalize(x - nearest), length(vec2(beyond, phi.w))) : phi;
 }
 
 float freeAround(vec3 x) {
-  ivec3 block = ivec3((x - gridLow) * cellsPerUnit() / blockCells);
-  return clearanceStep * float(texelFetch(clearance, clamp(block, ivec3(0), textureSize(clearance, 0) - 1), 0).r);
+  ivec3 blocks = textureSize(clearance, 0);
+  blocks.z /= bodies;
+  float free = FAR;
+  for (int body = 0; body < bodies; ++body) {
+    vec3 nearest = clamp(x, gridLow[body], gridHigh[body]);
+    ivec3 block = min(ivec3((nearest - gridLow[body]) * cellsPerUnit(body) / blockCells), blocks - 1);
+    float known = float(texelFetch(clearance, block + ivec3(0, 0, body * blocks.z), 0).r);
+    free = min(free, length(vec2(distance(x, nearest), clearanceStep[body] * known)));
+  }
+  return free;
 }
 
 int innermost(int inside) {
@@ -110,7 +122,7 @@ struct Hit {
 // The first surface on a line. Sphere tracing ends in a change of sign; then the root is bracketed (Illinois method).
 Hit surfaceAhead(vec3 x, vec3 d, int inside) {
   Hit hit = Hit(-1, 0.0, 0.0, vec3(0.0));
-  vec2 span = boxSpan(gridLow, gridHigh, x, d);
+  vec2 span = boxSpan(allLow, allHigh, x, d);
   float t = max(span.x, 0.0), leave = span.y;
   if (bodies == 0 || t >= leave) return hit;
   float before = t, after = FAR, ownSide = 1.0, otherSide = 0.0;
@@ -247,6 +259,16 @@ vec3 radianceFrom(vec3 x, vec3 d) {
       if (hit.body >= 0) {
         flipped = inside ^ (1 << hit.body);
         bodyAfter = innermost(flipped);
+        if (bodyAfter == 0 && bodyBefore > 0) {  // a thin gap of air between bodies counts as closed
+          vec3 behind = x + (hit.after + shortestStep) * d;
+          int met = 0;
+          for (int b = 0; b < bodies; ++b) {
+            if (b != hit.body && (signedDistance(b, behind).w < 0.0) != ((flipped >> b & 1) == 1)) met |= 1 << b;
+          }
+          if (met != 0) hit.after += shortestStep;
+          flipped ^= met;
+          bodyAfter = innermost(flipped);
+        }
       }
       float n = index[bodyAfter] / index[bodyBefore];
       bool bends = hit.body >= 0 && n != 1.0;
@@ -257,7 +279,8 @@ vec3 radianceFrom(vec3 x, vec3 d) {
         break;
       }
       vec3 normal = dot(hit.normal, d) > 0.0 ? -hit.normal : hit.normal;
-      vec3 apart = normal * ON_ITS_SIDE / min(cellsPerUnit().x, min(cellsPerUnit().y, cellsPerUnit().z));
+      vec3 cells = cellsPerUnit(hit.body);
+      vec3 apart = normal * ON_ITS_SIDE / min(cells.x, min(cells.y, cells.z));
       start = 0.0;
       if (!bends) {
         x += hit.after * d - apart;

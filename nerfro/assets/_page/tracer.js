@@ -92,8 +92,9 @@ class Tracer {
       focal: [view.focal[0] * scale[0], view.focal[1] * scale[1]],
       principal: [view.principal[0] * scale[0], view.principal[1] * scale[1]],
       jitter, height, axes: view.axes, eye: view.eye, near: view.near,
-      vertices: surface.vertices, gridLow: surface.low, gridHigh: surface.high, distanceStep: surface.step,
-      clearanceStep: surface.clearance, blockCells: surface.block, shortestStep: surface.shortest,
+      vertices: surface.vertices, gridLow: surface.low.flat(), gridHigh: surface.high.flat(),
+      allLow: extremes(surface.low, Math.min), allHigh: extremes(surface.high, Math.max), distanceStep: surface.steps,
+      clearanceStep: surface.clearances, blockCells: surface.block, shortestStep: surface.shortest,
       bodies: shown, nested: surface.nested, maxEvents: surface.events, startInside: shown ? this.bodiesAt(view.eye) : 0,
       index: [1, ...settings.iors], absorption: [0, 0, 0, ...settings.absorption.flat()],
       reflection: settings.reflection,
@@ -122,10 +123,12 @@ class Tracer {
   // A bit for each body that a place is in, by the vertex next to it.
   bodiesAt(place) {
     const { vertices, low, high, iors } = this.scene.surface;
-    const at = place.map((x, i) => Math.round(((x - low[i]) / (high[i] - low[i])) * (vertices[i] - 1)));
-    if (at.some((i, axis) => i < 0 || i >= vertices[axis])) return 0;
     const [nx, ny, nz] = vertices;
-    return iors.reduce((bits, _, b) => bits | ((this.signs[((b * nz + at[2]) * ny + at[1]) * nx + at[0]] < 0) << b), 0);
+    return iors.reduce((bits, _, b) => {
+      const at = place.map((x, i) => Math.round(((x - low[b][i]) / (high[b][i] - low[b][i])) * (vertices[i] - 1)));
+      if (at.some((i, axis) => i < 0 || i >= vertices[axis])) return bits;
+      return bits | ((this.signs[((b * nz + at[2]) * ny + at[1]) * nx + at[0]] < 0) << b);
+    }, 0);
   }
 
   resize(width, height) {
@@ -206,4 +209,6 @@ class Tracer {
   }
 }
 
+// The least or largest coordinate of several corners along each axis.
+const extremes = (corners, choose) => [0, 1, 2].map((axis) => choose(...corners.map((corner) => corner[axis])));
 const source = (name) => document.getElementById(`${name}.glsl`).textContent.trim();

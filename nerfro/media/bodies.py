@@ -1,0 +1,127 @@
+"""Bodies of a medium by name, as configurations describe them."""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Optional
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from nerfro.allowed import NotNegative, Positive, check
+from nerfro.errors import NerfroError, nearest_of
+from nerfro.media.material import Abbe, Material, find_material
+
+_LEARNED = ("ior", "absorption")
+
+
+@dataclass
+class BodySettings:
+    """Settings of a body, `bodies.NAME`.
+
+    Attributes:
+        mesh: closed triangle mesh, world units; by default `medium.mesh`.
+        ior: refractive index, of the d line if the body disperses light.
+        material: material of the catalogue (`python -m nerfro.plugins material`), with its dispersion.
+        abbe: Abbe number; without one, the index of a body with `ior` is the same for all colours.
+        absorption: coefficients of red, green and blue per world unit, or one for all.
+        priority: where bodies overlap, the one with the highest priority decides; of equal ones the last.
+        learn: quantities that are learned in training: `ior`, `absorption`.
+    """
+
+    mesh: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    ior: Optional[Positive] = None  # noqa: UP045
+    material: Optional[str] = None  # noqa: UP045
+    abbe: Optional[Positive] = None  # noqa: UP045
+    absorption: list[float] = dataclasses.field(default_factory=list)
+    priority: int = 0
+    learn: list[str] = dataclasses.field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Body:
+    """Surface and material of a body."""
+
+    name: str
+    mesh: str
+    material: Material
+
+
+def read_bodies(bodies: Any, mesh: str | None) -> list[Body]:
+    """Read the bodies of a configuration, in ascending order of their priorities.
+
+    The last body at a point decides there. The order therefore expresses priorities (Schmidt and Budge 2002, "Simple
+    Nested Dielectrics in Ray Traced Images").
+
+    Args:
+        bodies: settings of each body by name, see `BodySettings`.
+        mesh: mesh of bodies without one.
+
+    Raises:
+        NerfroError: a setting is unknown, missing or not allowed.
+    """
+    if not isinstance(bodies, Mapping):
+        raise NerfroError(f"bodies={bodies} is not a mapping; write bodies={{NAME: {{mesh: FILE, ior: 1.5}}}}")
+    settings = {str(name): _settings(str(name), given) for name, given in bodies.items()}
+    if not settings:
+        raise NerfroError("bodies={} has no body; write bodies={NAME: {mesh: FILE, ior: 1.5}}")
+    ordered = sorted(settings.items(), key=lambda item: item[1].priority)
+    return [Body(name, _mesh(name, given.mesh or mesh), _material(name, given)) for name, given in ordered]
+
+
+def mesh_files(medium: Any) -> list[str]:
+    """Return the mesh file of each body of a medium's configuration, which may have none."""
+    if not isinstance(medium, Mapping):
+        return []
+    bodies, mesh = medium.get("bodies"), medium.get("mesh")
+    if bodies is not None:
+        return [body.mesh for body in read_bodies(bodies, mesh)]
+    return [] if mesh is None else [str(mesh)]
+
+
+def _settings(name: str, given: Any) -> BodySettings:
+    where = f"bodies.{name}"
+    if not isinstance(given, Mapping):
+        raise NerfroError(f"{where}={given} is not a set of settings; write {where}={{mesh: FILE, ior: 1.5}}")
+    known = [field.name for field in dataclasses.fields(BodySettings)]
+    for key in given:
+        if key not in known:
+            raise NerfroError(f"{where}.{key} is not a setting; {nearest_of(str(key), known)}")
+    try:
+        merged = OmegaConf.merge(OmegaConf.structured(BodySettings), dict(given))
+        settings = typing.cast(BodySettings, OmegaConf.to_object(merged))
+    except OmegaConfBaseException as error:
+        reason = str(error).strip().split("\n", 1)[0]
+        raise NerfroError(f"{where}: {reason}; see docs/guides/several_bodies.md") from error
+    hints = typing.get_type_hints(BodySettings, include_extras=True)
+    check(f"{where}.", hints | {"absorption": Sequence[NotNegative]}, vars(settings))
+    if len(settings.absorption) not in (0, 1, 3):
+        raise NerfroError(f"{where}.absorption={settings.absorption} is not allowed; give red, green and blue, or one")
+    unknown = [quantity for quantity in settings.learn if quantity not in _LEARNED]
+    if unknown:
+        raise NerfroError(f"{where}.learn={settings.learn} is not allowed; choose {' and '.join(_LEARNED)}")
+    return settings
+
+
+def _mesh(name: str, mesh: str | None) -> str:
+    if mesh is None:
+        raise NerfroError(f"bodies.{name} needs a mesh; add bodies.{name}.mesh=FILE")
+    return str(mesh)
+
+
+def _material(name: str, given: BodySettings) -> Material:
+    if (given.ior is None) == (given.material is None):
+        raise NerfroError(f"bodies.{name} needs one of ior and material; write ior: 1.5, or material: water")
+    absorption = given.absorption * 3 if len(given.absorption) == 1 else given.absorption or [0.0] * 3
+    if given.material is None:
+        dispersion = None if given.abbe is None else Abbe(given.abbe)
+        return Material(typing.cast(float, given.ior), absorption, dispersion, given.learn)
+    if given.abbe is not None:
+        raise NerfroError(
+            f"bodies.{name}.abbe={given.abbe} contradicts its material, which has a dispersion; remove it"
+        )
+    formula = find_material(given.material)
+    return Material(formula.ior, absorption, formula, given.learn)

@@ -1,0 +1,206 @@
+"""Several bodies: apart, touching, overlapping; their settings by name, and the catalogue of materials."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+from nerfro.errors import NerfroError
+from nerfro.media.material import MATERIALS
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.samplers.eikonal import Eikonal
+from nerfro.samplers.snell import Snell, trace_interfaces
+from nerfro.types import Path as RayPath
+from nerfro.types import Rays
+from tests.closed_forms import angle, make_rays
+
+CENTRES = ((-10.0, 0.0, 0.0), (10.0, 0.0, 0.0))  # of balls of radius 1
+
+
+def _ball(folder: Path, centre: tuple[float, ...], subdivisions: int = 4) -> str:
+    shape = trimesh.creation.icosphere(subdivisions, 1.0)
+    shape.apply_translation(centre)
+    file = folder / f"ball{'_'.join(map(str, centre))}.ply"
+    shape.export(file)
+    return str(file)
+
+
+def _medium(resolution: int = 48, **bodies: dict[str, Any]) -> SdfGrid:
+    return SdfGrid(bodies=bodies, resolution=resolution, cache=False)
+
+
+def _rays_at(centre: tuple[float, ...], num: int = 300) -> Rays:
+    """Rays along -z through a ball."""
+    generator = torch.Generator().manual_seed(0)
+    height, turn = 0.9 * torch.rand(num, generator=generator).sqrt(), 2 * math.pi * torch.rand(num, generator=generator)
+    origins = torch.stack([height * turn.cos(), height * turn.sin(), torch.full((num,), 3.0)], -1)
+    return make_rays(origins + torch.tensor(centre), [[0.0, 0.0, -1.0]] * num, 0.5, 8.0)
+
+
+def _through(rays: Rays, centre: tuple[float, ...], ior: float | Tensor) -> Tensor:
+    """Exit directions behind a ball in closed form."""
+    offset = rays.origins - torch.tensor(centre, dtype=torch.float64)
+    across = offset - (offset * rays.directions).sum(-1, keepdim=True) * rays.directions
+    sine = across.norm(dim=-1, keepdim=True)
+    turn = 2 * (torch.asin(sine) - torch.asin(sine / ior))
+    return turn.cos() * rays.directions - turn.sin() * across / sine
+
+
+@pytest.mark.parametrize("tracer", ["kernel", "reference", "triangles", "eikonal"])
+def test_two_balls_far_apart_are_as_exact_as_each_alone(tracer: str, tmp_path: Path) -> None:
+    files = [_ball(tmp_path, centre) for centre in CENTRES]
+    both = _medium(a={"mesh": files[0], "ior": 1.5}, b={"mesh": files[1], "ior": 1.33})
+
+    def exits(rays: Rays, medium: SdfGrid) -> Tensor:
+        if tracer == "reference":
+            return trace_interfaces(rays, medium, 16).path.exit_directions
+        sampler = {"kernel": Snell(), "triangles": Snell("mesh"), "eikonal": Eikonal()}[tracer]
+        return sampler(rays, medium).exit_directions
+
+    for file, centre, ior in zip(files, CENTRES, (1.5, 1.33), strict=True):
+        rays, alone = _rays_at(centre), SdfGrid(file, ior, resolution=48, cache=False)
+        expected = _through(rays, centre, ior)
+        errors = [angle(exits(rays, medium), expected) for medium in (both, alone)]
+        assert errors[0].median() < (0.1 if tracer == "eikonal" else 0.03)
+        torch.testing.assert_close(*errors, atol=1e-4 if tracer == "eikonal" else 1e-9, rtol=1e-3)
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-5, -1e-5])
+@pytest.mark.parametrize("upper_first", [True, False])
+def test_light_passes_from_one_touching_body_to_the_other(gap: float, upper_first: bool, tmp_path: Path) -> None:
+    """It would be totally reflected at a layer of air, however thin."""
+    for name, z in (("upper", 0.6 + gap), ("lower", -0.6)):
+        shape = trimesh.creation.box((2.0, 2.0, 1.2), trimesh.transformations.translation_matrix([0, 0, z]))
+        shape.export(tmp_path / f"{name}.ply")
+    settings = {"upper": {"ior": 1.5}, "lower": {"ior": 1.4}}
+    names = ["upper", "lower"] if upper_first else ["lower", "upper"]
+    medium = _medium(**{name: {"mesh": str(tmp_path / f"{name}.ply"), **settings[name]} for name in names})
+    direction = torch.tensor([[0.6, 0.0, -0.8]], dtype=torch.float64)
+    rays = make_rays(torch.tensor([[-1.0, 0.1, 0.6]]) - 2 * direction, direction, 0.5, 9.0)
+    along_x = math.sqrt(1.5**2 - 0.8**2)
+    expected = torch.tensor([along_x, 0.0, -math.sqrt(1.4**2 - along_x**2)], dtype=torch.float64) / 1.4
+    numbers = [1 + names.index("upper"), 1 + names.index("lower")]
+    paths = [Snell()(rays, medium), trace_interfaces(rays, medium, 16).path]
+    if gap <= 0:  # triangles are where they are
+        paths.append(Snell("mesh")(rays, medium))
+    for path in paths:
+        assert path.body[0, :3].tolist() == [0, *numbers]
+        assert angle(path.directions[0, 2], expected) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("order", "priorities", "owner"),
+    [("ab", (0, 0), "b"), ("ba", (0, 0), "a"), ("ab", (1, 0), "a"), ("ba", (0, 1), "b"), ("ba", (-1, 0), "b")],
+)
+def test_priority_or_order_decides_where_bodies_overlap(
+    order: str, priorities: tuple[int, int], owner: str, tmp_path: Path
+) -> None:
+    centres = {"a": (0.0, 0.0, 0.5), "b": (0.0, 0.0, -0.5)}
+    settings = {
+        name: {"mesh": _ball(tmp_path, centre), "ior": ior, "priority": priority}
+        for (name, centre), ior, priority in zip(centres.items(), (1.5, 1.3), priorities, strict=True)
+    }
+    medium = _medium(**{name: settings[name] for name in order})
+    rays = make_rays([[0.0, 0.0, 3.0]], [[0.0, 0.0, -1.0]], 0.5, 8.0)
+    # On the axis light does not turn; the overlap reaches from z = 0.5 to -0.5.
+    boundary = 0.5 if owner == "b" else -0.5
+    for path in (Snell()(rays, medium), trace_interfaces(rays, medium, 16).path):
+        assert [medium.names[body - 1] for body in path.body[0, 1:3]] == ["a", "b"]
+        torch.testing.assert_close(
+            path.positions[0, 1:4, 2], torch.tensor([1.5, boundary, -1.5]).double(), atol=2e-3, rtol=0
+        )
+    n, _ = medium(torch.tensor([[0.0, 0.0, 0.0]]))
+    assert float(n) == pytest.approx(settings[owner]["ior"], abs=1e-6)
+
+
+def test_the_index_of_one_body_and_the_absorption_of_the_other_are_learned_together(tmp_path: Path) -> None:
+    files = [_ball(tmp_path, centre) for centre in CENTRES]
+    medium = _medium(
+        resolution=32,
+        glass={"mesh": files[0], "ior": 1.45, "learn": ["ior"]},
+        tinted={"mesh": files[1], "ior": 1.33, "absorption": [0.2, 0.2, 0.2], "learn": ["absorption"]},
+    )
+    assert {name for name, _ in medium.named_parameters()} == {"materials.0.ior", "materials.1._absorption"}
+    assert [parameter.shape for parameter in medium.bending_parameters()] == [()]
+    clear, tinted = (_rays_at(centre, 100) for centre in CENTRES)
+    expected = _through(clear, CENTRES[0], 1.5)
+    sigma = torch.tensor([0.5, 0.1, 0.3], dtype=torch.float64)
+    rates = {"materials.0.ior": 0.02, "materials.1._absorption": 0.1}
+    groups = [{"params": [values], "lr": rates[name]} for name, values in medium.named_parameters()]
+    sampler, optimizer = Snell(), torch.optim.Adam(groups)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.96)
+
+    def refined(rays: Rays) -> RayPath:
+        return medium.with_absorption(sampler.refine(sampler(rays, medium), rays, medium))
+
+    for _ in range(120):
+        path = refined(tinted)
+        chords = (path.s[:, 2] - path.s[:, 1]).detach()[:, None]
+        seen = path.transmitted(path.far[:, None])[:, 0]
+        loss = (seen - torch.exp(-sigma * chords)).square().mean()
+        loss = loss + (refined(clear).exit_directions - expected).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    learned = medium.learned()
+    assert learned["ior_glass"] == pytest.approx(1.5, abs=2e-3)
+    colours = [learned[f"absorption_tinted_{colour}"] for colour in ("red", "green", "blue")]
+    assert colours == pytest.approx(sigma.tolist(), abs=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"ior": 1.5, "index": 1}, r"bodies\.glass\.index is not a setting"),
+        ({"ior": 1.5, "material": "water"}, "needs one of ior and material"),
+        ({}, "needs one of ior and material"),
+        ({"material": "watr"}, "'watr' is not a material; .*water"),
+        ({"material": "water", "abbe": 50}, "contradicts its material"),
+        ({"ior": -1}, r"bodies\.glass\.ior=-1.0 is not allowed"),
+        ({"ior": "thick"}, r"bodies\.glass: .*thick"),
+        ({"ior": 1.5, "absorption": [0.1, 0.2]}, "give red, green and blue, or one"),
+        ({"ior": 1.5, "absorption": [-0.1]}, r"bodies\.glass\.absorption=.* is not allowed"),
+        ({"ior": 1.5, "learn": ["colour"]}, "choose ior and absorption"),
+        ({"ior": 1.5, "mesh": None}, r"bodies\.glass needs a mesh"),
+        ({"ior": 1.5, "mesh": "missing.ply"}, "missing.ply"),
+        (1.5, r"bodies\.glass=1.5 is not a set of settings"),
+    ],
+)
+def test_wrong_bodies_are_refused_by_name(settings: Any, message: str, tmp_path: Path) -> None:
+    if isinstance(settings, dict):
+        settings = {"mesh": _ball(tmp_path, (0.0, 0.0, 0.0), 2), **settings}
+    with pytest.raises(NerfroError, match=message):
+        _medium(16, glass=settings)
+
+
+def test_short_and_long_form_exclude_each_other(tmp_path: Path) -> None:
+    bodies = {"glass": {"mesh": _ball(tmp_path, (0.0, 0.0, 0.0), 2), "ior": 1.5}}
+    with pytest.raises(NerfroError, match=r"medium\.learn_ior has no meaning beside bodies"):
+        SdfGrid(bodies=bodies, learn_ior=True)
+    with pytest.raises(NerfroError, match="needs mesh"):
+        SdfGrid()
+
+
+# Index of the d line and Abbe number, as data sheets and handbooks print them.
+PUBLISHED = {
+    "water": (1.3334, 55.8), "soda_lime": (1.523, 64.0), "borosilicate": (1.4714, 65.7), "n_bk7": (1.5168, 64.17),
+    "acrylic": (1.4906, 53.2), "polycarbonate": (1.5848, 27.9), "sapphire": (1.7682, 72.2), "diamond": (2.4175, 55.3),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_materials_have_their_published_index_and_abbe_number(name: str, tmp_path: Path) -> None:
+    ior, abbe = PUBLISHED[name]
+    assert MATERIALS[name].ior == pytest.approx(ior, abs=4e-4)
+    assert MATERIALS[name].abbe == pytest.approx(abbe, rel=6e-3)
+    medium = _medium(16, body={"mesh": _ball(tmp_path, (0.0, 0.0, 0.0), 2), "material": name})
+    for wavelength in Snell().wavelengths:
+        at = medium.at_wavelength(wavelength).iors
+        assert at.tolist() == pytest.approx([MATERIALS[name].index(wavelength / 1000)], abs=1e-12)
