@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -92,6 +92,11 @@ class HashGridField(Field):
         num_harmonics = harmonics.spherical_harmonics(torch.zeros(1, 3), direction_bands).shape[-1]
         self.density_mlp = _mlp(hash_encoding.NUM_FEATURES * num_levels, width, 1, _GEOMETRY_FEATURES)
         self.colour_mlp = _mlp(_GEOMETRY_FEATURES + num_harmonics, width, 2, 3)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+        if self.observed is not None:  # earlier checkpoints do not contain it
+            state_dict.setdefault(f"{prefix}observed", torch.ones_like(self.observed))
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     @property
     def bounds(self) -> Float[Tensor, "2 3"] | None:

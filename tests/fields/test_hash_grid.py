@@ -198,3 +198,11 @@ def test_space_close_to_a_camera_is_empty_unless_three_cameras_see_it(num_camera
         (field(samples).density[:, 0], whole(samples).density[:, 0]),
     ):
         assert torch.equal(found, torch.where(empty, 0, expected))
+
+
+def test_checkpoints_without_observed_cells_have_none_that_are_empty() -> None:
+    field, restored = make_field(radius=2.0), make_field(radius=2.0)
+    restored.begin(cameras_around(12, 16))
+    restored.load_state_dict({name: value for name, value in field.state_dict().items() if name != "observed"})
+    points = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0)) * 8 - 4
+    assert torch.equal(restored.density(points), field.density(points))
