@@ -58,7 +58,7 @@ def few(mitsuba: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_poses_are_only_in_the_truth(few: Path) -> None:
     beside = [path.relative_to(few).parts[0] for path in few.rglob("*") if path.is_file()]
-    assert set(beside) == {"images", "masks", "truth"}
+    assert set(beside) == {"images", "masks", "truth", ".lock"}
     assert len(list((few / "images").iterdir())) == len(list((few / "masks").iterdir())) == 2
 
 

@@ -26,7 +26,8 @@ class Linear(nn.Linear):
         """Apply the layer to one or several inputs, which are concatenated."""
         first, *others = inputs
         if torch.compiler.is_compiling() or not _suits_onednn(first):
-            return super().forward(torch.cat([first, *(other.to(first.dtype) for other in others)], -1))
+            joined = torch.cat([first, *(other.to(first.dtype) for other in others)], -1) if others else first
+            return super().forward(joined)
         result = _Linear.apply(self.weight, self.bias, *(part.reshape(-1, part.shape[-1]) for part in inputs))
         # PyTorch would copy a view before an operator in place.
         return result if first.ndim == 2 else result.view(*first.shape[:-1], self.out_features)

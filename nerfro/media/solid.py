@@ -75,11 +75,9 @@ class Solid(Medium):
         self.names = list(names) or [str(body + 1) for body in range(len(materials))]
         self.register_load_state_dict_pre_hook(_read_old_parameters)
 
-    def extra_repr(self) -> str:
-        size = (self.box[1] - self.box[0]).tolist()
-        return (
-            f"ior={[round(n, 4) for n in self.indices.tolist()]}, box of {' x '.join(f'{side:.3g}' for side in size)}"
-        )
+    def __repr__(self) -> str:
+        size = " x ".join(f"{side:.3g}" for side in (self.box[1] - self.box[0]).tolist())
+        return f"{type(self).__name__}(ior={[round(n, 4) for n in self.indices.tolist()]}, box of {size})"
 
     @property
     def iors(self) -> Float[Tensor, "K"]:
