@@ -195,7 +195,10 @@ def propagate(
         )
     common = outlines.hull() if body is None else body
     if wanted and common is None:
-        raise NerfroError("the visual hull of the given masks is empty; correct the masks or the poses")
+        raise NerfroError(
+            "the visual hull of the given masks is empty; correct the masks or the poses, and check the format of the "
+            "data set (data=), which determines the camera axes"
+        )
     if not hull_only and FEWEST_VIEWS < len(given) <= _FEW:
         hull_only = _hull_predicts_better(images, outlines, given)
     found, overlaps = {}, {}
