@@ -180,6 +180,7 @@ def measure(overrides: list[str], steps: int, psnr: float, by_clock: bool, begun
     costs["step"] = 1e3 * per_step
     costs["quality"] = None if quality.reached is None else quality.reached * per_step
     cameras, clock = test.cameras.resized(RENDERED, RENDERED), time.perf_counter if by_clock else time.process_time
+    render_view(training.renderer, cameras, 0, Subdivision())  # compiles
     start = clock()
     render_view(training.renderer, cameras, 0, Subdivision())
     costs["render"] = (clock() - start) * 1e6 / RENDERED**2
