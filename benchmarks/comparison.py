@@ -68,8 +68,11 @@ def train(name: str, folder: Path, options: list[str]) -> None:
     if (folder / "metrics.json").exists():
         return
     shutil.rmtree(folder, ignore_errors=True)
-    command = [sys.executable, str(ROOT / "benchmarks" / "processor_time.py"), f"+experiment={name}"]
-    subprocess.run([*command, f"hydra.run.dir={folder.resolve()}", *options], check=True, cwd=ROOT)
+    folder = folder.resolve()
+    # The run records its command, which does not depend on the place of the checkout.
+    shown = folder.relative_to(ROOT) if folder.is_relative_to(ROOT) else folder
+    command = [sys.executable, "benchmarks/processor_time.py", f"+experiment={name}", f"hydra.run.dir={shown}"]
+    subprocess.run([*command, *options], check=True, cwd=ROOT)
 
 
 @contextlib.contextmanager

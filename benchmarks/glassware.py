@@ -33,7 +33,7 @@ from nerfro.evaluation.results import FULL, read_metrics_json
 from nerfro.light import to_srgb
 from nerfro.progress import track
 from nerfro.scenes.dataset import PlannedImage, write_image
-from nerfro.scenes.path_tracer import PathTracer, Pinhole, _mesh, _panel
+from nerfro.scenes.path_tracer import PathTracer, Pinhole, panel_shape, triangle_shape
 from nerfro.scenes.scene import Panel, Scene
 from nerfro.scenes.surface import Surface
 from nerfro.scenes.synthesis import find_scene
@@ -275,12 +275,12 @@ def render(kind: str, folder: Path, count: int, width: int, spp: int) -> None:
             "type": "scene",
             "integrator": {"type": "path", "max_depth": 64, "rr_depth": 16},
             "lamp": {"type": "sphere", "center": [2.0, -1.5, 4.2], "radius": 0.6, "emitter": LAMP},
-            **{f"panel_{number}": _panel(mi, panel) for number, panel in enumerate(panels)},
+            **{f"panel_{number}": panel_shape(mi, panel) for number, panel in enumerate(panels)},
             **{
-                f"part_{number}": _mesh(mi, f"part_{number}", surface, part.material())
+                f"part_{number}": triangle_shape(mi, f"part_{number}", surface, part.material())
                 for number, (part, surface) in enumerate(zip(parts, surfaces, strict=True))
             },
-            "clutter": _mesh(mi, "clutter", clutter, paint),
+            "clutter": triangle_shape(mi, "clutter", clutter, paint),
         }
     )
     poses = photographs.hand_held(count, 3, aim, DISTANCE, ELEVATIONS, LAPS)

@@ -116,7 +116,7 @@ class PathTracer:
         paint = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
         if absorbs:
             paint = {"type": EMBEDDED, "nested": paint, **absorption}
-        surroundings = {f"panel_{number}": _panel(mi, panel) for number, panel in enumerate(scene.panels)}
+        surroundings = {f"panel_{number}": panel_shape(mi, panel) for number, panel in enumerate(scene.panels)}
         if scene.sky is not None:
             # Two texels per pixel of the background.
             height = int(np.clip(2 * np.pi / camera.angle_x * camera.width, 256, 2048))
@@ -124,14 +124,14 @@ class PathTracer:
             upright = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
             texture = mi.Bitmap(envmap_texture(scene.sky, height, np.asarray(upright.matrix)[:3, :3]))
             surroundings["sky"] = {"type": "envmap", "bitmap": texture, "to_world": upright}
-        self.glass = mi.load_dict({"type": "scene", "glass": _mesh(mi, "glass", scene.glass, glass)})
+        self.glass = mi.load_dict({"type": "scene", "glass": triangle_shape(mi, "glass", scene.glass, glass)})
         self.scene = mi.load_dict(
             {
                 "type": "scene",
                 "integrator": {"type": "path", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH},
                 **surroundings,
-                "glass": _mesh(mi, "glass", scene.glass, glass),
-                "interior": _mesh(mi, "interior", scene.interior, paint),
+                "glass": triangle_shape(mi, "glass", scene.glass, glass),
+                "interior": triangle_shape(mi, "interior", scene.interior, paint),
             }
         )
 
@@ -220,7 +220,7 @@ def envmap_texture(sky: Sky, height: int, to_world: np.ndarray) -> np.ndarray:
     return texture
 
 
-def _panel(mi: ModuleType, panel: Panel) -> dict:
+def panel_shape(mi: ModuleType, panel: Panel) -> dict:
     """Return a Mitsuba rectangle with the image of the panel, decoded to linear, as radiance or albedo."""
     linear = {
         "type": "bitmap",
@@ -238,7 +238,7 @@ def _panel(mi: ModuleType, panel: Panel) -> dict:
     return shape | {"bsdf": {"type": "diffuse", "reflectance": linear}}
 
 
-def _mesh(mi: ModuleType, name: str, surface: Surface, material: dict):
+def triangle_shape(mi: ModuleType, name: str, surface: Surface, material: dict):
     """Return a Mitsuba mesh; vertex colours become the attribute `vertex_color`, decoded to linear albedo."""
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(material)

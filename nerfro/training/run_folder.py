@@ -265,8 +265,8 @@ def _command() -> str:
         # In a launcher's worker this process has another main module and other arguments.
         return shlex.join(["python", "-m", "nerfro.train", *HydraConfig.get().overrides.task])
     spec = getattr(sys.modules["__main__"], "__spec__", None)
-    module = spec.name if spec is not None else sys.argv[0]
-    return shlex.join([Path(sys.executable).name, "-m", module, *sys.argv[1:]])
+    program = [sys.argv[0]] if spec is None else ["-m", spec.name]
+    return shlex.join([Path(sys.executable).name, *program, *sys.argv[1:]])
 
 
 def _version(package: str) -> str | None:

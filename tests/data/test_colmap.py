@@ -16,27 +16,13 @@ from omegaconf import OmegaConf
 from nerfro.data.base import Views
 from nerfro.data.colmap_model import CAMERA_MODELS, read_colmap
 from nerfro.errors import NerfroError
+from tests.conftest import SMALL
 
 from .formats import BROWN, FORMATS, OPENCV, TRAIN, write_colmap
 from .photographs import CX, CY, FX, FY, HEIGHT, POINTS, WIDTH, camera_to_world, check_views, save_picture
 
 TORCH_POINTS = torch.from_numpy(POINTS).float()
-TINY = [
-    "sampler.points.num_samples=8",
-    "sampler.points.num_bins=16",
-    "sampler.points.resolution=16",
-    "field.num_levels=4",
-    "field.log2_table_size=10",
-    "field.width=16",
-    "medium.resolution=32",
-    "medium.cache=false",
-    "batches.size=32",
-    "evaluation.subdivision.side=1",
-    "trainer.accelerator=cpu",
-    "trainer.max_steps=2",
-    "trainer.max_time=null",
-    "logger=none",
-]
+TINY = [*SMALL, "evaluation.subdivision.side=1", "trainer.max_steps=2"]
 
 
 def load(root: Path, split: str = "train", **options: Any) -> Views:

@@ -59,7 +59,7 @@ def path_traced(
                 "integrator": tracer.scene.integrator(),
                 "sky": tracer.scene.environment(),
                 **shapes,
-                "inner": path_tracer._mesh(mi, "inner", surface, material),
+                "inner": path_tracer.triangle_shape(mi, "inner", surface, material),
             }
         )
     return torch.from_numpy(tracer.render(POSE, SPP, seed=1))

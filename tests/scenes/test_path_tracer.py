@@ -47,7 +47,7 @@ def trace(surface, origins, directions, crossings):
     """Follow rays through `transmitting_glass` alone; return directions and weights after `crossings` events."""
     mi = load_mitsuba()
     material = {"type": "transmitting_glass", "int_ior": IOR, "tint": mi.ScalarColor3f(0.5)}
-    scene = mi.load_dict({"type": "scene", "glass": path_tracer._mesh(mi, "glass", surface, material)})
+    scene = mi.load_dict({"type": "scene", "glass": path_tracer.triangle_shape(mi, "glass", surface, material)})
 
     def columns(array):
         return [mi.Float(np.ascontiguousarray(column, np.float32)) for column in array.T]
